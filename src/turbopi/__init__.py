@@ -1,0 +1,1 @@
+"""Turbo-Pi: Pi0.5 robot policies in real time, with openpi's exact semantics."""

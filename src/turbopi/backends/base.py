@@ -1,0 +1,60 @@
+"""The protocol that every backend implements. The policy knows nothing else about the one it holds."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Protocol
+
+import torch
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.model.kv_cache import KVCache
+from turbopi.model.reference import Precision, Trace
+from turbopi.observation import Observation
+
+# Loads the checkpoint's tensors, by canonical name, to a device in a precision.
+LoadState = Callable[[torch.device, Precision], dict[str, Tensor]]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One answer of a backend."""
+
+    actions: Tensor  # float32[B, H, action_dim], on the host
+    # milliseconds of "vision", "prefix", "denoise", measured on the device; a stage it can't tell apart is absent
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+
+class Backend(Protocol):
+    """A way to run the model. All of them compute what `turbopi.model.reference.Pi0Model` computes.
+
+    Observations and noise may be on the host or on the device; both are moved where they are needed.
+    """
+
+    name: ClassVar[str]
+    precisions: ClassVar[tuple[Precision, ...]]
+    config: ModelConfig
+    device: torch.device
+    precision: Precision
+
+    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+        """Load the weights; whatever can be prepared without an observation is prepared here."""
+
+    @classmethod
+    def unavailable(cls, device: torch.device) -> str | None:
+        """None if the backend can run on the device, else why it can't and what to do."""
+
+    def prefix(self, observation: Observation) -> KVCache:
+        """Keys and values of an observation."""
+
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int) -> Tensor:
+        """Actions float32[B, H, action_dim] on the device, from noise of that shape."""
+
+    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+        """Both halves, fused where the backend can: what the policy calls. Returns when the actions are on the host."""
+
+    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
+        """The same computation with its named intermediates (kv_k, kv_v, v_t and actions at least), for judging it."""
+
+    def describe(self) -> dict[str, Any]:
+        """What a user may want to know of this instance, as plain values: goes into the policy's metadata."""

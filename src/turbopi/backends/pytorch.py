@@ -1,0 +1,55 @@
+"""Backend `pytorch`: the reference itself, eager, on any device."""
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from turbopi.backends.base import LoadState, Sample
+from turbopi.backends.timing import StageTimer
+from turbopi.config import ModelConfig
+from turbopi.model.kv_cache import KVCache
+from turbopi.model.reference import Pi0Model, Precision, Trace
+from turbopi.observation import Observation
+
+
+class PyTorchBackend:
+    """Runs `Pi0Model`; a batch of one is compacted exactly, larger ones as far as their masks allow."""
+
+    name: ClassVar[str] = "pytorch"
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
+    model_class: ClassVar[type[Pi0Model]] = Pi0Model
+
+    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+        self.config = config
+        self.device = device
+        self.precision = precision
+        self.model = self.model_class.from_state(config, load(device, precision))
+
+    @classmethod
+    def unavailable(cls, device: torch.device) -> str | None:
+        return None
+
+    def prefix(self, observation: Observation) -> KVCache:
+        return self.model.prefix(observation.to(self.device))
+
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int) -> Tensor:
+        return self.model.denoise(cache, noise.to(self.device), num_steps)
+
+    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+        timer = StageTimer(self.device)
+        embedded = self.model.embed(observation.to(self.device))
+        timer.mark("vision")  # with the prompt's embedding lookup
+        cache = self.model.keys_values(embedded)
+        timer.mark("prefix")
+        actions = self.model.denoise(cache, noise.to(self.device), num_steps)
+        timer.mark("denoise")
+        return Sample(actions.cpu(), timer.milliseconds())
+
+    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
+        trace: Trace = {}
+        self.model.sample(observation.to(self.device), noise.to(self.device), num_steps, trace=trace)
+        return trace
+
+    def describe(self) -> dict[str, Any]:
+        return {"attention": "explicit float32" if self.precision == "f32" else "scaled_dot_product_attention"}

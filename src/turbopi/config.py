@@ -1,0 +1,168 @@
+"""What a policy is made of: the sizes of its model, and what no checkpoint records about its robot.
+
+`ModelConfig` is the network; `PolicyConfig` adds the edges (robot, statistics, prompt). Sizes are read from a
+checkpoint's tensors when it is loaded, so a preset's sizes only matter for random weights and for what shapes can't
+tell (vision heads of a non-standard width, the horizon). Sources: openpi's `gemma.py`, `siglip.py` and `config.py`.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from turbopi.errors import ConfigError
+
+Kind = Literal["pi05", "pi0"]
+NormMode = Literal["quantile", "zscore", "lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"]
+
+CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's order; prefix tokens follow it
+
+
+@dataclass(frozen=True)
+class VisionConfig:
+    """SigLIP. Defaults: So400m/14 at 224 px."""
+
+    width: int = 1152
+    depth: int = 27
+    mlp_dim: int = 4304
+    num_heads: int = 16
+    patch_size: int = 14
+    image_size: int = 224
+    layer_norm_eps: float = 1e-6
+
+    @property
+    def num_tokens(self) -> int:
+        return (self.image_size // self.patch_size) ** 2
+
+    @property
+    def head_dim(self) -> int:
+        return self.width // self.num_heads
+
+
+@dataclass(frozen=True)
+class GemmaConfig:
+    """One Gemma stack. PaliGemma and the action expert must agree in depth and in everything about heads."""
+
+    width: int
+    mlp_dim: int
+    depth: int = 18
+    num_heads: int = 8
+    num_kv_heads: int = 1
+    head_dim: int = 256
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The whole network. `action_horizon` shapes no weight: any H runs."""
+
+    kind: Kind = "pi05"
+    vision: VisionConfig = VisionConfig()
+    vlm: GemmaConfig = GemmaConfig(width=2048, mlp_dim=16384)
+    expert: GemmaConfig = GemmaConfig(width=1024, mlp_dim=4096)
+    vocab_size: int = 257_152
+    action_dim: int = 32
+    action_horizon: int = 50
+    max_prompt_tokens: int = 200
+    rms_norm_eps: float = 1e-6
+    rope_base: float = 10_000.0
+    # openpi accumulates t in float32; LeRobot computes 1 + step * dt
+    time_grid: Literal["accumulated", "multiplied"] = "accumulated"
+
+    def __post_init__(self) -> None:
+        for attribute in ("depth", "num_heads", "num_kv_heads", "head_dim"):
+            ours, theirs = getattr(self.vlm, attribute), getattr(self.expert, attribute)
+            if ours != theirs:
+                raise ConfigError(f"vlm and expert share one attention, but {attribute} is {ours} and {theirs}")
+        if self.vision.width % self.vision.num_heads:
+            raise ConfigError(f"vision width {self.vision.width} isn't a multiple of {self.vision.num_heads} heads")
+        if self.vlm.num_heads % self.vlm.num_kv_heads:
+            raise ConfigError(f"{self.vlm.num_heads} query heads don't divide by {self.vlm.num_kv_heads} KV heads")
+        if self.expert.head_dim % 2 or self.expert.width % 2:
+            raise ConfigError("RoPE and the time embedding need an even head_dim and an even expert width")
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """How state and actions are scaled; the `lerobot_*` modes differ from openpi's in their epsilons."""
+
+    state: NormMode = "quantile"
+    actions: NormMode = "quantile"
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """A model and its robot: everything `UnifiedPolicy` needs besides weights, statistics and a tokenizer."""
+
+    name: str
+    model: ModelConfig
+    robot: str  # "libero", "droid", "aloha", "lerobot", "plain", or a path to a robot's .json
+    normalization: Normalization = Normalization()
+    discrete_state_input: bool = True  # the state is written into the prompt (Pi0.5 only)
+    asset_id: str | None = None  # folder of norm_stats.json below assets/; None: the only one there
+    robot_options: Mapping[str, Any] = field(default_factory=dict)
+    default_prompt: str | None = None
+    image_resize: Literal["openpi", "lerobot"] = "openpi"
+
+    def with_model(self, **changes: Any) -> "PolicyConfig":
+        """The same policy with some of its model's fields replaced."""
+        return dataclasses.replace(self, model=dataclasses.replace(self.model, **changes))
+
+
+_PI05 = ModelConfig()
+_PI0 = ModelConfig(kind="pi0", max_prompt_tokens=48)
+_TINY = ModelConfig(
+    vision=VisionConfig(width=128, depth=6, mlp_dim=512, num_heads=4),
+    vlm=GemmaConfig(width=192, mlp_dim=512, depth=6, head_dim=32),
+    expert=GemmaConfig(width=128, mlp_dim=256, depth=6, head_dim=32),
+    vocab_size=1024,
+    action_horizon=10,
+)
+_ZSCORE = Normalization("zscore", "zscore")
+
+
+def _model(base: ModelConfig, horizon: int) -> ModelConfig:
+    return dataclasses.replace(base, action_horizon=horizon)
+
+
+# Horizons, assets and options: openpi's training/config.py. pi05_libero keeps the state out of the prompt.
+_PRESETS = (
+    PolicyConfig("pi05_base", _PI05, "plain"),
+    PolicyConfig(
+        "pi05_libero",
+        _model(_PI05, 10),
+        "libero",
+        asset_id="physical-intelligence/libero",
+        discrete_state_input=False,
+    ),
+    PolicyConfig("pi05_droid", _model(_PI05, 15), "droid", asset_id="droid"),
+    PolicyConfig(
+        "pi05_aloha",
+        _PI05,
+        "aloha",
+        asset_id="trossen",
+        robot_options={"adapt_to_pi": True, "delta_actions": True},
+    ),
+    PolicyConfig("pi05_tiny", _TINY, "libero", asset_id="physical-intelligence/libero"),
+    PolicyConfig("pi0_base", _PI0, "plain", _ZSCORE, discrete_state_input=False),
+    PolicyConfig(
+        "pi0_libero", _PI0, "libero", _ZSCORE, discrete_state_input=False, asset_id="physical-intelligence/libero"
+    ),
+    PolicyConfig("pi0_droid", _model(_PI0, 10), "droid", _ZSCORE, discrete_state_input=False, asset_id="droid"),
+    PolicyConfig(
+        "pi0_aloha",
+        _PI0,
+        "aloha",
+        _ZSCORE,
+        discrete_state_input=False,
+        asset_id="trossen",
+        robot_options={"adapt_to_pi": True, "delta_actions": True},
+    ),
+)
+PRESETS: dict[str, PolicyConfig] = {preset.name: preset for preset in _PRESETS}
+
+
+def preset(name: str) -> PolicyConfig:
+    """The preset called `name`. Raises ConfigError, listing the choices, if there is none."""
+    if name not in PRESETS:
+        raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}")
+    return PRESETS[name]

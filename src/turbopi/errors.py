@@ -1,0 +1,40 @@
+"""Every error that Turbo-Pi raises on purpose.
+
+    TurboPiError
+    ├── ConfigError            an option, preset or turbopi.json that can't be right       (also a ValueError)
+    ├── CheckpointError        a checkpoint that can't be read, or doesn't fit its config  (also a ValueError)
+    ├── TokenizerError         the SentencePiece model is missing or isn't one             (also a ValueError)
+    ├── ObservationError       an observation the policy can't use                         (also a ValueError)
+    └── BackendError           a backend can't do what it was asked to
+        └── BackendUnavailable it can't run here at all; says why and what to do
+
+Messages name the value, what was expected, and what to do about it. Broken invariants of our own are `assert`s.
+"""
+
+
+class TurboPiError(Exception):
+    """Base of all errors raised on purpose."""
+
+
+class ConfigError(TurboPiError, ValueError):
+    """An option, preset or `turbopi.json` that can't be right."""
+
+
+class CheckpointError(TurboPiError, ValueError):
+    """A checkpoint that can't be read, or doesn't fit its configuration."""
+
+
+class TokenizerError(TurboPiError, ValueError):
+    """The SentencePiece model is missing, unreadable, or doesn't fit the model's vocabulary."""
+
+
+class ObservationError(TurboPiError, ValueError):
+    """An observation the policy can't use: a missing key, a wrong shape or dtype, a value that isn't finite."""
+
+
+class BackendError(TurboPiError, RuntimeError):
+    """A backend can't do what it was asked to."""
+
+
+class BackendUnavailable(BackendError):
+    """A backend can't run on this machine; the message says why and what to do."""

@@ -1,0 +1,252 @@
+"""The reference: Pi0.5 and Pi0 in plain PyTorch, exact to openpi. Every backend is judged against it.
+
+    prefix(observation) -> KVCache      SigLIP and the language model, once an observation
+    denoise(cache, noise, N) -> actions the action expert, N times
+    sample(observation, noise, N)       both
+
+Intermediates go into a `trace` dict under the names, and in the layouts, that golden files use; see `Trace`.
+Precisions: float32 (the oracle), and bfloat16 as openpi serves it, except that RoPE stays float32 (as in openpi's JAX).
+"""
+
+import dataclasses
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from turbopi.config import ModelConfig
+from turbopi.errors import ObservationError
+from turbopi.model.denoise import euler_step, run_expert, suffix_mask, suffix_rope, time_embedding, time_grid
+from turbopi.model.gemma import Gemma
+from turbopi.model.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
+from turbopi.model.layers import rope_tables
+from turbopi.model.prefix import camera_slots, embed_images, embed_prompt, prefix_keys_values
+from turbopi.model.vision import VisionTower
+from turbopi.observation import Observation
+
+Precision = Literal["bf16", "f32"]
+
+# Names of what a trace records. N steps, B batch, S padded prefix slots, C cameras, H horizon, L layers.
+#   prefix_embs [B, S, D]   prefix_pad_mask bool[B, S]   prefix_positions int[B, S]   vision_last_hidden [C, B, 256, W]
+#   kv_k, kv_v [L, B, S, G, K]   times [N]   cond [N, B, D]   x_t [N + 1, B, H, 32]   suffix_out [N, B, H, D]
+#   v_t [N, B, H, 32]   expert_hidden_step0 [L, B, H (Pi0: H + 1), D]   actions [B, H, 32]
+Trace = dict[str, Tensor]
+
+_FLOAT32_ALWAYS = (
+    "vision.patch_embedding.",
+    "vision.position_embedding.",
+    "action_",
+    "time_mlp_",
+    "state_proj.",
+    "vlm.norm.",
+    "expert.norm.",
+)
+
+
+class Pi0Model(nn.Module):
+    """Pi0.5 or Pi0, by `config.kind`. Build it on the meta device and load a checkpoint's tensors into it."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, dim = config.expert.width, config.action_dim
+        self.vision = VisionTower(config.vision)
+        self.projector = nn.Linear(config.vision.width, config.vlm.width)
+        self.vlm = Gemma(config, config.vlm, vocab_size=config.vocab_size, adaptive=False)
+        self.expert = Gemma(config, config.expert, vocab_size=None, adaptive=config.kind == "pi05")
+        self.action_in_proj = nn.Linear(dim, width)
+        self.action_out_proj = nn.Linear(width, dim)
+        if config.kind == "pi05":
+            self.time_mlp_in = nn.Linear(width, width)
+            self.time_mlp_out = nn.Linear(width, width)
+        else:
+            self.state_proj = nn.Linear(dim, width)
+            self.action_time_mlp_in = nn.Linear(2 * width, width)
+            self.action_time_mlp_out = nn.Linear(width, width)
+        self.requires_grad_(False)
+
+    @classmethod
+    def from_state(cls, config: ModelConfig, state: dict[str, Tensor]) -> "Pi0Model":
+        """The model around tensors that are already on their device, in `parameter_dtype`s; they aren't copied."""
+        with torch.device("meta"):
+            model = cls(config)
+        model.load_state_dict(state, strict=True, assign=True)
+        return model.eval().requires_grad_(False)
+
+    @property
+    def device(self) -> torch.device:
+        return self.action_in_proj.weight.device
+
+    @property
+    def compute_dtype(self) -> torch.dtype:
+        """What activations are made of; a few parameters stay float32 (see parameter_dtype)."""
+        return self.projector.weight.dtype
+
+    # -- the two halves ----------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def sample(
+        self,
+        observation: Observation,
+        noise: Tensor,
+        num_steps: int,
+        *,
+        compact: bool = True,
+        trace: Trace | None = None,
+    ) -> Tensor:
+        """Actions float32[B, H, action_dim], normalised, from noise of that shape: deterministic for given noise."""
+        cache = self.prefix(observation, compact=compact, trace=trace)
+        return self.denoise(cache, noise, num_steps, trace=trace)
+
+    @torch.no_grad()
+    def prefix(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> KVCache:
+        """Keys and values of an observation: `embed`, then `keys_values`.
+
+        compact=True computes only the slots that some batch row needs (for B = 1: no masked camera and no padding);
+        compact=False computes all S slots under a mask. Both give the same actions.
+
+        Raises ObservationError if a row has no valid camera and no valid prompt token.
+        """
+        return self.keys_values(self.embed(observation, compact=compact, trace=trace), trace=trace)
+
+    @torch.no_grad()
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int, *, trace: Trace | None = None) -> Tensor:
+        """Integrate from noise float32[B, H, action_dim] to actions of the same shape in `num_steps` Euler steps."""
+        config = self.config
+        times = time_grid(num_steps, config.time_grid)
+        time_embs = time_embedding(times, config.expert.width).to(noise.device)  # [N, D]
+        conds = self.time_condition(time_embs) if config.kind == "pi05" else None
+        suffix_len = noise.shape[1] + (config.kind == "pi0")  # Pi0's state token comes first
+        rope = suffix_rope(cache, suffix_len, config.expert.head_dim, config.rope_base)
+        mask = suffix_mask(cache, suffix_len, config.kind == "pi0")
+
+        x_t, steps = noise, []
+        hidden: list[Tensor] = []
+        for i in range(num_steps):
+            time = (time_embs[i] if conds is None else conds[i])[None]
+            record = hidden if trace is not None and i == 0 else None
+            suffix_out, v_t = self.velocity(x_t, cache.state, time, cache.k, cache.v, rope, mask, record)
+            if trace is not None:
+                steps.append((x_t, suffix_out, v_t))
+            x_t = euler_step(x_t, v_t, num_steps)
+
+        if trace is not None:
+            trace["times"] = torch.from_numpy(times)
+            if conds is not None:
+                trace["cond"] = conds[:, None].expand(-1, noise.shape[0], -1)
+            trace["x_t"] = torch.stack([x for x, _, _ in steps] + [x_t])
+            trace["suffix_out"] = torch.stack([out for _, out, _ in steps])
+            trace["v_t"] = torch.stack([v for _, _, v in steps])
+            if hidden:
+                trace["expert_hidden_step0"] = torch.stack(hidden)
+            trace["actions"] = x_t
+        return x_t
+
+    # -- their parts: each one is a stage that a backend may time, compile or replace ----------------------------------
+
+    @torch.no_grad()
+    def embed(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> EmbeddedPrefix:
+        """Pictures and prompt to the embeddings that enter the language model (the vision tower is most of it)."""
+        per_image = self.config.vision.num_tokens
+        layout = PrefixLayout.of(observation, per_image, compact=compact)
+        lengths = layout.pad_mask.sum(1)
+        if not bool((lengths > 0).all()):
+            raise ObservationError("an observation without any valid camera or prompt token has nothing to attend to")
+        cameras = camera_slots(observation, compact=compact)
+        images = observation.images if cameras is None else observation.images[:, cameras]
+        image_embs, hidden = self.embed_images(images)
+        if cameras is not None:  # back to their slots, from which the layout selects
+            count = observation.image_mask.shape[1]
+            slots = (cameras[:, None] * per_image + torch.arange(per_image, device=cameras.device)).flatten()
+            image_embs = _scatter(image_embs, 1, slots, count * per_image)
+            hidden = _scatter(hidden, 0, cameras, count)
+        embs = torch.cat((image_embs, embed_prompt(self.vlm, observation.tokens)), dim=1)
+        embs = embs if layout.columns is None else embs[:, layout.columns]
+        if trace is not None:
+            trace["vision_last_hidden"] = hidden
+            trace["prefix_embs"] = layout.to_padded(embs, 1)
+            trace["prefix_pad_mask"] = layout.pad_mask
+            trace["prefix_positions"] = layout.positions
+        return EmbeddedPrefix(embs, layout, lengths, observation.state)
+
+    @torch.no_grad()
+    def keys_values(self, embedded: EmbeddedPrefix, *, trace: Trace | None = None) -> KVCache:
+        """Run the language model over embedded tokens and keep every layer's keys and values."""
+        layout = embedded.layout
+        mask = None if layout.mask is None else layout.mask[:, None, None, :]
+        k, v = self.encode_prefix(embedded.embs, layout.computed_positions, mask)
+        if trace is not None:
+            trace["kv_k"] = layout.to_padded(k, 3).transpose(2, 3)
+            trace["kv_v"] = layout.to_padded(v, 3).transpose(2, 3)
+        return KVCache(k, v, layout.mask, embedded.lengths, embedded.state)
+
+    def embed_images(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Pictures [B, C, 224, 224, 3] -> (language-model tokens [B, C * 256, D], the tower's output [C, B, 256, W])"""
+        return embed_images(self.vision, self.projector, images)
+
+    def encode_prefix(self, embs: Tensor, positions: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Embeddings [B, S, D] at int positions [B, S] -> K (rotated), V [layer, B, G, S, K]"""
+        rope = rope_tables(positions, self.config.vlm.head_dim, self.config.rope_base)
+        return prefix_keys_values(self.vlm, embs, rope, mask)
+
+    def velocity(
+        self,
+        x_t: Tensor,
+        state: Tensor,
+        time: Tensor,
+        cache_k: Tensor,
+        cache_v: Tensor,
+        rope: tuple[Tensor, Tensor],
+        mask: Tensor | None,
+        hidden: list[Tensor] | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """One evaluation of the action expert -> (its output float32[B, H, D], v_t float32[B, H, action_dim]).
+
+        `time` float32[1, D] is the adaRMS condition (Pi0.5) or the time embedding (Pi0).
+        """
+        adaptive = self.config.kind == "pi05"
+        tokens = self.embed_suffix(x_t, state, time)
+        out = run_expert(self.expert, tokens, time if adaptive else None, cache_k, cache_v, rope, mask, hidden)
+        suffix_out = out[:, -x_t.shape[1] :].float()
+        return suffix_out, self.action_out_proj(suffix_out)
+
+    def time_condition(self, time_embs: Tensor) -> Tensor:
+        """Pi0.5: adaRMS conditions float32[N, D]. They depend on the step alone."""
+        return F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(time_embs))))
+
+    def embed_suffix(self, x_t: Tensor, state: Tensor, time_emb: Tensor) -> Tensor:
+        """Suffix tokens in the compute dtype: H actions (Pi0.5), or the state and H actions mixed with t (Pi0)."""
+        actions = self.action_in_proj(x_t)
+        if self.config.kind == "pi05":
+            return actions.to(self.compute_dtype)
+        mixed = torch.cat((actions, time_emb.expand_as(actions)), dim=-1)
+        actions = self.action_time_mlp_out(F.silu(self.action_time_mlp_in(mixed)))
+        return torch.cat((self.state_proj(state)[:, None], actions), dim=1).to(self.compute_dtype)
+
+
+def _scatter(x: Tensor, dim: int, index: Tensor, size: int) -> Tensor:
+    """Zeros of `size` along `dim`, with x at `index`."""
+    out = x.new_zeros((*x.shape[:dim], size, *x.shape[dim + 1 :]))
+    return out.index_copy_(dim, index, x)
+
+
+def parameter_dtype(name: str, precision: Precision) -> torch.dtype:
+    """The dtype of a parameter (canonical name) in a precision.
+
+    bf16 follows openpi's PyTorch: patch and position embeddings, all Gemma norms with the adaRMS matrices, and the
+    action, time and state projections stay float32. SigLIP's LayerNorms are bfloat16.
+    """
+    if precision == "f32":
+        return torch.float32
+    is_gemma_norm = not name.startswith("vision.") and (
+        ".input_layernorm." in name or ".post_attention_layernorm." in name
+    )
+    return torch.float32 if is_gemma_norm or name.startswith(_FLOAT32_ALWAYS) else torch.bfloat16
+
+
+def parameter_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
+    """Canonical name -> shape of every parameter of a model."""
+    with torch.device("meta"):
+        model = Pi0Model(dataclasses.replace(config))
+    return {name: tuple(parameter.shape) for name, parameter in model.state_dict().items()}

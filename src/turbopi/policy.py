@@ -1,0 +1,227 @@
+"""The whole policy on one screen: preprocess → backend → postprocess."""
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from turbopi import backends
+from turbopi.checkpoint import Checkpoint, open_checkpoint
+from turbopi.config import PolicyConfig
+from turbopi.errors import ConfigError, ObservationError
+from turbopi.model.reference import Precision
+from turbopi.observation import Observation
+from turbopi.preprocess import Pipeline
+from turbopi.tokenizer import load_tokenizer
+
+MAX_STEPS = 1000  # far beyond any use; a larger number is a mistake, not a wish
+
+
+class UnifiedPolicy:
+    """A Pi0.5 or Pi0 policy over any backend: observation in, action chunk out, as openpi computes it.
+
+        policy = UnifiedPolicy("checkpoints/pi05_libero", config="pi05_libero")
+        actions = policy.infer(observation)["actions"]  # float64[H, d], in the robot's units
+
+    Args:
+        checkpoint_dir: an openpi (PyTorch or JAX) or LeRobot checkpoint folder, or a `Checkpoint` that is open already.
+        config: what no checkpoint records (robot, statistics, horizon, …): a preset's name, a .json, a PolicyConfig, or
+            "auto" for LeRobot's own config or the `turbopi.json` beside the weights.
+        backend: a name from `turbopi backends`; "auto" takes the fastest one available and says which in `metadata`.
+        precision: "bf16" as openpi serves it, or "f32".
+        num_denoising_steps: Euler steps a call, unless `infer` is told otherwise. openpi's default is 10.
+        device: "auto", "cpu", "cuda" or "cuda:N".
+        tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
+            the checkpoint folder or in openpi's cache.
+        default_prompt: the instruction for observations that bring none.
+        progress: show a bar while the weights load.
+
+    Raises ConfigError, CheckpointError, TokenizerError or BackendUnavailable, each with what to do about it.
+    Calls from several threads are served one at a time.
+    """
+
+    def __init__(
+        self,
+        checkpoint_dir: str | Path | Checkpoint,
+        *,
+        config: str | Path | PolicyConfig = "auto",
+        backend: str = "auto",
+        precision: Precision = "bf16",
+        num_denoising_steps: int = 10,
+        device: str | torch.device = "auto",
+        tokenizer: Any = None,
+        default_prompt: str | None = None,
+        progress: bool = False,
+    ) -> None:
+        self._num_steps = _checked_steps(num_denoising_steps, ConfigError)
+        self._device = backends.resolve_device(device)
+        name, why = backends.choose(self._device) if backend == "auto" else (backend, "asked for")
+
+        checkpoint = (
+            checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
+        )
+        self.config = checkpoint.config
+        self._pipeline = Pipeline(
+            checkpoint.config,
+            checkpoint.norm_stats,
+            load_tokenizer(
+                tokenizer,
+                checkpoint_dir=checkpoint.path,
+                candidates=checkpoint.tokenizer_candidates,
+                vocab_size=checkpoint.config.model.vocab_size,
+            ),
+            default_prompt=default_prompt,
+        )
+        self._loading: dict[str, Any] = {}
+
+        def load(to: torch.device, in_precision: Precision) -> dict[str, torch.Tensor]:
+            loaded = checkpoint.load(to, in_precision, progress=progress)
+            self._loading = {"load_seconds": round(loaded.seconds, 3), "weight_bytes": loaded.bytes}
+            return loaded.state
+
+        self.backend = backends.create(name, self.config.model, load, device=self._device, precision=precision)
+        self._generator = np.random.default_rng()
+        self._lock = threading.Lock()
+        self._backend_reason = why
+        self._checkpoint = checkpoint
+
+    def infer(
+        self,
+        obs: Mapping[str, Any],
+        *,
+        noise: np.ndarray | None = None,
+        seed: int | None = None,
+        num_steps: int | None = None,
+    ) -> dict[str, Any]:
+        """One observation to one action chunk.
+
+        Args:
+            obs: the observation under the robot's own keys (docs/robots.md), on the host, without a batch axis.
+            noise: float32[H, action_dim], x at t = 1. Given noise, or a seed, makes the result deterministic.
+            seed: draws the noise from `numpy.random.default_rng(seed)`; neither: fresh noise every call.
+            num_steps: denoising steps for this call alone.
+
+        Returns {"actions": float64[H, d], "policy_timing": {...}} in milliseconds: `infer_ms` is the model alone, from
+        inputs on the host to actions on the host, as openpi counts; `total_ms` the whole call; `preprocess_ms`,
+        `vision_ms`, `prefix_ms`, `denoise_ms`, `postprocess_ms` its stages, where the backend can tell them apart.
+
+        Raises ObservationError for anything wrong with the arguments, naming it.
+        """
+        return self.infer_batch([obs], noise=None if noise is None else [noise], seed=seed, num_steps=num_steps)[0]
+
+    def infer_batch(
+        self,
+        observations: Sequence[Mapping[str, Any]],
+        *,
+        noise: Sequence[np.ndarray] | np.ndarray | None = None,
+        seed: int | Sequence[int] | None = None,
+        num_steps: int | None = None,
+    ) -> list[dict[str, Any]]:
+        """Several observations in one run of the model: `infer` for each, with the times of the whole batch.
+
+        `noise` is [B, H, action_dim]; `seed` one number for the batch's first row, the next row taking the next
+        number, or one for each row.
+        """
+        start = time.perf_counter()
+        if not observations:
+            raise ObservationError("infer_batch was given no observation")
+        steps = self._num_steps if num_steps is None else _checked_steps(num_steps, ObservationError)
+        prepared = [self._pipeline.before(obs) for obs in observations]
+        inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
+        x_1 = torch.from_numpy(self._noise(len(observations), noise, seed))
+
+        with self._lock:
+            infer_start = time.perf_counter()
+            sample = self.backend.sample(inputs, x_1, steps)
+            infer_end = time.perf_counter()
+
+        actions = sample.actions.numpy()
+        results = [self._pipeline.after(chunk, state) for chunk, (_, state) in zip(actions, prepared, strict=True)]
+        end = time.perf_counter()
+        timing = {
+            "infer_ms": (infer_end - infer_start) * 1e3,
+            "preprocess_ms": (infer_start - start) * 1e3,
+            **{f"{stage}_ms": milliseconds for stage, milliseconds in sample.stage_ms.items()},
+            "postprocess_ms": (end - infer_end) * 1e3,
+            "total_ms": (end - start) * 1e3,
+        }
+        return [result | {"policy_timing": dict(timing)} for result in results]
+
+    def warmup(self, num_steps: int | None = None) -> float:
+        """Run one random observation, so that nothing is compiled or allocated during the first real one. Seconds."""
+        start = time.perf_counter()
+        self.infer(self.example_observation(), seed=0, num_steps=num_steps)
+        return time.perf_counter() - start
+
+    def example_observation(self, seed: int = 0) -> dict[str, Any]:
+        """A random observation in this robot's keys, shapes and dtypes."""
+        return self._pipeline.example(seed)
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What this policy is: the server sends it to every client on connection. Plain values only."""
+        model = self.config.model
+        return {
+            "config": self.config.name,
+            "model": model.kind,
+            "robot": self.config.robot,
+            "action_horizon": model.action_horizon,
+            "num_denoising_steps": self._num_steps,
+            "backend": self.backend.name,
+            "backend_reason": self._backend_reason,
+            "backend_details": self.backend.describe(),
+            "precision": self.backend.precision,
+            "device": str(self._device),
+            "device_name": torch.cuda.get_device_name(self._device) if self._device.type == "cuda" else "CPU",
+            "checkpoint_format": self._checkpoint.format,
+            "random_weights": self._checkpoint.format == "random",
+            "torch": torch.__version__,
+            **self._loading,
+            **self._pipeline.metadata,
+        }
+
+    def _noise(
+        self, batch: int, noise: Sequence[np.ndarray] | np.ndarray | None, seed: int | Sequence[int] | None
+    ) -> np.ndarray:
+        """float32[B, H, action_dim], given or drawn."""
+        shape = (self.config.model.action_horizon, self.config.model.action_dim)
+        if noise is not None:
+            if seed is not None:
+                raise ObservationError("noise and seed were both given; give one of them")
+            return _checked_noise(noise, (batch, *shape))
+        if seed is None:
+            return self._generator.standard_normal((batch, *shape), dtype=np.float32)
+        seeds = [seed + row for row in range(batch)] if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != batch or not all(isinstance(one, int | np.integer) and one >= 0 for one in seeds):
+            raise ObservationError(f"seed {seed!r} should be a whole number from 0, or one for each of {batch} rows")
+        return np.stack([np.random.default_rng(one).standard_normal(shape, dtype=np.float32) for one in seeds])
+
+
+def _checked_noise(noise: Sequence[np.ndarray] | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        array = np.asarray(noise, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise ObservationError(f"noise isn't an array of numbers: {error}") from None
+    if array.shape != shape:
+        raise ObservationError(
+            f"noise has shape {list(array.shape[1:])}, but this policy needs [action_horizon, action_dim] = "
+            f"{list(shape[1:])}"
+            if len(array) == shape[0]
+            else f"noise has shape {list(array.shape)}, expected {list(shape)}"
+        )
+    if not np.isfinite(array).all():
+        raise ObservationError("noise has values that aren't finite")
+    return np.ascontiguousarray(array)
+
+
+def _checked_steps(num_steps: int, error: type[ConfigError] | type[ObservationError]) -> int:
+    whole = isinstance(num_steps, int | np.integer) and not isinstance(num_steps, bool)
+    if not whole or not 1 <= num_steps <= MAX_STEPS:
+        raise error(
+            f"the number of denoising steps is {num_steps!r}; it should be a whole number from 1 to {MAX_STEPS}"
+        )
+    return int(num_steps)

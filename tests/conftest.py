@@ -1,0 +1,35 @@
+"""What several test files share: the golden folder and models built from it."""
+
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+import torch
+
+from turbopi.config import Kind
+from turbopi.judge.golden import Case, GoldenFolder
+from turbopi.model.reference import Pi0Model, Precision
+
+GOLDEN = Path(__file__).parent / "golden"
+torch.set_num_threads(2)
+
+
+@lru_cache
+def golden_folder() -> GoldenFolder:
+    return GoldenFolder(GOLDEN)
+
+
+@lru_cache
+def golden_cases() -> dict[str, Case]:
+    return {case.name: case for case in golden_folder().cases()}
+
+
+@lru_cache
+def golden_model(kind: Kind, precision: Precision = "f32") -> Pi0Model:
+    checkpoint = golden_folder().checkpoint(kind)
+    return Pi0Model.from_state(checkpoint.config.model, checkpoint.load(torch.device("cpu"), precision).state)
+
+
+@pytest.fixture(scope="session")
+def golden() -> Path:
+    return GOLDEN
