@@ -1,0 +1,137 @@
+"""Scaling of states and actions, its exact inverse, and the arithmetic between absolute and relative actions.
+
+openpi's modes compute in float64 (its statistics are float64) and keep openpi's widths: statistics are cut to a
+narrower input; dimensions past the statistics are left alone when un-normalising by quantiles, and multiplied by
+1 + 1e-6 by z-score (padded with mean 0, std 1). LeRobot's modes compute in float32, as its processors do, and return
+those numbers as float64. Nothing is clipped. Sources: openpi's `transforms.py`; LeRobot's `normalize_processor.py`.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from turbopi.checkpoint.norm_stats import NEEDS, FeatureStats
+from turbopi.config import NormMode
+from turbopi.errors import ConfigError, ObservationError
+
+_OPENPI_EPS = 1e-6
+_LEROBOT_EPS = 1e-8
+
+
+class Normalizer:
+    """One feature's scaling.
+
+    mode      how; "identity" leaves values alone and needs no statistics
+    stats     the feature's statistics
+    feature   its name in messages: "state" or "actions"
+
+    Raises ConfigError if the mode is unknown or its statistics are missing or don't fit each other.
+    """
+
+    def __init__(self, mode: NormMode, stats: FeatureStats | None, feature: str) -> None:
+        self.mode, self.feature = mode, feature
+        self.width: int | None = None  # of the statistics; None: any
+        if mode not in NEEDS:
+            raise ConfigError(f"unknown normalisation {mode!r}; choose one of {', '.join(NEEDS)}")
+        if not NEEDS[mode]:
+            return
+        self._a, self._b = self._statistics(stats)
+        self.width = len(self._a)
+
+    def _statistics(self, stats: FeatureStats | None) -> tuple[np.ndarray, np.ndarray]:
+        names = NEEDS[self.mode]
+        found = () if stats is None else stats.available
+        if not set(names) <= set(found):
+            raise ConfigError(
+                f"{self.mode} normalisation of {self.feature} needs {' and '.join(names)}, but the checkpoint's "
+                f"statistics have {', '.join(found) or 'nothing'} for {self.feature}. Use the checkpoint's own norm "
+                f"stats, or a configuration whose normalisation fits them"
+            )
+        a, b = (np.asarray(getattr(stats, name), np.float64) for name in names)
+        if a.ndim != 1 or a.shape != b.shape:
+            raise ConfigError(f"{self.feature} statistics {names[0]} {a.shape} and {names[1]} {b.shape} don't match")
+        return (a.astype(np.float32), b.astype(np.float32)) if self._is_lerobot else (a, b)
+
+    @property
+    def _is_lerobot(self) -> bool:
+        return self.mode.startswith("lerobot_")
+
+    def normalize(self, x: np.ndarray) -> np.ndarray:
+        """float[..., d] to float64[..., d]. Raises ObservationError if d is more than the statistics cover."""
+        if self.width is None:
+            return np.array(x, np.float64)  # a copy, as in every other mode
+        d = x.shape[-1]
+        if d > self.width or (self._is_lerobot and d != self.width):
+            raise ObservationError(f"{self.feature} has {d} values, but the checkpoint's statistics cover {self.width}")
+        a, b = self._a[:d], self._b[:d]
+        with np.errstate(over="ignore"):  # absurd inputs become inf, which the pipeline refuses
+            match self.mode:
+                case "quantile":
+                    return np.asarray((x - a) / (b - a + _OPENPI_EPS) * 2.0 - 1.0)
+                case "zscore":
+                    return np.asarray((x - a) / (b + _OPENPI_EPS))
+                case "lerobot_zscore":
+                    return np.asarray((x.astype(np.float32) - a) / (b + np.float32(_LEROBOT_EPS)), np.float64)
+                case _:  # lerobot_quantile, lerobot_min_max
+                    return np.asarray(2.0 * (x.astype(np.float32) - a) / _nonzero(b - a) - 1.0, np.float64)
+
+    def unnormalize(self, x: np.ndarray) -> np.ndarray:
+        """float[..., d] to float64[..., d], the inverse. Raises ConfigError if d is less than the statistics cover."""
+        if self.width is None:
+            return np.array(x, np.float64)  # a copy, as in every other mode
+        d = x.shape[-1]
+        if d < self.width:
+            raise ConfigError(f"{self.feature} has {d} values, but the checkpoint's statistics cover {self.width}")
+        out = x.astype(np.float64)
+        out[..., : self.width] = self._unscaled(x[..., : self.width])
+        if self.mode == "zscore":
+            out[..., self.width :] *= 1.0 + _OPENPI_EPS  # openpi pads std with 1, mean with 0
+        return out
+
+    def _unscaled(self, x: np.ndarray) -> np.ndarray:
+        a, b = self._a, self._b
+        if self._is_lerobot:
+            x = x.astype(np.float32)
+        match self.mode:
+            case "quantile":
+                return np.asarray((x + 1.0) / 2.0 * (b - a + _OPENPI_EPS) + a)
+            case "zscore":
+                return np.asarray(x * (b + _OPENPI_EPS) + a)
+            case "lerobot_quantile":
+                return np.asarray((x + 1.0) * _nonzero(b - a) / 2.0 + a)
+            case "lerobot_min_max":
+                return np.asarray((x + 1.0) / 2.0 * _nonzero(b - a) + a)
+            case _:  # lerobot_zscore: the epsilon is in the forward direction only
+                return np.asarray(x * b + a)
+
+
+def _nonzero(span: np.ndarray) -> np.ndarray:
+    return np.where(span == 0, np.float32(_LEROBOT_EPS), span)
+
+
+def action_mask(dims: Sequence[int]) -> tuple[bool, ...]:
+    """openpi's shorthand for a mask: n times True, or for -n as often False; (2, -1) is (True, True, False)."""
+    return tuple(flag for n in dims for flag in [n > 0] * abs(n))
+
+
+def delta_actions(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool]) -> np.ndarray:
+    """Absolute actions [..., H, d] relative to `state` [..., s] where `mask` is True; the dtype is kept."""
+    return _shifted(actions, state, mask, -1)
+
+
+def absolute_actions(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool]) -> np.ndarray:
+    """The inverse of `delta_actions`: `state`, un-normalised, added where `mask` is True; the dtype is kept."""
+    return _shifted(actions, state, mask, 1)
+
+
+def _shifted(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool], sign: int) -> np.ndarray:
+    n = len(mask)
+    out = actions.copy()
+    out[..., :n] += sign * np.where(mask, state[..., :n], 0)[..., None, :]
+    return out
+
+
+def pad_last(x: np.ndarray, width: int) -> np.ndarray:
+    """[..., d] padded with zeros to [..., width]; wider stays as it is. The dtype is kept."""
+    missing = width - x.shape[-1]
+    return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)]) if missing > 0 else x

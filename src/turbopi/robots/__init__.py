@@ -1,0 +1,95 @@
+"""Robots: keys in, keys out. The built-in ones have openpi's and LeRobot's keys; docs/robots.md describes one's own."""
+
+import dataclasses
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from turbopi.errors import ConfigError
+from turbopi.robots.aloha import Aloha
+from turbopi.robots.base import Robot, RobotInputs
+from turbopi.robots.described import Described, load_robot, robot_from_dict
+from turbopi.robots.droid import Droid
+from turbopi.robots.lerobot import LeRobot
+from turbopi.robots.libero import Libero
+from turbopi.robots.plain import Plain
+
+__all__ = [
+    "ROBOTS",
+    "Described",
+    "Robot",
+    "RobotInputs",
+    "create_robot",
+    "import_robot",
+    "load_robot",
+    "robot_from_dict",
+]
+
+ROBOTS: dict[str, type] = {"libero": Libero, "droid": Droid, "aloha": Aloha, "lerobot": LeRobot, "plain": Plain}
+
+
+def create_robot(robot: str | Path | Robot, options: Mapping[str, Any] | None = None) -> Robot:
+    """A robot from its name, from the path of its description (.json), or the robot itself.
+
+    options   of a built-in robot: its class's fields
+
+    Raises ConfigError for an unknown name or option, or a description that isn't right. A name never imports code, so
+    that no file can make it run: see `import_robot`.
+    """
+    options = dict(options or {})
+    if not isinstance(robot, str | Path):
+        _refuse_options(options, "a robot given as an object")
+        return _checked(robot)
+    if str(robot).endswith(".json"):
+        _refuse_options(options, "a robot described by a file")
+        return load_robot(robot)
+    cls = ROBOTS.get(str(robot))
+    if cls is None:
+        hint = "; robots in Python code are given as objects" if ":" in str(robot) else ""
+        raise ConfigError(
+            f"unknown robot {str(robot)!r}; choose one of {', '.join(ROBOTS)}, or a .json description{hint}"
+        )
+    fields = [field.name for field in dataclasses.fields(cls)]
+    required = [field.name for field in dataclasses.fields(cls) if field.default is dataclasses.MISSING]
+    unknown, missing = sorted(set(options) - set(fields)), [name for name in required if name not in options]
+    if unknown:
+        raise ConfigError(f"robot {robot} has no option {', '.join(unknown)}; it has {', '.join(fields) or 'none'}")
+    if missing:
+        raise ConfigError(f"robot {robot} needs the option {', '.join(missing)}")
+    created: Robot = cls(**options)
+    return created
+
+
+def import_robot(path: str) -> Robot:
+    """The robot at "module:Name", a class without arguments or an object. It runs that module's code.
+
+    Only for a path that a person gives on purpose. Raises ConfigError if it can't be imported or isn't a robot.
+    """
+    module_name, _, name = path.partition(":")
+    if not module_name or not name:
+        raise ConfigError(f"a robot's path is module:Class, got {path!r}")
+    try:
+        found = getattr(importlib.import_module(module_name), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"can't import the robot {path!r}: {error}") from error
+    try:
+        return _checked(found() if isinstance(found, type) else found)
+    except TypeError as error:  # abstract methods, or arguments that it needs
+        raise ConfigError(f"can't make the robot {path!r}: {error}") from error
+
+
+def _refuse_options(options: Mapping[str, Any], what: str) -> None:
+    if options:
+        raise ConfigError(f"{what} takes no robot_options, got {', '.join(options)}")
+
+
+def _checked(robot: Any) -> Robot:
+    needed = ("inputs", "outputs", "example")
+    attributes = ("name", "state_dim", "action_dim", "delta_mask", "reset_pose", "default_prompt")
+    missing = [name for name in (*needed, *attributes) if not hasattr(robot, name)]
+    if missing or isinstance(robot, type):
+        problem = "is a class; pass an instance" if isinstance(robot, type) else f"has no {', '.join(missing)}"
+        raise ConfigError(f"robot {robot!r} {problem}. Subclass turbopi.robots.Robot, which has defaults")
+    checked: Robot = robot
+    return checked

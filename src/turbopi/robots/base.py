@@ -1,0 +1,197 @@
+"""What a robot is to the policy, and the helpers that read its observations.
+
+A robot names its cameras, state and prompt in its own keys, and cuts the model's actions to what it can execute. Every
+reader raises ObservationError with the key, what was found and what was expected; none changes the observation.
+"""
+
+import itertools
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from turbopi.config import CAMERAS
+from turbopi.errors import ObservationError
+
+
+@dataclass(frozen=True)
+class RobotInputs:
+    """An observation in the model's words.
+
+    images      camera -> uint8[h, w, 3] in [0, 255], or float32[h, w, 3] in [0, 1] (LeRobot); RGB
+    image_mask  camera -> whether there is such a picture; left out: if `images` has one
+    state       float[s]       in the robot's units, before normalisation
+    prompt      the task, or None if the observation has none
+
+    Cameras are the model's (`base_0_rgb`, `left_wrist_0_rgb`, `right_wrist_0_rgb`; their order here doesn't matter and
+    those left out are masked), or, for models trained with other names, names in the model's order.
+    """
+
+    images: dict[str, np.ndarray]
+    image_mask: dict[str, bool]
+    state: np.ndarray
+    prompt: str | None = None
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """A robot's side of the pipeline. Subclass it and override what differs; only its three methods have no default.
+
+    name            for people and metadata
+    state_dim       width of its state, action_dim of its actions; None: whatever comes
+    delta_mask      per action dimension: True where the model's action is relative to the state; None: nowhere
+    reset_pose      joint positions to start from, for clients that ask for them; part of the policy's metadata
+    default_prompt  for observations without one
+    """
+
+    name: str = "custom"
+    state_dim: int | None = None
+    action_dim: int | None = None
+    delta_mask: tuple[bool, ...] | None = None
+    reset_pose: list[float] | None = None
+    default_prompt: str | None = None
+
+    @abstractmethod
+    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+        """An observation as its client sends it, in the model's words. Raises ObservationError."""
+        ...
+
+    @abstractmethod
+    def outputs(self, actions: np.ndarray) -> np.ndarray:
+        """float64[H, D] un-normalised absolute actions of the model to the robot's own float[H, d]."""
+        ...
+
+    @abstractmethod
+    def example(self, rng: np.random.Generator) -> dict[str, Any]:
+        """A random valid observation in the robot's own keys, for warm-up and tests."""
+        ...
+
+
+def find(observation: Mapping[str, Any], key: str) -> Any:
+    """The value at `key`, flat (`{"a/b": x}`) or nested (`{"a": {"b": x}}`); KeyError if there is none.
+
+    openpi's clients nest some keys and flatten others, and an .npz file can only be flat, so both are read everywhere.
+    """
+    if key in observation:
+        return observation[key]
+    head, _, rest = key.partition("/")
+    inner = observation[head]  # KeyError
+    if not rest or not isinstance(inner, Mapping):
+        raise KeyError(key)
+    return find(inner, rest)
+
+
+def has(observation: Mapping[str, Any], key: str) -> bool:
+    """Whether `find` would find it."""
+    try:
+        find(observation, key)
+    except KeyError:
+        return False
+    return True
+
+
+def require(observation: Mapping[str, Any], key: str, expected: tuple[str, ...]) -> Any:
+    """The value at `key`. Raises ObservationError, listing the keys given and the `expected` ones, if absent."""
+    try:
+        return find(observation, key)
+    except KeyError:
+        given = listed(keys_of(observation))
+        raise ObservationError(
+            f"the observation has no {key!r}. It has {given}; expected {', '.join(expected)}"
+        ) from None
+
+
+def keys_of(observation: Mapping[str, Any], depth: int = 3) -> Iterator[str]:
+    """All keys, those of nested mappings joined with "/", down to `depth`."""
+    for key, value in observation.items():
+        if isinstance(value, Mapping) and value and depth > 1:
+            yield from (f"{key}/{inner}" for inner in keys_of(value, depth - 1))
+        else:
+            yield str(key)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names for a message, which must stay short whatever a client sends."""
+    shown = [name if len(name) <= 60 else name[:60] + "…" for name in itertools.islice(names, 21)]
+    return ", ".join(shown[:20]) + (", …" if len(shown) > 20 else "") or "nothing"
+
+
+def names_in(observation: Mapping[str, Any], folder: str) -> list[str]:
+    """The names directly below `folder`, nested or flat: ["cam_high"] for either form of "images/cam_high"."""
+    nested = observation.get(folder, {})
+    if not isinstance(nested, Mapping):
+        raise ObservationError(f"{folder!r} is a {type(nested).__name__}, expected a dict of pictures by camera")
+    flat = [str(key)[len(folder) + 1 :] for key in observation if str(key).startswith(folder + "/")]
+    return [*map(str, nested), *flat]
+
+
+def names_in_prefix(observation: Mapping[str, Any], prefix: str) -> list[str]:
+    """The keys, as they are, that begin with `prefix`."""
+    return [str(key) for key in observation if str(key).startswith(prefix)]
+
+
+def read_state(value: Any, key: str, width: int | None) -> np.ndarray:
+    """A float[width] vector of finite numbers, any length if `width` is None.
+
+    Integers become float64; a plain number is a vector of width 1. Raises ObservationError for anything else.
+    """
+    try:
+        state = np.asarray(value)
+    except Exception as error:
+        raise ObservationError(f"{key} isn't an array of numbers: {error}") from error
+    if np.issubdtype(state.dtype, np.integer):
+        state = state.astype(np.float64)
+    if not np.issubdtype(state.dtype, np.floating):
+        raise ObservationError(f"{key} has dtype {state.dtype}; send floats")
+    if state.ndim == 0 and width == 1:
+        state = state[None]
+    if state.ndim != 1 or state.size == 0 or (width is not None and len(state) != width):
+        expected = "one axis, not empty" if width is None else f"shape ({width},)"
+        raise ObservationError(f"{key} has shape {state.shape}, expected {expected}")
+    finite = np.isfinite(state)
+    if not finite.all():
+        at = int(np.flatnonzero(~finite)[0])
+        raise ObservationError(f"{key} isn't finite: value {at} is {state[at]}")
+    return state
+
+
+def read_prompt(value: Any, key: str = "prompt") -> str:
+    """A prompt as text: str, numpy's str_, UTF-8 bytes, or an array that holds one of them."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if isinstance(value, bytes):
+        try:
+            value = value.decode()
+        except UnicodeDecodeError as error:
+            raise ObservationError(f"{key} is bytes that aren't UTF-8: {error}") from error
+    if isinstance(value, str):
+        return str(value)
+    if value is None:
+        raise ObservationError(f"{key} is None; leave the key out to use the default prompt")
+    raise ObservationError(f"{key} is a {type(value).__name__}, expected text")
+
+
+def optional_prompt(observation: Mapping[str, Any], key: str = "prompt") -> str | None:
+    """The prompt at `key`; None if the observation has no such key."""
+    return read_prompt(find(observation, key), key) if has(observation, key) else None
+
+
+def with_missing_cameras(images: dict[str, np.ndarray], like: str) -> tuple[dict[str, np.ndarray], dict[str, bool]]:
+    """All of the model's cameras in its order, those not in `images` black (of the size of `like`), and their mask."""
+    black = black_like(images[like])
+    return (
+        {camera: images.get(camera, black) for camera in CAMERAS},
+        {camera: camera in images for camera in CAMERAS},
+    )
+
+
+def black_like(image: np.ndarray) -> np.ndarray:
+    """A read-only black picture of the shape and dtype of `image`, without its memory."""
+    return np.broadcast_to(np.zeros((), image.dtype), image.shape)
+
+
+def random_image(rng: np.random.Generator, size: int = 224) -> np.ndarray:
+    """uint8[size, size, 3] noise."""
+    return rng.integers(256, size=(size, size, 3), dtype=np.uint8)

@@ -1,0 +1,152 @@
+"""A robot described by a small JSON file; docs/robots.md has an example and says what each field means."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from turbopi.config import CAMERAS
+from turbopi.errors import ConfigError
+from turbopi.images import parse_image
+from turbopi.normalize import action_mask
+from turbopi.robots.base import (
+    Robot,
+    RobotInputs,
+    optional_prompt,
+    random_image,
+    read_state,
+    require,
+    with_missing_cameras,
+)
+
+REQUIRED = ("name", "cameras", "state", "action_dim")
+OPTIONAL = ("delta_action_dims", "prompt_key", "default_prompt", "reset_pose")
+
+
+@dataclass(frozen=True)
+class Described(Robot):
+    """A robot as a file describes it.
+
+    cameras   observation key -> the model's camera; pictures (uint8|float)[h, w, 3] or [3, h, w], all required
+    state     observation key -> its width, concatenated in this order; a scalar counts as width 1
+    action_dim, delta_mask, prompt_key, default_prompt, reset_pose   see `Robot` and docs/robots.md
+    """
+
+    name: str = field()  # field(): no default, where the protocol has one
+    cameras: Mapping[str, str] = field()
+    state: Mapping[str, int] = field()
+    action_dim: int = field()
+    delta_mask: tuple[bool, ...] | None = None
+    prompt_key: str = "prompt"
+    default_prompt: str | None = None
+    reset_pose: list[float] | None = None
+
+    @property
+    def state_dim(self) -> int:  # type: ignore[override]
+        return sum(self.state.values())
+
+    @property
+    def _keys(self) -> tuple[str, ...]:
+        return (*self.cameras, *self.state, self.prompt_key)
+
+    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+        pictures = {
+            camera: parse_image(require(observation, key, self._keys), key) for key, camera in self.cameras.items()
+        }
+        images, mask = with_missing_cameras(pictures, like=next(iter(pictures)))
+        parts = [read_state(require(observation, key, self._keys), key, width) for key, width in self.state.items()]
+        return RobotInputs(images, mask, np.concatenate(parts), optional_prompt(observation, self.prompt_key))
+
+    def outputs(self, actions: np.ndarray) -> np.ndarray:
+        return actions[:, : self.action_dim]
+
+    def example(self, rng: np.random.Generator) -> dict[str, Any]:
+        pictures = {key: random_image(rng) for key in self.cameras}
+        state = {key: rng.uniform(-1, 1, width) for key, width in self.state.items()}
+        return {**pictures, **state, self.prompt_key: self.default_prompt or "pick up the red block"}
+
+
+def load_robot(path: str | Path) -> Described:
+    """The robot that the JSON file at `path` describes.
+
+    Raises ConfigError, naming the file and the field, if it can't be read, or has a field that is unknown, missing or
+    not what it should be.
+    """
+    path = Path(path).expanduser()
+    try:
+        described = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"can't read the robot's description {path}: {error.strerror}") from error
+    except ValueError as error:  # not JSON, or not UTF-8
+        raise ConfigError(f"{path} isn't JSON: {error}") from error
+    try:
+        return robot_from_dict(described)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def robot_from_dict(described: Any) -> Described:
+    """A robot from the fields of its description. Raises ConfigError, naming the field that is wrong."""
+    _expect(isinstance(described, dict), "the description", "an object", described)
+    unknown = sorted(set(described) - {*REQUIRED, *OPTIONAL})
+    missing = [name for name in REQUIRED if name not in described]
+    if unknown:
+        raise ConfigError(f"unknown field {', '.join(unknown)}; a robot has {', '.join((*REQUIRED, *OPTIONAL))}")
+    if missing:
+        raise ConfigError(f"{', '.join(missing)} missing; a robot needs {', '.join(REQUIRED)}")
+    for name in ("name", "prompt_key"):
+        value = described.get(name, "prompt")
+        _expect(isinstance(value, str) and value != "", name, "text", value)
+    _check_cameras(described["cameras"])
+    _check_state(described["state"])
+    action_dim = described["action_dim"]
+    _expect(_is_count(action_dim), "action_dim", "a positive integer", action_dim)
+    prompt, pose = described.get("default_prompt"), described.get("reset_pose")
+    _expect(prompt is None or isinstance(prompt, str), "default_prompt", "text", prompt)
+    pose_is_right = isinstance(pose, list) and all(_is_number(value) for value in pose)
+    _expect(pose is None or pose_is_right, "reset_pose", "a list of numbers", pose)
+    fields = {name: value for name, value in described.items() if name != "delta_action_dims"}
+    return Described(**fields, delta_mask=_delta_mask(described.get("delta_action_dims"), described))
+
+
+def _check_cameras(cameras: Any) -> None:
+    _expect(isinstance(cameras, dict) and len(cameras) > 0, "cameras", "an object: key -> the model's camera", cameras)
+    for key, camera in cameras.items():
+        _expect(camera in CAMERAS, f"cameras[{key!r}]", f"one of {', '.join(CAMERAS)}", camera)
+    if len(set(cameras.values())) < len(cameras):
+        raise ConfigError(f"cameras gives one of the model's cameras to two keys: {cameras}")
+
+
+def _check_state(state: Any) -> None:
+    _expect(isinstance(state, dict) and len(state) > 0, "state", "an object: key -> width", state)
+    for key, width in state.items():
+        _expect(_is_count(width), f"state[{key!r}]", "a positive integer", width)
+
+
+def _delta_mask(dims: Any, described: dict[str, Any]) -> tuple[bool, ...] | None:
+    if dims is None:
+        return None
+    is_dims = isinstance(dims, list) and all(isinstance(n, int) and not isinstance(n, bool) and n != 0 for n in dims)
+    _expect(is_dims, "delta_action_dims", "a list such as [6, -1]: six relative, one absolute", dims)
+    mask = action_mask(dims)
+    widths = {"action_dim": described["action_dim"], "the state's width": sum(described["state"].values())}
+    for name, width in widths.items():
+        if len(mask) > width:
+            raise ConfigError(f"delta_action_dims {dims} covers {len(mask)} dimensions, but {name} is {width}")
+    return mask
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _expect(right: bool, name: str, expected: str, got: Any) -> None:
+    if not right:
+        raise ConfigError(f"{name} must be {expected}, got {got!r}")

@@ -1,0 +1,60 @@
+"""DROID: a Franka arm with exterior cameras and one at its wrist."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from turbopi.images import parse_image
+from turbopi.robots.base import (
+    Robot,
+    RobotInputs,
+    optional_prompt,
+    random_image,
+    read_state,
+    require,
+    with_missing_cameras,
+)
+
+KEYS = (
+    "observation/exterior_image_1_left",
+    "observation/wrist_image_left",
+    "observation/joint_position",
+    "observation/gripper_position",
+    "prompt",
+)
+
+
+@dataclass(frozen=True)
+class Droid(Robot):
+    """openpi's DROID keys.
+
+    in      observation/exterior_image_1_left, observation/wrist_image_left   (uint8|float)[h, w, 3] or [3, h, w]
+            observation/joint_position   float[7];   observation/gripper_position   float[1] or a scalar
+            prompt
+    out     [H, 8]: 7 joint velocities, gripper position
+    """
+
+    name = "droid"
+    state_dim = 8
+    action_dim = 8
+
+    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+        base, wrist = (parse_image(require(observation, key, KEYS), key) for key in KEYS[:2])
+        images, mask = with_missing_cameras({"base_0_rgb": base, "left_wrist_0_rgb": wrist}, like="base_0_rgb")
+        joints = read_state(require(observation, KEYS[2], KEYS), KEYS[2], 7)
+        gripper = read_state(require(observation, KEYS[3], KEYS), KEYS[3], 1)
+        return RobotInputs(images, mask, np.concatenate([joints, gripper]), optional_prompt(observation))
+
+    def outputs(self, actions: np.ndarray) -> np.ndarray:
+        return actions[:, : self.action_dim]
+
+    def example(self, rng: np.random.Generator) -> dict[str, Any]:
+        return {
+            "observation/exterior_image_1_left": random_image(rng),
+            "observation/wrist_image_left": random_image(rng),
+            "observation/joint_position": rng.random(7),
+            "observation/gripper_position": rng.random(1),
+            "prompt": "put the marker in the cup",
+        }

@@ -1,0 +1,212 @@
+"""Prompts to token ids: clean-up, the state as integers in the text, SentencePiece, padding.
+
+Pi0.5 writes the normalised state into the prompt, one integer per dimension; Pi0 (and Pi0.5 trained without it) has the
+task alone, followed by a newline that is encoded by itself. Source: openpi's `tokenizer.py`.
+"""
+
+import logging
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import sentencepiece
+
+from turbopi.errors import ObservationError, TokenizerError
+
+logger = logging.getLogger(__name__)
+
+TINY_TOKENIZER = Path(__file__).parent / "data" / "tiny_tokenizer.model"  # 1024 pieces, for pi05_tiny; ours
+FILE_NAMES = ("tokenizer.model", "paligemma_tokenizer.model")
+MAX_PROMPT_CHARACTERS = 20_000  # far past any model's tokens; keeps a hostile prompt from stalling the robot
+_STATE_EDGES = np.linspace(-1, 1, 257)[:-1]
+_DOWNLOAD = "https://storage.googleapis.com/big_vision/paligemma_tokenizer.model"
+
+
+class Encoder(Protocol):
+    """What a tokenizer must have; `sentencepiece.SentencePieceProcessor` does."""
+
+    def encode(self, text: str, *, add_bos: bool) -> Sequence[int]: ...
+
+
+def clean_prompt(prompt: str) -> str:
+    """The prompt without surrounding blanks, with spaces for underscores and newlines; its case is kept."""
+    return prompt.strip().replace("_", " ").replace("\n", " ")
+
+
+def state_bins(state: np.ndarray) -> np.ndarray:
+    """The integers that stand for a normalised state in the prompt: [d] to int64[d].
+
+    256 equal bins over [-1, 1): below -1 gives -1, and 1 or more gives 255, as openpi.
+    """
+    return np.asarray(np.digitize(state, _STATE_EDGES) - 1)
+
+
+def prompt_texts(prompt: str, state: np.ndarray | None) -> list[tuple[str, bool]]:
+    """What is encoded, in order: (text, whether BOS goes before it)."""
+    cleaned = clean_prompt(prompt)
+    if state is None:
+        return [(cleaned, True), ("\n", False)]
+    numbers = " ".join(map(str, state_bins(state).tolist()))
+    return [(f"Task: {cleaned}, State: {numbers};\nAction: ", True)]
+
+
+class PromptTokenizer:
+    """Turns prompts into a model's token ids.
+
+    encoder     see `Encoder`
+    vocab_size  of the model: an id past it is refused
+    source      where the encoder came from, for people
+    """
+
+    def __init__(self, encoder: Encoder, *, vocab_size: int, source: str = "given object") -> None:
+        self.encoder, self.vocab_size, self.source = encoder, vocab_size, source
+        self._truncated_prompt: str | None = None  # warned about last
+
+    def encode(self, prompt: str, state: np.ndarray | None = None) -> list[int]:
+        """All ids of `prompt`, neither padded nor truncated. `state` [d], normalised, goes into the text.
+
+        Raises ObservationError for a prompt that can't be encoded, TokenizerError for ids past the vocabulary.
+        """
+        if len(prompt) > MAX_PROMPT_CHARACTERS:
+            raise ObservationError(f"the prompt has {len(prompt)} characters; at most {MAX_PROMPT_CHARACTERS} are read")
+        try:
+            prompt.encode()
+        except UnicodeEncodeError as error:
+            raise ObservationError(f"the prompt isn't valid Unicode text: {error}") from error
+        ids = [
+            int(token) for text, bos in prompt_texts(prompt, state) for token in self.encoder.encode(text, add_bos=bos)
+        ]
+        wrong = [token for token in ids if not 0 <= token < self.vocab_size]
+        if wrong:
+            raise TokenizerError(
+                f"the tokenizer ({self.source}) gave id {wrong[0]}, but the model's vocabulary has {self.vocab_size} "
+                f"entries; use the tokenizer that the model was trained with"
+            )
+        return ids
+
+    def tokenize(
+        self, prompt: str, state: np.ndarray | None = None, *, max_tokens: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Ids int64[max_tokens], padded on the right with 0, and their mask bool[max_tokens].
+
+        A longer prompt loses its end, as in openpi; a warning is logged once for each such prompt.
+        """
+        ids = self.encode(prompt, state)
+        count = min(len(ids), max_tokens)
+        if count < len(ids):
+            self._warn_truncated(prompt, len(ids), max_tokens, state is not None)
+        tokens = np.zeros(max_tokens, np.int64)
+        tokens[:count] = ids[:count]
+        mask = np.zeros(max_tokens, np.bool_)
+        mask[:count] = True
+        return tokens, mask
+
+    def _warn_truncated(self, prompt: str, length: int, max_tokens: int, has_state: bool) -> None:
+        if prompt == self._truncated_prompt:  # once, not at every step of an episode
+            return
+        self._truncated_prompt = prompt
+        lost = "the state, which is at the end, is cut" if has_state else "its end is cut"
+        logger.warning(
+            "the prompt takes %d tokens but the model reads %d: %s. Shorten the prompt: %r",
+            length,
+            max_tokens,
+            lost,
+            prompt[:200],
+        )
+
+
+def load_tokenizer(
+    source: str | Path | Encoder | None = None,
+    *,
+    vocab_size: int,
+    checkpoint_dir: str | Path | None = None,
+    candidates: Iterable[str | Path] = (),
+) -> PromptTokenizer:
+    """The tokenizer from the first of: `source`; `checkpoint_dir`; `candidates`; openpi's cache.
+
+    source          a SentencePiece file, a folder that holds one, or an object with `encode(text, add_bos=...)`
+    vocab_size      of the model
+    checkpoint_dir  searched, with its assets/, for tokenizer.model and paligemma_tokenizer.model
+    candidates      further files
+    openpi's cache  $OPENPI_DATA_HOME/big_vision/paligemma_tokenizer.model; ~/.cache/openpi if that isn't set
+
+    Raises TokenizerError if there is none (saying where to get it), if it isn't a SentencePiece model, or if it has
+    more pieces than the model. A given `source` is the only place looked at.
+    """
+    if source is not None and not isinstance(source, str | Path):
+        if not callable(getattr(source, "encode", None)):
+            raise TokenizerError(f"tokenizer {source!r} has no encode(text, add_bos) method")
+        return PromptTokenizer(source, vocab_size=vocab_size, source=type(source).__name__)
+    if source is not None:
+        return _open(_given_file(Path(source).expanduser()), vocab_size)
+    places = _places(checkpoint_dir, candidates)
+    for path in places:
+        if path.is_file():
+            return _open(path, vocab_size)
+    raise TokenizerError(_not_found(places))
+
+
+def _given_file(path: Path) -> Path:
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise TokenizerError(f"there is no tokenizer at {path}")
+    for inside in _in_folder(path):
+        if inside.is_file():
+            return inside
+    raise TokenizerError(f"the folder {path} holds no {' or '.join(FILE_NAMES)}")
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    return [parent / name for parent in (folder, folder / "assets") for name in FILE_NAMES]
+
+
+def _openpi_cache() -> Path:
+    home = os.environ.get("OPENPI_DATA_HOME") or "~/.cache/openpi"
+    return Path(home).expanduser() / "big_vision" / "paligemma_tokenizer.model"
+
+
+def _places(checkpoint_dir: str | Path | None, candidates: Iterable[str | Path]) -> list[Path]:
+    in_checkpoint = [] if checkpoint_dir is None else _in_folder(Path(checkpoint_dir).expanduser())
+    return list(dict.fromkeys([*in_checkpoint, *map(Path, candidates), _openpi_cache()]))
+
+
+def _not_found(places: Sequence[Path]) -> str:
+    target = places[-1]
+    looked = "\n".join(f"  {path}" for path in places)
+    return (
+        f"no tokenizer found. Looked for:\n{looked}\n"
+        f"Pi0 and Pi0.5 use PaliGemma's SentencePiece model. Get it (4 MB) where openpi looks for it, too:\n"
+        f"  mkdir -p '{target.parent}'\n"
+        f"  curl -L -o '{target}' {_DOWNLOAD}\n"
+        f"or: gsutil cp gs://big_vision/paligemma_tokenizer.model '{target}'\n"
+        f"Or pass its path as tokenizer=, or put it into the checkpoint's folder as {FILE_NAMES[0]} (on Hugging Face "
+        f"it is tokenizer.model of google/paligemma-3b-pt-224)"
+    )
+
+
+def _open(path: Path, vocab_size: int) -> PromptTokenizer:
+    try:
+        processor = sentencepiece.SentencePieceProcessor(model_proto=path.read_bytes())
+        pieces, bos = processor.vocab_size(), processor.bos_id()
+    except (OSError, RuntimeError) as error:
+        raise TokenizerError(f"{path} isn't a readable SentencePiece model: {error}") from error
+    if pieces == 0:  # an empty file parses as an empty model
+        raise TokenizerError(f"{path} isn't a SentencePiece model: it has no pieces")
+    if pieces > vocab_size:
+        raise TokenizerError(
+            f"{path} has {pieces} pieces, but the model's vocabulary has {vocab_size} entries; "
+            f"use the tokenizer that the model was trained with"
+        )
+    if bos < 0:
+        raise TokenizerError(f"{path} has no beginning-of-sequence piece, which every prompt starts with")
+    if pieces < 0.9 * vocab_size:
+        logger.warning(
+            "the tokenizer %s has %d pieces and the model %d: prompts won't mean to a trained model what they say",
+            path,
+            pieces,
+            vocab_size,
+        )
+    return PromptTokenizer(processor, vocab_size=vocab_size, source=str(path))

@@ -1,0 +1,210 @@
+"""Prompts: openpi's strings and bins exactly, padding, where tokenizers are found, and our small one."""
+
+import json
+import logging
+import runpy
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sentencepiece
+
+from turbopi import tokenizer
+from turbopi.config import preset
+from turbopi.errors import ObservationError, TokenizerError
+from turbopi.tokenizer import TINY_TOKENIZER, PromptTokenizer, clean_prompt, load_tokenizer, prompt_texts, state_bins
+
+FOLDER = Path(__file__).parent / "golden" / "preprocess"
+PROMPTS: list[dict[str, Any]] = json.loads((FOLDER / "prompts.json").read_text())
+BINS = np.load(FOLDER / "state_bins.npz")
+SCRIPT = Path(__file__).parent.parent / "scripts" / "train_tokenizer.py"
+TINY_VOCAB = preset("pi05_tiny").model.vocab_size
+
+
+class ByteTokenizer:
+    """The golden data's stand-in; remembers what it was asked."""
+
+    def __init__(self) -> None:
+        self.calls: list[list[Any]] = []
+
+    def encode(self, text: str, add_bos: bool) -> Sequence[int]:
+        self.calls.append([text, add_bos])
+        return [2] * add_bos + [3 + byte % 509 for byte in text.encode()]
+
+
+@pytest.fixture
+def no_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """openpi's cache, empty."""
+    monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "big_vision" / "paligemma_tokenizer.model"
+
+
+def tiny() -> PromptTokenizer:
+    return load_tokenizer(TINY_TOKENIZER, vocab_size=TINY_VOCAB)
+
+
+@pytest.mark.parametrize("case", PROMPTS, ids=lambda case: f"{case['state_dtype']}-{case['max_len']}")
+def test_strings_calls_and_padding_are_openpis_exactly(case: dict[str, Any]) -> None:
+    encoder = ByteTokenizer()
+    state = None if case["state"] is None else np.array(case["state"], case["state_dtype"])
+    tokens, mask = PromptTokenizer(encoder, vocab_size=512).tokenize(case["prompt"], state, max_tokens=case["max_len"])
+    assert encoder.calls == case["encode_calls"]
+    np.testing.assert_array_equal(tokens, np.array(case["byte_tokens"], np.int64), strict=True)
+    np.testing.assert_array_equal(mask, np.array(case["byte_mask"], np.bool_), strict=True)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_state_bins_are_openpis_exactly(dtype: str) -> None:
+    np.testing.assert_array_equal(state_bins(BINS[f"state_{dtype}"]), BINS[f"bins_{dtype}"])
+
+
+def test_prompts_are_cleaned_but_keep_their_case() -> None:
+    assert clean_prompt("  Pick_up\nthe RED_block \n") == "Pick up the RED block"
+    assert prompt_texts(" a_b ", None) == [("a b", True), ("\n", False)]
+
+
+def test_a_truncated_prompt_is_warned_about_once(caplog: pytest.LogCaptureFixture) -> None:
+    prompts = PromptTokenizer(ByteTokenizer(), vocab_size=512)
+    with caplog.at_level(logging.WARNING):
+        for value in (0.1, 0.2):  # two steps of an episode: only the state differs
+            tokens, mask = prompts.tokenize("fold the towel", np.array([value]), max_tokens=20)
+            assert mask.all()
+            assert (tokens > 0).all()
+        prompts.tokenize("open the door, please", None, max_tokens=20)
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2
+    length = len(prompts.encode("fold the towel", np.array([0.1])))
+    assert f"takes {length} tokens but the model reads 20: the state, which is at the end, is cut" in messages[0]
+    assert "its end is cut" in messages[1]
+
+
+def test_a_prompt_that_just_fits_isnt_warned_about(caplog: pytest.LogCaptureFixture) -> None:
+    prompts = PromptTokenizer(ByteTokenizer(), vocab_size=512)
+    prompts.tokenize("abc", None, max_tokens=5)  # BOS, three bytes, newline
+    assert not caplog.records
+
+
+def test_ids_past_the_vocabulary_are_refused() -> None:
+    with pytest.raises(TokenizerError, match="gave id 124, but the model's vocabulary has 100 entries"):
+        PromptTokenizer(ByteTokenizer(), vocab_size=100).encode("y")
+
+
+def test_prompts_that_arent_text_for_a_model_are_refused() -> None:
+    with pytest.raises(ObservationError, match="isn't valid Unicode"):
+        tiny().encode("\ud800")
+    with pytest.raises(ObservationError, match="has 20001 characters; at most 20000"):
+        tiny().encode("a" * 20_001)
+
+
+# Where a tokenizer is found
+
+
+def test_places_are_searched_in_order(tmp_path: Path, no_cache: Path) -> None:
+    checkpoint = tmp_path / "checkpoint"
+    candidate = tmp_path / "candidate.model"
+    places = [no_cache, candidate, checkpoint / "assets" / "tokenizer.model", checkpoint / "tokenizer.model"]
+    for place in places:  # from the last to the first
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(TINY_TOKENIZER.read_bytes())
+        found = load_tokenizer(checkpoint_dir=checkpoint, candidates=[candidate], vocab_size=TINY_VOCAB)
+        assert found.source == str(place)
+    given = load_tokenizer(TINY_TOKENIZER, checkpoint_dir=checkpoint, vocab_size=TINY_VOCAB)
+    assert given.source == str(TINY_TOKENIZER)
+    assert load_tokenizer(checkpoint, vocab_size=TINY_VOCAB).source == str(checkpoint / "tokenizer.model")
+
+
+def test_without_a_tokenizer_the_error_says_where_to_get_it(tmp_path: Path, no_cache: Path) -> None:
+    with pytest.raises(TokenizerError) as caught:
+        load_tokenizer(checkpoint_dir=tmp_path, vocab_size=257_152)
+    message = str(caught.value)
+    assert f"curl -L -o '{no_cache}' https://storage.googleapis.com/big_vision/paligemma_tokenizer.model" in message
+    assert "gs://big_vision/paligemma_tokenizer.model" in message
+    assert str(tmp_path / "tokenizer.model") in message
+
+
+def test_the_cache_is_in_the_home_folder_by_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("OPENPI_DATA_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    expected = tmp_path / ".cache" / "openpi" / "big_vision" / "paligemma_tokenizer.model"
+    with pytest.raises(TokenizerError, match=str(expected)):
+        load_tokenizer(vocab_size=257_152)
+
+
+def test_a_given_path_is_the_only_place(tmp_path: Path, no_cache: Path) -> None:
+    no_cache.parent.mkdir(parents=True)
+    no_cache.write_bytes(TINY_TOKENIZER.read_bytes())
+    with pytest.raises(TokenizerError, match=r"there is no tokenizer at .*absent\.model"):
+        load_tokenizer(tmp_path / "absent.model", vocab_size=TINY_VOCAB)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(TokenizerError, match=r"empty holds no tokenizer\.model or paligemma_tokenizer\.model"):
+        load_tokenizer(tmp_path / "empty", vocab_size=TINY_VOCAB)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a model", b"\x00" * 100])
+def test_files_of_something_else_are_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "tokenizer.model"
+    path.write_bytes(content)
+    with pytest.raises(TokenizerError, match=r"tokenizer\.model isn't a (readable )?SentencePiece model"):
+        load_tokenizer(path, vocab_size=TINY_VOCAB)
+
+
+def test_a_tokenizer_larger_than_the_model_is_refused() -> None:
+    with pytest.raises(TokenizerError, match="has 1024 pieces, but the model's vocabulary has 512 entries"):
+        load_tokenizer(TINY_TOKENIZER, vocab_size=512)
+
+
+def test_a_tokenizer_much_smaller_than_the_model_is_warned_about(caplog: pytest.LogCaptureFixture) -> None:
+    load_tokenizer(TINY_TOKENIZER, vocab_size=257_152)
+    assert "has 1024 pieces and the model 257152" in caplog.text
+
+
+def test_objects_must_be_able_to_encode() -> None:
+    with pytest.raises(TokenizerError, match=r"has no encode\(text, add_bos\) method"):
+        load_tokenizer(object(), vocab_size=10)  # type: ignore[arg-type]
+    assert load_tokenizer(ByteTokenizer(), vocab_size=512).encode("a") == [2, 100, 13]
+
+
+# Our small tokenizer
+
+
+def test_special_pieces_are_where_gemma_has_them() -> None:
+    pieces = sentencepiece.SentencePieceProcessor(model_file=str(TINY_TOKENIZER))
+    assert (pieces.pad_id(), pieces.eos_id(), pieces.bos_id(), pieces.unk_id()) == (0, 1, 2, 3)
+    assert pieces.vocab_size() == TINY_VOCAB
+    assert len(pieces.encode("\n")) == 1
+    assert pieces.encode("", add_bos=True) == [2]
+
+
+@pytest.mark.parametrize(
+    "text", ["pick up", " two  blanks ", "Grüße, 你好 🤖", "tab\there", "12 -1 255;\nAction: ", "<s></s>"]
+)
+def test_text_survives_unchanged(text: str) -> None:
+    pieces = sentencepiece.SentencePieceProcessor(model_file=str(TINY_TOKENIZER))
+    ids = pieces.encode(text)
+    assert pieces.decode(ids) == text
+    assert not {0, 1, 2, 3} & set(ids)  # neither control pieces nor unknown ones
+
+
+def test_every_state_number_costs_one_token_a_digit_and_a_blank() -> None:
+    pieces = sentencepiece.SentencePieceProcessor(model_file=str(TINY_TOKENIZER))
+    for number in range(-1, 256):
+        assert len(pieces.encode(f" {number}")) <= 1 + len(str(number))
+
+
+def test_a_libero_prompt_fits_in_sixty_tokens() -> None:
+    prompt = "pick up the black bowl between the plate and the ramekin and place it on the plate"
+    assert len(tiny().encode(prompt, np.full(8, 0.99))) < 60  # every number has three digits
+
+
+def test_the_script_makes_the_same_file_each_time() -> None:
+    script = runpy.run_path(str(SCRIPT))
+    first = script["train"]()
+    assert first == script["train"]()
+    if sentencepiece.__version__ == "0.2.3":  # what the file in the repository was made with
+        assert first == TINY_TOKENIZER.read_bytes()
+
+
+def test_the_tiny_tokenizer_is_part_of_the_package() -> None:
+    assert TINY_TOKENIZER.parent.parent == Path(tokenizer.__file__).parent
