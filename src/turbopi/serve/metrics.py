@@ -1,0 +1,70 @@
+"""What `GET /metrics` tells Prometheus."""
+
+from collections.abc import Callable
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
+
+CONTENT_TYPE = CONTENT_TYPE_LATEST
+
+# Kinds of `turbopi_errors_total`. The first six are the client's, "policy" is ours, the last two are nobody's.
+ERROR_KINDS = (
+    "malformed",
+    "observation",
+    "busy",
+    "too_large",
+    "unauthorized",
+    "origin",
+    "policy",
+    "disconnected",
+    "stopping",
+)
+RECORD_OUTCOMES = ("written", "dropped", "failed")
+
+# Seconds. A policy takes 10 ms to 1 s; a control loop cares about every 5 ms of it.
+_BUCKETS = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
+
+
+class Metrics:
+    """The server's counters, in a registry of their own, so that several servers fit into one process."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+
+        def histogram(name: str, text: str) -> Histogram:
+            return Histogram(name, text, buckets=_BUCKETS, registry=self.registry)
+
+        self.requests = Counter("turbopi_requests", "Messages received, good or bad", registry=self.registry)
+        self.request_seconds = histogram(
+            "turbopi_request_seconds", "From a whole observation received to its actions sent"
+        )
+        self.queue_seconds = histogram("turbopi_queue_seconds", "Waiting for the policy")
+        self.inference_seconds = histogram("turbopi_inference_seconds", "In the policy, successful or not")
+        self.clients = Gauge("turbopi_clients", "Clients connected now", registry=self.registry)
+        self._errors = Counter("turbopi_errors", "Requests that got no actions", ["kind"], registry=self.registry)
+        self._recorded = Counter(
+            "turbopi_recorded_calls", "Calls recorded, or not", ["outcome"], registry=self.registry
+        )
+        for kind in ERROR_KINDS:  # so that each is there from the start, at 0
+            self._errors.labels(kind)
+        for outcome in RECORD_OUTCOMES:
+            self._recorded.labels(outcome)
+
+    def error(self, kind: str) -> None:
+        assert kind in ERROR_KINDS, kind
+        self._errors.labels(kind).inc()
+
+    def recorded(self, outcome: str) -> None:
+        assert outcome in RECORD_OUTCOMES, outcome
+        self._recorded.labels(outcome).inc()
+
+    def watch(self, waiting: Callable[[], int], running: Callable[[], bool]) -> None:
+        """Read the queue's state from `waiting` and `running` whenever somebody asks."""
+        depth = Gauge("turbopi_queue_depth", "Requests waiting for the policy", registry=self.registry)
+        depth.set_function(waiting)
+        busy = Gauge("turbopi_inference_in_progress", "1 while the policy runs", registry=self.registry)
+        busy.set_function(running)
+
+    def text(self) -> str:
+        """Prometheus' text format."""
+        return generate_latest(self.registry).decode()

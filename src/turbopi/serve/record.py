@@ -1,0 +1,149 @@
+"""Recording while serving: a thread that writes calls to disk and never holds the robot up."""
+
+import itertools
+import json
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from turbopi.errors import ConfigError
+from turbopi.serve.record_format import (
+    FORMAT,
+    VERSION,
+    Call,
+    iter_recording,
+    load_call,
+    load_observation,
+    recorded_files,
+    save_call,
+)
+
+__all__ = ["Call", "Recorder", "iter_recording", "load_call", "load_observation", "recorded_files", "save_call"]
+
+logger = logging.getLogger(__name__)
+
+
+class Recorder:
+    """Writes calls into a new folder below `record_dir` (layout: record_format.py), from a background thread.
+
+    At most `queue_calls` calls or `queue_bytes` bytes wait for the disk; what comes beyond is dropped, and counted in
+    `dropped`. A call that can't be written (disk full, folder gone) is counted in `failed` and leaves a gap in the
+    numbers; the next one is tried again. `count` is called with "written", "dropped" or "failed", from any thread.
+
+    Raises ConfigError if the folder can't be made now.
+    """
+
+    def __init__(
+        self,
+        record_dir: str | Path,
+        metadata: dict[str, Any],
+        *,
+        queue_calls: int = 256,
+        queue_bytes: int = 256 * 2**20,
+        count: Callable[[str], None] = lambda outcome: None,
+    ) -> None:
+        self.written = self.dropped = self.failed = 0
+        self._count = count
+        self._queue_bytes = queue_bytes
+        self._waiting_bytes = 0
+        self._lock = threading.Lock()
+        self._queue: queue.Queue[tuple[Call, int] | None] = queue.Queue(queue_calls)
+        try:
+            self.folder = _new_folder(Path(record_dir))
+            manifest = {"format": FORMAT, "version": VERSION, "started": time.time(), "metadata": metadata}
+            (self.folder / "manifest.json").write_text(json.dumps(manifest, indent=1, default=_plain), encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"can't record into {record_dir}: {error}") from error
+        self._thread = threading.Thread(target=self._write_all, name="turbopi-recorder", daemon=True)
+        self._thread.start()
+
+    def put(self, observation: dict[str, Any], result: dict[str, Any], *, size: int) -> None:
+        """Record a call, or drop it if the disk is behind. Never waits, never raises.
+
+        The values are written later: hand over what nobody changes. `size` is about how many bytes they hold.
+        """
+        with self._lock:
+            full = self._waiting_bytes + size > self._queue_bytes and self._waiting_bytes > 0
+            if not full:
+                self._waiting_bytes += size
+        if not full:
+            try:
+                self._queue.put_nowait((Call(observation, result, time.time()), size))
+                return
+            except queue.Full:
+                self._release(size)
+        self.dropped += 1
+        self._count("dropped")
+        if _is_power_of_two(self.dropped):
+            logger.warning("%d calls weren't recorded: the disk can't keep up", self.dropped)
+
+    def close(self, timeout: float = 30.0) -> None:
+        """Write what waits, for at most `timeout` seconds, and stop. Call `put` no more."""
+        deadline = time.monotonic() + timeout
+        try:
+            self._queue.put(None, timeout=timeout)
+        except queue.Full:
+            logger.warning("the recording in %s is incomplete: the disk doesn't answer", self.folder)
+            return
+        self._thread.join(max(deadline - time.monotonic(), 0.0))
+        if self._thread.is_alive():
+            logger.warning("the recording in %s is incomplete: the disk doesn't answer", self.folder)
+        logger.info("recorded %d calls in %s", self.written, self.folder)
+
+    def _write_all(self) -> None:
+        for number in itertools.count():
+            if (item := self._queue.get()) is None:
+                return
+            call, size = item
+            failure: Exception | None = None
+            try:
+                self._write(f"{number:06d}.npz", call)
+            except Exception as error:  # whatever it is, it must not end serving or the rest of the recording
+                failure = error
+            self._release(size)
+            if failure is None:
+                self.written += 1
+                self._count("written")
+                continue
+            self.failed += 1
+            self._count("failed")
+            if _is_power_of_two(self.failed):
+                logger.warning("%d calls couldn't be recorded in %s: %s", self.failed, self.folder, failure)
+
+    def _write(self, name: str, call: Call) -> None:
+        save_call(self.folder / name, call)
+        timing = call.result.get("server_timing", {})
+        line = {"file": name, "time": call.time, "infer_ms": timing.get("infer_ms")}
+        with (self.folder / "index.jsonl").open("a", encoding="utf-8") as index:
+            index.write(json.dumps(line) + "\n")
+
+    def _release(self, size: int) -> None:
+        with self._lock:
+            self._waiting_bytes -= size
+
+
+def _new_folder(parent: Path) -> Path:
+    """A new folder named by the time, so that each run of the server has its own and they sort."""
+    name = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+    parent.mkdir(parents=True, exist_ok=True)
+    for attempt in range(1000):
+        folder = parent / (name if attempt == 0 else f"{name}-{attempt:03d}")
+        try:
+            folder.mkdir()
+            return folder
+        except FileExistsError:
+            continue
+    raise FileExistsError(f"{parent / name} and 999 names like it are taken")
+
+
+def _plain(value: Any) -> Any:
+    """Metadata for JSON: numpy arrays as lists, anything else as its text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _is_power_of_two(n: int) -> bool:
+    return n & (n - 1) == 0

@@ -1,0 +1,401 @@
+"""The policy server: openpi's websocket protocol around one inference worker.
+
+    client                          server
+      ── GET, Upgrade ────────────▶   /healthz and /metrics are answered as plain HTTP
+      ◀────────────── metadata ────   binary frame, msgpack map
+      ── observation ─────────────▶   binary frame, msgpack map
+      ◀─────────────── actions ────   binary frame: the policy's result and "server_timing"
+      ◀─────────────── message ────   or a text frame, when the observation was bad: the connection stays open
+      ◀─── traceback, close 1011 ──   or, when the policy failed
+
+The event loop only moves and decodes bytes; the policy runs on the worker's thread, so health checks, pings and other
+clients are served while it does. See docs/serving.md for what differs from openpi's own server.
+"""
+
+import asyncio
+import contextlib
+import logging
+import math
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+
+from turbopi.errors import ConfigError, ObservationError
+from turbopi.serve.gate import Gate
+from turbopi.serve.metrics import Metrics
+from turbopi.serve.record import Recorder
+from turbopi.serve.wire import WireError, pack, unpack
+from turbopi.serve.worker import Busy, Stopping, Worker
+
+logger = logging.getLogger(__name__)
+# The websockets library reports each port scan and health check as a failed handshake; what matters is logged here.
+_protocol_logger = logging.getLogger(f"{__name__}.protocol")
+_protocol_logger.setLevel(logging.CRITICAL)
+
+MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
+
+
+class Policy(Protocol):
+    """What can be served. `warmup()` is called once before the first client, if there is one."""
+
+    @property
+    def metadata(self) -> dict[str, Any]: ...
+
+    def infer(self, obs: dict[str, Any], /) -> dict[str, Any]: ...
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """What became of one call of the policy: a `result`, a `refusal` (the client's fault) or a `failure` (ours)."""
+
+    seconds: float
+    result: dict[str, Any] | None = None
+    refusal: str | None = None
+    failure: str | None = None
+
+
+class _ClientGone(Exception):
+    """The client disconnected before its actions were ready."""
+
+
+class _PolicyFailed(Exception):
+    """The policy raised something that isn't the client's fault; holds the traceback's text."""
+
+
+class PolicyServer:
+    """Serves one policy over openpi's websocket protocol. Good for one start.
+
+    host, port      where to listen; port 0 takes a free one (`server.port` says which, once started)
+    api_key         if given, every client must send `Authorization: Api-Key <api_key>`, for /metrics too
+    max_message_mb  larger messages end the connection with close code 1009
+    queue_limit     requests that may wait while another one runs; more get a text frame "busy: ..."
+    record_dir      if given, every observation and its actions are written below this folder
+
+    Raises ConfigError for options that can't be right.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8000,
+        api_key: str | None = None,
+        max_message_mb: float = 64,
+        queue_limit: int = 16,
+        record_dir: str | Path | None = None,
+    ) -> None:
+        if not 0 <= port <= 65535:
+            raise ConfigError(f"port must be between 0 and 65535, not {port}")
+        if not 0 < max_message_mb < math.inf:
+            raise ConfigError(f"max_message_mb must be more than 0 and finite, not {max_message_mb}")
+        if queue_limit < 0:
+            raise ConfigError(f"queue_limit must be 0 or more, not {queue_limit}")
+        self.host, self.port = host, port
+        self.metrics = Metrics()
+        self._policy = policy
+        self._gate = Gate(api_key, self.metrics)
+        self._max_bytes = int(max_message_mb * 2**20)
+        self._record_dir = None if record_dir is None else Path(record_dir)
+        self._recorder: Recorder | None = None
+        self._worker = Worker(queue_limit)
+        self.metrics.watch(lambda: self._worker.waiting, lambda: self._worker.running)
+        self._server: Server | None = None
+        self._idle: set[ServerConnection] = set()  # connections that wait for a request
+        self._stopping = False
+        self._greeting = b""
+
+    # --- lifecycle ----------------------------------------------------------------------------------------------------
+
+    @property
+    def url(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"ws://{host}:{self.port}"
+
+    @property
+    def recording(self) -> Path | None:
+        """The folder that this run's recording goes to; None if nothing is recorded."""
+        return None if self._recorder is None else self._recorder.folder
+
+    async def start(self) -> None:
+        """Take the port, warm the policy up on its thread, start recording, then let clients in.
+
+        Raises ConfigError if the port or the recording's folder can't be had, and whatever the warm-up raises.
+        """
+        if self._server is not None:
+            raise RuntimeError("a PolicyServer starts once: make a new one")
+        server = serve(
+            self._handle,
+            self.host,
+            self.port,
+            process_request=self._gate,
+            compression=None,  # pictures don't get smaller, only later
+            max_size=self._max_bytes,
+            max_queue=1,  # a client that sends ahead is read no further than one message
+            logger=_protocol_logger,
+            start_serving=False,
+        )
+        try:
+            self._server = await server
+        except OSError as error:
+            raise ConfigError(f"can't listen on {self.url}: {error}. Choose another --host or --port.") from error
+        try:
+            self.port = self._server.sockets[0].getsockname()[1]
+            warmup = getattr(self._policy, "warmup", None)
+            if warmup is not None:
+                await self._worker.call(lambda _: warmup(), None)
+            metadata = self._policy.metadata
+            self._greeting = pack(metadata)
+            if self._record_dir is not None:
+                self._recorder = Recorder(self._record_dir, metadata, count=self.metrics.recorded)
+            await self._server.start_serving()
+        except BaseException:
+            self._server.close()
+            self._worker.close()
+            raise
+
+    async def stop(self) -> None:
+        """Stop gracefully: refuse new clients, finish the running inference and send its actions, close with 1001."""
+        assert self._server is not None, "start() first"
+        self._stopping = True
+        self._worker.stop()
+        self._server.close(close_connections=False)
+        await asyncio.gather(*(self._say_goodbye(connection) for connection in tuple(self._idle)))
+        await self._server.wait_closed()
+        await self._worker.drain()
+        self._worker.close()
+        if self._recorder is not None:
+            await asyncio.to_thread(self._recorder.close)
+
+    async def __aenter__(self) -> "PolicyServer":
+        await self.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.stop()
+
+    def serve_forever(
+        self,
+        on_ready: Callable[["PolicyServer"], None] = lambda server: None,
+        on_stopping: Callable[["PolicyServer"], None] = lambda server: None,
+    ) -> None:
+        """Serve until SIGINT or SIGTERM, then stop gracefully. A second signal kills the process.
+
+        `on_ready` is called once clients can connect, `on_stopping` when the first signal has come.
+        """
+
+        async def main() -> None:
+            await self.start()
+            with _stop_signals() as stop:
+                try:
+                    on_ready(self)
+                    await stop.wait()
+                    on_stopping(self)
+                finally:
+                    await self.stop()
+
+        asyncio.run(main())
+
+    # --- the protocol -------------------------------------------------------------------------------------------------
+
+    async def _handle(self, connection: ServerConnection) -> None:
+        """One client, from its metadata to its close."""
+        self.metrics.clients.inc()
+        logger.info("%s connected", connection.remote_address)
+        try:
+            await connection.send(self._greeting)
+            await self._converse(connection)
+        except _ClientGone:
+            self.metrics.error("disconnected")
+            logger.info("%s left during its request", connection.remote_address)
+        except ConnectionClosed as closed:
+            if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
+                self.metrics.error("too_large")
+            logger.info("%s disconnected: %s", connection.remote_address, closed)
+        except _PolicyFailed as failure:
+            await self._fail(connection, str(failure))
+        except Exception:  # a fault of this server must cost one client, not all
+            logger.exception("%s: the server failed", connection.remote_address)
+            await self._fail(connection, traceback.format_exc())
+        finally:
+            self._idle.discard(connection)
+            self.metrics.clients.dec()
+
+    async def _fail(self, connection: ServerConnection, text: str) -> None:
+        """Send a traceback and close, as openpi does."""
+        self.metrics.error("policy")
+        with contextlib.suppress(ConnectionClosed):
+            await connection.send(text)
+            await connection.close(CloseCode.INTERNAL_ERROR, "internal server error: the last frame has the traceback")
+
+    async def _say_goodbye(self, connection: ServerConnection) -> None:
+        await connection.close(CloseCode.GOING_AWAY, "the server is shutting down")
+
+    async def _converse(self, connection: ServerConnection) -> None:
+        """One response for every request, until the client leaves or the server stops."""
+        previous_total: float | None = None
+        while not self._stopping:
+            started = time.perf_counter()
+            self._idle.add(connection)
+            message = await connection.recv()
+            self._idle.discard(connection)
+            received = time.perf_counter()
+            self.metrics.requests.inc()
+            reply = await self._reply(connection, message, previous_total)
+            if isinstance(reply, str):
+                await connection.send(reply)
+                continue
+            await connection.send(pack(reply))
+            finished = time.perf_counter()
+            self.metrics.request_seconds.observe(finished - received)
+            previous_total = finished - started  # with the wait for the request, as openpi counts it
+            if self._recorder is not None:  # decoded anew: the policy may have changed the dict it was given
+                assert isinstance(message, bytes)
+                self._recorder.put(unpack(message, max_bytes=self._max_bytes), reply, size=len(message))
+        await self._say_goodbye(connection)
+
+    async def _reply(
+        self, connection: ServerConnection, message: str | bytes, previous_total: float | None
+    ) -> dict[str, Any] | str:
+        """The result to send for `message`, or the text that tells the client why there is none.
+
+        Raises _PolicyFailed and _ClientGone.
+        """
+        try:
+            outcome = await self._infer(connection, _decode(message, self._max_bytes))
+        except WireError as error:
+            return self._refuse("malformed", f"bad request: {error}")
+        except Busy:
+            limit = self._worker.queue_limit
+            return self._refuse("busy", f"busy: {limit} requests wait already (--queue-limit {limit}); try again")
+        except Stopping:
+            return self._refuse("stopping", "the server is shutting down")
+        if outcome.refusal is not None:
+            return self._refuse("observation", f"bad observation: {outcome.refusal}")
+        if outcome.failure is not None:
+            raise _PolicyFailed(outcome.failure)
+        assert outcome.result is not None
+        timing = {"infer_ms": outcome.seconds * 1e3}
+        if previous_total is not None:
+            timing["prev_total_ms"] = previous_total * 1e3
+        return {**outcome.result, "server_timing": timing}
+
+    def _refuse(self, kind: str, text: str) -> str:
+        self.metrics.error(kind)
+        text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
+        logger.warning("%s", text)
+        return text
+
+    async def _infer(self, connection: ServerConnection, observation: dict[str, Any]) -> _Outcome:
+        """Run the policy when it is this request's turn, unless the client leaves first."""
+        asked = time.perf_counter()
+
+        def call(observation: dict[str, Any]) -> _Outcome:
+            self.metrics.queue_seconds.observe(time.perf_counter() - asked)
+            return self._call_policy(observation)
+
+        work = asyncio.ensure_future(self._worker.call(call, observation))
+        gone = asyncio.ensure_future(connection.wait_closed())
+        try:
+            await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
+            if not work.done():
+                raise _ClientGone
+            return work.result()
+        finally:
+            gone.cancel()
+            work.cancel()
+
+    def _call_policy(self, observation: dict[str, Any]) -> _Outcome:
+        """Call the policy, on the worker's thread. Never raises: an exception couldn't tell whose fault it is."""
+        started = time.perf_counter()
+        try:
+            result = self._policy.infer(observation)
+            if not isinstance(result, dict) or "actions" not in result:
+                raise TypeError(f'the policy\'s result must be a dict with "actions", not {type(result).__name__}')
+            return _Outcome(time.perf_counter() - started, result=result)
+        except ObservationError as error:
+            return _Outcome(time.perf_counter() - started, refusal=str(error))
+        except BaseException:  # sys.exit() in a policy mustn't end the server either
+            logger.exception("the policy failed")
+            return _Outcome(time.perf_counter() - started, failure=traceback.format_exc())
+        finally:
+            self.metrics.inference_seconds.observe(time.perf_counter() - started)
+
+
+def _decode(message: str | bytes, max_bytes: int) -> dict[str, Any]:
+    """One request as the policy gets it. Raises WireError."""
+    if isinstance(message, str):
+        raise WireError("a request is a binary frame with a msgpack map, not a text frame")
+    observation = unpack(message, max_bytes=max_bytes)
+    if not isinstance(observation, dict):
+        raise WireError(f"a request is a map of observation keys to values, not {type(observation).__name__}")
+    if not all(isinstance(key, str) for key in observation):
+        raise WireError("the keys of an observation are strings (msgpack str), not bytes (msgpack bin)")
+    return observation
+
+
+@contextlib.contextmanager
+def _stop_signals() -> Iterator[asyncio.Event]:
+    """An event that the first SIGINT or SIGTERM sets; the next one kills, since an inference may hang.
+
+    Only the main thread may handle signals: in any other the event is simply never set.
+    """
+    stop = asyncio.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    loop = asyncio.get_running_loop()
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def on_signal(*_: object) -> None:
+        for number in before:
+            signal.signal(number, signal.SIG_DFL)
+        loop.call_soon_threadsafe(stop.set)
+
+    for number in before:
+        signal.signal(number, on_signal)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def running(policy: Policy, *, port: int = 0, **options: Any) -> Iterator[PolicyServer]:
+    """A server in a background thread for the length of a `with` block. For tests, notebooks and demos.
+
+    Takes PolicyServer's options; port 0 picks a free one. Raises what `start` raises.
+    """
+    server = PolicyServer(policy, port=port, **options)
+    ready: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        try:
+            await server.start()
+        except BaseException as error:
+            ready.set_exception(error)
+            return
+        ready.set_result((asyncio.get_running_loop(), stop))
+        await stop.wait()
+        await server.stop()
+
+    thread = threading.Thread(target=lambda: asyncio.run(main()), name="turbopi-server", daemon=True)
+    thread.start()
+    loop, stop = ready.result()
+    try:
+        yield server
+    finally:
+        loop.call_soon_threadsafe(stop.set)
+        thread.join()

@@ -1,0 +1,275 @@
+"""openpi's wire format: msgpack, with numpy arrays and scalars as small maps. Same bytes as openpi, safer to decode.
+
+    array   {b"__ndarray__": True, b"data": C-order bytes, b"dtype": "<f4", b"shape": [2, 3]}
+    scalar  {b"__npgeneric__": True, b"data": 1.25, b"dtype": "<f4"}   but float64, str and bytes as plain values
+
+The keys are msgpack `bin`, not `str`. Real and integer dtypes, bool, fixed-width strings and datetimes pass; void,
+object and complex don't. Nothing is ever pickled.
+
+A message is not trusted: its headers are walked before msgpack builds anything (msgpack allocates what an array
+header claims, so a few bytes could ask for gigabytes), and an array must bring exactly the bytes its shape needs.
+Decoding therefore allocates a small multiple of the message's length, whatever the message says.
+"""
+
+import math
+import re
+import reprlib
+from collections import Counter
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from turbopi.errors import ObservationError
+
+MAX_DEPTH = 32  # containers inside each other; an ALOHA request has 3
+MAX_VALUES = 20_000  # msgpack values, keys included; a request has about 50, so this leaves room for lists of numbers
+MAX_DIMS = 32  # what NumPy 1 can hold
+MAX_EMPTY = 2**20  # product of an empty array's other dimensions: [0, 2**60] needs no data, but who sums it up pays
+MAX_BYTES = 64 * 2**20
+
+_REFUSED_KINDS = "VOc"
+_DTYPE = re.compile(r"[<>|=]?([a-zA-Z?])(\d{0,7})(\[\d{0,4}[a-zA-Z]{1,2}\])?")
+_SCALAR_TYPES: dict[str, tuple[type, ...]] = {
+    "b": (bool,),
+    "i": (int,),
+    "u": (int,),
+    "f": (float, int),
+    "S": (bytes,),
+    "U": (str,),
+}
+
+
+class WireError(ObservationError):
+    """A message that isn't in the wire format, or a value that can't be sent in it."""
+
+
+# --- encoding ---------------------------------------------------------------------------------------------------------
+
+
+def pack(value: Any) -> bytes:
+    """Encode `value`: dicts, lists, strings, bytes, numbers, None, numpy arrays and scalars.
+
+    Raises WireError for anything else, and for void, object and complex dtypes.
+    """
+    try:
+        packed = msgpack.packb(value, default=_pack_numpy)
+    except WireError:
+        raise
+    except (TypeError, ValueError, OverflowError) as error:
+        raise WireError(f"can't send this value: {error}") from error
+    assert isinstance(packed, bytes)
+    return packed
+
+
+def _pack_numpy(value: Any) -> dict[bytes, Any]:
+    if isinstance(value, int):  # msgpack asks about what it can't hold
+        raise WireError(f"can't send the integer {_shown(value)}: the format's integers have 64 bits")
+    if not isinstance(value, np.ndarray | np.generic):
+        raise WireError(
+            f"can't send a {type(value).__module__}.{type(value).__qualname__}: "
+            "a message holds dicts, lists, strings, bytes, numbers, None and numpy arrays"
+        )
+    if value.dtype.kind in _REFUSED_KINDS:
+        raise WireError(f"can't send dtype {value.dtype}: void, object and complex aren't part of the format")
+    if isinstance(value, np.ndarray):
+        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+    item = value.item()
+    if not isinstance(item, bool | int | float) or isinstance(item, np.generic):
+        raise WireError(f"can't send a {value.dtype} scalar: send it as a 0-dimensional array")
+    return {b"__npgeneric__": True, b"data": item, b"dtype": value.dtype.str}
+
+
+# --- decoding ---------------------------------------------------------------------------------------------------------
+
+
+def unpack(data: bytes, *, max_bytes: int = MAX_BYTES) -> Any:
+    """Decode one message. Arrays are read-only views of `data`'s copy inside the decoded value; never more than that.
+
+    Raises WireError, and nothing else, for whatever is wrong; the message names the place and what was expected there.
+    """
+    if len(data) > max_bytes:
+        raise WireError(f"the message has {len(data)} bytes; the limit is {max_bytes}")
+    _check_structure(data)
+    try:
+        value = msgpack.unpackb(data, strict_map_key=True, object_pairs_hook=_unique_keys)
+    except WireError:
+        raise
+    except UnicodeDecodeError as error:
+        raise WireError(f"not a msgpack message: a string isn't UTF-8 ({error.reason})") from error
+    except (ValueError, TypeError, msgpack.UnpackException) as error:  # the structure is right: it's about the keys
+        raise WireError(f"the keys of a map must be str or bin: {error}") from error
+    return _restore(value, ())
+
+
+_SKIP, _ARRAY, _MAP, _EXT, _INVALID = range(5)
+
+
+def _head_table() -> tuple[tuple[int, int, int], ...]:
+    """(kind, bytes of length field, fixed length) for each first byte, from the msgpack specification.
+
+    The length is the number of bytes to skip (_SKIP), of elements (_ARRAY), or of pairs (_MAP).
+    """
+    table = [(_SKIP, 0, 0)] * 256  # integers below 128, negative fixints, nil, booleans
+    for n in range(16):
+        table[0x80 + n] = (_MAP, 0, n)
+        table[0x90 + n] = (_ARRAY, 0, n)
+    for n in range(32):
+        table[0xA0 + n] = (_SKIP, 0, n)
+    table[0xC1] = (_INVALID, 0, 0)
+    for n in range(3):
+        table[0xC4 + n] = (_SKIP, 1 << n, 0)  # bin
+        table[0xD9 + n] = (_SKIP, 1 << n, 0)  # str
+    for n in range(4):
+        table[0xCC + n] = table[0xD0 + n] = (_SKIP, 0, 1 << n)  # unsigned, signed
+    table[0xCA], table[0xCB] = (_SKIP, 0, 4), (_SKIP, 0, 8)  # float32, float64
+    for head in (*range(0xC7, 0xCA), *range(0xD4, 0xD9)):
+        table[head] = (_EXT, 0, 0)
+    table[0xDC], table[0xDD] = (_ARRAY, 2, 0), (_ARRAY, 4, 0)
+    table[0xDE], table[0xDF] = (_MAP, 2, 0), (_MAP, 4, 0)
+    return tuple(table)
+
+
+_HEADS = _head_table()
+
+
+def _check_structure(data: bytes) -> None:
+    """Walk the headers of `data` without building anything: complete, nothing left over, within the limits."""
+    size, position, values = len(data), 0, 0
+    pending = [1]  # values still to come, in each open container
+    while pending:
+        if not pending[-1]:
+            pending.pop()
+            continue
+        pending[-1] -= 1
+        values += 1
+        if values > MAX_VALUES:
+            raise WireError(f"more than {MAX_VALUES} values in one message: send numbers as numpy arrays, not as lists")
+        if position >= size:
+            raise WireError(f"not a msgpack message: it ends after {size} bytes, where another value should follow")
+        kind, length_bytes, length = _HEADS[data[position]]
+        start, position = position, position + 1
+        if kind == _INVALID:
+            raise WireError(f"not a msgpack message: byte {start} is 0xc1, which begins no value")
+        if kind == _EXT:
+            raise WireError(f"a msgpack extension type at byte {start}: this protocol has none")
+        if length_bytes:
+            length = int.from_bytes(data[position : position + length_bytes], "big")
+            position += length_bytes
+        needed = length * 2 if kind == _MAP else length  # every element takes at least one byte
+        if needed > size - position:
+            raise WireError(
+                f"not a msgpack message: the value at byte {start} needs {needed} more bytes, "
+                f"of which {max(size - position, 0)} are there"
+            )
+        if kind == _SKIP:
+            position += length
+        elif len(pending) > MAX_DEPTH:
+            raise WireError(f"more than {MAX_DEPTH} maps and lists inside each other")
+        else:
+            pending.append(needed)
+    if position != size:
+        raise WireError(f"not a msgpack message: {size - position} bytes follow its end at byte {position}")
+
+
+def _unique_keys(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    value = dict(pairs)
+    if len(value) != len(pairs):
+        ((repeated, _),) = Counter(key for key, _ in pairs).most_common(1)
+        raise WireError(f"a map holds the key {_shown(repeated)} more than once")
+    return value
+
+
+def _restore(value: Any, path: tuple[Any, ...]) -> Any:
+    """Turn the maps that stand for arrays and scalars into those. `path` is where `value` is, for the messages."""
+    if isinstance(value, dict):
+        if b"__ndarray__" in value:
+            return _array(value, path)
+        if b"__npgeneric__" in value:
+            return _scalar(value, path)
+        if "__ndarray__" in value or "__npgeneric__" in value:
+            raise WireError(f"{_at(path)}: the keys of a packed array are msgpack bin, not str")
+        return {key: _restore(item, (*path, key)) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_restore(item, (*path, index)) for index, item in enumerate(value)]
+    return value
+
+
+def _array(fields: dict[Any, Any], path: tuple[Any, ...]) -> np.ndarray:
+    _check_fields(fields, (b"__ndarray__", b"data", b"dtype", b"shape"), path)
+    dtype = _dtype(fields[b"dtype"], path)
+    data, shape = fields[b"data"], fields[b"shape"]
+    if not isinstance(data, bytes):
+        raise WireError(f"{_at(path)}: an array's data must be msgpack bin, not {type(data).__name__}")
+    if not isinstance(shape, list) or not all(type(n) is int and n >= 0 for n in shape):
+        raise WireError(f"{_at(path)}: shape must be a list of integers from 0 up, not {_shown(shape)}")
+    if len(shape) > MAX_DIMS or (0 in shape and math.prod(n for n in shape if n) > MAX_EMPTY):
+        raise WireError(f"{_at(path)}: shape {_shown(shape)} is too large")
+    expected = math.prod(shape) * dtype.itemsize
+    if len(data) != expected:
+        raise WireError(
+            f"{_at(path)}: shape {_shown(shape)} of {dtype.str} needs {expected} bytes of data, but {len(data)} came"
+        )
+    if dtype.kind == "b" and data.translate(None, b"\x00\x01"):
+        raise WireError(f"{_at(path)}: a bool array's bytes must be 0 or 1")
+    if dtype.kind == "U":
+        codes = np.frombuffer(data, np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+        if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes <= 0xDFFF))).any():
+            raise WireError(f"{_at(path)}: a string array holds a number that is no Unicode character")
+    return np.ndarray(tuple(shape), dtype, data)
+
+
+def _scalar(fields: dict[Any, Any], path: tuple[Any, ...]) -> Any:
+    _check_fields(fields, (b"__npgeneric__", b"data", b"dtype"), path)
+    dtype, data = _dtype(fields[b"dtype"], path), fields[b"data"]
+    if type(data) not in _SCALAR_TYPES.get(dtype.kind, ()):
+        raise WireError(f"{_at(path)}: a {dtype.str} scalar can't be made from {_shown(data)}")
+    if dtype.kind in "iu" and not np.iinfo(dtype).min <= data <= np.iinfo(dtype).max:
+        raise WireError(f"{_at(path)}: {data} doesn't fit into {dtype.str}")
+    with np.errstate(over="ignore"):
+        value = dtype.type(data)
+    if dtype.kind == "f" and np.isinf(value) and not math.isinf(data):
+        raise WireError(f"{_at(path)}: {data} doesn't fit into {dtype.str}")
+    return value
+
+
+def _check_fields(fields: dict[Any, Any], expected: tuple[bytes, ...], path: tuple[Any, ...]) -> None:
+    if set(fields) != set(expected):
+        keys = _shown(list(fields))
+        raise WireError(f"{_at(path)}: a map with {expected[0]!r} must have the keys {expected}, not {keys}")
+    if fields[expected[0]] is not True:
+        raise WireError(f"{_at(path)}: {expected[0]!r} must be true, not {_shown(fields[expected[0]])}")
+
+
+def _dtype(text: Any, path: tuple[Any, ...]) -> np.dtype[Any]:
+    """`text` as a dtype. Only what `dtype.str` produces is read: NumPy's own parser takes whole structures."""
+    match = _DTYPE.fullmatch(text) if isinstance(text, str) else None
+    if match is None:
+        raise WireError(f"{_at(path)}: dtype must be a string like '<f4', not {_shown(text)}")
+    if match[1] in _REFUSED_KINDS:
+        raise WireError(f"{_at(path)}: dtype {text!r} is refused: void, object and complex aren't part of the format")
+    if match[1] not in "biufSUmM" or not match[2] or (match[3] and match[1] not in "mM"):
+        raise WireError(f"{_at(path)}: dtype must be a string like '<f4', not {_shown(text)}")
+    try:
+        dtype = np.dtype(text)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise WireError(f"{_at(path)}: NumPy knows no dtype {text!r}") from error
+    if dtype.itemsize <= 0:
+        raise WireError(f"{_at(path)}: dtype {text!r} has no bytes")
+    return dtype
+
+
+def _at(path: tuple[Any, ...]) -> str:
+    return "/".join(_shown(key) for key in path) if path else "the message"
+
+
+class _Short(reprlib.Repr):
+    """`repr` that stays short, and costs little, however large the value."""
+
+    maxstring = 80
+
+    def repr_bytes(self, value: bytes, level: int) -> str:
+        return repr(value) if len(value) <= 40 else f"{value[:40]!r}…"
+
+
+_shown = _Short().repr

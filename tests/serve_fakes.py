@@ -1,0 +1,88 @@
+"""Policies without a model, and a bare HTTP client, for the serving tests."""
+
+import asyncio
+import threading
+from typing import Any
+
+import numpy as np
+
+from turbopi.errors import ObservationError
+
+OBSERVATION = {
+    "observation/image": np.arange(12, dtype=np.uint8).reshape(2, 2, 3),
+    "observation/state": np.linspace(-1, 1, 8),
+    "prompt": "put the bowl away",
+}
+
+
+class FakePolicy:
+    """Answers with what it was sent; `prompt` selects the trouble it makes, and `hold` makes it wait for `release`."""
+
+    def __init__(self) -> None:
+        self.metadata: dict[str, Any] = {"policy": "fake", "reset_pose": [0.0, 1.5], "action_horizon": 2}
+        self.seen: list[str] = []
+        self.observations: dict[str, dict[str, Any]] = {}
+        self.threads: set[int] = set()
+        self.overlaps = 0
+        self.warmed_up = False
+        self.started, self.release = threading.Event(), threading.Event()
+        self._running = threading.Lock()
+
+    def warmup(self) -> None:
+        self.threads.add(threading.get_ident())
+        self.warmed_up = True
+
+    def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
+        if not self._running.acquire(blocking=False):
+            self.overlaps += 1
+        else:
+            try:
+                return self._infer(obs)
+            finally:
+                self._running.release()
+        raise AssertionError("two inferences at once")
+
+    def _infer(self, obs: dict[str, Any]) -> dict[str, Any]:
+        self.threads.add(threading.get_ident())
+        if "observation/state" not in obs:
+            raise ObservationError(f"the key 'observation/state' is missing; this robot sends {sorted(obs)}")
+        state = np.asarray(obs["observation/state"])
+        if state.dtype.kind != "f":
+            raise ObservationError(f"observation/state must be float, not {state.dtype}")
+        if not np.isfinite(state).all():
+            raise ObservationError("observation/state holds nan at [0]: every value must be finite")
+        prompt = str(obs.get("prompt", ""))
+        self.seen.append(prompt)
+        self.observations[prompt] = dict(obs)
+        if prompt.startswith("hold"):
+            self.started.set()
+            assert self.release.wait(30)
+        if prompt == "crash":
+            raise RuntimeError("CUDA error: an illegal memory access was encountered")
+        if prompt == "stop iteration":
+            next(iter(()))
+        if prompt == "exit":
+            raise SystemExit(3)
+        if prompt == "no actions":
+            return {"policy_timing": {}}
+        if prompt == "unpackable":
+            return {"actions": object()}
+        if prompt == "mutate":
+            obs.clear()
+        return {"actions": np.stack([state, state]), "policy_timing": {"infer_ms": 1.0}, "prompt": prompt}
+
+
+def observation(prompt: str = "") -> dict[str, Any]:
+    return {**OBSERVATION, "prompt": prompt}
+
+
+async def http_get(port: int, path: str, *headers: str) -> tuple[int, dict[str, str], str]:
+    """Status, headers (lower case) and body of a GET."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    lines = [f"GET {path} HTTP/1.1", f"Host: 127.0.0.1:{port}", *headers, "", ""]
+    writer.write("\r\n".join(lines).encode())
+    answer = (await asyncio.wait_for(reader.read(), 5)).decode()
+    writer.close()
+    head, _, body = answer.partition("\r\n\r\n")
+    status, *fields = head.split("\r\n")
+    return int(status.split()[1]), {k.lower(): v.strip() for k, _, v in (f.partition(":") for f in fields)}, body

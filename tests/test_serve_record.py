@@ -1,0 +1,312 @@
+"""Recordings: what goes in comes out, and the disk never holds the robot up."""
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from PIL import Image
+
+from turbopi.errors import ConfigError, ObservationError
+from turbopi.serve import record
+from turbopi.serve.record import Call, Recorder, iter_recording, load_call, load_observation, save_call
+
+RESULT = {
+    "actions": np.arange(14.0).reshape(2, 7),
+    "policy_timing": {"infer_ms": 12.5},
+    "server_timing": {"infer_ms": 13.0},
+}
+ALOHA = {
+    "images": {"cam_high": np.full((3, 4, 5), 7, np.uint8), "cam_left_wrist": np.zeros((3, 4, 5), np.uint8)},
+    "state": np.linspace(0, 1, 14, dtype=np.float32),
+    "prompt": "fold the towel ✓",
+}
+
+
+def assert_equal(actual: Any, expected: Any) -> None:
+    if isinstance(expected, dict):
+        assert list(actual) == list(expected)
+        for key in expected:
+            assert_equal(actual[key], expected[key])
+    elif isinstance(expected, list):
+        assert len(actual) == len(expected)
+        for a, e in zip(actual, expected, strict=True):
+            assert_equal(a, e)
+    elif isinstance(expected, np.ndarray | np.generic):
+        assert type(actual) is type(expected)
+        assert (actual.dtype, actual.shape) == (expected.dtype, expected.shape)
+        np.testing.assert_array_equal(actual, expected)
+    else:
+        assert type(actual) is type(expected)
+        assert actual == expected
+
+
+LEAVES = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats(allow_nan=False)
+    | st.text()
+    | st.binary()
+    | npst.arrays(st.sampled_from(["<f4", ">f8", "|u1", "|b1", "<U3", "|S2", "<M8[s]"]), npst.array_shapes(min_dims=0))
+    | st.sampled_from([np.float32(1.5), np.uint8(3), np.bool_(True)])
+)
+KEYS = st.sampled_from(["a", "b", "a/b", "a.npy", "", "/", "..", "ключ", "x" * 200]) | st.text(max_size=4)
+TREES = st.dictionaries(
+    KEYS,
+    st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=3)),
+    max_size=5,
+)
+
+
+@given(TREES)
+@settings(deadline=None, max_examples=100)
+def test_any_observation_comes_back_unchanged(
+    tmp_path_factory: pytest.TempPathFactory, observation: dict[str, Any]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "call.npz"
+    save_call(path, Call(observation, RESULT, 1.5))
+    call = load_call(path)
+    assert_equal(call.observation, observation)
+    assert_equal(call.result, RESULT)
+    assert call.time == 1.5
+
+
+def test_keys_that_join_to_the_same_name_stay_apart(tmp_path: Path) -> None:
+    observation = {"a/b": np.zeros(1), "a": {"b": np.ones(2)}}
+    save_call(tmp_path / "x.npz", Call(observation, RESULT, 0.0))
+    assert_equal(load_observation(tmp_path / "x.npz"), observation)
+
+
+def test_plain_numpy_reads_the_arrays_by_their_keys(tmp_path: Path) -> None:
+    save_call(tmp_path / "x.npz", Call({"observation/state": np.arange(8.0)}, RESULT, 0.0))
+    with np.load(tmp_path / "x.npz", allow_pickle=False) as archive:
+        assert set(archive.files) == {"observation/observation/state", "result/actions", "index"}
+        np.testing.assert_array_equal(archive["result/actions"], RESULT["actions"])
+
+
+@pytest.mark.parametrize("value", [object(), np.array([None]), {1: 2}])
+def test_what_cannot_be_stored_is_refused_and_leaves_no_file(tmp_path: Path, value: Any) -> None:
+    with pytest.raises(ObservationError, match="can't record"):
+        save_call(tmp_path / "x.npz", Call({"x": value}, RESULT, 0.0))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_comes_back_in_order_with_its_manifest(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, {"policy": "fake", "reset_pose": np.zeros(2)})
+    for n in range(12):
+        recorder.put({**ALOHA, "prompt": str(n)}, RESULT, size=1)
+    recorder.close()
+    calls = list(iter_recording(tmp_path))
+    assert [obs["prompt"] for obs, _ in calls] == [str(n) for n in range(12)]
+    assert_equal(calls[0][0], {**ALOHA, "prompt": "0"})
+    assert_equal(calls[0][1], RESULT["actions"])
+    assert len(list(iter_recording(recorder.folder))) == 12
+    assert len(list(iter_recording(recorder.folder / "000003.npz"))) == 1
+    manifest = json.loads((recorder.folder / "manifest.json").read_text())
+    assert manifest["metadata"] == {"policy": "fake", "reset_pose": [0.0, 0.0]}
+    lines = [json.loads(line) for line in (recorder.folder / "index.jsonl").read_text().splitlines()]
+    assert [line["file"] for line in lines] == [f"{n:06d}.npz" for n in range(12)]
+    assert all(line["infer_ms"] == 13.0 and line["time"] >= manifest["started"] for line in lines)
+
+
+def test_each_run_has_its_own_folder_and_the_runs_follow_each_other(tmp_path: Path) -> None:
+    for run in range(3):
+        recorder = Recorder(tmp_path, {})
+        recorder.put({"run": run}, RESULT, size=1)
+        recorder.close()
+    assert [obs["run"] for obs, _ in iter_recording(tmp_path)] == [0, 1, 2]
+
+
+class SlowDisk:
+    """Stands in for `save_call`: waits until it may write."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.writing, self.may_write = threading.Event(), threading.Event()
+        monkeypatch.setattr(record, "save_call", self)
+
+    def __call__(self, path: Path, call: Call) -> None:
+        self.writing.set()
+        assert self.may_write.wait(30)
+        save_call(path, call)
+
+
+@pytest.mark.parametrize(
+    ("limits", "sizes"),
+    [({"queue_calls": 2, "queue_bytes": 500}, [100] * 6), ({"queue_bytes": 300}, [100] * 6)],
+    ids=["calls", "bytes"],
+)
+def test_a_slow_disk_drops_calls_with_a_counted_warning(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    limits: dict[str, int],
+    sizes: list[int],
+) -> None:
+    disk = SlowDisk(monkeypatch)
+    counted: list[str] = []
+    recorder = Recorder(tmp_path, {}, count=counted.append, **limits)
+    for n, size in enumerate(sizes):
+        recorder.put({"n": n}, RESULT, size=size)
+        assert disk.writing.wait(5)  # the first call is out of the queue before the second comes
+    assert recorder.dropped == 3
+    assert "2 calls weren't recorded: the disk can't keep up" in caplog.text
+    disk.may_write.set()
+    while recorder.written < 3:
+        threading.Event().wait(0.01)
+    recorder.put({"n": 6}, RESULT, size=400)
+    recorder.close()
+    assert [obs["n"] for obs, _ in iter_recording(tmp_path)] == [0, 1, 2, 6]
+    assert sorted(counted) == ["dropped"] * 3 + ["written"] * 4
+
+
+def test_one_call_larger_than_the_queue_is_still_recorded(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, {}, queue_bytes=10)
+    recorder.put({"n": 1}, RESULT, size=100)
+    recorder.close()
+    assert (recorder.written, recorder.dropped) == (1, 0)
+
+
+def test_a_full_disk_loses_calls_and_not_the_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    real, full = np.savez, threading.Event()
+    full.set()
+
+    def savez(file: Any, **members: Any) -> None:
+        file.write(b"half")
+        if full.is_set():
+            raise OSError(28, "No space left on device")
+        file.seek(0)
+        real(file, **members)
+
+    monkeypatch.setattr(np, "savez", savez)
+    counted: list[str] = []
+    recorder = Recorder(tmp_path, {}, count=counted.append)
+    recorder.put({"n": 0}, RESULT, size=1)
+    recorder.put({"n": object()}, RESULT, size=1)
+    while recorder.failed < 2:
+        threading.Event().wait(0.01)
+    full.clear()
+    recorder.put({"n": 2}, RESULT, size=1)
+    recorder.close()
+    assert counted == ["failed", "failed", "written"]
+    assert "1 calls couldn't be recorded" in caplog.text
+    assert "No space left on device" in caplog.text
+    assert sorted(path.name for path in recorder.folder.iterdir()) == ["000002.npz", "index.jsonl", "manifest.json"]
+
+
+def test_a_folder_that_vanishes_ends_no_thread(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, {})
+    recorder.folder.rename(tmp_path / "moved")
+    recorder.put({"n": 0}, RESULT, size=1)
+    recorder.close()
+    assert recorder.failed == 1
+
+
+def test_a_folder_that_cannot_be_made_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"can't record into .*file"):
+        Recorder(tmp_path / "file", {})
+
+
+# --- loading one observation ------------------------------------------------------------------------------------------
+
+
+def test_an_observation_is_read_from_a_recording(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, {})
+    recorder.put(ALOHA, RESULT, size=1)
+    recorder.close()
+    assert_equal(load_observation(tmp_path), ALOHA)
+    assert_equal(load_observation(recorder.folder / "000000.npz"), ALOHA)
+
+
+def test_an_observation_is_read_from_a_plain_npz(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", **{"observation/state": np.zeros(8), "prompt": np.array("go")})  # type: ignore[arg-type]
+    assert_equal(load_observation(tmp_path / "x.npz"), {"observation/state": np.zeros(8), "prompt": "go"})
+
+
+def test_an_observation_is_read_from_a_folder_of_pictures(tmp_path: Path) -> None:
+    pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    Image.fromarray(pixels).save(tmp_path / "high.png")
+    np.save(tmp_path / "wrist.npy", pixels)
+    description = {
+        "images": {"cam_high": {"file": "high.png", "layout": "chw"}, "cam_left_wrist": {"file": "wrist.npy"}},
+        "observation/image": {"file": "high.png"},
+        "state": [0, 0.5],
+        "prompt": "go",
+    }
+    (tmp_path / "observation.json").write_text(json.dumps(description))
+    expected = {
+        "images": {"cam_high": pixels.transpose(2, 0, 1), "cam_left_wrist": pixels},
+        "observation/image": pixels,
+        "state": np.array([0, 0.5]),
+        "prompt": "go",
+    }
+    assert_equal(load_observation(tmp_path), expected)
+
+
+@pytest.mark.parametrize(
+    ("description", "message"),
+    [
+        ("{", "isn't JSON"),
+        ("[]", "must hold an object, not a list"),
+        ('{"a": {"file": "none.png"}}', "'a' names the file 'none.png', which isn't in"),
+        ('{"a": {"file": "../secret.npy"}}', "which isn't in"),
+        ('{"a": {"file": "text.png"}}', "is neither a readable picture nor .npy"),
+        ('{"a": {"file": "text.npy"}}', "isn't a readable .npy file"),
+        ('{"a": {"file": "text.png", "layout": "nchw"}}', "'a' must be"),
+        ('{"a": {"file": "text.png", "size": 3}}', "'a' must be"),
+        ('{"a": ["x"]}', "'a' must be a list of numbers"),
+        ('{"a": {"b": [[1], [2, 3]]}}', "'a/b' must be a list of numbers"),
+    ],
+)
+def test_a_wrong_observation_folder_is_refused(tmp_path: Path, description: str, message: str) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    np.save(tmp_path / "secret.npy", np.zeros(1))
+    (folder / "text.png").write_text("text")
+    (folder / "text.npy").write_text("text")
+    (folder / "observation.json").write_text(description)
+    with pytest.raises(ObservationError, match=message):
+        load_observation(folder)
+
+
+def test_files_that_are_no_recordings_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ObservationError, match="doesn't exist"):
+        load_observation(tmp_path / "none.npz")
+    with pytest.raises(ObservationError, match="holds no recording"):
+        load_observation(tmp_path)
+    (tmp_path / "text.npz").write_text("text")
+    with pytest.raises(ObservationError, match=r"text\.npz isn't a readable \.npz file"):
+        load_observation(tmp_path / "text.npz")
+    np.save(tmp_path / "array.npy", np.zeros(2))
+    with pytest.raises(ObservationError, match=r"array\.npy isn't an \.npz file"):
+        load_observation(tmp_path / "array.npy")
+    np.savez(tmp_path / "pickle.npz", x=np.array([{}], object))
+    with pytest.raises(ObservationError, match="isn't a readable"):
+        load_observation(tmp_path / "pickle.npz")
+    np.savez(tmp_path / "plain.npz", x=np.zeros(1))
+    with pytest.raises(ObservationError, match="without an index"):
+        load_call(tmp_path / "plain.npz")
+
+
+@pytest.mark.parametrize(
+    ("index", "message"),
+    [
+        (b"{", "damaged index"),
+        (b"[]", "damaged index"),
+        (b'{"format": "turbopi-recording", "version": 2}', "version 2; this reads turbopi-recording of version 1"),
+        (b'{"format": "turbopi-recording", "version": 1, "time": 0, "observation": {"array": "x"}}', "damaged index"),
+        (b'{"format": "turbopi-recording", "version": 1, "time": 0, "observation": {"what": "x"}}', "damaged index"),
+    ],
+)
+def test_a_damaged_index_is_refused(tmp_path: Path, index: bytes, message: str) -> None:
+    np.savez(tmp_path / "x.npz", index=np.frombuffer(index, np.uint8))
+    with pytest.raises(ObservationError, match=message):
+        load_call(tmp_path / "x.npz")

@@ -1,0 +1,353 @@
+"""openpi's wire format: the same bytes, and no message that hurts."""
+
+import base64
+import json
+import re
+import struct
+import time
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from turbopi.errors import ObservationError
+from turbopi.serve.wire import MAX_DEPTH, MAX_VALUES, WireError, pack, unpack
+
+GOLDEN = json.loads((Path(__file__).parent / "golden" / "preprocess" / "msgpack.json").read_text())
+OBJECTS = {item["name"]: item for item in GOLDEN["objects"]}
+
+
+def golden_value(item: dict[str, Any]) -> Any:
+    if item["kind"] == "python":
+        return item["value"]
+    if item["kind"] == "dict":
+        return {key: golden_value(value) for key, value in item["items"].items()}
+    data = base64.b64decode(item["c_order_data_base64"])
+    array = np.ndarray(tuple(item["shape"]), item["dtype"], data)
+    return array[()] if item["kind"] == "numpy scalar" else array
+
+
+def array_map(**changes: Any) -> dict[bytes, Any]:
+    fields = {"__ndarray__": True, "data": bytes(24), "dtype": "<f4", "shape": [2, 3], **changes}
+    return {key.encode(): value for key, value in fields.items() if value is not ...}
+
+
+def scalar_map(**changes: Any) -> dict[bytes, Any]:
+    fields = {"__npgeneric__": True, "data": 1.5, "dtype": "<f4", **changes}
+    return {key.encode(): value for key, value in fields.items() if value is not ...}
+
+
+def assert_same(actual: Any, expected: Any) -> None:
+    assert type(actual) is type(expected)
+    if isinstance(expected, dict):
+        assert list(actual) == list(expected)
+        for key in expected:
+            assert_same(actual[key], expected[key])
+    elif isinstance(expected, np.ndarray):
+        assert (actual.dtype.str, actual.shape) == (expected.dtype.str, expected.shape)
+        assert actual.tobytes() == expected.tobytes()
+    else:
+        assert actual == expected
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_bytes_are_those_of_openpi(name: str) -> None:
+    value = golden_value(OBJECTS[name])
+    if name == "fortran_order":
+        value = np.asfortranarray(value)
+    assert pack(value) == base64.b64decode(OBJECTS[name]["packed_base64"])
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_openpi_bytes_decode_to_the_value_that_was_packed(name: str) -> None:
+    item = OBJECTS[name]
+    actual = unpack(base64.b64decode(item["packed_base64"]))
+    if item.get("unpacked_type") is not None:
+        assert type(actual).__name__.strip("_") == item["unpacked_type"].rpartition(".")[2].strip("_")  # bool_ is bool
+    expected = golden_value(item)
+    assert_same(actual, expected.item() if isinstance(expected, np.float64 | np.str_) else expected)
+
+
+@pytest.mark.parametrize(
+    "value", [np.zeros(2, np.complex64), np.array([{}]), np.zeros(2, "i4,f4"), np.complex128(1), np.void(b"x")]
+)
+def test_void_object_and_complex_are_not_sent(value: Any) -> None:
+    with pytest.raises(ValueError, match="void, object and complex aren't part of the format"):
+        pack({"x": value})
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (object(), "can't send a builtins.object"),
+        ({"x": {1, 2}}, "can't send a builtins.set"),
+        (np.datetime64("2026-01-01"), r"can't send a datetime64\[D\] scalar"),
+        (np.longdouble(1), "scalar: send it as a 0-dimensional array"),
+        (2**70, "can't send the integer 1180591620717411303424"),
+        ("\ud800", "can't send this value: .*surrogates not allowed"),
+    ],
+)
+def test_what_msgpack_cannot_hold_is_not_sent(value: Any, message: str) -> None:
+    with pytest.raises(WireError, match=message):
+        pack(value)
+
+
+def test_decoded_arrays_are_read_only() -> None:
+    array = unpack(pack({"state": np.arange(3.0)}))["state"]
+    with pytest.raises(ValueError, match="read-only"):
+        array[0] = 1
+
+
+WIRE_DTYPES = st.one_of(
+    npst.boolean_dtypes(),
+    npst.integer_dtypes(endianness="?"),
+    npst.unsigned_integer_dtypes(endianness="?"),
+    npst.floating_dtypes(endianness="?", sizes=(16, 32, 64)),
+    npst.unicode_string_dtypes(endianness="?", max_len=5),
+    npst.byte_string_dtypes(max_len=5),
+    npst.datetime64_dtypes(endianness="?"),
+)
+ARRAYS = WIRE_DTYPES.flatmap(
+    lambda dtype: npst.arrays(dtype, npst.array_shapes(min_dims=0, min_side=0, max_side=4))
+).filter(lambda array: array.dtype.kind != "U" or not re.search("[\ud800-\udfff]", "".join(array.flat)))
+PLAIN = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats(allow_nan=False) | st.text()
+VALUES = st.recursive(
+    PLAIN | st.binary() | ARRAYS,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(VALUES.filter(lambda value: "__ndarray__" not in str(value) and "__npgeneric__" not in str(value)))
+@settings(deadline=None, max_examples=200)
+def test_whatever_can_be_sent_arrives_unchanged(value: Any) -> None:
+    def compare(actual: Any, expected: Any) -> None:
+        if isinstance(expected, list):
+            assert len(actual) == len(expected)
+            for a, e in zip(actual, expected, strict=True):
+                compare(a, e)
+        elif isinstance(expected, dict):
+            assert list(actual) == list(expected)
+            for key in expected:
+                compare(actual[key], expected[key])
+        else:
+            assert_same(actual, expected)
+
+    compare(unpack(pack(value)), value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"data": bytes(23)}, r"shape \[2, 3\] of <f4 needs 24 bytes of data, but 23 came"),
+        ({"data": bytes(25)}, "but 25 came"),
+        ({"data": "x" * 24}, "data must be msgpack bin, not str"),
+        ({"data": [0] * 24}, "data must be msgpack bin, not list"),
+        ({"data": ...}, "must have the keys"),
+        ({"strides": [4, 8]}, "must have the keys"),
+        ({"__ndarray__": False}, "must be true, not False"),
+        ({"dtype": "O"}, "dtype 'O' is refused: void, object and complex"),
+        ({"dtype": "|O8"}, "is refused"),
+        ({"dtype": "<c8", "shape": [3]}, "is refused"),
+        ({"dtype": "|V4"}, "is refused"),
+        ({"dtype": "f4,f4"}, "dtype must be a string like '<f4'"),
+        ({"dtype": "float32"}, "dtype must be a string like '<f4'"),
+        ({"dtype": "<f3"}, "NumPy knows no dtype '<f3'"),
+        ({"dtype": "<f4[s]"}, "dtype must be a string like '<f4'"),
+        ({"dtype": "<U999999999"}, "<U999999999"),
+        ({"dtype": "<U0", "data": b"", "shape": [10**9]}, "has no bytes"),
+        ({"dtype": 4}, "dtype must be a string like '<f4', not 4"),
+        ({"dtype": [["a", "<f4"]]}, "dtype must be a string like '<f4'"),
+        ({"shape": [-2, -3]}, "shape must be a list of integers from 0 up"),
+        ({"shape": [2.0, 3]}, "shape must be a list of integers from 0 up"),
+        ({"shape": [True, 6]}, "shape must be a list of integers from 0 up"),
+        ({"shape": 6}, "shape must be a list of integers from 0 up, not 6"),
+        ({"shape": [2**32, 2**32], "data": b""}, f"needs {2**66} bytes of data, but 0 came"),  # in 64 bits: 0
+        ({"shape": [0, 2**62], "data": b""}, "is too large"),
+        ({"shape": [1] * 33, "data": bytes(4)}, "is too large"),
+        ({"shape": [2**20, 2**10]}, "needs 4294967296 bytes of data, but 24 came"),
+        ({"dtype": "|b1", "shape": [24], "data": b"\x02" * 24}, "bytes must be 0 or 1"),
+        ({"dtype": "<U1", "shape": [6], "data": b"\xff" * 24}, "no Unicode character"),
+        ({"dtype": ">U1", "shape": [1], "data": b"\x00\x00\xd8\x00"}, "no Unicode character"),
+    ],
+)
+def test_a_wrong_array_is_refused_by_name(changes: dict[str, Any], message: str) -> None:
+    data = msgpack.packb({"images": {"cam_high": array_map(**changes)}})
+    with pytest.raises(WireError, match=f"^'images'/'cam_high': .*{message}"):
+        unpack(data)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"data": "1.5"}, "a <f4 scalar can't be made from '1.5'"),
+        ({"data": 1e300}, "1e\\+300 doesn't fit into <f4"),
+        ({"data": 300, "dtype": "|u1"}, "300 doesn't fit into |u1"),
+        ({"data": True, "dtype": "<i8"}, "a <i8 scalar can't be made from True"),
+        ({"data": 1, "dtype": "|b1"}, "can't be made from 1"),
+        ({"data": [1.5]}, "can't be made from"),
+        ({"data": 5, "dtype": "<M8[s]"}, "can't be made from 5"),
+        ({"dtype": "<c8"}, "is refused"),
+        ({"shape": []}, "must have the keys"),
+    ],
+)
+def test_a_wrong_scalar_is_refused_by_name(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(WireError, match=f"^'state'/\\[1\\]: .*{message}|^'state'/1: .*{message}"):
+        unpack(msgpack.packb({"state": [0, scalar_map(**changes)]}))
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "ends after 0 bytes"),
+        (b"hello", "4 bytes follow its end"),
+        (b'{"prompt": "json"}', "bytes follow its end"),
+        (b"\xc1", "0xc1, which begins no value"),
+        (b"\x81\xa1x", "needs 2 more bytes, of which 1 are there|ends after"),
+        (b"\x82\xa1x\x01\xa1x\x02", "holds the key 'x' more than once"),
+        (b"\x81\x01\x02", "the keys of a map must be str or bin: int is not allowed"),
+        (b"\x81\x90\x02", "the keys of a map must be str or bin"),
+        (b"\xa2\xff\xfe", "isn't UTF-8"),
+        (b"\xd4\x01x", "extension type at byte 0"),
+        (b"\xd6\xff" + bytes(4), "extension type"),
+        (b"\xc6\xff\xff\xff\xff" + bytes(10), "needs 4294967295 more bytes, of which 10 are there"),
+        (b"\xdd\xff\xff\xff\xff" + bytes(10), "needs 4294967295 more bytes"),
+        (b"\xdf\x00\x00\x00\x08" + bytes(10), "needs 16 more bytes, of which 10"),
+        (b"\xda\x00", "needs"),
+        (b"\x91" * (MAX_DEPTH + 1) + b"\x00", f"more than {MAX_DEPTH} maps and lists inside each other"),
+        (b"\xdc\x60\x00" + bytes(0x6000), f"more than {MAX_VALUES} values"),
+        (b"\x81\xab__ndarray__\xc3", "the keys of a packed array are msgpack bin, not str"),
+    ],
+)
+def test_a_wrong_message_is_refused_with_its_reason(data: bytes, message: str) -> None:
+    with pytest.raises(WireError, match=message):
+        unpack(data)
+
+
+def test_the_deepest_allowed_message_is_read() -> None:
+    assert unpack(b"\x91" * (MAX_DEPTH - 1) + b"\x90") is not None
+
+
+def test_the_size_limit_is_exact() -> None:
+    data = pack({"x": np.zeros(100)})
+    assert unpack(data, max_bytes=len(data)) is not None
+    with pytest.raises(WireError, match=f"has {len(data)} bytes; the limit is {len(data) - 1}"):
+        unpack(data, max_bytes=len(data) - 1)
+
+
+def test_a_wire_error_is_an_observation_error() -> None:
+    with pytest.raises(ObservationError):
+        unpack(b"\xc1")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"".join(b"\xdd" + struct.pack(">I", 900_000) for _ in range(30)) + bytes(1_000_000),
+        b"\xdd" + struct.pack(">I", 1_000_000) + b"\x80" * 1_000_000,
+        msgpack.packb(array_map(shape=[0, 2**30], data=b"")),
+        msgpack.packb(array_map(shape=[2**30], data=b"")),
+        msgpack.packb(array_map(dtype="<U250000000", shape=[1])),
+        b"\x91" * 1_000_000,
+        b"\xdf" + struct.pack(">I", 400_000) + b"\xa1x\x00" * 330_000,
+        b"\xde"
+        + struct.pack(">H", 9_990)
+        + b"".join(b"\xcd" + struct.pack(">H", 1000 + i // 2) + b"\0" for i in range(9_990)),
+        b"\xde" + struct.pack(">H", 9_990) + b"".join(b"\xa4%04d\0" % (i // 2) for i in range(9_990)),
+        msgpack.packb(array_map(shape=[b"x" * 100_000] * 20)),
+        msgpack.packb(scalar_map(data={"x" * 1000: ["y" * 1000] * 1000})),
+    ],
+    ids=[
+        "nested claims",
+        "many maps",
+        "empty giant",
+        "giant",
+        "giant string",
+        "deep",
+        "wide map",
+        "int keys",
+        "repeated keys",
+        "long",
+        "large",
+    ],
+)
+def test_no_message_allocates_more_than_it_weighs(data: bytes) -> None:
+    tracemalloc.start()
+    started = time.perf_counter()
+    with pytest.raises(WireError) as refusal:
+        unpack(data)
+    assert len(str(refusal.value)) < 1000
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * len(data) + 4_000_000
+    assert time.perf_counter() - started < 2
+
+
+# --- fuzzing: any bytes either decode or raise WireError --------------------------------------------------------------
+
+REQUEST = base64.b64decode(OBJECTS["request"]["packed_base64"])
+ODD_KEYS = st.sampled_from([b"__ndarray__", b"__npgeneric__", b"data", b"dtype", b"shape", "__ndarray__", "state", b""])
+ODD_LEAVES = st.one_of(
+    PLAIN,
+    st.binary(max_size=20),
+    st.sampled_from(["<f4", "|u1", "<U3", "|b1", "O", "<M8[s]", "<M8[25s]", "<m8", "=i2", ">f8", "<f16", "?", "|S0"]),
+    st.lists(st.integers(-1, 2**40), max_size=4),
+)
+ODD_VALUES = st.recursive(
+    ODD_LEAVES,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(ODD_KEYS, inner, max_size=4),
+    max_leaves=20,
+)
+ARRAY_LIKE = st.fixed_dictionaries(
+    {
+        b"__ndarray__": st.just(True),
+        b"data": st.binary(max_size=32),
+        b"dtype": st.from_regex(r"[<>|=]?[biufSUmMcOV?][0-9]{0,3}(\[[0-9]{0,3}[a-zA-Z]{1,2}\])?", fullmatch=True),
+        b"shape": st.lists(st.integers(0, 8), max_size=3),
+    }
+)
+SCALAR_LIKE = st.fixed_dictionaries(
+    {
+        b"__npgeneric__": st.just(True),
+        b"data": PLAIN | st.binary(max_size=8),
+        b"dtype": st.from_regex(r"[<>|=]?[biufSUmM][0-9]{0,2}", fullmatch=True),
+    }
+)
+
+
+def decodes_or_refuses(data: bytes) -> None:
+    try:
+        value = unpack(data)
+    except WireError as error:
+        assert str(error)  # noqa: PT017
+        assert len(str(error)) < 1000  # noqa: PT017
+    else:
+        repr(value)  # nothing in it is broken
+
+
+@given(st.binary(max_size=200))
+@settings(deadline=None, max_examples=500)
+def test_random_bytes_never_crash_the_decoder(data: bytes) -> None:
+    decodes_or_refuses(data)
+
+
+@given(st.lists(st.tuples(st.integers(0, len(REQUEST) - 1), st.integers(0, 255)), min_size=1, max_size=4), st.data())
+@settings(deadline=None, max_examples=500)
+def test_a_damaged_request_never_crashes_the_decoder(changes: list[tuple[int, int]], data: st.DataObject) -> None:
+    damaged = bytearray(REQUEST)
+    for position, byte in changes:
+        damaged[position] = byte
+    cut = data.draw(st.integers(0, len(damaged)) | st.just(len(damaged)))
+    decodes_or_refuses(bytes(damaged[:cut]))
+
+
+@given(ODD_VALUES | ARRAY_LIKE | SCALAR_LIKE)
+@settings(deadline=None, max_examples=500)
+def test_odd_structures_never_crash_the_decoder(value: Any) -> None:
+    decodes_or_refuses(msgpack.packb(value))
