@@ -1,0 +1,212 @@
+"""A checkpoint: weights behind one interface, whatever the format they are stored in."""
+
+import hashlib
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import prod
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from torch import Tensor
+
+from turbopi.checkpoint.norm_stats import NormStats
+from turbopi.checkpoint.source import Piece, WeightSource
+from turbopi.config import PolicyConfig
+from turbopi.model.reference import Precision, parameter_dtype
+
+PARTS = ("vision", "projector", "vlm", "expert")  # the rest: action, state and time projections
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """Weights in memory: `state` under canonical names, on their device, in the dtypes of the precision."""
+
+    state: dict[str, Tensor]
+    seconds: float
+    bytes: int
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """An opened checkpoint: checked, described, not yet loaded. Made by `open_checkpoint` and `random_checkpoint`."""
+
+    path: Path | None  # None: random weights
+    config: PolicyConfig  # sizes are the tensors'
+    config_source: str
+    norm_stats: NormStats
+    source: WeightSource
+    asset_id: str | None = None
+    tokenizer_candidates: tuple[Path, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)  # further lines of `info`, of this format alone
+
+    @property
+    def format(self) -> str:
+        """One of "openpi_torch", "openpi_jax", "lerobot", "random"."""
+        return self.source.format
+
+    def load(self, device: torch.device | str, precision: Precision, *, progress: bool = False) -> Loaded:
+        """Read all weights straight into their final dtype and device, a piece at a time.
+
+        Host memory besides the result stays small: safetensors are mapped, Orbax arrays decoded one chunk at a time.
+        """
+        device = torch.device(device)
+        began = time.perf_counter()
+        shapes = self.source.shapes
+        state: dict[str, Tensor] = {}
+        with progress_bar(progress, f"loading {self.format}", self.stored_bytes) as advance:
+            for piece in self.source.pieces(device):
+                if piece.name not in state:
+                    dtype = parameter_dtype(piece.name, precision)
+                    state[piece.name] = torch.empty(shapes[piece.name], dtype=dtype, device=device)
+                put(state[piece.name], piece)
+                advance.update(piece.values.numel() * piece.values.element_size())
+        assert state.keys() == shapes.keys(), state.keys() ^ shapes.keys()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
+        return Loaded(state, time.perf_counter() - began, total)
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the weights: of every parameter's canonical name, shape and float32 bytes (little endian).
+
+        The format and the stored dtype don't enter it: the same numbers have the same fingerprint in any of them.
+        Random weights are hashed by what they are made from. Reads everything, once per object.
+        """
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        recipe = getattr(self.source, "recipe", None)  # random weights
+        if recipe is not None:
+            return hashlib.sha256(str(recipe).encode()).hexdigest()
+        hashes = {name: hashlib.sha256() for name in self.source.shapes}
+        for piece in self.source.pieces(torch.device("cpu")):
+            values = piece.values.to(torch.float32).contiguous()
+            hashes[piece.name].update(values.numpy().data)
+        lines = [
+            f"{name} {list(self.source.shapes[name])} {digest.hexdigest()}" for name, digest in sorted(hashes.items())
+        ]
+        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes of the model's weights as they are stored (uncompressed)."""
+        return describe_weights(self.source)["stored_bytes"]
+
+    def info(self) -> dict[str, Any]:
+        """What `turbopi inspect` prints, as plain JSON types."""
+        return {
+            **describe_weights(self.source),
+            "path": None if self.path is None else str(self.path),
+            "random_weights": self.format == "random",
+            "kind": self.config.model.kind,
+            "sizes": model_sizes_info(self.config),
+            "name": self.config.name,
+            "config_source": self.config_source,
+            "robot": self.config.robot,
+            "action_horizon": self.config.model.action_horizon,
+            "max_prompt_tokens": self.config.model.max_prompt_tokens,
+            "discrete_state_input": self.config.discrete_state_input,
+            "normalization": {
+                "state": self.config.normalization.state,
+                "actions": self.config.normalization.actions,
+            },
+            "asset_id": self.asset_id,
+            "norm_stats": norm_stats_info(self.norm_stats),
+            "tokenizers": [str(file) for file in self.tokenizer_candidates],
+            **self.details,
+        }
+
+
+def put(target: Tensor, piece: Piece) -> None:
+    """Copy a piece into its place, rounding to the target's dtype."""
+    values = piece.values
+    if not values.is_contiguous() and values.dtype != target.dtype:
+        values = values.to(target.dtype)  # torch transposes within one dtype much faster than across two
+    if values.ndim:
+        target[piece.start : piece.start + values.shape[0]].copy_(values)
+    else:
+        target.copy_(values)
+
+
+def describe_weights(source: WeightSource) -> dict[str, Any]:
+    """What is known of weights without any configuration."""
+    itemsize = {"F32": 4, "BF16": 2, "F16": 2}
+    counts = {name: prod(shape) for name, shape in source.shapes.items()}
+    parameters: dict[str, int] = dict.fromkeys((*PARTS, "action_time"), 0)
+    for name, count in counts.items():
+        part = name.split(".", 1)[0]
+        parameters[part if part in PARTS else "action_time"] += count
+    return {
+        "format": source.format,
+        "parameters": {**parameters, "total": sum(counts.values())},
+        "tensors": len(counts),
+        "stored_dtypes": sorted(set(source.dtypes.values())),
+        "stored_bytes": sum(count * itemsize.get(source.dtypes[name], 1) for name, count in counts.items()),
+        "notes": list(source.notes),
+    }
+
+
+def model_sizes_info(config: PolicyConfig) -> dict[str, Any]:
+    model = config.model
+    gemma = ("width", "mlp_dim", "depth", "num_heads", "num_kv_heads", "head_dim")
+    vision = ("width", "depth", "mlp_dim", "num_heads", "patch_size", "image_size")
+    return {
+        "vision": {key: getattr(model.vision, key) for key in vision},
+        "vlm": {key: getattr(model.vlm, key) for key in gemma},
+        "expert": {key: getattr(model.expert, key) for key in gemma},
+        "vocab_size": model.vocab_size,
+        "action_dim": model.action_dim,
+    }
+
+
+def norm_stats_info(stats: NormStats) -> dict[str, Any]:
+    return {
+        name: None if feature is None else {"dim": feature.dim, "statistics": list(feature.available)}
+        for name, feature in (("state", stats.state), ("actions", stats.actions))
+    }
+
+
+# -- progress ----------------------------------------------------------------------------------------------------------
+
+
+class Advance(Protocol):
+    """A progress bar, or nothing."""
+
+    def update(self, count: int) -> None: ...
+
+
+class _Silent:
+    def update(self, count: int) -> None:
+        pass
+
+
+class _Bar:
+    def __init__(self, progress: Progress, description: str, total: int) -> None:
+        self._progress = progress
+        self._task = progress.add_task(description, total=total)
+
+    def update(self, count: int) -> None:
+        self._progress.advance(self._task, count)
+
+
+@contextmanager
+def progress_bar(shown: bool, description: str, total: int) -> Iterator[Advance]:
+    if not shown:
+        yield _Silent()
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        yield _Bar(progress, description, total)

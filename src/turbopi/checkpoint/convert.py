@@ -1,0 +1,240 @@
+"""Writing checkpoints in openpi's PyTorch layout, from any format, without holding the weights in memory.
+
+    model.safetensors                  openpi's names; the tied embedding once, as lm_head; all in one dtype, as by
+                                       openpi's own converter (whose bf16 also rounds what is served in float32)
+    config.json                        what openpi's converter records
+    assets/<asset id>/norm_stats.json
+    turbopi.json                       what the layout can't record: robot, horizon, prompt, normalisation, vision heads
+    *.model                            the source folder's SentencePiece tokenizer, if it has one
+
+openpi insists on `gemma_expert.lm_head.weight`, which nothing reads: it is written as zeros, as a hole in the file.
+Everything is written into a temporary folder beside the target and renamed at the end, so a failure leaves nothing.
+"""
+
+import json
+import os
+import shutil
+import struct
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from math import prod
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+
+from turbopi.checkpoint.base import Checkpoint, progress_bar
+from turbopi.checkpoint.names import EMBEDDING, TIED_EMBEDDING, TIED_HEAD, UNUSED_HEAD, to_openpi
+from turbopi.checkpoint.norm_stats import FILE_NAME as NORM_STATS
+from turbopi.checkpoint.norm_stats import dump_norm_stats
+from turbopi.checkpoint.opening import open_checkpoint
+from turbopi.checkpoint.random_weights import random_checkpoint
+from turbopi.checkpoint.settings import FILE_NAME as SETTINGS
+from turbopi.checkpoint.settings import ConfigSource, Settings, parse_values, policy_config
+from turbopi.checkpoint.source import Piece, Shape
+from turbopi.checkpoint.torch_files import WEIGHTS
+from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig
+from turbopi.errors import CheckpointError, ConfigError
+from turbopi.model.reference import Precision
+
+_DTYPES: dict[Precision, tuple[str, torch.dtype]] = {"bf16": ("BF16", torch.bfloat16), "f32": ("F32", torch.float32)}
+_VARIANTS = {  # openpi's names of sizes: width, MLP
+    "gemma_2b": GemmaConfig(width=2048, mlp_dim=16384),
+    "gemma_300m": GemmaConfig(width=1024, mlp_dim=4096),
+    "dummy": GemmaConfig(width=64, mlp_dim=128, depth=4, head_dim=16),
+}
+
+
+def convert(
+    src: str | Path | Checkpoint,
+    dst: str | Path,
+    *,
+    precision: Precision,
+    config: ConfigSource = "auto",
+    progress: bool = False,
+) -> Path:
+    """Write the checkpoint `src` to the folder `dst` in openpi's PyTorch layout; returns `dst`.
+
+    Weights become bfloat16 ("bf16", rounded to nearest even) or float32 ("f32"). Statistics are written as they are;
+    LeRobot's way of applying them is recorded in turbopi.json, since its epsilons aren't openpi's.
+
+    Raises CheckpointError if `dst` exists and isn't an empty folder, and whatever `open_checkpoint` raises.
+    """
+    if precision not in _DTYPES:
+        raise ConfigError(f"precision is {precision!r}; expected one of {', '.join(_DTYPES)}")
+    dst = Path(dst).expanduser()
+    if dst.exists() and (not dst.is_dir() or any(dst.iterdir())):
+        raise CheckpointError(f"{dst} exists and isn't an empty folder; give a new one")
+    checkpoint = src if isinstance(src, Checkpoint) else open_checkpoint(src, config)
+    asset_id = checkpoint.asset_id or ("lerobot" if checkpoint.format == "lerobot" else "own")
+    settings, robot_file = _settings(checkpoint.config, asset_id)
+    with _new_folder(dst) as folder:
+        _write_weights(checkpoint, folder / WEIGHTS, precision, progress)
+        _write_json(folder / "config.json", _openpi_config(checkpoint.config.model, precision))
+        _write_json(folder / SETTINGS, settings)
+        if robot_file is not None:
+            shutil.copyfile(robot_file, folder / robot_file.name)
+        for file in checkpoint.tokenizer_candidates:
+            copy = folder / (file.relative_to(checkpoint.path) if checkpoint.path else file.name)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, copy)
+        if checkpoint.norm_stats.state is not None or checkpoint.norm_stats.actions is not None:
+            file = folder / "assets" / asset_id / NORM_STATS
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(dump_norm_stats(checkpoint.norm_stats))
+    return dst
+
+
+def write_random(
+    preset: str | PolicyConfig, dst: str | Path, *, precision: Precision = "bf16", seed: int = 0, progress: bool = False
+) -> Path:
+    """Write random weights of a preset as a checkpoint folder; see `random_checkpoint` and `convert`."""
+    return convert(random_checkpoint(preset, seed), dst, precision=precision, progress=progress)
+
+
+# -- the weights -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """Where a tensor goes in the file."""
+
+    offset: int
+    row_bytes: int
+
+
+def _write_weights(checkpoint: Checkpoint, file: Path, precision: Precision, progress: bool) -> None:
+    """Header first, then every piece at its place."""
+    stored, dtype = _DTYPES[precision]
+    shapes = {to_openpi(name): shape for name, shape in checkpoint.source.shapes.items()}
+    model = checkpoint.config.model
+    shapes[UNUSED_HEAD] = (model.vocab_size, model.expert.width)
+    header, slots, size = _header(shapes, stored, dtype.itemsize)
+    with (
+        file.open("wb") as out,
+        progress_bar(progress, f"writing {file.name}", checkpoint.stored_bytes) as advance,
+    ):
+        out.write(header)
+        out.truncate(len(header) + size)
+        for piece in checkpoint.source.pieces(torch.device("cpu")):
+            _write_piece(out, slots[to_openpi(piece.name)], piece, dtype)
+            advance.update(piece.values.numel() * piece.values.element_size())
+        out.flush()
+        os.fsync(out.fileno())
+
+
+def _header(shapes: dict[str, Shape], stored: str, itemsize: int) -> tuple[bytes, dict[str, _Slot], int]:
+    """The bytes before the data, each tensor's slot, and the length of the data."""
+    entries: dict[str, Any] = {"__metadata__": {TIED_EMBEDDING: TIED_HEAD}}  # openpi's files record the tie like this
+    spans, end = {}, 0
+    for name in sorted(shapes):
+        start, end = end, end + prod(shapes[name]) * itemsize
+        entries[name] = {"dtype": stored, "shape": list(shapes[name]), "data_offsets": [start, end]}
+        spans[name] = start
+    text = json.dumps(entries, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    header = struct.pack("<Q", len(text)) + text
+    slots = {name: _Slot(len(header) + start, prod(shapes[name][1:]) * itemsize) for name, start in spans.items()}
+    return header, slots, end
+
+
+def _write_piece(out: BinaryIO, slot: _Slot, piece: Piece, dtype: torch.dtype) -> None:
+    values = piece.values.to(dtype).contiguous()
+    out.seek(slot.offset + piece.start * slot.row_bytes)
+    out.write(values.reshape(-1).view(torch.uint8).numpy().data)
+
+
+# -- what goes beside them ---------------------------------------------------------------------------------------------
+
+
+def _openpi_config(model: ModelConfig, precision: Precision) -> dict[str, Any]:
+    return {
+        "action_dim": model.action_dim,
+        "action_horizon": model.action_horizon,
+        "paligemma_variant": _variant(model.vlm),
+        "action_expert_variant": _variant(model.expert),
+        "precision": "bfloat16" if precision == "bf16" else "float32",
+    }
+
+
+def _variant(sizes: GemmaConfig) -> str:
+    return next((name for name, known in _VARIANTS.items() if known == sizes), "custom")
+
+
+def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, Any], Path | None]:
+    """The turbopi.json that brings `config` back, and the robot's own file if it has one.
+
+    Raises ConfigError if some value of a hand-made PolicyConfig has no place in it.
+    """
+    robot = Path(config.robot) if config.robot.endswith(".json") else None
+    preset = config.name if _is_preset(config) else f"{config.model.kind}_base"
+    values = {
+        "preset": preset,
+        "name": config.name,
+        "robot": robot.name if robot else config.robot,
+        "robot_options": dict(config.robot_options),
+        "normalization": asdict(config.normalization),
+        "discrete_state_input": config.discrete_state_input,
+        "action_horizon": config.model.action_horizon,
+        "max_prompt_tokens": config.model.max_prompt_tokens,
+        "asset_id": asset_id,
+        "default_prompt": config.default_prompt,
+        "image_resize": config.image_resize,
+        "time_grid": config.model.time_grid,
+        "vision_heads": config.model.vision.num_heads,
+    }
+    parsed = Settings(SETTINGS, values=parse_values(json.loads(json.dumps(values)), SETTINGS))
+    back = policy_config(parsed, config.model.kind, horizon=None, assets=[], where=Path(SETTINGS))
+    lost = [
+        f"{owner}.{item.name}"
+        for owner, ours, theirs in (
+            ("config", config, back),
+            ("config.model", config.model, back.model),
+            ("config.model.vision", config.model.vision, back.model.vision),
+        )
+        for item in fields(ours)
+        if item.name not in _ELSEWHERE and getattr(ours, item.name) != getattr(theirs, item.name)
+    ]
+    if lost:
+        raise ConfigError(f"{SETTINGS} has no place for {', '.join(lost)}, so this config can't be converted")
+    return values, robot
+
+
+# compared on their own, read from the tensors, or changed on purpose
+_ELSEWHERE = {"model", "vision", "vlm", "expert", "robot", "asset_id", "vocab_size", "action_dim"} | {
+    "width",
+    "depth",
+    "mlp_dim",
+    "num_heads",
+    "patch_size",
+    "image_size",
+}
+
+
+def _is_preset(config: PolicyConfig) -> bool:
+    return config.name in PRESETS and PRESETS[config.name].model.kind == config.model.kind
+
+
+def _write_json(file: Path, content: dict[str, Any]) -> None:
+    file.write_text(json.dumps(content, indent=2) + "\n")
+
+
+@contextmanager
+def _new_folder(dst: Path) -> Iterator[Path]:
+    """A temporary folder that becomes `dst` if all goes well, and disappears otherwise."""
+    dst.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{dst.name}-", dir=dst.parent))
+    try:
+        yield temporary
+        temporary.chmod(0o755)  # mkdtemp makes it private
+        if dst.exists():
+            dst.rmdir()  # empty: checked before
+        temporary.rename(dst)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+assert to_openpi(EMBEDDING) == TIED_HEAD

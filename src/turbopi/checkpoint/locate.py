@@ -1,0 +1,126 @@
+"""Finding out what a path holds, and telling users what to do about what Turbo-Pi can't read."""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from turbopi.checkpoint.lerobot import is_lerobot
+from turbopi.checkpoint.openpi_jax import MANIFEST
+from turbopi.checkpoint.source import listing
+from turbopi.checkpoint.torch_files import INDEX, WEIGHTS
+from turbopi.errors import CheckpointError
+
+CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "random"]
+
+_DOWNLOAD = {
+    "gs": "gsutil -m cp -r {address} DIR (or openpi's own openpi.shared.download)",
+    "s3": "aws s3 cp --recursive {address} DIR",
+    "hf": "hf download {name} --local-dir DIR",
+    "http": "a download of the whole folder",
+    "https": "a download of the whole folder",
+}
+
+
+@dataclass(frozen=True)
+class Location:
+    """A checkpoint on disk."""
+
+    format: CheckpointFormat
+    folder: Path  # what holds assets/, config.json and turbopi.json
+    weights: Path  # the folder of the safetensors files, or of the Orbax tree
+
+    @property
+    def assets(self) -> Path:
+        return self.folder / "assets"
+
+
+def locate(path: str | Path) -> Location:
+    """The checkpoint at `path`: its folder, or one level off (openpi's params/, LeRobot's training output).
+
+    Raises CheckpointError for addresses, hub names, folders that hold no checkpoint, and formats that aren't read.
+    """
+    folder = _local(path)
+    if (folder / MANIFEST).is_file():  # openpi's params/ itself
+        return Location("openpi_jax", folder.parent if folder.name == "params" else folder, folder)
+    if (folder / "pretrained_model").is_dir():  # one step of LeRobot's training output
+        folder = folder / "pretrained_model"
+    _refuse_other_formats(folder)
+    if _has_safetensors(folder):  # before params/, as openpi does
+        return Location("lerobot" if is_lerobot(folder) else "openpi_torch", folder, folder)
+    if (folder / "params").is_dir():
+        return Location("openpi_jax", folder, folder / "params")
+    raise CheckpointError(_nothing_here(folder))
+
+
+def tokenizer_candidates(folder: Path) -> list[Path]:
+    """SentencePiece models in or below a checkpoint's folder (params/ and hidden folders aside), nearest first."""
+    patterns = ("*.model", "assets/*.model", "tokenizer/*.model", "big_vision/*.model")
+    return [file for pattern in patterns for file in sorted(folder.glob(pattern)) if file.is_file()]
+
+
+def recorded_config(location: Location) -> dict[str, int]:
+    """action_dim and action_horizon of the config.json that openpi's converter writes, where it has them."""
+    file = location.folder / "config.json"
+    if location.format != "openpi_torch" or not file.is_file():
+        return {}
+    try:
+        content = json.loads(file.read_text())
+    except ValueError as error:
+        raise CheckpointError(f"{file} isn't JSON: {error}") from error
+    found = {}
+    for key in ("action_dim", "action_horizon"):
+        value = content.get(key) if isinstance(content, dict) else None
+        if value is None:
+            continue
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise CheckpointError(f"{file}: {key} is {value!r}; expected a whole number, 1 or more")
+        found[key] = value
+    return found
+
+
+def _local(path: str | Path) -> Path:
+    text = str(path)
+    address = re.match(r"([a-z][a-z0-9+.-]*):/{1,2}(.*)", text)  # Path() turns :// into :/
+    if address and address[1] in _DOWNLOAD:
+        how = _DOWNLOAD[address[1]].format(address=f"{address[1]}://{address[2]}", name=address[2])
+        raise CheckpointError(f"{text} is an address; Turbo-Pi reads local folders. Fetch it first, with {how}")
+    folder = Path(path).expanduser()
+    if folder.is_dir():
+        return folder
+    if folder.is_file():
+        raise CheckpointError(f"{folder} is a file; give the checkpoint's folder, probably {folder.parent}")
+    hint = ""
+    if re.fullmatch(r"[\w.-]+/[\w.-]+", text):
+        hint = f". If it is a name on the Hugging Face hub, fetch it first: hf download {text} --local-dir DIR"
+    raise CheckpointError(f"there is no folder {folder}{hint}")
+
+
+def _has_safetensors(folder: Path) -> bool:
+    return (folder / WEIGHTS).is_file() or (folder / INDEX).is_file()
+
+
+def _refuse_other_formats(folder: Path) -> None:
+    if (folder / "adapter_config.json").is_file():
+        raise CheckpointError(
+            f"{folder} holds adapters of the peft library, to be used with another model's weights. Merge them there "
+            "(merge_and_unload), save the whole model, and give that folder"
+        )
+    pickled = [file.name for suffix in ("bin", "pt", "pth", "ckpt") for file in sorted(folder.glob(f"*.{suffix}"))]
+    if pickled and not _has_safetensors(folder) and not (folder / "params").is_dir():
+        raise CheckpointError(
+            f"{folder} holds {listing(pickled)}: pickled weights can run code when loaded and aren't read. Save them "
+            f"as {WEIGHTS} (safetensors.torch.save_model)"
+        )
+
+
+def _nothing_here(folder: Path) -> str:
+    steps = sorted((entry.name for entry in folder.iterdir() if entry.name.isdigit() and entry.is_dir()), key=int)
+    if steps:
+        return f"{folder} holds training steps ({', '.join(steps)}); give one of them, such as {folder / steps[-1]}"
+    entries = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in folder.iterdir())
+    return (
+        f"{folder} holds no checkpoint: expected {WEIGHTS} (openpi's PyTorch, LeRobot) or params/ (openpi's JAX), "
+        f"but it has {listing(entries) if entries else 'nothing'}"
+    )

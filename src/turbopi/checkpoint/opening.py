@@ -1,0 +1,116 @@
+"""Opening a checkpoint: find it, read its description, check its tensors, and settle its configuration."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from turbopi.checkpoint.base import Checkpoint, describe_weights
+from turbopi.checkpoint.lerobot import LeRobotFolder
+from turbopi.checkpoint.locate import Location, locate, recorded_config, tokenizer_candidates
+from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
+from turbopi.checkpoint.openpi_jax import JaxSource
+from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
+from turbopi.checkpoint.sizes import detect_kind, model_sizes
+from turbopi.checkpoint.source import WeightSource, check_tensors
+from turbopi.checkpoint.torch_files import TorchSource
+from turbopi.config import PolicyConfig
+from turbopi.errors import CheckpointError, ConfigError
+from turbopi.model.reference import parameter_shapes
+
+
+def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoint:
+    """Open an openpi (PyTorch or JAX) or LeRobot checkpoint; nothing is loaded yet, and everything is checked.
+
+    `path` is a checkpoint's folder (openpi's params/ and LeRobot's training output are understood too). `config` says
+    what the folder doesn't record: see `settings.py`. Sizes always come from the tensors.
+
+    Raises CheckpointError if the folder can't be read or its tensors or statistics aren't all there, and ConfigError if
+    the configuration doesn't fit or isn't known; the message lists the choices.
+    """
+    location = locate(path)
+    settings = read_settings(config, location.folder)
+    source = open_weights(location, settings)
+    kind = detect_kind(source, location.weights)
+    if location.format == "lerobot":
+        return _open_lerobot(location, settings, source)
+    recorded = recorded_config(location)
+    policy = policy_config(
+        settings,
+        kind,
+        horizon=recorded.get("action_horizon"),
+        assets=asset_ids(location.assets),
+        where=location.folder,
+    )
+    policy = _with_sizes(policy, source, settings, location)
+    if recorded.get("action_dim", policy.model.action_dim) != policy.model.action_dim:
+        raise CheckpointError(
+            f"{location.folder}: config.json has action_dim {recorded['action_dim']}, but the weights have "
+            f"{policy.model.action_dim}; one of the files belongs to another checkpoint"
+        )
+    stats, asset_id = find_norm_stats(location.assets, policy.asset_id, policy.normalization)
+    return Checkpoint(
+        path=location.folder,
+        config=policy,
+        config_source=settings.source,
+        norm_stats=stats,
+        source=source,
+        asset_id=asset_id,
+        tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
+    )
+
+
+def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[str, Any]:
+    """`open_checkpoint(path, config).info()`; if only its configuration can't be settled, what is known without it.
+
+    The key "config_error" then holds the ConfigError's message. CheckpointErrors are raised as ever, and so is the
+    ConfigError about LoRA adapters whose alpha isn't known.
+    """
+    try:
+        return open_checkpoint(path, config).info()
+    except ConfigError as error:
+        location = locate(path)
+        source = open_weights(location, Settings("none"))
+        return {
+            **describe_weights(source),
+            "path": str(location.folder),
+            "random_weights": False,
+            "kind": detect_kind(source, location.weights),
+            "assets": asset_ids(location.assets),
+            **recorded_config(location),
+            "tokenizers": [str(file) for file in tokenizer_candidates(location.folder)],
+            "config_error": str(error),
+        }
+
+
+def open_weights(location: Location, settings: Settings) -> WeightSource:
+    """The weights at a location, names and shapes only."""
+    if location.format == "openpi_jax":
+        return JaxSource(location.weights, settings.lora)
+    if settings.values.keys() & {"lora_alpha", "lora_rslora"}:
+        raise ConfigError(f"{settings.source}: lora_alpha and lora_rslora only apply to openpi's JAX checkpoints")
+    prefix = "model." if location.format == "lerobot" else ""
+    return TorchSource(location.weights, format=location.format, prefix=prefix)
+
+
+def _open_lerobot(location: Location, settings: Settings, source: WeightSource) -> Checkpoint:
+    folder = LeRobotFolder(location.folder)
+    policy = _with_sizes(folder.policy_config(settings), source, settings, location)
+    if policy.model.kind != "pi05":
+        raise CheckpointError(f"{location.folder}: config.json says pi05, but these are {policy.model.kind} weights")
+    source.notes.extend(folder.notes())
+    return Checkpoint(
+        path=location.folder,
+        config=policy,
+        config_source="LeRobot's config.json and processors" if settings.source == "auto" else settings.source,
+        norm_stats=folder.norm_stats(policy.normalization),
+        source=source,
+        tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
+        details={"num_inference_steps": folder.num_inference_steps},
+    )
+
+
+def _with_sizes(policy: PolicyConfig, source: WeightSource, settings: Settings, location: Location) -> PolicyConfig:
+    """`policy` with the checkpoint's sizes, after every tensor is checked against them."""
+    model = model_sizes(source, policy.model, vision_heads=settings.vision_heads, where=location.weights)
+    check_tensors(source, parameter_shapes(model), location.weights)
+    return replace(policy, model=model)

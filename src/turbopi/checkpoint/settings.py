@@ -1,0 +1,255 @@
+"""`config=`: what no tensor records about a policy, and where it is taken from.
+
+`open_checkpoint(path, config=...)` takes a preset's name, a path to a .json, a PolicyConfig, or "auto": the file
+`turbopi.json` beside the weights, or LeRobot's own files. A .json is an object with these keys, all but `preset`
+optional; `preset` names what the rest starts from, and has no place beside a LeRobot checkpoint, which describes
+itself.
+
+    preset                a name of turbopi.config.PRESETS, of the same kind (Pi0 or Pi0.5) as the weights
+    name                  what the policy is called
+    robot                 "libero", "droid", ... or a robot's .json, relative to this file
+    robot_options         object, passed to the robot in place of the preset's; a `robot` without it has none
+    normalization         a mode ("quantile", "zscore", ...) or {"state": mode, "actions": mode}
+    discrete_state_input  true if the state is written into the prompt (Pi0.5 only)
+    action_horizon        H >= 1, the number of actions in a chunk
+    max_prompt_tokens     >= 1
+    asset_id              folder of norm_stats.json below assets/; null for the only one there
+    default_prompt        text or null
+    image_resize          "openpi" or "lerobot"
+    time_grid             "accumulated" (openpi) or "multiplied" (LeRobot)
+    vision_heads          attention heads of a vision tower of a non-standard width
+    lora_alpha            number, or {"vlm": number, "expert": number}: see lora.py
+    lora_rslora           true if adapters were trained rank-stabilised
+
+Unknown keys and wrong types are errors. `config=` replaces a turbopi.json beside the weights as a whole.
+
+The horizon: the .json's, else config.json's `action_horizon`, else the preset's. A PolicyConfig is taken at its word,
+except for sizes, which always come from the tensors.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, get_args
+
+from turbopi.checkpoint.lora import LoraScale
+from turbopi.config import PRESETS, Kind, Normalization, NormMode, PolicyConfig
+from turbopi.errors import ConfigError
+
+FILE_NAME = "turbopi.json"
+ConfigSource = str | Path | PolicyConfig
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A parsed `config=`: a PolicyConfig, or values to put over a preset or over LeRobot's description."""
+
+    source: str  # for messages and `inspect`: "preset pi05_libero", a path, ...
+    policy: PolicyConfig | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def lora(self) -> LoraScale:
+        return LoraScale(self.values.get("lora_alpha"), bool(self.values.get("lora_rslora", False)))
+
+    @property
+    def vision_heads(self) -> int | None:
+        heads: int | None = self.values.get("vision_heads")
+        return heads
+
+
+def read_settings(config: ConfigSource, folder: Path) -> Settings:
+    """Parse `config=` for the checkpoint in `folder`. Raises ConfigError for whatever can't be right about it."""
+    if isinstance(config, PolicyConfig):
+        return Settings(f"PolicyConfig {config.name}", policy=config)
+    if isinstance(config, str) and config == "auto":
+        file = folder / FILE_NAME
+        return _read_file(file) if file.is_file() else Settings("auto")
+    if isinstance(config, str) and config in PRESETS:
+        return Settings(f"preset {config}", values={"preset": config})
+    if isinstance(config, str | Path) and str(config).endswith(".json"):
+        return _read_file(Path(config))
+    raise ConfigError(
+        f"config is {config!r}; expected 'auto', a path to a .json, a PolicyConfig, or one of {', '.join(PRESETS)}"
+    )
+
+
+def policy_config(
+    settings: Settings, kind: Kind, *, horizon: int | None, assets: list[str], where: Path
+) -> PolicyConfig:
+    """The policy of an openpi checkpoint, sizes still the preset's.
+
+    `horizon` is what the checkpoint's config.json records, `assets` the asset ids it has. Raises ConfigError, listing
+    the presets that fit, if nothing says which robot it is for.
+    """
+    if settings.policy is not None:
+        _check_kind(settings.policy, kind, settings.source, where)
+        return settings.policy
+    fitting = [name for name, preset in PRESETS.items() if preset.model.kind == kind and not name.endswith("_tiny")]
+    if "preset" not in settings.values:
+        raise ConfigError(_undetectable(fitting, kind, assets, where, settings))
+    preset = PRESETS[settings.values["preset"]]
+    _check_kind(preset, kind, settings.source, where)
+    config = preset if horizon is None else preset.with_model(action_horizon=horizon)
+    return with_values(config, settings)
+
+
+def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
+    """`config` with the values of a .json over it."""
+    values = settings.values
+    fields = (
+        "name",
+        "robot",
+        "robot_options",
+        "normalization",
+        "discrete_state_input",
+        "asset_id",
+        "default_prompt",
+        "image_resize",
+    )
+    if "robot" in values:  # the options were the other robot's
+        config = replace(config, robot_options={})
+    config = replace(config, **{key: values[key] for key in fields if key in values})
+    model = {key: values[key] for key in ("action_horizon", "max_prompt_tokens", "time_grid") if key in values}
+    config = config.with_model(**model)
+    if config.model.kind == "pi0" and config.discrete_state_input:
+        raise ConfigError(f"{settings.source}: discrete_state_input is true, but Pi0 reads its state as a number token")
+    return config
+
+
+def _check_kind(config: PolicyConfig, kind: Kind, source: str, where: Path) -> None:
+    if config.model.kind != kind:
+        fitting = [name for name, preset in PRESETS.items() if preset.model.kind == kind]
+        raise ConfigError(
+            f"{source} is for {config.model.kind}, but {where} holds {kind} weights; presets that fit: "
+            f"{', '.join(fitting)}"
+        )
+
+
+def _undetectable(fitting: list[str], kind: Kind, assets: list[str], where: Path, settings: Settings) -> str:
+    """openpi's checkpoints never record their robot, so "auto" can only list the choices."""
+    found = f"{settings.source} has no preset" if settings.values else f"{where} has no {FILE_NAME}"
+    suggested = [name for name in fitting if PRESETS[name].asset_id in assets]
+    hint = f"; its statistics ({', '.join(assets)}) suggest {' or '.join(suggested)}" if suggested else ""
+    return (
+        f"{found}, and an openpi checkpoint doesn't record its robot, its horizon, or whether the state goes into the "
+        f"prompt. These are {kind} weights{hint}. Choose with config= one of {', '.join(fitting)}, or put a "
+        f'{FILE_NAME} beside the weights, such as {{"preset": "{(suggested or fitting)[0]}"}}'
+    )
+
+
+# -- the .json ---------------------------------------------------------------------------------------------------------
+
+
+def _read_file(file: Path) -> Settings:
+    try:
+        values = json.loads(file.read_text())
+    except OSError as error:
+        raise ConfigError(f"config {file} can't be read: {error.strerror}") from error
+    except ValueError as error:
+        raise ConfigError(f"{file} isn't JSON: {error}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{file} is a {type(values).__name__}; expected an object with keys such as preset")
+    parsed = parse_values(values, str(file))
+    robot = parsed.get("robot")
+    if robot is not None and robot.endswith(".json"):
+        path = file.parent / robot
+        if not path.is_file():
+            raise ConfigError(f"{file}: robot is {robot!r}, but there is no file {path}")
+        parsed["robot"] = str(path.resolve())
+    return Settings(str(file), values=parsed)
+
+
+def parse_values(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Check a settings object and bring it into PolicyConfig's types. ConfigError names the key and what it may be."""
+    unknown = [key for key in values if key not in _SCHEMA]
+    if unknown:
+        raise ConfigError(f"{where}: unknown keys {', '.join(map(repr, unknown))}; known are {', '.join(_SCHEMA)}")
+    parsed = {}
+    for key, value in values.items():
+        expected, parse = _SCHEMA[key]
+        try:
+            parsed[key] = parse(value)
+        except (TypeError, ValueError, KeyError):
+            raise ConfigError(f"{where}: {key} is {value!r}; expected {expected}") from None
+    return parsed
+
+
+def _require(condition: bool) -> None:
+    if not condition:
+        raise ValueError
+
+
+def _text(value: Any) -> str:
+    _require(isinstance(value, str) and bool(value.strip()))
+    return str(value)
+
+
+def _text_or_null(value: Any) -> str | None:
+    return None if value is None else _text(value)
+
+
+def _flag(value: Any) -> bool:
+    _require(isinstance(value, bool))
+    return bool(value)
+
+
+def _count(value: Any) -> int:
+    _require(isinstance(value, int) and not isinstance(value, bool) and value >= 1)
+    return int(value)
+
+
+def _object(value: Any) -> dict[str, Any]:
+    _require(isinstance(value, dict))
+    return dict(value)
+
+
+def _choice(*choices: str) -> Callable[[Any], str]:
+    def parse(value: Any) -> str:
+        _require(isinstance(value, str) and value in choices)
+        return str(value)
+
+    return parse
+
+
+_MODES = get_args(NormMode)
+
+
+def _normalization(value: Any) -> Normalization:
+    mode = _choice(*_MODES)
+    if isinstance(value, str):
+        return Normalization(mode(value), mode(value))  # type: ignore[arg-type]
+    _require(isinstance(value, dict) and set(value) == {"state", "actions"})
+    return Normalization(mode(value["state"]), mode(value["actions"]))  # type: ignore[arg-type]
+
+
+def _number(value: Any) -> float:
+    _require(isinstance(value, int | float) and not isinstance(value, bool) and value > 0)
+    return float(value)
+
+
+def _lora_alpha(value: Any) -> dict[str, float]:
+    if not isinstance(value, dict):
+        return {"vlm": _number(value), "expert": _number(value)}
+    _require(bool(value) and set(value) <= {"vlm", "expert"})
+    return {key: _number(alpha) for key, alpha in value.items()}
+
+
+_SCHEMA: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "preset": (f"one of {', '.join(PRESETS)}", _choice(*PRESETS)),
+    "name": ("a text", _text),
+    "robot": ("a robot's name or a path to its .json", _text),
+    "robot_options": ("an object", _object),
+    "normalization": (f"one of {', '.join(_MODES)}, or {{'state': ..., 'actions': ...}} of them", _normalization),
+    "discrete_state_input": ("true or false", _flag),
+    "action_horizon": ("a whole number, 1 or more", _count),
+    "max_prompt_tokens": ("a whole number, 1 or more", _count),
+    "asset_id": ("a folder's name below assets/, or null", _text_or_null),
+    "default_prompt": ("a text or null", _text_or_null),
+    "image_resize": ("'openpi' or 'lerobot'", _choice("openpi", "lerobot")),
+    "time_grid": ("'accumulated' or 'multiplied'", _choice("accumulated", "multiplied")),
+    "vision_heads": ("a whole number, 1 or more", _count),
+    "lora_alpha": ("a positive number, or an object with vlm and expert", _lora_alpha),
+    "lora_rslora": ("true or false", _flag),
+}

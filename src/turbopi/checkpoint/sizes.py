@@ -1,0 +1,127 @@
+"""A model's kind and sizes, read from the shapes of its parameters."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import isqrt
+
+from turbopi.checkpoint.source import Shape, WeightSource, listing
+from turbopi.config import GemmaConfig, Kind, ModelConfig, VisionConfig
+from turbopi.errors import CheckpointError, ConfigError
+
+_STANDARD_VISION = VisionConfig()  # So400m: 1152 wide, 16 heads
+
+# What sizes are read from. A checkpoint without one of these gets a message about it rather than about sizes.
+_PROBES = (
+    "vision.patch_embedding.weight",
+    "vision.position_embedding.weight",
+    "vision.layers.0.mlp.fc1.weight",
+    "vlm.embed_tokens.weight",
+    "vlm.layers.0.self_attn.q_proj.weight",
+    "vlm.layers.0.self_attn.k_proj.weight",
+    "vlm.layers.0.mlp.gate_proj.weight",
+    "expert.layers.0.self_attn.q_proj.weight",
+    "expert.layers.0.self_attn.k_proj.weight",
+    "expert.layers.0.mlp.gate_proj.weight",
+    "action_in_proj.weight",
+)
+
+
+def detect_kind(source: WeightSource, where: object) -> Kind:
+    """Pi0.5 has a time MLP and adaRMS norms, Pi0 a state projection. CheckpointError if it is neither, or both."""
+    names = source.shapes
+    pi05 = [name for name in names if name.startswith(("time_mlp_", "expert.norm.dense."))]
+    pi0 = [name for name in names if name.startswith(("state_proj.", "action_time_mlp_"))]
+    has_actions = any(name.startswith(("action_in_proj.", "expert.")) for name in names)
+    if not has_actions and any(name.startswith("vlm.") for name in names):
+        raise CheckpointError(
+            f"{where} has a language model but no action expert: this looks like Pi0-FAST, which decodes action tokens "
+            "one by one. Turbo-Pi runs the flow-matching Pi0 and Pi0.5; serve this checkpoint with openpi"
+        )
+    if bool(pi05) == bool(pi0):
+        found = f"tensors of both ({pi05[0]}, {pi0[0]})" if pi05 else "neither time_mlp_in (Pi0.5) nor state_proj (Pi0)"
+        raise CheckpointError(f"{where} is neither Pi0.5 nor Pi0: it has {found}")
+    return "pi05" if pi05 else "pi0"
+
+
+def model_sizes(
+    source: WeightSource,
+    base: ModelConfig,
+    *,
+    vision_heads: int | None,
+    where: object,
+) -> ModelConfig:
+    """`base` with its kind and every size replaced by what the parameters' shapes say.
+
+    Of `base` stay the horizon, the prompt length, the time grid and the constants. Vision heads, which the PyTorch
+    layout doesn't store: the JAX layout's; else `vision_heads`; else 16 at width 1152; else those of `base` if its
+    vision tower has the checkpoint's width; else ConfigError.
+
+    Raises CheckpointError if a parameter that sizes are read from is missing or impossible.
+    """
+    shapes = source.shapes
+    absent = [source.native_name(name) for name in _PROBES if name not in shapes]
+    if absent:
+        raise CheckpointError(f"{where}: tensors are missing: {listing(absent)}")
+    try:
+        vision = _vision_sizes(shapes, base.vision)
+        depth = max(_depth(shapes, "vlm.layers."), _depth(shapes, "expert.layers."))  # check_tensors: absent layers
+        vlm, expert = _gemma_sizes(shapes, "vlm", depth), _gemma_sizes(shapes, "expert", depth)
+        vocab_size, action_dim = shapes["vlm.embed_tokens.weight"][0], shapes["action_in_proj.weight"][1]
+    except (IndexError, ZeroDivisionError, ValueError) as error:
+        raise CheckpointError(f"{where}: tensors have impossible shapes ({error})") from error
+    vision = replace(vision, num_heads=_vision_heads(source, vision.width, base.vision, vision_heads, where))
+    kind = detect_kind(source, where)
+    try:
+        return replace(
+            base, kind=kind, vision=vision, vlm=vlm, expert=expert, vocab_size=vocab_size, action_dim=action_dim
+        )
+    except ConfigError as error:
+        raise CheckpointError(f"{where}: {error}") from error
+
+
+def _vision_sizes(shapes: Mapping[str, Shape], base: VisionConfig) -> VisionConfig:
+    width, _, patch, _ = shapes["vision.patch_embedding.weight"]
+    tokens = shapes["vision.position_embedding.weight"][0]
+    side = isqrt(tokens)
+    if side * side != tokens:
+        raise ValueError(f"{tokens} vision positions aren't a square grid of patches")
+    return replace(
+        base,
+        width=width,
+        depth=_depth(shapes, "vision.layers."),
+        mlp_dim=shapes["vision.layers.0.mlp.fc1.weight"][0],
+        num_heads=1,
+        patch_size=patch,
+        image_size=side * patch,
+    )
+
+
+def _gemma_sizes(shapes: Mapping[str, Shape], stack: str, depth: int) -> GemmaConfig:
+    mlp_dim, width = shapes[f"{stack}.layers.0.mlp.gate_proj.weight"]
+    head_dim = shapes[f"{stack}.layers.0.self_attn.k_proj.weight"][0]  # one KV head in every Pi0 and Pi0.5
+    heads = shapes[f"{stack}.layers.0.self_attn.q_proj.weight"][0] // head_dim
+    return GemmaConfig(width=width, mlp_dim=mlp_dim, depth=depth, num_heads=heads, num_kv_heads=1, head_dim=head_dim)
+
+
+def _depth(shapes: Mapping[str, Shape], prefix: str) -> int:
+    indices = (name[len(prefix) :].split(".", 1)[0] for name in shapes if name.startswith(prefix))
+    return 1 + max((int(index) for index in indices if index.isdigit()), default=-1)
+
+
+def _vision_heads(source: WeightSource, width: int, base: VisionConfig, explicit: int | None, where: object) -> int:
+    if source.vision_heads is not None:
+        if explicit not in (None, source.vision_heads):
+            raise ConfigError(f"vision_heads is {explicit}, but {where} stores {source.vision_heads} attention heads")
+        return source.vision_heads
+    if explicit is not None:
+        if width % explicit:
+            raise ConfigError(f"vision_heads is {explicit}, but the vision tower of {where} is {width} wide")
+        return explicit
+    for known in (_STANDARD_VISION, base):
+        if width == known.width:
+            return known.num_heads
+    raise ConfigError(
+        f"the vision tower of {where} is {width} wide, and no tensor tells its number of attention heads (16 at the "
+        f"standard width {_STANDARD_VISION.width}). Give it in turbopi.json beside the weights, or in the .json that "
+        'config= names: {"preset": ..., "vision_heads": ...}'
+    )

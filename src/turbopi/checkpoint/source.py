@@ -1,0 +1,92 @@
+"""Where weights come from: one protocol that every checkpoint format implements, and the checks they share.
+
+A source knows names, shapes and stored dtypes at once, and hands out values as a stream of small pieces, so that
+loading, hashing and converting never hold more than a piece (and what the reader must decode) besides their result.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from turbopi.errors import CheckpointError
+
+PIECE_BYTES = (
+    8 * 2**20
+)  # of stored values: small beside any model that fills a machine, large beside the cost of a read
+
+Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Rows `start : start + len(values)` of a parameter; `values` is only valid until the next piece."""
+
+    name: str  # canonical
+    start: int
+    values: Tensor  # stored dtype, canonical layout, possibly a strided view
+
+
+class WeightSource(Protocol):
+    """A checkpoint's weights under canonical names."""
+
+    format: str  # "openpi_torch", "openpi_jax", "lerobot" or "random"
+    shapes: dict[str, Shape]
+    dtypes: dict[str, str]  # stored: "F32", "BF16", "F16"
+    vision_heads: int | None  # where the layout carries them
+    notes: list[str]  # what a reader of `inspect` should know (merged adapters, ...)
+
+    def native_name(self, name: str) -> str:
+        """What the checkpoint itself calls a canonical parameter."""
+
+    def pieces(self, device: torch.device) -> Iterator[Piece]:
+        """Every parameter once, largest first; each one's pieces are in order and cover it."""
+
+
+def row_ranges(shape: Sequence[int], itemsize: int, limit: int = PIECE_BYTES) -> Iterator[tuple[int, int]]:
+    """Split axis 0 of an array into ranges of at most `limit` bytes (at least one row each)."""
+    row_bytes = itemsize
+    for size in shape[1:]:
+        row_bytes *= size
+    step = max(1, limit // max(1, row_bytes))
+    for start in range(0, shape[0], step):
+        yield start, min(start + step, shape[0])
+
+
+def check_tensors(source: WeightSource, expected: Mapping[str, Shape], path: Path | None) -> None:
+    """Every expected parameter is there in its shape and nothing else is; CheckpointError names what isn't so."""
+    native = source.native_name
+    missing = [native(name) for name in expected if name not in source.shapes]
+    extra = [native(name) for name in source.shapes if name not in expected]
+    wrong = [
+        f"{native(name)} is {list(source.shapes[name])}, expected {list(shape)}"
+        for name, shape in expected.items()
+        if name in source.shapes and source.shapes[name] != shape
+    ]
+    problems = []
+    if missing:
+        problems.append(f"missing {listing(missing)}")
+    if extra:
+        problems.append(f"not a part of the model: {listing(extra)}")
+    if wrong:
+        problems.append(f"wrong shapes (in canonical [out, in] layout): {listing(wrong)}")
+    if problems:
+        raise CheckpointError(f"{path}: the weights don't fit the model: " + "; ".join(problems) + adapter_hint(extra))
+
+
+def adapter_hint(names: Sequence[str]) -> str:
+    """What to do when leftover names look like adapters that were never merged."""
+    if any("lora" in name.lower() or "base_layer" in name for name in names):
+        return ". These look like a training library's LoRA adapters: merge them there (merge_and_unload), save again"
+    return ""
+
+
+def listing(names: Sequence[str], limit: int = 5) -> str:
+    """`a, b, c and 7 more (10 tensors)`"""
+    shown = ", ".join(names[:limit])
+    if len(names) > limit:
+        shown += f" and {len(names) - limit} more ({len(names)} in all)"
+    return shown

@@ -1,0 +1,136 @@
+"""openpi's PyTorch layout and LeRobot's: safetensors, memory-mapped, tensor by tensor."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from turbopi.checkpoint.names import EMBEDDING, TIED_EMBEDDING, TIED_HEAD, UNUSED_HEAD, from_openpi, to_openpi
+from turbopi.checkpoint.source import Piece, Shape, listing, row_ranges
+from turbopi.errors import CheckpointError
+
+ITEMSIZE = {"F32": 4, "BF16": 2, "F16": 2}
+WEIGHTS, INDEX = "model.safetensors", "model.safetensors.index.json"
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """One tensor of a file."""
+
+    file: Path
+    key: str
+    shape: Shape
+    dtype: str
+
+
+class TorchSource:
+    """`model.safetensors` (or its shards) in `folder`; names may carry `prefix` (LeRobot's `model.`)."""
+
+    vision_heads: int | None = None  # no tensor of this layout tells
+
+    def __init__(self, folder: Path, *, format: str, prefix: str = "") -> None:
+        self.format = format
+        self.notes: list[str] = []
+        self._prefix = prefix
+        self._stored: dict[str, _Stored] = {}
+        heads: dict[str, _Stored] = {}
+        for file in _weight_files(folder):
+            for stored in _read_header(file):
+                key = stored.key.removeprefix(prefix) if prefix else stored.key
+                if key == UNUSED_HEAD:
+                    continue
+                if key in (TIED_HEAD, TIED_EMBEDDING):
+                    heads[key] = stored
+                    continue
+                name = from_openpi(key)
+                if name in self._stored:
+                    raise CheckpointError(f"{folder}: {self._stored[name].key} and {stored.key} are the same parameter")
+                self._stored[name] = stored
+        if heads:
+            self._stored[EMBEDDING] = self._tied(heads, folder)
+        unusable = [s.key for s in self._stored.values() if s.dtype not in ITEMSIZE]
+        if unusable:
+            kinds = sorted({s.dtype for s in self._stored.values()} - set(ITEMSIZE))
+            raise CheckpointError(
+                f"{folder}: tensors stored as {', '.join(kinds)} can't be read: {listing(unusable)}. "
+                "Turbo-Pi reads float32, bfloat16 and float16 weights and quantises by itself"
+            )
+        self.shapes = {name: stored.shape for name, stored in self._stored.items()}
+        self.dtypes = {name: stored.dtype for name, stored in self._stored.items()}
+
+    def native_name(self, name: str) -> str:
+        return self._stored[name].key if name in self._stored else self._prefix + to_openpi(name)
+
+    def pieces(self, device: torch.device) -> Iterator[Piece]:
+        by_size = sorted(self._stored, key=lambda name: -_nbytes(self._stored[name]))
+        for name in by_size:
+            stored = self._stored[name]
+            values = _read(stored)  # maps the file; only what is copied from it is ever read
+            if not stored.shape:
+                yield Piece(name, 0, values)
+                continue
+            for start, stop in row_ranges(stored.shape, ITEMSIZE[stored.dtype]):
+                yield Piece(name, start, values[start:stop])
+
+    def _tied(self, heads: dict[str, _Stored], folder: Path) -> _Stored:
+        """openpi ties the prompt embedding to the head: one of them is stored, or both with equal values."""
+        stored = next(iter(heads.values()))
+        if len(heads) == 1:
+            return stored
+        a, b = heads.values()
+        if a.shape != b.shape or a.dtype != b.dtype or not _equal(_read(a), _read(b)):
+            raise CheckpointError(
+                f"{folder}: {a.key} and {b.key} are tied in the model but differ in the file, so it's unclear which "
+                "one the model was trained with. Remove the wrong one from the file"
+            )
+        return stored
+
+
+def _weight_files(folder: Path) -> list[Path]:
+    index = folder / INDEX
+    if not index.exists():
+        return [folder / WEIGHTS]
+    try:
+        weight_map: dict[str, Any] = json.loads(index.read_text())["weight_map"]
+        names = sorted(set(weight_map.values()))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"{index} isn't a safetensors index: {error!r}") from error
+    absent = [name for name in names if not (folder / name).is_file()]
+    if absent:
+        raise CheckpointError(f"{index} lists files that aren't there: {listing(absent)}; the download is incomplete")
+    return [folder / name for name in names]
+
+
+def _read_header(file: Path) -> list[_Stored]:
+    try:
+        with safe_open(file, "pt") as handle:
+            stored = []
+            for key in handle.keys():  # noqa: SIM118  (not a dict)
+                tensor = handle.get_slice(key)
+                stored.append(_Stored(file, key, tuple(tensor.get_shape()), tensor.get_dtype()))
+            return stored
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{file} can't be read as safetensors ({error}); is the download complete?") from error
+
+
+def _read(stored: _Stored) -> Tensor:
+    with safe_open(stored.file, "pt") as handle:
+        tensor: Tensor = handle.get_tensor(stored.key)
+    return tensor
+
+
+def _equal(a: Tensor, b: Tensor) -> bool:
+    ranges = row_ranges(a.shape, a.element_size())
+    return all(torch.equal(a[start:stop], b[start:stop]) for start, stop in ranges)
+
+
+def _nbytes(stored: _Stored) -> int:
+    count = ITEMSIZE[stored.dtype]
+    for size in stored.shape:
+        count *= size
+    return count

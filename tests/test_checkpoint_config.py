@@ -1,0 +1,197 @@
+"""`config=`: presets, turbopi.json, and what is refused because nothing records it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from checkpoint_helpers import GOLDEN, LIBERO, jax_copy, read_tree, torch_copy, write_json
+
+from turbopi.checkpoint import open_checkpoint
+from turbopi.checkpoint.settings import parse_values
+from turbopi.config import PRESETS, Normalization
+from turbopi.errors import CheckpointError, ConfigError
+
+PI05, PI0 = GOLDEN / "pi05" / "jax", GOLDEN / "pi0" / "jax"
+
+
+def test_auto_without_turbopi_json_lists_the_presets_that_fit() -> None:
+    with pytest.raises(ConfigError) as caught:
+        open_checkpoint(PI05)
+    text = str(caught.value)
+    assert "pi05_base, pi05_libero, pi05_droid, pi05_aloha" in text
+    assert "pi0_" not in text
+    assert f"statistics ({LIBERO}) suggest pi05_libero" in text
+    assert "doesn't record its robot, its horizon, or whether the state goes into the prompt" in text
+    with pytest.raises(ConfigError, match=r"statistics \(trossen\) suggest pi0_aloha"):
+        open_checkpoint(PI0)
+
+
+@pytest.mark.parametrize(("folder", "preset"), [(PI05, "pi0_libero"), (PI0, "pi05_aloha")])
+def test_a_preset_of_the_other_kind_is_refused(folder: Path, preset: str) -> None:
+    with pytest.raises(ConfigError, match=f"preset {preset} is for .* weights; presets that fit: "):
+        open_checkpoint(folder, preset)
+    with pytest.raises(ConfigError, match=f"PolicyConfig {preset} is for"):
+        open_checkpoint(folder, PRESETS[preset])
+
+
+def test_a_presets_edges_are_kept_and_its_sizes_are_not() -> None:
+    config, preset = open_checkpoint(PI05, "pi05_libero").config, PRESETS["pi05_libero"]
+    assert config.robot == "libero"
+    assert config.discrete_state_input is False
+    assert config.model.action_horizon == preset.model.action_horizon == 10
+    assert config.model.vlm.width == 96
+
+
+@pytest.mark.parametrize("config", ["pi05_liber0", "", "somewhere/else", 5, None])
+def test_an_unknown_config_lists_the_choices(config: Any) -> None:
+    with pytest.raises(ConfigError, match=r"config is .*; expected 'auto', a path to a .json.*pi05_libero"):
+        open_checkpoint(PI05, config)
+
+
+def test_turbopi_json_beside_the_weights_is_used_and_config_replaces_it(tmp_path: Path) -> None:
+    folder = jax_copy(tmp_path / "c", read_tree(PI05 / "params"))
+    write_json(folder / "turbopi.json", {"preset": "pi05_libero", "action_horizon": 25, "default_prompt": "fold it"})
+    by_file, by_name = open_checkpoint(folder), open_checkpoint(folder, "pi05_libero")
+    assert (by_file.config.model.action_horizon, by_file.config.default_prompt) == (25, "fold it")
+    assert by_file.config_source == str(folder / "turbopi.json")
+    assert (by_name.config.model.action_horizon, by_name.config.default_prompt) == (10, None)
+
+
+def test_every_key_of_turbopi_json_reaches_the_config(tmp_path: Path) -> None:
+    values = {
+        "preset": "pi05_base",
+        "name": "mine",
+        "robot": "libero",
+        "robot_options": {"a": 1},
+        "normalization": {"state": "zscore", "actions": "quantile"},
+        "discrete_state_input": False,
+        "action_horizon": 16,
+        "max_prompt_tokens": 64,
+        "asset_id": LIBERO,
+        "default_prompt": "go",
+        "image_resize": "lerobot",
+        "time_grid": "multiplied",
+        "vision_heads": 4,
+    }
+    write_json(tmp_path / "mine.json", values)
+    config = open_checkpoint(PI05, str(tmp_path / "mine.json")).config
+    assert config.normalization == Normalization("zscore", "quantile")
+    model = config.model
+    assert (model.action_horizon, model.max_prompt_tokens, model.time_grid) == (16, 64, "multiplied")
+    assert model.vision.num_heads == 4
+    for key in ("name", "robot", "robot_options", "discrete_state_input", "asset_id", "default_prompt", "image_resize"):
+        assert getattr(config, key) == values[key]
+
+
+def test_a_robot_given_without_options_has_none_of_the_presets(tmp_path: Path) -> None:
+    write_json(tmp_path / "mine.json", {"preset": "pi05_aloha", "robot": "libero", "asset_id": LIBERO})
+    assert open_checkpoint(PI05, tmp_path / "mine.json").config.robot_options == {}
+
+
+def test_a_robots_own_file_is_found_beside_the_json(tmp_path: Path) -> None:
+    write_json(tmp_path / "arm.json", {})
+    write_json(tmp_path / "mine.json", {"preset": "pi05_base", "robot": "arm.json"})
+    assert open_checkpoint(PI05, tmp_path / "mine.json").config.robot == str(tmp_path / "arm.json")
+    (tmp_path / "arm.json").unlink()
+    with pytest.raises(ConfigError, match=r"robot is 'arm\.json', but there is no file"):
+        open_checkpoint(PI05, tmp_path / "mine.json")
+
+
+WRONG: dict[str, list[Any]] = {
+    "preset": ["pi06", 3, None],
+    "robot": [None, "", 4],
+    "robot_options": [[], "x"],
+    "normalization": ["median", {"state": "zscore"}, {"state": "zscore", "actions": "x"}, 1],
+    "discrete_state_input": [1, "true", None],
+    "action_horizon": [0, -1, 2.0, "10", True],
+    "max_prompt_tokens": [0, None],
+    "asset_id": [3, ""],
+    "default_prompt": [["a"], ""],
+    "image_resize": ["bicubic"],
+    "time_grid": ["exact"],
+    "vision_heads": [0, "4"],
+    "lora_alpha": [0, -1, "16", {}, {"llm": 16}, {"vlm": True}],
+    "lora_rslora": ["yes"],
+}
+
+
+@pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in WRONG.items() for value in values])
+def test_values_of_the_wrong_type_are_refused_by_name(key: str, value: Any) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_values({key: value}, "turbopi.json")
+    assert str(caught.value).startswith(f"turbopi.json: {key} is {value!r}; expected ")
+
+
+def test_unknown_keys_are_refused_with_the_known_ones(tmp_path: Path) -> None:
+    write_json(tmp_path / "mine.json", {"preset": "pi05_libero", "horizon": 10})
+    with pytest.raises(ConfigError, match="unknown keys 'horizon'; known are preset, name, robot"):
+        open_checkpoint(PI05, tmp_path / "mine.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("{", "isn't JSON"), ("[]", "is a list; expected an object"), ('{"robot": "libero"}', "has no preset")],
+)
+def test_a_broken_json_is_refused(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "mine.json").write_text(content)
+    with pytest.raises(ConfigError, match=message):
+        open_checkpoint(PI05, tmp_path / "mine.json")
+    with pytest.raises(ConfigError, match=r"absent\.json can't be read"):
+        open_checkpoint(PI05, tmp_path / "absent.json")
+
+
+def test_pi0_cannot_have_its_state_in_the_prompt(tmp_path: Path) -> None:
+    write_json(tmp_path / "mine.json", {"preset": "pi0_aloha", "discrete_state_input": True})
+    with pytest.raises(ConfigError, match="discrete_state_input is true, but Pi0"):
+        open_checkpoint(PI0, tmp_path / "mine.json")
+
+
+def test_the_horizon_is_the_jsons_then_config_jsons_then_the_presets(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "c")
+    recorded = json.loads((folder / "config.json").read_text())
+
+    def horizon(**settings: Any) -> int:
+        write_json(folder / "turbopi.json", {"preset": "pi05_libero", "vision_heads": 4} | settings)
+        return open_checkpoint(folder).config.model.action_horizon
+
+    write_json(folder / "config.json", recorded | {"action_horizon": 33})
+    assert horizon() == 33
+    assert horizon(action_horizon=12) == 12
+    (folder / "config.json").unlink()
+    assert horizon() == 10
+
+
+def test_a_config_json_of_another_checkpoint_is_refused(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "c")
+    write_json(folder / "config.json", {"action_dim": 24, "action_horizon": 10})
+    with pytest.raises(CheckpointError, match=r"config.json has action_dim 24, but the weights have 32"):
+        open_checkpoint(folder)
+    write_json(folder / "config.json", {"action_horizon": "10"})
+    with pytest.raises(CheckpointError, match="action_horizon is '10'; expected a whole number"):
+        open_checkpoint(folder)
+
+
+def test_one_of_several_assets_must_be_chosen(tmp_path: Path) -> None:
+    folder = jax_copy(tmp_path / "c", read_tree(PI05 / "params"))
+    only = open_checkpoint(folder, "pi05_base")  # names no asset: the only one
+    assert only.asset_id == LIBERO
+    (folder / "assets" / "mine").mkdir()
+    stats = (folder / "assets" / LIBERO / "norm_stats.json").read_text()
+    (folder / "assets" / "mine" / "norm_stats.json").write_text(stats)
+    with pytest.raises(ConfigError, match=f'has mine, {LIBERO}; choose with {{"asset_id": ...}}'):
+        open_checkpoint(folder, "pi05_base")
+    write_json(folder / "turbopi.json", {"preset": "pi05_base", "asset_id": "mine"})
+    assert open_checkpoint(folder).asset_id == "mine"
+    with pytest.raises(
+        CheckpointError, match=f"no .*assets/droid/norm_stats.json; there are statistics of mine, {LIBERO}"
+    ):
+        open_checkpoint(folder, "pi05_droid")
+
+
+def test_an_asset_id_never_leads_out_of_the_assets(tmp_path: Path) -> None:
+    folder = jax_copy(tmp_path / "c", read_tree(PI05 / "params"))
+    (tmp_path / "norm_stats.json").write_text((folder / "assets" / LIBERO / "norm_stats.json").read_text())
+    write_json(folder / "turbopi.json", {"preset": "pi05_base", "asset_id": "../.."})
+    with pytest.raises(CheckpointError, match="norm stats are missing"):
+        open_checkpoint(folder)

@@ -1,0 +1,219 @@
+"""LeRobot's pi05 checkpoints: described by their own files, and refused where Turbo-Pi would compute something else."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from checkpoint_helpers import GOLDEN, edit_json, edit_tensors, lerobot_copy, lerobot_statistics, write_json
+
+from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
+from turbopi.config import PRESETS, GemmaConfig, Normalization, VisionConfig
+from turbopi.errors import CheckpointError, ConfigError
+
+PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
+
+
+@pytest.fixture(autouse=True)
+def standard_heads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot only has full-size models, whose 16 heads are known: let the golden width be the standard one here."""
+    monkeypatch.setattr("turbopi.checkpoint.sizes._STANDARD_VISION", VisionConfig(width=64, num_heads=4))
+
+
+def step(content: Any, name: str) -> Any:
+    return next(entry for entry in content["steps"] if entry["registry_name"] == name)
+
+
+def test_a_lerobot_folder_describes_itself(tmp_path: Path) -> None:
+    checkpoint = open_checkpoint(lerobot_copy(tmp_path / "c"))
+    config = checkpoint.config
+    assert checkpoint.format == "lerobot"
+    assert (config.robot, config.image_resize, config.discrete_state_input) == ("lerobot", "lerobot", True)
+    assert config.normalization == Normalization("lerobot_quantile", "lerobot_quantile")
+    assert (config.model.action_horizon, config.model.max_prompt_tokens) == (30, 180)
+    assert config.model.time_grid == "multiplied"
+    assert config.model.expert == GemmaConfig(width=32, mlp_dim=64, depth=3, head_dim=16)
+    assert config.robot_options == {
+        "image_keys": ["observation.images.image", "observation.images.image2"],
+        "num_missing_cameras": 1,
+        "state_dim": 8,
+        "action_dim": 7,
+    }
+    assert checkpoint.info()["num_inference_steps"] == 7
+
+
+def test_its_weights_are_openpis(tmp_path: Path) -> None:
+    ours = open_checkpoint(lerobot_copy(tmp_path / "c"))
+    assert ours.fingerprint() == open_checkpoint(GOLDEN / "pi05" / "jax", "pi05_libero").fingerprint()
+
+
+@pytest.mark.parametrize(
+    ("mode", "expected", "used"),
+    [
+        ("QUANTILES", "lerobot_quantile", ("q01", "q99")),
+        ("MEAN_STD", "lerobot_zscore", ("mean", "std")),
+        ("MIN_MAX", "lerobot_min_max", ("min", "max")),
+        ("IDENTITY", "identity", ()),
+    ],
+)
+def test_every_normalisation_finds_its_statistics_by_state_file(
+    tmp_path: Path, mode: str, expected: str, used: tuple[str, ...]
+) -> None:
+    checkpoint = open_checkpoint(lerobot_copy(tmp_path / "c", mode))
+    stored = lerobot_statistics()
+    assert checkpoint.config.normalization == Normalization(expected, expected)  # type: ignore[arg-type]
+    stats = checkpoint.norm_stats
+    assert stats.state is not None
+    assert stats.actions is not None
+    for name in used:
+        assert np.array_equal(getattr(stats.state, name), stored[f"observation.state.{name}"].double().numpy())
+        assert np.array_equal(getattr(stats.actions, name), stored[f"action.{name}"].double().numpy())
+
+
+def test_the_training_outputs_folder_is_understood(tmp_path: Path) -> None:
+    (tmp_path / "020000").mkdir()
+    folder = lerobot_copy(tmp_path / "020000" / "pretrained_model")
+    assert open_checkpoint(tmp_path / "020000").path == folder
+
+
+def test_cameras_are_called_what_observations_call_them(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    renames = {"observation.images.top": "observation.images.image"}
+    edit_json(folder / PRE, lambda c: step(c, "rename_observations_processor")["config"].update(rename_map=renames))
+    keys = open_checkpoint(folder).config.robot_options["image_keys"]
+    assert keys == ["observation.images.top", "observation.images.image2"]
+
+
+def test_empty_cameras_count_even_if_the_features_leave_them_out(tmp_path: Path) -> None:
+    checkpoint = open_checkpoint(lerobot_copy(tmp_path / "c", empty_cameras=3))
+    assert checkpoint.config.robot_options["num_missing_cameras"] == 3
+
+
+def test_turbopi_json_puts_single_differences_over_the_description(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    write_json(folder / "turbopi.json", {"robot": "libero", "action_horizon": 12})
+    config = open_checkpoint(folder).config
+    assert (config.robot, config.robot_options, config.model.action_horizon) == ("libero", {}, 12)
+    assert config.normalization.state == "lerobot_quantile"
+    assert config.model.time_grid == "multiplied"
+
+
+def test_a_preset_does_not_fit_a_lerobot_folder(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    with pytest.raises(ConfigError, match='describes itself, so preset pi05_libero doesn\'t fit: use config="auto"'):
+        open_checkpoint(folder, "pi05_libero")
+    assert "describes itself" in inspect_checkpoint(folder, "pi05_libero")["config_error"]
+    assert open_checkpoint(folder, PRESETS["pi05_base"].with_model(action_horizon=9)).config.model.action_horizon == 9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"type": "pi0"}, "LeRobot checkpoint of type 'pi0'; Turbo-Pi reads LeRobot's 'pi05'"),
+        ({"type": "pi0_fast"}, "of type 'pi0_fast'"),
+        ({"image_resolution": [448, 448]}, r"image_resolution = \[448, 448\], which Turbo-Pi doesn't compute"),
+        ({"use_relative_actions": True}, "use_relative_actions = True"),
+        ({"n_obs_steps": 2}, "n_obs_steps = 2"),
+        ({"max_period": 8.0}, "max_period = 8.0"),
+        ({"chunk_size": None}, "chunk_size is None; expected a whole number from 1"),
+        ({"chunk_size": "50"}, "chunk_size is '50'; expected a whole number"),
+        ({"empty_cameras": -1}, "empty_cameras is -1; expected a whole number from 0"),
+        ({"input_features": {"observation.state": [8]}}, "expected features with type and shape"),
+        ({"output_features": {"action": {"type": "ACTION", "shape": [2, 7]}}}, r"action has shape \[2, 7\]"),
+        ({"tokenizer_max_length": 64}, "prompts have 180 tokens in .* but 64"),
+        ({"input_features": {}}, "lists no camera"),
+        (
+            {"normalization_mapping": {"STATE": "MEAN_STD"}},
+            "normalises STATE by QUANTILES, but config.json says MEAN_STD",
+        ),
+    ],
+)
+def test_what_turbopi_does_not_compute_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    folder = lerobot_copy(tmp_path / "c", **change)
+    with pytest.raises(CheckpointError, match=message):
+        open_checkpoint(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "change", "message"),
+    [
+        (PRE, "normalizer_processor", {"eps": 1e-6}, "normalizer_processor has eps 1e-06"),
+        (PRE, "normalizer_processor", {"norm_map": {"STATE": "QUANTILE10"}}, "normalises STATE by QUANTILE10"),
+        (POST, "unnormalizer_processor", {"norm_map": {"ACTION": "MEAN_STD"}}, "ACTION by MEAN_STD, but config.json"),
+        (
+            PRE,
+            "normalizer_processor",
+            {"norm_map": {"STATE": "QUANTILES", "VISUAL": "MEAN_STD"}},
+            "normalises pictures by MEAN_STD",
+        ),
+        (PRE, "normalizer_processor", {"features": {}}, "features leave out observation.state.*needs q01 and q99"),
+        (PRE, "normalizer_processor", {"normalize_observation_keys": ["a"]}, "features leave out observation.state"),
+        (PRE, "tokenizer_processor", {"tokenizer_name": "bert"}, "tokenises with bert"),
+        (
+            PRE,
+            "rename_observations_processor",
+            {"rename_map": {"state": "observation.state"}},
+            "observations call the state 'state'",
+        ),
+    ],
+)
+def test_processors_that_do_something_else_are_refused(
+    tmp_path: Path, file: str, name: str, change: dict[str, Any], message: str
+) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    edit_json(folder / file, lambda c: step(c, name)["config"].update(change))
+    with pytest.raises(CheckpointError, match=message):
+        open_checkpoint(folder)
+
+
+def test_unknown_steps_and_relative_actions_are_refused(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    relative = {"registry_name": "relative_actions_processor", "config": {"enabled": False}}
+    edit_json(folder / PRE, lambda c: c["steps"].insert(2, relative))
+    open_checkpoint(folder)
+    edit_json(folder / PRE, lambda c: c["steps"][2]["config"].update(enabled=True))
+    with pytest.raises(CheckpointError, match="relative_actions_processor is enabled"):
+        open_checkpoint(folder)
+    edit_json(folder / PRE, lambda c: c["steps"][2].update(registry_name="noise_processor"))
+    with pytest.raises(CheckpointError, match="has a step 'noise_processor' that Turbo-Pi doesn't know"):
+        open_checkpoint(folder)
+
+
+def test_a_base_model_without_statistics_is_never_a_silent_identity(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    edit_json(folder / PRE, lambda c: step(c, "normalizer_processor").pop("state_file"))
+    with pytest.raises(CheckpointError, match=r"has no state_file.*needs q01 and q99, but there is nothing"):
+        open_checkpoint(folder)
+    write_json(folder / "turbopi.json", {"normalization": {"state": "identity", "actions": "lerobot_quantile"}})
+    assert open_checkpoint(folder).norm_stats.state is None
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    for index, name in enumerate(("post.safetensors", POST, PRE)):
+        folder = lerobot_copy(tmp_path / str(index))
+        (folder / name).unlink()
+        with pytest.raises(CheckpointError, match=name):
+            open_checkpoint(folder)
+
+
+def test_a_state_file_never_leads_out_of_the_folder(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    (folder / "pre_stats.safetensors").rename(tmp_path / "pre_stats.safetensors")
+    edit_json(folder / PRE, lambda c: step(c, "normalizer_processor").update(state_file="../pre_stats.safetensors"))
+    with pytest.raises(CheckpointError, match=r"names \.\./pre_stats.safetensors, which isn't there"):
+        open_checkpoint(folder)
+
+
+def test_keys_that_lerobot_does_not_have_are_pointed_out(tmp_path: Path) -> None:
+    checkpoint = open_checkpoint(lerobot_copy(tmp_path / "c", state_cond=True))
+    assert checkpoint.info()["notes"] == ["config.json has keys that Turbo-Pi doesn't know or follow: state_cond"]
+
+
+def test_tensors_are_named_with_lerobots_prefix(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    edit_tensors(folder, model__critic__bias=torch.zeros(32), model__time_mlp_in__bias=None)
+    with pytest.raises(
+        CheckpointError, match=r"missing model.time_mlp_in.bias; not a part of the model: model.critic.b"
+    ):
+        open_checkpoint(folder)

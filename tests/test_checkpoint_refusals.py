@@ -1,0 +1,200 @@
+"""What isn't a checkpoint that Turbo-Pi reads, and checkpoints with something wrong: each says what, and what to do."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from checkpoint_helpers import GOLDEN, Tree, edit_tensors, jax_copy, read_tree, torch_copy, write_json, write_tree
+from safetensors.torch import load_file
+
+from turbopi.checkpoint import open_checkpoint
+from turbopi.errors import CheckpointError
+
+V = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
+
+
+@pytest.fixture
+def tree() -> Tree:
+    return read_tree(GOLDEN / "pi05" / "jax" / "params")
+
+
+@pytest.mark.parametrize(
+    ("address", "advice"),
+    [
+        ("gs://openpi-assets/checkpoints/pi05_libero", "gsutil -m cp -r gs://openpi-assets/checkpoints/pi05_libero"),
+        ("s3://bucket/pi05", "aws s3 cp --recursive s3://bucket/pi05"),
+        ("hf://lerobot/pi05_base", "hf download lerobot/pi05_base --local-dir"),
+        ("https://example.com/pi05", "a download of the whole folder"),
+    ],
+)
+def test_addresses_are_refused_with_how_to_fetch_them(address: str, advice: str) -> None:
+    for path in (address, Path(address)):  # a Path loses one slash
+        with pytest.raises(CheckpointError, match="is an address; Turbo-Pi reads local folders") as caught:
+            open_checkpoint(path)
+        assert advice in str(caught.value)
+
+
+def test_a_hub_name_is_recognised() -> None:
+    with pytest.raises(
+        CheckpointError, match=r"no folder lerobot/pi05_base.*hf download lerobot/pi05_base --local-dir"
+    ):
+        open_checkpoint("lerobot/pi05_base")
+
+
+def test_paths_that_hold_no_checkpoint_say_what_is_there(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"there is no folder .*/nowhere$"):
+        open_checkpoint(tmp_path / "nowhere")
+    with pytest.raises(CheckpointError, match=r"holds no checkpoint: expected model.safetensors .* but it has nothing"):
+        open_checkpoint(tmp_path)
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "logs").mkdir()
+    with pytest.raises(CheckpointError, match=r"but it has logs/, notes.txt"):
+        open_checkpoint(tmp_path)
+    with pytest.raises(
+        CheckpointError, match=f"notes.txt is a file; give the checkpoint's folder, probably {tmp_path}"
+    ):
+        open_checkpoint(tmp_path / "notes.txt")
+
+
+def test_a_training_run_names_its_steps(tmp_path: Path) -> None:
+    for step in ("10000", "29999", "5000"):
+        (tmp_path / step / "params").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=r"training steps \(5000, 10000, 29999\); give one .*, such as .*/29999"):
+        open_checkpoint(tmp_path)
+
+
+def test_pickled_weights_and_unmerged_adapters_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "pytorch_model.bin").touch()
+    with pytest.raises(CheckpointError, match=r"pytorch_model.bin: pickled weights can run code"):
+        open_checkpoint(tmp_path)
+    (tmp_path / "adapter_config.json").touch()
+    with pytest.raises(CheckpointError, match=r"adapters of the peft library.*merge_and_unload"):
+        open_checkpoint(tmp_path)
+
+
+def test_pi0_fast_is_refused(tmp_path: Path, tree: Tree) -> None:
+    fast = {path: array for path, array in tree.items() if path.startswith("PaliGemma/") and "_1" not in path}
+    with pytest.raises(CheckpointError, match=r"looks like Pi0-FAST.*serve this checkpoint with openpi"):
+        open_checkpoint(jax_copy(tmp_path / "c", fast), "pi05_libero")
+
+
+def test_weights_of_neither_kind_or_of_both_are_refused(tmp_path: Path, tree: Tree) -> None:
+    neither = {path: array for path, array in tree.items() if "time_mlp" not in path and "final_norm_1" not in path}
+    with pytest.raises(CheckpointError, match=r"neither time_mlp_in \(Pi0.5\) nor state_proj \(Pi0\)"):
+        open_checkpoint(jax_copy(tmp_path / "neither", neither), "pi05_libero")
+    both = tree | {"state_proj/kernel": np.zeros((32, 32), np.float32)}
+    with pytest.raises(CheckpointError, match="tensors of both"):
+        open_checkpoint(jax_copy(tmp_path / "both", both), "pi05_libero")
+
+
+def test_missing_left_over_and_misshapen_tensors_are_named_by_their_own_names(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "c")
+    layer = V + "encoder.layers.1.layer_norm1."
+    edit_tensors(
+        folder,
+        **{
+            (layer + "weight").replace(".", "__"): None,
+            (layer + "bias").replace(".", "__"): torch.zeros(65),
+            "critic__weight": torch.zeros(2),
+        },
+    )
+    with pytest.raises(CheckpointError) as caught:
+        open_checkpoint(folder)
+    text = str(caught.value)
+    assert f"missing {layer}weight;" in text
+    assert "not a part of the model: critic.weight;" in text
+    assert f"{layer}bias is [65], expected [64]" in text
+
+
+def test_many_missing_tensors_are_counted(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "c")
+    names = [name for name in load_file(folder / "model.safetensors") if "language_model.layers.2." in name]
+    edit_tensors(folder, **{name.replace(".", "__"): None for name in names})
+    with pytest.raises(CheckpointError, match=rf"and {len(names) - 5} more \({len(names)} in all\)"):
+        open_checkpoint(folder)
+
+
+def test_the_jax_layout_names_its_paths(tmp_path: Path, tree: Tree) -> None:
+    linear, extra = tree.pop("PaliGemma/llm/layers/mlp_1/linear"), np.zeros(3, np.float32)
+    with pytest.raises(CheckpointError, match=r"missing PaliGemma/llm/layers/mlp_1/linear\[0\].*: critic/bias"):
+        open_checkpoint(jax_copy(tmp_path / "c", tree | {"critic/bias": extra}), "pi05_libero")
+    wrong = tree | {"PaliGemma/llm/layers/mlp_1/linear": linear[:, :, :-1]}
+    with pytest.raises(CheckpointError, match=r"mlp_1/linear\[0\] is \[31, 64\], expected \[32, 64\]"):
+        open_checkpoint(jax_copy(tmp_path / "d", wrong), "pi05_libero")
+
+
+def test_a_tensor_that_sizes_come_from_is_missed_by_name(tmp_path: Path, tree: Tree) -> None:
+    del tree["action_in_proj/kernel"]
+    with pytest.raises(CheckpointError, match="tensors are missing: action_in_proj/kernel"):
+        open_checkpoint(jax_copy(tmp_path / "c", tree), "pi05_libero")
+
+
+@pytest.mark.parametrize(
+    ("path", "shape", "message"),
+    [
+        ("PaliGemma/llm/layers/attn/kv_einsum/w", (3, 2, 2, 96, 16), "1 KV head"),
+        ("PaliGemma/llm/layers/attn/q_einsum/w", (3,), "which no Pi0 or Pi0.5 has"),
+        ("action_in_proj/kernel", (32,), "which no Pi0 or Pi0.5 has"),
+        ("PaliGemma/img/pos_embedding", (1, 250, 64), "aren't a square grid"),
+        ("PaliGemma/llm/layers/attn/q_einsum_1/w", (3, 4, 32, 16), "vlm and expert share one attention"),
+    ],
+)
+def test_impossible_shapes_are_refused(
+    tmp_path: Path, tree: Tree, path: str, shape: tuple[int, ...], message: str
+) -> None:
+    folder = jax_copy(tmp_path / "c", tree | {path: np.zeros(shape, np.float32)})
+    with pytest.raises(CheckpointError, match=message):
+        open_checkpoint(folder, "pi05_libero")
+
+
+def test_adapters_of_a_training_library_get_a_hint(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "c")
+    edit_tensors(folder, action_in_proj__lora_A__weight=torch.zeros(2, 32))
+    with pytest.raises(CheckpointError, match="LoRA adapters: merge them there"):
+        open_checkpoint(folder)
+
+
+def test_quantised_weights_are_refused(tmp_path: Path, tree: Tree) -> None:
+    folder = torch_copy(tmp_path / "c")
+    edit_tensors(folder, time_mlp_in__bias=torch.zeros(32, dtype=torch.int8))
+    with pytest.raises(CheckpointError, match=r"stored as I8 can't be read: time_mlp_in.bias"):
+        open_checkpoint(folder)
+    folder = jax_copy(tmp_path / "d", tree | {"time_mlp_in/bias": np.zeros(32, np.int8)})
+    with pytest.raises(CheckpointError, match=r"time_mlp_in/bias is stored as \|i1; expected one of float32"):
+        open_checkpoint(folder, "pi05_libero")
+
+
+def test_a_parameter_stored_twice_is_refused(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "c")
+    stored = load_file(folder / "model.safetensors")[V + "post_layernorm.bias"]
+    edit_tensors(folder, **{(V.replace("vision_model.", "") + "post_layernorm.bias").replace(".", "__"): stored})
+    with pytest.raises(CheckpointError, match="are the same parameter"):
+        open_checkpoint(folder)
+
+
+def test_truncated_files_ask_whether_the_download_is_complete(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "c")
+    file = folder / "model.safetensors"
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(CheckpointError, match=r"can't be read as safetensors .*; is the download complete"):
+        open_checkpoint(folder)
+    (tmp_path / "j" / "params").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=r"params has no manifest.ocdbt"):
+        open_checkpoint(tmp_path / "j", "pi05_libero")
+    (tmp_path / "j" / "params" / "manifest.ocdbt").write_bytes(b"nonsense")
+    with pytest.raises(CheckpointError, match="can't be read as an OCDBT store"):
+        open_checkpoint(tmp_path / "j", "pi05_libero")
+
+
+def test_a_broken_shard_index_is_refused(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "c")
+    write_json(folder / "model.safetensors.index.json", {"weights": {}})
+    with pytest.raises(CheckpointError, match="isn't a safetensors index"):
+        open_checkpoint(folder)
+
+
+def test_a_tree_with_another_root_is_refused(tmp_path: Path) -> None:
+    params = write_tree(tmp_path / "c" / "params", {"a": np.zeros(2, np.float32)}, root="opt_state.")
+    with pytest.raises(CheckpointError, match=f"{params} holds opt_state.a; expected arrays below the root `params`"):
+        open_checkpoint(tmp_path / "c", "pi05_libero")
