@@ -1,5 +1,9 @@
 """What several test files share: the golden folder and models built from it."""
 
+import os
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: spinning threads slow a busy machine
+
 from functools import lru_cache
 from pathlib import Path
 

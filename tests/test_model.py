@@ -10,11 +10,11 @@ import torch
 from conftest import golden_cases, golden_model
 from torch import Tensor
 
-from turbopi.config import GemmaConfig, ModelConfig
+from turbopi.config import GemmaConfig, Kind, ModelConfig
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.model.denoise import time_embedding, time_grid
 from turbopi.model.layers import attention
-from turbopi.model.reference import Pi0Model, parameter_dtype, parameter_shapes
+from turbopi.model.reference import Pi0Model, Precision, parameter_dtype, parameter_shapes
 from turbopi.observation import Observation
 
 STEPS = 3
@@ -42,9 +42,9 @@ def stack(*observations: Observation) -> Observation:
 
 @pytest.mark.parametrize("case", ["a_three_cams", "b_third_masked", "p0_pi0_state"])
 @pytest.mark.parametrize("precision", ["f32", "bf16"])
-def test_compaction_is_exact(case: str, precision: str) -> None:
+def test_compaction_is_exact(case: str, precision: Precision) -> None:
     one = golden_cases()[case]
-    model = golden_model(one.kind, precision)  # type: ignore[arg-type]
+    model = golden_model(one.kind, precision)
     padded = model.sample(one.observation, one.noise, 10, compact=False)
     compacted = model.sample(one.observation, one.noise, 10)
     relative = float((padded - compacted).square().mean().sqrt() / padded.square().mean().sqrt())
@@ -76,8 +76,8 @@ def test_masked_camera_and_padding_change_nothing(compact: bool) -> None:
 
 
 @pytest.mark.parametrize("kind", ["pi05", "pi0"])
-def test_a_batch_of_unequal_rows_equals_its_rows(kind: str) -> None:
-    model = golden_model(kind)  # type: ignore[arg-type]
+def test_a_batch_of_unequal_rows_equals_its_rows(kind: Kind) -> None:
+    model = golden_model(kind)
     rows = [random_observation(1, prompt=5), random_observation(2, prompt=31), random_observation(3, prompt=40)]
     rows[1] = dataclasses.replace(rows[1], image_mask=torch.tensor([[True, True, False]]))
     rows[2] = dataclasses.replace(rows[2], image_mask=torch.tensor([[False, True, False]]))

@@ -145,7 +145,13 @@ _PRESETS = (
     PolicyConfig("pi05_tiny", _TINY, "libero", asset_id="physical-intelligence/libero"),
     PolicyConfig("pi0_base", _PI0, "plain", _ZSCORE, discrete_state_input=False),
     PolicyConfig(
-        "pi0_libero", _PI0, "libero", _ZSCORE, discrete_state_input=False, asset_id="physical-intelligence/libero"
+        "pi0_libero",
+        _PI0,
+        "libero",
+        _ZSCORE,
+        discrete_state_input=False,
+        asset_id="physical-intelligence/libero",
+        robot_options={"delta_actions": True},  # unlike pi05_libero, trained on actions relative to the state
     ),
     PolicyConfig("pi0_droid", _model(_PI0, 10), "droid", _ZSCORE, discrete_state_input=False, asset_id="droid"),
     PolicyConfig(

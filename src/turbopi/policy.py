@@ -14,9 +14,10 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.config import PolicyConfig
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.model.reference import Precision
-from turbopi.observation import Observation
+from turbopi.observation import ModelInputs, Observation
 from turbopi.preprocess import Pipeline
-from turbopi.tokenizer import load_tokenizer
+from turbopi.robots import Robot
+from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
 
 MAX_STEPS = 1000  # far beyond any use; a larger number is a mistake, not a wish
 
@@ -38,6 +39,7 @@ class UnifiedPolicy:
         tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
             the checkpoint folder or in openpi's cache.
         default_prompt: the instruction for observations that bring none.
+        robot: instead of the config's: a name, the path of a robot's .json, or your own `Robot` (docs/robots.md).
         progress: show a bar while the weights load.
 
     Raises ConfigError, CheckpointError, TokenizerError or BackendUnavailable, each with what to do about it.
@@ -55,27 +57,26 @@ class UnifiedPolicy:
         device: str | torch.device = "auto",
         tokenizer: Any = None,
         default_prompt: str | None = None,
+        robot: str | Robot | None = None,
         progress: bool = False,
     ) -> None:
         self._num_steps = _checked_steps(num_denoising_steps, ConfigError)
         self._device = backends.resolve_device(device)
-        name, why = backends.choose(self._device) if backend == "auto" else (backend, "asked for")
+        name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "asked for")
 
         checkpoint = (
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)
         )
+        if checkpoint.format == "random" and tokenizer is None:
+            tokenizer = TINY_TOKENIZER  # any will do: no weight knows a word
         self.config = checkpoint.config
-        self._pipeline = Pipeline(
-            checkpoint.config,
-            checkpoint.norm_stats,
-            load_tokenizer(
-                tokenizer,
-                checkpoint_dir=checkpoint.path,
-                candidates=checkpoint.tokenizer_candidates,
-                vocab_size=checkpoint.config.model.vocab_size,
-            ),
-            default_prompt=default_prompt,
+        prompt_tokenizer = load_tokenizer(
+            tokenizer,
+            checkpoint_dir=checkpoint.path,
+            candidates=checkpoint.tokenizer_candidates,
+            vocab_size=checkpoint.config.model.vocab_size,
         )
+        self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
         self._loading: dict[str, Any] = {}
 
         def load(to: torch.device, in_precision: Precision) -> dict[str, torch.Tensor]:
@@ -152,10 +153,18 @@ class UnifiedPolicy:
         return [result | {"policy_timing": dict(timing)} for result in results]
 
     def warmup(self, num_steps: int | None = None) -> float:
-        """Run one random observation, so that nothing is compiled or allocated during the first real one. Seconds."""
+        """Make the first real call as fast as later ones: compile, allocate, capture. Returns the seconds it took."""
         start = time.perf_counter()
-        self.infer(self.example_observation(), seed=0, num_steps=num_steps)
+        example = self.example_observation()
+        steps = self._num_steps if num_steps is None else _checked_steps(num_steps, ObservationError)
+        with self._lock:
+            self.backend.warmup(Observation.stack([self._pipeline.before(example)[0]]), steps)
+        self.infer(example, seed=0, num_steps=steps)
         return time.perf_counter() - start
+
+    def prepare(self, obs: Mapping[str, Any]) -> ModelInputs:
+        """What the model is given for an observation. Raises ObservationError if it can't be used."""
+        return self._pipeline.before(obs)[0]
 
     def example_observation(self, seed: int = 0) -> dict[str, Any]:
         """A random observation in this robot's keys, shapes and dtypes."""
@@ -168,7 +177,6 @@ class UnifiedPolicy:
         return {
             "config": self.config.name,
             "model": model.kind,
-            "robot": self.config.robot,
             "action_horizon": model.action_horizon,
             "num_denoising_steps": self._num_steps,
             "backend": self.backend.name,
@@ -179,6 +187,7 @@ class UnifiedPolicy:
             "device_name": torch.cuda.get_device_name(self._device) if self._device.type == "cuda" else "CPU",
             "checkpoint_format": self._checkpoint.format,
             "random_weights": self._checkpoint.format == "random",
+            "tokenizer": self._pipeline.tokenizer.source,
             "torch": torch.__version__,
             **self._loading,
             **self._pipeline.metadata,
@@ -195,8 +204,9 @@ class UnifiedPolicy:
             return _checked_noise(noise, (batch, *shape))
         if seed is None:
             return self._generator.standard_normal((batch, *shape), dtype=np.float32)
-        seeds = [seed + row for row in range(batch)] if isinstance(seed, int | np.integer) else list(seed)
-        if len(seeds) != batch or not all(isinstance(one, int | np.integer) and one >= 0 for one in seeds):
+        seeds = [seed + row for row in range(batch)] if isinstance(seed, int | np.integer) else seed
+        whole = isinstance(seeds, Sequence) and all(isinstance(one, int | np.integer) and one >= 0 for one in seeds)
+        if not whole or len(seeds) != batch:
             raise ObservationError(f"seed {seed!r} should be a whole number from 0, or one for each of {batch} rows")
         return np.stack([np.random.default_rng(one).standard_normal(shape, dtype=np.float32) for one in seeds])
 
@@ -207,12 +217,8 @@ def _checked_noise(noise: Sequence[np.ndarray] | np.ndarray, shape: tuple[int, .
     except (TypeError, ValueError) as error:
         raise ObservationError(f"noise isn't an array of numbers: {error}") from None
     if array.shape != shape:
-        raise ObservationError(
-            f"noise has shape {list(array.shape[1:])}, but this policy needs [action_horizon, action_dim] = "
-            f"{list(shape[1:])}"
-            if len(array) == shape[0]
-            else f"noise has shape {list(array.shape)}, expected {list(shape)}"
-        )
+        given, expected = (array.shape[1:], shape[1:]) if len(array) == shape[0] else (array.shape, shape)
+        raise ObservationError(f"noise has shape {list(given)}, but this policy needs {list(expected)}")
     if not np.isfinite(array).all():
         raise ObservationError("noise has values that aren't finite")
     return np.ascontiguousarray(array)

@@ -37,7 +37,14 @@ _SPECS = (
         "PyTorchCompileBackend",
         "the reference through torch.compile: any device with a compiler",
     ),
+    BackendSpec(
+        "cuda_graph",
+        "turbopi.backends.cuda_graph",
+        "CudaGraphBackend",
+        "the whole call in one CUDA graph, PyTorch's kernels: NVIDIA GPUs from compute capability 8.0",
+    ),
 )
+_FASTEST_FIRST = ("cuda_graph", "pytorch_compile")
 BACKENDS: dict[str, BackendSpec] = {spec.name: spec for spec in _SPECS}
 
 
@@ -66,21 +73,26 @@ def availability(name: str, device: torch.device) -> str | None:
     return _backend_class(name).unavailable(device)
 
 
-def choose(device: torch.device) -> tuple[str, str]:
-    """The backend that "auto" stands for on a device, and why."""
+def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, str]:
+    """The backend that "auto" stands for on a device in a precision, and why."""
     if device.type == "cpu":
         return "pytorch", "auto: on a CPU the eager reference starts at once and compiling gains little"
-    reason = availability("pytorch_compile", device)
-    if reason is None:
-        return "pytorch_compile", "auto: the fastest backend available on this GPU"
-    return "pytorch", f"auto: pytorch_compile can't run here ({reason})"
+    reasons = []
+    for name in _FASTEST_FIRST:
+        if precision not in precisions(name):
+            continue
+        reason = availability(name, device)
+        if reason is None and precision not in precisions(name):
+            reason = f"it doesn't run in {precision}"
+        if reason is None:
+            skipped = f" ({'; '.join(reasons)})" if reasons else ""
+            return name, f"auto: the fastest backend for this GPU and precision{skipped}"
+        reasons.append(f"{name} can't run here: {reason}")
+    return "pytorch", f"auto: {'; '.join(reasons)}"
 
 
-def create(name: str, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> Backend:
-    """Build the backend called `name` around a checkpoint's tensors.
-
-    Raises ConfigError for an unknown name or precision, BackendUnavailable where it can't run.
-    """
+def check(name: str, device: torch.device, precision: Precision) -> None:
+    """Raise ConfigError for an unknown name or precision, BackendUnavailable where the backend can't run."""
     if precision not in PRECISIONS:
         raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(PRECISIONS)}")
     cls = _backend_class(name)
@@ -89,7 +101,12 @@ def create(name: str, config: ModelConfig, load: LoadState, *, device: torch.dev
     reason = cls.unavailable(device)
     if reason is not None:
         raise BackendUnavailable(f"backend {name!r} can't run on {device}: {reason}")
-    return cls(config, load, device=device, precision=precision)
+
+
+def create(name: str, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> Backend:
+    """Build the backend called `name` around a checkpoint's tensors. Raises what `check` raises."""
+    check(name, device, precision)
+    return _backend_class(name)(config, load, device=device, precision=precision)
 
 
 def precisions(name: str) -> tuple[Precision, ...]:

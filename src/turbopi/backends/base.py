@@ -44,6 +44,9 @@ class Backend(Protocol):
     def unavailable(cls, device: torch.device) -> str | None:
         """None if the backend can run on the device, else why it can't and what to do."""
 
+    def warmup(self, observation: Observation, num_steps: int) -> None:
+        """Compile, allocate or capture whatever later observations with these cameras may need."""
+
     def prefix(self, observation: Observation) -> KVCache:
         """Keys and values of an observation."""
 

@@ -30,6 +30,10 @@ class PyTorchBackend:
     def unavailable(cls, device: torch.device) -> str | None:
         return None
 
+    def warmup(self, observation: Observation, num_steps: int) -> None:
+        noise = torch.zeros(observation.batch_size, self.config.action_horizon, self.config.action_dim)
+        self.sample(observation, noise, num_steps)
+
     def prefix(self, observation: Observation) -> KVCache:
         return self.model.prefix(observation.to(self.device))
 

@@ -37,17 +37,8 @@ class CompiledModel(Pi0Model):
             torch._dynamo.mark_dynamic(mask, 3)
         return self._encode_prefix(embs, positions, mask)
 
-    def velocity(
-        self,
-        x_t: Tensor,
-        state: Tensor,
-        time: Tensor,
-        cache_k: Tensor,
-        cache_v: Tensor,
-        rope: tuple[Tensor, Tensor],
-        mask: Tensor | None,
-        hidden: list[Tensor] | None = None,  # lives inside the compiled step: not recorded
-    ) -> tuple[Tensor, Tensor]:
+    def velocity(self, x_t: Tensor, state: Tensor, time: Tensor, cache_k: Tensor, cache_v: Tensor, *rest: Any) -> Any:
+        rope, mask = rest[:2]  # without `hidden`, which lives inside the compiled step: not recorded
         torch._dynamo.mark_dynamic(cache_k, 3)
         torch._dynamo.mark_dynamic(cache_v, 3)
         if mask is not None:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from turbopi.checkpoint import Checkpoint, open_checkpoint
-from turbopi.config import CAMERAS, GemmaConfig, Kind, ModelConfig, PolicyConfig, VisionConfig
+from turbopi.config import CAMERAS, GemmaConfig, Kind, ModelConfig, Normalization, PolicyConfig, VisionConfig
 from turbopi.errors import CheckpointError, ObservationError
 from turbopi.observation import Observation
 
@@ -80,7 +80,9 @@ class GoldenFolder:
         folder = self.path / "checkpoints" / kind
         for layout, mark in (("torch", "model.safetensors"), ("jax", "params")):
             if (folder / layout / mark).exists():
-                config = PolicyConfig(f"golden {kind}", self.model_config(kind), robot="plain")
+                config = PolicyConfig(
+                    f"golden {kind}", self.model_config(kind), "plain", Normalization("identity", "identity")
+                )
                 return open_checkpoint(folder / layout, config)
         raise CheckpointError(f"{folder} has neither torch/model.safetensors nor jax/params")
 

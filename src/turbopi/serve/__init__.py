@@ -1,6 +1,21 @@
-"""Serving a policy over openpi's websocket protocol: `serve.run(policy)`, or PolicyServer inside an event loop."""
+"""Serving a policy over openpi's websocket protocol: `serve.run(policy)`, or PolicyServer inside an event loop.
 
-from turbopi.serve.launch import run
-from turbopi.serve.server import Policy, PolicyServer, running
+The names here are imported when they are used: recordings and the wire format need no server.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from turbopi.serve.launch import run
+    from turbopi.serve.server import Policy, PolicyServer, running
 
 __all__ = ["Policy", "PolicyServer", "run", "running"]
+
+_MODULES = {"run": "launch", "Policy": "server", "PolicyServer": "server", "running": "server"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -1,0 +1,5 @@
+"""`python -m turbopi` is `turbopi`."""
+
+from turbopi.cli import main
+
+main()

@@ -1,0 +1,65 @@
+"""What this machine can do, measured on the spot: memory bandwidth, matrix rate, the cost of a launch."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+
+@dataclass(frozen=True)
+class Floors:
+    """Ceilings of one device in one precision."""
+
+    copy_bytes_per_second: float  # a large device copy, read and written bytes both counted
+    matmul_flops_per_second: float
+    launch_us: float | None  # one dependent tiny kernel inside a CUDA graph; None on a CPU
+
+
+def measure_floors(device: torch.device, dtype: torch.dtype) -> Floors:
+    """Medians over a few repetitions, on random data. Takes about a second."""
+    if device.type == "cuda":
+        return Floors(_copy_rate(device, 1 << 31), _matmul_rate(device, dtype, 8192), _launch_us(device))
+    return Floors(_copy_rate(device, 1 << 28), _matmul_rate(device, dtype, 1024), None)
+
+
+def median_seconds(run: Callable[[], object], device: torch.device, repeats: int = 10) -> float:
+    """Median time of `run`, on the device's own clock, after three warm-up runs."""
+    times = []
+    for i in range(repeats + 3):
+        if device.type == "cuda":
+            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]
+            start.record()
+            run()
+            end.record()
+            end.synchronize()
+            seconds = start.elapsed_time(end) / 1e3
+        else:
+            begin = time.perf_counter()
+            run()
+            seconds = time.perf_counter() - begin
+        if i >= 3:
+            times.append(seconds)
+    return sorted(times)[len(times) // 2]
+
+
+def _copy_rate(device: torch.device, size: int) -> float:
+    source = torch.randint(0, 127, (size,), dtype=torch.int8, device=device)
+    target = torch.empty_like(source)
+    return 2 * size / median_seconds(lambda: target.copy_(source), device)
+
+
+def _matmul_rate(device: torch.device, dtype: torch.dtype, n: int) -> float:
+    a, b = (torch.randn(n, n, device=device).to(dtype) for _ in range(2))
+    return 2 * n**3 / median_seconds(lambda: a @ b, device)
+
+
+def _launch_us(device: torch.device, kernels: int = 1000) -> float:
+    x = torch.zeros(1, device=device)
+    graph = torch.cuda.CUDAGraph()
+    x.add_(1)
+    torch.cuda.synchronize(device)
+    with torch.cuda.graph(graph):
+        for _ in range(kernels):
+            x.add_(1)
+    return median_seconds(graph.replay, device) / kernels * 1e6

@@ -1,0 +1,136 @@
+"""Timing a policy's calls: every call a fresh observation, prompt and noise, from host to host."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from turbopi.bench.work import Job
+from turbopi.checkpoint import Checkpoint
+from turbopi.config import CAMERAS, Normalization
+from turbopi.errors import ConfigError
+from turbopi.model.reference import Precision
+from turbopi.policy import UnifiedPolicy
+
+_WORDS = "pick up the red black white bowl mug plate and place put it on in left right drawer stove open a to of"
+WORDS = _WORDS.split()
+PROMPTS = 16  # different ones, taken in turn
+PERCENTILES = (5, 50, 95, 99)
+
+
+def bench_policy(
+    checkpoint: Checkpoint, backend: str, precision: Precision, device: torch.device, job: Job, tokenizer: Any = None
+) -> UnifiedPolicy:
+    """The checkpoint's policy for a job: its model with the `plain` robot, so that cameras and prompt can be chosen.
+
+    The state stays out of the prompt and nothing is normalised: actions are the model's own.
+    """
+    identity = Normalization("identity", "identity")
+    config = dataclasses.replace(
+        checkpoint.config, robot="plain", robot_options={}, discrete_state_input=False, normalization=identity
+    ).with_model(action_horizon=job.horizon)
+    return UnifiedPolicy(
+        dataclasses.replace(checkpoint, config=config),
+        backend=backend,
+        precision=precision,
+        num_denoising_steps=job.steps,
+        device=device,
+        tokenizer=tokenizer,
+    )
+
+
+class Observations:
+    """Random observations of a job: another picture, state and prompt each time, the same ones for the same seed."""
+
+    def __init__(self, policy: UnifiedPolicy, job: Job, seed: int = 0) -> None:
+        if not 1 <= job.cameras <= len(CAMERAS):
+            raise ConfigError(f"a job has 1 to {len(CAMERAS)} cameras, not {job.cameras}")
+        self._rng = np.random.default_rng(seed)
+        self._cameras = CAMERAS[: job.cameras]
+        self._policy = policy
+        self._prompts = [self._prompt(job.prompt_tokens) for _ in range(PROMPTS)]
+        self._next = 0
+
+    def __next__(self) -> dict[str, Any]:
+        self._next += 1
+        return self._observation(self._prompts[self._next % PROMPTS])
+
+    def _observation(self, prompt: str) -> dict[str, Any]:
+        pictures = {camera: self._rng.integers(0, 256, (224, 224, 3), dtype=np.uint8) for camera in self._cameras}
+        return {"images": pictures, "state": self._rng.uniform(-1, 1, 7), "prompt": prompt}
+
+    def _tokens(self, prompt: str) -> int:
+        return int(self._policy.prepare(self._observation(prompt)).token_mask.sum())
+
+    def _prompt(self, tokens: int) -> str:
+        """A random prompt of exactly that many tokens."""
+        for _ in range(100):
+            words: list[str] = []
+            while (count := self._tokens(" ".join(words))) < tokens:
+                words.append(str(self._rng.choice(WORDS)))
+            if count == tokens:
+                return " ".join(words)
+        raise ConfigError(f"found no prompt of exactly {tokens} tokens with this tokenizer; try another number")
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Milliseconds over the calls of one measurement."""
+
+    calls: int
+    mean: float
+    percentiles: dict[int, float]
+
+    @classmethod
+    def of(cls, values: list[float]) -> "Latency":
+        return cls(len(values), float(np.mean(values)), {p: float(np.percentile(values, p)) for p in PERCENTILES})
+
+    @property
+    def median(self) -> float:
+        return self.percentiles[50]
+
+    def as_dict(self) -> dict[str, float]:
+        return {"mean": self.mean, **{f"p{p}": value for p, value in self.percentiles.items()}}
+
+
+def measure_calls(
+    policy: UnifiedPolicy, job: Job, calls: int, *, seed: int = 0, advance: Callable[[], None] = lambda: None
+) -> dict[str, Latency]:
+    """Latency of "total", "infer", the stages, and "device", their sum, over `calls` calls after three for warm-up."""
+    observations = Observations(policy, job, seed)
+    timings: dict[str, list[float]] = {}
+    for i in range(calls + 3):
+        timing = policy.infer(next(observations), num_steps=job.steps)["policy_timing"]
+        if i < 3:
+            continue
+        stages = [timing[f"{stage}_ms"] for stage in ("vision", "prefix", "denoise") if f"{stage}_ms" in timing]
+        if stages:
+            timing["device_ms"] = sum(stages)
+        for name, milliseconds in timing.items():
+            timings.setdefault(name.removesuffix("_ms"), []).append(milliseconds)
+        advance()
+    return {name: Latency.of(values) for name, values in timings.items()}
+
+
+def error_against(policy: UnifiedPolicy, oracle: UnifiedPolicy, job: Job, *, observations: int = 4) -> dict[str, float]:
+    """The model's actions of a policy against the float32 reference's, on the same observations and noise.
+
+    Relative rms is of the whole set; max is the worst single value.
+    """
+    source = Observations(policy, job, seed=1)
+    shape = (job.horizon, policy.config.model.action_dim)
+    differences, exact = [], []
+    for seed in range(observations):
+        obs, noise = next(source), np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
+        ours, theirs = (p.infer(obs, noise=noise, num_steps=job.steps)["actions"] for p in (policy, oracle))
+        differences.append(ours - theirs)
+        exact.append(theirs)
+    difference, scale = np.stack(differences), np.stack(exact)
+    return {
+        "relative_rms": float(np.sqrt(np.mean(difference**2) / np.mean(scale**2))),
+        "max": float(np.abs(difference).max()),
+        "observations": observations,
+    }

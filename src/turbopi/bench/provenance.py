@@ -1,0 +1,73 @@
+"""Where a figure comes from: hardware, clocks, versions, commit."""
+
+import os
+import platform
+import subprocess
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import torch
+
+_GPU_FIELDS = ("name", "driver_version", "clocks.sm", "clocks.mem", "clocks_throttle_reasons.active", "temperature.gpu")
+
+
+def provenance(device: torch.device) -> dict[str, Any]:
+    """Plain values for a result file; the clocks are those of the moment of the call."""
+    about: dict[str, Any] = {
+        "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "commit": _commit(),
+        "device": str(device),
+    }
+    if device.type == "cuda":
+        properties = torch.cuda.get_device_properties(device)
+        about["gpu"] = {
+            "compute_capability": f"{properties.major}.{properties.minor}",
+            "multiprocessors": properties.multi_processor_count,
+            "memory_bytes": properties.total_memory,
+            "cuda": torch.version.cuda,
+            **_nvidia_smi(device),
+        }
+    else:
+        about["cpu"] = {"machine": platform.machine(), "name": _cpu_name(), "threads": torch.get_num_threads()}
+    return about
+
+
+def _nvidia_smi(device: torch.device) -> dict[str, str]:
+    command = [
+        "nvidia-smi",
+        f"--query-gpu={','.join(_GPU_FIELDS)}",
+        "--format=csv,noheader",
+        f"--id={device.index or 0}",
+    ]
+    values = _output(command).split(", ")
+    return dict(zip(_GPU_FIELDS, values, strict=True)) if len(values) == len(_GPU_FIELDS) else {}
+
+
+def _commit() -> str:
+    """This checkout's commit, with "+" behind it where files differ from it.
+
+    Outside a checkout: TURBOPI_COMMIT, which whoever copied the files sets, else "unknown".
+    """
+    here = str(Path(__file__).parent)
+    commit = _output(["git", "-C", here, "rev-parse", "--short=12", "HEAD"])
+    if not commit:
+        return os.environ.get("TURBOPI_COMMIT", "unknown")
+    return commit + ("+" if _output(["git", "-C", here, "status", "--porcelain", "--untracked-files=no"]) else "")
+
+
+def _cpu_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
+
+
+def _output(command: list[str]) -> str:
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""

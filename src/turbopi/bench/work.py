@@ -1,0 +1,80 @@
+"""The least work that a policy's call can do, counted from the sizes: operations, and bytes through device memory.
+
+A stage's floor is the larger of operations / matrix rate and bytes / bandwidth. Norms, RoPE, softmax and launches are
+not counted: the floor is what no implementation in that precision gets under, not what one should reach.
+"""
+
+from dataclasses import dataclass
+
+from turbopi.config import GemmaConfig, ModelConfig
+
+
+@dataclass(frozen=True)
+class Job:
+    """One benchmark point. `prompt_tokens` counts valid tokens, the state's among them."""
+
+    cameras: int = 2
+    prompt_tokens: int = 48
+    horizon: int = 10
+    steps: int = 10
+
+    def __str__(self) -> str:
+        return f"{self.cameras} cameras, {self.prompt_tokens} tokens, H={self.horizon}, {self.steps} steps"
+
+
+@dataclass(frozen=True)
+class Work:
+    flops: float  # multiply and add counted apart
+    bytes: float  # weights read once (denoising: once a step), the KV cache written and read
+
+    def __add__(self, other: "Work") -> "Work":
+        return Work(self.flops + other.flops, self.bytes + other.bytes)
+
+
+def stage_work(config: ModelConfig, job: Job, bytes_per_value: int) -> dict[str, Work]:
+    """Stage ("vision", "prefix", "denoise") -> its work: batch 1, compacted, the last prefix layer cut to K and V."""
+    image_tokens = job.cameras * config.vision.num_tokens
+    prefix = image_tokens + job.prompt_tokens
+    suffix = job.horizon + (config.kind == "pi0")
+    return {
+        "vision": _vision(config, image_tokens, bytes_per_value),
+        "prefix": _prefix(config, prefix, bytes_per_value),
+        "denoise": _denoise(config, prefix, suffix, job.steps, bytes_per_value),
+    }
+
+
+def floor_ms(work: Work, flops_per_second: float, bytes_per_second: float) -> float:
+    """The time that no implementation gets under, in milliseconds."""
+    return max(work.flops / flops_per_second, work.bytes / bytes_per_second) * 1e3
+
+
+def _vision(config: ModelConfig, tokens: int, value: int) -> Work:
+    v = config.vision
+    block = 4 * v.width**2 + 2 * v.width * v.mlp_dim
+    weights = v.depth * block + 3 * v.patch_size**2 * v.width + v.width * config.vlm.width
+    attention = v.depth * 4 * tokens * v.num_tokens * v.width  # q kᵀ and p v, within one picture
+    return Work(2 * tokens * weights + attention, weights * value)
+
+
+def _layer_weights(g: GemmaConfig) -> tuple[int, int]:
+    """Weights of a layer's key and value projections, and of the rest."""
+    heads = g.num_heads * g.head_dim
+    return 2 * g.width * g.num_kv_heads * g.head_dim, 2 * g.width * heads + 3 * g.width * g.mlp_dim
+
+
+def _prefix(config: ModelConfig, tokens: int, value: int) -> Work:
+    g = config.vlm
+    kv, rest = _layer_weights(g)
+    weights = g.depth * kv + (g.depth - 1) * rest
+    attention = (g.depth - 1) * 4 * tokens**2 * g.num_heads * g.head_dim
+    cache = g.depth * 2 * tokens * g.num_kv_heads * g.head_dim
+    return Work(2 * tokens * weights + attention, (weights + cache) * value)
+
+
+def _denoise(config: ModelConfig, prefix: int, suffix: int, steps: int, value: int) -> Work:
+    g = config.expert
+    kv, rest = _layer_weights(g)
+    weights = g.depth * (kv + rest) + 2 * config.action_dim * g.width
+    attention = g.depth * 4 * suffix * (prefix + suffix) * g.num_heads * g.head_dim
+    cache = g.depth * 2 * prefix * g.num_kv_heads * g.head_dim
+    return Work(steps * (2 * suffix * weights + attention), steps * (weights + cache) * value)

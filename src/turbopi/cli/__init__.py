@@ -1,0 +1,41 @@
+"""The command line: `turbopi demo | infer | serve | bench | eval | compare | inspect | convert | backends | doctor`."""
+
+from importlib import metadata
+from typing import Annotated
+
+import typer
+
+# Importing a module declares its commands, in the order of --help
+# isort: off
+from turbopi.cli import demo, infer, serve, bench, checkpoints, backends, doctor  # noqa: F401
+from turbopi.cli.framework import app
+# isort: on
+
+__all__ = ["app", "main"]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        try:
+            print(f"turbopi {metadata.version('turbopi')}")
+        except metadata.PackageNotFoundError:
+            print("turbopi, not installed: run from its source folder")
+        raise typer.Exit
+
+
+@app.callback(
+    epilog="[bold]Exit codes[/]: 0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of Turbo-Pi's own."
+)
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Pi0.5 robot policies in real time, with openpi's exact semantics.
+
+    Start with `turbopi demo`: it needs no checkpoint and no GPU.
+    """
+
+
+def main() -> None:
+    app(prog_name="turbopi")

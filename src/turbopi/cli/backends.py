@@ -1,0 +1,52 @@
+"""`turbopi backends`."""
+
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from turbopi.cli.framework import JsonFlag, Output, command
+from turbopi.errors import ConfigError
+
+
+@command("backends", examples=("turbopi backends", "turbopi backends --device cpu --json"))
+def backends(
+    device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
+    precision: Annotated[
+        str, typer.Option("--precision", metavar="bf16|f32", help="For which auto would choose.")
+    ] = "bf16",
+    as_json: JsonFlag = False,
+) -> None:
+    """List the backends: whether each can run here, in which precisions, and why not."""
+    from turbopi import backends as registry
+
+    output = Output(as_json)
+    resolved = registry.resolve_device(device)
+    if precision not in registry.PRECISIONS:
+        raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(registry.PRECISIONS)}")
+    chosen, why = registry.choose(resolved, precision)
+    listed = [
+        {
+            "name": spec.name,
+            "available": (reason := registry.availability(spec.name, resolved)) is None,
+            "reason": reason,
+            "precisions": list(registry.precisions(spec.name)),
+            "summary": spec.summary,
+            "auto": spec.name == chosen,
+        }
+        for spec in registry.BACKENDS.values()
+    ]
+    table = Table(title=f"backends on {resolved}", title_justify="left")
+    for column in ("backend", "available", "precisions", "what it is, or why it can't run and what to do"):
+        table.add_column(column)
+    for entry in listed:
+        mark = "[green]yes[/]" if entry["available"] else "[red]no[/]"
+        name = f"[bold]{entry['name']}[/] (auto)" if entry["auto"] else str(entry["name"])
+        about = str(entry["summary"] if entry["available"] else entry["reason"])
+        table.add_row(name, mark, ", ".join(registry.precisions(str(entry["name"]))), escape(about))
+    output.table(table)
+    output.line(f"auto takes {chosen} in {precision}: {why.removeprefix('auto: ')}")
+    output.document(
+        {"device": str(resolved), "precision": precision, "auto": chosen, "auto_reason": why, "backends": listed}
+    )

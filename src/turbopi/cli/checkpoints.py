@@ -1,0 +1,192 @@
+"""`turbopi inspect` and `turbopi convert`."""
+
+import json
+import shutil
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
+from turbopi.cli.options import CheckpointArgument, WeightOptions
+
+PART_NAMES = {
+    "vision": "vision tower (SigLIP)",
+    "projector": "projector",
+    "vlm": "language model (PaliGemma)",
+    "expert": "action expert",
+    "action_time": "action, state and time projections",
+}
+
+
+@command(
+    "inspect",
+    shared=WeightOptions,
+    examples=(
+        "turbopi inspect checkpoints/pi05_libero",
+        "turbopi inspect checkpoints/pi05_droid --config pi05_droid --json",
+        "turbopi inspect --random-weights pi05_base --hash",
+    ),
+)
+def inspect(
+    options: WeightOptions,
+    checkpoint: CheckpointArgument = None,
+    hash: Annotated[
+        bool, typer.Option("--hash", help="Also the SHA-256 of the weights, the same in any format: reads them all.")
+    ] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Show what a checkpoint holds, without loading it: format, sizes, statistics, robot, horizon.
+
+    If its robot can't be known without --config, the rest is shown.
+    """
+    output = Output(as_json)
+    options.check(checkpoint)
+    from turbopi.checkpoint import inspect_checkpoint
+
+    if checkpoint is None:
+        info = options.open(None).info()
+    else:
+        info = inspect_checkpoint(checkpoint, "auto" if options.config is None else options.config)
+    if hash:
+        info["sha256"] = options.open(checkpoint).fingerprint()
+    _show(info, output)
+    output.document(info)
+
+
+def _show(info: dict[str, Any], output: Output) -> None:
+    facts = Table(show_header=False, title=info["path"] or "random weights", title_justify="left")
+    facts.add_column(style="bold")
+    facts.add_column(overflow="fold")
+    for name, value in _facts(info):
+        facts.add_row(name, escape(value))
+    output.table(facts)
+    parameters = Table(title="parameters", title_justify="left")
+    parameters.add_column("part")
+    parameters.add_column("count", justify="right")
+    for part, count in info["parameters"].items():
+        if part != "total":
+            parameters.add_row(PART_NAMES.get(part, part), f"{count:,}")
+    parameters.add_section()
+    parameters.add_row("total", f"{info['parameters']['total']:,}", style="bold")
+    output.table(parameters)
+    for note in info["notes"]:
+        output.line(f"note: {note}", "yellow")
+    if "config_error" in info:
+        output.line(f"not known yet: {info['config_error']}", "yellow")
+
+
+def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
+    facts = [("format", info["format"]), ("model", info["kind"])]
+    if "robot" in info:
+        normalization = info["normalization"]
+        facts += [
+            ("configuration", f"{info['name']}, from {info['config_source']}"),
+            ("robot", info["robot"]),
+            ("action horizon", str(info["action_horizon"])),
+            ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
+            ("statistics", _statistics_source(info)),
+            ("  of the state", _statistics(info["norm_stats"]["state"], normalization["state"])),
+            ("  of the actions", _statistics(info["norm_stats"]["actions"], normalization["actions"])),
+            *((f"sizes: {name}", _sizes(sizes)) for name, sizes in info["sizes"].items() if isinstance(sizes, dict)),
+            ("vocabulary", f"{info['sizes']['vocab_size']:,}"),
+            ("action dimensions", str(info["sizes"]["action_dim"])),
+        ]
+    else:
+        facts.append(("statistics", ", ".join(info["assets"]) or "none"))
+        facts += [(key.replace("_", " "), str(info[key])) for key in ("action_horizon", "action_dim") if key in info]
+    facts += [
+        ("weights", f"{info['tensors']} tensors, {info['stored_bytes'] / 1e9:.3f} GB, {_dtypes(info)}"),
+        ("tokenizer", ", ".join(info["tokenizers"]) or "none in the folder"),
+    ]
+    return [*facts, ("SHA-256", info["sha256"])] if "sha256" in info else facts
+
+
+def _statistics_source(info: dict[str, Any]) -> str:
+    if info["random_weights"]:
+        return "made up: values of about 1"
+    return f"asset {info['asset_id']}" if info["asset_id"] else "in the checkpoint's own files"
+
+
+def _state_input(info: dict[str, Any]) -> str:
+    if info["kind"] == "pi0":
+        return "the state is a token of its own"
+    return "the state in it" if info["discrete_state_input"] else "without the state"
+
+
+def _statistics(stats: dict[str, Any] | None, mode: str) -> str:
+    have = "none" if stats is None else f"{stats['dim']} dimensions of {', '.join(stats['statistics'])}"
+    return f"{mode}; {have}"
+
+
+def _sizes(sizes: dict[str, int]) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in sizes.items())
+
+
+def _dtypes(info: dict[str, Any]) -> str:
+    return "made as needed" if info["random_weights"] else f"stored as {', '.join(info['stored_dtypes'])}"
+
+
+class _ConvertCommand(CheckpointThen):
+    other = "FOLDER"
+
+
+@command(
+    "convert",
+    cls=_ConvertCommand,
+    shared=WeightOptions,
+    examples=(
+        "turbopi convert checkpoints/pi05_droid_jax checkpoints/pi05_droid --config pi05_droid",
+        "turbopi convert my_lerobot_policy converted --precision f32",
+        "turbopi convert --random-weights pi05_tiny tiny_checkpoint",
+    ),
+)
+def convert(
+    options: WeightOptions,
+    paths: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[CHECKPOINT] FOLDER",
+            help="The checkpoint's folder (none with --random-weights), then the new folder.",
+            show_default=False,
+        ),
+    ],
+    precision: Annotated[
+        str, typer.Option("--precision", metavar="bf16|f32", help="In which the weights are written.")
+    ] = "bf16",
+    as_json: JsonFlag = False,
+) -> None:
+    """Write a checkpoint in openpi's PyTorch layout, with its statistics and a turbopi.json that describes it.
+
+    Any format that Turbo-Pi reads goes in; --random-weights makes a checkpoint to try things with.
+    """
+    output = Output(as_json)
+    from turbopi.checkpoint import convert as write
+
+    source, target = options.split("convert", paths, "new folder")
+    opened = options.open(source)
+    options.tell_if_random(opened, output)
+    started = time.perf_counter()
+    folder = write(opened, Path(target), precision=precision, progress=output.shows_progress)  # type: ignore[arg-type]
+    seconds = time.perf_counter() - started
+    tokenizer = _complete_random(folder, options.weights_seed or 0) if opened.format == "random" else None
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    output.line(f"{opened.format} -> {folder}: {size / 1e9:.3f} GB in {precision}, {seconds:.1f} s")
+    output.line(f"Look at it with `turbopi inspect {folder}`.")
+    output.document(
+        {"folder": folder, "precision": precision, "bytes": size, "seconds": seconds, "tokenizer": tokenizer}
+    )
+
+
+def _complete_random(folder: Path, seed: int) -> Path:
+    """Make random weights' folder complete with the project's small tokenizer, and have it say what it is, always."""
+    from turbopi.checkpoint.settings import FILE_NAME
+    from turbopi.tokenizer import FILE_NAMES, TINY_TOKENIZER
+
+    settings = json.loads((folder / FILE_NAME).read_text())
+    settings["name"] += f" with random weights, seed {seed}"
+    (folder / FILE_NAME).write_text(json.dumps(settings, indent=2) + "\n")
+    return Path(shutil.copyfile(TINY_TOKENIZER, folder / FILE_NAMES[0]))

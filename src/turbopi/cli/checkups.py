@@ -1,0 +1,325 @@
+"""What `turbopi doctor` looks at. Each check is a function that returns a row; none of them changes anything."""
+
+import importlib
+import importlib.util
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from turbopi.cli.ports import why_not_free
+from turbopi.errors import TurboPiError
+
+Level = Literal["OK", "WARN", "FAIL"]
+
+MIN_PYTHON, MIN_TORCH = (3, 10), (2, 8)
+# Weights of the full-size model (docs: 3.617 B parameters), and room for what runs beside them
+FULL_SIZE_GB = {"bf16": 7.2, "f32": 14.5}
+ACTIVATIONS_GB = 1.5
+MIN_CAPABILITY = (8, 0)  # the first with bfloat16 tensor cores
+MIN_DRIVER = 525  # CUDA 12
+MIN_DISK_GB = 15.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the report; `fix` is empty if there is nothing to do."""
+
+    level: Level
+    name: str
+    found: str
+    fix: str = ""
+
+
+def examine(*, checkpoint: str | None, config: str | None, tokenizer: str | None, port: int) -> Iterator[Row]:
+    """Every check, in the order in which to mend things."""
+    yield check_python()
+    yield check_packages()
+    yield check_torch()
+    yield from check_gpu()
+    yield check_triton()
+    yield check_compiler()
+    yield check_cpu()
+    opened, row = (None, None) if checkpoint is None else open_for_check(checkpoint, config)
+    yield check_memory(None if opened is None else opened.info()["parameters"]["total"])
+    if row is not None:
+        yield row
+    if checkpoint is None or opened is not None:  # a checkpoint that can't be opened hides its tokenizer
+        yield check_tokenizer(tokenizer, opened)
+    yield check_port(port)
+    yield check_disk(Path.cwd())
+
+
+def check_python() -> Row:
+    found = f"{platform.python_version()} ({sys.executable})"
+    if sys.version_info < MIN_PYTHON:
+        return Row("FAIL", "Python", found, "install Python 3.10 or newer, and make the environment anew with it")
+    return Row("OK", "Python", found)
+
+
+def check_packages() -> Row:
+    """Everything that Turbo-Pi requires is installed, and recent enough."""
+    try:
+        required = metadata.requires("turbopi") or []
+        version = metadata.version("turbopi")
+    except metadata.PackageNotFoundError:
+        return Row("WARN", "packages", "turbopi itself isn't installed", "pip install -e . in its folder")
+    problems = []
+    for requirement in required:
+        match = re.match(r"([A-Za-z0-9_.-]+)\s*(?:>=\s*([\d.]+))?", requirement)
+        if match is None or "extra ==" in requirement:
+            continue
+        name, minimum = match.groups()
+        try:
+            installed = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            problems.append(f"{name} is missing")
+            continue
+        if minimum and version_tuple(installed) < version_tuple(minimum):
+            problems.append(f"{name} is {installed}, older than {minimum}")
+    if problems:
+        return Row("FAIL", "packages", "; ".join(problems), "pip install --upgrade turbopi")
+    return Row("OK", "packages", f"turbopi {version} and all that it requires")
+
+
+def version_tuple(version: str) -> tuple[int, ...]:
+    """The leading numbers: "2.13.0+cpu" is (2, 13, 0)."""
+    leading = re.match(r"\d+(\.\d+)*", version)
+    return tuple(int(part) for part in leading[0].split(".")) if leading else ()
+
+
+def check_torch() -> Row:
+    try:
+        import torch
+    except Exception as error:  # a broken installation raises anything
+        return Row("FAIL", "PyTorch", f"can't be imported: {error}", "pip install --force-reinstall 'torch>=2.8'")
+    build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "ROCm" if torch.version.hip else "CPU only"
+    found = f"{torch.__version__} ({build})"
+    if version_tuple(torch.__version__) < MIN_TORCH:
+        return Row("FAIL", "PyTorch", found, "pip install --upgrade 'torch>=2.8'")
+    return Row("OK", "PyTorch", found)
+
+
+def check_gpu() -> Iterator[Row]:
+    """Driver and GPUs, or why there are none."""
+    torch: Any = _torch()
+    if torch is None:
+        return
+    driver, names = nvidia_smi()
+    if not torch.cuda.is_available():
+        yield _no_gpu(torch, driver, names)
+        return
+    if driver is not None:
+        old = version_tuple(driver)[:1] < (MIN_DRIVER,)
+        fix = f"update the NVIDIA driver to {MIN_DRIVER} or newer" if old else ""
+        yield Row("WARN" if old else "OK", "NVIDIA driver", driver, fix)
+    supported = torch.cuda.get_arch_list()
+    for index in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(index)
+        yield judge_gpu(
+            index,
+            properties.name,
+            (properties.major, properties.minor),
+            properties.total_memory / 1e9,
+            supported,
+        )
+
+
+def judge_gpu(index: int, name: str, capability: tuple[int, int], memory_gb: float, supported: list[str]) -> Row:
+    """One GPU: what PyTorch can do with it, and whether the model fits."""
+    major, minor = capability
+    found = f"{name}, compute capability {major}.{minor}, {memory_gb:.0f} GB"
+    label = f"GPU {index}"
+    known = [re.sub(r"\D", "", arch) for arch in supported]
+    # code for 8.0 runs on 8.6; a PTX ("compute_90") runs on anything newer
+    runs = any(arch[:-1] == str(major) and int(arch[-1]) <= minor for arch in known if arch)
+    ptx = [int(re.sub(r"\D", "", arch)) for arch in supported if arch.startswith("compute_")]
+    if supported and not runs and not any(major * 10 + minor >= arch for arch in ptx):
+        return Row(
+            "FAIL", label, f"{found}; this PyTorch has no code for it", "install a PyTorch built for it: pytorch.org"
+        )
+    if capability < MIN_CAPABILITY:
+        return Row("WARN", label, found, "bfloat16 is slow below 8.0 (Ampere): use a newer GPU")
+    if memory_gb < FULL_SIZE_GB["bf16"] + ACTIVATIONS_GB:
+        return Row("WARN", label, found, "too small for a full-size model in bf16 (about 9 GB); tiny ones run")
+    return Row("OK", label, found)
+
+
+def _no_gpu(torch: Any, driver: str | None, names: list[str]) -> Row:
+    if names and torch.version.cuda is None:
+        return Row(
+            "FAIL",
+            "GPU",
+            f"{', '.join(names)}, but this PyTorch is built without CUDA",
+            "pip install --force-reinstall torch (on Linux the wheels of PyPI have CUDA)",
+        )
+    if names:
+        return Row(
+            "FAIL",
+            "GPU",
+            f"{', '.join(names)} (driver {driver}), but PyTorch (CUDA {torch.version.cuda}) can't use it",
+            "update the NVIDIA driver, or see that CUDA_VISIBLE_DEVICES and the container let the GPU through",
+        )
+    return Row("WARN", "GPU", "no NVIDIA GPU", "none needed for pi05_tiny, tests and development; real time needs one")
+
+
+def nvidia_smi() -> tuple[str | None, list[str]]:
+    """Driver version and GPU names as nvidia-smi tells them; nothing if it isn't there or fails."""
+    program = shutil.which("nvidia-smi")
+    if program is None:
+        return None, []
+    query = [program, "--query-gpu=driver_version,name", "--format=csv,noheader"]
+    try:
+        lines = subprocess.run(query, capture_output=True, text=True, timeout=20, check=True).stdout.splitlines()
+    except (OSError, subprocess.SubprocessError):
+        return None, []
+    pairs = [line.split(",", 1) for line in lines if "," in line]
+    return (pairs[0][0].strip() if pairs else None), [name.strip() for _, name in pairs]
+
+
+def check_triton() -> Row:
+    torch: Any = _torch()
+    has_gpu = torch is not None and torch.cuda.is_available()
+    if importlib.util.find_spec("triton") is None:
+        if has_gpu:
+            return Row("FAIL", "Triton", "missing", "pip install triton")
+        return Row("OK", "Triton", "not installed; only GPUs need it")
+    try:
+        return Row("OK", "Triton", str(importlib.import_module("triton").__version__))
+    except Exception as error:
+        return Row("FAIL", "Triton", f"can't be imported: {error}", "pip install --force-reinstall triton")
+
+
+def check_compiler() -> Row:
+    """Triton builds its launcher with a C compiler, torch.compile its CPU code with a C++ one."""
+    found = [path for name in ("gcc", "g++", "clang", "clang++") if (path := shutil.which(name))]
+    c, cpp = (any(Path(path).name in names for path in found) for names in (("gcc", "clang"), ("g++", "clang++")))
+    if c and cpp:
+        return Row("OK", "C compiler", ", ".join(found))
+    lacks = "no C++ compiler" if c else "no C compiler"
+    return Row("WARN", "C compiler", lacks, "apt install gcc g++: pytorch_compile and Triton kernels need them")
+
+
+def check_cpu() -> Row:
+    import psutil
+
+    torch: Any = _torch()
+    cores = psutil.cpu_count(logical=False)
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = None if torch is None else torch.get_num_threads()
+    found = f"{cores or '?'} cores, {usable} usable CPUs, PyTorch uses {threads} threads"
+    if threads is not None and threads > usable:
+        return Row("WARN", "CPU", found, f"set OMP_NUM_THREADS={usable}: more threads than CPUs are slow")
+    load = psutil.getloadavg()[0]
+    if load > usable:  # threads that wait for each other spin: measured 5 times slower on busy CPUs
+        busy = f"{found}, but {load:.1f} want to run"
+        return Row("WARN", "CPU", busy, "stop other programs, or set OMP_WAIT_POLICY=PASSIVE: steady, a bit slower")
+    return Row("OK", "CPU", found)
+
+
+def check_memory(parameters: int | None) -> Row:
+    """Host memory against the weights: a checkpoint's, or the full-size model's."""
+    import psutil
+
+    available = psutil.virtual_memory().available / 1e9
+    limit = cgroup_limit_gb()
+    found = f"{available:.1f} GB free" + (f", at most {limit:.1f} GB allowed here" if limit is not None else "")
+    usable = min(available, limit) if limit is not None else available
+    need = {"bf16": 2e-9 * parameters, "f32": 4e-9 * parameters} if parameters is not None else FULL_SIZE_GB
+    what = "this checkpoint" if parameters is not None else "full size"
+    needs = f"{what} takes {need['bf16']:.1f} GB in bf16, {need['f32']:.1f} GB in f32"
+    if usable < need["bf16"]:
+        level: Level = "FAIL" if parameters is not None and not _has_gpu() else "WARN"
+        fix = f"{needs}: free memory" + (", or load it onto a GPU" if _has_gpu() else ", or use a larger machine")
+        return Row(level, "memory", found, fix)
+    if usable < need["f32"]:
+        return Row("OK", "memory", f"{found}; {needs}: enough for bf16 alone")
+    return Row("OK", "memory", f"{found}; {needs}")
+
+
+def cgroup_limit_gb(root: Path = Path("/sys/fs/cgroup")) -> float | None:
+    """A container's memory limit; None if there is none."""
+    for name in ("memory.max", "memory/memory.limit_in_bytes"):
+        try:
+            text = (root / name).read_text().strip()
+        except OSError:
+            continue
+        if text.isdigit() and int(text) < 2**60:
+            return int(text) / 1e9
+    return None
+
+
+def open_for_check(path: str, config: str | None) -> tuple[Any, Row]:
+    """The opened checkpoint (None if it can't be), and its row."""
+    from turbopi.checkpoint import open_checkpoint
+
+    try:
+        opened = open_checkpoint(path, "auto" if config is None else config)
+    except TurboPiError as error:
+        return None, Row("FAIL", "checkpoint", str(error), "see the message")
+    info = opened.info()
+    found = (
+        f"{info['path']}: {info['format']}, {info['kind']}, {info['name']} for {info['robot']}, "
+        f"{info['parameters']['total'] / 1e6:,.0f} M parameters"
+    )
+    return opened, Row("OK", "checkpoint", found)
+
+
+def check_tokenizer(given: str | None, checkpoint: Any) -> Row:
+    """Where UnifiedPolicy would find its tokenizer. Without a checkpoint, its absence is only a warning."""
+    from turbopi.config import ModelConfig
+    from turbopi.tokenizer import load_tokenizer
+
+    vocab_size = ModelConfig().vocab_size if checkpoint is None else checkpoint.config.model.vocab_size
+    try:
+        loaded = load_tokenizer(
+            given,
+            vocab_size=vocab_size,
+            checkpoint_dir=None if checkpoint is None else checkpoint.path,
+            candidates=() if checkpoint is None else checkpoint.tokenizer_candidates,
+        )
+    except TurboPiError as error:
+        first, *rest = str(error).splitlines()
+        fix = " && ".join(line.strip() for line in rest if "curl" in line or "mkdir" in line) or "see the message"
+        if checkpoint is None and given is None:
+            return Row("WARN", "tokenizer", "PaliGemma's isn't here; a real checkpoint needs it", fix)
+        return Row("FAIL", "tokenizer", first.removesuffix(". Looked for:"), fix)
+    return Row("OK", "tokenizer", loaded.source)
+
+
+def check_port(port: int) -> Row:
+    reason = why_not_free("127.0.0.1", port)
+    if reason is not None:
+        return Row("WARN", f"port {port}", f"can't be listened on: {reason}", "turbopi serve --port N with another one")
+    return Row("OK", f"port {port}", "free")
+
+
+def check_disk(folder: Path) -> Row:
+    free = shutil.disk_usage(folder).free / 1e9
+    found = f"{free:.0f} GB free in {folder}"
+    if free < MIN_DISK_GB:
+        need = f"a full-size checkpoint takes {FULL_SIZE_GB['bf16']} GB in bf16, {FULL_SIZE_GB['f32']} GB in f32"
+        return Row("WARN", "disk", found, f"{need}: free some, or convert into another folder")
+    if not os.access(folder, os.W_OK):
+        return Row("WARN", "disk", f"{folder} isn't writable", "work in a folder of yours: reports are written to it")
+    return Row("OK", "disk", found)
+
+
+def _torch() -> Any:
+    """PyTorch, or None where it can't be imported (check_torch says so)."""
+    try:
+        return importlib.import_module("torch")
+    except Exception:
+        return None
+
+
+def _has_gpu() -> bool:
+    torch = _torch()
+    return torch is not None and bool(torch.cuda.is_available())

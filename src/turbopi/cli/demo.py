@@ -1,0 +1,215 @@
+"""`turbopi demo`."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import Progress
+from rich.table import Table
+
+from turbopi.cli.files import check_folder
+from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console, plain
+from turbopi.cli.options import CheckpointArgument, PolicyOptions
+from turbopi.cli.timings import timing_columns
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from turbopi.demo import Frame, OracleCheck
+
+DEFAULT_PRESET = "pi05_tiny"
+
+
+@command(
+    "demo",
+    shared=PolicyOptions,
+    examples=(
+        "turbopi demo",
+        "turbopi demo --backend pytorch_compile --steps 5 --report /tmp/report",
+        "turbopi demo checkpoints/pi05_libero --config pi05_libero",
+        "turbopi demo --random-weights pi05_libero --frames 1",
+    ),
+)
+def demo(
+    options: PolicyOptions,
+    checkpoint: CheckpointArgument = None,
+    report: Annotated[
+        Path, typer.Option("--report", metavar="DIR", help="Where pictures, actions and numbers are written.")
+    ] = Path("turbopi-report"),
+    frames: Annotated[
+        int | None,
+        typer.Option("--frames", min=1, metavar="N", help="Use only the first N frames.", show_default="all"),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the noise that actions start from.")] = 0,
+    as_json: JsonFlag = False,
+) -> None:
+    """Run a policy on real LIBERO pictures and check it against the float32 oracle.
+
+    Without a checkpoint the weights are random (pi05_tiny): the whole way runs, in under a minute on two cores, but the
+    actions mean nothing. The report folder gets demo.png, actions.npz and report.json. Exit code 1: the check failed.
+    """
+    if checkpoint is None and options.random_weights is None:
+        from dataclasses import replace
+
+        options = replace(options, random_weights=DEFAULT_PRESET)
+    check_folder(report)  # what can't be written is better known before the work
+    output = Output(as_json)
+    run = _Run(options, checkpoint, frames, seed, output)
+    run.report_to(report)
+    if not run.check.ok:
+        raise typer.Exit(CHECK_FAILED)
+
+
+class _Run:
+    """One demo: the backend on every frame, then the oracle; prints as it goes."""
+
+    def __init__(
+        self, options: PolicyOptions, checkpoint: str | None, limit: int | None, seed: int, output: Output
+    ) -> None:
+        opened = options.open(checkpoint)
+        from turbopi.demo import check, load_frames, num_oracle_runs, observations, run_frames, with_libero_stats
+        from turbopi.policy import UnifiedPolicy
+
+        self.output, self.seed = output, seed
+        self.frames: list[Frame] = load_frames()[:limit]
+        options.tell_if_random(opened, output)
+        opened = with_libero_stats(opened)
+        policy = options.make_policy(opened, output)
+        self.metadata = policy.metadata
+        self.robot: str = self.metadata["robot"]
+        output.line(f"warm-up: {policy.warmup():.2f} s")
+        observed = observations(policy, self.frames)
+        with _progress(output) as bar:
+            task = bar.add_task("policy", total=len(observed))
+            self.results = run_frames(policy, observed, seed, lambda: bar.advance(task))
+        self._show_timings()
+        self._show_chunk(self.results[0]["actions"])
+
+        del policy  # its weights make room for the oracle's
+        arguments = options.policy_arguments() | {"backend": "pytorch", "precision": "f32"}
+        oracle = UnifiedPolicy(opened, progress=output.shows_progress, **arguments)
+        with _progress(output) as bar:
+            task = bar.add_task("float32 oracle and its control", total=num_oracle_runs(len(observed)))
+            self.check: OracleCheck = check(
+                [result["actions"] for result in self.results],
+                oracle,
+                observed,
+                precision=self.metadata["precision"],
+                seed=seed,
+                tick=lambda: bar.advance(task),
+            )
+        self._show_check()
+
+    def _show_timings(self) -> None:
+        columns = timing_columns(self.results[0]["policy_timing"])
+        table = Table(title="milliseconds", title_justify="left")
+        table.add_column("frame")
+        table.add_column("prompt", overflow="fold")
+        for name in columns:
+            table.add_column(name, justify="right")
+        for number, (frame, result) in enumerate(zip(self.frames, self.results, strict=True)):
+            timing = result["policy_timing"]
+            table.add_row(str(number), frame.prompt, *(f"{timing[key]:.1f}" for key in columns.values()))
+        self.output.table(table)
+
+    def _show_chunk(self, actions: "np.ndarray") -> None:
+        from turbopi.plots import action_groups
+
+        steps, dims = actions.shape
+        shown = min(steps, 10, max(3, (self.output.console.width - 30) // 9))
+        cut = f"; the first {shown}" if shown < steps else ""
+        title = f"frame 0: the chunk, {steps} steps of {dims}{cut} (step 0 is the next to execute)"
+        table = Table(title=title, title_justify="left")
+        for heading in ("action", "unit"):
+            table.add_column(heading, no_wrap=True)
+        for step in range(shown):
+            table.add_column(str(step), justify="right")
+        for group in action_groups(self.robot, dims):
+            table.add_section()
+            for index, name in group.names.items():
+                label = name if name == group.title or name.startswith("dim ") else f"{group.title} {name}"
+                table.add_row(label, group.unit, *(f"{value:+.3f}" for value in actions[:shown, index]))
+        self.output.table(table)
+
+    def _show_check(self) -> None:
+        check, worst = self.check, self.check.worst
+        table = Table(title="against the float32 oracle, same noise", title_justify="left")
+        for column in ("frame", "rms error", "its bound", "max error", ""):
+            table.add_column(column, justify="left" if column == "" else "right")
+        for number, difference in enumerate(check.differences):
+            ok = difference.rms <= check.bound
+            verdict = "[green]ok[/]" if ok else "[bold red]FAIL[/]"
+            values = (f"{value:.1e}" for value in (difference.rms, check.bound, difference.max))
+            table.add_row(str(number), *values, verdict)
+        self.output.table(table)
+        precision = self.metadata["precision"]
+        step = "half a bfloat16 step" if precision == "bf16" else "half a float32 step (scaled from bfloat16's)"
+        self.output.line(
+            "Errors are in units of each action dimension's own spread. "
+            f"The bound is {check.factor:g} times the control, {check.control:.1e}: how far the oracle itself moves "
+            f"when every weight moves by up to {step}.",
+            "dim",
+        )
+        backend = self.metadata["backend"]
+        if check.ok:
+            self.output.line(
+                f"OK: {backend} {precision} is within {worst.rms:.1e} of the oracle (bound {check.bound:.1e}).",
+                "bold green",
+            )
+        else:
+            self.output.line(
+                f"FAIL: {backend} {precision} is {worst.rms:.1e} from the oracle, beyond its bound "
+                f"{check.bound:.1e}: this is more than rounding.",
+                "bold red",
+            )
+
+    def report_to(self, folder: Path) -> None:
+        """Write demo.png, actions.npz and report.json."""
+        import numpy as np
+
+        folder.mkdir(parents=True, exist_ok=True)
+        actions = np.stack([result["actions"] for result in self.results])
+        np.savez(folder / "actions.npz", actions=actions, oracle_actions=self.check.oracle_actions)
+        document = self._document()
+        text = json.dumps(plain(document), indent=1, ensure_ascii=False)
+        (folder / "report.json").write_text(text + "\n", encoding="utf-8")
+        self._plot(folder / "demo.png")
+        self.output.line(f"written to {folder}: demo.png, actions.npz, report.json")
+        self.output.document(document)
+
+    def _document(self) -> dict[str, Any]:
+        return {
+            "ok": self.check.ok,
+            "random_weights": self.metadata["random_weights"],
+            "check": self.check.as_json(),
+            "seed": self.seed,
+            "frames": [
+                {"prompt": frame.prompt, "timing": result["policy_timing"], "actions": result["actions"]}
+                for frame, result in zip(self.frames, self.results, strict=True)
+            ],
+            "policy": self.metadata,
+        }
+
+    def _plot(self, file: Path) -> None:
+        from turbopi.plots import Row, plot_chunks
+
+        rows = [
+            Row(
+                heading=f"“{frame.prompt}”    {result['policy_timing']['total_ms']:.0f} ms, "
+                f"rms error {difference.rms:.2%}",
+                pictures={"base camera": frame.base, "wrist camera": frame.wrist},
+                actions=result["actions"],
+                oracle=truth,
+            )
+            for frame, result, truth, difference in zip(
+                self.frames, self.results, self.check.oracle_actions, self.check.differences, strict=True
+            )
+        ]
+        about = self.metadata
+        title = f"turbopi demo: {about['config']}, {about['backend']} {about['precision']} on {about['device_name']}"
+        plot_chunks(file, rows, robot=self.robot, title=title, random_weights=about["random_weights"])
+
+
+def _progress(output: Output) -> Progress:
+    return Progress(console=new_console(stderr=True), disable=not output.shows_progress, transient=True)

@@ -1,0 +1,46 @@
+"""Files that commands write and read."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from turbopi.errors import ConfigError, ObservationError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+def check_folder(folder: Path) -> None:
+    """Raise ConfigError now for a folder that couldn't be made or written to later, after all the work."""
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise ConfigError(f"can't write into {folder}: {existing} is a file")
+    if not os.access(existing, os.W_OK):
+        raise ConfigError(f"can't write into {folder}: {existing} isn't writable")
+
+
+def check_writable(file: Path) -> None:
+    """Raise ConfigError now for an output file that couldn't be written later, after all the work."""
+    if file.is_dir():
+        raise ConfigError(f"{file} is a folder; give a file's name")
+    if not file.absolute().parent.is_dir():
+        raise ConfigError(f"can't write {file}: there is no folder {file.absolute().parent}")
+
+
+def load_noise(file: Path) -> "np.ndarray":
+    """The noise in an .npy file, or under `noise` in an .npz. Raises ObservationError if there is none."""
+    import numpy as np
+
+    try:
+        content = np.load(file, allow_pickle=False)
+    except OSError as error:
+        raise ObservationError(f"the noise {file} can't be read: {error.strerror or error}") from error
+    except (ValueError, EOFError) as error:
+        raise ObservationError(f"the noise {file} is neither .npy nor .npz: {error}") from error
+    if isinstance(content, np.ndarray):
+        return content
+    with content:
+        if "noise" not in content.files:
+            raise ObservationError(f"{file} has no array named noise, only {', '.join(content.files) or 'nothing'}")
+        noise: np.ndarray = content["noise"]
+        return noise

@@ -1,0 +1,201 @@
+"""What every command shares: how it is declared, where its output goes, and how it fails.
+
+Exit codes: 0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of Turbo-Pi's own, 130 Ctrl-C.
+Nothing here or at the top of a command's module imports torch, so that `turbopi --help` answers at once.
+"""
+
+import functools
+import inspect
+import json
+import logging
+import math
+import os
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import rich
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from typer.core import TyperCommand
+
+from turbopi.errors import TurboPiError
+
+CHECK_FAILED, BAD_INPUT, OUR_FAULT, INTERRUPTED = 1, 2, 3, 130
+PLAIN_WIDTH = 140  # columns of tables where there is no terminal
+
+app = typer.Typer(
+    name="turbopi",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+JsonFlag = Annotated[
+    bool,
+    typer.Option("--json", help="Print one JSON document to standard output; all else goes to standard error."),
+]
+_Debug = Annotated[
+    bool, typer.Option("--debug", envvar="TURBOPI_DEBUG", help="Show the traceback of an error.", show_default=False)
+]
+
+
+class Output:
+    """Where a command writes: people's output to stdout, or, with --json, to stderr beside one document on stdout."""
+
+    def __init__(self, as_json: bool = False) -> None:
+        self.as_json = as_json
+        self.console = new_console(stderr=as_json)
+
+    def line(self, text: str = "", style: str | None = None) -> None:
+        """A line, taken as it is and never wrapped."""
+        self.console.print(escape(text), style=style, highlight=False, soft_wrap=True)
+
+    def styled(self, markup: str) -> None:
+        """A line with rich's markup, never wrapped."""
+        self.console.print(markup, highlight=False, soft_wrap=True)
+
+    def table(self, table: Table) -> None:
+        self.console.print(table)
+
+    def document(self, content: Mapping[str, Any]) -> None:
+        """The JSON document, if one was asked for."""
+        if self.as_json:
+            sys.stdout.write(json.dumps(plain(content), indent=1, ensure_ascii=False) + "\n")
+
+    @property
+    def shows_progress(self) -> bool:
+        """Bars are for people who watch; they are drawn on stderr."""
+        return sys.stderr.isatty()
+
+
+def new_console(*, stderr: bool) -> Console:
+    """A console that doesn't squeeze tables into 80 columns when its output goes to a file or a pipe."""
+    console = Console(stderr=stderr)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = PLAIN_WIDTH
+    return console
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON's types: arrays as lists, paths as text, what isn't finite as null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):  # NumPy
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+class CheckpointThen(TyperCommand):
+    """A command whose one argument is a list: a checkpoint, which random weights do without, and something else."""
+
+    other = "PATH"
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        return ["[OPTIONS]", "[CHECKPOINT]", self.other]
+
+
+def command(
+    name: str, *, examples: Sequence[str], shared: type | None = None, cls: type[TyperCommand] | None = None
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Declare a function as `turbopi <name>`.
+
+    examples   command lines for the end of its --help
+    shared     a dataclass whose annotated fields become options; the function gets an instance as `options`
+    cls        for another usage line
+    """
+    shared_fields = fields(shared) if shared is not None else ()
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(function)
+        def run(*, debug: bool, **values: Any) -> None:
+            if shared is not None:
+                values["options"] = shared(**{field.name: values.pop(field.name) for field in shared_fields})
+            with_errors_told(lambda: function(**values), debug=debug)
+
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        own = [p.replace(kind=keyword) for p in inspect.signature(function).parameters.values() if p.name != "options"]
+        injected = [
+            inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)
+            for field in shared_fields
+        ]
+        parameters = [*own, *injected, inspect.Parameter("debug", keyword, default=False, annotation=_Debug)]
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in parameters}
+        del run.__wrapped__  # or typer would read the undecorated signature
+        app.command(name, cls=cls, help=_unwrapped(function), epilog=_epilog(examples))(run)
+        return run
+
+    return decorate
+
+
+def _unwrapped(function: Callable[..., None]) -> str:
+    """The docstring with each paragraph on one line: the terminal's width decides where lines end."""
+    paragraphs = inspect.cleandoc(function.__doc__ or "").split("\n\n")
+    return "\n\n".join(escape(" ".join(paragraph.split())) for paragraph in paragraphs)
+
+
+def _epilog(examples: Sequence[str]) -> str:
+    lines = [f"[cyan]{escape(example)}[/]" for example in examples]
+    return "\n\n".join(["[bold]Examples[/]", *lines])
+
+
+def with_errors_told(work: Callable[[], None], *, debug: bool) -> None:
+    """Run a command; an error becomes one red line on stderr and an exit code, and only our faults a traceback."""
+    rich.reconfigure(stderr=True)  # progress bars of the library use rich's own console
+    _log_to_stderr()
+    try:
+        work()
+    except (typer.Exit, typer.Abort, BrokenPipeError):
+        raise
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
+    except Exception as error:
+        message = _users_message(error)
+        if debug or message is None:
+            traceback.print_exc()
+        if message is None:
+            message = f"this is a fault of Turbo-Pi's own ({type(error).__name__}); please report it with the traceback"
+        console = new_console(stderr=True)
+        console.print(f"[bold red]error:[/] {escape(message)}", highlight=False, soft_wrap=True)
+        raise typer.Exit(OUR_FAULT if _users_message(error) is None else BAD_INPUT) from None
+
+
+def _users_message(error: Exception) -> str | None:
+    """What to tell of an error that isn't a fault in the program; None if it is one."""
+    if isinstance(error, TurboPiError):
+        return str(error)
+    if isinstance(error, OSError) and error.filename is not None:  # a file of the user's: unwritable, vanished, …
+        return f"{os.fsdecode(error.filename)}: {error.strerror}"
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # torch's, unimported
+        return (
+            f"out of memory: {error}. Full-size models need 7.2 GB in bf16 and 14.5 GB in f32; "
+            "`turbopi doctor` shows what there is"
+        )
+    return None
+
+
+class _StderrHandler(logging.Handler):
+    """Log records as short lines on whatever sys.stderr is when they come."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
+        print(f"{level}{record.getMessage()}", file=sys.stderr, flush=True)
+        if record.exc_info:
+            traceback.print_exception(*record.exc_info, file=sys.stderr)
+
+
+def _log_to_stderr() -> None:
+    logger = logging.getLogger("turbopi")
+    if not any(isinstance(handler, _StderrHandler) for handler in logger.handlers):
+        logger.addHandler(_StderrHandler())

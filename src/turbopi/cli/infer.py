@@ -1,0 +1,241 @@
+"""`turbopi infer`."""
+
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import Progress
+from rich.table import Table
+
+from turbopi.cli.files import check_writable, load_noise
+from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command, new_console
+from turbopi.cli.options import PolicyOptions
+from turbopi.cli.timings import timing_columns
+from turbopi.errors import ConfigError, ObservationError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from turbopi.policy import UnifiedPolicy
+
+PLOT_SUFFIXES = (".png", ".pdf", ".svg")
+MAX_ROWS = 8  # of a plot; a recording's other calls are in the .npz
+
+
+class _InferCommand(CheckpointThen):
+    other = "OBSERVATION"
+
+
+@command(
+    "infer",
+    cls=_InferCommand,
+    shared=PolicyOptions,
+    examples=(
+        "turbopi infer checkpoints/pi05_libero observation.npz --config pi05_libero",
+        "turbopi infer checkpoints/pi05_droid my_observation/ -o actions.npz --plot actions.png --seed 7",
+        "turbopi infer --random-weights pi05_tiny recordings/20260101T120000Z --call 0",
+    ),
+)
+def infer(
+    options: PolicyOptions,
+    paths: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[CHECKPOINT] OBSERVATION",
+            help="The checkpoint's folder (none with --random-weights), then the observation: an .npz with the robot's "
+            "keys; a folder with observation.json and the pictures that it names; or what `turbopi serve --record` "
+            "wrote, a call or a folder of them.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="Where the actions go, an .npz.")] = Path(
+        "actions.npz"
+    ),
+    plot: Annotated[
+        Path | None,
+        typer.Option("--plot", metavar="FILE", help="Where the plot goes.", show_default="beside the actions, .png"),
+    ] = None,
+    no_plot: Annotated[bool, typer.Option("--no-plot", help="Draw none.")] = False,
+    noise: Annotated[
+        Path | None,
+        typer.Option("--noise", metavar="FILE", help="The noise to start from: an .npy, or `noise` in an .npz."),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            "--seed", min=0, metavar="N", help="Of the noise; call i of a recording takes N + i.", show_default="new"
+        ),
+    ] = None,
+    call: Annotated[
+        int | None, typer.Option("--call", min=0, metavar="N", help="Of a recording, only call N.", show_default="all")
+    ] = None,
+    warmup: Annotated[bool, typer.Option("--warmup/--no-warmup", help="Run once before, for true times.")] = True,
+    as_json: JsonFlag = False,
+) -> None:
+    """Turn an observation into an action chunk.
+
+    The .npz gets `actions`, float64[H, d] in the robot's units ([N, H, d] for a recording of N calls), and `noise`, the
+    noise they started from.
+    """
+    output = Output(as_json)
+    checkpoint, source = options.split("infer", paths, "observation")
+    if noise is not None and seed is not None:
+        raise ConfigError("--noise and --seed were both given; give one of them")
+    if plot is not None and no_plot:
+        raise ConfigError("--plot and --no-plot were both given; give one of them")
+    check_writable(out)
+    drawing = None if no_plot else plot or out.with_suffix(".png")
+    from turbopi.serve.record import load_observation
+
+    _check_targets(Path(source), out, drawing)
+    sources = _sources(Path(source), call)
+    load_observation(sources[0])  # what can't be read is better known before minutes of loading
+    given_noise = None if noise is None else load_noise(noise)
+    opened = options.open(checkpoint)
+    options.tell_if_random(opened, output)
+    policy = options.make_policy(opened, output)
+    draw = _noise(policy, given_noise, seed, output)
+    if warmup:
+        output.line(f"warm-up: {policy.warmup():.2f} s")
+    answers = _run(policy, sources, draw, output)
+    _show_timings([answer.timing for answer in answers], output)
+    _write(out, answers, output)
+    if drawing is not None:
+        _plot(drawing, policy.metadata, answers)
+        output.line(f"plot written to {drawing}")
+    output.document(
+        {
+            "actions": _joined([answer.actions for answer in answers]),
+            "policy_timing": [answer.timing for answer in answers],
+            "out": out,
+            "plot": drawing,
+            "policy": policy.metadata,
+        }
+    )
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """One call. The observation is kept only while a plot may show it."""
+
+    observation: dict[str, Any] | None
+    noise: "np.ndarray"
+    actions: "np.ndarray"
+    timing: dict[str, float]
+
+
+def _check_targets(source: Path, out: Path, drawing: Path | None) -> None:
+    if drawing is not None:
+        check_writable(drawing)
+    for file in (out, drawing):
+        if file is not None and file.exists() and source.exists() and file.samefile(source):
+            raise ConfigError(f"{file} is the observation itself: write to another file")
+    if drawing is not None and drawing.absolute() == out.absolute():
+        raise ConfigError(f"the actions and the plot would both be written to {out}: end the former's name in .npz")
+    if drawing is not None and drawing.suffix not in PLOT_SUFFIXES:
+        raise ConfigError(f"the plot {drawing} should end in one of {', '.join(PLOT_SUFFIXES)}")
+
+
+def _sources(path: Path, call: int | None) -> list[Path]:
+    """The observation at a path, or all those of a recording; `call` picks one of them."""
+    from turbopi.serve.record import recorded_files
+
+    if not path.is_dir() or (path / "observation.json").is_file():
+        if call is not None:
+            raise ConfigError(f"--call picks one call of a recording's folder, but {path} is a single observation")
+        return [path]
+    files = recorded_files(path)
+    if call is None:
+        return files
+    if call >= len(files):
+        raise ConfigError(f"there is no call {call}: {path} holds {len(files)}, numbered from 0")
+    return [files[call]]
+
+
+def _noise(
+    policy: "UnifiedPolicy", given: "np.ndarray | None", seed: int | None, output: Output
+) -> Callable[[int], "np.ndarray"]:
+    """Call i -> float32[H, action_dim]: the given noise for all, or what UnifiedPolicy draws for seed + i."""
+    import numpy as np
+
+    if given is not None:
+        return lambda number: given
+    first = secrets.randbelow(2**31) if seed is None else seed
+    if seed is None:
+        output.line(f"noise: seed {first} (--seed {first} gives these actions again)")
+    shape = (policy.config.model.action_horizon, policy.config.model.action_dim)
+    return lambda number: np.random.default_rng(first + number).standard_normal(shape, dtype=np.float32)
+
+
+def _run(
+    policy: "UnifiedPolicy", sources: list[Path], draw: Callable[[int], "np.ndarray"], output: Output
+) -> list[_Answer]:
+    """Every observation through the policy. ObservationError names the file of a recording that is wrong."""
+    from turbopi.serve.record import load_observation
+
+    answers = []
+    hidden = not output.shows_progress or len(sources) == 1
+    with Progress(console=new_console(stderr=True), disable=hidden, transient=True) as bar:
+        for number, source in enumerate(bar.track(sources, description="observations")):
+            observation, noise = load_observation(source), draw(number)
+            try:
+                result = policy.infer(observation, noise=noise)
+            except ObservationError as error:
+                raise ObservationError(f"{source}: {error}") from error
+            kept = observation if number < MAX_ROWS else None
+            answers.append(_Answer(kept, noise, result["actions"], result["policy_timing"]))
+    return answers
+
+
+def _joined(arrays: "list[np.ndarray]") -> "np.ndarray":
+    """One array as it is, several stacked."""
+    import numpy as np
+
+    return arrays[0] if len(arrays) == 1 else np.stack(arrays)
+
+
+def _write(out: Path, answers: list[_Answer], output: Output) -> None:
+    import numpy as np
+
+    actions = _joined([answer.actions for answer in answers])
+    with out.open("wb") as stream:  # np.savez would add .npz to a name that doesn't end so
+        np.savez(stream, actions=actions, noise=_joined([answer.noise for answer in answers]))
+    output.line(f"actions [{' x '.join(map(str, actions.shape))}] written to {out}")
+
+
+def _show_timings(timings: list[dict[str, float]], output: Output) -> None:
+    import numpy as np
+
+    columns = timing_columns(timings[0])
+    table = Table(title="milliseconds", title_justify="left")
+    if len(timings) > 1:
+        table.add_column(f"of {len(timings)} calls")
+    for name in columns:
+        table.add_column(name, justify="right")
+    values = np.array([[timing[key] for key in columns.values()] for timing in timings])
+    rows = {"median": np.median(values, 0), "95 %": np.percentile(values, 95, 0), "max": values.max(0)}
+    for name, row in rows.items() if len(timings) > 1 else [("", values[0])]:
+        table.add_row(*([name] if name else []), *(f"{value:.1f}" for value in row))
+    output.table(table)
+
+
+def _plot(file: Path, about: dict[str, Any], answers: list[_Answer]) -> None:
+    from turbopi.plots import Row, pictures_of, plot_chunks
+
+    rows = [
+        Row(_prompt(answer.observation, about), pictures_of(answer.observation), answer.actions)
+        for answer in answers
+        if answer.observation is not None
+    ]
+    title = f"{about['config']}, {about['backend']} {about['precision']} on {about['device_name']}"
+    if len(rows) < len(answers):
+        title += f": the first {len(rows)} of {len(answers)} calls"
+    plot_chunks(file, rows, robot=about["robot"], title=title, random_weights=about["random_weights"])
+
+
+def _prompt(observation: dict[str, Any], about: dict[str, Any]) -> str:
+    prompt = observation.get("prompt", observation.get("task", about["default_prompt"]))
+    return f"“{prompt}”"

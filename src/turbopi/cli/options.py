@@ -1,0 +1,186 @@
+"""Options that several commands share: which weights, and how to run them."""
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from turbopi.cli.framework import Output
+from turbopi.config import PRESETS
+from turbopi.errors import ConfigError
+
+if TYPE_CHECKING:
+    from turbopi.checkpoint import Checkpoint
+    from turbopi.policy import UnifiedPolicy
+
+SHOW_LOADING_BYTES = 1e9  # smaller weights load before a line about it is read
+
+_WEIGHTS, _RUNNING = "Weights", "How to run them"
+CHECKPOINT_HELP = "A checkpoint's folder: openpi's (PyTorch or JAX) or LeRobot's."
+
+CheckpointArgument = Annotated[
+    str | None, typer.Argument(metavar="CHECKPOINT", help=CHECKPOINT_HELP, show_default=False)
+]
+
+
+def _option(*names: str, panel: str, metavar: str, help: str) -> Any:
+    return typer.Option(*names, metavar=metavar, help=help, rich_help_panel=panel)
+
+
+@dataclass(frozen=True)
+class WeightOptions:
+    """Which weights: those of a CHECKPOINT argument, or random ones."""
+
+    random_weights: Annotated[
+        str | None,
+        _option(
+            "--random-weights",
+            panel=_WEIGHTS,
+            metavar="PRESET",
+            help=f"Random weights instead of a checkpoint: {', '.join(PRESETS)}. Their actions mean nothing.",
+        ),
+    ] = None
+    weights_seed: Annotated[
+        int | None,
+        _option("--weights-seed", panel=_WEIGHTS, metavar="N", help="Seed of the random weights; 0 unless given."),
+    ] = None
+    config: Annotated[
+        str | None,
+        _option(
+            "--config",
+            panel=_WEIGHTS,
+            metavar="PRESET|FILE",
+            help="What the checkpoint doesn't record (robot, horizon, …): a preset's name or a .json. Unless given, "
+            "the turbopi.json beside the weights, or LeRobot's own files.",
+        ),
+    ] = None
+
+    def open(self, checkpoint: str | None) -> "Checkpoint":
+        """The checkpoint that the user means. Raises ConfigError unless exactly one is named."""
+        self.check(checkpoint)
+        from turbopi.checkpoint import open_checkpoint, random_checkpoint
+
+        if self.random_weights is not None:
+            return random_checkpoint(self.random_weights, self.weights_seed or 0)
+        assert checkpoint is not None
+        return open_checkpoint(checkpoint, "auto" if self.config is None else self.config)
+
+    def split(self, command: str, paths: Sequence[str], other: str) -> tuple[str | None, str]:
+        """`[CHECKPOINT] OTHER` as it was typed: the checkpoint, if there should be one, and the other path."""
+        if self.random_weights is not None and len(paths) == 1:
+            return None, paths[0]
+        if len(paths) == 2:
+            self.check(paths[0])
+            return paths[0], paths[1]
+        wanted = (
+            f"one path, the {other} (the weights are random)"
+            if self.random_weights is not None
+            else f"two paths, the checkpoint and the {other} (or --random-weights PRESET and the {other} alone)"
+        )
+        raise ConfigError(f"{command} takes {wanted}, but got {len(paths)}: {' '.join(paths)}")
+
+    def check(self, checkpoint: str | None) -> None:
+        """Raise ConfigError for options that contradict each other."""
+        if checkpoint is None and self.random_weights is None:
+            raise ConfigError(
+                "no weights: give a checkpoint's folder, or --random-weights PRESET (such as pi05_tiny) to do without"
+            )
+        if checkpoint is not None and self.random_weights is not None:
+            raise ConfigError(
+                f"two kinds of weights: the checkpoint {checkpoint!r} and --random-weights {self.random_weights}; "
+                "give one of them"
+            )
+        if self.random_weights is None and self.weights_seed is not None:
+            raise ConfigError("--weights-seed is the seed of --random-weights, which wasn't given")
+        if self.random_weights is not None and self.config is not None:
+            raise ConfigError("--config describes a checkpoint; random weights take everything from their preset")
+
+    def tell_if_random(self, checkpoint: "Checkpoint", output: Output) -> None:
+        if checkpoint.format == "random":
+            seed = self.weights_seed or 0
+            output.line(
+                f"RANDOM WEIGHTS ({checkpoint.config.name}, seed {seed}): the actions mean nothing.", "bold yellow"
+            )
+
+
+@dataclass(frozen=True)
+class PolicyOptions(WeightOptions):
+    """Which weights, and everything else that UnifiedPolicy is made of."""
+
+    backend: Annotated[
+        str, _option("--backend", panel=_RUNNING, metavar="NAME", help="One of `turbopi backends`, or auto.")
+    ] = "auto"
+    precision: Annotated[
+        str, _option("--precision", panel=_RUNNING, metavar="bf16|f32", help="bf16 as openpi serves it, or f32.")
+    ] = "bf16"
+    steps: Annotated[int, _option("--steps", panel=_RUNNING, metavar="N", help="Denoising steps of an inference.")] = 10
+    device: Annotated[
+        str,
+        _option("--device", panel=_RUNNING, metavar="DEVICE", help="cpu, cuda, cuda:N, or auto: the GPU if any."),
+    ] = "auto"
+    tokenizer: Annotated[
+        str | None,
+        _option(
+            "--tokenizer",
+            panel=_RUNNING,
+            metavar="FILE",
+            help="SentencePiece model. Unless given: the checkpoint folder's, or openpi's cached one; for random "
+            "weights Turbo-Pi's own small one.",
+        ),
+    ] = None
+    default_prompt: Annotated[
+        str | None,
+        _option("--default-prompt", panel=_RUNNING, metavar="TEXT", help="Instruction for observations without one."),
+    ] = None
+
+    robot: Annotated[
+        str | None,
+        _option(
+            "--robot",
+            panel=_RUNNING,
+            metavar="NAME|FILE|CLASS",
+            help="Instead of the configuration's robot: a built-in one, a description (.json), or your own class as "
+            "module:Class, whose code is run.",
+        ),
+    ] = None
+
+    def policy_arguments(self) -> dict[str, Any]:
+        """UnifiedPolicy's arguments besides the checkpoint."""
+        return {
+            "backend": self.backend,
+            "precision": self.precision,
+            "num_denoising_steps": self.steps,
+            "device": self.device,
+            "tokenizer": self.tokenizer,
+            "default_prompt": self.default_prompt,
+            "robot": self._robot(),
+        }
+
+    def make_policy(self, checkpoint: "Checkpoint", output: Output) -> "UnifiedPolicy":
+        """The policy, with what it is printed."""
+        from turbopi.policy import UnifiedPolicy
+
+        if checkpoint.stored_bytes > SHOW_LOADING_BYTES:
+            output.line(f"Loading {checkpoint.stored_bytes / 1e9:.1f} GB of weights …")
+        policy = UnifiedPolicy(checkpoint, progress=output.shows_progress, **self.policy_arguments())
+        about = policy.metadata
+        output.line(
+            f"{about['config']} for {about['robot']}, {about['precision']} on {about['device']} "
+            f"({about['device_name']}), {about['num_denoising_steps']} steps; "
+            f"weights: {about['weight_bytes'] / 1e6:,.0f} MB in {about['load_seconds']:.1f} s"
+        )
+        output.line(f"backend: {about['backend']} ({about['backend_reason']})")
+        return policy
+
+    def _robot(self) -> Any:
+        """What UnifiedPolicy takes as `robot`; "module:Class" runs that module's code, as was asked for."""
+        if self.robot is None or ":" not in self.robot:
+            return self.robot
+        from turbopi.robots import import_robot
+
+        if os.getcwd() not in sys.path:  # a console script's path lacks it, `python -m` has it
+            sys.path.insert(0, os.getcwd())
+        return import_robot(self.robot)

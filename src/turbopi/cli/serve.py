@@ -1,0 +1,94 @@
+"""`turbopi serve`."""
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from turbopi.cli.framework import Output, command
+from turbopi.cli.options import CheckpointArgument, PolicyOptions
+from turbopi.cli.ports import why_not_free
+from turbopi.errors import ConfigError
+
+if TYPE_CHECKING:
+    from turbopi.policy import UnifiedPolicy
+
+
+@command(
+    "serve",
+    shared=PolicyOptions,
+    examples=(
+        "turbopi serve checkpoints/pi05_libero --config pi05_libero",
+        "turbopi serve checkpoints/pi05_droid --config pi05_droid --host 0.0.0.0 --api-key SECRET --record recordings",
+        "turbopi serve --random-weights pi05_tiny --port 8001",
+    ),
+)
+def serve(
+    options: PolicyOptions,
+    checkpoint: CheckpointArgument = None,
+    host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets other machines in.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", "-p", min=0, max=65535, help="0 takes a free one.")] = 8000,
+    api_key: Annotated[
+        str | None,
+        typer.Option(
+            "--api-key",
+            envvar="TURBOPI_API_KEY",
+            metavar="KEY",
+            help="Clients must send `Authorization: Api-Key KEY`. The variable keeps it out of the list of processes.",
+        ),
+    ] = None,
+    max_message_mb: Annotated[
+        float, typer.Option("--max-message-mb", metavar="MB", help="Larger messages end the connection.")
+    ] = 64,
+    queue_limit: Annotated[
+        int, typer.Option("--queue-limit", min=0, metavar="N", help="Requests that may wait while one runs.")
+    ] = 16,
+    record: Annotated[
+        Path | None, typer.Option("--record", metavar="DIR", help="Write every observation and its actions below DIR.")
+    ] = None,
+    warmup: Annotated[
+        bool, typer.Option("--warmup/--no-warmup", help="Run once before the first client, which compiles.")
+    ] = True,
+) -> None:
+    """Serve a policy to openpi's clients.
+
+    Speaks openpi's websocket protocol; /healthz and /metrics (Prometheus) answer on the same port. Ctrl-C finishes the
+    inference that runs, then stops.
+    """
+    output = Output()
+    options.check(checkpoint)
+    reason = why_not_free(host, port)
+    if reason is not None:  # before minutes of loading, not after
+        raise ConfigError(f"can't listen on {host}:{port}: {reason}. Choose another --host or --port")
+    opened = options.open(checkpoint)
+    options.tell_if_random(opened, output)
+    policy = options.make_policy(opened, output)
+
+    from turbopi import serve as serving
+
+    logging.getLogger("turbopi").setLevel(logging.INFO)
+    serving.run(
+        policy if warmup else _Cold(policy),
+        host=host,
+        port=port,
+        api_key=api_key,
+        max_message_mb=max_message_mb,
+        queue_limit=queue_limit,
+        record_dir=record,
+        console=output.console,
+    )
+
+
+class _Cold:
+    """A policy that isn't warmed up: the server warms up what has a `warmup`."""
+
+    def __init__(self, policy: "UnifiedPolicy") -> None:
+        self._policy = policy
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        return self._policy.metadata
+
+    def infer(self, obs: dict[str, Any], /) -> dict[str, Any]:
+        return self._policy.infer(obs)

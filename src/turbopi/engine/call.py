@@ -1,0 +1,198 @@
+"""One whole call with fixed shapes: inputs up, vision, prefix, all denoising steps, actions down.
+
+`StaticCall.run` is that sequence of kernels on fixed buffers; on a GPU it is captured once and replayed. Inputs travel
+in one copy out of one pinned buffer, actions come back in one.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.engine import forward
+from turbopi.engine.ops import Ops
+from turbopi.engine.weights import Weights
+from turbopi.model.denoise import euler_step, time_embedding, time_grid
+
+Mark = Callable[[str], None]
+
+
+class Denoiser(Protocol):
+    """All denoising steps in one launch, for one number of steps and one horizon."""
+
+    def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
+        """From noise float32[H, A] and the cache's first `length` rows: x_t float32[N + 1, H, A], v_t [N, H, A]."""
+
+
+@dataclass(frozen=True)
+class CallShape:
+    """What a captured call is fixed to."""
+
+    cameras: int  # valid ones
+    prompt_slots: int  # the bucket: valid prompt tokens and padding behind them
+    horizon: int
+    num_steps: int
+    float_images: bool = False  # LeRobot's resizing leaves the uint8 grid
+
+    def prefix_slots(self, config: ModelConfig) -> int:
+        return self.cameras * config.vision.num_tokens + self.prompt_slots
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Views into one flat buffer, on the host or on the device. Byte offsets are multiples of 16."""
+
+    flat: Tensor  # uint8
+    images: Tensor  # (uint8|float32)[V, 224, 224, 3]
+    noise: Tensor  # float32[H, action_dim]
+    state: Tensor  # float32[action_dim]
+    tokens: Tensor  # int64[P]
+    length: Tensor  # int64[1]  valid prefix tokens
+
+    @classmethod
+    def allocate(cls, config: ModelConfig, shape: CallShape, device: torch.device, *, pinned: bool) -> "Inputs":
+        size = config.vision.image_size
+        fields = {
+            "images": ((shape.cameras, size, size, 3), torch.float32 if shape.float_images else torch.uint8),
+            "noise": ((shape.horizon, config.action_dim), torch.float32),
+            "state": ((config.action_dim,), torch.float32),
+            "tokens": ((shape.prompt_slots,), torch.int64),
+            "length": ((1,), torch.int64),
+        }
+        sizes = {name: math.prod(dims) * dtype.itemsize for name, (dims, dtype) in fields.items()}
+        padded = {name: (count + 15) // 16 * 16 for name, count in sizes.items()}
+        flat = torch.zeros(sum(padded.values()), dtype=torch.uint8, device=device, pin_memory=pinned)
+        views, start = {}, 0
+        for name, (dims, dtype) in fields.items():
+            views[name] = flat[start : start + sizes[name]].view(dtype).view(dims)
+            start += padded[name]
+        return cls(flat, **views)
+
+
+@dataclass(frozen=True)
+class Cache:
+    """Keys and values of the largest prefix and suffix that fit; calls of all shapes take views of it in turn."""
+
+    k: Tensor  # [layer, rows, K]
+    v: Tensor
+
+    @classmethod
+    def allocate(cls, config: ModelConfig, rows: int, device: torch.device, dtype: torch.dtype) -> "Cache":
+        size = (config.vlm.depth, rows, config.vlm.head_dim)
+        # NaN: a row that is read before it is written shows
+        return cls(*(torch.full(size, torch.nan, device=device, dtype=dtype) for _ in range(2)))
+
+
+class StaticCall:
+    """A call of one shape on buffers of its own; only `cache` and weights are shared with other shapes."""
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        weights: Weights,
+        ops: Ops,
+        shape: CallShape,
+        cache: Cache,
+        table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation
+        denoiser: Denoiser | None = None,  # in place of the operations of `denoise`
+    ) -> None:
+        self.config, self.weights, self.ops, self.shape = config, weights, ops, shape
+        device = cache.k.device
+        on_gpu = device.type == "cuda"
+        suffix = shape.horizon + (config.kind == "pi0")
+        rows = shape.prefix_slots(config) + suffix
+        assert rows <= cache.k.shape[1], f"{shape} needs {rows} cache rows, there are {cache.k.shape[1]}"
+        self.cache_k, self.cache_v = cache.k[:, :rows], cache.v[:, :rows]
+        self.table, self.denoiser = table, denoiser
+        self.rope = forward.rope_of_all_positions(config, rows, device)
+        self.suffix_offsets = torch.arange(suffix, device=device)
+        # cameras' tokens, then the prompt's
+        self.embs = torch.empty(shape.prefix_slots(config), config.vlm.width, device=device, dtype=cache.k.dtype)
+        times = time_grid(shape.num_steps, config.time_grid)
+        self.time_embs = time_embedding(times, config.expert.width).to(device)  # Pi0's
+        self.host = Inputs.allocate(config, shape, torch.device("cpu"), pinned=on_gpu)
+        self.inputs = Inputs.allocate(config, shape, device, pinned=False)
+        chunk = (shape.horizon, config.action_dim)
+        self.x_t = torch.empty(shape.num_steps + 1, *chunk, device=device)
+        self.v_t = torch.empty(shape.num_steps, *chunk, device=device)
+        self.actions = torch.empty(chunk, pin_memory=on_gpu)
+
+    def write_inputs(self, images: np.ndarray, noise: np.ndarray, state: np.ndarray, tokens: np.ndarray) -> None:
+        """Put one observation, compacted, into the host buffer: valid pictures and valid tokens only."""
+        self.host.images.numpy()[:] = images
+        self.host.noise.numpy()[:] = noise
+        self.host.state.numpy()[:] = state
+        padded = self.host.tokens.numpy()
+        padded[: len(tokens)] = tokens
+        padded[len(tokens) :] = 0
+        self.host.length[0] = self.shape.cameras * self.config.vision.num_tokens + len(tokens)
+
+    def run(self, mark: Mark = lambda stage: None) -> None:
+        """All kernels of the call, in order. `mark` is told the end of each stage."""
+        self.upload()
+        self.encode(mark)
+        self.denoise(mark)
+
+    def upload(self) -> None:
+        self.inputs.flat.copy_(self.host.flat, non_blocking=True)
+
+    def encode(self, mark: Mark = lambda stage: None) -> None:
+        """Pictures and prompt to the cache's first rows."""
+        config, weights, ops, inputs = self.config, self.weights, self.ops, self.inputs
+        slots = self.shape.prefix_slots(config)
+        pictures = slots - self.shape.prompt_slots
+        ops.embed_prompt(inputs.tokens, weights.embed_tokens, self.embs[pictures:])
+        if self.shape.cameras:
+            forward.vision_tokens(config, weights, ops, inputs.images, self.embs[:pictures])
+        mark("vision")
+        rope = (self.rope[0][:slots], self.rope[1][:slots])
+        forward.prefix_cache(config, weights, ops, self.embs, inputs.length, self.cache_k, self.cache_v, rope)
+        mark("prefix")
+
+    def denoise(self, mark: Mark = lambda stage: None) -> None:
+        """Noise to actions on the host, all steps, from the cache's first rows."""
+        if self.denoiser is None:
+            self._denoise_by_operations()
+        else:
+            inputs = self.inputs
+            self.denoiser.launch(inputs.noise, self.cache_k, self.cache_v, inputs.length, self.x_t, self.v_t)
+        self.actions.copy_(self.x_t[-1], non_blocking=True)
+        mark("denoise")
+
+    def _denoise_by_operations(self) -> None:
+        positions = self.inputs.length + self.suffix_offsets
+        rope = (self.rope[0][positions], self.rope[1][positions])
+        self.x_t[0] = self.inputs.noise
+        for step in range(self.shape.num_steps):
+            out = forward.expert_output(
+                self.config,
+                self.weights,
+                self.ops,
+                self._suffix_tokens(step),
+                None if self.table is None else self.table[step],
+                self.inputs.length,
+                self.cache_k,
+                self.cache_v,
+                rope,
+            )
+            self.v_t[step] = self._project("action_out_proj", out[-self.shape.horizon :])
+            self.x_t[step + 1] = euler_step(self.x_t[step], self.v_t[step], self.shape.num_steps)
+
+    def _suffix_tokens(self, step: int) -> Tensor:
+        """The suffix [H, D] of a step: actions, and for Pi0 the state token before them and the time mixed in."""
+        actions = self._project("action_in_proj", self.x_t[step])
+        dtype = self.weights.embed_tokens.dtype
+        if self.config.kind == "pi05":
+            return actions.to(dtype)
+        mixed = torch.cat((actions, self.time_embs[step].expand_as(actions)), dim=-1)
+        actions = self._project("action_time_mlp_out", F.silu(self._project("action_time_mlp_in", mixed)))
+        return torch.cat((self._project("state_proj", self.inputs.state[None]), actions)).to(dtype)
+
+    def _project(self, name: str, x: Tensor) -> Tensor:
+        return F.linear(x, self.weights.small[f"{name}.weight"], self.weights.small[f"{name}.bias"])

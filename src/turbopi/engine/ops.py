@@ -1,0 +1,227 @@
+"""What the engine computes, as operations that can be exchanged one by one.
+
+`PLAIN` is their definition in PyTorch; `compiled()` is the same with Inductor's kernels between the matrix products;
+own kernels must equal `PLAIN`. Reductions and nonlinear functions are float32 inside; results have the activations'
+dtype.
+
+Shapes: D, W widths, F hidden width of an MLP, K head_dim, n query heads over one key/value head.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.model.layers import apply_rope, rms_normalize
+from turbopi.model.vision import normalize_images
+
+
+@dataclass(frozen=True)
+class Ops:
+    """Any of them may be exchanged for another implementation; `origin` says whose they are, for metadata.
+
+    `residual_linear` is a product that only the `y` of a residual norm reads; what it returns is a matter between those
+    two.
+    """
+
+    embed_patches: Callable[..., Tensor]
+    embed_prompt: Callable[..., None]
+    residual_rms_norm: Callable[..., tuple[Tensor, Tensor]]
+    residual_layer_norm: Callable[..., tuple[Tensor, Tensor]]
+    linear: Callable[..., Tensor]
+    residual_linear: Callable[..., Tensor]
+    linear_gelu: Callable[[Tensor, Tensor, Tensor], Tensor]
+    linear_geglu: Callable[[Tensor, Tensor], Tensor]
+    rope_split: Callable[..., Tensor]
+    vision_attention: Callable[[Tensor, int, int], Tensor]
+    attention: Callable[..., Tensor]
+    origin: Mapping[str, str] = field(default_factory=dict)
+
+
+def patch_rows(images: Tensor, patch: int) -> Tensor:
+    """Pictures (uint8|float32)[V, S, S, 3] -> their patches in [-1, 1], float32[V * tokens, 3 * patch * patch]."""
+    n, side = images.shape[0], images.shape[1] // patch
+    rows = normalize_images(images).reshape(n, side, patch, side, patch, 3).permute(0, 1, 3, 5, 2, 4)
+    return rows.reshape(n * side * side, -1)
+
+
+def embed_patches(images: Tensor, weight: Tensor, position: Tensor, dtype: torch.dtype) -> Tensor:
+    """Pictures (uint8|float32)[V, S, S, 3] -> [V * tokens, W] in `dtype`, computed in float32.
+
+    weight float32[W, 3 * patch * patch]; position float32[tokens, W] has the bias in it.
+    """
+    rows = patch_rows(images, round((weight.shape[1] / 3) ** 0.5))
+    return (F.linear(rows, weight).view(-1, *position.shape) + position).flatten(0, 1).to(dtype)
+
+
+def embed_prompt(tokens: Tensor, table: Tensor, out: Tensor) -> None:
+    """Rows of `table` [vocab, D] times √D, rounded to its dtype, into `out` [P, D]. tokens int64[P]."""
+    out.copy_(F.embedding(tokens, table) * table.shape[1] ** 0.5)
+
+
+def residual_rms_norm(
+    x: Tensor, y: Tensor | None, gate: Tensor | None, scale: Tensor, shift: Tensor | None, eps: float
+) -> tuple[Tensor, Tensor]:
+    """(x + y * gate, its RMSNorm * scale + shift). x, y [tokens, D]; gate, scale, shift float32[D]; None: left out.
+
+    The gate is rounded to x's dtype first, as in the reference.
+    """
+    if y is not None:
+        x = x + (y if gate is None else y * gate.to(x.dtype))
+    normed = rms_normalize(x, eps) * scale
+    return x, (normed if shift is None else normed + shift).to(x.dtype)
+
+
+def residual_layer_norm(x: Tensor, y: Tensor | None, weight: Tensor, bias: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """(x + y, its LayerNorm). x, y [tokens, W]."""
+    if y is not None:
+        x = x + y
+    return x, F.layer_norm(x, (x.shape[-1],), weight, bias, eps)
+
+
+def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+    """x @ weightᵀ + bias, into `out` if it is given."""
+    result = F.linear(x, weight, bias)
+    return result if out is None else out.copy_(result)
+
+
+def gelu(x: Tensor) -> Tensor:
+    return F.gelu(x, approximate="tanh")
+
+
+def geglu(gate_up: Tensor) -> Tensor:
+    """[tokens, 2F], gate columns before up columns -> [tokens, F]"""
+    gate, up = gate_up.chunk(2, dim=-1)
+    return F.gelu(gate, approximate="tanh") * up
+
+
+def rope_split(qkv: Tensor, cos: Tensor, sin: Tensor, k_out: Tensor, v_out: Tensor) -> Tensor:
+    """Split [tokens, (n + 2) * K]; write rotated keys and values [tokens, K]; return rotated queries [tokens * n, K].
+
+    cos, sin float32[tokens, K/2].
+    """
+    head_dim = k_out.shape[-1]
+    parts = qkv.view(qkv.shape[0], -1, head_dim)
+    rotated = apply_rope(parts[:, :-1], cos[:, None], sin[:, None])
+    k_out.copy_(rotated[:, -1])
+    v_out.copy_(parts[:, -1])
+    return rotated[:, :-1].reshape(-1, head_dim)
+
+
+def vision_attention(qkv: Tensor, images: int, heads: int) -> Tensor:
+    """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W]."""
+    rows, width = qkv.shape[0], qkv.shape[1] // 3
+    q, k, v = qkv.view(images, -1, 3, heads, width // heads).permute(2, 0, 3, 1, 4)
+    return F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(rows, width)
+
+
+def masked_softmax(
+    logits: Tensor, length: Tensor, slots: int, heads: int, state_token: bool, scale: float, dtype: torch.dtype
+) -> Tensor:
+    """softmax(logits * scale) over the visible keys, in `dtype`; see `attention`. logits float32[tokens * n, keys]"""
+    key = torch.arange(logits.shape[1], device=logits.device)
+    visible = (key < length) | (key >= slots)
+    if state_token:
+        row = torch.arange(logits.shape[0], device=logits.device)[:, None]
+        visible = visible & ((row >= heads) | (key <= slots))
+    return (logits * scale).masked_fill(~visible, -torch.inf).softmax(-1).to(dtype)
+
+
+def attention(
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    length: Tensor,
+    slots: int,
+    heads: int,
+    state_token: bool = False,
+    *,
+    softmax: Callable[..., Tensor] = masked_softmax,
+) -> Tensor:
+    """softmax(q kᵀ / √K) v over keys [0, length) and [slots, …): q [tokens * n, K] -> [tokens, n * K].
+
+    k, v [keys, K], finite; length int64[1] on the device: padding of the prefix begins there, `slots` is where it ends
+    and the suffix's keys begin. With `state_token` the first query token doesn't see keys beyond `slots` (Pi0).
+    All query heads read the same keys, so they are rows of one product.
+    """
+    logits = _matmul_f32(q, k.t())
+    probabilities = softmax(logits, length, slots, heads, state_token, q.shape[1] ** -0.5, v.dtype)
+    return (probabilities @ v).view(-1, heads * q.shape[1])
+
+
+def _matmul_f32(a: Tensor, b: Tensor) -> Tensor:
+    """a @ b with the float32 accumulators kept, which CUDA's library does for bfloat16 inputs."""
+    if a.dtype == torch.float32:
+        return a @ b
+    if a.device.type == "cuda":
+        return torch.mm(a, b, out_dtype=torch.float32)
+    return a.float() @ b.float()
+
+
+PLAIN = Ops(
+    embed_patches=embed_patches,
+    embed_prompt=embed_prompt,
+    residual_rms_norm=residual_rms_norm,
+    residual_layer_norm=residual_layer_norm,
+    linear=linear,
+    residual_linear=linear,
+    linear_gelu=lambda x, weight, bias: gelu(F.linear(x, weight, bias)),
+    linear_geglu=lambda x, gate_up: geglu(F.linear(x, gate_up)),
+    rope_split=rope_split,
+    vision_attention=vision_attention,
+    attention=attention,
+    origin={"matrix products": "cuBLAS", "vision attention": "scaled_dot_product_attention", "all else": "PyTorch"},
+)
+
+# Axes that differ from call to call (tokens, keys), by argument; all others are fixed by the model's sizes.
+_DYNAMIC_AXES: dict[Callable[..., Any], dict[str, tuple[int, ...]]] = {
+    residual_rms_norm: {"x": (0,), "y": (0,)},
+    residual_layer_norm: {"x": (0,), "y": (0,)},
+    gelu: {"x": (0,)},
+    geglu: {"gate_up": (0,)},
+    rope_split: {"qkv": (0,), "cos": (0,), "sin": (0,), "k_out": (0,), "v_out": (0,)},
+    masked_softmax: {"logits": (0, 1)},
+}
+_RECOMPILE_LIMIT = 64  # one compilation per width and per set of optional arguments; PyTorch's default is 8
+
+
+def compiled() -> Ops:
+    """The same operations with torch.compile between the matrix products, for any number of tokens and keys."""
+    softmax, compiled_gelu, compiled_geglu = _compiled(masked_softmax), _compiled(gelu), _compiled(geglu)
+
+    def compiled_attention(*args: Any) -> Tensor:
+        return attention(*args, softmax=softmax)
+
+    return Ops(
+        embed_patches=embed_patches,
+        embed_prompt=embed_prompt,
+        residual_rms_norm=_compiled(residual_rms_norm),
+        residual_layer_norm=_compiled(residual_layer_norm),
+        linear=linear,
+        residual_linear=linear,
+        linear_gelu=lambda x, weight, bias: compiled_gelu(F.linear(x, weight, bias)),
+        linear_geglu=lambda x, gate_up: compiled_geglu(F.linear(x, gate_up)),
+        rope_split=_compiled(rope_split),
+        vision_attention=vision_attention,
+        attention=compiled_attention,
+        origin=PLAIN.origin | {"all else": "Inductor"},
+    )
+
+
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    jitted = torch.compile(function, fullgraph=True)
+    names = list(inspect.signature(function).parameters)
+    dynamic_axes = _DYNAMIC_AXES[function]
+
+    def call(*args: Any) -> Any:
+        for name, arg in zip(names, args, strict=False):
+            for axis in dynamic_axes.get(name, ()) if arg is not None else ():
+                torch._dynamo.maybe_mark_dynamic(arg, axis)
+        with torch._dynamo.config.patch(recompile_limit=_RECOMPILE_LIMIT):
+            return jitted(*args)
+
+    return call

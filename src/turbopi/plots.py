@@ -1,0 +1,145 @@
+"""Pictures of action chunks, as PNG files."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from turbopi.errors import ConfigError
+
+_DPI = 110
+_WARNING = "#b00020"
+
+
+@dataclass(frozen=True)
+class ActionGroup:
+    """Action dimensions that share one unit, and so one axis."""
+
+    title: str
+    unit: str
+    names: dict[int, str]  # dimension -> what it moves
+
+
+def _numbered(prefix: str, indices: Sequence[int]) -> dict[int, str]:
+    return {index: f"{prefix} {number}" for number, index in enumerate(indices, start=1)}
+
+
+# LIBERO: inputs of robosuite's OSC_POSE controller, whose output_max is 0.05 m and 0.5 rad
+_GROUPS: dict[str, list[ActionGroup]] = {
+    "libero": [
+        ActionGroup("translation", "1 = 0.05 m a step", {0: "x", 1: "y", 2: "z"}),
+        ActionGroup("rotation", "1 = 0.5 rad a step", {3: "about x", 4: "about y", 5: "about z"}),
+        ActionGroup("gripper", "−1 open, 1 closed", {6: "gripper"}),
+    ],
+    "droid": [
+        ActionGroup("joint velocities", "1 = the fastest command", _numbered("joint", range(7))),
+        ActionGroup("gripper", "0 open, 1 closed", {7: "gripper"}),
+    ],
+    "aloha": [
+        ActionGroup("left arm", "rad", _numbered("joint", range(6))),
+        ActionGroup("right arm", "rad", _numbered("joint", range(7, 13))),
+        ActionGroup("grippers", "0 closed, 1 open", {6: "left", 13: "right"}),
+    ],
+}
+
+
+def action_groups(robot: str, dims: int) -> list[ActionGroup]:
+    """How the dimensions of a robot's actions belong together; for an unknown robot, groups of eight to be legible."""
+    groups = _GROUPS.get(robot, [])
+    if sum(len(group.names) for group in groups) == dims:
+        return groups
+    eights = [range(start, min(start + 8, dims)) for start in range(0, dims, 8)]
+    return [
+        ActionGroup(
+            f"actions {eight[0]} to {eight[-1]}", "the robot's units", {index: f"dim {index}" for index in eight}
+        )
+        for eight in eights
+    ]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One observation and its chunk. `oracle`, if given, is drawn as dots on the lines of `actions` (both [H, d])."""
+
+    heading: str
+    pictures: dict[str, np.ndarray]  # camera -> [h, w, 3]
+    actions: np.ndarray
+    oracle: np.ndarray | None = None
+
+
+def plot_chunks(file: Path, rows: Sequence[Row], *, robot: str, title: str, random_weights: bool) -> None:
+    """Write a PNG with one row an observation: its pictures, then its action chunk by groups of one unit.
+
+    Raises ConfigError if `file` can't be written.
+    """
+    groups = action_groups(robot, rows[0].actions.shape[1])
+    num_pictures = max(len(row.pictures) for row in rows)
+    widths = [1.0] * num_pictures + [1.45] * len(groups)
+    figure = Figure(figsize=(0.8 + 2.45 * sum(widths), 0.9 + 2.75 * len(rows)), dpi=_DPI, layout="constrained")
+    if random_weights:
+        title += "\nrandom weights: the actions mean nothing"
+    figure.suptitle(title, fontsize=14, fontweight="bold", color=_WARNING if random_weights else "black")
+    for row, panel in zip(rows, np.atleast_1d(np.array(figure.subfigures(len(rows), 1))), strict=True):
+        panel.suptitle(row.heading, fontsize=10.5, x=0.01, ha="left")
+        axes = np.atleast_1d(panel.subplots(1, num_pictures + len(groups), width_ratios=widths))
+        _draw_pictures(axes[:num_pictures], row.pictures)
+        for ax, group in zip(axes[num_pictures:], groups, strict=True):
+            _draw_group(ax, group, row)
+    try:
+        figure.savefig(file)
+    except (OSError, ValueError) as error:  # ValueError: an unknown ending
+        raise ConfigError(f"can't write the plot {file}: {error}") from error
+
+
+def _draw_pictures(axes: Any, pictures: dict[str, np.ndarray]) -> None:
+    for ax in axes:
+        ax.set_axis_off()
+    for ax, (camera, picture) in zip(axes, pictures.items(), strict=False):
+        ax.imshow(picture)
+        ax.set_title(camera, fontsize=9)
+
+
+def _draw_group(ax: Axes, group: ActionGroup, row: Row) -> None:
+    steps = np.arange(len(row.actions))
+    dot: dict[str, Any] = {
+        "marker": "o",
+        "markersize": 4.5 if len(steps) <= 20 else 3,
+        "markerfacecolor": "none",
+        "linestyle": "",
+    }
+    handles = []
+    for color, (index, name) in enumerate(group.names.items()):
+        handles += ax.plot(steps, row.actions[:, index], color=f"C{color}", linewidth=1.6, label=name)
+        if row.oracle is not None:
+            ax.plot(steps, row.oracle[:, index], color=f"C{color}", **dot)
+    if row.oracle is not None:
+        handles.append(
+            Line2D([], [], marker="o", color="0.3", linestyle="", markerfacecolor="none", label="f32 oracle")
+        )
+    ax.set_title(group.title, fontsize=9)
+    ax.set_xlabel("step of the chunk", fontsize=8)
+    ax.set_ylabel(group.unit, fontsize=8)
+    ax.tick_params(labelsize=8)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.grid(alpha=0.3)
+    ax.legend(handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.02), frameon=False)
+
+
+def pictures_of(observation: Mapping[str, Any], below: str = "") -> dict[str, np.ndarray]:
+    """The pictures in an observation of any robot, by key, as [h, w, 3] to look at."""
+    found: dict[str, np.ndarray] = {}
+    for key, value in observation.items():
+        name = f"{below}/{key}" if below else str(key)
+        if isinstance(value, Mapping):
+            found |= pictures_of(value, name)
+        elif isinstance(value, np.ndarray) and value.ndim == 3:
+            picture = value.transpose(1, 2, 0) if value.shape[0] == 3 else value
+            if picture.shape[-1] == 3:
+                found[name] = picture if picture.dtype == np.uint8 else np.clip(picture, 0, 1)
+    return found

@@ -1,0 +1,25 @@
+"""Running the command line inside the test's process."""
+
+import re
+
+from typer.testing import CliRunner, Result
+
+from turbopi.cli import app
+
+
+def turbopi(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"TURBOPI_DEBUG": None})
+
+
+def text_of(output: str) -> str:
+    """Without colours, and with every run of blanks as one: help is boxed and wrapped."""
+    return " ".join(re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]", " ", output).split())
+
+
+def refusal(result: Result) -> str:
+    """The one line of an error, which must be all there is on stderr, with nothing on stdout."""
+    assert result.exit_code == 2, (result.exit_code, result.output, result.exception)
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ")
+    assert "Traceback" not in result.stderr
+    return result.stderr.removeprefix("error: ").rstrip("\n")

@@ -1,0 +1,141 @@
+"""`turbopi inspect` and `turbopi convert`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli_helpers import refusal, text_of, turbopi
+
+from turbopi.checkpoint import open_checkpoint, random_checkpoint
+from turbopi.demo import FRAMES, load_frames
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint folder that `turbopi convert` made of random weights."""
+    folder = tmp_path_factory.mktemp("checkpoints") / "tiny"
+    result = turbopi("convert", "--random-weights", "pi05_tiny", folder, "--weights-seed", 4)
+    assert result.exit_code == 0, result.output
+    assert "RANDOM WEIGHTS (pi05_tiny, seed 4): the actions mean nothing." in result.stdout
+    assert f"random -> {folder}: 0.012 GB in bf16" in result.stdout
+    return folder
+
+
+def test_inspect_shows_what_the_folder_holds(tiny: Path) -> None:
+    result = turbopi("inspect", tiny)
+    assert result.exit_code == 0, result.output
+    shown = text_of(result.stdout)
+    for fact in (
+        "format openpi_torch",
+        "model pi05",
+        "configuration pi05_tiny with random weights, seed 4, from",
+        "robot libero",
+        "action horizon 10",
+        "prompt at most 200 tokens, the state in it",
+        "statistics asset physical-intelligence/libero",
+        "of the state quantile; 8 dimensions of mean, std, q01, q99",
+        "of the actions quantile; 7 dimensions",
+        "sizes: vlm width 192, mlp dim 512, depth 6, num heads 8, num kv heads 1, head dim 32",
+        "weights 235 tensors, 0.011 GB, stored as BF16",
+        "vision tower (SigLIP) 1,298,048",
+        "total 5,672,480",
+    ):
+        assert fact in shown.replace("┃", " ").replace("  ", " "), fact
+
+
+def test_inspect_json_is_the_checkpoints_own_description(tiny: Path) -> None:
+    result = turbopi("inspect", tiny, "--json", "--hash")
+    document = json.loads(result.stdout)
+    opened = open_checkpoint(tiny)
+    assert document == {**opened.info(), "sha256": opened.fingerprint()}
+    assert len(document["sha256"]) == 64
+
+
+def test_inspect_of_random_weights_says_so() -> None:
+    document = json.loads(turbopi("inspect", "--random-weights", "pi05_libero", "--json").stdout)
+    assert document["random_weights"] is True
+    assert document["parameters"]["total"] > 3.3e9
+    shown = turbopi("inspect", "--random-weights", "pi05_tiny", "--weights-seed", 7).stdout
+    assert "note: random weights, seed 7: actions mean nothing" in shown
+
+
+def test_inspect_without_a_configuration_shows_the_rest_and_the_choices(golden: Path) -> None:
+    result = turbopi("inspect", golden / "checkpoints" / "pi05" / "torch")
+    assert result.exit_code == 0
+    assert "not known yet: " in result.stdout
+    assert "suggest pi05_libero" in result.stdout
+    assert "443,232" in result.stdout
+
+
+def test_inspect_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
+    assert refusal(turbopi("inspect", tmp_path / "nothing")) == f"there is no folder {tmp_path / 'nothing'}"
+    assert "holds no checkpoint: expected model.safetensors" in refusal(turbopi("inspect", tmp_path))
+    assert "is an address; Turbo-Pi reads local folders" in refusal(turbopi("inspect", "gs://openpi/pi05_libero"))
+
+
+def test_a_converted_folder_runs_like_the_weights_it_is_made_of(tiny: Path, tmp_path: Path) -> None:
+    """But for the few weights that bf16 mode keeps in float32 and the folder has in bfloat16."""
+    frame = load_frames()[0]
+    observation: dict[str, Any] = {
+        "observation/image": frame.base,
+        "observation/wrist_image": frame.wrist,
+        "observation/state": frame.state,
+        "prompt": frame.prompt,
+    }
+    np.savez(tmp_path / "observation.npz", **observation)
+    options = ("--seed", 1, "--steps", 2, "--no-plot", "--no-warmup", "-o")
+    first, second = tmp_path / "folder.npz", tmp_path / "random.npz"
+    observed = tmp_path / "observation.npz"
+    result = turbopi("infer", tiny, observed, *options, first)
+    assert result.exit_code == 0, result.output
+    random = ("--random-weights", "pi05_tiny", "--weights-seed", 4)
+    result = turbopi("infer", *random, observed, *options, second)
+    assert result.exit_code == 0, result.output
+    with np.load(first) as folder, np.load(second) as made:
+        np.testing.assert_allclose(folder["actions"], made["actions"], atol=0.1)
+        assert np.ptp(folder["actions"]) > 1
+
+
+def test_convert_takes_a_checkpoint_to_float32(tiny: Path, tmp_path: Path) -> None:
+    result = turbopi("convert", tiny, tmp_path / "f32", "--precision", "f32", "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["folder"] == str(tmp_path / "f32")
+    assert document["precision"] == "f32"
+    assert open_checkpoint(tmp_path / "f32").fingerprint() == open_checkpoint(tiny).fingerprint()
+    assert "openpi_torch -> " in result.stderr
+
+
+def test_convert_refuses_a_folder_that_is_in_use(tiny: Path) -> None:
+    result = turbopi("convert", "--random-weights", "pi05_tiny", tiny, "--json")
+    assert result.exit_code == 2
+    assert result.stderr.splitlines()[-1] == f"error: {tiny} exists and isn't an empty folder; give a new one"
+    assert open_checkpoint(tiny).info()["name"] == "pi05_tiny with random weights, seed 4"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["a"], "convert takes two paths, the checkpoint and the new folder (or --random-weights PRESET and the new"),
+        (["a", "b", "c"], "but got 3: a b c"),
+        (["a", "b", "--random-weights", "pi05_tiny"], "two kinds of weights: the checkpoint 'a'"),
+        (["no-such", "b"], "there is no folder no-such"),
+    ],
+)
+def test_convert_refuses_wrong_paths(arguments: list[str], expected: str) -> None:
+    assert expected in refusal(turbopi("convert", *arguments))
+
+
+def test_convert_refuses_an_unknown_precision(tmp_path: Path) -> None:
+    result = turbopi("convert", "--random-weights", "pi05_tiny", tmp_path / "x", "--precision", "fp8", "--json")
+    assert result.exit_code == 2
+    assert "error: precision is 'fp8'; expected one of bf16, f32" in result.stderr
+    assert not (tmp_path / "x").exists()
+
+
+def test_the_frames_statistics_are_openpis_format() -> None:
+    content = json.loads((FRAMES / "norm_stats.json").read_text())
+    assert set(content["norm_stats"]) == {"state", "actions"}
+    assert random_checkpoint("pi05_tiny").norm_stats.state is not None

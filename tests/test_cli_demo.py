@@ -1,0 +1,185 @@
+"""`turbopi demo`: the main job end to end, and a check that can fail."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cli_helpers import turbopi
+from PIL import Image
+
+from turbopi import demo
+from turbopi.backends.base import Sample
+from turbopi.backends.pytorch import PyTorchBackend
+from turbopi.checkpoint import random_checkpoint
+from turbopi.errors import BackendError, TurboPiError
+from turbopi.observation import Observation
+from turbopi.plots import action_groups
+from turbopi.policy import UnifiedPolicy
+
+
+def tiny_oracle(preset: str = "pi05_tiny") -> UnifiedPolicy:
+    return UnifiedPolicy(random_checkpoint(preset), backend="pytorch", precision="f32", num_denoising_steps=2)
+
+
+def test_the_frames_are_real_pictures_with_states_and_prompts() -> None:
+    frames = demo.load_frames()
+    assert len(frames) >= 3
+    for frame in frames:
+        for picture in (frame.base, frame.wrist):
+            assert picture.shape == (256, 256, 3)
+            assert picture.dtype == np.uint8
+            assert picture.std() > 10
+        assert frame.state.shape == (8,)
+        assert frame.prompt
+    assert len({frame.base.tobytes() for frame in frames}) == len(frames)
+
+
+def test_missing_pictures_are_said_to_be_missing(tmp_path: Path) -> None:
+    with pytest.raises(TurboPiError, match=r"has no frames.json: the installation lacks the demo's pictures"):
+        demo.load_frames(tmp_path)
+
+
+def test_without_a_checkpoint_the_demo_runs_and_says_that_weights_are_random(tmp_path: Path) -> None:
+    result = turbopi("demo", "--frames", 2, "--report", tmp_path / "report", "--seed", 3)
+    assert result.exit_code == 0, result.output
+    out = result.stdout
+    assert out.startswith("RANDOM WEIGHTS (pi05_tiny, seed 0): the actions mean nothing.\n")
+    assert "pi05_tiny for libero, bf16 on cpu (CPU), 10 steps" in out
+    assert "backend: pytorch (auto: on a CPU" in out
+    for heading in ("preprocess", "vision", "prefix", "denoise", "postprocess", "model", "total"):
+        assert heading in out
+    for frame in demo.load_frames()[:2]:
+        assert frame.prompt.split()[-1] in out
+    assert "the chunk, 10 steps of 7" in out
+    assert "The bound is 5 times the control" in out
+    assert "OK: pytorch bf16 is within" in out
+    assert "\x1b" not in out
+
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["ok"] is True
+    assert report["random_weights"] is True
+    assert report["seed"] == 3
+    assert len(report["frames"]) == 2
+    check = report["check"]
+    assert check["bound"] == pytest.approx(5 * check["control_rms"])
+    assert 0 < max(check["rms"]) <= check["bound"]
+    with np.load(tmp_path / "report" / "actions.npz") as actions:
+        assert actions["actions"].shape == actions["oracle_actions"].shape == (2, 10, 7)
+        assert actions["actions"].dtype == np.float64
+        np.testing.assert_allclose(actions["actions"][1], report["frames"][1]["actions"])
+        assert not np.array_equal(actions["actions"], actions["oracle_actions"])
+    with Image.open(tmp_path / "report" / "demo.png") as picture:
+        assert picture.width > 1200
+        assert np.asarray(picture.convert("L")).std() > 20
+
+
+def swapped_cameras(self: PyTorchBackend, observation: Observation, noise: torch.Tensor, num_steps: int) -> Sample:
+    """A fault of the fast path alone: the oracle, in f32, is spared."""
+    if self.precision == "bf16":
+        observation = replace(observation, images=observation.images[:, [1, 0, 2]])
+    return RIGHT_SAMPLE(self, observation, noise, num_steps)
+
+
+RIGHT_SAMPLE = PyTorchBackend.sample
+
+
+def test_a_backend_that_swaps_cameras_fails_with_code_1(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(PyTorchBackend, "sample", swapped_cameras)
+    result = turbopi("demo", "--frames", 1, "--report", tmp_path, "--json")
+    assert result.exit_code == 1, result.output
+    assert "FAIL: pytorch bf16 is" in result.stderr
+    assert "from the oracle, beyond its bound" in result.stderr
+    document = json.loads(result.stdout)
+    assert document["ok"] is False
+    assert max(document["check"]["rms"]) > 2 * document["check"]["bound"]
+    assert json.loads((tmp_path / "report.json").read_text()) == document
+
+
+def test_a_report_folder_that_cannot_be_made_is_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    result = turbopi("demo", "--report", tmp_path / "file", "--frames", 1)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == f"error: can't write into {tmp_path / 'file'}: {tmp_path / 'file'} is a file\n"
+
+
+@pytest.mark.parametrize("preset", ["pi05_tiny", "pi05_droid", "pi05_aloha", "pi05_base"])
+def test_the_pictures_reach_every_robots_cameras(preset: str) -> None:
+    frame = demo.load_frames()[0]
+    checkpoint = random_checkpoint("pi05_tiny")
+    robot = random_checkpoint(preset).config.robot
+    policy = UnifiedPolicy(checkpoint, backend="pytorch", robot=robot) if robot == "libero" else _for_robot(robot)
+    (observation,) = demo.observations(policy, [frame])
+    inputs, _ = policy._pipeline.before(observation)
+    expected = np.asarray(Image.fromarray(frame.base).resize((224, 224), Image.Resampling.BILINEAR))
+    np.testing.assert_array_equal(inputs.images[0], expected)
+    assert inputs.image_mask[:2].all()
+    assert not np.array_equal(inputs.images[0], inputs.images[1])
+
+
+def _for_robot(robot: str) -> UnifiedPolicy:
+    """A tiny policy for another robot than LIBERO's."""
+    tiny = random_checkpoint("pi05_tiny").config
+    return UnifiedPolicy(random_checkpoint(replace(tiny, robot=robot)), backend="pytorch")
+
+
+def test_the_check_passes_the_oracle_itself_and_refuses_anything_else() -> None:
+    oracle = tiny_oracle()
+    observed = demo.observations(oracle, demo.load_frames()[:1])
+    exact = [result["actions"] for result in demo.run_frames(oracle, observed, 0, lambda: None)]
+
+    def judged(actions: np.ndarray, precision: Any = "bf16") -> demo.OracleCheck:
+        return demo.check([actions], oracle, observed, precision=precision, seed=0)
+
+    same = judged(exact[0])
+    assert same.ok
+    assert same.worst.rms == 0
+    assert 1e-4 < same.control < 2e-2
+    spread = exact[0].std(axis=0)
+    assert not judged(exact[0] + 1.1 * same.bound * spread).ok
+    assert judged(exact[0] + 0.9 * same.bound * spread).ok
+    assert not judged(np.full_like(exact[0], np.nan)).ok
+    last_dimension = exact[0].copy()
+    last_dimension[:, 6] += 3 * same.bound * spread[6]  # alone, and small beside the others' units
+    assert not judged(last_dimension).ok
+    assert judged(exact[0], "f32").bound < 1e-5
+    with pytest.raises(BackendError, match=r"the backend's chunk has shape \[9, 7\], the oracle's \[10, 7\]"):
+        judged(exact[0][:9])
+
+
+def test_jitter_moves_what_bfloat16_would_round_and_is_undone() -> None:
+    model = tiny_oracle().backend.model  # type: ignore[attr-defined]
+    before = {name: parameter.clone() for name, parameter in model.named_parameters()}
+    with demo.jittered(model, 1):
+        moved = {name for name, parameter in model.named_parameters() if not torch.equal(parameter, before[name])}
+        weight = model.vlm.layers[0].mlp.up_proj.weight
+        ratio = weight / before["vlm.layers.0.mlp.up_proj.weight"] - 1
+        assert 2**-9.1 < ratio.abs().max() <= 2**-9 * (1 + 1e-4)
+    assert "vlm.layers.0.mlp.up_proj.weight" in moved
+    assert "action_in_proj.weight" not in moved
+    for name, parameter in model.named_parameters():
+        torch.testing.assert_close(parameter.detach(), before[name], rtol=1e-6, atol=0)
+
+
+def test_random_libero_weights_get_the_statistics_of_real_episodes() -> None:
+    random = random_checkpoint("pi05_tiny")
+    real = demo.with_libero_stats(random).norm_stats.state
+    assert real is not None
+    assert real.q01 is not None
+    assert real.q99 is not None
+    states = np.stack([frame.state for frame in demo.load_frames()])
+    margin = 0.25 * (real.q99 - real.q01)
+    assert ((real.q01 - margin <= states) & (states <= real.q99 + margin)).mean() > 0.9
+    droid = replace(random, config=replace(random.config, robot="droid"))
+    assert demo.with_libero_stats(droid) is droid
+
+
+@pytest.mark.parametrize(("robot", "dims"), [("libero", 7), ("droid", 8), ("aloha", 14), ("aloha", 7), ("mine", 19)])
+def test_every_action_dimension_is_drawn_once_with_a_unit(robot: str, dims: int) -> None:
+    groups = action_groups(robot, dims)
+    assert sorted(index for group in groups for index in group.names) == list(range(dims))
+    assert all(group.unit and group.title and len(group.names) <= 8 for group in groups)
+    assert (groups[0].unit == "the robot's units") == ((robot, dims) in [("aloha", 7), ("mine", 19)])

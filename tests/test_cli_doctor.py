@@ -1,0 +1,208 @@
+"""`turbopi doctor` and `turbopi backends`."""
+
+import json
+import socket
+import types
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from cli_helpers import refusal, turbopi
+
+from turbopi.backends.pytorch_compile import PyTorchCompileBackend
+from turbopi.checkpoint import write_random
+from turbopi.cli import checkups
+from turbopi.cli.checkups import Row
+from turbopi.tokenizer import TINY_TOKENIZER
+
+
+def doctor(*arguments: object) -> tuple[int, dict[str, dict[str, str]]]:
+    """Exit code, and the rows by name."""
+    result = turbopi("doctor", "--json", *arguments)
+    document = json.loads(result.stdout)
+    assert document["ok"] == (result.exit_code == 0)
+    return result.exit_code, {row["name"]: row for row in document["checks"]}
+
+
+@pytest.fixture
+def cpu_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A machine without a GPU, without PaliGemma's tokenizer, and with nothing else to do."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(checkups, "nvidia_smi", lambda: (None, []))
+    monkeypatch.setattr("psutil.getloadavg", lambda: (0.5, 0.5, 0.5))
+    monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
+
+
+@pytest.mark.usefixtures("cpu_only")
+def test_a_machine_without_a_gpu_is_warned_about_and_passes() -> None:
+    code, rows = doctor()
+    assert code == 0
+    assert rows["GPU"]["level"] == "WARN"
+    assert rows["GPU"]["found"] == "no NVIDIA GPU"
+    assert rows["Python"]["level"] == rows["PyTorch"]["level"] == rows["disk"]["level"] == "OK"
+    for row in rows.values():
+        assert row["found"]
+        assert bool(row["fix"]) == (row["level"] != "OK"), row
+        assert "\n" not in row["fix"]
+
+
+@pytest.mark.usefixtures("cpu_only")
+def test_the_report_for_people_has_a_line_each_and_a_fix_below_it() -> None:
+    result = turbopi("doctor")
+    assert result.exit_code == 0
+    assert "WARN  GPU         no NVIDIA GPU\n" in result.stdout
+    assert "-> none needed for pi05_tiny, tests and development; real time needs one\n" in result.stdout
+    assert result.stdout.splitlines()[-1].endswith(" 0 failed")
+
+
+@pytest.mark.usefixtures("cpu_only")
+def test_a_missing_tokenizer_comes_with_the_command_that_gets_it(tmp_path: Path) -> None:
+    _, rows = doctor()
+    assert rows["tokenizer"]["level"] == "WARN"
+    target = tmp_path / "big_vision" / "paligemma_tokenizer.model"
+    assert rows["tokenizer"]["fix"].startswith(f"mkdir -p '{target.parent}' && curl -L -o '{target}' https://")
+
+
+@pytest.mark.usefixtures("cpu_only")
+def test_a_checkpoint_without_its_tokenizer_fails(tmp_path: Path) -> None:
+    folder = write_random("pi05_tiny", tmp_path / "tiny")
+    code, rows = doctor("--checkpoint", folder)
+    assert code == 1
+    assert rows["checkpoint"]["level"] == "OK"
+    assert "openpi_torch, pi05, pi05_tiny for libero, 6 M parameters" in rows["checkpoint"]["found"]
+    assert "this checkpoint takes 0.0 GB" in rows["memory"]["found"]
+    assert rows["tokenizer"]["level"] == "FAIL"
+    assert rows["tokenizer"]["found"] == "no tokenizer found"
+    code, rows = doctor("--checkpoint", folder, "--tokenizer", TINY_TOKENIZER)
+    assert code == 0
+    assert rows["tokenizer"]["found"] == str(TINY_TOKENIZER)
+
+
+def test_a_checkpoint_that_cannot_be_opened_fails(tmp_path: Path) -> None:
+    code, rows = doctor("--checkpoint", tmp_path / "nothing")
+    assert code == 1
+    assert rows["checkpoint"]["level"] == "FAIL"
+    assert rows["checkpoint"]["found"] == f"there is no folder {tmp_path / 'nothing'}"
+    assert "tokenizer" not in rows
+
+
+def test_a_taken_port_is_a_warning() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        row = checkups.check_port(taken.getsockname()[1])
+    assert row.level == "WARN"
+    assert row.fix == "turbopi serve --port N with another one"
+
+
+def test_missing_and_old_packages_fail_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    required = ["torch>=2.8", "rich>=99.1", "no-such-package>=1.0", 'not-for-users>=1; extra == "dev"']
+    version = metadata.version
+    monkeypatch.setattr(metadata, "requires", lambda name: required)
+    monkeypatch.setattr(metadata, "version", lambda name: "0.1.0" if name == "turbopi" else version(name))
+    row = checkups.check_packages()
+    assert row.level == "FAIL"
+    assert row.found == f"rich is {version('rich')}, older than 99.1; no-such-package is missing"
+
+
+GPU_CASES = [
+    ((9, 0), 141, ["sm_80", "sm_90"], "OK", ""),
+    ((8, 6), 24, ["sm_80", "sm_90"], "OK", ""),
+    ((12, 0), 32, ["sm_90", "compute_90"], "OK", ""),
+    ((12, 0), 32, ["sm_80", "sm_90"], "FAIL", "install a PyTorch built for it: pytorch.org"),
+    ((8, 0), 40, ["sm_86"], "FAIL", "install a PyTorch built for it: pytorch.org"),
+    ((7, 5), 16, ["sm_75"], "WARN", "bfloat16 is slow below 8.0 (Ampere): use a newer GPU"),
+    ((8, 6), 8, ["sm_80"], "WARN", "too small for a full-size model in bf16 (about 9 GB); tiny ones run"),
+]
+
+
+@pytest.mark.parametrize(("capability", "memory", "code", "level", "fix"), GPU_CASES)
+def test_a_gpu_is_judged_by_capability_code_and_memory(
+    capability: tuple[int, int], memory: float, code: list[str], level: str, fix: str
+) -> None:
+    row = checkups.judge_gpu(0, "Some GPU", capability, memory, code)
+    assert (row.level, row.fix) == (level, fix)
+    assert row.found.startswith(f"Some GPU, compute capability {capability[0]}.{capability[1]}, {memory} GB")
+
+
+@pytest.mark.parametrize(
+    ("cuda", "found", "fix"),
+    [
+        (None, "this PyTorch is built without CUDA", "pip install --force-reinstall torch"),
+        ("12.8", "PyTorch (CUDA 12.8) can't use it", "update the NVIDIA driver"),
+    ],
+)
+def test_a_gpu_that_pytorch_cannot_use_fails(
+    cuda: str | None, found: str, fix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    monkeypatch.setattr(checkups, "nvidia_smi", lambda: ("570.1", ["NVIDIA H200"]))
+    (row,) = checkups.check_gpu()
+    assert row.level == "FAIL"
+    assert "NVIDIA H200" in row.found
+    assert found in row.found
+    assert row.fix.startswith(fix)
+
+
+@pytest.mark.parametrize(
+    ("available", "parameters", "level"),
+    [(64e9, None, "OK"), (10e9, None, "OK"), (4e9, None, "WARN"), (4e9, 3_617_000_000, "FAIL"), (4e9, 6_000_000, "OK")],
+)
+def test_memory_is_held_against_what_the_weights_take(
+    available: float, parameters: int | None, level: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: types.SimpleNamespace(available=available))
+    monkeypatch.setattr(checkups, "cgroup_limit_gb", lambda: None)
+    row = checkups.check_memory(parameters)
+    assert row.level == level
+    assert ("enough for bf16 alone" in row.found) == (available == 10e9)
+    monkeypatch.setattr(checkups, "cgroup_limit_gb", lambda: 0.001)
+    assert checkups.check_memory(parameters).level == ("WARN" if parameters is None else "FAIL")
+
+
+def test_a_containers_memory_limit_is_read(tmp_path: Path) -> None:
+    assert checkups.cgroup_limit_gb(tmp_path) is None
+    (tmp_path / "memory.max").write_text("max\n")
+    assert checkups.cgroup_limit_gb(tmp_path) is None
+    (tmp_path / "memory.max").write_text("8000000000\n")
+    assert checkups.cgroup_limit_gb(tmp_path) == 8.0
+
+
+def test_busy_cpus_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("psutil.getloadavg", lambda: (1000.0, 1.0, 1.0))
+    row: Row = checkups.check_cpu()
+    assert row.level == "WARN"
+    assert "1000.0 want to run" in row.found
+
+
+def test_no_compiler_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    assert checkups.check_compiler() == Row(
+        "WARN", "C compiler", "no C compiler", "apt install gcc g++: pytorch_compile and Triton kernels need them"
+    )
+
+
+def test_backends_are_listed_with_reasons_and_what_auto_takes(monkeypatch: Any) -> None:
+    reason = "torch.compile needs a C++ compiler on a CPU; install g++"
+    monkeypatch.setattr(PyTorchCompileBackend, "unavailable", classmethod(lambda cls, device: reason))
+    result = turbopi("backends", "--device", "cpu", "--json")
+    document = json.loads(result.stdout)
+    assert (document["device"], document["auto"]) == ("cpu", "pytorch")
+    by_name = {entry["name"]: entry for entry in document["backends"]}
+    assert by_name["pytorch"]["available"] is True
+    assert by_name["pytorch"]["auto"] is True
+    assert by_name["pytorch"]["precisions"] == ["bf16", "f32"]
+    assert by_name["pytorch_compile"]["available"] is False
+    assert by_name["pytorch_compile"]["reason"] == reason
+    shown = turbopi("backends", "--device", "cpu").stdout
+    assert reason in shown
+    assert "auto takes pytorch in bf16: on a CPU the eager reference starts at once" in shown
+
+
+def test_backends_refuses_what_it_cannot_list() -> None:
+    assert "unknown device 'tpu'" in refusal(turbopi("backends", "--device", "tpu"))
+    assert "unknown precision 'fp8'; choose one of bf16, f32" in refusal(turbopi("backends", "--precision", "fp8"))

@@ -1,0 +1,179 @@
+"""The command line as a whole: help, exit codes, where output and errors go."""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from cli_helpers import refusal, text_of, turbopi
+from typer.testing import CliRunner
+
+from turbopi.cli import app
+from turbopi.cli.framework import plain, with_errors_told
+from turbopi.errors import ObservationError
+
+COMMANDS = ("demo", "infer", "serve", "inspect", "convert", "backends", "doctor")
+
+
+def test_help_lists_every_command_and_the_exit_codes() -> None:
+    help = text_of(turbopi("--help").stdout)
+    for command in COMMANDS:
+        assert f" {command} " in help
+    assert "Start with `turbopi demo`: it needs no checkpoint and no GPU." in help
+    assert "0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of Turbo-Pi's own" in help
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_help_ends_with_examples_of_that_command(command: str) -> None:
+    result = turbopi(command, "--help")
+    assert result.exit_code == 0
+    assert text_of(result.stdout).split("Examples ")[1].startswith(f"turbopi {command}")
+
+
+@pytest.mark.parametrize("command", ["demo", "infer", "serve"])
+def test_commands_that_run_a_policy_share_its_options(command: str) -> None:
+    help = text_of(turbopi(command, "--help").stdout)
+    shared = "random-weights weights-seed config backend precision steps device tokenizer default-prompt robot debug"
+    for option in shared.split():
+        assert f"--{option} " in help
+
+
+def test_a_list_of_paths_is_named_in_the_usage_line() -> None:
+    assert "turbopi infer [OPTIONS] [CHECKPOINT] OBSERVATION" in text_of(turbopi("infer", "--help").stdout)
+    assert "turbopi convert [OPTIONS] [CHECKPOINT] FOLDER" in text_of(turbopi("convert", "--help").stdout)
+
+
+def test_help_imports_neither_torch_nor_matplotlib() -> None:
+    code = (
+        "import sys; sys.argv = ['turbopi', 'demo', '--help']\n"
+        "from turbopi.cli import main\n"
+        "try: main()\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "heavy = {'torch', 'numpy', 'matplotlib', 'PIL', 'websockets'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+
+
+def test_the_module_runs_as_the_console_script_does() -> None:
+    command = [sys.executable, "-m", "turbopi.cli", "infer", "only-one-path"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith("error: infer takes two paths")
+    assert "\x1b" not in result.stderr
+
+
+def test_version_is_one_line() -> None:
+    assert re.fullmatch(r"turbopi .+\n", turbopi("--version").stdout)
+
+
+@pytest.mark.parametrize("arguments", [["nonsense"], ["demo", "--nonsense"], ["serve", "--port", "70000"], ["infer"]])
+def test_bad_usage_is_exit_code_2(arguments: list[str]) -> None:
+    assert turbopi(*arguments).exit_code == 2
+
+
+def test_weights_must_be_named_exactly_once() -> None:
+    assert refusal(turbopi("inspect")) == (
+        "no weights: give a checkpoint's folder, or --random-weights PRESET (such as pi05_tiny) to do without"
+    )
+    assert refusal(turbopi("serve", "folder", "--random-weights", "pi05_tiny")) == (
+        "two kinds of weights: the checkpoint 'folder' and --random-weights pi05_tiny; give one of them"
+    )
+
+
+def test_options_that_would_be_ignored_are_refused() -> None:
+    assert "--weights-seed is the seed of --random-weights" in refusal(turbopi("inspect", "x", "--weights-seed", 1))
+    both = turbopi("inspect", "--random-weights", "pi05_tiny", "--config", "pi05_droid")
+    assert "--config describes a checkpoint; random weights take everything from their preset" in refusal(both)
+
+
+def test_an_unknown_preset_lists_the_choices() -> None:
+    message = refusal(turbopi("inspect", "--random-weights", "pi06"))
+    assert message.startswith("unknown preset 'pi06'; choose one of pi05_base, pi05_libero")
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("--backend", "cuda", "unknown backend 'cuda'; choose one of pytorch, pytorch_compile"),
+        ("--precision", "fp8", "unknown precision 'fp8'; choose one of bf16, f32"),
+        ("--steps", "0", "the number of denoising steps is 0; it should be a whole number from 1"),
+        ("--device", "tpu", "unknown device 'tpu'; use 'auto', 'cpu', 'cuda' or 'cuda:N'"),
+        ("--tokenizer", "nowhere.model", "there is no tokenizer at nowhere.model"),
+        ("--robot", "r2d2", "unknown robot 'r2d2'; choose one of libero"),
+        ("--robot", "nomodule:Arm", "can't import the robot 'nomodule:Arm'"),
+    ],
+)
+def test_wrong_values_of_shared_options_are_refused(option: str, value: str, expected: str) -> None:
+    result = turbopi("demo", "--json", option, value)  # --json: what comes before the error goes to stderr
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert expected in result.stderr.splitlines()[-1]
+
+
+def errors_of(work: Callable[[], None], capsys: Any, debug: bool = False) -> tuple[int, str]:
+    with pytest.raises(typer.Exit) as stopped:
+        with_errors_told(work, debug=debug)
+    return stopped.value.exit_code, capsys.readouterr().err
+
+
+def raising(error: BaseException) -> Callable[[], None]:
+    def work() -> None:
+        raise error
+
+    return work
+
+
+def test_an_error_on_purpose_is_one_line_and_code_2(capsys: Any) -> None:
+    assert errors_of(raising(ObservationError("no [base] camera")), capsys) == (2, "error: no [base] camera\n")
+
+
+def test_debug_adds_the_traceback(capsys: Any) -> None:
+    code, text = errors_of(raising(ObservationError("no camera")), capsys, debug=True)
+    assert code == 2
+    assert text.startswith("Traceback")
+    assert text.endswith("error: no camera\n")
+
+
+def test_the_debug_variable_adds_the_traceback() -> None:
+    result = CliRunner().invoke(app, ["inspect"], env={"TURBOPI_DEBUG": "1"})
+    assert result.exit_code == 2
+    assert "Traceback" in result.stderr
+
+
+def test_our_own_fault_shows_its_traceback_and_is_code_3(capsys: Any) -> None:
+    code, text = errors_of(raising(KeyError("vision")), capsys)
+    assert code == 3
+    assert text.startswith("Traceback")
+    assert text.endswith("this is a fault of Turbo-Pi's own (KeyError); please report it with the traceback\n")
+
+
+def test_a_file_that_cannot_be_used_is_named(capsys: Any) -> None:
+    error = PermissionError(13, "Permission denied", "/x/actions.npz")
+    assert errors_of(raising(error), capsys) == (2, "error: /x/actions.npz: Permission denied\n")
+
+
+def test_running_out_of_memory_says_what_the_model_needs(capsys: Any) -> None:
+    code, text = errors_of(raising(MemoryError("8 GB")), capsys)
+    assert code == 2
+    assert text == (
+        "error: out of memory: 8 GB. Full-size models need 7.2 GB in bf16 and 14.5 GB in f32; "
+        "`turbopi doctor` shows what there is\n"
+    )
+
+
+def test_ctrl_c_is_quiet_and_code_130(capsys: Any) -> None:
+    assert errors_of(raising(KeyboardInterrupt()), capsys) == (130, "")
+
+
+def test_json_has_only_what_json_can_say() -> None:
+    document = {"a": np.array([1.5, np.nan]), "b": (np.float32(2), float("inf")), 3: {"path": None}}
+    assert json.loads(json.dumps(plain(document), allow_nan=False)) == {
+        "a": [1.5, None],
+        "b": [2.0, None],
+        "3": {"path": None},
+    }

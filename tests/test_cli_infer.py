@@ -1,0 +1,191 @@
+"""`turbopi infer`: every form of observation in, actions and a plot out."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli_helpers import refusal, turbopi
+from PIL import Image
+from typer.testing import Result
+
+from turbopi.demo import FRAMES, load_frames
+from turbopi.policy import UnifiedPolicy
+from turbopi.serve.record import Call, save_call
+
+TINY = ("--random-weights", "pi05_tiny", "--steps", 2, "--no-warmup")
+
+
+def observation(number: int = 0) -> dict[str, Any]:
+    frame = load_frames()[number]
+    return {
+        "observation/image": frame.base,
+        "observation/wrist_image": frame.wrist,
+        "observation/state": frame.state,
+        "prompt": frame.prompt,
+    }
+
+
+@pytest.fixture
+def npz(tmp_path: Path) -> Path:
+    file = tmp_path / "observation.npz"
+    np.savez(file, **observation())
+    return file
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    for number in range(3):
+        result = {"actions": np.zeros((10, 7)), "policy_timing": {}}
+        save_call(folder / f"{number:06d}.npz", Call(observation(number), result, 0.0))
+    return folder
+
+
+def infer(tmp_path: Path, *arguments: object) -> Result:
+    result = turbopi("infer", *TINY, *arguments, "-o", tmp_path / "actions.npz")
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def actions_in(tmp_path: Path) -> np.ndarray:
+    with np.load(tmp_path / "actions.npz") as archive:
+        assert set(archive.files) == {"actions", "noise"}
+        actions: np.ndarray = archive["actions"]
+        return actions
+
+
+def test_an_npz_becomes_actions_and_a_plot(npz: Path, tmp_path: Path) -> None:
+    result = infer(tmp_path, npz, "--seed", 5)
+    actions = actions_in(tmp_path)
+    assert actions.shape == (10, 7)
+    assert actions.dtype == np.float64
+    assert "RANDOM WEIGHTS (pi05_tiny, seed 0)" in result.stdout
+    assert re.search(r"preprocess .* vision .* prefix .* denoise .* postprocess .* model .* total", result.stdout)
+    assert f"actions [10 x 7] written to {tmp_path / 'actions.npz'}\n" in result.stdout
+    assert f"plot written to {tmp_path / 'actions.png'}\n" in result.stdout
+    with Image.open(tmp_path / "actions.png") as plot:
+        assert plot.width > plot.height > 200
+
+
+def test_the_actions_are_the_policys_own(npz: Path, tmp_path: Path) -> None:
+    from turbopi.checkpoint import random_checkpoint
+
+    infer(tmp_path, npz, "--seed", 5, "--no-plot")
+    assert not (tmp_path / "actions.png").exists()
+    policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), num_denoising_steps=2)
+    np.testing.assert_array_equal(actions_in(tmp_path), policy.infer(observation(), seed=5)["actions"])
+
+
+def test_a_folder_with_pictures_gives_the_same_as_their_arrays(npz: Path, tmp_path: Path) -> None:
+    infer(tmp_path, npz, "--seed", 5, "--no-plot")
+    expected = actions_in(tmp_path)
+    folder = tmp_path / "by_hand"
+    folder.mkdir()
+    entry = json.loads((FRAMES / "frames.json").read_text())[0]
+    for name in ("image", "wrist_image"):
+        (folder / entry[name]).write_bytes((FRAMES / entry[name]).read_bytes())
+    written = {f"observation/{name}": {"file": entry[name]} for name in ("image", "wrist_image")}
+    written |= {"observation/state": entry["state"], "prompt": entry["prompt"]}
+    (folder / "observation.json").write_text(json.dumps(written))
+    infer(tmp_path, folder, "--seed", 5, "--no-plot")
+    np.testing.assert_array_equal(actions_in(tmp_path), expected)
+
+
+def test_a_recording_is_run_call_by_call(npz: Path, recording: Path, tmp_path: Path) -> None:
+    result = infer(tmp_path, recording, "--seed", 5, "--plot", tmp_path / "all.pdf")
+    chunks = actions_in(tmp_path)
+    assert chunks.shape == (3, 10, 7)
+    assert "of 3 calls" in result.stdout
+    assert "median" in result.stdout
+    assert (tmp_path / "all.pdf").stat().st_size > 10_000
+    infer(tmp_path, recording, "--call", 1, "--seed", 6, "--no-plot")
+    np.testing.assert_array_equal(actions_in(tmp_path), chunks[1])
+    infer(tmp_path, npz, "--seed", 5, "--no-plot")
+    np.testing.assert_array_equal(actions_in(tmp_path), chunks[0])
+
+
+def test_noise_from_a_file_is_what_the_model_starts_from(npz: Path, tmp_path: Path) -> None:
+    infer(tmp_path, npz, "--seed", 5, "--no-plot")
+    expected = actions_in(tmp_path)
+    (tmp_path / "actions.npz").rename(tmp_path / "first.npz")
+    infer(tmp_path, npz, "--noise", tmp_path / "first.npz", "--no-plot")
+    np.testing.assert_array_equal(actions_in(tmp_path), expected)
+    np.save(tmp_path / "noise.npy", np.zeros((10, 32), np.float32))
+    infer(tmp_path, npz, "--noise", tmp_path / "noise.npy", "--no-plot")
+    assert not np.array_equal(actions_in(tmp_path), expected)
+
+
+def test_without_a_seed_the_one_drawn_is_told_and_gives_the_same_again(npz: Path, tmp_path: Path) -> None:
+    told = re.search(r"--seed (\d+) gives these actions again", infer(tmp_path, npz, "--no-plot").stdout)
+    assert told is not None
+    drawn = actions_in(tmp_path)
+    infer(tmp_path, npz, "--no-plot", "--seed", told[1])
+    np.testing.assert_array_equal(actions_in(tmp_path), drawn)
+
+
+def test_json_is_one_document_on_stdout(npz: Path, tmp_path: Path) -> None:
+    result = infer(tmp_path, npz, "--json", "--no-plot")
+    document = json.loads(result.stdout)
+    np.testing.assert_array_equal(document["actions"], actions_in(tmp_path))
+    assert document["policy"]["random_weights"] is True
+    assert document["policy_timing"][0]["total_ms"] > document["policy_timing"][0]["infer_ms"] > 0
+    assert document["plot"] is None
+    assert "RANDOM WEIGHTS" in result.stderr
+
+
+def test_wrong_paths_are_told_what_infer_takes() -> None:
+    assert refusal(turbopi("infer", "a")) == (
+        "infer takes two paths, the checkpoint and the observation "
+        "(or --random-weights PRESET and the observation alone), but got 1: a"
+    )
+    assert refusal(turbopi("infer", "a", "b", "c", "--random-weights", "pi05_tiny")) == (
+        "infer takes one path, the observation (the weights are random), but got 3: a b c"
+    )
+    assert "two kinds of weights" in refusal(turbopi("infer", "a", "b", "--random-weights", "pi05_tiny"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["nowhere.npz"], "nowhere.npz doesn't exist"),
+        (["OBS", "--seed", "1", "--noise", "n.npy"], "--noise and --seed were both given; give one of them"),
+        (["OBS", "--plot", "x.png", "--no-plot"], "--plot and --no-plot were both given; give one of them"),
+        (["OBS", "--plot", "x.xyz"], "the plot x.xyz should end in one of .png, .pdf, .svg"),
+        (["OBS", "--noise", "nowhere.npy"], "the noise nowhere.npy can't be read: No such file or directory"),
+        (["OBS", "--noise", "OBS"], "has no array named noise, only observation/image"),
+        (["OBS", "-o", "OBS"], "is the observation itself: write to another file"),
+        (["OBS", "-o", "no/folder/actions.npz"], "can't write no/folder/actions.npz: there is no folder"),
+        (["OBS", "-o", "."], ". is a folder; give a file's name"),
+        (["OBS", "-o", "both.png"], "would both be written to both.png"),
+        (["OBS", "--call", "0"], "--call picks one call of a recording's folder"),
+        (["REC", "--call", "3"], "there is no call 3: "),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_is_loaded(
+    arguments: list[str], expected: str, npz: Path, recording: Path
+) -> None:
+    paths = {"OBS": str(npz), "REC": str(recording)}
+    result = turbopi("infer", *TINY, *(paths.get(argument, argument) for argument in arguments))
+    assert expected in refusal(result)
+
+
+def test_an_observation_the_robot_cannot_use_is_refused_by_name(npz: Path, tmp_path: Path) -> None:
+    with np.load(npz) as archive:
+        content = dict(archive)
+    del content["observation/wrist_image"]
+    np.savez(npz, **content)
+    result = turbopi("infer", *TINY, npz, "-o", tmp_path / "actions.npz")
+    assert result.exit_code == 2
+    assert f"error: {npz}: the observation has no 'observation/wrist_image'" in result.stderr
+    assert not (tmp_path / "actions.npz").exists()
+
+
+def test_noise_of_another_shape_is_refused(npz: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "noise.npy", np.zeros((9, 32), np.float32))
+    result = turbopi("infer", *TINY, npz, "--noise", tmp_path / "noise.npy", "-o", tmp_path / "actions.npz")
+    assert result.exit_code == 2
+    assert "noise has shape [9, 32], but this policy needs [10, 32]" in result.stderr

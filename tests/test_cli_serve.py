@@ -1,0 +1,135 @@
+"""`turbopi serve`: as a process of its own, with a client."""
+
+import json
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+from cli_helpers import refusal, turbopi
+from websockets.sync.client import connect
+
+from turbopi.demo import load_frames
+from turbopi.serve.record import iter_recording
+from turbopi.serve.wire import pack, unpack
+
+TINY = ("--random-weights", "pi05_tiny", "--steps", "2")
+
+
+@contextmanager
+def serving(*options: str, **environment: str) -> Iterator[tuple["subprocess.Popen[str]", str, list[str]]]:
+    """A server process: itself, its URL, and what it has printed."""
+    command = [sys.executable, "-m", "turbopi.cli", "serve", *TINY, "--port", "0", *options]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | environment,
+    ) as process:
+        try:
+            printed: list[str] = []
+            yield process, wait_for_url(process, printed), printed
+        finally:
+            if process.poll() is None:
+                process.kill()
+
+
+def wait_for_url(process: "subprocess.Popen[str]", printed: list[str]) -> str:
+    assert process.stdout is not None
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        readable, _, _ = select.select([process.stdout], [], [], 1)
+        if readable:
+            line = process.stdout.readline()
+            if not line:
+                assert process.stderr is not None
+                raise AssertionError(f"the server ended: {printed} {process.stderr.read()}")
+            printed.append(line)
+            if found := re.search(r"Serving at (ws://\S+)", line):
+                return found[1]
+    raise AssertionError(f"no server after 120 s: {printed}")
+
+
+def test_a_client_gets_actions_and_ctrl_c_stops(tmp_path: Path) -> None:
+    frame = load_frames()[0]
+    observation: dict[str, Any] = {
+        "observation/image": frame.base,
+        "observation/wrist_image": frame.wrist,
+        "observation/state": frame.state,
+    }  # no prompt: the default
+    options = ("--default-prompt", "open the drawer", "--record", str(tmp_path))
+    with serving(*options, TURBOPI_API_KEY="k3y") as (process, url, printed):
+        assert printed[0] == "RANDOM WEIGHTS (pi05_tiny, seed 0): the actions mean nothing.\n"
+        assert "Warming up …\n" in printed
+        with connect(url, additional_headers={"Authorization": "Api-Key k3y"}, compression=None) as client:
+            metadata = unpack(client.recv(decode=False))
+            assert metadata["default_prompt"] == "open the drawer"
+            assert metadata["random_weights"] is True
+            client.send(pack(observation))
+            result = unpack(client.recv(decode=False))
+            assert result["actions"].shape == (10, 7)
+            assert np.isfinite(result["actions"]).all()
+        http = url.replace("ws://", "http://")
+        assert urlopen(f"{http}/healthz", timeout=10).read() == b"OK\n"
+        metrics = urlopen(Request(f"{http}/metrics", headers={"Authorization": "Api-Key k3y"}), timeout=10)
+        assert b"turbopi_requests_total 1.0" in metrics.read()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert out.endswith("Stopped.\n")
+    assert "Traceback" not in err
+    ((seen, actions),) = iter_recording(tmp_path)
+    np.testing.assert_array_equal(seen["observation/image"], frame.base)
+    np.testing.assert_array_equal(actions, result["actions"])
+    (manifest,) = tmp_path.glob("*/manifest.json")
+    assert json.loads(manifest.read_text())["metadata"]["config"] == "pi05_tiny"
+
+
+def test_no_warmup_hides_the_policys_warmup_from_the_server(monkeypatch: Any) -> None:
+    served: dict[str, Any] = {}
+    monkeypatch.setattr("turbopi.serve.run", lambda policy, **options: served.update(policy=policy, **options))
+    result = turbopi("serve", *TINY, "--port", 0, "--no-warmup", "--queue-limit", 3, "--max-message-mb", 1.5)
+    assert result.exit_code == 0, result.output
+    assert not hasattr(served["policy"], "warmup")
+    assert served["policy"].metadata["num_denoising_steps"] == 2
+    assert (served["queue_limit"], served["max_message_mb"]) == (3, 1.5)
+    assert (served["host"], served["port"], served["api_key"], served["record_dir"]) == ("127.0.0.1", 0, None, None)
+
+
+def test_a_taken_port_is_refused_before_weights_are_loaded() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        message = refusal(turbopi("serve", *TINY, "--port", port))
+    assert message.startswith(f"can't listen on 127.0.0.1:{port}: ")
+    assert message.endswith("Choose another --host or --port")
+
+
+def test_a_host_that_is_not_this_machine_is_refused() -> None:
+    assert "can't listen on 192.0.2.1:8000: " in refusal(turbopi("serve", *TINY, "--host", "192.0.2.1"))
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("--max-message-mb", "0", "max_message_mb must be more than 0"),
+        ("--api-key", "two words", "the API key must be printable ASCII without spaces"),
+    ],
+)
+def test_what_the_server_refuses_is_one_line(option: str, value: str, expected: str) -> None:
+    result = turbopi("serve", *TINY, "--port", 0, option, value)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {expected}")
