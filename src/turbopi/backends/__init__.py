@@ -43,8 +43,14 @@ _SPECS = (
         "CudaGraphBackend",
         "the whole call in one CUDA graph, PyTorch's kernels: NVIDIA GPUs from compute capability 8.0",
     ),
+    BackendSpec(
+        "fused",
+        "turbopi.backends.fused",
+        "FusedBackend",
+        "cuda_graph with kernels of our own, bf16: NVIDIA GPUs from compute capability 8.0",
+    ),
 )
-_FASTEST_FIRST = ("cuda_graph", "pytorch_compile")
+_FASTEST_FIRST = ("fused", "cuda_graph", "pytorch_compile")
 BACKENDS: dict[str, BackendSpec] = {spec.name: spec for spec in _SPECS}
 
 
@@ -77,13 +83,11 @@ def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, st
     """The backend that "auto" stands for on a device in a precision, and why."""
     if device.type == "cpu":
         return "pytorch", "auto: on a CPU the eager reference starts at once and compiling gains little"
-    reasons = []
+    reasons: list[str] = []
     for name in _FASTEST_FIRST:
         if precision not in precisions(name):
             continue
         reason = availability(name, device)
-        if reason is None and precision not in precisions(name):
-            reason = f"it doesn't run in {precision}"
         if reason is None:
             skipped = f" ({'; '.join(reasons)})" if reasons else ""
             return name, f"auto: the fastest backend for this GPU and precision{skipped}"

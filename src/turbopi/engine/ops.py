@@ -208,7 +208,7 @@ def compiled() -> Ops:
         rope_split=_compiled(rope_split),
         vision_attention=vision_attention,
         attention=compiled_attention,
-        origin=PLAIN.origin | {"all else": "Inductor"},
+        origin={**PLAIN.origin, "all else": "Inductor"},
     )
 
 

@@ -1,0 +1,1 @@
+"""Our own GPU kernels. CUDA C++ is compiled when first needed, without nvcc, and the result is cached on disk."""

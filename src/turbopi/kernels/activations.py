@@ -1,0 +1,54 @@
+"""GELU and GeGLU. Twins: `engine.ops.gelu`, `engine.ops.geglu`."""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from turbopi.kernels.launch import dependent_launch, launch_dependents, wait_for_producer
+
+
+@triton.jit
+def gelu_tanh(x):
+    """0.5 x (1 + tanh(√(2/π) (x + 0.044715 x³))), written as x · sigmoid of twice the argument; x float32."""
+    return x / (1 + tl.exp2(x * (-2.302208198 - 0.1029432397 * x * x)))  # 2 √(2/π) log2(e), times 0.044715
+
+
+@triton.jit
+def _gelu_kernel(x, out, count, BLOCK: tl.constexpr, PDL: tl.constexpr):
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    value = gelu_tanh(tl.load(x + at, at < count, 0.0).to(tl.float32))
+    tl.store(out + at, value.to(out.dtype.element_ty), at < count)
+
+
+@triton.jit
+def _geglu_kernel(gate_up, out, hidden, BLOCK: tl.constexpr, PDL: tl.constexpr):
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    row = tl.program_id(1).to(tl.int64)
+    cols = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = cols < hidden
+    gate = gelu_tanh(tl.load(gate_up + row * 2 * hidden + cols, mask, 0.0).to(tl.float32))
+    up = tl.load(gate_up + (row * 2 + 1) * hidden + cols, mask, 0.0).to(tl.float32)
+    tl.store(out + row * hidden + cols, (gate * up).to(out.dtype.element_ty), mask)
+
+
+def gelu(x: Tensor) -> Tensor:
+    assert x.is_contiguous(), "x is read as it lies in memory"
+    out = torch.empty_like(x)
+    _gelu_kernel[(triton.cdiv(x.numel(), 2048),)](x, out, x.numel(), BLOCK=2048, num_warps=8, **dependent_launch(x))
+    return out
+
+
+def geglu(gate_up: Tensor) -> Tensor:
+    """[tokens, 2F], gate columns before up columns -> [tokens, F]; the product isn't rounded in between."""
+    assert gate_up.is_contiguous(), "gate_up is read as it lies in memory"
+    rows, hidden = gate_up.shape[0], gate_up.shape[1] // 2
+    out = gate_up.new_empty(rows, hidden)
+    block = min(2048, triton.next_power_of_2(hidden))
+    _geglu_kernel[(triton.cdiv(hidden, block), rows)](
+        gate_up, out, hidden, BLOCK=block, num_warps=max(1, block // 256), **dependent_launch(gate_up)
+    )
+    return out

@@ -1,0 +1,167 @@
+"""Attention without materialised logits: inside pictures, and of many query heads over one key/value head.
+
+Twins: `engine.ops.vision_attention`, `engine.ops.attention`, `engine.ops.masked_softmax`. Logits, softmax and sums are
+float32; probabilities are rounded to the values' dtype for their product, as in the twins.
+"""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from turbopi.kernels.launch import dependent_launch, launch_dependents, wait_for_producer
+
+LOG2_E = 1.4426950408889634
+
+
+@triton.jit
+def _vision_kernel(
+    qkv, out, tokens, heads, scale,
+    DIM: tl.constexpr, BLOCK_A: tl.constexpr, BLOCK_B: tl.constexpr,
+    BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr,
+):  # fmt: skip
+    """One head's BLOCK_M queries of one picture. A head's columns come as BLOCK_A (a power of two) and BLOCK_B more."""
+    image, head = tl.program_id(1) // heads, tl.program_id(1) % heads
+    width = heads * DIM
+    m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
+    n = tl.arange(0, BLOCK_N)
+    a = tl.arange(0, BLOCK_A)
+    b = BLOCK_A + tl.arange(0, BLOCK_B if BLOCK_B > 0 else 16)
+    base = qkv + image * tokens * 3 * width + head * DIM
+    q = base + m[:, None] * 3 * width
+    q_a = tl.load(q + a[None, :], (m < tokens)[:, None], 0.0)
+    acc_a = tl.zeros((BLOCK_M, BLOCK_A), tl.float32)
+    if BLOCK_B > 0:
+        q_b = tl.load(q + b[None, :], (m < tokens)[:, None] & (b < DIM)[None, :], 0.0)
+        acc_b = tl.zeros((BLOCK_M, BLOCK_B), tl.float32)
+    top = tl.full((BLOCK_M,), -float("inf"), tl.float32)
+    total = tl.zeros((BLOCK_M,), tl.float32)
+    for start in range(0, tokens, BLOCK_N):
+        valid = start + n < tokens
+        k = base + width + (start + n)[:, None] * 3 * width
+        logits = tl.dot(q_a, tl.load(k + a[None, :], valid[:, None], 0.0).T, input_precision="ieee")
+        if BLOCK_B > 0:
+            k_b = tl.load(k + b[None, :], valid[:, None] & (b < DIM)[None, :], 0.0)
+            logits = tl.dot(q_b, k_b.T, logits, input_precision="ieee")
+        logits = tl.where(valid[None, :], logits * scale, -float("inf"))
+        new_top = tl.maximum(top, tl.max(logits, 1))
+        p = tl.exp2(logits - new_top[:, None])
+        shrink = tl.exp2(top - new_top)
+        total = total * shrink + tl.sum(p, 1)
+        top = new_top
+        p = p.to(qkv.dtype.element_ty)
+        v = k + width
+        acc_a = tl.dot(p, tl.load(v + a[None, :], valid[:, None], 0.0), acc_a * shrink[:, None], input_precision="ieee")
+        if BLOCK_B > 0:
+            v_b = tl.load(v + b[None, :], valid[:, None] & (b < DIM)[None, :], 0.0)
+            acc_b = tl.dot(p, v_b, acc_b * shrink[:, None], input_precision="ieee")
+    to = out + (image * tokens + m)[:, None] * width + head * DIM
+    dtype = out.dtype.element_ty
+    tl.store(to + a[None, :], (acc_a / total[:, None]).to(dtype), (m < tokens)[:, None])
+    if BLOCK_B > 0:
+        stored = (m < tokens)[:, None] & (b < DIM)[None, :]
+        tl.store(to + b[None, :], (acc_b / total[:, None]).to(dtype), stored)
+
+
+def vision_attention(qkv: Tensor, images: int, heads: int) -> Tensor:
+    """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W]."""
+    assert qkv.is_contiguous(), "qkv is read as it lies in memory"
+    rows, width = qkv.shape[0], qkv.shape[1] // 3
+    tokens, dim = rows // images, width // heads
+    block_a = 1 << (dim.bit_length() - 1)
+    assert block_a >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
+    block_b = 0 if block_a == dim else max(16, triton.next_power_of_2(dim - block_a))
+    out = qkv.new_empty(rows, width)
+    block_m, block_n, warps, stages = VISION_TILE
+    # launched early, several blocks would crowd onto each of the few SMs that the product before leaves idle
+    _vision_kernel[(triton.cdiv(tokens, block_m), images * heads)](
+        qkv, out, tokens, heads, dim**-0.5 * LOG2_E, DIM=dim, BLOCK_A=block_a, BLOCK_B=block_b,
+        BLOCK_M=block_m, BLOCK_N=block_n, num_warps=warps, num_stages=stages,
+    )  # fmt: skip
+    return out
+
+
+VISION_TILE = (64, 64, 4, 3)
+
+
+@triton.jit
+def _prefix_kernel(
+    q, k, v, length, out, rows, scale,
+    DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """BLOCK_M rows of queries (of any head: they share the keys) over the first `length` keys."""
+    m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
+    n = tl.arange(0, BLOCK_N)
+    d = tl.arange(0, BLOCK_D)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    end = tl.load(length).to(tl.int32)
+    inside = (m < rows)[:, None] & (d < DIM)[None, :]
+    queries = tl.load(q + m[:, None] * DIM + d[None, :], inside, 0.0)
+    acc = tl.zeros((BLOCK_M, BLOCK_D), tl.float32)
+    top = tl.full((BLOCK_M,), -float("inf"), tl.float32)
+    total = tl.zeros((BLOCK_M,), tl.float32)
+    for start in range(0, end, BLOCK_N):
+        valid = start + n < end
+        loaded = valid[:, None] & (d < DIM)[None, :]
+        at = (start + n)[:, None] * DIM + d[None, :]
+        logits = tl.dot(queries, tl.load(k + at, loaded, 0.0).T, input_precision="ieee") * scale
+        logits = tl.where(valid[None, :], logits, -float("inf"))
+        new_top = tl.maximum(top, tl.max(logits, 1))
+        p = tl.exp2(logits - new_top[:, None])
+        shrink = tl.exp2(top - new_top)
+        total = total * shrink + tl.sum(p, 1)
+        top = new_top
+        values = tl.load(v + at, loaded, 0.0)
+        acc = tl.dot(p.to(values.dtype), values, acc * shrink[:, None], input_precision="ieee")
+    tl.store(out + m[:, None] * DIM + d[None, :], (acc / total[:, None]).to(out.dtype.element_ty), inside)
+
+
+def prefix_attention(q: Tensor, k: Tensor, v: Tensor, length: Tensor, heads: int) -> Tensor:
+    """Rows q [tokens * n, K] over the first `length` (int64[1], on the device, at least 1) keys -> [tokens, n * K].
+
+    k, v [keys, K]; what lies beyond `length` is never read.
+    """
+    assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
+    rows, dim = q.shape
+    assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
+    out = q.new_empty(rows // heads, heads * dim)
+    block_m, block_n, warps, stages = PREFIX_TILE
+    _prefix_kernel[(triton.cdiv(rows, block_m),)](
+        q, k, v, length, out, rows, dim**-0.5 * LOG2_E, DIM=dim, BLOCK_D=triton.next_power_of_2(dim),
+        BLOCK_M=block_m, BLOCK_N=block_n, num_warps=warps, num_stages=stages, **dependent_launch(q),
+    )  # fmt: skip
+    return out
+
+
+PREFIX_TILE = (64, 64, 4, 2)
+
+
+@triton.jit
+def _softmax_kernel(
+    logits, length, out, keys, slots, heads, scale, STATE_TOKEN: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr
+):  # fmt: skip
+    row = tl.program_id(0)
+    key = tl.arange(0, BLOCK)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    visible = (key < tl.load(length)) | ((key >= slots) & (key < keys))
+    if STATE_TOKEN:
+        visible = visible & ((row >= heads) | (key <= slots))
+    x = tl.load(logits + row * keys + key, visible, -float("inf")) * scale
+    p = tl.exp2(x - tl.max(x, 0))
+    tl.store(out + row * keys + key, (p / tl.sum(p, 0)).to(out.dtype.element_ty), key < keys)
+
+
+def masked_softmax(
+    logits: Tensor, length: Tensor, slots: int, heads: int, state_token: bool, scale: float, dtype: torch.dtype
+) -> Tensor:
+    """softmax(logits * scale) over the visible keys, in `dtype`; logits float32[tokens * n, keys]"""
+    assert logits.is_contiguous(), "logits are read as they lie in memory"
+    rows, keys = logits.shape
+    out = torch.empty(rows, keys, dtype=dtype, device=logits.device)
+    _softmax_kernel[(rows,)](
+        logits, length, out, keys, slots, heads, scale * LOG2_E,
+        STATE_TOKEN=state_token, BLOCK=triton.next_power_of_2(keys), num_warps=4, **dependent_launch(logits),
+    )  # fmt: skip
+    return out

@@ -1,0 +1,254 @@
+// out[M, N] = epilogue(a[M, K] @ w[N, K]^T) in bfloat16 with float32 sums: TMA feeds shared memory, wgmma multiplies.
+// For compute capability 9.0. gemm.py sets the TP_ constants and writes `mma` for the tile's width.
+//
+// A CTA has one producer warp and TP_WGS consumer warpgroups of TP_MT * 64 rows each, and walks over its tiles
+// (grid = SMs, not tiles), so the next tile's loads run during an epilogue. TP_CM x TP_CN CTAs form a cluster of
+// neighbouring tiles: those of a row share their part of `a` and those of a column theirs of `w`; each loads its share
+// of it into all of them, as reading operands from L2 would be the bottleneck.
+// Weights don't depend on the kernel before this one: their first loads are issued before waiting for its end. With TP_PER_SM = 2 a CTA takes half an SM's memory and registers, so it can do that while
+// the kernel before still runs: short products gain more from that than they lose by fewer stages.
+//
+// Epilogues: 0 plain, 1 + bias, 2 gelu(+ bias), 3 GeGLU (w has N gate rows, then N up rows), 4 float32 sums of a part
+// of K each (+ bias in the first) as out[split, M, N].
+
+typedef unsigned int u32;
+typedef unsigned long long u64;
+typedef unsigned short u16;
+struct alignas(64) TensorMap { char bytes[128]; };
+
+constexpr int WGS = TP_WGS, MT = TP_MT, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
+constexpr int EPILOGUE = TP_EPILOGUE, CLUSTER = CM * CN;
+constexpr int BM = 64 * WGS * MT, BK = 64, TILE_N = EPILOGUE == 3 ? BN / 2 : BN;
+constexpr int A_BYTES = BM * BK * 2, B_BYTES = BN * BK * 2, STAGE_BYTES = A_BYTES + B_BYTES;
+constexpr bool BIASED = EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4;
+constexpr int PER_SM = TP_PER_SM, THREADS = 128 * WGS + (PER_SM == 1 ? 128 : 32);
+constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;  // where registers are moved to consumers
+constexpr int PRODUCER_REGISTERS = WGS == 1 ? 40 : WGS == 2 ? 40 : 24;
+
+__device__ __forceinline__ u32 shared_address(const void* p) { return (u32)__cvta_generic_to_shared(p); }
+
+__device__ __forceinline__ void barrier_init(u32 bar, u32 count) {
+    asm volatile("mbarrier.init.shared::cta.b64 [%0], %1;" ::"r"(bar), "r"(count));
+}
+__device__ __forceinline__ void barrier_expect(u32 bar, u32 bytes) {
+    asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(bar), "r"(bytes) : "memory");
+}
+__device__ __forceinline__ void barrier_arrive(u32 bar, u32 cta) {
+    asm volatile(
+        "{ .reg .b32 remote; mapa.shared::cluster.u32 remote, %0, %1;"
+        "mbarrier.arrive.shared::cluster.b64 _, [remote]; }" ::"r"(bar), "r"(cta) : "memory");
+}
+__device__ __forceinline__ void barrier_arrive(u32 bar) {
+    asm volatile("mbarrier.arrive.shared::cta.b64 _, [%0];" ::"r"(bar) : "memory");
+}
+__device__ __forceinline__ void barrier_wait(u32 bar, u32 parity) {
+    asm volatile(
+        "{ .reg .pred done;\n"
+        "again: mbarrier.try_wait.parity.shared::cta.b64 done, [%0], %1;\n"
+        "@!done bra again; }" ::"r"(bar), "r"(parity) : "memory");
+}
+// into the CTAs of `mask`, at the same place in each
+template <bool MULTICAST>
+__device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int row, u32 bar, u32 mask) {
+    if (MULTICAST)
+        asm volatile(
+            "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster"
+            " [%0], [%1, {%2, %3}], [%4], %5;"
+            ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar), "h"((u16)mask) : "memory");
+    else
+        asm volatile(
+            "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3}], [%4];"
+            ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar) : "memory");
+}
+__device__ __forceinline__ void cluster_sync() {
+    asm volatile("barrier.cluster.arrive.relaxed;\nbarrier.cluster.wait;" ::: "memory");
+}
+// K-major operand in shared memory, rows of 128 bytes, swizzled; groups of 8 rows lie 1024 bytes apart
+__device__ __forceinline__ u64 operand(u32 address) {
+    return ((u64)(address & 0x3ffff) >> 4) | (1ull << 16) | (64ull << 32) | (1ull << 62);
+}
+
+TP_MMA  // mma(float (&sums)[BN / 2], u64 a, u64 b, int keep)
+
+__device__ __forceinline__ float gelu(float x) {  // tanh's, as x * sigmoid
+    return __fdividef(x, 1.0f + exp2f(x * (-2.302208198f - 0.1029432397f * x * x)));
+}
+__device__ __forceinline__ u32 pack(float low, float high) {
+    u32 both;
+    asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
+    return both;
+}
+__device__ __forceinline__ float bf16_low(u32 both) { return __uint_as_float(both << 16); }
+__device__ __forceinline__ float bf16_high(u32 both) { return __uint_as_float(both & 0xffff0000u); }
+
+// A quad holds 4 blocks of 8 columns of one row, 2 columns of each block a lane; afterwards lane i holds block i.
+__device__ __forceinline__ uint4 transpose_quad(u32 p0, u32 p1, u32 p2, u32 p3, int lane) {
+    const bool odd = lane & 1, high = lane & 2;
+    const u32 r0 = __shfl_xor_sync(~0u, odd ? p0 : p1, 1), r1 = __shfl_xor_sync(~0u, odd ? p2 : p3, 1);
+    const u32 x0 = odd ? r0 : p0, x1 = odd ? p1 : r0, y0 = odd ? r1 : p2, y1 = odd ? p3 : r1;
+    const u32 s0 = __shfl_xor_sync(~0u, high ? x0 : y0, 2), s1 = __shfl_xor_sync(~0u, high ? x1 : y1, 2);
+    return high ? make_uint4(s0, s1, y0, y1) : make_uint4(x0, x1, s0, s1);
+}
+
+struct Tile {
+    int m, n, k, k_end, split;
+};
+
+__device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, int k_blocks, int rank) {
+    Tile t;
+    t.m = (unit % m_groups * CM + rank / CN) * BM;
+    const int rest = unit / m_groups;
+    t.n = (rest % n_groups * CN + rank % CN) * TILE_N;
+    t.split = rest / n_groups;
+    t.k = k_blocks * t.split / SPLITS;
+    t.k_end = k_blocks * (t.split + 1) / SPLITS;
+    return t;
+}
+
+extern "C" __global__ void __launch_bounds__(THREADS, PER_SM)
+gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap map_w, void* out, const u32* bias,
+     int M, int N, int k_blocks, int m_groups, int n_groups) {
+    extern __shared__ char raw[];
+    const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
+    const u32 full = base + STAGES * STAGE_BYTES, empty = full + 8 * STAGES;
+    const int warpgroup = threadIdx.x / 128, rank = CLUSTER > 1 ? blockIdx.x % CLUSTER : 0;
+    const int units = m_groups * n_groups * SPLITS, stride = gridDim.x / CLUSTER, first = blockIdx.x / CLUSTER;
+
+    if (threadIdx.x == 128 * WGS) {
+        asm volatile("prefetch.tensormap [%0];\nprefetch.tensormap [%1];" ::"l"(&map_a), "l"(&map_w));
+    }
+    if (threadIdx.x == 0) {
+        for (int s = 0; s < STAGES; ++s) {
+            barrier_init(full + 8 * s, 1);
+            barrier_init(empty + 8 * s, WGS * (CM + CN - 1));
+        }
+        asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
+    }
+    if (CLUSTER > 1) cluster_sync();
+    else __syncthreads();
+    asm volatile("griddepcontrol.launch_dependents;");
+
+    if (warpgroup == WGS) {
+        if (PER_SM == 1) asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
+        if (threadIdx.x == 128 * WGS) {
+            const int cm = rank / CN, cn = rank % CN;
+            const u32 same_row = ((1u << CN) - 1) << cm * CN;
+            u32 same_column = 0;
+            for (int i = 0; i < CM; ++i) same_column |= 1u << (i * CN + cn);
+            constexpr int PARTS = EPILOGUE == 3 ? 2 : 1, ROWS = BN / PARTS / CM;
+            auto load_w = [&](int s, int k, int n) {
+                const u32 bar = full + 8 * s;
+                barrier_expect(bar, STAGE_BYTES);
+                for (int part = 0; part < PARTS; ++part) {
+                    const u32 to = base + s * STAGE_BYTES + A_BYTES + (part * CM + cm) * ROWS * BK * 2;
+                    load<(CM > 1)>(to, &map_w, k * BK, part * N + n + cm * ROWS, bar, same_column);
+                }
+            };
+            auto load_a = [&](int s, int k, int m) {
+                const u32 to = base + s * STAGE_BYTES + cn * (A_BYTES / CN);
+                load<(CN > 1)>(to, &map_a, k * BK, m + cn * (BM / CN), full + 8 * s, same_row);
+            };
+            int step = 0;
+            for (int unit = first; unit < units; unit += stride) {
+                const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
+                int k = t.k;
+                if (unit == first) {
+                    const int early = min(STAGES, t.k_end - t.k);
+                    for (; step < early; ++step) load_w(step, k + step, t.n);
+                    asm volatile("griddepcontrol.wait;" ::: "memory");
+                    for (step = 0; step < early; ++step, ++k) load_a(step, k, t.m);
+                }
+                for (; k < t.k_end; ++k, ++step) {
+                    const int s = step % STAGES;
+                    if (step >= STAGES) barrier_wait(empty + 8 * s, (step / STAGES + 1) & 1);
+                    load_w(s, k, t.n);
+                    load_a(s, k, t.m);
+                }
+            }
+        }
+    } else {
+        if (PER_SM == 1) asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
+        const int group = warpgroup, lane = threadIdx.x % 32, warp = threadIdx.x / 32 % 4;
+        auto release = [&](int step) {
+            const u32 bar = empty + 8 * (step % STAGES);
+            if (CLUSTER == 1) {
+                if (threadIdx.x % 128 == 0) barrier_arrive(bar);
+            } else {  // all that load into this CTA
+                const int cta = threadIdx.x % 128;
+                if (cta < CLUSTER && (cta / CN == rank / CN || cta % CN == rank % CN)) barrier_arrive(bar, cta);
+            }
+        };
+        int step = 0;
+        for (int unit = first; unit < units; unit += stride) {
+            const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
+            float sums[MT][BN / 2];
+            u32 offsets[BIASED ? BN / 8 : 1];  // the bias of this lane's columns, read long before it is needed
+            if (BIASED) {
+#pragma unroll
+                for (int j = 0; j < BN / 8; ++j) {
+                    const int col = t.n + j * 8 + lane % 4 * 2;
+                    offsets[j] = bias && col < N && t.split == 0 ? bias[col / 2] : 0;
+                }
+            }
+            for (int k = t.k; k < t.k_end; ++k, ++step) {
+                const int s = step % STAGES;
+                barrier_wait(full + 8 * s, (step / STAGES) & 1);
+                const u32 a = base + s * STAGE_BYTES + group * MT * 8192, b = base + s * STAGE_BYTES + A_BYTES;
+                asm volatile("wgmma.fence.sync.aligned;" ::: "memory");
+#pragma unroll
+                for (int j = 0; j < 4; ++j)
+#pragma unroll
+                    for (int i = 0; i < MT; ++i)
+                        mma(sums[i], operand(a + i * 8192 + j * 32), operand(b + j * 32), k > t.k || j > 0);
+                asm volatile("wgmma.commit_group.sync.aligned;\nwgmma.wait_group.sync.aligned 1;" ::: "memory");
+                if (k > t.k) release(step - 1);
+            }
+            asm volatile("wgmma.wait_group.sync.aligned 0;" ::: "memory");
+            release(step - 1);
+
+#pragma unroll
+            for (int i = 0; i < MT; ++i)
+#pragma unroll
+                for (int half = 0; half < 2; ++half) {
+                    const int row = t.m + (group * MT + i) * 64 + warp * 16 + lane / 4 + half * 8;
+                    const bool inside = row < M;
+                    constexpr int BLOCKS = TILE_N / 8;
+                    if (EPILOGUE == 4) {
+                        float* to = (float*)out + ((size_t)t.split * M + row) * N;
+#pragma unroll
+                        for (int j = 0; j < BLOCKS; ++j) {
+                            const int col = t.n + j * 8 + lane % 4 * 2;
+                            float x = sums[i][4 * j + 2 * half], y = sums[i][4 * j + 2 * half + 1];
+                            x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
+                            if (inside && col < N) *(float2*)(to + col) = make_float2(x, y);
+                        }
+                    } else {
+                        u16* to = (u16*)out + (size_t)row * N;
+                        auto value = [&](int j) -> u32 {
+                            float x = sums[i][4 * j + 2 * half], y = sums[i][4 * j + 2 * half + 1];
+                            if (BIASED) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
+                            if (EPILOGUE == 2) x = gelu(x), y = gelu(y);
+                            if (EPILOGUE == 3) {
+                                x = gelu(x) * sums[i][BN / 4 + 4 * j + 2 * half];
+                                y = gelu(y) * sums[i][BN / 4 + 4 * j + 2 * half + 1];
+                            }
+                            return pack(x, y);
+                        };
+#pragma unroll
+                        for (int j = 0; j + 3 < BLOCKS; j += 4) {
+                            const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
+                            const int col = t.n + (j + lane % 4) * 8;
+                            if (inside && col < N) *(uint4*)(to + col) = v;
+                        }
+#pragma unroll
+                        for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
+                            const int col = t.n + j * 8 + lane % 4 * 2;
+                            const u32 v = value(j);
+                            if (inside && col < N) *(u32*)(to + col) = v;
+                        }
+                    }
+                }
+        }
+    }
+    if (CLUSTER > 1) cluster_sync();  // the other CTA may still signal barriers here
+}

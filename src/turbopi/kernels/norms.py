@@ -1,0 +1,125 @@
+"""Residual addition and the norm behind it in one pass: one row a program.
+
+Twins: `engine.ops.residual_rms_norm`, `engine.ops.residual_layer_norm`. `y` may also be float32[splits, tokens, D]: the
+partial sums of a product split over its inner axis, added up here (rounded once less than the twin).
+"""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from turbopi.kernels.launch import dependent_launch, launch_dependents, wait_for_producer
+
+
+@triton.jit
+def _add_residual(x, y, gate, out, row, rows, cols, width, mask, SPLITS, HAS_GATE):
+    """x + y * gate, stored and rounded as stored; y is one matrix or SPLITS float32 partial sums of one."""
+    dtype = out.dtype.element_ty
+    a = tl.load(x + row * width + cols, mask, 0.0).to(tl.float32)
+    if SPLITS == 0:
+        b = tl.load(y + row * width + cols, mask, 0.0).to(tl.float32)
+    else:
+        b = tl.zeros_like(a)
+        for split in tl.static_range(SPLITS):
+            b += tl.load(y + (split * rows + row) * width + cols, mask, 0.0)
+    if HAS_GATE:
+        b = (b * tl.load(gate + cols, mask, 0.0).to(dtype).to(tl.float32)).to(dtype).to(tl.float32)
+    total = (a + b).to(dtype)
+    tl.store(out + row * width + cols, total, mask)
+    return total.to(tl.float32)
+
+
+@triton.jit
+def _rms_norm_kernel(
+    x, y, gate, scale, shift, out, normed, rows, width, eps,
+    HAS_Y: tl.constexpr, SPLITS: tl.constexpr, HAS_GATE: tl.constexpr, HAS_SHIFT: tl.constexpr,
+    BLOCK: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    row = tl.program_id(0)
+    cols = tl.arange(0, BLOCK)
+    mask = cols < width
+    factor = tl.load(scale + cols, mask, 0.0)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    if HAS_Y:
+        a = _add_residual(x, y, gate, out, row, rows, cols, width, mask, SPLITS, HAS_GATE)
+    else:
+        a = tl.load(x + row * width + cols, mask, 0.0).to(tl.float32)
+    result = a * tl.rsqrt(tl.sum(a * a, 0) / width + eps) * factor
+    if HAS_SHIFT:
+        result += tl.load(shift + cols, mask, 0.0)
+    tl.store(normed + row * width + cols, result.to(normed.dtype.element_ty), mask)
+
+
+@triton.jit
+def _layer_norm_kernel(
+    x, y, weight, bias, out, normed, rows, width, eps,
+    HAS_Y: tl.constexpr, SPLITS: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    row = tl.program_id(0)
+    cols = tl.arange(0, BLOCK)
+    mask = cols < width
+    factor = tl.load(weight + cols, mask, 0.0).to(tl.float32)
+    offset = tl.load(bias + cols, mask, 0.0).to(tl.float32)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    if HAS_Y:
+        a = _add_residual(x, y, x, out, row, rows, cols, width, mask, SPLITS, False)
+    else:
+        a = tl.load(x + row * width + cols, mask, 0.0).to(tl.float32)
+    centred = tl.where(mask, a - tl.sum(a, 0) / width, 0.0)
+    result = centred * tl.rsqrt(tl.sum(centred * centred, 0) / width + eps) * factor + offset
+    tl.store(normed + row * width + cols, result.to(normed.dtype.element_ty), mask)
+
+
+def residual_rms_norm(
+    x: Tensor,
+    y: Tensor | None,
+    gate: Tensor | None,
+    scale: Tensor,
+    shift: Tensor | None,
+    eps: float,
+) -> tuple[Tensor, Tensor]:
+    """(x + y * gate, its RMSNorm * scale + shift). x [tokens, D] contiguous."""
+    rows, width = _checked(x, y)
+    out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x)
+    block = triton.next_power_of_2(width)
+    _rms_norm_kernel[(rows,)](
+        x, _or(y, x), _or(gate, scale), scale, _or(shift, scale), out, normed, rows, width, eps,
+        HAS_Y=y is not None, SPLITS=_splits(y), HAS_GATE=gate is not None,
+        HAS_SHIFT=shift is not None, BLOCK=block, num_warps=_warps(block), **dependent_launch(x),
+    )  # fmt: skip
+    return out, normed
+
+
+def residual_layer_norm(x: Tensor, y: Tensor | None, weight: Tensor, bias: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """(x + y, its LayerNorm). x [tokens, W] contiguous."""
+    rows, width = _checked(x, y)
+    out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x)
+    block = triton.next_power_of_2(width)
+    _layer_norm_kernel[(rows,)](
+        x, _or(y, x), weight, bias, out, normed, rows, width, eps,
+        HAS_Y=y is not None, SPLITS=_splits(y), BLOCK=block, num_warps=_warps(block),
+        **dependent_launch(x),
+    )  # fmt: skip
+    return out, normed
+
+
+def _checked(x: Tensor, y: Tensor | None) -> tuple[int, int]:
+    assert x.is_contiguous() and (y is None or y.is_contiguous()), "rows are read as they lie in memory"
+    assert y is None or y.shape[-2:] == x.shape
+    return x.shape[0], x.shape[1]
+
+
+def _splits(y: Tensor | None) -> int:
+    """0: y is one matrix."""
+    return 0 if y is None or y.dim() == 2 else y.shape[0]
+
+
+def _or(tensor: Tensor | None, unused: Tensor) -> Tensor:
+    return unused if tensor is None else tensor
+
+
+def _warps(block: int) -> int:
+    return max(1, min(8, block // 512))

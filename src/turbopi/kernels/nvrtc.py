@@ -1,0 +1,97 @@
+"""Compile CUDA C++ at run time, keep the result on disk, launch it on PyTorch's current stream.
+
+NVRTC and the driver are called through `cuda.bindings`, which comes with PyTorch's CUDA builds.
+"""
+
+import ctypes
+import hashlib
+import importlib
+import logging
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from turbopi.errors import BackendError, BackendUnavailable
+
+logger = logging.getLogger(__name__)
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept: $XDG_CACHE_HOME/turbopi or ~/.cache/turbopi."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "turbopi"
+
+
+def bindings(name: str) -> Any:
+    """`cuda.bindings.driver` or `cuda.bindings.nvrtc`. Raises BackendUnavailable if the package isn't there."""
+    try:
+        return importlib.import_module(f"cuda.bindings.{name}")
+    except ImportError as e:
+        raise BackendUnavailable(f"our CUDA kernels need cuda.bindings ({e}); pip install cuda-python") from e
+
+
+def compile_cubin(source: str, arch: str, defines: dict[str, int], *, folder: Path | None = None) -> bytes:
+    """Machine code of `source` for `arch` ("sm_90a"), from the cache if it was compiled before.
+
+    Raises BackendError with the compiler's log.
+    """
+    nvrtc = bindings("nvrtc")
+    major, minor = _checked(nvrtc, nvrtc.nvrtcVersion())
+    options = [f"-arch={arch}", "-std=c++17", *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
+    key = hashlib.sha256("\0".join((source, *options, f"{major}.{minor}")).encode()).hexdigest()[:32]
+    path = (folder or cache_folder()) / f"{key}.cubin"
+    if path.is_file():
+        return path.read_bytes()
+    code = _compile(nvrtc, source, options)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:  # several processes may start at once
+        file.write(code)
+    os.replace(file.name, path)
+    logger.info("compiled a kernel for %s: %s", arch, path)
+    return code
+
+
+def _compile(nvrtc: Any, source: str, options: list[str]) -> bytes:
+    program = _checked(nvrtc, nvrtc.nvrtcCreateProgram(source.encode(), b"kernel.cu", 0, [], []))
+    (status,) = nvrtc.nvrtcCompileProgram(program, len(options), [option.encode() for option in options])
+    if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
+        log = b" " * _checked(nvrtc, nvrtc.nvrtcGetProgramLogSize(program))
+        nvrtc.nvrtcGetProgramLog(program, log)
+        raise BackendError(f"a kernel doesn't compile with {' '.join(options)}:\n{log.decode().rstrip(chr(0))}")
+    code = b" " * _checked(nvrtc, nvrtc.nvrtcGetCUBINSize(program))
+    _checked(nvrtc, nvrtc.nvrtcGetCUBIN(program, code))
+    nvrtc.nvrtcDestroyProgram(program)
+    return code
+
+
+class Kernel:
+    """One function of a cubin, loaded on the current CUDA device."""
+
+    def __init__(self, cubin: bytes, name: str, shared_bytes: int) -> None:
+        self._driver = bindings("driver")
+        d = self._driver
+        self._module = _checked(d, d.cuModuleLoadData(cubin))
+        self._function = _checked(d, d.cuModuleGetFunction(self._module, name.encode()))
+        self._shared = shared_bytes
+        attribute = d.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+        _checked(d, d.cuFuncSetAttribute(self._function, attribute, shared_bytes))
+
+    def launch_cooperative(self, blocks: int, threads: int, args: ctypes.Structure) -> None:
+        """Launch on PyTorch's current stream, all blocks resident at once; `args` is the kernel's one parameter."""
+        d = self._driver
+        pointers = (ctypes.c_void_p * 1)(ctypes.addressof(args))
+        stream = torch.cuda.current_stream().cuda_stream
+        result = d.cuLaunchCooperativeKernel(
+            self._function, blocks, 1, 1, threads, 1, 1, self._shared, stream, ctypes.addressof(pointers)
+        )
+        _checked(d, result)
+
+
+def _checked(module: Any, result: tuple[Any, ...]) -> Any:
+    """The value(s) behind the status of a driver or NVRTC call, which must be 0."""
+    status, *values = result
+    if int(status) != 0:
+        raise BackendError(f"{module.__name__.rpartition('.')[2]} call failed: {status!r}")
+    return values[0] if len(values) == 1 else tuple(values)

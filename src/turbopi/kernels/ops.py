@@ -1,0 +1,144 @@
+"""The engine's operations with our kernels where they win and the library's elsewhere, for NVIDIA GPUs in bfloat16."""
+
+from functools import lru_cache
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.engine import ops as plain
+from turbopi.engine.ops import Ops
+from turbopi.kernels import activations, attention, embedding, norms, rope
+from turbopi.kernels.gemm import Tile, matmul
+from turbopi.kernels.launch import capability
+
+GEGLU_TILES = (Tile(3, 1, 192), Tile(2, 1, 256))
+GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
+
+# SigLIP So400m's products that beat cuBLAS on an H200, by [rows, out, in]: the tiles fill its SMs just once.
+VISION_TILES = {
+    (256, 3456, 1152): Tile(1, 1, 112),
+    (256, 1152, 1152): Tile(2, 1, 40, splits=2),
+    (256, 4304, 1152): Tile(2, 1, 72),
+    (256, 1152, 4304): Tile(2, 1, 72, cluster_n=2, splits=4),
+    (512, 3456, 1152): Tile(2, 1, 112),
+    (512, 1152, 1152): Tile(2, 1, 40),
+    (512, 4304, 1152): Tile(2, 1, 136),
+    (512, 1152, 4304): Tile(2, 1, 96, cluster_m=2, cluster_n=2, splits=2),
+    (768, 3456, 1152): Tile(2, 1, 160),
+    (768, 1152, 1152): Tile(2, 1, 64, cluster_m=2),
+    (768, 4304, 1152): Tile(3, 1, 136),
+    (768, 1152, 4304): Tile(2, 1, 144, cluster_m=2, cluster_n=2, splits=2),
+}
+
+
+def fused_ops(device: torch.device) -> Ops:
+    """Triton's kernels between the products; on Hopper our products where they win, elsewhere cuBLAS with epilogues."""
+    hopper = capability(device) == (9, 0)
+    return Ops(
+        embed_patches=EmbedPatches(),
+        embed_prompt=embedding.embed_prompt,
+        residual_rms_norm=norms.residual_rms_norm,
+        residual_layer_norm=norms.residual_layer_norm,
+        linear=tuned_linear if hopper else linear,
+        residual_linear=tuned_residual_linear if hopper else linear,
+        linear_gelu=tuned_linear_gelu if hopper else linear_gelu,
+        linear_geglu=tuned_linear_geglu if hopper else linear_geglu,
+        rope_split=rope.rope_split,
+        vision_attention=attention.vision_attention,
+        attention=attend,
+        origin={
+            "matrix products": "cuBLAS, with bias and GELU in its epilogue",
+            "vision products": f"CUDA for {_rows_covered()} rows, else cuBLAS" if hopper else "cuBLAS",
+            "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS" if hopper else "Triton",
+            "vision attention": "Triton",
+            "prefix attention": "Triton",
+            "suffix attention": "cuBLAS and Triton's softmax",
+            "norms, GeGLU of the suffix, RoPE, patches, prompt embedding": "Triton",
+        },
+    )
+
+
+def _rows_covered() -> str:
+    return ", ".join(str(rows) for rows in sorted({rows for rows, _, _ in VISION_TILES}))
+
+
+class EmbedPatches:
+    """Pixels are whole numbers, so tensor cores can multiply them exactly: see `embedding.odd_rows`."""
+
+    def __init__(self) -> None:
+        self._split: dict[int, Tensor] = {}  # by the weight's address
+
+    def __call__(self, images: Tensor, weight: Tensor, position: Tensor, dtype: torch.dtype) -> Tensor:
+        patch = round((weight.shape[1] / 3) ** 0.5)
+        if images.dtype != torch.uint8:
+            return embedding.add_position(F.linear(embedding.patch_rows(images, patch), weight), position, dtype)
+        if weight.data_ptr() not in self._split:
+            self._split[weight.data_ptr()] = embedding.split_in_two(weight)
+        products = torch.mm(
+            embedding.odd_rows(images, patch), self._split[weight.data_ptr()].t(), out_dtype=torch.float32
+        )
+        return embedding.add_position(products, position, dtype)
+
+
+def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+    if out is None:
+        return F.linear(x, weight, bias)
+    return torch.mm(x, weight.t(), out=out) if bias is None else torch.addmm(bias, x, weight.t(), out=out)
+
+
+def linear_gelu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    return torch._addmm_activation(bias, x, weight.t(), use_gelu=True)  # on CUDA: tanh's GELU, in the epilogue
+
+
+def linear_geglu(x: Tensor, gate_up: Tensor) -> Tensor:
+    return activations.geglu(F.linear(x, gate_up))
+
+
+def _tile(x: Tensor, weight: Tensor) -> Tile | None:
+    return VISION_TILES.get((x.shape[0], weight.shape[0], weight.shape[1]))
+
+
+def tuned_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+    tile = _tile(x, weight)
+    if tile is None or bias is None:
+        return linear(x, weight, bias, out)
+    return matmul(x, weight, tile, "bias", bias, out)
+
+
+def tuned_residual_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """The product, or float32 parts of it that the norms add up."""
+    tile = _tile(x, weight)
+    if tile is None or bias is None:
+        return linear(x, weight, bias)
+    return matmul(x, weight, tile, "partial" if tile.splits > 1 else "bias", bias)
+
+
+def tuned_linear_gelu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    tile = _tile(x, weight)
+    return linear_gelu(x, weight, bias) if tile is None else matmul(x, weight, tile, "gelu", bias)
+
+
+def tuned_linear_geglu(x: Tensor, gate_up: Tensor) -> Tensor:
+    tile = _geglu_tile(x.shape[0], gate_up.shape[0] // 2, x.device)
+    return linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu")
+
+
+@lru_cache
+def _geglu_tile(rows: int, hidden: int, device: torch.device) -> Tile | None:
+    """The tile that wastes least on the matrix's ragged edges and on the last wave of tiles, if that is little."""
+    sms = torch.cuda.get_device_properties(device).multi_processor_count
+
+    def fill(tile: Tile) -> float:
+        tiles = -(-rows // tile.rows) * -(-2 * hidden // tile.columns)
+        return rows * 2 * hidden / (-(-tiles // sms) * sms * tile.rows * tile.columns)
+
+    best = max(GEGLU_TILES, key=fill)
+    return best if fill(best) > GEGLU_FILL else None
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor, length: Tensor, slots: int, heads: int, *state_token: Any) -> Tensor:
+    if k.shape[0] == slots:  # no suffix behind the prefix
+        return attention.prefix_attention(q, k, v, length, heads)
+    return plain.attention(q, k, v, length, slots, heads, *state_token, softmax=attention.masked_softmax)

@@ -1,0 +1,49 @@
+"""What "auto" stands for, and that it says why."""
+
+import pytest
+import torch
+
+from turbopi import backends
+from turbopi.backends.fused import FusedBackend
+
+GPU = torch.device("cuda", 0)
+
+
+def pretend(monkeypatch: pytest.MonkeyPatch, missing: dict[str, str]) -> None:
+    monkeypatch.setattr(backends, "availability", lambda name, device: missing.get(name))
+
+
+def test_auto_takes_the_fastest_backend_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch, {})
+    assert backends.choose(GPU) == ("fused", "auto: the fastest backend for this GPU and precision")
+
+
+def test_auto_names_what_it_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch, {"fused": "Triton isn't installed", "cuda_graph": "too old"})
+    name, why = backends.choose(GPU)
+    assert name == "pytorch_compile"
+    assert "fused can't run here: Triton isn't installed; cuda_graph can't run here: too old" in why
+
+
+def test_auto_takes_no_backend_that_lacks_the_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch, {})
+    assert backends.choose(GPU, "f32")[0] == "cuda_graph"
+
+
+def test_auto_falls_to_the_reference_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch, dict.fromkeys(("fused", "cuda_graph", "pytorch_compile"), "no"))
+    assert backends.choose(GPU)[0] == "pytorch"
+
+
+def test_fused_refuses_a_cpu() -> None:
+    assert "need an NVIDIA GPU" in str(FusedBackend.unavailable(torch.device("cpu")))
+
+
+@pytest.mark.parametrize(
+    ("package", "reason"), [("triton", "written in Triton, which isn't installed"), ("cuda", "through cuda.bindings")]
+)
+def test_fused_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, package: str, reason: str) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
+    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/gcc")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name.startswith(package) else object())
+    assert reason in str(FusedBackend.unavailable(GPU))

@@ -1,0 +1,112 @@
+"""The engine's static forward pass equals the reference on the CPU: every golden case, odd prompts, 0 to 3 cameras."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import golden_cases, golden_model
+from torch import Tensor
+
+from turbopi.config import Kind
+from turbopi.engine.call import Cache, CallShape, StaticCall
+from turbopi.engine.ops import PLAIN
+from turbopi.engine.weights import modulation, pack
+from turbopi.model.reference import Precision
+from turbopi.observation import Observation
+
+FIELDS = ("images", "image_mask", "tokens", "token_mask", "state")
+CPU = torch.device("cpu")
+CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
+
+
+def static_call(kind: Kind, shape: CallShape, precision: Precision = "f32") -> StaticCall:
+    model = golden_model(kind, precision)
+    weights = pack(model.config, dict(model.state_dict()))
+    cache = Cache.allocate(model.config, shape.prefix_slots(model.config) + 64, CPU, weights.embed_tokens.dtype)
+    return StaticCall(
+        model.config, weights, PLAIN, shape, cache, modulation(model.config, weights.conditioning, shape.num_steps)
+    )
+
+
+def answer(call: StaticCall, observation: Observation, noise: Tensor, row: int = 0) -> Tensor:
+    call.write_inputs(
+        observation.images[row][observation.image_mask[row]].numpy(),
+        noise[row].numpy(),
+        observation.state[row].numpy(),
+        observation.tokens[row][observation.token_mask[row]].numpy(),
+    )
+    call.run()
+    return call.actions.clone()
+
+
+def shape_of(observation: Observation, noise: Tensor, steps: int, row: int = 0) -> CallShape:
+    tokens = int(observation.token_mask[row].sum())
+    slots = max(16, -(-tokens // 16) * 16)
+    floats = observation.images.dtype == torch.float32
+    return CallShape(int(observation.image_mask[row].sum()), slots, noise.shape[1], steps, floats)
+
+
+def made_up(kind: Kind, cameras: int, tokens: int, seed: int = 0) -> tuple[Observation, Tensor]:
+    config = golden_model(kind).config
+    g = torch.Generator().manual_seed(seed)
+    width = config.max_prompt_tokens
+    size = config.vision.image_size
+    observation = Observation(
+        images=torch.randint(0, 256, (1, 3, size, size, 3), generator=g, dtype=torch.uint8),
+        image_mask=(torch.arange(3) < cameras)[None],
+        tokens=torch.randint(1, config.vocab_size, (1, width), generator=g),
+        token_mask=(torch.arange(width) < tokens)[None],
+        state=torch.randn(1, config.action_dim, generator=g),
+    )
+    return observation, torch.randn(1, 7, config.action_dim, generator=g)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("steps", [1, 3, 10])
+def test_equals_the_reference_on_golden_cases(case: str, steps: int) -> None:
+    one = golden_cases()[case]
+    for row in range(one.observation.batch_size):
+        call = static_call(one.kind, shape_of(one.observation, one.noise, steps, row))
+        expected = golden_model(one.kind).sample(one.observation, one.noise, steps)[row]
+        torch.testing.assert_close(answer(call, one.observation, one.noise, row), expected, atol=5e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["pi05", "pi0"])
+@pytest.mark.parametrize(("cameras", "tokens"), [(0, 5), (1, 16), (2, 1), (2, 47), (3, 33)])
+def test_equals_the_reference_for_odd_prompts_and_cameras(kind: Kind, cameras: int, tokens: int) -> None:
+    observation, noise = made_up(kind, cameras, tokens)
+    call = static_call(kind, shape_of(observation, noise, 2))
+    other, _ = made_up(kind, 3, tokens)  # a second row with cameras: the reference can't run without any
+    both = Observation(*(torch.cat((getattr(observation, f), getattr(other, f))) for f in FIELDS))
+    expected = golden_model(kind).sample(both, noise.repeat(2, 1, 1), 2)[0]
+    torch.testing.assert_close(answer(call, observation, noise), expected, atol=5e-6, rtol=1e-5)
+
+
+def test_a_longer_prompt_leaves_nothing_behind_for_a_shorter_one() -> None:
+    long, noise = made_up("pi05", 1, 32)
+    short, _ = made_up("pi05", 1, 19, seed=1)
+    call = static_call("pi05", shape_of(long, noise, 2))
+    answer(call, long, noise)
+    expected = golden_model("pi05").sample(short, noise, 2)[0]
+    torch.testing.assert_close(answer(call, short, noise), expected, atol=5e-6, rtol=1e-5)
+
+
+def test_bfloat16_is_as_close_to_float32_as_the_reference_is() -> None:
+    one = golden_cases()["b_third_masked"]
+    exact = golden_model("pi05").sample(one.observation, one.noise, 10)[0]
+    reference = golden_model("pi05", "bf16").sample(one.observation, one.noise, 10)[0]
+    call = static_call("pi05", shape_of(one.observation, one.noise, 10), "bf16")
+
+    def error(actions: Tensor) -> float:
+        return float((actions - exact).square().mean().sqrt())
+
+    assert 0 < error(answer(call, one.observation, one.noise)) <= 1.25 * error(reference)
+
+
+def test_the_host_buffer_holds_valid_pictures_and_tokens_only() -> None:
+    observation, noise = made_up("pi05", 2, 5)
+    call = static_call("pi05", shape_of(observation, noise, 1))
+    call.host.tokens.fill_(7)
+    answer(call, observation, noise)
+    np.testing.assert_array_equal(call.host.tokens.numpy()[:5], observation.tokens[0, :5].numpy())
+    assert not call.host.tokens[5:].any()
+    assert call.host.length.item() == 2 * call.config.vision.num_tokens + 5

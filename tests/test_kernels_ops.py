@@ -1,0 +1,345 @@
+"""Each Triton kernel equals its plain-PyTorch twin.
+
+Without a GPU in float32 through Triton's interpreter (its bfloat16 products are wrong). On a GPU in bfloat16 with large
+outliers: the kernel's error may be twice the twin's, both against the twin in float32 on the same numbers.
+"""
+
+import os
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+ON_GPU = torch.cuda.is_available()
+if not ON_GPU:
+    os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is first imported
+pytest.importorskip("triton", reason="Triton isn't installed")
+
+from turbopi.engine import ops as plain  # noqa: E402
+from turbopi.kernels import activations, attention, embedding, norms, rope  # noqa: E402
+from turbopi.kernels import ops as fused  # noqa: E402
+from turbopi.kernels.gemm import Epilogue, Tile, matmul  # noqa: E402
+from turbopi.model.layers import rope_tables  # noqa: E402
+
+DEVICE = torch.device("cuda" if ON_GPU else "cpu")
+DTYPE = torch.bfloat16 if ON_GPU else torch.float32
+# one claim, two ways to check it: scripts that pick `-m gpu` on a GPU find these tests there
+pytestmark = (
+    [pytest.mark.gpu]
+    if ON_GPU
+    # the interpreter is NumPy, which warns of infinities, and it turns arrays of one element into numbers
+    else [
+        pytest.mark.filterwarnings("ignore::RuntimeWarning"),
+        pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    ]
+)
+seeds = iter(range(10**6))
+
+
+def random(*shape: int, outliers: bool = False, dtype: torch.dtype = DTYPE) -> Tensor:
+    g = torch.Generator().manual_seed(next(seeds))
+    x = torch.randn(shape, generator=g)
+    if outliers:  # a few columns hundreds of times as large, as in trained transformers
+        x[..., torch.randint(0, shape[-1], (3,), generator=g)] *= 300
+    return x.to(DEVICE, dtype)
+
+
+def assert_as_good(ours: Tensor, twin: Tensor, exact: Tensor) -> None:
+    """`ours` is finite and no worse than twice `twin`'s error against `exact` (float32)."""
+    assert ours.shape == twin.shape and ours.dtype == twin.dtype and bool(ours.isfinite().all())
+    if ours.dtype == torch.float32:
+        torch.testing.assert_close(ours, exact, atol=1e-5 * max(1.0, exact.abs().max().item()), rtol=1e-5)
+        return
+    assert_error_at_most_double(ours, twin, exact)
+
+
+def assert_error_at_most_double(ours: Tensor, twin: Tensor, exact: Tensor) -> None:
+    def rms(x: Tensor) -> float:
+        return float((x.double() - exact.double()).square().mean().sqrt())
+
+    assert rms(ours) <= 2 * rms(twin) + 1e-7 * float(exact.double().square().mean().sqrt())
+    largest = (twin.double() - exact.double()).abs().max()
+    assert (ours.double() - exact.double()).abs().max() <= 2 * largest + 1e-7 * exact.abs().max()
+
+
+def poison_allocator() -> None:
+    """Leave NaN where the next outputs will be allocated."""
+    if ON_GPU:
+        for size in (1 << 12, 1 << 16, 1 << 20, 1 << 22, 1 << 24):
+            torch.full((size,), torch.nan, device=DEVICE)
+
+
+@pytest.mark.parametrize("width", [32, 96, 1024, 1152, 2048])
+@pytest.mark.parametrize("rows", [1, 10, 51, 563])
+@pytest.mark.parametrize("form", ["first", "residual", "modulated", "split"])
+def test_residual_rms_norm(width: int, rows: int, form: str) -> None:
+    if not ON_GPU and rows > 51:
+        rows = 5
+    x, scale = random(rows, width, outliers=True), random(width, dtype=torch.float32)
+    y = None if form == "first" else random(rows, width)
+    gate, shift = (random(width, dtype=torch.float32) for _ in range(2)) if form == "modulated" else (None, None)
+    given = y
+    if form == "split":
+        assert y is not None
+        parts = random(2, rows, width, dtype=torch.float32)
+        given = torch.cat((parts, (y.float() - parts.sum(0))[None]))
+    poison_allocator()
+    ours = norms.residual_rms_norm(x, given, gate, scale, shift, 1e-6)
+    twin = plain.residual_rms_norm(x, y, gate, scale, shift, 1e-6)
+    exact_gate = None if gate is None else gate.to(DTYPE).float()
+    exact = plain.residual_rms_norm(x.float(), None if y is None else y.float(), exact_gate, scale, shift, 1e-6)
+    for a, b, c in zip(ours, twin, exact, strict=True):
+        assert_as_good(a, b, c)
+
+
+@pytest.mark.parametrize("width", [64, 128, 1152])
+@pytest.mark.parametrize("rows", [1, 256, 512])
+@pytest.mark.parametrize("residual", [False, True])
+def test_residual_layer_norm(width: int, rows: int, residual: bool) -> None:
+    if not ON_GPU and rows > 1:
+        rows = 5
+    x, y = random(rows, width, outliers=True) + 3, random(rows, width) if residual else None
+    weight, bias = random(width), random(width)
+    poison_allocator()
+    ours = norms.residual_layer_norm(x, y, weight, bias, 1e-6)
+    twin = plain.residual_layer_norm(x, y, weight, bias, 1e-6)
+    exact = plain.residual_layer_norm(x.float(), None if y is None else y.float(), weight.float(), bias.float(), 1e-6)
+    for a, b, c in zip(ours, twin, exact, strict=True):
+        assert_as_good(a, b, c)
+
+
+@pytest.mark.parametrize("shape", [(3, 128), (10, 4304), (1, 7)])
+def test_gelu(shape: tuple[int, int]) -> None:
+    x = random(*shape, outliers=True)
+    poison_allocator()
+    assert_as_good(activations.gelu(x), plain.gelu(x), plain.gelu(x.float()))
+
+
+@pytest.mark.parametrize("shape", [(3, 256), (10, 8192), (1, 96), (5, 2 * 4304)])
+def test_geglu(shape: tuple[int, int]) -> None:
+    x = random(*shape, outliers=True)
+    poison_allocator()
+    assert_as_good(activations.geglu(x), plain.geglu(x), plain.geglu(x.float()))
+
+
+@pytest.mark.parametrize(("head_dim", "heads"), [(16, 8), (32, 8), (256, 8), (256, 0), (64, 3)])
+@pytest.mark.parametrize("tokens", [1, 11, 563])
+def test_rope_split(head_dim: int, heads: int, tokens: int) -> None:
+    if not ON_GPU:
+        tokens = min(tokens, 11)
+    qkv = random(tokens, (heads + 2) * head_dim, outliers=True)
+    cos, sin = (t[0, 0] for t in rope_tables(torch.arange(7, 7 + tokens)[None], head_dim, 1e4))
+    cos, sin = cos.to(DEVICE), sin.to(DEVICE)
+
+    def cache(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        whole = torch.full((2, tokens + 2, head_dim), torch.nan, dtype=dtype, device=DEVICE)
+        return whole[0, 1:-1], whole[1, 1:-1]
+
+    ours_k, ours_v = cache(DTYPE)
+    twin_k, twin_v = cache(DTYPE)
+    exact_k, exact_v = cache(torch.float32)
+    poison_allocator()
+    ours_q = rope.rope_split(qkv, cos, sin, ours_k, ours_v)
+    twin_q = plain.rope_split(qkv, cos, sin, twin_k, twin_v)
+    exact_q = plain.rope_split(qkv.float(), cos, sin, exact_k, exact_v)
+    if heads:
+        assert_as_good(ours_q, twin_q, exact_q)
+    assert_as_good(ours_k, twin_k, exact_k)
+    assert torch.equal(ours_v, twin_v)
+    base = ours_k._base
+    assert base is not None and bool(base[:, [0, -1]].isnan().all()), "wrote outside its rows"
+
+
+@pytest.mark.parametrize(("heads", "head_dim"), [(4, 16), (4, 32), (16, 72), (2, 24)])
+@pytest.mark.parametrize(("images", "tokens"), [(1, 256), (3, 256), (2, 50)])
+def test_vision_attention(heads: int, head_dim: int, images: int, tokens: int) -> None:
+    if not ON_GPU:
+        images, tokens, heads = min(images, 2), min(tokens, 50), min(heads, 2)
+    qkv = random(images * tokens, 3 * heads * head_dim)
+    qkv[:, ::17] *= 8
+    poison_allocator()
+    ours = attention.vision_attention(qkv, images, heads)
+    assert_as_good(ours, plain.vision_attention(qkv, images, heads), plain.vision_attention(qkv.float(), images, heads))
+
+
+@pytest.mark.parametrize(("heads", "head_dim"), [(8, 16), (8, 32), (8, 256), (4, 48)])
+@pytest.mark.parametrize(("slots", "length"), [(16, 1), (272, 261), (560, 560), (816, 803)])
+def test_prefix_attention_reads_nothing_beyond_the_length(heads: int, head_dim: int, slots: int, length: int) -> None:
+    if not ON_GPU and slots > 16:
+        slots, length, heads = slots // 8, length // 8, 2
+    q, k, v = random(slots * heads, head_dim), random(slots, head_dim), random(slots, head_dim)
+    q[:, ::5] *= 8
+    k[:, ::7] *= 8
+    on_device = torch.tensor([length], device=DEVICE)
+    twin = plain.attention(q, k, v, on_device, slots, heads)
+    exact = plain.attention(q.float(), k.float(), v.float(), on_device, slots, heads)
+    k[length:], v[length:] = torch.nan, torch.nan
+    poison_allocator()
+    assert_as_good(attention.prefix_attention(q, k, v, on_device, heads), twin, exact)
+
+
+@pytest.mark.parametrize("state_token", [False, True])
+@pytest.mark.parametrize(("suffix", "slots", "length"), [(10, 560, 549), (51, 16, 1), (1, 272, 272), (7, 0, 0)])
+def test_masked_softmax(suffix: int, slots: int, length: int, state_token: bool) -> None:
+    heads = 8 if ON_GPU else 2
+    logits = random(suffix * heads, slots + suffix, dtype=torch.float32) * 30
+    on_device = torch.tensor([length], device=DEVICE)
+    args = (on_device, slots, heads, state_token, 0.25)
+    exact = plain.masked_softmax(logits, *args, torch.float32)
+    twin = plain.masked_softmax(logits, *args, DTYPE)
+    logits[:, length:slots] = torch.nan
+    poison_allocator()
+    assert_as_good(attention.masked_softmax(logits, *args, DTYPE), twin, exact)
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+@pytest.mark.parametrize("images", [1, 3])
+def test_patch_rows_are_exact(images: int, dtype: torch.dtype) -> None:
+    size = 224 if ON_GPU else 28
+    g = torch.Generator().manual_seed(images)
+    pictures = torch.randint(0, 256, (images, size, size, 3), generator=g).to(DEVICE, dtype)
+    poison_allocator()
+    ours, twin = embedding.patch_rows(pictures, 14), plain.patch_rows(pictures, 14)
+    torch.testing.assert_close(ours, twin, atol=1.2e-7, rtol=0)
+
+
+@pytest.mark.skipif(not ON_GPU, reason="a product of the library's with float32 results needs a GPU")
+@pytest.mark.parametrize("images", [1, 3])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_embed_patches_loses_nothing_of_float32(images: int, dtype: torch.dtype) -> None:
+    g = torch.Generator().manual_seed(images)
+    pictures = torch.randint(0, 256, (images, 224, 224, 3), generator=g).to(DEVICE, torch.uint8)
+    given = pictures if dtype == torch.uint8 else pictures.float() / 255 * 2 - 1
+    weight, position = random(1152, 588, dtype=torch.float32), random(256, 1152, dtype=torch.float32)
+    ours = fused.EmbedPatches()(given, weight, position, torch.float32)
+    normalised = pictures.double() / 255 * 2 - 1
+    exact = plain.embed_patches(normalised, weight.double(), position.double(), torch.float64)
+    assert (ours - exact).square().mean().sqrt() < 1e-5 * exact.square().mean().sqrt()
+
+
+def test_odd_rows_are_255_times_the_patches() -> None:
+    pictures = torch.randint(0, 256, (2, 28, 28, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(3))
+    pictures = pictures.to(DEVICE)
+    ours = embedding.odd_rows(pictures, 14, DTYPE).float()
+    twice = plain.patch_rows(pictures, 14).repeat(1, 2) * 255
+    torch.testing.assert_close(ours, twice.round(), atol=0, rtol=0)
+
+
+def test_add_position() -> None:
+    x, position = random(6, 96, dtype=torch.float32), random(3, 96, dtype=torch.float32)
+    exact = x + position.repeat(2, 1)
+    assert_as_good(embedding.add_position(x, position, DTYPE), exact.to(DTYPE), exact)
+
+
+@pytest.mark.parametrize("width", [96, 2048])
+def test_embed_prompt_is_exact(width: int) -> None:
+    table, tokens = random(300, width), torch.tensor([0, 299, 5, 5, 17], device=DEVICE)
+    ours, twin = (torch.full((5, width), torch.nan, dtype=DTYPE, device=DEVICE) for _ in range(2))
+    embedding.embed_prompt(tokens, table, ours)
+    plain.embed_prompt(tokens, table, twin)
+    assert torch.equal(ours, twin)
+
+
+on_hopper = pytest.mark.skipif(
+    not ON_GPU or torch.cuda.get_device_capability() != (9, 0), reason="needs compute capability 9.0"
+)
+TILES = [
+    Tile(3, 1, 192),
+    Tile(2, 1, 256, cluster_n=2),
+    Tile(2, 1, 128, cluster_m=2, cluster_n=2),
+    Tile(1, 1, 80),
+    Tile(2, 2, 128),
+    Tile(2, 1, 96, per_sm=2),
+]
+
+
+@on_hopper
+@pytest.mark.parametrize("tile", TILES)
+@pytest.mark.parametrize("epilogue", ["plain", "bias", "gelu", "geglu"])
+@pytest.mark.parametrize(("m", "n", "k"), [(560, 2048, 1152), (1, 8, 8), (203, 4304, 72), (816, 264, 4304)])
+def test_matmul(m: int, n: int, k: int, epilogue: Epilogue, tile: Tile) -> None:
+    x, weight = random(m, k, outliers=True), random(2 * n if epilogue == "geglu" else n, k)
+    bias = random(n) if epilogue in ("bias", "gelu") else None
+
+    def after(y: Tensor) -> Tensor:
+        return plain.gelu(y) if epilogue == "gelu" else plain.geglu(y) if epilogue == "geglu" else y
+
+    twin = after(plain.linear(x, weight, bias))
+    exact = after(plain.linear(x.float(), weight.float(), None if bias is None else bias.float()))
+    out = torch.full((m, n), torch.nan, device=DEVICE, dtype=DTYPE)
+    assert_as_good(matmul(x, weight, tile, epilogue, bias, out), twin, exact)
+
+
+@on_hopper
+@pytest.mark.parametrize("shape", fused.VISION_TILES)
+def test_tuned_products_of_the_vision_tower(shape: tuple[int, int, int]) -> None:
+    m, n, k = shape
+    x, weight, bias = random(m, k, outliers=True), random(n, k), random(n)
+    poison_allocator()
+    ours = fused.tuned_residual_linear(x, weight, bias)
+    twin, exact = plain.linear(x, weight, bias), plain.linear(x.float(), weight.float(), bias.float())
+    assert_as_good((ours.sum(0) if ours.dim() == 3 else ours).to(DTYPE), twin, exact)
+    if fused.VISION_TILES[shape].splits == 1:
+        assert_as_good(fused.tuned_linear_gelu(x, weight, bias), plain.gelu(twin), plain.gelu(exact))
+
+
+@on_hopper
+@pytest.mark.parametrize("rows", [11, 304, 352, 560, 816, 976])
+def test_tuned_geglu(rows: int) -> None:
+    x, weight = random(rows, 2048, outliers=True), random(2 * 16384, 2048) / 45
+    poison_allocator()
+    twin = plain.geglu(plain.linear(x, weight))
+    assert_as_good(fused.tuned_linear_geglu(x, weight), twin, plain.geglu(plain.linear(x.float(), weight.float())))
+
+
+@on_hopper
+@pytest.mark.parametrize("splits", [1, 3, 4])
+@pytest.mark.parametrize("with_bias", [False, True])
+def test_partial_sums_add_up(splits: int, with_bias: bool) -> None:
+    x, weight, bias = random(531, 4304), random(1152, 4304), random(1152) if with_bias else None
+    poison_allocator()
+    parts = matmul(x, weight, Tile(2, 1, 144, splits=splits), "partial", bias)
+    assert parts.shape == (splits, 531, 1152) and parts.dtype == torch.float32
+    exact = plain.linear(x.float(), weight.float(), None if bias is None else bias.float())
+    torch.testing.assert_close(parts.sum(0), exact, atol=2e-3, rtol=1e-4)
+
+
+@on_hopper
+def test_matmul_waits_for_the_kernel_before_it() -> None:
+    """Its blocks start early; a long chain in one graph, each product reading the last one's result."""
+    weights = [random(1024, 1024) / 32 for _ in range(8)]
+    start = random(512, 1024)
+
+    scale = torch.ones(1024, device=DEVICE)
+
+    def ours(y: Tensor, weight: Tensor) -> Tensor:
+        product = matmul(y, weight, Tile(2, 1, 128), "plain")
+        return norms.residual_rms_norm(product, None, None, scale, None, 1e-6)[1]
+
+    def twin(y: Tensor, weight: Tensor) -> Tensor:
+        return plain.residual_rms_norm(plain.linear(y, weight), None, None, scale, None, 1e-6)[1]
+
+    def chain(step: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        y = start
+        for weight in weights:
+            y = step(y, weight)
+        return y
+
+    first = chain(ours)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = chain(ours)
+    for _ in range(20):
+        captured.fill_(torch.nan)
+        graph.replay()
+        assert torch.equal(captured, first)
+    assert (first.float() - chain(twin).float()).abs().mean() < 0.05
+
+
+@pytest.mark.skipif(not ON_GPU, reason="cuBLAS's epilogue needs a GPU")
+@pytest.mark.parametrize(("m", "n", "k"), [(512, 4304, 1152), (256, 128, 64), (3, 64, 32)])
+def test_linear_gelu_is_tanhs(m: int, n: int, k: int) -> None:
+    x, weight, bias = random(m, k, outliers=True), random(n, k), random(n)
+    exact = plain.gelu(plain.linear(x.float(), weight.float(), bias.float()))
+    assert_as_good(fused.linear_gelu(x, weight, bias), plain.gelu(plain.linear(x, weight, bias)), exact)
