@@ -1,6 +1,5 @@
-"""GELU and GeGLU. Twins: `engine.ops.gelu`, `engine.ops.geglu`."""
+"""GeGLU behind a product that hasn't it in its epilogue. Twin: `engine.ops.geglu`."""
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -15,15 +14,6 @@ def gelu_tanh(x):
 
 
 @triton.jit
-def _gelu_kernel(x, out, count, BLOCK: tl.constexpr, PDL: tl.constexpr):
-    wait_for_producer(PDL)
-    launch_dependents(PDL)
-    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    value = gelu_tanh(tl.load(x + at, at < count, 0.0).to(tl.float32))
-    tl.store(out + at, value.to(out.dtype.element_ty), at < count)
-
-
-@triton.jit
 def _geglu_kernel(gate_up, out, hidden, BLOCK: tl.constexpr, PDL: tl.constexpr):
     wait_for_producer(PDL)
     launch_dependents(PDL)
@@ -33,13 +23,6 @@ def _geglu_kernel(gate_up, out, hidden, BLOCK: tl.constexpr, PDL: tl.constexpr):
     gate = gelu_tanh(tl.load(gate_up + row * 2 * hidden + cols, mask, 0.0).to(tl.float32))
     up = tl.load(gate_up + (row * 2 + 1) * hidden + cols, mask, 0.0).to(tl.float32)
     tl.store(out + row * hidden + cols, (gate * up).to(out.dtype.element_ty), mask)
-
-
-def gelu(x: Tensor) -> Tensor:
-    assert x.is_contiguous(), "x is read as it lies in memory"
-    out = torch.empty_like(x)
-    _gelu_kernel[(triton.cdiv(x.numel(), 2048),)](x, out, x.numel(), BLOCK=2048, num_warps=8, **dependent_launch(x))
-    return out
 
 
 def geglu(gate_up: Tensor) -> Tensor:

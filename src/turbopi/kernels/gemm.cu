@@ -1,12 +1,11 @@
 // out[M, N] = epilogue(a[M, K] @ w[N, K]^T) in bfloat16 with float32 sums: TMA feeds shared memory, wgmma multiplies.
 // For compute capability 9.0. gemm.py sets the TP_ constants and writes `mma` for the tile's width.
 //
-// A CTA has one producer warp and TP_WGS consumer warpgroups of TP_MT * 64 rows each, and walks over its tiles
+// A CTA has one producer warp and TP_WGS consumer warpgroups of 64 rows each, and walks over its tiles
 // (grid = SMs, not tiles), so the next tile's loads run during an epilogue. TP_CM x TP_CN CTAs form a cluster of
 // neighbouring tiles: those of a row share their part of `a` and those of a column theirs of `w`; each loads its share
 // of it into all of them, as reading operands from L2 would be the bottleneck.
-// Weights don't depend on the kernel before this one: their first loads are issued before waiting for its end. With TP_PER_SM = 2 a CTA takes half an SM's memory and registers, so it can do that while
-// the kernel before still runs: short products gain more from that than they lose by fewer stages.
+// Weights don't depend on the kernel before this one: their first loads are issued before waiting for its end.
 //
 // Epilogues: 0 plain, 1 + bias, 2 gelu(+ bias), 3 GeGLU (w has N gate rows, then N up rows), 4 float32 sums of a part
 // of K each (+ bias in the first) as out[split, M, N].
@@ -16,13 +15,12 @@ typedef unsigned long long u64;
 typedef unsigned short u16;
 struct alignas(64) TensorMap { char bytes[128]; };
 
-constexpr int WGS = TP_WGS, MT = TP_MT, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
+constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
 constexpr int EPILOGUE = TP_EPILOGUE, CLUSTER = CM * CN;
-constexpr int BM = 64 * WGS * MT, BK = 64, TILE_N = EPILOGUE == 3 ? BN / 2 : BN;
+constexpr int BM = 64 * WGS, BK = 64, TILE_N = EPILOGUE == 3 ? BN / 2 : BN;
 constexpr int A_BYTES = BM * BK * 2, B_BYTES = BN * BK * 2, STAGE_BYTES = A_BYTES + B_BYTES;
 constexpr bool BIASED = EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4;
-constexpr int PER_SM = TP_PER_SM, THREADS = 128 * WGS + (PER_SM == 1 ? 128 : 32);
-constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;  // where registers are moved to consumers
+constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
 constexpr int PRODUCER_REGISTERS = WGS == 1 ? 40 : WGS == 2 ? 40 : 24;
 
 __device__ __forceinline__ u32 shared_address(const void* p) { return (u32)__cvta_generic_to_shared(p); }
@@ -105,7 +103,7 @@ __device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, in
     return t;
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS, PER_SM)
+extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), 1)
 gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap map_w, void* out, const u32* bias,
      int M, int N, int k_blocks, int m_groups, int n_groups) {
     extern __shared__ char raw[];
@@ -129,7 +127,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
     asm volatile("griddepcontrol.launch_dependents;");
 
     if (warpgroup == WGS) {
-        if (PER_SM == 1) asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
+        asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
         if (threadIdx.x == 128 * WGS) {
             const int cm = rank / CN, cn = rank % CN;
             const u32 same_row = ((1u << CN) - 1) << cm * CN;
@@ -167,7 +165,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             }
         }
     } else {
-        if (PER_SM == 1) asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
+        asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
         const int group = warpgroup, lane = threadIdx.x % 32, warp = threadIdx.x / 32 % 4;
         auto release = [&](int step) {
             const u32 bar = empty + 8 * (step % STAGES);
@@ -181,7 +179,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
         int step = 0;
         for (int unit = first; unit < units; unit += stride) {
             const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
-            float sums[MT][BN / 2];
+            float sums[BN / 2];
             u32 offsets[BIASED ? BN / 8 : 1];  // the bias of this lane's columns, read long before it is needed
             if (BIASED) {
 #pragma unroll
@@ -193,13 +191,11 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             for (int k = t.k; k < t.k_end; ++k, ++step) {
                 const int s = step % STAGES;
                 barrier_wait(full + 8 * s, (step / STAGES) & 1);
-                const u32 a = base + s * STAGE_BYTES + group * MT * 8192, b = base + s * STAGE_BYTES + A_BYTES;
+                const u32 a = base + s * STAGE_BYTES + group * 8192, b = base + s * STAGE_BYTES + A_BYTES;
                 asm volatile("wgmma.fence.sync.aligned;" ::: "memory");
 #pragma unroll
                 for (int j = 0; j < 4; ++j)
-#pragma unroll
-                    for (int i = 0; i < MT; ++i)
-                        mma(sums[i], operand(a + i * 8192 + j * 32), operand(b + j * 32), k > t.k || j > 0);
+                    mma(sums, operand(a + j * 32), operand(b + j * 32), k > t.k || j > 0);
                 asm volatile("wgmma.commit_group.sync.aligned;\nwgmma.wait_group.sync.aligned 1;" ::: "memory");
                 if (k > t.k) release(step - 1);
             }
@@ -207,47 +203,45 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             release(step - 1);
 
 #pragma unroll
-            for (int i = 0; i < MT; ++i)
+            for (int half = 0; half < 2; ++half) {
+                const int row = t.m + group * 64 + warp * 16 + lane / 4 + half * 8;
+                const bool inside = row < M;
+                constexpr int BLOCKS = TILE_N / 8;
+                if (EPILOGUE == 4) {
+                    float* to = (float*)out + ((size_t)t.split * M + row) * N;
 #pragma unroll
-                for (int half = 0; half < 2; ++half) {
-                    const int row = t.m + (group * MT + i) * 64 + warp * 16 + lane / 4 + half * 8;
-                    const bool inside = row < M;
-                    constexpr int BLOCKS = TILE_N / 8;
-                    if (EPILOGUE == 4) {
-                        float* to = (float*)out + ((size_t)t.split * M + row) * N;
-#pragma unroll
-                        for (int j = 0; j < BLOCKS; ++j) {
-                            const int col = t.n + j * 8 + lane % 4 * 2;
-                            float x = sums[i][4 * j + 2 * half], y = sums[i][4 * j + 2 * half + 1];
-                            x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
-                            if (inside && col < N) *(float2*)(to + col) = make_float2(x, y);
+                    for (int j = 0; j < BLOCKS; ++j) {
+                        const int col = t.n + j * 8 + lane % 4 * 2;
+                        float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
+                        x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
+                        if (inside && col < N) *(float2*)(to + col) = make_float2(x, y);
+                    }
+                } else {
+                    u16* to = (u16*)out + (size_t)row * N;
+                    auto value = [&](int j) -> u32 {
+                        float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
+                        if (BIASED) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
+                        if (EPILOGUE == 2) x = gelu(x), y = gelu(y);
+                        if (EPILOGUE == 3) {
+                            x = gelu(x) * sums[BN / 4 + 4 * j + 2 * half];
+                            y = gelu(y) * sums[BN / 4 + 4 * j + 2 * half + 1];
                         }
-                    } else {
-                        u16* to = (u16*)out + (size_t)row * N;
-                        auto value = [&](int j) -> u32 {
-                            float x = sums[i][4 * j + 2 * half], y = sums[i][4 * j + 2 * half + 1];
-                            if (BIASED) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
-                            if (EPILOGUE == 2) x = gelu(x), y = gelu(y);
-                            if (EPILOGUE == 3) {
-                                x = gelu(x) * sums[i][BN / 4 + 4 * j + 2 * half];
-                                y = gelu(y) * sums[i][BN / 4 + 4 * j + 2 * half + 1];
-                            }
-                            return pack(x, y);
-                        };
+                        return pack(x, y);
+                    };
 #pragma unroll
-                        for (int j = 0; j + 3 < BLOCKS; j += 4) {
-                            const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
-                            const int col = t.n + (j + lane % 4) * 8;
-                            if (inside && col < N) *(uint4*)(to + col) = v;
-                        }
+                    for (int j = 0; j + 3 < BLOCKS; j += 4) {
+                        const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
+                        const int col = t.n + (j + lane % 4) * 8;
+                        if (inside && col < N) *(uint4*)(to + col) = v;
+                    }
 #pragma unroll
-                        for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
-                            const int col = t.n + j * 8 + lane % 4 * 2;
-                            const u32 v = value(j);
-                            if (inside && col < N) *(u32*)(to + col) = v;
-                        }
+                    for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
+                        const int col = t.n + j * 8 + lane % 4 * 2;
+                        const u32 v = value(j);
+                        if (inside && col < N) *(u32*)(to + col) = v;
                     }
                 }
+            }
         }
     }
     if (CLUSTER > 1) cluster_sync();  // the other CTA may still signal barriers here

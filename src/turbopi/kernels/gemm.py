@@ -18,25 +18,23 @@ from turbopi.kernels.nvrtc import Kernel, bindings, compile_cubin
 
 Epilogue = Literal["plain", "bias", "gelu", "geglu", "partial"]
 EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, "partial": 4}
-SHARED_BYTES = {1: 227 * 1024, 2: 113 * 1024}  # of a CTA, by CTAs that an SM has room for
+SHARED_BYTES = 227 * 1024
 DEPTH = 64  # of a step along the inner axis
 
 
 @dataclass(frozen=True)
 class Tile:
-    """How a product is cut: warpgroups * row_blocks * 64 rows by `columns` a CTA, the inner axis into `splits`."""
+    """How a product is cut: 64 * warpgroups rows by `columns` a CTA, the inner axis into `splits`."""
 
     warpgroups: int
-    row_blocks: int
     columns: int  # of the product; for GeGLU half of them gate, half up
     cluster_m: int = 1  # CTAs that share rows of the weight
     cluster_n: int = 1  # CTAs that share rows of a
     splits: int = 1
-    per_sm: int = 1
 
     @property
     def rows(self) -> int:
-        return 64 * self.warpgroups * self.row_blocks
+        return 64 * self.warpgroups
 
     @property
     def cluster(self) -> int:
@@ -45,7 +43,7 @@ class Tile:
     @property
     def stages(self) -> int:
         """As many as fit, beside 1 KB of alignment and the barriers."""
-        return min(16, (SHARED_BYTES[self.per_sm] - 2048) // ((self.rows + self.columns) * DEPTH * 2))
+        return min(16, (SHARED_BYTES - 2048) // ((self.rows + self.columns) * DEPTH * 2))
 
 
 def matmul(
@@ -119,19 +117,17 @@ class DependentKernel(Kernel):
 def _kernel(tile: Tile, epilogue: Epilogue, device: torch.device) -> DependentKernel:
     sizes = {
         "TP_WGS": tile.warpgroups,
-        "TP_MT": tile.row_blocks,
         "TP_BN": tile.columns,
         "TP_STAGES": tile.stages,
         "TP_CM": tile.cluster_m,
         "TP_CN": tile.cluster_n,
         "TP_SPLITS": tile.splits,
-        "TP_PER_SM": tile.per_sm,
         "TP_EPILOGUE": EPILOGUES[epilogue],
     }
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile.columns), "sm_90a", sizes)
-        threads = 128 * tile.warpgroups + (128 if tile.per_sm == 1 else 32)
-        return DependentKernel(cubin, "gemm", SHARED_BYTES[tile.per_sm], threads, tile.cluster)
+        threads = 128 * (tile.warpgroups + 1)
+        return DependentKernel(cubin, "gemm", SHARED_BYTES, threads, tile.cluster)
 
 
 def source(columns: int) -> str:

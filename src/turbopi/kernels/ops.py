@@ -13,23 +13,23 @@ from turbopi.kernels import activations, attention, embedding, norms, rope
 from turbopi.kernels.gemm import Tile, matmul
 from turbopi.kernels.launch import capability
 
-GEGLU_TILES = (Tile(3, 1, 192), Tile(2, 1, 256))
+GEGLU_TILES = (Tile(3, 192), Tile(2, 256))
 GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
 
 # SigLIP So400m's products that beat cuBLAS on an H200, by [rows, out, in]: the tiles fill its SMs just once.
 VISION_TILES = {
-    (256, 3456, 1152): Tile(1, 1, 112),
-    (256, 1152, 1152): Tile(2, 1, 40, splits=2),
-    (256, 4304, 1152): Tile(2, 1, 72),
-    (256, 1152, 4304): Tile(2, 1, 72, cluster_n=2, splits=4),
-    (512, 3456, 1152): Tile(2, 1, 112),
-    (512, 1152, 1152): Tile(2, 1, 40),
-    (512, 4304, 1152): Tile(2, 1, 136),
-    (512, 1152, 4304): Tile(2, 1, 96, cluster_m=2, cluster_n=2, splits=2),
-    (768, 3456, 1152): Tile(2, 1, 160),
-    (768, 1152, 1152): Tile(2, 1, 64, cluster_m=2),
-    (768, 4304, 1152): Tile(3, 1, 136),
-    (768, 1152, 4304): Tile(2, 1, 144, cluster_m=2, cluster_n=2, splits=2),
+    (256, 3456, 1152): Tile(1, 112),
+    (256, 1152, 1152): Tile(2, 40, splits=2),
+    (256, 4304, 1152): Tile(2, 72),
+    (256, 1152, 4304): Tile(2, 72, cluster_n=2, splits=4),
+    (512, 3456, 1152): Tile(2, 112),
+    (512, 1152, 1152): Tile(2, 40),
+    (512, 4304, 1152): Tile(2, 136),
+    (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2),
+    (768, 3456, 1152): Tile(2, 160),
+    (768, 1152, 1152): Tile(2, 64, cluster_m=2),
+    (768, 4304, 1152): Tile(3, 136),
+    (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2),
 }
 
 
