@@ -102,6 +102,15 @@ def test_any_number_of_cameras(cameras: int) -> None:
     assert model.prefix(observation).k.shape[3] == cameras * 256 + 20
 
 
+@pytest.mark.parametrize("compact", [True, False])
+def test_a_prompt_alone_is_enough(compact: bool) -> None:
+    blind = dataclasses.replace(random_observation(0), image_mask=torch.zeros(1, 3, dtype=torch.bool))
+    model = golden_model("pi05")
+    assert model.prefix(blind).k.shape[3] == 20
+    padded = model.sample(blind, noise(0), STEPS, compact=False)
+    torch.testing.assert_close(model.sample(blind, noise(0), STEPS, compact=compact), padded, rtol=0, atol=5e-6)
+
+
 @pytest.mark.parametrize("horizon", [1, 7, 50])
 @pytest.mark.parametrize("num_steps", [1, 2])
 def test_any_horizon_and_number_of_steps(horizon: int, num_steps: int) -> None:

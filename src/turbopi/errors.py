@@ -5,8 +5,12 @@
     ├── CheckpointError        a checkpoint that can't be read, or doesn't fit its config  (also a ValueError)
     ├── TokenizerError         the SentencePiece model is missing or isn't one             (also a ValueError)
     ├── ObservationError       an observation the policy can't use                         (also a ValueError)
-    └── BackendError           a backend can't do what it was asked to
-        └── BackendUnavailable it can't run here at all; says why and what to do
+    ├── BackendError           a backend can't do what it was asked to
+    │   └── BackendUnavailable it can't run here at all; says why and what to do
+    ├── sim.base.SimulatorUnavailable      a simulator isn't installed or can't draw
+    ├── evaluate.sources.PolicyLost        a policy server went away; the run can be continued
+    ├── evaluate.sources.PolicyRefused     a policy doesn't fit the simulator
+    └── evaluate.schedule.TooManyCrashes   the simulator breaks again and again
 
 Messages name the value, what was expected, and what to do about it. Broken invariants of our own are `assert`s.
 """

@@ -7,7 +7,7 @@ import typer
 
 # Importing a module declares its commands, in the order of --help
 # isort: off
-from turbopi.cli import demo, infer, serve, bench, checkpoints, backends, doctor  # noqa: F401
+from turbopi.cli import demo, infer, serve, bench, evaluate, compare, checkpoints, backends, doctor  # noqa: F401
 from turbopi.cli.framework import app
 # isort: on
 

@@ -102,7 +102,7 @@ def attention(q_BHSK: Tensor, k_BGTK: Tensor, v_BGTK: Tensor, mask: Tensor | Non
 
 def split_heads(x: Tensor, head_dim: int) -> Tensor:
     """[B, S, heads * K] -> [B, heads, S, K]"""
-    return x.view(*x.shape[:2], -1, head_dim).transpose(1, 2)
+    return x.view(*x.shape[:2], x.shape[-1] // head_dim, head_dim).transpose(1, 2)
 
 
 def merge_heads(x: Tensor) -> Tensor:

@@ -1,0 +1,134 @@
+"""`turbopi compare`."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from turbopi.cli.evaluate import EvalOptions, run_with_progress
+from turbopi.cli.framework import JsonFlag, Output, command
+from turbopi.errors import ConfigError
+
+if TYPE_CHECKING:
+    from turbopi.evaluate.compare import Variant
+    from turbopi.evaluate.results import Results
+
+
+@command(
+    "compare",
+    shared=EvalOptions,
+    examples=(
+        "turbopi compare turbopi-eval/run-a turbopi-eval/run-b",
+        "turbopi compare pytorch:f32 pytorch:bf16 pytorch:bf16:5 --checkpoint checkpoints/pi05_libero "
+        "--config pi05_libero --trials 10 --out turbopi-compare",
+    ),
+)
+def compare_command(
+    options: EvalOptions,
+    runs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN RUN…",
+            help="Folders of finished evaluations; or ways to run, each BACKEND[:PRECISION[:STEPS]].",
+        ),
+    ],
+    checkpoint: Annotated[
+        str | None, typer.Option("--checkpoint", metavar="DIR", help="The weights, unless the runs are folders.")
+    ] = None,
+    simulator: Annotated[
+        str, typer.Option("--simulator", metavar="NAME", help="Where ways to run are evaluated.")
+    ] = "libero",
+    as_json: JsonFlag = False,
+) -> None:
+    """The same episodes through several policies, in one table, paired with the first.
+
+    Ways to run (backend, precision, denoising steps) are evaluated first, one after the other, with the same episodes
+    and the same noise; their action error is measured against the float32 reference with the first one's number of
+    steps, on observations that each of them met. Folders are compared as they are.
+    """
+    from turbopi.evaluate.compare import HEADS, LEGEND, cells, compare, document, write_comparison
+    from turbopi.evaluate.results import FILE, load_results
+
+    output = Output(as_json)
+    if len(runs) < 2:
+        raise ConfigError(f"compare needs two runs or more, but got {len(runs)}: {' '.join(runs)}")
+    folders = [(Path(run) / FILE).exists() for run in runs]
+    if all(folders):
+        out = options.out
+        compared = compare([load_results(Path(run)) for run in runs])
+    elif any(Path(run).is_dir() for run in runs):
+        named = ", ".join(run for run, is_folder in zip(runs, folders, strict=True) if not is_folder)
+        raise ConfigError(f"runs are all folders of evaluations, or all ways to run; not a folder with {FILE}: {named}")
+    else:
+        out = options.out or Path("turbopi-compare")
+        results, errors = _run_variants(options, runs, checkpoint, simulator, out, output)
+        compared = compare(results, errors)
+    table = Table(
+        title=f"{compared[0].results.protocol['suite']}: {compared[0].rate.trials} episodes", title_justify="left"
+    )
+    for number, name in enumerate(HEADS):
+        table.add_column(name, justify="right" if number else "left", no_wrap=True)
+    for run in compared:
+        table.add_row(*cells(run))
+    output.table(table)
+    output.line(LEGEND)
+    if out is not None:
+        output.line(f"wrote {', '.join(str(path) for path in write_comparison(out, compared))}")
+    output.document(document(compared))
+
+
+def _run_variants(
+    options: EvalOptions, texts: list[str], checkpoint: str | None, simulator_name: str, out: Path, output: Output
+) -> "tuple[list[Results], list[dict[str, float] | None]]":
+    """Evaluate each way to run into a folder of its own, then ask the reference about what they met."""
+    from turbopi.evaluate.visited import Visited, action_error
+
+    options.check(checkpoint)
+    variants = [parse_variant(text, options) for text in texts]
+    if len(set(variants)) < len(variants):
+        raise ConfigError(f"the same way to run is named twice in {' '.join(texts)}")
+    simulator = options.simulator(simulator_name, output)
+    protocol = options.protocol(simulator, simulator_name)
+    jobs = options.jobs(simulator, protocol.suite)
+    results, samples = [], []
+    for variant in variants:
+        own = replace(options, backend=variant.backend, precision=variant.precision, steps=variant.steps)
+        source = own.local_policy(checkpoint, output)
+        folder = out / variant.folder
+        if options.restart and (folder / "visited.npz").exists():
+            (folder / "visited.npz").unlink()
+        visited = Visited(folder)
+        try:
+            results.append(
+                run_with_progress(
+                    own, protocol, source, simulator, jobs, folder, output, max_batch=1, on_answer=visited
+                )
+            )
+        finally:
+            visited.save()
+            source.close()
+        samples.append(visited.entries)
+    output.line(f"float32 reference, {variants[0].steps} steps, on {sum(map(len, samples))} observations")
+    reference_options = replace(options, backend="pytorch", precision="f32", steps=variants[0].steps)
+    reference = reference_options.local_policy(checkpoint, output)
+    return results, [action_error(entries, reference) for entries in samples]
+
+
+def parse_variant(text: str, options: EvalOptions) -> "Variant":
+    """ "pytorch:bf16:5"; what is left out is --precision's and --steps'. Raises ConfigError for anything else."""
+    from turbopi import backends
+    from turbopi.backends import BACKENDS
+    from turbopi.evaluate.compare import Variant
+
+    parts = text.split(":")
+    backend = parts[0]
+    precision = parts[1] if len(parts) > 1 else options.precision
+    steps = parts[2] if len(parts) > 2 else str(options.steps)
+    if backend not in BACKENDS or precision not in backends.PRECISIONS or not steps.isdigit() or len(parts) > 3:
+        raise ConfigError(
+            f"{text!r} is neither the folder of an evaluation nor a way to run: BACKEND[:PRECISION[:STEPS]], "
+            f"with a backend of {', '.join(BACKENDS)}, and {' or '.join(backends.PRECISIONS)}"
+        )
+    return Variant(backend, precision, int(steps))

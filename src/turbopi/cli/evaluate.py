@@ -1,0 +1,332 @@
+"""`turbopi eval`."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
+from turbopi.cli.options import CheckpointArgument, PolicyOptions
+from turbopi.errors import ConfigError
+
+if TYPE_CHECKING:
+    from turbopi.evaluate.plan import Job, Protocol, VideoPlan
+    from turbopi.evaluate.results import Episode, Results
+    from turbopi.evaluate.run import OnEpisode
+    from turbopi.evaluate.schedule import OnAnswer
+    from turbopi.evaluate.sources import PolicySource
+    from turbopi.sim import Simulator
+
+_EPISODES, _PROTOCOL, _RUNS, _OUTPUT = "Which episodes", "Protocol (openpi's unless given)", "How fast", "Output"
+DEFAULT_OUT = Path("turbopi-eval")
+
+
+def _option(*names: str, panel: str, help: str, metavar: str | None = None, **more: Any) -> Any:
+    return typer.Option(*names, metavar=metavar, help=help, rich_help_panel=panel, **more)
+
+
+@dataclass(frozen=True)
+class EvalOptions(PolicyOptions):
+    """Which policy, which episodes, and how they are run."""
+
+    suite: Annotated[
+        str | None,
+        _option("--suite", panel=_EPISODES, metavar="NAME", help="libero: spatial (default), object, goal, 10 or 90."),
+    ] = None
+    tasks: Annotated[
+        str | None, _option("--tasks", panel=_EPISODES, metavar="N,N-N", help="Indices of tasks; all unless given.")
+    ] = None
+    initial_states: Annotated[
+        str | None,
+        _option(
+            "--initial-states", panel=_EPISODES, metavar="N,N-N", help="Of each task; all unless given (LIBERO: 0-49)."
+        ),
+    ] = None
+    trials: Annotated[
+        int | None,
+        _option("--trials", panel=_EPISODES, metavar="N", help="Only the first N of a task's initial states.", min=1),
+    ] = None
+    seed: Annotated[int, _option("--seed", panel=_PROTOCOL, metavar="N", help="Of environments and noise.", min=0)] = 7
+    seeding: Annotated[
+        str,
+        _option(
+            "--seeding",
+            panel=_PROTOCOL,
+            metavar="episode|task",
+            help="Seed the environment before every episode, or once for each task as openpi does.",
+        ),
+    ] = "episode"
+    replan: Annotated[
+        int,
+        _option("--replan", panel=_PROTOCOL, metavar="N", help="Actions carried out before the policy is asked again."),
+    ] = 5
+    max_steps: Annotated[
+        int | None,
+        _option("--max-steps", panel=_PROTOCOL, metavar="N", help="Limit of an episode; the suite's own unless given."),
+    ] = None
+    wait_steps: Annotated[
+        int, _option("--wait-steps", panel=_PROTOCOL, metavar="N", help="Steps of standing still at the beginning.")
+    ] = 10
+    camera_px: Annotated[
+        int, _option("--camera-px", panel=_PROTOCOL, metavar="N", help="Width and height that cameras are drawn at.")
+    ] = 256
+    image_px: Annotated[
+        int, _option("--image-px", panel=_PROTOCOL, metavar="N", help="Width and height that the policy is sent.")
+    ] = 224
+    workers: Annotated[
+        int | None,
+        _option(
+            "--workers", panel=_RUNS, metavar="N", help="Simulator processes; half of the CPUs unless given.", min=1
+        ),
+    ] = None
+    max_batch: Annotated[
+        int | None,
+        _option(
+            "--max-batch",
+            panel=_RUNS,
+            metavar="N",
+            help="Requests that are computed together: as many as workers, and in compare 1. With 1, a run repeats "
+            "bit for bit.",
+            min=1,
+        ),
+    ] = None
+    videos: Annotated[
+        str,
+        _option("--videos", panel=_OUTPUT, metavar="sample|all|none", help="sample: all failures and some successes."),
+    ] = "sample"
+    video_successes: Annotated[
+        int,
+        _option(
+            "--video-successes", panel=_OUTPUT, metavar="N", help="Initial states of a task whose success is filmed."
+        ),
+    ] = 1
+    smooth_videos: Annotated[
+        bool,
+        _option("--smooth-videos", panel=_OUTPUT, help="Draw every control step for them, which takes its time."),
+    ] = False
+    out: Annotated[
+        Path | None, _option("--out", panel=_OUTPUT, metavar="DIR", help="Where results go, and continue; see below.")
+    ] = None
+    restart: Annotated[bool, _option("--restart", panel=_OUTPUT, help="Forget what the folder holds.")] = False
+
+    def simulator(self, name: str, output: Output) -> "Simulator":
+        """Checked, with its warnings printed."""
+        from turbopi.sim import create
+
+        simulator = create(name)
+        for warning in simulator.check():
+            output.line(f"warning: {warning}", "yellow")
+        return simulator
+
+    def protocol(self, simulator: "Simulator", name: str) -> "Protocol":
+        from turbopi.evaluate.plan import Protocol
+        from turbopi.sim import SimSettings
+        from turbopi.sim.base import full_suite_name
+
+        suite = simulator.suites[0] if self.suite is None else full_suite_name(simulator, self.suite)
+        settings = SimSettings(self.seed, self.seeding, self.wait_steps, self.camera_px)  # type: ignore[arg-type]
+        return Protocol(name, suite, settings, self.replan, self.image_px, self.max_steps)
+
+    def video_plan(self) -> "VideoPlan":
+        from turbopi.evaluate.plan import VideoPlan
+
+        return VideoPlan(self.videos, self.video_successes, self.smooth_videos)  # type: ignore[arg-type]
+
+    def jobs(self, simulator: "Simulator", suite: str) -> "list[Job]":
+        from turbopi.evaluate.plan import choose_tasks, make_jobs, parse_numbers
+
+        wanted = None if self.tasks is None else parse_numbers("--tasks", self.tasks)
+        states = None if self.initial_states is None else parse_numbers("--initial-states", self.initial_states)
+        return make_jobs(choose_tasks(simulator, suite, wanted), states, self.trials, self.video_plan())
+
+    def local_policy(self, checkpoint: str | None, output: Output) -> "PolicySource":
+        """The policy in this process, warmed up."""
+        from turbopi.demo import with_libero_stats
+        from turbopi.evaluate.sources import LocalPolicy
+
+        opened = with_libero_stats(self.open(checkpoint))
+        self.tell_if_random(opened, output)
+        policy = self.make_policy(opened, output)
+        policy.warmup()
+        return LocalPolicy(policy, opened.fingerprint())
+
+
+@command(
+    "eval",
+    shared=EvalOptions,
+    examples=(
+        "turbopi eval libero checkpoints/pi05_libero --config pi05_libero",
+        "turbopi eval libero checkpoints/pi05_libero --config pi05_libero --suite goal --trials 10 --workers 8",
+        "turbopi eval libero --port 8000 --suite libero_10",
+        "turbopi eval libero --random-weights pi05_tiny --tasks 0,1 --trials 1 --max-steps 20",
+        "turbopi eval reacher --random-weights pi05_tiny --trials 2",
+    ),
+)
+def evaluate_command(
+    options: EvalOptions,
+    simulator: Annotated[
+        str, typer.Argument(metavar="SIMULATOR", help="libero; or reacher, a toy to try the evaluation itself with.")
+    ],
+    checkpoint: CheckpointArgument = None,
+    host: Annotated[
+        str | None, typer.Option("--host", metavar="HOST", help="Evaluate a policy server: openpi's or Turbo-Pi's.")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option("--port", "-p", min=1, max=65535, metavar="N", help="Its port; 8000 unless given.")
+    ] = None,
+    api_key: Annotated[
+        str | None, typer.Option("--api-key", envvar="TURBOPI_API_KEY", metavar="KEY", help="That the server wants.")
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Let a policy act in a simulator, and count its successes.
+
+    The policy runs in this process, from a CHECKPOINT or --random-weights, or behind openpi's websocket protocol
+    (--host, --port). The folder gets results.json, report.html, plots and videos; unless --out is given it is
+    turbopi-eval/ and a name made of suite and policy. Giving the same command again continues an interrupted run,
+    and retries episodes that crashed. Exit code 1: some episodes crashed, so the result isn't complete.
+    """
+    output = Output(as_json)
+    remote = host is not None or port is not None
+    if remote and (checkpoint is not None or options.random_weights is not None):
+        raise ConfigError("--host and --port name a server's policy; give no weights beside them")
+    if not remote:
+        options.check(checkpoint)
+    chosen = options.simulator(simulator, output)
+    protocol = options.protocol(chosen, simulator)
+    jobs = options.jobs(chosen, protocol.suite)
+    if remote:
+        from turbopi.evaluate.sources import RemotePolicy
+
+        source: PolicySource = RemotePolicy(host or "127.0.0.1", port or 8000, api_key)
+    else:
+        source = options.local_policy(checkpoint, output)
+    try:
+        folder = options.out or DEFAULT_OUT / _folder_name(protocol.suite, source.label, source.about)
+        results = run_with_progress(options, protocol, source, chosen, jobs, folder, output)
+    finally:
+        source.close()
+    _show(results, output)
+    output.document({"folder": results.folder, **results.summary()})
+    if not results.complete:
+        raise typer.Exit(CHECK_FAILED)
+
+
+def run_with_progress(
+    options: EvalOptions,
+    protocol: "Protocol",
+    source: "PolicySource",
+    simulator: "Simulator",
+    jobs: "list[Job]",
+    folder: Path,
+    output: Output,
+    *,
+    max_batch: int | None = None,
+    on_answer: "OnAnswer | None" = None,
+) -> "Results":
+    """Check that the policy fits, then run with a bar, or a line an episode where nobody watches."""
+    from turbopi.evaluate.run import default_workers, evaluate, pending, prepare
+    from turbopi.evaluate.sources import check_fit
+
+    check_fit(source, simulator, protocol.sim, protocol.image_px, protocol.replan)
+    results = prepare(folder, protocol, source, simulator, jobs, restart=options.restart)
+    left = len(pending(results, jobs))
+    workers = min(options.workers or default_workers(), max(1, left))
+    output.line(f"{protocol.suite}: {len(jobs)} episodes with {source.label} into {folder}")
+    if left < len(jobs):
+        output.line(f"{len(jobs) - left} of them are finished already; {left} to go")
+    with _told(output, len(jobs), len(jobs) - left) as on_episode:
+        return evaluate(
+            results,
+            protocol,
+            source,
+            simulator,
+            jobs,
+            num_workers=workers,
+            max_batch=options.max_batch or max_batch or workers,
+            videos=options.video_plan(),
+            on_episode=on_episode,
+            on_answer=on_answer,
+        )
+
+
+@contextmanager
+def _told(output: Output, total: int, done: int) -> "Iterator[OnEpisode]":
+    """Progress: a bar with the running success on a terminal, else a line an episode."""
+    if not output.shows_progress:
+        yield lambda episode, results: output.line(f"{_line(episode)}; {_running(results)}")
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=new_console(stderr=True)) as bar:
+        task = bar.add_task("starting simulators", total=total, completed=done)
+
+        def ended(episode: "Episode", results: "Results") -> None:
+            if episode.message:
+                bar.console.print(_line(episode), markup=False, highlight=False)
+            bar.update(task, advance=1, description=_running(results))
+
+        yield ended
+
+
+def _line(episode: "Episode") -> str:
+    why = f" ({episode.message.strip().splitlines()[-1]})" if episode.message else ""
+    return (
+        f"task {episode.task}, initial state {episode.initial_state}: {episode.status} after {episode.steps} steps, "
+        f"{episode.seconds:.0f} s{why}"
+    )
+
+
+def _running(results: "Results") -> str:
+    from turbopi.evaluate.results import rate
+
+    episodes = results.episodes.values()
+    crashes = sum(not episode.judged for episode in episodes)
+    return f"success {rate(episodes)}" + (f", {crashes} crashed" if crashes else "")
+
+
+def _show(results: "Results", output: Output) -> None:
+    from turbopi.evaluate.results import rate
+
+    episodes = results.in_order()
+    table = Table(title=f"{results.protocol['suite']}: {results.label}", title_justify="left")
+    table.add_column("task", justify="right")
+    table.add_column("instruction", overflow="fold")
+    for name in ("solved", "success [95 % interval]", "steps", "crashed"):
+        table.add_column(name, justify="right")
+    rows = [
+        (str(index), task.instruction, [e for e in episodes if e.task == index])
+        for index, task in results.tasks.items()
+    ]
+    for index, instruction, own in [*rows, ("", "all", episodes)]:
+        solved, found = [e.steps for e in own if e.success], rate(own)
+        steps = f"{sum(solved) / len(solved):.0f}" if solved else "-"
+        crashes = sum(not e.judged for e in own)
+        if own:
+            table.add_row(
+                index, instruction, f"{found.successes}/{found.trials}", str(found), steps, str(crashes or "-")
+            )
+    output.table(table)
+    summary = results.summary()
+    for name, what in (("call_ms", "the policy's whole call"), ("infer_ms", "the model alone")):
+        if summary[name]:
+            found_ms = ", ".join(f"{q} {summary[name][q]:.1f}" for q in ("p50", "p95", "p99"))
+            output.line(f"{what}: {found_ms} ms")
+    if summary["aborted"]:
+        output.line(
+            f"{summary['aborted']} episodes were aborted, as actions weren't finite; they count as failures", "red"
+        )
+    if summary["crashes"]:
+        output.line(
+            f"{summary['crashes']} episodes crashed and count as nothing; the same command tries them again", "red"
+        )
+    output.line(f"report: {results.folder / 'report.html'}")
+
+
+def _folder_name(suite: str, label: str, about: dict[str, Any]) -> str:
+    text = "-".join(str(part) for part in (suite, about.get("config"), label) if part)
+    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in text)

@@ -1,0 +1,1 @@
+"""Closed-loop evaluation: a policy acts in a simulator, and its success is counted with confidence intervals."""

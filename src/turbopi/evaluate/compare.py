@@ -1,0 +1,181 @@
+"""Several runs of the same episodes, beside each other: paired with the first of them."""
+
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from turbopi.errors import ConfigError
+from turbopi.evaluate.plots import write_comparison_plot
+from turbopi.evaluate.report import page, table
+from turbopi.evaluate.results import Episode, Results
+from turbopi.evaluate.statistics import Paired, Rate, percentiles
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to run the policy."""
+
+    backend: str
+    precision: str
+    steps: int
+
+    @property
+    def folder(self) -> str:
+        return f"{self.backend}-{self.precision}-{self.steps}steps"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A run among others.
+
+    rate      on the episodes that all runs have a verdict for
+    paired    with the first run's outcomes; None for the first itself
+    error     of its actions against the float32 reference, if that was measured
+    """
+
+    results: Results
+    label: str
+    rate: Rate
+    paired: Paired | None
+    call_ms: dict[str, float] | None
+    infer_ms: dict[str, float] | None
+    steps: dict[str, float] | None
+    error: dict[str, float] | None
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "label": self.label,
+            "folder": str(self.results.folder),
+            "success": self.rate.as_json(),
+            "paired_with_first": None if self.paired is None else self.paired.as_json(),
+            "call_ms": self.call_ms,
+            "infer_ms": self.infer_ms,
+            "steps_to_success": self.steps,
+            "action_error": self.error,
+            "crashes": sum(not episode.judged for episode in self.results.episodes.values()),
+            "episodes": len(self.results.episodes),
+        }
+
+
+def compare(runs: Sequence[Results], errors: Sequence[dict[str, float] | None] | None = None) -> list[Compared]:
+    """Every run on the episodes that all of them have a verdict for, paired with the first.
+
+    Raises ConfigError if the protocols differ, or if there is no common episode.
+    """
+    check_same_protocol(runs)
+    common = sorted(set.intersection(*({e.key for e in run.episodes.values() if e.judged} for run in runs)))
+    if not common:
+        names = ", ".join(str(run.folder) for run in runs)
+        raise ConfigError(f"no episode has a verdict in every one of {names}: there is nothing to compare")
+    first = runs[0]
+    compared = []
+    for number, run in enumerate(runs):
+        own = [run.episodes[key] for key in common]
+        pairs = [(first.episodes[key].success, run.episodes[key].success) for key in common]
+        compared.append(
+            Compared(
+                run,
+                run.label,
+                Rate(sum(episode.success for episode in own), len(own)),
+                Paired.of(pairs) if number else None,
+                percentiles([ms for episode in own for ms in episode.call_ms]),
+                percentiles([ms for episode in own for ms in episode.infer_ms]),
+                percentiles([episode.steps for episode in own if episode.success]),
+                errors[number] if errors is not None else None,
+            )
+        )
+    return compared
+
+
+def check_same_protocol(runs: Sequence[Results]) -> None:
+    first = runs[0]
+    for run in runs[1:]:
+        for name in sorted({*first.protocol, *run.protocol}):
+            mine, theirs = first.protocol.get(name), run.protocol.get(name)
+            if mine != theirs:
+                raise ConfigError(
+                    f"{first.folder} and {run.folder} aren't comparable: "
+                    f"{name} is {mine!r} in one and {theirs!r} in the other"
+                )
+
+
+def document(compared: Sequence[Compared]) -> dict[str, Any]:
+    return {
+        "protocol": compared[0].results.protocol,
+        "episodes": compared[0].rate.trials,
+        "runs": [run.as_json() for run in compared],
+    }
+
+
+HEADS = (
+    "run",
+    "success [95 %]",
+    "difference [95 %]",
+    "only 1st :\nonly this",
+    "p",
+    "call\np50 ms",
+    "call\np95 ms",
+    "steps",
+    "action\nerror",
+)
+
+
+def cells(run: Compared) -> list[str]:
+    """The table's row as text."""
+    row = [run.label, str(run.rate)]
+    if run.paired is None:
+        row += ["-", "-", "-"]
+    else:
+        low, high = run.paired.interval
+        row += [
+            f"{100 * (run.paired.difference or 0):+.1f} % [{100 * low:+.1f}, {100 * high:+.1f}]",
+            f"{run.paired.only_first} : {run.paired.only_second}",
+            f"{run.paired.p_value:.3f}",
+        ]
+    row += [f"{run.call_ms[name]:.1f}" if run.call_ms else "-" for name in ("p50", "p95")]
+    row.append(f"{run.steps['p50']:.0f}" if run.steps else "-")
+    row.append(f"{run.error['rms']:.2g}" if run.error else "-")
+    return row
+
+
+LEGEND = (
+    "All rates are on the episodes that every run has a verdict for. difference: this run's rate less the first one's, "
+    "with Bonett and Price's interval; p: McNemar's exact test; call: the policy's whole answer; steps: to success, "
+    "median; action error: rms against the float32 reference with the same noise, on observations that the run met, "
+    "in units of each action dimension's spread."
+)
+
+
+def write_comparison(folder: Path, compared: Sequence[Compared]) -> list[Path]:
+    """compare.json, compare.png and compare.html."""
+    folder.mkdir(parents=True, exist_ok=True)
+    told = folder / "compare.json"
+    told.write_text(json.dumps(document(compared), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    plot = write_comparison_plot(folder / "compare.png", [(run.label, run.rate) for run in compared])
+    shown = folder / "compare.html"
+    suite = str(compared[0].results.protocol["suite"])
+    rows = [[html.escape(cell) for cell in cells(run)] for run in compared]
+    body = (
+        f"<h1>{html.escape(suite)}: {len(compared)} runs of {compared[0].rate.trials} episodes</h1>"
+        f"{table(HEADS, rows)}<p class=sub>{html.escape(LEGEND)}</p>"
+        f'<div class=plots><img src="{plot.name}" alt="success of each run"></div>'
+        f"<h2>Episodes that not all runs agree on</h2>{_disagreements(compared)}"
+    )
+    shown.write_text(page(f"{suite}: comparison", body), encoding="utf-8")
+    return [told, plot, shown]
+
+
+def _disagreements(compared: Sequence[Compared]) -> str:
+    runs = [run.results for run in compared]
+    rows = []
+    for key in sorted(runs[0].episodes):
+        found: list[Episode | None] = [run.episodes.get(key) for run in runs]
+        if len({episode.success for episode in found if episode is not None and episode.judged}) > 1:
+            outcomes = [f"<span class={e.status}>{e.status}</span>" if e else "-" for e in found]
+            rows.append([str(key[0]), str(key[1]), *outcomes])
+    if not rows:
+        return "<p>None.</p>"
+    return table(("task", "initial state", *(run.label for run in compared)), rows, numbers_from=9)

@@ -1,0 +1,126 @@
+"""What is evaluated: which episodes, by which protocol."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from turbopi.errors import ConfigError
+from turbopi.sim import SimSettings, Simulator, Task
+
+VideoChoice = Literal["sample", "all", "none"]
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Everything that decides what happens in an episode, besides the policy. The defaults are openpi's.
+
+    replan       actions of a chunk that are carried out before the policy is asked again
+    image_px     pictures are resized to this square with padding before they are sent to the policy
+    max_steps    control steps after the wait; None: the suite's own limit
+    """
+
+    simulator: str
+    suite: str
+    sim: SimSettings = field(default_factory=SimSettings)
+    replan: int = 5
+    image_px: int = 224
+    max_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("replan", self.replan), ("image_px", self.image_px), ("max_steps", self.max_steps)):
+            if value is not None and value < 1:
+                raise ConfigError(f"{name} is {value}; it should be at least 1")
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class VideoPlan:
+    """Which episodes are filmed: with "sample" every failure, and successes among a task's first initial states.
+
+    smooth   draw at every control step instead of only where the policy looks: four times slower without a GPU
+    """
+
+    which: VideoChoice = "sample"
+    successes: int = 1
+    smooth: bool = False
+
+    def __post_init__(self) -> None:
+        if self.which not in ("sample", "all", "none"):
+            raise ConfigError(f"videos are {self.which!r}; choose sample, all or none")
+        if self.successes < 0:
+            raise ConfigError(f"{self.successes} successes a task can't be filmed; it should be 0 or more")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One episode to run."""
+
+    task: Task
+    initial_state: int
+    video: str | None = None  # the file's name without its ending, if it is filmed
+    keep_success: bool = False  # whether a film of a success is kept too
+
+    @property
+    def key(self) -> tuple[int, int]:
+        return self.task.index, self.initial_state
+
+
+def noise_seed(seed: int, task: int, initial_state: int, step: int) -> int:
+    """The seed of the noise that a chunk starts from: the same for any backend, whatever ran before."""
+    low, high = np.random.SeedSequence([seed, task, initial_state, step]).generate_state(2)
+    return int(low) | int(high) << 32
+
+
+def choose_tasks(simulator: Simulator, suite: str, wanted: Sequence[int] | None) -> list[Task]:
+    """The tasks with these indices, or all. Raises ConfigError, listing what there is."""
+    tasks = {task.index: task for task in simulator.tasks(suite)}
+    unknown = [index for index in wanted or () if index not in tasks]
+    if unknown:
+        names = "\n".join(f"  {task.index}: {task.instruction}" for task in tasks.values())
+        raise ConfigError(f"{suite} has no task {', '.join(map(str, unknown))}; its tasks are\n{names}")
+    return [tasks[index] for index in sorted(set(tasks if wanted is None else wanted))]
+
+
+def make_jobs(
+    tasks: Sequence[Task], initial_states: Sequence[int] | None, trials: int | None, videos: VideoPlan
+) -> list[Job]:
+    """Every task from each of these initial states (all of them unless given), or from the first `trials` of them.
+
+    Raises ConfigError for initial states that a task doesn't have.
+    """
+    jobs = []
+    for task in tasks:
+        states = range(task.num_initial_states) if initial_states is None else sorted(set(initial_states))
+        if trials is not None:
+            if not 1 <= trials <= len(states):
+                raise ConfigError(
+                    f"{trials} trials of task {task.index} aren't possible: from 1 to {len(states)} are, one from each "
+                    "initial state"
+                )
+            states = states[:trials]
+        if states[0] < 0 or states[-1] >= task.num_initial_states:
+            raise ConfigError(
+                f"task {task.index} has the initial states 0 to {task.num_initial_states - 1}; "
+                f"{states[0]} to {states[-1]} were asked for"
+            )
+        for number, state in enumerate(states):
+            name = f"task{task.index:02d}_state{state:02d}" if videos.which != "none" else None
+            jobs.append(Job(task, state, name, videos.which == "all" or number < videos.successes))
+    return jobs
+
+
+def parse_numbers(option: str, text: str) -> list[int]:
+    """ "0,2,5-7" as [0, 2, 5, 6, 7]. Raises ConfigError, naming the option."""
+    numbers: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdigit() or (dash and not last.isdigit()):
+            raise ConfigError(f"{option} is {text!r}; expected whole numbers and ranges, such as 0,2,5-7")
+        numbers += range(int(first), int(last or first) + 1)
+    if not numbers:
+        raise ConfigError(f"{option} is {text!r}: there is nothing in that range")
+    return numbers

@@ -1,0 +1,118 @@
+"""One evaluation from start to finish: continue what is there, run the rest, write what came out."""
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from turbopi.bench.provenance import provenance
+from turbopi.evaluate.episode import WorkerSetup
+from turbopi.evaluate.plan import Job, Protocol, VideoPlan
+from turbopi.evaluate.report import write_report
+from turbopi.evaluate.results import FILE, Episode, Results, load_results, protocol_json
+from turbopi.evaluate.schedule import OnAnswer, Scheduler
+from turbopi.evaluate.sources import PolicySource
+from turbopi.evaluate.video import check_can_write
+from turbopi.evaluate.workers import LOG
+from turbopi.sim import Simulator
+
+# Is told of every episode as it ends, with the results so far
+OnEpisode = Callable[[Episode, Results], None]
+
+
+def default_workers() -> int:
+    """Half of the CPUs: the policy and the renderers need the others."""
+    return max(1, min(16, (os.cpu_count() or 2) // 2))
+
+
+def prepare(
+    folder: Path, protocol: Protocol, source: PolicySource, simulator: Simulator, jobs: Sequence[Job], *, restart: bool
+) -> Results:
+    """Results for these jobs, with the episodes that the folder holds already unless `restart`.
+
+    Raises ConfigError if those were run in another way, or by another policy.
+    """
+    policy = {"label": source.label, "identity": source.identity, "about": source.about}
+    versions = {"simulator": simulator.versions(), **provenance(torch.device("cpu"))}
+    results = Results(folder, protocol_json(protocol), policy, [job.task for job in jobs], versions, {})
+    if restart:
+        _clear(folder)
+    elif (folder / FILE).exists():
+        results.continue_from(load_results(folder))
+    results.planned |= {job.key for job in jobs}
+    return results
+
+
+def pending(results: Results, jobs: Sequence[Job]) -> list[Job]:
+    """Jobs without a verdict; crashed ones are tried again."""
+    return [job for job in jobs if job.key not in results.episodes or not results.episodes[job.key].judged]
+
+
+def evaluate(
+    results: Results,
+    protocol: Protocol,
+    source: PolicySource,
+    simulator: Simulator,
+    jobs: Sequence[Job],
+    *,
+    num_workers: int,
+    max_batch: int,
+    videos: VideoPlan,
+    on_episode: OnEpisode = lambda episode, results: None,
+    on_answer: OnAnswer | None = None,
+) -> Results:
+    """Run the jobs that have no verdict yet; add them to `results`, in whose folder everything is written.
+
+    Whatever ends it, Ctrl-C or a lost server, results.json and report.html then hold what was finished.
+    """
+    if videos.which != "none":
+        check_can_write()
+    results.folder.mkdir(parents=True, exist_ok=True)
+    results.options = {"workers": num_workers, "max_batch": max_batch, "videos": asdict(videos)}
+
+    def ended(episode: Episode, job: Job) -> None:
+        results.add(episode)
+        on_episode(episode, results)
+
+    setup = WorkerSetup(
+        protocol.simulator,
+        protocol.suite,
+        protocol.sim,
+        protocol.replan,
+        protocol.max_steps,
+        videos.smooth,
+        str(results.folder),
+    )
+    scheduler = Scheduler(
+        protocol,
+        setup,
+        source,
+        simulator.image_keys,
+        num_workers=num_workers,
+        max_batch=max_batch,
+        on_episode=ended,
+        on_answer=on_answer,
+    )
+    start = time.monotonic()
+    try:
+        scheduler.run(pending(results, jobs))
+    finally:
+        results.wall_seconds += time.monotonic() - start
+        results.save()
+        write_report(results)
+    return results
+
+
+def _clear(folder: Path) -> None:
+    """Remove what an earlier run wrote, and nothing else."""
+    for name in (FILE, LOG, "report.html", "success.png", "steps.png", "latency.png", "visited.npz"):
+        with contextlib.suppress(FileNotFoundError):
+            (folder / name).unlink()
+    for film in (folder / "videos").glob("task*_state*_*.mp4"):
+        film.unlink()
+    with contextlib.suppress(OSError):
+        (folder / "videos").rmdir()

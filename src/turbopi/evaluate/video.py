@@ -1,0 +1,140 @@
+"""Films of episodes: what the cameras saw, the instruction, and the chunk that the policy predicted.
+
+A frame is drawn with Pillow, which is a hundred times faster than a plot of its own for each.
+"""
+
+import importlib.util
+import textwrap
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from turbopi.errors import TurboPiError
+from turbopi.evaluate.episode import Frame
+
+VIEW = 320  # pixels of each camera's square
+PANEL = 150  # height of the chunk's plots
+MARGIN = 14
+END_S = 1.5  # the last frame stays
+MIN_FPS = 8.0  # frames are repeated up to this rate: players stutter below it
+INSTALL = "pip install 'imageio[ffmpeg]'"
+
+Color = tuple[int, int, int]
+BACKGROUND, INK, FAINT = (250, 250, 248), (32, 33, 36), (150, 152, 158)
+LINES: tuple[Color, ...] = ((31, 119, 180), (214, 102, 12), (44, 140, 60), (150, 90, 170))
+ENDINGS: dict[str, Color] = {"success": (24, 128, 56), "failure": (190, 40, 40), "aborted": (190, 40, 40)}
+
+
+def check_can_write() -> None:
+    """Raise TurboPiError with the install command if videos can't be written."""
+    if any(importlib.util.find_spec(name) is None for name in ("imageio", "imageio_ffmpeg")):
+        raise TurboPiError(f"videos need imageio and ffmpeg: {INSTALL}, or give --videos none")
+
+
+def write_video(
+    path: Path, frames: Sequence[Frame], caption: str, ending: str, robot: str, frames_per_second: float
+) -> None:
+    """An MP4 at the robot's own speed. `frames_per_second`: of simulated time between two frames."""
+    import imageio.v2 as imageio
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    repeats = max(1, int(np.ceil(MIN_FPS / frames_per_second)))
+    fps = frames_per_second * repeats
+    groups = chunk_groups(robot, frames[0].chunk.shape[1])
+    with imageio.get_writer(path, fps=fps, codec="libx264", quality=7, macro_block_size=2) as writer:
+        for number, frame in enumerate(frames):
+            last = number == len(frames) - 1
+            picture = draw_frame(frame, caption, groups, ending if last else None)
+            for _ in range(repeats + (round(END_S * fps) if last else 0)):
+                writer.append_data(picture)
+
+
+def chunk_groups(robot: str, width: int) -> list[tuple[str, dict[int, str]]]:
+    """How the action's numbers belong together: (title, {index: name})."""
+    from turbopi.plots import action_groups
+
+    return [(group.title, dict(list(group.names.items())[: len(LINES)])) for group in action_groups(robot, width)]
+
+
+def draw_frame(
+    frame: Frame, caption: str, groups: Sequence[tuple[str, dict[int, str]]], ending: str | None
+) -> np.ndarray:
+    """One frame of a film: uint8[h, w, 3], both even."""
+    width = len(frame.pictures) * VIEW + (len(frame.pictures) + 1) * MARGIN
+    lines = textwrap.wrap(caption, width=max(20, width // 9))
+    top = MARGIN + 22 * len(lines) + 6
+    height = top + VIEW + MARGIN + PANEL + MARGIN
+    image = Image.new("RGB", (width + width % 2, height + height % 2), BACKGROUND)
+    draw = ImageDraw.Draw(image)
+    for number, line in enumerate(lines):
+        draw.text((MARGIN, MARGIN - 4 + 22 * number), line, fill=INK, font=_font(17))
+    for number, picture in enumerate(frame.pictures):
+        view = Image.fromarray(picture).resize((VIEW, VIEW), Image.Resampling.BILINEAR)
+        image.paste(view, (MARGIN + number * (VIEW + MARGIN), top))
+    _tag(draw, (MARGIN + 8, top + 8), f"step {frame.step}", INK)
+    if ending is not None:
+        _tag(draw, (MARGIN + 8, top + 36), ending, ENDINGS[ending])
+    step = (width - MARGIN) / len(groups)
+    for number, (title, names) in enumerate(groups):
+        left = MARGIN + number * step
+        box = (left, top + VIEW + MARGIN, left + step - MARGIN, height - MARGIN)
+        _draw_group(draw, box, title, names, frame)
+    return np.asarray(image)
+
+
+def _draw_group(
+    draw: ImageDraw.ImageDraw,
+    box: tuple[float, float, float, float],
+    title: str,
+    names: dict[int, str],
+    frame: Frame,
+) -> None:
+    """The chunk's lines of one group, in [-1, 1] or further; the part that is carried out is shaded."""
+    x0, y0, x1, y1 = box
+    chunk = frame.chunk
+    draw.text((x0, y0), title, fill=INK, font=_font(13))
+    x = x0 + draw.textlength(title, font=_font(13)) + 8
+    if len(names) > 1:
+        for number, name in enumerate(names.values()):
+            draw.text((x, y0 + 1), name, fill=LINES[number], font=_font(12))
+            x += draw.textlength(name, font=_font(12)) + 7
+    y0 += 20
+    columns = list(names)
+    values = chunk[:, columns]
+    finite = values[np.isfinite(values)]
+    limit = max(1.0, float(np.abs(finite).max()) if finite.size else 1.0)
+
+    def place(row: float, value: float) -> tuple[float, float]:
+        across = row / max(1, len(chunk) - 1)
+        return x0 + across * (x1 - x0), (y0 + y1) / 2 - value / limit * (y1 - y0) / 2
+
+    draw.rectangle((x0, y0, place(max(frame.planned - 1, 0), 0)[0], y1), fill=(230, 233, 240))
+    if frame.done:
+        now = place(frame.done - 1, 0)[0]
+        draw.line((now, y0, now, y1), fill=FAINT, width=2)
+    draw.rectangle((x0, y0, x1, y1), outline=(205, 207, 212))
+    draw.line((*place(0, 0), *place(len(chunk) - 1, 0)), fill=(215, 217, 222))
+    for number, column in enumerate(columns):
+        points = [place(row, value) for row, value in enumerate(chunk[:, column]) if np.isfinite(value)]
+        if len(points) > 1:
+            draw.line(points, fill=LINES[number], width=2)
+        for px, py in points:
+            draw.ellipse((px - 2, py - 2, px + 2, py + 2), fill=LINES[number])
+    draw.text((x0 + 4, y0 + 2), f"{limit:.2g}", fill=FAINT, font=_font(11))
+    draw.text((x0 + 4, y1 - 16), f"-{limit:.2g}", fill=FAINT, font=_font(11))
+
+
+def _tag(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, color: Color) -> None:
+    x, y = place
+    width = draw.textlength(text, font=_font(14))
+    draw.rounded_rectangle((x, y, x + width + 14, y + 22), radius=5, fill=(255, 255, 255), outline=color)
+    draw.text((x + 7, y + 2), text, fill=color, font=_font(14))
+
+
+@lru_cache
+def _font(size: int) -> Any:
+    return ImageFont.load_default(size)

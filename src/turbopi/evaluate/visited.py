@@ -1,0 +1,73 @@
+"""Observations that a policy met on its way, kept to ask another policy about them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from turbopi.evaluate.plan import Job
+from turbopi.evaluate.sources import Answer, PolicySource
+
+FILE = "visited.npz"
+KEPT = 48
+
+
+class Visited:
+    """A uniform sample of all requests of a run (reservoir sampling), kept beside its results.
+
+    Each entry: the observation as the policy got it, the noise's seed, and the actions it gave.
+    """
+
+    def __init__(self, folder: Path, kept: int = KEPT) -> None:
+        """Continues the sample that the folder holds."""
+        self._path, self._kept = folder / FILE, kept
+        self._rng = np.random.default_rng(0)
+        self.seen = 0
+        self.entries: list[dict[str, Any]] = []
+        if self._path.exists():
+            with np.load(self._path) as stored:
+                self.seen, count = int(stored["seen"]), int(stored["count"])
+                names = {name.split("|", 1)[1] for name in stored.files if "|" in name}
+                self.entries = [{name: stored[f"{row}|{name}"] for name in names} for row in range(count)]
+            self._rng = np.random.default_rng(self.seen)
+
+    def __call__(self, job: Job, step: int, observation: dict[str, Any], seed: int, answer: Answer) -> None:
+        self.seen += 1
+        entry = {key: np.asarray(value) for key, value in observation.items()}
+        entry |= {"seed": np.asarray(seed, np.uint64), "actions": answer.actions}
+        if len(self.entries) < self._kept:
+            self.entries.append(entry)
+            return
+        place = int(self._rng.integers(self.seen))
+        if place < self._kept:
+            self.entries[place] = entry
+
+    def save(self) -> None:
+        stored = {f"{row}|{name}": value for row, entry in enumerate(self.entries) for name, value in entry.items()}
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(self._path, seen=self.seen, count=len(self.entries), **stored)
+
+
+def action_error(entries: Sequence[dict[str, Any]], reference: PolicySource) -> dict[str, float] | None:
+    """How far the entries' actions are from the reference's, given the same observations and noise.
+
+    Root mean square and largest difference, each action dimension in units of its own spread over the reference's
+    chunks. None without entries.
+    """
+    if not entries:
+        return None
+    exact = []
+    for entry in entries:
+        observation = {key: value for key, value in entry.items() if key not in ("seed", "actions")}
+        observation = {key: str(value) if value.dtype.kind == "U" else value for key, value in observation.items()}
+        exact.append(reference.infer([observation], [int(entry["seed"])])[0].actions)
+    truth, given = np.stack(exact), np.stack([entry["actions"] for entry in entries])
+    spread = truth.std(axis=(0, 1))
+    spread[spread == 0] = 1
+    error = (given - truth) / spread
+    return {
+        "rms": float(np.sqrt(np.mean(error**2))),
+        "max": float(np.abs(error).max()),
+        "observations": len(entries),
+    }

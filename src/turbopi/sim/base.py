@@ -1,0 +1,114 @@
+"""What an evaluation needs of a simulator: one class that lists tasks and opens environments, one that is stepped.
+
+Modules of simulators are imported by worker processes, many at once: they import neither torch nor matplotlib.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from turbopi.errors import ConfigError, TurboPiError
+
+Seeding = Literal["episode", "task"]
+
+
+class SimulatorUnavailable(TurboPiError):
+    """A simulator can't run on this machine; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task of a suite."""
+
+    index: int
+    name: str
+    instruction: str
+    num_initial_states: int
+    max_steps: int  # openpi's limit, in control steps after the wait
+
+
+@dataclass(frozen=True)
+class SimSettings:
+    """How episodes begin and what cameras deliver. The defaults are openpi's.
+
+    seeding   "episode": the environment is seeded before every reset, with `episode_seed`, so that an episode is the
+              same whatever ran before it. "task": seeded once for each task, as openpi does; the n-th reset of a task
+              then depends on how many came before.
+    """
+
+    seed: int = 7
+    seeding: Seeding = "episode"
+    wait_steps: int = 10
+    camera_px: int = 256
+
+    def __post_init__(self) -> None:
+        if self.seeding not in ("episode", "task"):
+            raise ConfigError(f"seeding is {self.seeding!r}; choose episode or task")
+        for name, least, most in (("seed", 0, 2**32 - 1), ("wait_steps", 0, 1000), ("camera_px", 16, 4096)):
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise ConfigError(f"{name} is {value}; it should be from {least} to {most}")
+
+    def episode_seed(self, task: int, initial_state: int) -> int:
+        """What the environment's random generator is seeded with: 32 bits."""
+        if self.seeding == "task":
+            return self.seed
+        return int(np.random.SeedSequence([self.seed, task, initial_state]).generate_state(1)[0])
+
+
+class Environment(Protocol):
+    """One task. Its pictures are drawn only when they are asked for, as drawing takes most of a simulator's time."""
+
+    def reset(self, initial_state: int) -> None:
+        """Begin an episode from that initial state and wait until things have come to rest. Draws the pictures."""
+
+    def observation(self) -> dict[str, Any]:
+        """What a policy is sent: pictures uint8[px, px, 3], state float64[d], prompt, under the robot's keys.
+
+        Only after `reset` or a `step` with look=True.
+        """
+
+    def step(self, action: np.ndarray, look: bool) -> bool:
+        """One control step; True if the task is solved after it. `look`: the pictures are needed after this step."""
+
+    def draw(self) -> list[np.ndarray]:
+        """What the cameras see now, for a video: uint8[px, px, 3] each. Changes nothing in the simulation."""
+
+    def close(self) -> None:
+        """Free the renderer and whatever else is held."""
+
+
+class Simulator(Protocol):
+    """A family of tasks behind one install."""
+
+    name: str
+    robot: str  # whose keys its observations have: turbopi.robots
+    action_dim: int
+    control_hz: float
+    image_keys: tuple[str, ...]
+    suites: tuple[str, ...]  # the first is the default
+
+    def check(self) -> list[str]:
+        """Raise SimulatorUnavailable if it can't run here. Returns warnings to show."""
+
+    def tasks(self, suite: str) -> Sequence[Task]:
+        """The tasks of a suite, named as in `suites`; call `check` before."""
+
+    def open(self, suite: str, task: int, settings: SimSettings) -> Environment:
+        """An environment for one task, in this process. Raises SimulatorUnavailable where nothing can be drawn."""
+
+    def example(self, settings: SimSettings) -> dict[str, Any]:
+        """An observation of the same keys, shapes and dtypes, without a simulator."""
+
+    def versions(self) -> dict[str, str]:
+        """Of the libraries that decide what happens, and the renderer."""
+
+
+def full_suite_name(simulator: Simulator, suite: str) -> str:
+    """`suite` as in `simulator.suites`: "spatial" for "libero_spatial" will do. Raises ConfigError if there is none."""
+    for known in simulator.suites:
+        if suite.lower() in (known, known.removeprefix(f"{simulator.name}_")):
+            return known
+    raise ConfigError(f"unknown suite {suite!r} of {simulator.name}; choose one of {', '.join(simulator.suites)}")

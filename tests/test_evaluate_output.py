@@ -1,0 +1,153 @@
+"""Films, reports, comparisons."""
+
+import html
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluate_fakes import SeekingPolicy, run
+
+from turbopi.errors import ConfigError
+from turbopi.evaluate.compare import cells, compare, write_comparison
+from turbopi.evaluate.episode import Frame
+from turbopi.evaluate.plan import VideoPlan, parse_numbers
+from turbopi.evaluate.sources import LocalPolicy
+from turbopi.evaluate.video import chunk_groups, draw_frame, write_video
+from turbopi.evaluate.visited import Visited, action_error
+
+GROUPS = chunk_groups("libero", 7)
+
+
+def frame(step: int = 0, value: float = 0.5) -> Frame:
+    picture = np.full((32, 32, 3), 90, np.uint8)
+    return Frame(step, [picture, picture], np.full((10, 7), value), planned=5, done=0)
+
+
+def test_a_frame_shows_caption_pictures_and_chunk() -> None:
+    drawn = draw_frame(frame(), "reach the dot", GROUPS, None)
+    assert drawn.dtype == np.uint8 and drawn.shape[0] % 2 == drawn.shape[1] % 2 == 0
+    assert (drawn == 90).all(axis=2).sum() > 2 * 310 * 310  # both views, but for the tag
+    other = draw_frame(frame(value=-0.5), "reach the dot", GROUPS, None)
+    changed = np.nonzero((drawn != other).any(axis=(1, 2)))[0]
+    assert len(changed) and changed.min() > 320  # another chunk changes the plots below the views, and nothing else
+    longer = draw_frame(
+        frame(), "pick up the black bowl next to the ramekin and place it on the plate " * 2, GROUPS, None
+    )
+    assert longer.shape[0] > drawn.shape[0]
+
+
+@pytest.mark.parametrize("value", [np.nan, 0.0, 1e6])
+def test_any_chunk_can_be_drawn(value: float) -> None:
+    assert draw_frame(frame(value=value), "x", GROUPS, "aborted").shape[2] == 3
+
+
+def test_a_film_has_the_simulations_speed(tmp_path: Path) -> None:
+    imageio = pytest.importorskip("imageio.v2", reason="pip install 'imageio[ffmpeg]'")
+    write_video(tmp_path / "a.mp4", [frame(step) for step in range(0, 40, 5)], "x", "success", "libero", 4.0)
+    with imageio.get_reader(tmp_path / "a.mp4") as film:
+        assert film.get_meta_data()["fps"] == 8
+        assert film.count_frames() == 8 * 2 + 12  # each twice, the last one for another 1.5 s
+
+
+def test_failures_and_a_sample_of_successes_are_filmed(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="pip install 'imageio[ffmpeg]'")
+    results = run(tmp_path, SeekingPolicy({0: "nan"}), states=(0, 1, 2, 3), videos=VideoPlan(successes=2))
+    names = {episode.initial_state: episode.video for episode in results.in_order()}
+    assert names == {
+        0: "videos/task00_state00_aborted.mp4",
+        1: "videos/task00_state01_success.mp4",
+        2: None,
+        3: None,
+    }
+    assert {f"videos/{path.name}" for path in (tmp_path / "videos").iterdir()} == {names[0], names[1]}
+
+
+def test_a_video_that_cannot_be_written_costs_no_verdict(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="pip install 'imageio[ffmpeg]'")
+    (tmp_path / "videos").write_text("in the way")
+    (episode,) = run(tmp_path, SeekingPolicy(), states=(0,), videos=VideoPlan("all")).in_order()
+    assert episode.success and episode.video is None
+    assert str(episode.message).startswith("the video couldn't be written: ")
+
+
+def test_the_report_opens_from_disk_and_loads_nothing_else(tmp_path: Path) -> None:
+    results = run(tmp_path, SeekingPolicy({0: "nan"}), tasks=(0, 1), states=(0, 1))
+    text = (tmp_path / "report.html").read_text()
+    assert not re.search(r"https?:|//|<script|<link|@import", text.split("</head>")[1])
+    for name in re.findall(r'src="([^"]+)"', text):
+        assert (tmp_path / name).is_file()
+    shown = html.unescape(text)
+    assert "3/4" in shown and "75.0 %" in shown and "30.1 to 95.4 %" in shown
+    assert "Aborted, as actions weren't finite: 1" in shown and "aren't finite (nan at [2, 1])" in shown
+    assert results.tasks[1].instruction in shown
+
+
+def test_what_comes_from_outside_is_escaped_in_the_report(tmp_path: Path) -> None:
+    policy = SeekingPolicy()
+    policy.metadata["config"] = "<img src=x onerror=alert(1)>"
+    run(tmp_path, policy, states=(0,))
+    assert "<img src=x" not in (tmp_path / "report.html").read_text()
+
+
+def test_comparing_pairs_the_common_episodes(tmp_path: Path) -> None:
+    first = run(tmp_path / "a", SeekingPolicy(), states=(0, 1, 2, 3))
+    second = run(tmp_path / "b", SeekingPolicy({0: "nan"}), states=(0, 1, 2))
+    compared = compare([first, second])
+    assert [(c.rate.successes, c.rate.trials) for c in compared] == [(3, 3), (2, 3)]
+    paired = compared[1].paired
+    assert paired is not None
+    assert (paired.both, paired.only_first, paired.only_second, paired.neither) == (2, 1, 0, 0)
+    assert cells(compared[1])[1] == "66.7 % [20.8, 93.9]"
+    assert cells(compared[1])[3:5] == ["1 : 0", "1.000"]
+    written = write_comparison(tmp_path / "c", compared)
+    assert json.loads(written[0].read_text())["runs"][1]["paired_with_first"]["only_first"] == 1
+    assert "aborted" in written[2].read_text()
+
+
+def test_runs_of_another_protocol_are_not_compared(tmp_path: Path) -> None:
+    first = run(tmp_path / "a", SeekingPolicy(), states=(0,))
+    second = run(tmp_path / "b", SeekingPolicy(), states=(0,), replan=3)
+    with pytest.raises(ConfigError, match="aren't comparable: replan is 5 in one and 3 in the other"):
+        compare([first, second])
+    third = run(tmp_path / "c", SeekingPolicy(), states=(1,))
+    with pytest.raises(ConfigError, match="no episode has a verdict in every one of"):
+        compare([first, third])
+
+
+def test_visited_observations_give_the_action_error(tmp_path: Path) -> None:
+    class Off(SeekingPolicy):
+        def infer_batch(self, observations: Any, seed: Any) -> Any:
+            results = super().infer_batch(observations, seed)
+            return [result | {"actions": result["actions"] + 0.25} for result in results]
+
+    visited, source = Visited(tmp_path, kept=4), LocalPolicy(SeekingPolicy())
+    observations = []
+    for number in range(9):
+        picture = np.full((32, 32, 3), 235, np.uint8)
+        picture[3 * number, 5] = (200, 40, 40)
+        state = np.zeros(8)
+        observation = {"observation/image": picture, "observation/state": state, "prompt": f"number {number}"}
+        observations.append(observation)
+        visited(None, 0, observation, 2**63 + number, source.infer([observation], [0])[0])  # type: ignore[arg-type]
+    assert visited.seen == 9 and len(visited.entries) == 4
+    visited.save()
+    again = Visited(tmp_path, kept=4)
+    assert again.seen == 9
+    assert [str(entry["prompt"]) for entry in again.entries] == [str(entry["prompt"]) for entry in visited.entries]
+    exact = action_error(again.entries, source)
+    assert exact is not None and exact["rms"] == exact["max"] == 0
+    off = action_error(again.entries, LocalPolicy(Off()))
+    assert off is not None and off["max"] >= off["rms"] > 0.1
+    assert action_error([], source) is None
+
+
+def test_numbers_and_ranges_are_read() -> None:
+    assert parse_numbers("--tasks", "0,2,5-7") == [0, 2, 5, 6, 7]
+    for text in ("", "a", "3-", "-3", "1,,2"):
+        with pytest.raises(ConfigError, match=r"--tasks is .*expected whole numbers and ranges"):
+            parse_numbers("--tasks", text)
+    with pytest.raises(ConfigError, match="nothing in that range"):
+        parse_numbers("--tasks", "7-5")

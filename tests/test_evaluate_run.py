@@ -1,0 +1,221 @@
+"""Whole runs in the built-in simulator: scheduling, batching, resuming, crashes, and what is written."""
+
+import html
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluate_fakes import NO_VIDEOS, SeekingPolicy, TroubledSimulator, jobs_for, run
+
+from turbopi.errors import ConfigError, TurboPiError
+from turbopi.evaluate.plan import noise_seed
+from turbopi.evaluate.results import Results, load_results
+from turbopi.evaluate.schedule import TooManyCrashes
+from turbopi.sim import SimulatorUnavailable
+
+TROUBLED = "evaluate_fakes:TroubledSimulator"
+
+
+def outcomes(results: Results) -> dict[tuple[int, int], tuple[str, int]]:
+    return {key: (episode.status, episode.steps) for key, episode in results.episodes.items()}
+
+
+def test_a_policy_that_sees_solves_every_episode(tmp_path: Path) -> None:
+    policy = SeekingPolicy()
+    results = run(tmp_path, policy, tasks=(0, 1, 2), states=(0, 5))
+    assert [episode.status for episode in results.in_order()] == ["success"] * 6
+    for episode in results.in_order():
+        assert len(episode.call_ms) == len(episode.infer_ms) == -(-episode.steps // 5)  # asked every five steps
+    assert results.complete and load_results(tmp_path).as_json()["summary"] == results.as_json()["summary"]
+
+
+def test_workers_requests_are_batched_which_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Slow(SeekingPolicy):
+        """While it is at the first request, those of the other two workers come in."""
+
+        def infer_batch(self, observations: Any, seed: Any) -> Any:
+            if not self.batches:
+                time.sleep(1)
+            return super().infer_batch(observations, seed)
+
+    alone, batched = SeekingPolicy(), Slow()
+    first = run(tmp_path / "one", alone, tasks=(0, 1, 2), states=(0, 1))
+    assert set(alone.batches) == {1}
+    (tmp_path / "gather").mkdir()
+    monkeypatch.setenv("GATHER_FOLDER", str(tmp_path / "gather"))
+    monkeypatch.setenv("GATHER_COUNT", "3")
+    gathering = "evaluate_fakes:GatheringSimulator"
+    second = run(tmp_path / "two", batched, simulator=gathering, tasks=(0, 1, 2), states=(0, 1), workers=3, max_batch=2)
+    assert batched.batches[:2] == [1, 2] and max(batched.batches) == 2
+    assert outcomes(second) == outcomes(first)
+    assert sorted(batched.seeds) == sorted(alone.seeds)
+    assert second.summary()["mean_batch"] > 1
+
+
+def test_the_noise_depends_on_the_episode_and_the_step_alone(tmp_path: Path) -> None:
+    policy = SeekingPolicy()
+    results = run(tmp_path, policy, states=(2, 4))
+    steps = {state: range(0, results.episodes[0, state].steps, 5) for state in (2, 4)}
+    assert policy.seeds == [noise_seed(7, 0, state, step) for state in (2, 4) for step in steps[state]]
+    assert len(set(policy.seeds)) == len(policy.seeds)
+
+
+def test_the_order_of_episodes_changes_none_of_them(tmp_path: Path) -> None:
+    forwards = run(tmp_path / "a", SeekingPolicy(), states=(0, 1, 2))
+    alone = run(tmp_path / "b", SeekingPolicy(), states=(2,))
+    assert outcomes(alone)[0, 2] == outcomes(forwards)[0, 2]
+    assert alone.episodes[0, 2].seed == forwards.episodes[0, 2].seed != forwards.episodes[0, 1].seed
+
+
+def test_the_step_limit_ends_an_episode_as_a_failure(tmp_path: Path) -> None:
+    results = run(tmp_path, SeekingPolicy(), max_steps=7)
+    assert outcomes(results) == {(0, 0): ("failure", 7), (0, 1): ("failure", 7)}
+    assert results.summary()["success"]["wilson95"][1] == pytest.approx(0.6576, abs=1e-4)
+
+
+def test_a_crash_is_no_failure_and_is_tried_again(tmp_path: Path) -> None:
+    states = (0, TroubledSimulator.RAISES, TroubledSimulator.DIES, 5)
+    results = run(tmp_path, SeekingPolicy(), simulator=TROUBLED, states=states)
+    found = {state: results.episodes[0, state] for state in states}
+    assert [found[state].status for state in states] == ["success", "crash", "crash", "success"]
+    assert "the physics exploded" in str(found[TroubledSimulator.RAISES].message)
+    assert "exit code 11" in str(found[TroubledSimulator.DIES].message)
+    summary = results.summary()
+    assert summary["crashes"] == 2 and summary["success"]["trials"] == 2 and summary["success"]["rate"] == 1
+    assert not results.complete
+    policy = SeekingPolicy()
+    again = run(tmp_path, policy, simulator=TROUBLED, states=(0, TroubledSimulator.RAISES))
+    assert again.episodes[0, 3].status == "crash" and not policy.batches  # only the crashed one was run
+
+
+def test_a_simulator_that_always_crashes_ends_the_run(tmp_path: Path) -> None:
+    with pytest.raises(TooManyCrashes, match="crashed 5 times in a row; the last time: RuntimeError: no such scene"):
+        run(tmp_path, SeekingPolicy(), simulator="evaluate_fakes:BrokenSimulator", states=range(9))
+    assert load_results(tmp_path).summary()["crashes"] == 5
+
+
+def test_a_simulator_that_cannot_draw_ends_the_run_at_once(tmp_path: Path) -> None:
+    with pytest.raises(SimulatorUnavailable, match="can't draw with egl here"):
+        run(tmp_path, SeekingPolicy(), simulator="evaluate_fakes:BlindSimulator")
+    assert not load_results(tmp_path).episodes
+
+
+def test_actions_that_are_not_finite_abort_the_episode(tmp_path: Path) -> None:
+    results = run(tmp_path, SeekingPolicy({1: "nan"}))
+    first, second = results.in_order()
+    assert (first.status, first.steps, second.status) == ("aborted", 5, "success")
+    assert first.message == "step 5: the policy's actions aren't finite (nan at [2, 1]); the episode was aborted"
+    assert results.summary()["success"]["trials"] == 2 and results.summary()["aborted"] == 1  # it counts, as a failure
+
+
+def test_a_policy_that_breaks_leaves_valid_results_and_the_run_continues(tmp_path: Path) -> None:
+    calls = len(run(tmp_path / "whole", SeekingPolicy(), states=(0,)).episodes[0, 0].call_ms)
+    with pytest.raises(TurboPiError, match="gone"):
+        run(tmp_path / "cut", SeekingPolicy({calls + 1: TurboPiError("gone")}), states=(0, 1, 2))
+    kept = load_results(tmp_path / "cut")
+    assert list(kept.episodes) == [(0, 0)] and not kept.complete
+    assert "The run isn't complete." in html.unescape((tmp_path / "cut" / "report.html").read_text())
+    policy = SeekingPolicy()
+    continued = run(tmp_path / "cut", policy, states=(0, 1, 2))
+    assert continued.complete and noise_seed(7, 0, 0, 0) not in policy.seeds  # the finished one wasn't run again
+    assert outcomes(continued) == outcomes(run(tmp_path / "all", SeekingPolicy(), states=(0, 1, 2)))
+
+
+def test_ctrl_c_leaves_valid_results_and_no_process(tmp_path: Path) -> None:
+    import multiprocessing
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, SeekingPolicy({4: KeyboardInterrupt()}), states=(0, 1, 2), workers=2)
+    assert load_results(tmp_path).planned == {(0, 0), (0, 1), (0, 2)}
+    assert not multiprocessing.active_children()
+
+
+def test_a_run_is_not_continued_in_another_way(tmp_path: Path) -> None:
+    run(tmp_path, SeekingPolicy(), states=(0,))
+    with pytest.raises(
+        ConfigError, match=r"protocol\.replan = 5, but this one has 3: give another --out, or --restart"
+    ):
+        run(tmp_path, SeekingPolicy(), states=(0,), replan=3)
+    other = SeekingPolicy()
+    other.metadata["precision"] = "bf16"
+    with pytest.raises(ConfigError, match=r"policy\.precision = 'f32', but this one has 'bf16'"):
+        run(tmp_path, other, states=(0,))
+    assert run(tmp_path, other, states=(1,), restart=True).planned == {(0, 1)}
+
+
+def test_more_episodes_can_be_added_to_a_run(tmp_path: Path) -> None:
+    run(tmp_path, SeekingPolicy(), tasks=(0,), states=(0,))
+    results = run(tmp_path, SeekingPolicy(), tasks=(1,), states=(0,))
+    assert set(results.episodes) == results.planned == {(0, 0), (1, 0)}
+
+
+def test_seeding_by_task_gives_the_same_whatever_is_skipped(tmp_path: Path) -> None:
+    whole = run(tmp_path / "a", SeekingPolicy(), states=(0, 1, 2), seeding="task", workers=2)
+    part = run(tmp_path / "b", SeekingPolicy(), states=(2,), seeding="task")
+    assert outcomes(part)[0, 2] == outcomes(whole)[0, 2]
+    assert {episode.seed for episode in whole.episodes.values()} == {7}
+
+
+def test_results_are_replaced_as_a_whole(tmp_path: Path) -> None:
+    results = run(tmp_path, SeekingPolicy(), states=(0,))
+    stop, broken = threading.Event(), []
+
+    def read() -> None:
+        while not stop.is_set():
+            try:
+                json.loads((tmp_path / "results.json").read_text())
+            except ValueError as error:
+                broken.append(error)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for _ in range(50):
+        results.save()
+    stop.set()
+    reader.join()
+    assert not broken and not (tmp_path / "results.json.tmp").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "is neither"),
+        ("{", "can't be read"),
+        ('{"format": 99}', "isn't a result of this version"),
+        ('{"format": 1}', "isn't a complete result: KeyError"),
+    ],
+)
+def test_files_that_are_no_results_are_refused(tmp_path: Path, text: str, why: str) -> None:
+    (tmp_path / "results.json").write_text(text)
+    with pytest.raises(ConfigError, match=why if text else "can't be read"):
+        load_results(tmp_path)
+
+
+def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"holds no results\.json: it isn't the folder of an evaluation"):
+        load_results(tmp_path)
+
+
+def test_initial_states_that_do_not_exist_are_refused() -> None:
+    with pytest.raises(ConfigError, match="task 0 has the initial states 0 to 49; 3 to 50 were asked for"):
+        jobs_for(states=(3, 50))
+    with pytest.raises(ConfigError, match="reacher_colors has no task 3, 9; its tasks are\n  0: reach the red dot"):
+        jobs_for(tasks=(3, 0, 9))
+
+
+def test_requests_carry_the_resized_pictures(tmp_path: Path) -> None:
+    class Watching(SeekingPolicy):
+        shapes: set[Any] = set()  # noqa: RUF012
+
+        def infer_batch(self, observations: Any, seed: Any) -> Any:
+            self.shapes |= {observations[0][key].shape for key in ("observation/image", "observation/wrist_image")}
+            assert observations[0]["observation/image"].dtype == np.uint8
+            assert observations[0]["prompt"] == "reach the red dot"
+            return super().infer_batch(observations, seed)
+
+    run(tmp_path, Watching(), states=(0,), videos=NO_VIDEOS)
+    assert Watching.shapes == {(64, 64, 3)}
