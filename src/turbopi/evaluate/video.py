@@ -45,7 +45,9 @@ def write_video(
     repeats = max(1, int(np.ceil(MIN_FPS / frames_per_second)))
     fps = frames_per_second * repeats
     groups = chunk_groups(robot, frames[0].chunk.shape[1])
-    with imageio.get_writer(path, fps=fps, codec="libx264", quality=7, macro_block_size=2) as writer:
+    options: dict[str, Any] = {"fps": fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
+    writer: Any  # imageio's own types lack the methods of its writers
+    with imageio.get_writer(path, **options) as writer:
         for number, frame in enumerate(frames):
             last = number == len(frames) - 1
             picture = draw_frame(frame, caption, groups, ending if last else None)
