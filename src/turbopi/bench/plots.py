@@ -18,7 +18,7 @@ def job_label(job: dict[str, int]) -> str:
 
 
 def write_plots(document: dict[str, Any], folder: Path) -> list[Path]:
-    """stages.png for the first job, steps.png where several numbers of steps were measured."""
+    """stages.png for the job with the most steps, steps.png where several numbers of steps were measured."""
     written = [_stages(document, folder / "stages.png")]
     if len({result["job"]["steps"] for result in document["results"]}) > 1:
         written.append(_steps(document, folder / "steps.png"))
@@ -27,7 +27,7 @@ def write_plots(document: dict[str, Any], folder: Path) -> list[Path]:
 
 def _stages(document: dict[str, Any], path: Path) -> Path:
     """One bar a backend, stacked by stage; the floor as a bar of its own."""
-    job = document["results"][0]["job"]
+    job = max((result["job"] for result in document["results"]), key=lambda job: job["steps"])
     results = [result for result in document["results"] if result["job"] == job]
     figure = Figure(figsize=(9, 1.6 + 0.5 * 2 * len(results)), layout="constrained")
     axes = figure.subplots()
