@@ -9,7 +9,8 @@ from turbopi.backends.fused import FusedBackend
 GPU = torch.device("cuda", 0)
 
 
-def pretend(monkeypatch: pytest.MonkeyPatch, missing: dict[str, str]) -> None:
+def pretend(monkeypatch: pytest.MonkeyPatch, missing: dict[str, str], capability: tuple[int, int] = (9, 0)) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
     monkeypatch.setattr(backends, "availability", lambda name, device: missing.get(name))
 
 
@@ -22,7 +23,14 @@ def test_auto_names_what_it_passed_over(monkeypatch: pytest.MonkeyPatch) -> None
     pretend(monkeypatch, {"fused": "Triton isn't installed", "cuda_graph": "too old"})
     name, why = backends.choose(GPU)
     assert name == "pytorch_compile"
-    assert "fused can't run here: Triton isn't installed; cuda_graph can't run here: too old" in why
+    assert "not fused: Triton isn't installed; not cuda_graph: too old" in why
+
+
+def test_auto_takes_no_kernels_of_ours_on_a_gpu_they_were_never_run_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend(monkeypatch, {}, capability=(8, 9))
+    name, why = backends.choose(GPU)
+    assert name == "cuda_graph"
+    assert "not fused: it was never run on compute capability 8.9; try it with backend='fused'" in why
 
 
 def test_auto_takes_no_backend_that_lacks_the_precision(monkeypatch: pytest.MonkeyPatch) -> None:

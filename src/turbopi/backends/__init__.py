@@ -51,6 +51,7 @@ _SPECS = (
     ),
 )
 _FASTEST_FIRST = ("fused", "cuda_graph", "pytorch_compile")
+_RUN_ON = {"fused": (9,)}  # major compute capabilities that our own kernels were run on: auto takes them nowhere else
 BACKENDS: dict[str, BackendSpec] = {spec.name: spec for spec in _SPECS}
 
 
@@ -87,12 +88,20 @@ def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, st
     for name in _FASTEST_FIRST:
         if precision not in precisions(name):
             continue
-        reason = availability(name, device)
+        reason = availability(name, device) or _unproven(name, device)
         if reason is None:
             skipped = f" ({'; '.join(reasons)})" if reasons else ""
             return name, f"auto: the fastest backend for this GPU and precision{skipped}"
-        reasons.append(f"{name} can't run here: {reason}")
+        reasons.append(f"not {name}: {reason}")
     return "pytorch", f"auto: {'; '.join(reasons)}"
+
+
+def _unproven(name: str, device: torch.device) -> str | None:
+    """Why "auto" doesn't take a backend that could run on the device."""
+    major, minor = torch.cuda.get_device_capability(device)
+    if major in _RUN_ON.get(name, (major,)):
+        return None
+    return f"it was never run on compute capability {major}.{minor}; try it with backend={name!r}"
 
 
 def check(name: str, device: torch.device, precision: Precision) -> None:
