@@ -17,7 +17,7 @@ from turbopi.cli import app
 from turbopi.cli.framework import plain, with_errors_told
 from turbopi.errors import ObservationError
 
-COMMANDS = ("demo", "infer", "serve", "inspect", "convert", "backends", "doctor")
+COMMANDS = ("demo", "infer", "serve", "inspect", "convert", "export", "backends", "doctor")
 
 
 def test_help_lists_every_command_and_the_exit_codes() -> None:

@@ -21,11 +21,11 @@ pytestmark = [
     pytest.mark.filterwarnings("default"),  # Inductor warns of what it does
 ]
 CASES = [path.parent.name for path in sorted(GOLDEN.glob("cases/*/inputs.npz"))]
-GRAPHS = [name for name in backends.BACKENDS if name not in ("pytorch", "pytorch_compile")]
+GRAPHS = [name for name in backends.BACKENDS if name not in ("pytorch", "pytorch_compile", "onnx")]
 MODES = [  # pytorch_compile takes minutes to compile them all; gpu_check runs it through scripts/check_golden
     (name, precision)
     for name in backends.BACKENDS
-    if name != "pytorch_compile"
+    if name not in ("pytorch_compile", "onnx")  # onnx runs on CPUs
     for precision in backends.precisions(name)
 ]
 

@@ -49,6 +49,12 @@ _SPECS = (
         "FusedBackend",
         "cuda_graph with kernels of our own, bf16: NVIDIA GPUs from compute capability 8.0",
     ),
+    BackendSpec(
+        "onnx",
+        "turbopi.backends.onnx",
+        "OnnxBackend",
+        "the exported ONNX graphs in ONNX Runtime, f32: CPUs",
+    ),
 )
 _FASTEST_FIRST = ("fused", "cuda_graph", "pytorch_compile")
 _RUN_ON = {"fused": (9,)}  # major compute capabilities that our own kernels were run on: auto takes them nowhere else

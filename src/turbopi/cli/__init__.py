@@ -1,4 +1,8 @@
-"""The command line: `turbopi demo | infer | serve | bench | eval | compare | inspect | convert | backends | doctor`."""
+"""The command line.
+
+turbopi demo | infer | serve | bench | eval |
+    compare | inspect | convert | export | backends | doctor
+"""
 
 from importlib import metadata
 from typing import Annotated
@@ -7,7 +11,7 @@ import typer
 
 # Importing a module declares its commands, in the order of --help
 # isort: off
-from turbopi.cli import demo, infer, serve, bench, evaluate, compare, checkpoints, backends, doctor  # noqa: F401
+from turbopi.cli import demo, infer, serve, bench, evaluate, compare, checkpoints, export, backends, doctor  # noqa: F401
 from turbopi.cli.framework import app
 # isort: on
 

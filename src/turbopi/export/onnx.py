@@ -1,0 +1,205 @@
+"""A model as a folder of ONNX files, written at once or not at all, and read back with checks.
+
+<graph>.onnx         vision, prompt, prefix and denoise_step: the graphs of turbopi.export.graphs, float32
+<graph>.onnx.data    its weights, as a file of protobuf holds 2 GB at most
+turbopi_onnx.json    sizes, inputs and outputs, versions, the weights' hash
+"""
+
+import hashlib
+import importlib.util
+import json
+import logging
+import shutil
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbopi.config import GemmaConfig, ModelConfig, VisionConfig
+from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError
+from turbopi.export.graphs import Graph, graphs
+from turbopi.model.reference import Pi0Model
+
+MANIFEST = "turbopi_onnx.json"
+GRAPHS = ("vision", "prompt", "prefix", "denoise_step")
+OPSET = 20  # the first with Gelu as one node
+FORMAT_VERSION = 1
+INSTALL = "pip install 'turbopi[onnx]'"
+EXPORT_NEEDS = ("onnx", "onnxscript")
+
+
+@dataclass(frozen=True)
+class Export:
+    """An exported folder."""
+
+    folder: Path
+    config: ModelConfig
+    manifest: Mapping[str, Any]
+
+    def graph(self, name: str) -> Path:
+        return self.folder / f"{name}.onnx"
+
+    @property
+    def bytes(self) -> int:
+        return sum(self.manifest["files"].values())
+
+
+def missing_library(needed: tuple[str, ...]) -> str | None:
+    """None if all of these packages are installed, else which one isn't and what to do."""
+    absent = [name for name in needed if importlib.util.find_spec(name) is None]
+    return f"{' and '.join(absent)} isn't installed; {INSTALL}" if absent else None
+
+
+def check_target(dst: Path) -> None:
+    """Raise CheckpointError unless a folder can be made at `dst`: nothing is there, or an empty folder."""
+    if dst.exists() and (not dst.is_dir() or any(dst.iterdir())):
+        raise CheckpointError(f"{dst} exists and isn't an empty folder; give a new one")
+
+
+def export_onnx(model: Pi0Model, dst: str | Path, *, report: Callable[[str], None] = lambda line: None) -> Export:
+    """Write the four graphs of a float32 model on the CPU into the folder `dst`; `report` hears of each one.
+
+    Raises CheckpointError if `dst` exists and isn't an empty folder, BackendUnavailable if a library is missing,
+    ConfigError for a model in another precision.
+    """
+    dst = Path(dst).expanduser()
+    check_target(dst)
+    missing = missing_library(EXPORT_NEEDS)
+    if missing is not None:
+        raise BackendUnavailable(f"can't export to ONNX: {missing}")
+    if model.compute_dtype != torch.float32 or model.device.type != "cpu":
+        raise ConfigError(f"the export takes a float32 model on the CPU, not {model.compute_dtype} on {model.device}")
+    signatures = {}
+    with _new_folder(dst) as folder:
+        for graph in graphs(model):
+            report(f"exporting {graph.name}")
+            signatures[graph.name] = _write(graph, folder)
+        manifest = {
+            "format_version": FORMAT_VERSION,
+            "kind": model.config.kind,
+            "precision": "f32",
+            "opset": OPSET,
+            "sizes": asdict(model.config),
+            "graphs": signatures,
+            "weights_sha256": weights_sha256(model.state_dict()),
+            "versions": {name: _version(name) for name in ("turbopi", "torch", "onnx", "onnxscript")},
+            "files": {file.name: file.stat().st_size for file in sorted(folder.iterdir())},
+        }
+        (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
+    return Export(dst, model.config, manifest)
+
+
+def open_export(folder: str | Path) -> Export:
+    """A folder that `export_onnx` wrote. Raises CheckpointError if it isn't one, or if a file isn't as it was written.
+
+    Files are checked by name and length; contents are read by the runtime.
+    """
+    folder = Path(folder).expanduser()
+    file = folder / MANIFEST
+    if not file.is_file():
+        raise CheckpointError(f"{folder} has no {MANIFEST}: it isn't a folder that `turbopi export onnx` wrote")
+    try:
+        manifest = json.loads(file.read_text())
+        version, files = manifest["format_version"], dict(manifest["files"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{file} can't be read ({error!r}); export again") from error
+    if version != FORMAT_VERSION:
+        raise CheckpointError(f"{file} has format version {version}, not {FORMAT_VERSION}; export again")
+    for name in (*(f"{graph}.onnx" for graph in GRAPHS), *files):
+        size = (folder / name).stat().st_size if (folder / name).is_file() else None
+        if size is None or size != files.get(name):
+            found = "is missing" if size is None else f"has {size} bytes instead of {files.get(name)}"
+            raise CheckpointError(f"{folder / name} {found}; copy the whole folder or export again")
+    try:
+        sizes = dict(manifest["sizes"])
+        vision, vlm = VisionConfig(**sizes.pop("vision")), GemmaConfig(**sizes.pop("vlm"))
+        config = ModelConfig(vision=vision, vlm=vlm, expert=GemmaConfig(**sizes.pop("expert")), **sizes)
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"{file}: its sizes aren't those of a model ({error!r}); export again") from error
+    return Export(folder, config, manifest)
+
+
+def weights_sha256(state: Mapping[str, Tensor]) -> str:
+    """SHA-256 of float32 weights by canonical name: what `turbopi inspect --hash` shows of the same numbers."""
+    lines = []
+    for name, tensor in sorted(state.items()):
+        assert tensor.dtype == torch.float32, (name, tensor.dtype)
+        digest = hashlib.sha256(tensor.contiguous().numpy().data).hexdigest()
+        lines.append(f"{name} {list(tensor.shape)} {digest}")
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def _write(graph: Graph, folder: Path) -> dict[str, Any]:
+    """Export one graph; returns its inputs and outputs as name -> dtype and shape, free axes by name."""
+    with _quiet_exporter():
+        program = torch.onnx.export(
+            graph.module.eval(),
+            tuple(graph.inputs.values()),
+            dynamo=True,
+            input_names=list(graph.inputs),
+            output_names=list(graph.outputs),
+            dynamic_shapes=tuple(graph.dynamic.values()),
+            opset_version=OPSET,
+            verbose=False,
+        )
+    assert program is not None
+    for node in program.model.graph.all_nodes():
+        node.metadata_props.pop("pkg.torch.onnx.stack_trace", None)  # paths on the machine that exported
+    program.save(str(folder / f"{graph.name}.onnx"), external_data=True)
+    ends = program.model.graph
+    return {"inputs": _signature(ends.inputs), "outputs": _signature(ends.outputs)}
+
+
+def _signature(values: Any) -> dict[str, Any]:
+    return {
+        value.name: {
+            "dtype": str(value.dtype.numpy()),
+            "shape": [axis if isinstance(axis, int) else str(axis.value) for axis in value.shape],
+        }
+        for value in values
+    }
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """Without what the exporter says of its own deprecated calls, of axes of one name, of torchvision's absence."""
+    logger = logging.getLogger("torch.onnx._internal.exporter._registration")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
+            warnings.filterwarnings("ignore", r"# The axis name: .* will not be used", UserWarning)
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:  # Turbo-Pi run from its source folder
+        return "not installed"
+
+
+@contextmanager
+def _new_folder(dst: Path) -> Iterator[Path]:
+    """A temporary folder that becomes `dst` if all goes well, and disappears otherwise."""
+    dst.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{dst.name}-", dir=dst.parent))
+    try:
+        yield temporary
+        temporary.chmod(0o755)  # mkdtemp makes it private
+        if dst.exists():
+            dst.rmdir()  # empty: checked before
+        temporary.rename(dst)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise

@@ -1,0 +1,366 @@
+"""ONNX: the exported graphs compute the reference, the folder is checked, and bad input is refused by name."""
+
+import dataclasses
+import importlib.util
+import json
+import shutil
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from cli_helpers import refusal, turbopi
+from conftest import golden_cases, golden_folder, golden_model
+from torch import Tensor
+from typer.testing import Result
+
+from turbopi import backends
+from turbopi.backends.onnx import OnnxBackend, Sessions
+from turbopi.checkpoint import convert
+from turbopi.config import Kind
+from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError
+from turbopi.export import onnx as exporting
+from turbopi.export.graphs import graphs
+from turbopi.export.onnx import MANIFEST, export_onnx, open_export
+from turbopi.judge.check_golden import check_case
+
+for library in ("onnx", "onnxscript", "onnxruntime"):
+    pytest.importorskip(library)
+
+CPU = torch.device("cpu")
+KINDS: tuple[Kind, ...] = ("pi05", "pi0")
+
+
+@pytest.fixture(scope="module")
+def command(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """`turbopi export onnx` of the golden Pi0.5 checkpoint."""
+    root = tmp_path_factory.mktemp("pi05")
+    source = convert(golden_folder().checkpoint("pi05"), root / "checkpoint", precision="f32")
+    result = turbopi("export", "onnx", source, root / "exported", "--json")
+    assert result.exit_code == 0, result.output
+    return result
+
+
+@pytest.fixture(scope="module")
+def exported(command: Result, tmp_path_factory: pytest.TempPathFactory) -> dict[Kind, Path]:
+    """The golden weights' exports, of Pi0.5 by the command and of Pi0 from Python."""
+    pi0 = export_onnx(golden_model("pi0"), tmp_path_factory.mktemp("pi0") / "exported")
+    return {"pi05": Path(json.loads(command.stdout)["folder"]), "pi0": pi0.folder}
+
+
+@pytest.fixture
+def folder(exported: dict[Kind, Path], tmp_path: Path) -> Path:
+    """A copy of an export, to be damaged."""
+    return Path(shutil.copytree(exported["pi05"], tmp_path / "copy"))
+
+
+@lru_cache
+def opened(folder: Path) -> OnnxBackend:
+    return OnnxBackend.open(folder)
+
+
+def fresh_inputs(kind: Kind, graph: str, length: int, horizon: int) -> dict[str, Tensor]:
+    """Random inputs of a graph, for `length` pictures, prompt or prefix tokens."""
+    config = golden_model(kind).config
+    random = torch.Generator().manual_seed(1000 * length + horizon)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=random)
+
+    if graph == "vision":
+        return {"images": torch.rand(length, 224, 224, 3, generator=random) * 2 - 1}
+    if graph == "prompt":
+        return {"tokens": torch.randint(config.vocab_size, (1, length), generator=random)}
+    mask = torch.rand(1, length, generator=random) < 0.8
+    mask[0, 0] = True
+    positions = mask.cumsum(1) - 1
+    if graph == "prefix":
+        return {"embs": normal(1, length, config.vlm.width), "positions": positions, "mask": mask}
+    vlm = config.vlm
+    cache = (vlm.depth, 1, vlm.num_kv_heads, length, vlm.head_dim)
+    state = {"state": normal(1, config.action_dim)} if kind == "pi0" else {}
+    return {
+        "x_t": normal(1, horizon, config.action_dim),
+        "time_emb": normal(1, config.expert.width),
+        "k": normal(*cache),
+        "v": normal(*cache),
+        "mask": mask,
+        "positions": mask.sum(1, keepdim=True) + torch.arange(horizon + len(state)),
+        **state,
+    }
+
+
+def reference(kind: Kind, graph: str, inputs: dict[str, Tensor]) -> list[Tensor]:
+    """What the reference's own functions make of a graph's inputs."""
+    from turbopi.model.denoise import suffix_mask, suffix_rope
+    from turbopi.model.kv_cache import KVCache
+    from turbopi.model.prefix import embed_prompt
+
+    model = golden_model(kind)
+    if graph == "vision":
+        return [model.embed_images(inputs["images"][:, None])[0]]
+    if graph == "prompt":
+        return [embed_prompt(model.vlm, inputs["tokens"])]
+    if graph == "prefix":
+        return list(model.encode_prefix(inputs["embs"], inputs["positions"], inputs["mask"][:, None, None, :]))
+    state = inputs.get("state", torch.zeros(1, model.config.action_dim))
+    cache = KVCache(inputs["k"], inputs["v"], inputs["mask"], inputs["mask"].sum(1), state)
+    count = inputs["positions"].shape[1]
+    rope = suffix_rope(cache, count, model.config.expert.head_dim, model.config.rope_base)
+    mask = suffix_mask(cache, count, kind == "pi0")
+    time = model.time_condition(inputs["time_emb"]) if kind == "pi05" else inputs["time_emb"]
+    return [model.velocity(inputs["x_t"], state, time, cache.k, cache.v, rope, mask)[1]]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("graph", "length", "horizon"),
+    [
+        ("vision", 1, 0),
+        ("vision", 3, 0),
+        ("prompt", 1, 0),
+        ("prompt", 48, 0),
+        ("prefix", 1, 0),
+        ("prefix", 23, 0),
+        ("prefix", 968, 0),
+        ("denoise_step", 1, 1),
+        ("denoise_step", 23, 50),
+        ("denoise_step", 968, 10),
+    ],
+)
+def test_every_graph_computes_the_reference(
+    exported: dict[Kind, Path], kind: Kind, graph: str, length: int, horizon: int
+) -> None:
+    inputs = fresh_inputs(kind, graph, length, horizon)
+    outputs, expected = opened(exported[kind])._sessions.run(graph, **inputs), reference(kind, graph, inputs)
+    assert len(outputs) == len(expected)
+    for ours, theirs in zip(outputs, expected, strict=True):
+        assert ours.shape == theirs.shape
+        assert (ours - theirs).norm() <= 1e-5 * theirs.norm()
+
+
+@pytest.mark.parametrize("name", sorted(golden_cases()))
+def test_exported_folders_equal_openpi(exported: dict[Kind, Path], name: str) -> None:
+    case = golden_cases()[name]
+    comparisons = check_case(case, opened(exported[case.kind]))
+    everything = {"prefix_embs", "kv_k", "kv_v", "v_t", "x_t", "actions"}
+    recorded = {tensor for run in case.runs for golden in run.variants.values() for tensor in golden}
+    assert everything & recorded <= {c.tensor for c in comparisons}
+    assert not [c for c in comparisons if not c.ok]
+
+
+def test_the_backend_exports_the_weights_it_is_given_and_leaves_no_files(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, exported: dict[Kind, Path]
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    checkpoint, case = golden_folder().checkpoint("pi05"), golden_cases()["b_third_masked"]
+    backend = backends.create(
+        "onnx",
+        checkpoint.config.model,
+        lambda to, mode: checkpoint.load(to, mode).state,
+        device=CPU,
+        precision="f32",
+    )
+    assert not list(tmp_path.iterdir())
+    sample = backend.sample(case.observation, case.noise, 3)
+    assert torch.equal(sample.actions, opened(exported["pi05"]).sample(case.observation, case.noise, 3).actions)
+    assert list(sample.stage_ms) == ["vision", "prefix", "denoise"]
+    about = backend.describe()
+    assert about["runtime"].startswith("ONNX Runtime ")
+    assert about["weights_sha256"] == checkpoint.fingerprint()
+
+
+def test_halves_of_a_batch_with_unlike_rows_equal_the_whole_and_the_reference(exported: dict[Kind, Path]) -> None:
+    case, backend = golden_cases()["b_third_masked"], opened(exported["pi05"])
+    one = case.observation
+    other = dataclasses.replace(one, image_mask=torch.tensor([[True, False, False]]), images=one.images.flip(1))
+    names = [field.name for field in dataclasses.fields(one)]
+    both = dataclasses.replace(one, **{name: torch.cat([getattr(o, name)[:1] for o in (one, other)]) for name in names})
+    noise = torch.randn(2, *case.noise.shape[1:], generator=torch.Generator().manual_seed(1))
+    whole = backend.sample(both, noise, 4).actions
+    cache = backend.prefix(both)
+    assert cache.mask is not None and cache.mask.sum(1).tolist() == cache.lengths.tolist()
+    torch.testing.assert_close(backend.denoise(cache, noise, 4), whole, rtol=0, atol=1e-5)
+    torch.testing.assert_close(golden_model("pi05").sample(both, noise, 4), whole, rtol=0, atol=1e-5)
+
+
+def test_pictures_as_bytes_are_the_same_as_floats(exported: dict[Kind, Path]) -> None:
+    case, backend = golden_cases()["a_three_cams"], opened(exported["pi05"])
+    pixels = torch.randint(256, case.observation.images.shape, dtype=torch.uint8)
+    as_bytes = dataclasses.replace(case.observation, images=pixels)
+    as_floats = dataclasses.replace(case.observation, images=pixels.float() / 255 * 2 - 1)
+    actions = [backend.sample(seen, case.noise, 1).actions for seen in (as_bytes, as_floats)]
+    assert torch.equal(*actions)
+
+
+def test_an_observation_of_nothing_is_refused(exported: dict[Kind, Path]) -> None:
+    case = golden_cases()["a_three_cams"]
+    masks = {name: torch.zeros_like(getattr(case.observation, name)) for name in ("image_mask", "token_mask")}
+    with pytest.raises(ObservationError, match="nothing to attend to"):
+        opened(exported["pi05"]).prefix(dataclasses.replace(case.observation, **masks))
+
+
+# -- the folder --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_folder_says_what_it_holds(exported: dict[Kind, Path], kind: Kind) -> None:
+    names = {f"{graph}.onnx{data}" for graph in exporting.GRAPHS for data in ("", ".data")}
+    assert {file.name for file in exported[kind].iterdir()} == names | {MANIFEST}
+    export, model = open_export(exported[kind]), golden_model(kind)
+    assert export.config == model.config
+    manifest: dict[str, Any] = dict(export.manifest)
+    assert (manifest["kind"], manifest["precision"], manifest["opset"]) == (kind, "f32", 20)
+    assert manifest["weights_sha256"] == golden_folder().checkpoint(kind).fingerprint()
+    assert manifest["versions"].keys() == {"turbopi", "torch", "onnx", "onnxscript"}
+    step = manifest["graphs"]["denoise_step"]
+    assert step["inputs"]["x_t"] == {"dtype": "float32", "shape": [1, "horizon", model.config.action_dim]}
+    assert step["inputs"]["k"]["shape"][3] == "prefix"
+    assert ("state" in step["inputs"]) == (kind == "pi0")
+
+
+def test_every_weight_is_outside_the_graph_and_no_path_is_in_it(exported: dict[Kind, Path]) -> None:
+    import onnx
+
+    for graph in exporting.GRAPHS:
+        file = exported["pi05"] / f"{graph}.onnx"
+        model = onnx.load(str(file), load_external_data=False)
+        large = [w for w in model.graph.initializer if torch.Size(w.dims).numel() > 64]
+        assert large and all(w.data_location == onnx.TensorProto.EXTERNAL for w in large)
+        assert str(Path(exporting.__file__).parent.parent).encode() not in file.read_bytes()
+    onnx.checker.check_model(str(file), full_check=True)
+
+
+def test_fp8_and_fused_attention_are_not_in_the_graphs(exported: dict[Kind, Path]) -> None:
+    import onnx
+
+    model = onnx.load(str(exported["pi05"] / "prefix.onnx"), load_external_data=False)
+    kinds = {node.op_type for node in model.graph.node}
+    assert {"MatMul", "Softmax"} <= kinds
+    assert not kinds & {"Attention", "QuantizeLinear", "DequantizeLinear"}
+    assert {node.domain for node in model.graph.node} == {""}  # standard operators alone
+
+
+def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("keep me")
+    with pytest.raises(CheckpointError, match="exists and isn't an empty folder; give a new one"):
+        export_onnx(golden_model("pi05"), tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_an_export_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(state: Any) -> str:
+        raise OSError("no space left")
+
+    one = [graph for graph in graphs(golden_model("pi05")) if graph.name == "prompt"]
+    monkeypatch.setattr(exporting, "graphs", lambda model: one)
+    monkeypatch.setattr(exporting, "weights_sha256", fail)
+    with pytest.raises(OSError, match="no space left"):
+        export_onnx(golden_model("pi05"), tmp_path / "new")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_model_in_bf16_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"takes a float32 model on the CPU, not torch\.bfloat16 on cpu"):
+        export_onnx(golden_model("pi05", "bf16"), tmp_path / "new")
+
+
+def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=f"has no {MANIFEST}: it isn't a folder that `turbopi export onnx` wrote"):
+        OnnxBackend.open(tmp_path)
+
+
+def test_another_format_version_is_refused(folder: Path) -> None:
+    manifest = json.loads((folder / MANIFEST).read_text())
+    (folder / MANIFEST).write_text(json.dumps({**manifest, "format_version": 99}))
+    with pytest.raises(CheckpointError, match="format version 99, not 1; export again"):
+        OnnxBackend.open(folder)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}"])
+def test_a_broken_description_is_refused(folder: Path, text: str) -> None:
+    (folder / MANIFEST).write_text(text)
+    with pytest.raises(CheckpointError, match=rf"{MANIFEST} can't be read .*; export again"):
+        OnnxBackend.open(folder)
+
+
+def test_unknown_sizes_are_refused(folder: Path) -> None:
+    manifest = json.loads((folder / MANIFEST).read_text())
+    manifest["sizes"]["wings"] = 2
+    (folder / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(CheckpointError, match=r"its sizes aren't those of a model .*wings"):
+        OnnxBackend.open(folder)
+
+
+def test_a_cut_or_missing_file_is_refused(folder: Path) -> None:
+    data = folder / "prefix.onnx.data"
+    size = data.stat().st_size
+    data.write_bytes(data.read_bytes()[:-4])
+    with pytest.raises(CheckpointError, match=rf"prefix\.onnx\.data has {size - 4} bytes instead of {size}; copy"):
+        OnnxBackend.open(folder)
+    data.unlink()
+    with pytest.raises(CheckpointError, match=r"prefix\.onnx\.data is missing; copy the whole folder or export again"):
+        OnnxBackend.open(folder)
+
+
+def test_a_graph_that_is_none_is_refused_by_its_name(folder: Path) -> None:
+    file = folder / "vision.onnx"
+    file.write_bytes(b"\xff" * file.stat().st_size)
+    with pytest.raises(CheckpointError, match=r"vision\.onnx: ONNX Runtime can't load it"):
+        Sessions(open_export(folder))
+
+
+# -- what must be installed, and the command ---------------------------------------------------------------------------
+
+
+def without(monkeypatch: pytest.MonkeyPatch, *absent: str) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *more: None if name in absent else find(name, *more))
+
+
+@pytest.mark.parametrize("library", ["onnx", "onnxscript", "onnxruntime"])
+def test_a_missing_library_is_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch, library: str) -> None:
+    assert backends.availability("onnx", CPU) is None
+    without(monkeypatch, library)
+    with pytest.raises(BackendUnavailable, match=rf"{library} isn't installed; pip install 'turbopi\[onnx\]'"):
+        backends.check("onnx", CPU, "f32")
+
+
+def test_other_devices_and_precisions_are_refused() -> None:
+    with pytest.raises(BackendUnavailable, match="it runs ONNX Runtime's CPU provider; use device 'cpu'"):
+        backends.check("onnx", torch.device("cuda", 0), "f32")
+    with pytest.raises(ConfigError, match="backend 'onnx' runs in f32, not in 'bf16'"):
+        backends.check("onnx", CPU, "bf16")
+
+
+def test_the_command_says_what_it_wrote(command: Result) -> None:
+    document = json.loads(command.stdout)
+    folder = document["folder"]
+    assert [line for line in command.stderr.splitlines() if line.startswith("exporting")] == [
+        f"exporting {graph}" for graph in exporting.GRAPHS
+    ]
+    assert f"openpi_torch -> {folder}: 0.00" in command.stderr
+    assert document["bytes"] == sum(document["files"].values())
+    assert document["seconds"] > 0
+    assert open_export(folder).manifest.items() <= document.items()
+
+
+def test_random_weights_are_exported_with_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exporting, "graphs", lambda model: [one for one in graphs(model) if one.name == "prompt"])
+    result = turbopi("export", "onnx", "--random-weights", "pi05_tiny", tmp_path / "tiny")
+    assert result.exit_code == 0, result.output
+    assert "RANDOM WEIGHTS (pi05_tiny, seed 0)" in result.stdout
+    assert {file.name for file in (tmp_path / "tiny").iterdir()} == {"prompt.onnx", "prompt.onnx.data", MANIFEST}
+
+
+def test_the_command_refuses_before_it_loads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    random = ("--random-weights", "pi05_tiny")
+    assert "unknown format 'tflite'; choose one of onnx" in refusal(turbopi("export", "tflite", *random, "x"))
+    assert "export onnx takes two paths, the checkpoint and the new folder" in refusal(turbopi("export", "onnx", "a"))
+    (tmp_path / "mine.txt").write_text("keep me")
+    assert "isn't an empty folder" in refusal(turbopi("export", "onnx", *random, tmp_path))
+    without(monkeypatch, "onnxscript")
+    said = refusal(turbopi("export", "onnx", *random, tmp_path / "x"))
+    assert said == "can't export to ONNX: onnxscript isn't installed; pip install 'turbopi[onnx]'"
+    assert not (tmp_path / "x").exists()
