@@ -171,6 +171,11 @@ class UnifiedPolicy:
         return self._pipeline.example(seed)
 
     @property
+    def pipeline(self) -> Pipeline:
+        """What happens before and after the model."""
+        return self._pipeline
+
+    @property
     def metadata(self) -> dict[str, Any]:
         """What this policy is: the server sends it to every client on connection. Plain values only."""
         model = self.config.model

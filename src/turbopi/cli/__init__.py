@@ -1,6 +1,6 @@
 """The command line.
 
-turbopi demo | infer | serve | bench | eval |
+turbopi demo | infer | serve | bench | verify | eval |
     compare | inspect | convert | export | backends | doctor
 """
 
@@ -11,7 +11,7 @@ import typer
 
 # Importing a module declares its commands, in the order of --help
 # isort: off
-from turbopi.cli import demo, infer, serve, bench, evaluate, compare, checkpoints, export, backends, doctor  # noqa: F401
+from turbopi.cli import demo, infer, serve, bench, verify, evaluate, compare, checkpoints, export, backends, doctor  # noqa: F401
 from turbopi.cli.framework import app
 # isort: on
 

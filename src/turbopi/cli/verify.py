@@ -1,0 +1,195 @@
+"""`turbopi verify`: a certificate for a backend on one's own weights."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from turbopi.cli.files import check_folder
+from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console, plain
+from turbopi.cli.options import CheckpointArgument, PolicyOptions
+
+
+@command(
+    "verify",
+    shared=PolicyOptions,
+    examples=(
+        "turbopi verify --random-weights pi05_tiny --backend pytorch --precision bf16",
+        "turbopi verify checkpoints/pi05_libero --config pi05_libero --backend fused --report certificate",
+        "turbopi verify checkpoints/pi05_droid --observations recordings/20260101T120000Z --count 32 --noises 4",
+        "turbopi verify checkpoints/pi05_libero --precision f32 --bound 2e-6 --json",
+    ),
+)
+def verify(
+    options: PolicyOptions,
+    checkpoint: CheckpointArgument = None,
+    observations: Annotated[
+        Path | None,
+        typer.Option(
+            "--observations",
+            metavar="PATH",
+            help="What `turbopi serve --record` wrote, an .npz, or a folder with observation.json. Unless given: "
+            "LIBERO pictures for that robot, then random examples.",
+        ),
+    ] = None,
+    count: Annotated[
+        int | None,
+        typer.Option("--count", min=1, metavar="N", help="Observations.", show_default="8, or all of PATH"),
+    ] = None,
+    noises: Annotated[int, typer.Option("--noises", min=1, metavar="M", help="Noises for each observation.")] = 2,
+    seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the first noise.")] = 0,
+    bound: Annotated[
+        float | None,
+        typer.Option("--bound", metavar="X", help="Hold the actions' relative rms to X instead of the stated bound."),
+    ] = None,
+    factor: Annotated[
+        float | None,
+        typer.Option("--factor", metavar="X", help="Hold it to X times the control's instead."),
+    ] = None,
+    no_hash: Annotated[
+        bool, typer.Option("--no-hash", help="Leave out the weights' fingerprint, which reads all of them once more.")
+    ] = False,
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="DIR", help="Write verify.json and plots there.")
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Certify a backend on your own weights and observations.
+
+    Every named intermediate and the actions are compared with the float32 reference, beside a control: what plain
+    bfloat16 does to the same inputs. Exit code 0: PASS; 1: FAIL, and the first intermediate that is off is named.
+    """
+    if report is not None:
+        check_folder(report)
+    output = Output(as_json)
+    opened = options.open(checkpoint)
+    from turbopi.judge.verify import verify as run
+    from turbopi.judge.verify_inputs import Plan
+
+    options.tell_if_random(opened, output)
+    plan = Plan(
+        options.policy_arguments(),
+        observations,
+        count,
+        noises,
+        seed,
+        bound=bound,
+        factor=factor,
+        fingerprint=not no_hash,
+    )
+    document = _with_bar(lambda progress: run(opened, plan, progress), output)
+    _show(document, output)
+    if report is not None:
+        _write(document, report, output)
+    output.line(document["verdict"], "bold green" if document["ok"] else "bold red")
+    output.document(document)
+    if not document["ok"]:
+        raise typer.Exit(CHECK_FAILED)
+
+
+def _with_bar(work: Callable[[Any], dict[str, Any]], output: Output) -> dict[str, Any]:
+    from turbopi.judge.verify import Progress as Told
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = new_console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not output.shows_progress) as bar:
+        task = bar.add_task("", total=None)
+
+        def begin(text: str, total: int) -> None:
+            bar.reset(task, description=text, total=total)
+
+        return work(Told(begin, lambda: bar.advance(task)))
+
+
+def _write(document: dict[str, Any], folder: Path, output: Output) -> None:
+    from turbopi.judge.verify_plots import write_plots
+
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "verify.json"
+    file.write_text(json.dumps(plain(document), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    written = [file, *write_plots(document, folder)]
+    output.line(f"wrote {', '.join(str(path) for path in written)}")
+
+
+def _show(document: dict[str, Any], output: Output) -> None:
+    observed, weights, times = document["observations"], document["weights"], document["latency_ms"]
+    subject = f"{document['backend']} {document['precision']}"
+    output.line(
+        f"{document['model']}, {subject} on {document['policy']['device_name']}, {document['steps']} steps; "
+        f"{observed['count']} observations x {observed['noises']} noises"
+    )
+    output.line(f"weights {weights['fingerprint'] or 'not hashed'}")
+    output.line(f"observations {observed['sha256']}")
+    output.table(_intermediates(document))
+    output.line(
+        f"Where a name has layers or steps, the worst beside its control. Control: {document['control']}.", "dim"
+    )
+    output.table(_dimensions(document["actions"]["dimensions"]))
+    worst = document["actions"]["worst"]
+    output.line(
+        f"worst: {worst['observation']}, noise seed {worst['seed']}: relative rms {worst['relative_rms']:.2e}, "
+        f"cosine {worst['cosine']:.6f}"
+    )
+    for title, key in ((subject, "backend"), (document["oracle"], "oracle")):
+        time = times[key]
+        output.line(f"latency of {title}: median {time['p50']:.2f} ms, p95 {time['p95']:.2f} ms, {time['calls']} calls")
+    gpu = document["provenance"].get("gpu", {})
+    if "clocks.sm" in gpu:
+        output.line(
+            f"GPU {gpu['name']}, driver {gpu['driver_version']}, SM {gpu['clocks.sm']}, memory {gpu['clocks.mem']}, "
+            f"throttling {gpu['clocks_throttle_reasons.active']}"
+        )
+    if document["first_off"] is not None:
+        output.line(f"first off: {document['first_off']['text']}", "yellow")
+    bounds = document["bounds"]
+    own = " (overridden)" if bounds["overridden"] else ""
+    output.line(f"bound{own}: actions' relative rms {bounds['actions_relative_rms']:.2e}: {bounds['reason']}")
+    for check in document["checks"]:
+        output.line(f"{'ok  ' if check['ok'] else 'FAIL'} {check['text']}", None if check["ok"] else "red")
+
+
+def _intermediates(document: dict[str, Any]) -> Table:
+    """One row a name: its worst layer or step, in proportion to what is allowed there."""
+    table = Table(title="against the float32 reference, attended slots", title_justify="left")
+    table.add_column("intermediate")
+    table.add_column("worst at")
+    for column in ("relative rms", "control's", "allowed", "cosine", "max"):
+        table.add_column(column, justify="right")
+    worst: dict[str, dict[str, Any]] = {}
+    for row in document["intermediates"]:
+        name = row["name"]
+        if name not in worst or _badness(row) > _badness(worst[name]):
+            worst[name] = row
+    for name, row in worst.items():
+        control = row["control"]
+        table.add_row(
+            name,
+            "" if row["index"] is None else str(row["index"]),
+            f"{row['relative_rms']:.2e}",
+            "-" if control is None else f"{control['relative_rms']:.2e}",
+            f"{row['allowed']:.2e}",
+            f"{row['cosine']:.6f}",
+            f"{row['max']:.1e}",
+            style="red" if row["relative_rms"] > row["allowed"] else None,
+        )
+    return table
+
+
+def _badness(row: dict[str, Any]) -> float:
+    return row["relative_rms"] / row["allowed"] if row["allowed"] else row["relative_rms"]
+
+
+def _dimensions(dimensions: list[dict[str, Any]]) -> Table:
+    table = Table(title="actions in the robot's units", title_justify="left")
+    table.add_column("action")
+    table.add_column("unit")
+    for column in ("rms", "control's rms", "max", "control's max"):
+        table.add_column(column, justify="right")
+    for row in dimensions:
+        values = (row["rms"], row["control_rms"], row["max"], row["control_max"])
+        table.add_row(row["name"], row["unit"], *(f"{value:.1e}" for value in values))
+    return table

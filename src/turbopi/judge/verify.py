@@ -1,0 +1,241 @@
+"""A certificate for a backend, on the user's own weights and observations.
+
+Every named intermediate and the actions against the float32 reference, beside what plain bfloat16 does to the same
+inputs. The oracle runs first and its tensors stay on the host; then the control, then the backend, so that only one of
+them holds weights at a time. What the noise doesn't enter is compared once an observation.
+"""
+
+import gc
+import hashlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from turbopi import backends, demo
+from turbopi.bench.provenance import provenance
+from turbopi.checkpoint import Checkpoint
+from turbopi.errors import BackendError, CheckpointError
+from turbopi.judge.intermediates import Tensors, in_order, tensors_of
+from turbopi.judge.verdict import ACTIONS, Compared, Repetition, Rule, judge
+from turbopi.judge.verify_inputs import Call, Plan, check_observations, make_calls, read_samples
+from turbopi.model.reference import Pi0Model
+from turbopi.policy import UnifiedPolicy
+
+_DEMANDED = ("kv_k", "kv_v", "v_t", "actions")  # by the Backend protocol
+
+
+@dataclass
+class Progress:
+    """How a run tells what it is doing; by default it doesn't."""
+
+    begin: Callable[[str, int], None] = field(default=lambda text, total: None)
+    advance: Callable[[], None] = field(default=lambda: None)
+
+
+# -- the run -----------------------------------------------------------------------------------------------------------
+
+
+def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None) -> dict[str, Any]:
+    """The whole verdict as one plain document (docs/verify.md).
+
+    Raises ConfigError or BackendUnavailable before anything is loaded, ObservationError naming the observation that
+    can't be used, CheckpointError where the reference itself gives values that aren't finite.
+    """
+    progress = progress or Progress()
+    arguments = dict(plan.arguments)
+    device = backends.resolve_device(arguments["device"])
+    precision = arguments["precision"]
+    name = backends.choose(device, precision)[0] if arguments["backend"] == "auto" else arguments["backend"]
+    backends.check(name, device, precision)
+    rule = Rule.of(name, precision, plan.bound, plan.factor)
+    check_observations(plan)
+    if arguments.get("robot") is None:
+        checkpoint = demo.with_libero_stats(checkpoint)
+    arguments |= {"backend": name, "device": device}
+
+    reference = _Reference(checkpoint, arguments, plan, progress)
+    control = reference.control(rule, checkpoint, arguments, progress)
+    steps, calls = reference.steps, reference.calls
+    reference.release()
+    subject = UnifiedPolicy(checkpoint, **arguments)
+    progress.begin(f"{name} {precision}", 3 * len(calls))
+    warmup = subject.warmup()
+    compared = reference.compare(subject, progress)
+    repetition = _repeat(subject, calls, steps, progress)
+    about = provenance(device)  # clocks while the GPU is warm
+    details = subject.metadata
+    del subject
+    _free(device)
+
+    document = judge(rule, precision, details["robot"], compared, control, repetition)
+    exposed = {place.name for place in compared.by_place}
+    document |= {
+        "model": checkpoint.config.name,
+        "backend": name,
+        "precision": precision,
+        "steps": steps,
+        "oracle": "pytorch f32",
+        "control": rule.control_says,
+        "not_exposed": sorted(reference.names - exposed),
+        "latency_ms": {"backend": _latency(repetition.milliseconds), "oracle": _latency(reference.milliseconds)},
+        "warmup_seconds": round(warmup, 3),
+        "observations": reference.describe(plan),
+        "weights": {
+            "path": None if checkpoint.path is None else str(checkpoint.path),
+            "format": checkpoint.format,
+            "random": checkpoint.format == "random",
+            "fingerprint": checkpoint.fingerprint() if plan.fingerprint else None,
+        },
+        "policy": details,
+        "provenance": about,
+    }
+    return document
+
+
+class _Reference:
+    """The oracle's answers to all calls, kept on the host."""
+
+    def __init__(self, checkpoint: Checkpoint, arguments: Mapping[str, Any], plan: Plan, progress: Progress) -> None:
+        self._policy: UnifiedPolicy | None = UnifiedPolicy(
+            checkpoint, **(dict(arguments) | {"backend": "pytorch", "precision": "f32"})
+        )
+        policy, self.device = self._policy, arguments["device"]
+        self.steps = int(policy.metadata["num_denoising_steps"])
+        self._pipeline = policy.pipeline
+        self.samples = list(read_samples(policy, plan))
+        self.calls = make_calls(policy, self.samples, plan)
+        self.milliseconds: list[float] = []
+        self._exact: list[Tensors] = []
+        self._robot: list[np.ndarray] = []
+        progress.begin("float32 reference", len(self.calls))
+        policy.warmup()
+        for call in self.calls:
+            tensors = _run(policy, call, self.steps)
+            self.milliseconds.append(_sample(policy, call, self.steps)[1])
+            for place in in_order(tensors):
+                if not np.isfinite(tensors[place]).all():
+                    raise CheckpointError(
+                        f"the float32 reference itself gives values that aren't finite: {place}, on "
+                        f"{call.sample.source}; these weights or statistics are damaged"
+                    )
+            self._exact.append(tensors)
+            self._robot.append(self._robot_units(tensors, call))
+            progress.advance()
+
+    @property
+    def names(self) -> set[str]:
+        return {place.name for place in self._exact[0]}
+
+    def compare(self, policy: UnifiedPolicy, progress: Progress, into: Compared | None = None) -> Compared:
+        """A policy on all calls against these answers, added to `into`."""
+        compared = Compared() if into is None else into
+        for call in self.calls:
+            tensors = _run(policy, call, self.steps)
+            robot = self._robot_units(tensors, call)
+            compared.add(call, tensors, self._exact[call.number], robot, self._robot[call.number])
+            progress.advance()
+        return compared
+
+    def control(self, rule: Rule, checkpoint: Checkpoint, arguments: Mapping[str, Any], progress: Progress) -> Compared:
+        """What rounding alone does. Changes the reference's weights in their last bit: nothing exact comes after it."""
+        assert self._policy is not None
+        runs = len(demo.CONTROL_SEEDS) if rule.control == "jitter" else 1
+        progress.begin("control", runs * len(self.calls))
+        if rule.control == "bf16":
+            self.release()
+            policy = UnifiedPolicy(checkpoint, **(dict(arguments) | {"backend": "pytorch", "precision": "bf16"}))
+            compared = self.compare(policy, progress)
+            del policy
+            _free(self.device)
+            return compared
+        compared = Compared()
+        model: Pi0Model = self._policy.backend.model  # type: ignore[attr-defined]
+        for seed in demo.CONTROL_SEEDS:
+            with demo.jittered(model, seed):
+                self.compare(self._policy, progress, compared)
+        return compared
+
+    def release(self) -> None:
+        """Let go of the weights."""
+        self._policy = None
+        _free(self.device)
+
+    def _robot_units(self, tensors: Tensors, call: Call) -> np.ndarray:
+        chunk = tensors[ACTIONS]
+        if not np.isfinite(chunk).all():  # the robot's edge needn't cope with these
+            shape = self._robot[0].shape if self._robot else chunk.shape
+            return np.full(shape, np.nan)
+        return self._pipeline.after(chunk, call.sample.state)["actions"]
+
+    def describe(self, plan: Plan) -> dict[str, Any]:
+        """What it was run on, with a hash of all of the model's inputs."""
+        digest = hashlib.sha256()
+        for sample in self.samples:
+            for name, value in asdict(sample.inputs).items():
+                digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+                digest.update(np.ascontiguousarray(value).tobytes())
+        return {
+            "path": None if plan.observations is None else str(plan.observations),
+            "count": len(self.samples),
+            "names": [sample.source for sample in self.samples],
+            "sha256": digest.hexdigest(),
+            "noises": plan.noises,
+            "seed": plan.seed,
+        }
+
+
+def _run(policy: UnifiedPolicy, call: Call, steps: int) -> Tensors:
+    """One call's intermediates on the host, with the actions that `sample` gives."""
+    observation = call.observation
+    trace = policy.backend.intermediates(observation, call.noise, steps)
+    missing = [name for name in _DEMANDED if name not in trace]
+    if missing:
+        raise BackendError(f"backend {policy.backend.name!r} doesn't expose {', '.join(missing)}; it can't be verified")
+    tensors = tensors_of(trace, call.sample.inputs, with_prefix=call.first)
+    tensors[ACTIONS] = _sample(policy, call, steps)[0][0]
+    return tensors
+
+
+def _sample(policy: UnifiedPolicy, call: Call, steps: int) -> tuple[np.ndarray, float]:
+    """Actions float32[1, H, action_dim], a copy, and the milliseconds they took from host to host."""
+    observation = call.observation
+    start = time.perf_counter()
+    actions = policy.backend.sample(observation, call.noise, steps).actions
+    milliseconds = (time.perf_counter() - start) * 1e3
+    return actions.float().cpu().numpy().copy(), milliseconds
+
+
+def _repeat(policy: UnifiedPolicy, calls: Sequence[Call], steps: int, progress: Progress) -> Repetition:
+    result = Repetition()
+    first: dict[int, np.ndarray] = {}
+    for call in [*calls, *reversed(calls)]:
+        chunk, milliseconds = _sample(policy, call, steps)
+        result.milliseconds.append(milliseconds)
+        progress.advance()
+        if call.number not in first:
+            first[call.number] = chunk
+            continue
+        before = first[call.number]
+        result.calls += 1
+        if chunk.tobytes() == before.tobytes():
+            result.identical += 1
+            continue
+        result.differing = result.differing or call.sample.source
+        both = np.isfinite(chunk) & np.isfinite(before)
+        result.max = max(result.max, float(np.abs(chunk[both] - before[both]).max(initial=0.0)))
+    return result
+
+
+def _latency(milliseconds: Sequence[float]) -> dict[str, float]:
+    median, high = np.percentile(milliseconds, (50, 95))
+    return {"calls": len(milliseconds), "p50": float(median), "p95": float(high)}
+
+
+def _free(device: torch.device) -> None:
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()

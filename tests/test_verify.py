@@ -1,0 +1,275 @@
+"""The certificate: what is right passes, each planted fault fails by its name, and the document is complete."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import verify_fakes
+from cli_helpers import refusal, turbopi
+
+from turbopi import backends
+from turbopi.checkpoint import random_checkpoint
+from turbopi.errors import CheckpointError
+from turbopi.judge.intermediates import Errors, Place, first_suspect, in_order, tensors_of
+from turbopi.judge.verdict import ACTIONS, Rule
+from turbopi.judge.verify import verify
+from turbopi.judge.verify_inputs import Plan
+from turbopi.model.reference import Pi0Model
+from turbopi.observation import ModelInputs
+from turbopi.policy import UnifiedPolicy
+from turbopi.serve.record import Call, save_call
+
+STEPS = 2
+WEIGHTS = ("--random-weights", "pi05_tiny")
+QUICK = (*WEIGHTS, "--device", "cpu", "--steps", STEPS, "--count", 1, "--noises", 2)
+
+
+def plant(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    assert hasattr(verify_fakes, name)
+    spec = backends.BackendSpec("faulty", "verify_fakes", name, "for a test")
+    monkeypatch.setitem(backends.BACKENDS, "faulty", spec)
+
+
+def certified(backend: str, *more: object, exit_code: int = 0) -> dict[str, Any]:
+    """The document of a run with that exit code."""
+    result = turbopi("verify", *QUICK, "--backend", backend, "--json", *more)
+    assert result.exit_code == exit_code, (result.output, result.exception)
+    document: dict[str, Any] = json.loads(result.stdout)
+    last = result.stderr.rstrip().splitlines()[-1]
+    assert last == document["verdict"]
+    assert last.startswith("PASS: " if exit_code == 0 else "FAIL: ")
+    return document
+
+
+# What is right
+
+
+def test_plain_bf16_passes_and_its_document_is_complete(tmp_path: Path) -> None:
+    document = certified("pytorch", "--report", tmp_path)
+    assert document["ok"] is True
+    assert document["first_off"] is None
+    assert document["bounds"]["factor_of_control"] == 5
+    assert document["bounds"]["overridden"] is False
+    assert document["control"].startswith("pytorch f32 with every weight")
+    actions = document["actions"]
+    assert 1e-4 < actions["relative_rms"] < document["bounds"]["actions_relative_rms"]
+    assert actions["control"]["relative_rms"] * 5 == pytest.approx(document["bounds"]["actions_relative_rms"])
+    assert 0.999 < actions["cosine"] < 1
+    assert actions["worst"]["observation"] == "LIBERO frame 0"
+    assert [row["name"] for row in actions["dimensions"]][-1] == "gripper"
+    assert all(0 < row["rms"] <= row["max"] for row in actions["dimensions"])
+    names = [(row["name"], row["index"]) for row in document["intermediates"]]
+    assert names.index(("prefix_embs", None)) < names.index(("kv_k", 0)) < names.index(("kv_v", 0))
+    assert names.index(("kv_v", 0)) < names.index(("kv_k", 1)) < names.index(("cond", 0)) < names.index(("v_t", 0))
+    assert names.index(("v_t", 0)) < names.index(("x_t", 1)) < names.index(("v_t", 1)) < names.index(("x_t", 2))
+    assert names[-1] == ("actions", None)
+    assert {name for name, _ in names} >= {"suffix_out", "vision_last_hidden", "expert_hidden_step0"}
+    determinism = document["determinism"]
+    assert (determinism["identical"], determinism["calls"], determinism["differing"]) == (2, 2, None)
+    for times in document["latency_ms"].values():
+        assert 0 < times["p50"] <= times["p95"]
+    assert document["weights"]["fingerprint"] == random_checkpoint("pi05_tiny").fingerprint()
+    assert len(document["observations"]["sha256"]) == 64
+    assert document["provenance"]["commit"]
+    assert json.loads((tmp_path / "verify.json").read_text()) == document
+    for plot in ("layers.png", "steps.png"):
+        assert (tmp_path / plot).stat().st_size > 5000
+
+
+def test_the_oracle_has_no_error_against_itself() -> None:
+    document = certified("pytorch", "--precision", "f32", "--no-hash", "--noises", 1)
+    assert all(row["relative_rms"] == 0 and row["cosine"] == 1 for row in document["intermediates"])
+    assert document["bounds"]["actions_relative_rms"] == 1e-5
+    assert document["control"] == "pytorch bf16"
+    assert document["actions"]["control"]["relative_rms"] > 1e-3
+    assert document["weights"]["fingerprint"] is None
+
+
+def test_another_bf16_backend_is_held_to_plain_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant(monkeypatch, "Correct")
+    document = certified("faulty")
+    assert document["control"] == "pytorch bf16"
+    actions = document["actions"]
+    assert actions["relative_rms"] == actions["control"]["relative_rms"] > 0
+    assert document["bounds"]["actions_relative_rms"] == pytest.approx(1.25 * actions["relative_rms"])
+    assert "prefix_embs" in document["not_exposed"]
+
+
+# What is wrong
+
+
+@pytest.mark.parametrize(
+    ("fault", "precision", "first"),
+    [
+        ("WrongKeys", "bf16", ("kv_k", verify_fakes.FAULTY_LAYER)),
+        ("EarlySuffix", "bf16", ("v_t", 0)),
+        ("EarlySuffix", "f32", ("v_t", 0)),
+        ("FastPathDiffers", "bf16", ("actions", None)),
+    ],
+)
+def test_the_first_wrong_intermediate_is_named(
+    fault: str, precision: str, first: tuple[str, int | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plant(monkeypatch, fault)
+    document = certified("faulty", "--precision", precision, "--noises", 1, exit_code=1)
+    assert (document["first_off"]["name"], document["first_off"]["index"]) == first
+    assert f"first off: {document['first_off']['text']}" in document["verdict"]
+    assert document["checks"][0]["ok"] is False
+
+
+def test_what_is_not_finite_fails_with_a_whole_report(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    plant(monkeypatch, "NotFinite")
+    document = certified("faulty", "--report", tmp_path, "--noises", 1, exit_code=1)
+    assert "the actions aren't finite" in document["verdict"]
+    assert f"first off: v_t step {verify_fakes.FAULTY_STEP} (not finite)" in document["verdict"]
+    assert document["actions"]["relative_rms"] is None  # JSON has no infinity
+    assert document["actions"]["finite"] is False
+    assert (tmp_path / "steps.png").exists()
+
+
+def test_bits_that_change_on_repetition_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant(monkeypatch, "Unsteady")
+    document = certified("faulty", exit_code=1)
+    assert [check["name"] for check in document["checks"] if not check["ok"]] == ["determinism"]
+    assert "0 of 2 repeated calls were bit-identical" in document["verdict"]
+    assert document["determinism"]["differing"] == "LIBERO frame 0"
+    assert 0 < document["determinism"]["max"] < 1e-5
+
+
+def test_a_backend_that_hides_what_is_demanded_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant(monkeypatch, "Secretive")
+    assert "'faulty' doesn't expose v_t" in refusal_of("--backend", "faulty")
+
+
+def test_weights_whose_reference_is_not_finite_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def overflowing(model: Pi0Model, *args: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        k, v = original(model, *args)
+        v[1, 0, 0, 5] = float("inf")
+        return k, v
+
+    original = Pi0Model.encode_prefix
+    monkeypatch.setattr(Pi0Model, "encode_prefix", overflowing)
+    with pytest.raises(CheckpointError, match=r"itself gives values that aren't finite: kv_v layer 1, on LIBERO frame"):
+        verify(random_checkpoint("pi05_tiny"), quick_plan())
+
+
+# Bounds, observations, refusals
+
+
+def test_overridden_bounds_decide_and_are_recorded() -> None:
+    document = certified("pytorch", "--bound", "1e-9", "--noises", 1, exit_code=1)
+    assert document["bounds"]["overridden"] is True
+    assert document["bounds"]["actions_relative_rms"] == 1e-9
+    assert document["bounds"]["reason"] == "given by the user"
+    assert "is not within 1.00e-09" in document["verdict"]
+
+
+def test_a_recording_is_verified_by_its_files(tmp_path: Path) -> None:
+    policy = tiny_policy()
+    for number in range(3):
+        call = Call(policy.example_observation(number), {"actions": np.zeros((10, 7))}, 0.0)
+        save_call(tmp_path / f"{number:06d}.npz", call)
+    document = verify(random_checkpoint("pi05_tiny"), quick_plan(observations=tmp_path, count=2))
+    assert document["observations"]["names"] == ["000000.npz", "000001.npz"]
+    assert document["observations"]["count"] == 2
+
+
+def test_an_observation_that_cannot_be_used_is_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "one.npz", state=np.zeros(8))
+    assert refusal_of("--observations", tmp_path / "one.npz").startswith("one.npz: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--bound", "1e-3", "--factor", "2"], "--bound and --factor were both given"),
+        (["--factor", "-1"], "--factor is -1.0; expected a number above 0"),
+        (["--bound", "nan"], "--bound is nan"),
+        (["--precision", "fp7"], "unknown precision 'fp7'"),
+        (["--backend", "warp"], "unknown backend 'warp'"),
+        (["--observations", "nowhere"], "nowhere doesn't exist"),
+    ],
+)
+def test_wrong_options_are_refused(arguments: list[str], message: str) -> None:
+    assert message in refusal_of(*arguments)
+
+
+def refusal_of(*arguments: object) -> str:
+    """The error line of a run whose other output goes to stderr, too."""
+    result = turbopi("verify", *QUICK, *arguments, "--json")
+    assert result.exit_code == 2, (result.output, result.exception)
+    assert result.stdout == ""
+    return result.stderr.rstrip().splitlines()[-1].removeprefix("error: ")
+
+
+def test_no_weights_are_refused() -> None:
+    assert "no weights" in refusal(turbopi("verify"))
+
+
+# The numbers themselves
+
+
+def test_errors_pool_what_is_added() -> None:
+    errors = Errors()
+    errors.add(np.array([1.0, 2.0]), np.array([1.0, 1.0]))
+    errors.add(np.array([3.0]), np.array([5.0]))
+    assert errors.max == 2
+    assert errors.rms == pytest.approx(math.sqrt(5 / 3))
+    assert errors.relative_rms == pytest.approx(math.sqrt(5 / 27))
+    assert errors.cosine == pytest.approx(18 / math.sqrt(14 * 27))
+    errors.add(np.array([np.nan]), np.array([0.0]))
+    assert errors.relative_rms == float("inf")
+
+
+def test_slots_nobody_attends_to_are_left_out() -> None:
+    mask = np.array([True, False])
+    inputs = ModelInputs(np.zeros(0), mask, np.zeros(3), np.array([True, True, False]), np.zeros(0))
+    slots = torch.arange(7.0)  # two pictures of two tokens, three of the prompt
+    kv = slots[None, None, :, None, None].expand(2, 1, 7, 1, 1)
+    tensors = tensors_of({"prefix_embs": slots[None, :, None], "kv_k": kv}, inputs, with_prefix=True)
+    for place in (Place("prefix_embs"), Place("kv_k", 0), Place("kv_k", 1)):
+        assert tensors[place].ravel().tolist() == [0, 1, 4, 5]
+    assert tensors_of({"kv_k": kv, "times": torch.ones(2)}, inputs, with_prefix=False).keys() == {Place("times")}
+
+
+def _off_by(values: dict[Place, float]) -> dict[Place, Errors]:
+    out = {}
+    for place, value in values.items():
+        out[place] = Errors()
+        out[place].add(np.array([1 + value]), np.array([1.0]))
+    return out
+
+
+def test_a_jump_is_suspect_only_where_the_control_does_not_jump() -> None:
+    places = [Place("v_t", step) for step in range(3)]
+    jumping = dict(zip(places, (1e-4, 2e-4, 6e-3), strict=True))
+    allowed = dict.fromkeys(places, 1e-2)
+    suspect = first_suspect(_off_by(jumping), _off_by(dict.fromkeys(places, 3e-3)), allowed, 10)
+    assert suspect is not None
+    assert str(suspect) == "v_t step 2 (relative rms 6.00e-03, 30 x that before)"
+    assert first_suspect(_off_by(jumping), _off_by(jumping), allowed, 10) is None
+
+
+def test_actions_come_last_and_every_name_has_its_place() -> None:
+    places = [ACTIONS, Place("x_t", 1), Place("kv_v", 0), Place("v_t", 0), Place("kv_k", 1), Place("prefix_embs")]
+    expected = ["prefix_embs", "kv_v layer 0", "kv_k layer 1", "v_t step 0", "x_t step 1", "actions"]
+    assert [str(place) for place in in_order(places)] == expected
+
+
+def test_the_stated_bounds() -> None:
+    assert Rule.of("pytorch_compile", "f32").limit(control=0.5) == 1e-5
+    assert Rule.of("fused", "bf16").limit(control=0.02) == pytest.approx(0.025)
+    assert Rule.of("pytorch", "bf16").limit(control=0.02) == pytest.approx(0.1)
+
+
+def tiny_policy() -> UnifiedPolicy:
+    return UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu", num_denoising_steps=1)
+
+
+def quick_plan(**more: Any) -> Plan:
+    arguments = {"backend": "pytorch", "precision": "f32", "num_denoising_steps": 1, "device": "cpu"}
+    return Plan(arguments, **{"count": 1, "noises": 1, **more})
