@@ -8,7 +8,7 @@ too, and lands at 0.7 to 3.2 times the control (66 chunks of `pytorch` and `pyto
 seeds, openpi's golden Pi0.5 and Pi0; 1, 3 and 10 steps). The bound is 5 times the control. On pi05_tiny one wrong
 prompt token lands at 8 times, swapped cameras at 16, and attended padding, a lost camera mask or BGR beyond 75.
 
-Float32 rounds 2^15 times finer, and so is its control. Compiled float32 lands at 2.4 to 5 times that; the bound is 30,
+Float32 rounds 2^16 times finer, and so is its control. Compiled float32 lands at 5 to 10 times that; the bound is 30,
 since every way of adding up differs, and bugs are as much further off.
 """
 
@@ -30,7 +30,7 @@ from turbopi.policy import UnifiedPolicy
 
 CONTROL_SEEDS = (1, 2)
 BOUND_FACTORS: dict[Precision, float] = {"bf16": 5.0, "f32": 30.0}
-ROUNDING: dict[Precision, float] = {"bf16": 1.0, "f32": 2.0**-15}  # in proportion to bfloat16's
+ROUNDING: dict[Precision, float] = {"bf16": 1.0, "f32": 2.0**-16}  # in proportion to bfloat16's
 _HALF_BF16_STEP = 2.0**-9
 
 Tick = Callable[[], None]  # called after each inference, for a progress bar
