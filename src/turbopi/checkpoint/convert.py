@@ -15,9 +15,6 @@ import json
 import os
 import shutil
 import struct
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from math import prod
 from pathlib import Path
@@ -37,6 +34,7 @@ from turbopi.checkpoint.source import Piece, Shape
 from turbopi.checkpoint.torch_files import WEIGHTS
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
+from turbopi.folders import new_folder
 from turbopi.model.reference import Precision
 
 _DTYPES: dict[Precision, tuple[str, torch.dtype]] = {"bf16": ("BF16", torch.bfloat16), "f32": ("F32", torch.float32)}
@@ -70,7 +68,7 @@ def convert(
     checkpoint = src if isinstance(src, Checkpoint) else open_checkpoint(src, config)
     asset_id = checkpoint.asset_id or ("lerobot" if checkpoint.format == "lerobot" else "own")
     settings, robot_file = _settings(checkpoint.config, asset_id)
-    with _new_folder(dst) as folder:
+    with new_folder(dst) as folder:
         _write_weights(checkpoint, folder / WEIGHTS, precision, progress)
         _write_json(folder / "config.json", _openpi_config(checkpoint.config.model, precision))
         _write_json(folder / SETTINGS, settings)
@@ -219,22 +217,6 @@ def _is_preset(config: PolicyConfig) -> bool:
 
 def _write_json(file: Path, content: dict[str, Any]) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
-
-
-@contextmanager
-def _new_folder(dst: Path) -> Iterator[Path]:
-    """A temporary folder that becomes `dst` if all goes well, and disappears otherwise."""
-    dst.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{dst.name}-", dir=dst.parent))
-    try:
-        yield temporary
-        temporary.chmod(0o755)  # mkdtemp makes it private
-        if dst.exists():
-            dst.rmdir()  # empty: checked before
-        temporary.rename(dst)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
 
 
 assert to_openpi(EMBEDDING) == TIED_HEAD

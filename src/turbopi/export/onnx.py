@@ -9,8 +9,6 @@ import hashlib
 import importlib.util
 import json
 import logging
-import shutil
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -25,6 +23,7 @@ from torch import Tensor
 from turbopi.config import GemmaConfig, ModelConfig, VisionConfig
 from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError
 from turbopi.export.graphs import Graph, graphs
+from turbopi.folders import new_folder
 from turbopi.model.reference import Pi0Model
 
 MANIFEST = "turbopi_onnx.json"
@@ -77,7 +76,7 @@ def export_onnx(model: Pi0Model, dst: str | Path, *, report: Callable[[str], Non
     if model.compute_dtype != torch.float32 or model.device.type != "cpu":
         raise ConfigError(f"the export takes a float32 model on the CPU, not {model.compute_dtype} on {model.device}")
     signatures = {}
-    with _new_folder(dst) as folder:
+    with new_folder(dst) as folder:
         for graph in graphs(model):
             report(f"exporting {graph.name}")
             signatures[graph.name] = _write(graph, folder)
@@ -187,19 +186,3 @@ def _version(package: str) -> str:
         return metadata.version(package)
     except metadata.PackageNotFoundError:  # Turbo-Pi run from its source folder
         return "not installed"
-
-
-@contextmanager
-def _new_folder(dst: Path) -> Iterator[Path]:
-    """A temporary folder that becomes `dst` if all goes well, and disappears otherwise."""
-    dst.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{dst.name}-", dir=dst.parent))
-    try:
-        yield temporary
-        temporary.chmod(0o755)  # mkdtemp makes it private
-        if dst.exists():
-            dst.rmdir()  # empty: checked before
-        temporary.rename(dst)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise

@@ -1,0 +1,26 @@
+"""Folders that appear whole or not at all."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def new_folder(dst: Path) -> Iterator[Path]:
+    """A temporary folder that becomes `dst` if all goes well, and disappears otherwise.
+
+    The caller has checked that `dst` doesn't exist or is empty.
+    """
+    dst.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{dst.name}-", dir=dst.parent))
+    try:
+        yield temporary
+        temporary.chmod(0o755)  # mkdtemp makes it private
+        if dst.exists():
+            dst.rmdir()  # empty: checked before
+        temporary.rename(dst)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
