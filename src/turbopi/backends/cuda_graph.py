@@ -116,6 +116,10 @@ class CudaGraphBackend:
         )
 
     def denoise(self, cache: KVCache, noise: Tensor, num_steps: int) -> Tensor:
+        if cache.k.shape[1] != 1 or cache.mask is not None:
+            raise BackendError(
+                f"{self.name} denoises one unpadded observation's cache, not a batch of {cache.k.shape[1]}"
+            )
         length, per_image = cache.k.shape[3], self.config.vision.num_tokens
         cameras = min(length // per_image, MAX_CAMERAS)
         shape = CallShape(cameras, _bucket(length - cameras * per_image), noise.shape[1], num_steps)
