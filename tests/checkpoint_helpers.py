@@ -1,7 +1,9 @@
 """Checkpoint folders for tests: copies of the golden ones in other shapes, and an Orbax tree reader and writer."""
 
+import atexit
 import json
 import shutil
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,34 @@ import tensorstore as ts
 import torch
 from safetensors.torch import load_file, save_file
 
-GOLDEN = Path(__file__).parent / "golden" / "checkpoints"
+from turbopi.checkpoint import convert
+
+STORED = Path(__file__).parent / "golden" / "checkpoints"
 STATS = Path(__file__).parent / "golden" / "preprocess" / "norm_stats"
 LIBERO = "physical-intelligence/libero"
 
 Tree = dict[str, np.ndarray]
+
+
+def _whole() -> Path:
+    """The golden checkpoints with pi05's model.safetensors, which isn't stored: it is converted from pi05/jax.
+
+    `test_pi05_from_jax_is_openpis_bfloat16_file` proves it equal to openpi's, tensor by tensor.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="turbopi-golden-"))
+    atexit.register(shutil.rmtree, folder)
+    converted = convert(STORED / "pi05" / "jax", folder / "converted", precision="bf16", config="pi05_libero")
+    for shared in ("model.json", "pi0"):
+        (folder / shared).symlink_to(STORED / shared)
+    (folder / "pi05").mkdir()
+    (folder / "pi05" / "jax").symlink_to(STORED / "pi05" / "jax")
+    shutil.copytree(STORED / "pi05" / "torch", folder / "pi05" / "torch")
+    (converted / "model.safetensors").rename(folder / "pi05" / "torch" / "model.safetensors")
+    shutil.rmtree(converted)
+    return folder
+
+
+GOLDEN = _whole()
 
 
 # -- openpi's PyTorch layout -------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from checkpoint_helpers import GOLDEN
 from cli_helpers import refusal, text_of, turbopi
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
@@ -61,8 +62,8 @@ def test_inspect_of_random_weights_says_so() -> None:
     assert "note: random weights, seed 7: actions mean nothing" in shown
 
 
-def test_inspect_without_a_configuration_shows_the_rest_and_the_choices(golden: Path) -> None:
-    result = turbopi("inspect", golden / "checkpoints" / "pi05" / "torch")
+def test_inspect_without_a_configuration_shows_the_rest_and_the_choices() -> None:
+    result = turbopi("inspect", GOLDEN / "pi05" / "torch")
     assert result.exit_code == 0
     assert "not known yet: " in result.stdout
     assert "suggest pi05_libero" in result.stdout
