@@ -19,6 +19,8 @@ from turbopi.errors import BackendError, TurboPiError
 from turbopi.observation import Observation
 from turbopi.plots import action_groups
 from turbopi.policy import UnifiedPolicy
+from turbopi.sim import SimulatorUnavailable
+from turbopi.sim.libero import LiberoSimulator
 
 
 def tiny_oracle(preset: str = "pi05_tiny") -> UnifiedPolicy:
@@ -43,11 +45,12 @@ def test_missing_pictures_are_said_to_be_missing(tmp_path: Path) -> None:
         demo.load_frames(tmp_path)
 
 
-def test_without_a_checkpoint_the_demo_runs_and_says_that_weights_are_random(tmp_path: Path) -> None:
-    result = turbopi("demo", "--frames", 2, "--report", tmp_path / "report", "--seed", 3)
+def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_expert(tmp_path: Path) -> None:
+    result = turbopi("demo", "--frames", 2, "--report", tmp_path / "report", "--seed", 3, "--episodes", 0)
     assert result.exit_code == 0, result.output
     out = result.stdout
-    assert out.startswith("RANDOM WEIGHTS (pi05_tiny, seed 0): the actions mean nothing.\n")
+    assert "RANDOM" not in out
+    assert "against what the expert did next" in out
     assert "pi05_tiny for libero, bf16 on cpu (CPU), 10 steps" in out
     assert "backend: pytorch (auto: on a CPU" in out
     for heading in ("preprocess", "vision", "prefix", "denoise", "postprocess", "model", "total"):
@@ -55,17 +58,18 @@ def test_without_a_checkpoint_the_demo_runs_and_says_that_weights_are_random(tmp
     for frame in demo.load_frames()[:2]:
         assert frame.prompt.split()[-1] in out
     assert "the chunk, 10 steps of 7" in out
-    assert "The bound is 5 times the control" in out
+    assert "The bound is 10 times the control" in out
     assert "OK: pytorch bf16 is within" in out
     assert "\x1b" not in out
 
     report = json.loads((tmp_path / "report" / "report.json").read_text())
     assert report["ok"] is True
-    assert report["random_weights"] is True
+    assert report["random_weights"] is False
+    assert report["episodes"] is None
     assert report["seed"] == 3
     assert len(report["frames"]) == 2
     check = report["check"]
-    assert check["bound"] == pytest.approx(5 * check["control_rms"])
+    assert check["bound"] == pytest.approx(10 * check["control_rms"])
     assert 0 < max(check["rms"]) <= check["bound"]
     with np.load(tmp_path / "report" / "actions.npz") as actions:
         assert actions["actions"].shape == actions["oracle_actions"].shape == (2, 10, 7)
@@ -75,6 +79,27 @@ def test_without_a_checkpoint_the_demo_runs_and_says_that_weights_are_random(tmp
     with Image.open(tmp_path / "report" / "demo.png") as picture:
         assert picture.width > 1200
         assert np.asarray(picture.convert("L")).std() > 20
+
+
+def test_random_weights_are_said_to_be_random_and_held_to_the_closer_bound(tmp_path: Path) -> None:
+    result = turbopi("demo", "--random-weights", "pi05_tiny", "--frames", 1, "--report", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("RANDOM WEIGHTS (pi05_tiny, seed 0): the actions mean nothing.\n")
+    assert "The bound is 5 times the control" in result.stdout
+    assert "expert" not in result.stdout
+
+
+def test_episodes_that_are_asked_for_without_a_simulator_are_refused(tmp_path: Path, monkeypatch: Any) -> None:
+    def missing(self: LiberoSimulator) -> list[str]:
+        raise SimulatorUnavailable("LIBERO isn't installed here")
+
+    monkeypatch.setattr(LiberoSimulator, "check", missing)
+    result = turbopi("demo", "--frames", 1, "--report", tmp_path, "--episodes", 1)
+    assert result.exit_code == 2
+    assert "LIBERO isn't installed here" in result.stderr
+    told = turbopi("demo", "--frames", 1, "--report", tmp_path)
+    assert told.exit_code == 0, told.output
+    assert "The policy didn't act in the simulator: LIBERO isn't installed here" in " ".join(told.stdout.split())
 
 
 def swapped_cameras(self: PyTorchBackend, observation: Observation, noise: torch.Tensor, num_steps: int) -> Sample:
@@ -89,7 +114,7 @@ RIGHT_SAMPLE = PyTorchBackend.sample
 
 def test_a_backend_that_swaps_cameras_fails_with_code_1(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(PyTorchBackend, "sample", swapped_cameras)
-    result = turbopi("demo", "--frames", 1, "--report", tmp_path, "--json")
+    result = turbopi("demo", "--frames", 1, "--report", tmp_path, "--json", "--episodes", 0)
     assert result.exit_code == 1, result.output
     assert "FAIL: pytorch bf16 is" in result.stderr
     assert "from the oracle, beyond its bound" in result.stderr

@@ -65,12 +65,13 @@ def action_groups(robot: str, dims: int) -> list[ActionGroup]:
 
 @dataclass(frozen=True)
 class Row:
-    """One observation and its chunk. `oracle`, if given, is drawn as dots on the lines of `actions` (both [H, d])."""
+    """One observation and its chunk [H, d]; `oracle` is drawn as dots on its lines, `expert` as broken lines."""
 
     heading: str
     pictures: dict[str, np.ndarray]  # camera -> [h, w, 3]
     actions: np.ndarray
     oracle: np.ndarray | None = None
+    expert: np.ndarray | None = None
 
 
 def plot_chunks(file: Path, rows: Sequence[Row], *, robot: str, title: str, random_weights: bool) -> None:
@@ -113,15 +114,20 @@ def _draw_group(ax: Axes, group: ActionGroup, row: Row) -> None:
         "markerfacecolor": "none",
         "linestyle": "",
     }
+    broken: dict[str, Any] = {"linestyle": "--", "linewidth": 1.0, "alpha": 0.8}
     handles = []
     for color, (index, name) in enumerate(group.names.items()):
         handles += ax.plot(steps, row.actions[:, index], color=f"C{color}", linewidth=1.6, label=name)
         if row.oracle is not None:
             ax.plot(steps, row.oracle[:, index], color=f"C{color}", **dot)
+        if row.expert is not None:
+            ax.plot(steps[: len(row.expert)], row.expert[: len(steps), index], color=f"C{color}", **broken)
     if row.oracle is not None:
         handles.append(
             Line2D([], [], marker="o", color="0.3", linestyle="", markerfacecolor="none", label="f32 oracle")
         )
+    if row.expert is not None:
+        handles.append(Line2D([], [], color="0.3", label="expert", **broken))
     ax.set_title(group.title, fontsize=9)
     ax.set_xlabel("step of the chunk", fontsize=8)
     ax.set_ylabel(group.unit, fontsize=8)

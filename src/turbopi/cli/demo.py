@@ -18,14 +18,13 @@ if TYPE_CHECKING:
 
     from turbopi.demo import Frame, OracleCheck
 
-DEFAULT_PRESET = "pi05_tiny"
-
 
 @command(
     "demo",
     shared=PolicyOptions,
     examples=(
         "turbopi demo",
+        "turbopi demo --episodes 10",
         "turbopi demo --backend pytorch_compile --steps 5 --report /tmp/report",
         "turbopi demo checkpoints/pi05_libero --config pi05_libero",
         "turbopi demo --random-weights pi05_libero --frames 1",
@@ -42,20 +41,34 @@ def demo(
         typer.Option("--frames", min=1, metavar="N", help="Use only the first N frames.", show_default="all"),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the noise that actions start from.")] = 0,
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            "--episodes",
+            min=0,
+            max=20,
+            metavar="N",
+            help="Let the policy act in LIBERO, too: N episodes.",
+            show_default="3 if the simulator is installed",
+        ),
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run a policy on real LIBERO pictures and check it against the float32 oracle.
+    """Run a policy on real LIBERO pictures, check it against the float32 oracle, and let it act in the simulator.
 
-    Without a checkpoint the weights are random (pi05_tiny): the whole way runs, in under a minute on two cores, but the
-    actions mean nothing. The report folder gets demo.png, actions.npz and report.json. Exit code 1: the check failed.
+    Without a checkpoint it is the small policy that comes with Turbo-Pi, trained on these tasks; its chunks are set
+    against what the expert did that it learned from. Where the simulator is installed (pip install 'turbopi[libero]')
+    it acts in a few episodes, with success, latency and videos at the end. The report folder gets demo.png,
+    actions.npz, report.json and episodes/. Exit code 1: the check failed.
     """
     if checkpoint is None and options.random_weights is None:
-        from dataclasses import replace
+        from turbopi.demo import SMALL_POLICY
 
-        options = replace(options, random_weights=DEFAULT_PRESET)
+        checkpoint = str(SMALL_POLICY)
     check_folder(report)  # what can't be written is better known before the work
     output = Output(as_json)
     run = _Run(options, checkpoint, frames, seed, output)
+    run.play(report / "episodes", episodes)
     run.report_to(report)
     if not run.check.ok:
         raise typer.Exit(CHECK_FAILED)
@@ -86,6 +99,8 @@ class _Run:
         self._show_timings()
         self._show_chunk(self.results[0]["actions"])
 
+        self._show_expert()
+
         del policy  # its weights make room for the oracle's
         arguments = options.policy_arguments() | {"backend": "pytorch", "precision": "f32"}
         oracle = UnifiedPolicy(opened, progress=output.shows_progress, **arguments)
@@ -100,6 +115,32 @@ class _Run:
                 tick=lambda: bar.advance(task),
             )
         self._show_check()
+        self.policy_again = lambda: options.make_policy(opened, Output(True))
+        self.played: dict[str, Any] | None = None
+
+    def play(self, folder: Path, episodes: int | None) -> None:
+        """In the simulator, if it is there and the policy is for it; says why not otherwise, if that was asked for."""
+        from turbopi.cli.demo_episodes import play_episodes
+
+        trained = self.robot == "libero" and not self.metadata["random_weights"]
+        if episodes == 0 or (episodes is None and not trained):
+            return
+        self.played = play_episodes(self.policy_again, episodes, folder, self.output)
+
+    def _show_expert(self) -> None:
+        """How near the chunks are to the expert's, for a policy that should be."""
+        from turbopi.demo import expert_distance
+
+        if self.robot != "libero" or self.metadata["random_weights"]:
+            return
+        table = Table(title="against what the expert did next (first 5 actions)", title_justify="left")
+        for column in ("frame", "mean difference of position", "expert's mean command", "same gripper command"):
+            table.add_column(column, justify="right")
+        for number, (frame, result) in enumerate(zip(self.frames, self.results, strict=True)):
+            if frame.expert is not None:
+                found = expert_distance(result["actions"], frame.expert)
+                table.add_row(str(number), f"{found.position:.2f}", f"{found.scale:.2f}", f"{found.gripper:.0%}")
+        self.output.table(table)
 
     def _show_timings(self) -> None:
         columns = timing_columns(self.results[0]["policy_timing"])
@@ -189,6 +230,7 @@ class _Run:
                 for frame, result in zip(self.frames, self.results, strict=True)
             ],
             "policy": self.metadata,
+            "episodes": self.played,
         }
 
     def _plot(self, file: Path) -> None:
@@ -201,6 +243,7 @@ class _Run:
                 pictures={"base camera": frame.base, "wrist camera": frame.wrist},
                 actions=result["actions"],
                 oracle=truth,
+                expert=frame.expert if self.robot == "libero" and not self.metadata["random_weights"] else None,
             )
             for frame, result, truth, difference in zip(
                 self.frames, self.results, self.check.oracle_actions, self.check.differences, strict=True

@@ -163,6 +163,7 @@ class EvalOptions(PolicyOptions):
         "turbopi eval libero checkpoints/pi05_libero --config pi05_libero",
         "turbopi eval libero checkpoints/pi05_libero --config pi05_libero --suite goal --trials 10 --workers 8",
         "turbopi eval libero --port 8000 --suite libero_10",
+        "turbopi eval libero checkpoints/pi05_libero --config pi05_libero --trials 5 --control prompt",
         "turbopi eval libero --random-weights pi05_tiny --tasks 0,1 --trials 1 --max-steps 20",
         "turbopi eval reacher --random-weights pi05_tiny --trials 2",
     ),
@@ -181,6 +182,14 @@ def evaluate_command(
     ] = None,
     api_key: Annotated[
         str | None, typer.Option("--api-key", envvar="TURBOPI_API_KEY", metavar="KEY", help="That the server wants.")
+    ] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(
+            "--control",
+            metavar="prompt|pictures",
+            help="Give the policy another task's prompt, or pictures: it should fail.",
+        ),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -207,6 +216,11 @@ def evaluate_command(
     else:
         source = options.local_policy(checkpoint, output)
     try:
+        if control is not None:
+            from turbopi.evaluate.controls import Controlled
+
+            instructions = [job.task.instruction for job in jobs]
+            source = Controlled(source, control, instructions, chosen.image_keys)  # type: ignore[arg-type]
         folder = options.out or DEFAULT_OUT / _folder_name(protocol.suite, source.label, source.about)
         results = run_with_progress(options, protocol, source, chosen, jobs, folder, output)
     finally:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from turbopi.calibrate.artifact import RANDOM_NOISE
 from turbopi.errors import ConfigError
 from turbopi.evaluate.plots import write_comparison_plot
 from turbopi.evaluate.report import page, table
@@ -45,9 +46,18 @@ class Compared:
     steps: dict[str, float] | None
     error: dict[str, float] | None
 
+    @property
+    def precision(self) -> str:
+        """What the policy ran in, where it told; FP8 that was calibrated on noise says so."""
+        precision = str(self.results.policy.get("identity", {}).get("precision") or "-")
+        details = self.results.policy.get("about", {}).get("backend_details") or {}
+        noisy = isinstance(details, dict) and details.get("fp8", {}).get("observations") == RANDOM_NOISE
+        return f"{precision}, random noise" if noisy else precision
+
     def as_json(self) -> dict[str, Any]:
         return {
             "label": self.label,
+            "precision": self.precision,
             "folder": str(self.results.folder),
             "success": self.rate.as_json(),
             "paired_with_first": None if self.paired is None else self.paired.as_json(),
@@ -112,6 +122,7 @@ def document(compared: Sequence[Compared]) -> dict[str, Any]:
 
 HEADS = (
     "run",
+    "precision",
     "success [95 %]",
     "difference [95 %]",
     "only 1st :\nonly this",
@@ -125,7 +136,7 @@ HEADS = (
 
 def cells(run: Compared) -> list[str]:
     """The table's row as text."""
-    row = [run.label, str(run.rate)]
+    row = [run.label, run.precision, str(run.rate)]
     if run.paired is None:
         row += ["-", "-", "-"]
     else:

@@ -1,0 +1,61 @@
+"""Controls: a policy that is given the wrong prompt, or the wrong pictures, should fail.
+
+If it doesn't, its success doesn't come from what it was told, or from what it saw.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from turbopi.errors import ConfigError
+from turbopi.evaluate.sources import Answer, PolicySource
+
+Control = Literal["prompt", "pictures"]
+CONTROLS: tuple[Control, ...] = ("prompt", "pictures")
+_GRAY = 128
+
+
+class Controlled:
+    """A policy source that hands wrong observations on to another one.
+
+    prompt     the instruction of the task after this one (and the first's for the last)
+    pictures   what was seen last in the next task that has been seen at all, gray until there is one. They depend on
+               which episodes run side by side, so with several workers a run doesn't repeat exactly.
+
+    instructions   of the tasks that are evaluated, in order. Raises ConfigError if there are fewer than two.
+    """
+
+    def __init__(
+        self, source: PolicySource, control: Control, instructions: Sequence[str], image_keys: Sequence[str]
+    ) -> None:
+        if control not in CONTROLS:
+            raise ConfigError(f"the control is {control!r}; choose one of {', '.join(CONTROLS)}")
+        self._order = list(dict.fromkeys(instructions))
+        if len(self._order) < 2:
+            raise ConfigError(f"the control {control!r} takes another task's, but only one is evaluated; give more")
+        self._source, self._control, self._image_keys = source, control, tuple(image_keys)
+        self._seen: dict[str, dict[str, np.ndarray]] = {}
+        self.max_batch = source.max_batch
+        self.label = f"{source.label}, {control} of another task"
+        self.identity = source.identity | {"control": control}
+        self.about = source.about | {"control": control}
+
+    def infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Answer]:
+        for observation in observations:
+            self._seen[observation["prompt"]] = {key: observation[key] for key in self._image_keys}
+        return self._source.infer([self._wrong(observation) for observation in observations], seeds)
+
+    def close(self) -> None:
+        self._source.close()
+
+    def _wrong(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        prompt = observation["prompt"]
+        if prompt not in self._order:  # the example that is asked before the run
+            return dict(observation)
+        at = self._order.index(prompt)
+        others = self._order[at + 1 :] + self._order[:at]
+        if self._control == "prompt":
+            return {**observation, "prompt": others[0]}
+        seen = next((self._seen[other] for other in others if other in self._seen), None)
+        return {**observation, **(seen or {key: np.full_like(observation[key], _GRAY) for key in self._image_keys})}

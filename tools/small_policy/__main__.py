@@ -1,0 +1,150 @@
+"""Make the small policy. Run from the repository, in an environment with turbopi[libero]:
+
+    export PYTHONPATH=src:tools MUJOCO_GL=egl
+    python -m small_policy measure --initial-states 0-49             how good the expert is
+    python -m small_policy stats --out work/norm_stats.json          statistics of demonstrations, without pictures
+    python -m small_policy train --out work/run --stats work/norm_stats.json --seconds 420 --workers 32
+    python -m small_policy card --help                               the model card, from results and curves
+    python -m small_policy throughput                                samples a second, before a GPU is rented for long
+
+`train` needs a GPU with 60 GB (fewer with a smaller --capacity) and 2 GB of memory for each worker. It leaves
+
+    checkpoint/      openpi's PyTorch layout: turbopi eval libero work/run/checkpoint --initial-states 30-49
+    curves.csv       losses, speed, frames, and the learner's success on validation states, by time
+    episodes.jsonl   every episode that was played: scene, prompt, initial state, seed, success
+    state.pt         to go on from, with --resume
+
+The data are in expert.py, scenes.py and collect.py, the learning in forward.py and train.py.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m small_policy", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    measure = commands.add_parser("measure", help="let the expert play, and count")
+    measure.add_argument("--tasks", default="0-9")
+    measure.add_argument("--initial-states", default="0-9")
+    stats = commands.add_parser("stats", help="play demonstrations and write norm_stats.json")
+    stats.add_argument("--out", type=Path, required=True)
+    stats.add_argument("--tasks", default="0-9")
+    stats.add_argument("--episodes", type=int, default=6, help="of each task")
+    stats.add_argument("--raw", type=Path, help="also keep states and actions, as .npz; several runs' can be merged")
+    stats.add_argument("--merge", type=Path, nargs="*", help="play nothing; take these .npz")
+    card = commands.add_parser("card", help="write the model card from results and curves")
+    card.add_argument("--results", type=Path, required=True, help="summary of evaluations, as in benchmarks/results")
+    card.add_argument("--curves", type=Path, required=True, help="the training's curves.csv")
+    card.add_argument("--out", type=Path, required=True)
+    speed = commands.add_parser("throughput", help="time training steps on random data")
+    _add_settings(commands.add_parser("train", help="collect and train, by the clock"))
+    _add_settings(speed, required=False)
+    arguments = parser.parse_args()
+    run = {"measure": _measure, "stats": _stats, "train": _train, "throughput": _throughput, "card": _card}
+    run[arguments.command](arguments)
+
+
+def _add_settings(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    """One option for each field of train.Settings."""
+    from small_policy.train import Settings
+
+    for item in fields(Settings):
+        name = "--" + item.name.replace("_", "-")
+        needed = required and item.name in ("out", "stats")
+        if item.type is bool:
+            parser.add_argument(name, action=argparse.BooleanOptionalAction, default=item.default)
+        else:
+            default = None if item.name in ("out", "stats") else item.default
+            parser.add_argument(name, type=item.type, default=default, required=needed)
+
+
+def _settings(arguments: argparse.Namespace) -> Any:
+    from small_policy.train import Settings
+
+    return Settings(**{item.name: getattr(arguments, item.name) for item in fields(Settings)})
+
+
+def _card(arguments: argparse.Namespace) -> None:
+    from small_policy.card import write_card
+
+    write_card(arguments.results, arguments.curves, arguments.out)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from small_policy.train import train
+
+    train(_settings(arguments))
+
+
+def _throughput(arguments: argparse.Namespace) -> None:
+    import torch
+
+    from small_policy.train import Trainer, toy_memory
+
+    trainer = Trainer(_settings(arguments))
+    memory = toy_memory(2 * arguments.batch, trainer.device)
+    for number in range(60):
+        if number in (1, 20):
+            if trainer.device.type == "cuda":
+                torch.cuda.synchronize()
+            start = time.perf_counter()
+        losses = trainer.step(memory.batch(memory.draw(arguments.batch)), 0.0)
+        if number in (0, 1, 19, 59):
+            values = {name: round(float(value), 4) for name, value in losses.items()}
+            print(number, values, f"{time.perf_counter() - start:.2f} s" if number else "", flush=True)
+    print(f"{40 * arguments.batch / (time.perf_counter() - start):.0f} samples/s")
+    if trainer.device.type == "cuda":
+        print(f"{torch.cuda.max_memory_allocated() / 2**30:.1f} GiB")
+
+
+def _measure(arguments: argparse.Namespace) -> None:
+    from small_policy.expert import Expert
+    from small_policy.scenes import BOWL, MAX_STEPS, PracticeScene
+    from turbopi.evaluate.plan import parse_numbers
+
+    total: list[int | None] = []
+    for task in parse_numbers("--tasks", arguments.tasks):
+        scene, steps = PracticeScene(task), []
+        for state in parse_numbers("--initial-states", arguments.initial_states):
+            scene.reset(state)
+            expert = Expert(scene.domain, BOWL)
+            solved = (number for number in range(1, MAX_STEPS + 1) if scene.step(expert.act(), look=False))
+            steps.append(next(solved, None))
+        scene.close()
+        total += steps
+        print(json.dumps({"task": task, **_summary(steps)}), flush=True)
+    print(json.dumps({"task": "all", **_summary(total)}))
+
+
+def _summary(steps: "list[int | None]") -> dict[str, Any]:
+    from small_policy.scenes import MAX_STEPS
+
+    solved = [number for number in steps if number is not None]
+    within = sum(number <= 190 for number in solved)
+    mean = round(float(np.mean(solved)), 1) if solved else None
+    return {"episodes": len(steps), f"solved in {MAX_STEPS}": len(solved), "in 190": within, "steps": mean}
+
+
+def _stats(arguments: argparse.Namespace) -> None:
+    from small_policy.statistics import merged, play, write
+
+    if arguments.merge is None:
+        states, actions = play(arguments.tasks, arguments.episodes)
+    else:
+        states, actions = merged(arguments.merge)
+    if arguments.raw:
+        np.savez_compressed(arguments.raw, states=states, actions=actions)
+    write(arguments.out, states, actions)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Writes a trained model as a checkpoint in openpi's PyTorch layout, which the ordinary loader reads."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from turbopi.checkpoint.base import Checkpoint
+from turbopi.checkpoint.convert import convert
+from turbopi.checkpoint.norm_stats import NormStats
+from turbopi.checkpoint.source import Piece, Shape
+from turbopi.config import PolicyConfig, preset
+from turbopi.model.reference import Precision
+from turbopi.tokenizer import TINY_TOKENIZER
+
+ASSET_ID = "turbopi/libero_spatial"
+# As openpi's own pi05_libero, it doesn't read the state: where the hand is, the pictures show
+CONFIG: PolicyConfig = dataclasses.replace(
+    preset("pi05_tiny"), name="pi05_tiny", discrete_state_input=False, asset_id=ASSET_ID
+)
+
+
+class TrainedWeights:
+    """A state dict as a source of weights."""
+
+    format = "openpi_torch"
+    vision_heads: int | None = CONFIG.model.vision.num_heads
+
+    def __init__(self, state: dict[str, Tensor]) -> None:
+        self._state = state
+        self.shapes: dict[str, Shape] = {name: tuple(value.shape) for name, value in state.items()}
+        self.dtypes = dict.fromkeys(state, "F32")
+        self.notes: list[str] = []
+
+    def native_name(self, name: str) -> str:
+        return name
+
+    def pieces(self, device: torch.device) -> Iterator[Piece]:
+        for name, value in self._state.items():
+            yield Piece(name, 0, value.detach().to(device, torch.float32))
+
+
+def export(state: dict[str, Tensor], stats: NormStats, folder: Path, precision: Precision = "bf16") -> Path:
+    """Write canonical weights, statistics and the tokenizer into a new folder."""
+    checkpoint = Checkpoint(
+        path=None,
+        config=CONFIG,
+        config_source="training",
+        norm_stats=stats,
+        source=TrainedWeights(state),
+        asset_id=ASSET_ID,
+        tokenizer_candidates=(TINY_TOKENIZER,),
+    )
+    convert(checkpoint, folder, precision=precision)
+    (folder / TINY_TOKENIZER.name).rename(folder / "tokenizer.model")
+    return folder

@@ -1,0 +1,149 @@
+"""The worker processes, and the thread that serves them: frames into memory, chunks out to those who ask."""
+
+import json
+import multiprocessing
+import os
+import threading
+import time
+from collections import defaultdict, deque
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from small_policy.actor import Actor
+from small_policy.collect import IMAGE_PX, Mix, Record, run_worker
+from small_policy.memory import Memory
+from small_policy.scenes import NUM_TASKS
+from turbopi.normalize import Normalizer
+
+HARDER = (4, 9, 0, 7, 2, 6)  # scenes that get a further worker first
+_GATHER_S = 0.008  # how long a question waits for company
+
+
+def scene_of(worker: int) -> int:
+    """Every scene has as many workers as any other, but for the last few."""
+    round_, index = divmod(worker, NUM_TASKS)
+    return index if round_ % 2 == 0 else [*HARDER, *(s for s in range(NUM_TASKS) if s not in HARDER)][index]
+
+
+class Fleet(threading.Thread):
+    """Runs until `stop`. `log` receives one JSON line for each episode."""
+
+    def __init__(
+        self, workers: int, seed: int, memory: Memory, actor: Actor, scale: Normalizer, log: Path, output: Path
+    ) -> None:
+        super().__init__(daemon=True)
+        self.memory, self.actor, self.scale, self.log = memory, actor, scale, log
+        self.stopping = False
+        self.error: BaseException | None = None
+        self.ready = self.episodes = 0
+        self.trials: dict[int, deque[bool]] = defaultdict(lambda: deque(maxlen=12))
+        self.counts: dict[str, int] = defaultdict(int)
+        self._mix: Mix | None = None
+        self._weights_lock = threading.Lock()
+        context = multiprocessing.get_context("spawn")
+        self._pipes, self._processes = [], []
+        for worker in range(workers):
+            ours, theirs = context.Pipe()
+            arguments = (theirs, scene_of(worker), seed * 1000 + worker, str(output))
+            process = context.Process(target=_main, args=arguments, daemon=True)
+            process.start()
+            theirs.close()
+            self._pipes.append(ours)
+            self._processes.append(process)
+
+    def set_mix(self, mix: Mix) -> None:
+        self._mix = mix
+        for pipe in self._pipes:
+            try:
+                pipe.send(("mix", mix))
+            except OSError:
+                continue
+
+    def give(self, weights: dict[str, Any]) -> None:
+        """Newer weights for the learner at the wheel."""
+        with self._weights_lock:
+            self.actor.take(weights)
+
+    def stop(self) -> None:
+        self.stopping = True
+        self.join(timeout=10)
+        for process in self._processes:
+            process.kill()
+
+    def run(self) -> None:
+        try:
+            with self.log.open("a") as log:
+                self._serve(log)
+        except BaseException as error:
+            self.error = error
+            raise
+
+    def _serve(self, log: Any) -> None:
+        live = list(self._pipes)
+        asked: list[tuple[Any, np.ndarray, int]] = []
+        since = 0.0
+        while not self.stopping and live:
+            ready: list[Any] = connection.wait(live, timeout=0.002 if asked else 0.1)
+            for pipe in ready:
+                try:
+                    message = pipe.recv()
+                    if message[0] == "frames":
+                        self._take(message[1], pipe.recv_bytes(), log)
+                except (EOFError, OSError):
+                    live.remove(pipe)
+                    self.counts["lost workers"] += 1
+                    continue
+                if message[0] == "look":
+                    since = since if asked else time.monotonic()
+                    asked.append((pipe, message[1], message[2]))
+                elif message[0] == "ready":
+                    self.ready += 1
+            full = len(asked) >= self.actor.rows
+            if asked and (full or time.monotonic() - since > _GATHER_S):
+                self._answer(asked[: self.actor.rows])
+                asked = asked[self.actor.rows :]
+
+    def _answer(self, asked: list[tuple[Any, np.ndarray, int]]) -> None:
+        with self._weights_lock:
+            actions = self.actor.act(np.stack([one[1] for one in asked]), [one[2] for one in asked])
+        chunks = self.scale.unnormalize(actions)[..., :7]
+        for (pipe, _, _), chunk in zip(asked, chunks, strict=True):
+            try:
+                pipe.send(("chunk", chunk))
+            except OSError:
+                continue
+
+    def _take(self, record: Record, payload: bytes, log: Any) -> None:
+        n = len(record.chunks)
+        if n:
+            pictures = np.frombuffer(bytearray(payload), np.uint8).reshape(n, 2, IMAGE_PX, IMAGE_PX, 3)
+            self.counts[f"{record.kind} frames"] += self.memory.add(record, pictures)
+        self.counts[record.kind] += 1
+        self.counts[f"{record.kind} solved"] += record.success
+        if record.kind == "trial":
+            self.trials[record.setting.prompt].append(record.success)
+        setting = record.setting
+        line = {
+            "kind": record.kind,
+            "scene": setting.scene,
+            "prompt": setting.prompt,
+            "initial_state": setting.initial_state,
+            "moved_seed": setting.moved_seed,
+            "success": record.success,
+            "steps": record.steps,
+            "learner_steps": record.learner_steps,
+            "frames": n,
+        }
+        log.write(json.dumps(line) + "\n")
+        log.flush()
+
+
+def _main(pipe: Any, scene: int, seed: int, output: str) -> None:
+    with open(output, "ab") as file:  # simulators print
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    run_worker(pipe, scene, seed)
