@@ -1,134 +1,15 @@
 """The denoising kernel: its packing on the CPU, its results on a GPU against the same loop in plain PyTorch."""
 
 import dataclasses
-from functools import lru_cache
 from pathlib import Path
 
 import pytest
 import torch
-import torch.nn.functional as F
+from denoise_helpers import CONFIGS, FULL, GPU, Problem, has_nvrtc, ordinary_bf16, plain, problem, relative
 from torch import Tensor
 
-from turbopi.config import GemmaConfig, ModelConfig, preset
-from turbopi.engine.weights import GemmaLayer
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import denoise, nvrtc
-from turbopi.model.layers import apply_rope, rms_normalize, rope_tables
-
-FULL = preset("pi05_libero").model
-BF16 = torch.bfloat16
-
-
-def sized(width: int, mlp_dim: int, depth: int, head_dim: int, heads: int = 8) -> ModelConfig:
-    expert = GemmaConfig(width=width, mlp_dim=mlp_dim, depth=depth, head_dim=head_dim, num_heads=heads)
-    vlm = dataclasses.replace(FULL.vlm, depth=depth, head_dim=head_dim, num_heads=heads)
-    return dataclasses.replace(FULL, expert=expert, vlm=vlm)
-
-
-CONFIGS = {
-    "golden": sized(32, 64, 3, 16),
-    "tiny": sized(128, 256, 6, 32),
-    "odd": sized(160, 224, 2, 48, 4),
-    "shallow": sized(1024, 4096, 3, 256),
-    "full": FULL,
-}
-
-
-@dataclasses.dataclass
-class Problem:
-    """Random weights, modulation and inputs; the cache is NaN beyond the valid length."""
-
-    config: ModelConfig
-    layers: list[GemmaLayer]
-    small: dict[str, Tensor]
-    table: Tensor
-    noise: Tensor
-    cache_k: Tensor
-    cache_v: Tensor
-    length: int
-
-
-def problem(
-    name: str, steps: int, suffix: int, length: int, seed: int, device: torch.device, *, outliers: bool = False
-) -> Problem:
-    config = CONFIGS[name]
-    g, gen = config.expert, torch.Generator(device).manual_seed(seed)
-    heads = g.num_heads * g.head_dim
-
-    def random(*shape: int, std: float = 1.0, dtype: torch.dtype = torch.float32) -> Tensor:
-        return (torch.randn(*shape, generator=gen, device=device) * std).to(dtype)
-
-    layers = [
-        GemmaLayer(
-            qkv=random(heads + 2 * g.head_dim, g.width, std=g.width**-0.5, dtype=BF16),
-            out=random(g.width, heads, std=heads**-0.5, dtype=BF16),
-            gate_up=random(2 * g.mlp_dim, g.width, std=g.width**-0.5, dtype=BF16),
-            down=random(g.width, g.mlp_dim, std=1.5 * g.mlp_dim**-0.5, dtype=BF16),
-            norm1=None,
-            norm2=None,
-        )
-        for _ in range(g.depth)
-    ]
-    if outliers:  # one residual column and one input far above the rest, as in trained models
-        for layer in layers:
-            layer.down[3] *= 30
-            layer.qkv[:, 5] *= 4
-    small = {
-        "action_in_proj.weight": random(g.width, config.action_dim, std=config.action_dim**-0.5),
-        "action_in_proj.bias": random(g.width, std=0.1),
-        "action_out_proj.weight": random(config.action_dim, g.width, std=g.width**-0.5),
-        "action_out_proj.bias": random(config.action_dim, std=0.1),
-    }
-    table = random(steps, 2 * g.depth + 1, 3, g.width, std=0.3)
-    table[:, :, 0] += 1
-    table[:, :, 2] *= 2
-    cache = [random(g.depth, length + 7, g.head_dim, dtype=BF16) for _ in "kv"]
-    for part in cache:
-        part[:, length:] = torch.nan
-    noise = random(suffix, config.action_dim)
-    return Problem(config, layers, small, table, noise, cache[0], cache[1], length)
-
-
-def plain(p: Problem, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    noise = p.noise.to(dtype)
-    return denoise.denoise_plain(p.config, p.layers, p.small, p.table, noise, p.cache_k, p.cache_v, p.length)
-
-
-def ordinary_bf16(p: Problem) -> Tensor:
-    """The same with PyTorch's bfloat16 operations, as the reference rounds: what the kernel's error is measured by."""
-    g, suffix, x_t = p.config.expert, p.noise.shape[0], p.noise
-    positions = p.length + torch.arange(suffix, device=x_t.device)
-    cos, sin = (t[0, 0][:, None] for t in rope_tables(positions[None], g.head_dim, p.config.rope_base))
-
-    def normed(x: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
-        y = rms_normalize(x, p.config.rms_norm_eps) * modulation[0] + modulation[1]
-        return y.to(BF16), modulation[2].to(BF16)
-
-    def affine(name: str, x: Tensor) -> Tensor:
-        return F.linear(x, p.small[f"{name}.weight"], p.small[f"{name}.bias"])
-
-    for modulation in p.table:
-        x = affine("action_in_proj", x_t).to(BF16)
-        for i, layer in enumerate(p.layers):
-            y, gate = normed(x, modulation[2 * i])
-            parts = F.linear(y, layer.qkv).view(suffix, -1, g.head_dim)
-            rotated = apply_rope(parts[:, :-1], cos, sin)
-            keys = torch.cat((p.cache_k[i, : p.length], rotated[:, -1]))
-            values = torch.cat((p.cache_v[i, : p.length], parts[:, -1]))
-            q = rotated[:, :-1].reshape(-1, g.head_dim)
-            attended = ((q @ keys.T).float() * g.head_dim**-0.5).softmax(-1).to(BF16) @ values
-            x = x + F.linear(attended.view(suffix, -1), layer.out) * gate
-            y, gate = normed(x, modulation[2 * i + 1])
-            up_gate, up = F.linear(y, layer.gate_up).chunk(2, dim=-1)
-            x = x + F.linear(F.gelu(up_gate, approximate="tanh") * up, layer.down) * gate
-        v_t = affine("action_out_proj", normed(x, modulation[2 * g.depth])[0].float())
-        x_t = denoise.euler_step(x_t, v_t, p.table.shape[0])
-    return x_t
-
-
-def relative(x: Tensor, reference: Tensor) -> float:
-    return float((x.double() - reference.double()).norm() / reference.double().norm())
-
 
 # ---- on the CPU
 
@@ -199,15 +80,6 @@ def test_a_machine_without_gpu_is_refused() -> None:
         denoise.DenoiseKernel(p.config, p.layers, p.small, p.table, cache_rows=10, suffix=4, device=torch.device("cpu"))
 
 
-@lru_cache
-def has_nvrtc() -> bool:
-    try:
-        nvrtc.bindings("nvrtc").nvrtcVersion()
-    except (BackendError, RuntimeError):  # no package, or no library behind it
-        return False
-    return True
-
-
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 def test_the_source_compiles_for_hopper_and_is_kept(tmp_path: Path) -> None:
     sizes = denoise.kernel_sizes(CONFIGS["golden"], cache_rows=100, suffix=10, num_sms=132, shared_bytes=232448)
@@ -224,8 +96,6 @@ def test_a_source_that_does_not_compile_shows_the_compilers_log(tmp_path: Path) 
 
 
 # ---- on a GPU
-
-GPU = torch.device("cuda", 0)
 
 
 def run(p: Problem, kernel: denoise.DenoiseKernel) -> tuple[Tensor, Tensor]:

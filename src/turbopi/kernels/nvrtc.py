@@ -78,6 +78,29 @@ class Kernel:
         attribute = d.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
         _checked(d, d.cuFuncSetAttribute(self._function, attribute, shared_bytes))
 
+    def max_active_clusters(self, ranks: int, threads: int) -> int:
+        """How many clusters of `ranks` blocks the device holds at once."""
+        d = self._driver
+        attribute = d.CUlaunchAttribute()
+        attribute.id = d.CUlaunchAttributeID.CU_LAUNCH_ATTRIBUTE_CLUSTER_DIMENSION
+        attribute.value.clusterDim.x, attribute.value.clusterDim.y, attribute.value.clusterDim.z = ranks, 1, 1
+        config = d.CUlaunchConfig()
+        config.gridDimX, config.gridDimY, config.gridDimZ = ranks, 1, 1
+        config.blockDimX, config.blockDimY, config.blockDimZ = threads, 1, 1
+        config.sharedMemBytes = self._shared
+        config.attrs, config.numAttrs = [attribute], 1
+        return int(_checked(d, d.cuOccupancyMaxActiveClusters(self._function, config)))
+
+    def launch(self, blocks: int, threads: int, args: ctypes.Structure) -> None:
+        """Launch on PyTorch's current stream; `args` is the kernel's one parameter."""
+        d = self._driver
+        pointers = (ctypes.c_void_p * 1)(ctypes.addressof(args))
+        stream = torch.cuda.current_stream().cuda_stream
+        result = d.cuLaunchKernel(
+            self._function, blocks, 1, 1, threads, 1, 1, self._shared, stream, ctypes.addressof(pointers), 0
+        )
+        _checked(d, result)
+
     def launch_cooperative(self, blocks: int, threads: int, args: ctypes.Structure) -> None:
         """Launch on PyTorch's current stream, all blocks resident at once; `args` is the kernel's one parameter."""
         d = self._driver

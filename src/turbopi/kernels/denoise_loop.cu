@@ -1,0 +1,226 @@
+// Part 4 of 4: between steps, the loop, the kernel.
+
+constexpr int GROUPS = CONSUMERS / A, HELD = most(T, GROUPS);  // threads per action number, tokens each of them keeps
+
+// Thread (action number `out`, token group) keeps x_t[group + i * GROUPS][out].
+struct Actions {
+  int out, group;
+  float x[HELD];
+};
+
+// x_t to the stream: action_in_proj, this rank's slice, and x_t's copy in region H for it.
+__device__ __forceinline__ void embed(const Block& b, const Actions& actions, float4 (&x)[ITEMS_X],
+                                      const float* scale) {
+  float* xt = (float*)(b.smem + M_H);
+#pragma unroll
+  for (int i = 0; i < HELD; ++i) {
+    const int token = actions.group + i * GROUPS;
+    if (actions.group < GROUPS && token < T) xt[token * A + actions.out] = actions.x[i];
+  }
+  consumers_sync();
+#pragma unroll
+  for (int j = 0; j < ITEMS_X; ++j) {
+    const Item item = stream_item(b, j);
+    x[j] = make_float4(0, 0, 0, 0);
+    const int col = (b.x0() + item.tile) * 16 + 2 * b.g();
+    if (item.real) {
+      const float* w = b.a.in_w + size_t(col) * A;
+      const float* x0 = xt + item.token * A;
+      const float* x1 = xt + min(item.token + 1, T - 1) * A;
+      float4 c = make_float4(b.a.in_b[col], b.a.in_b[col], b.a.in_b[col + 1], b.a.in_b[col + 1]);
+#pragma unroll 4
+      for (int k = 0; k < A; k += 4) {
+        const float4 w0 = __ldg((const float4*)(w + k)), w1 = __ldg((const float4*)(w + A + k));
+        const float4 y0 = *(const float4*)(x0 + k), y1 = *(const float4*)(x1 + k);
+        c.x += w0.x * y0.x + w0.y * y0.y + w0.z * y0.z + w0.w * y0.w,
+            c.y += w0.x * y1.x + w0.y * y1.y + w0.z * y1.z + w0.w * y1.w;
+        c.z += w1.x * y0.x + w1.y * y0.y + w1.z * y0.z + w1.w * y0.w,
+            c.w += w1.x * y1.x + w1.y * y1.y + w1.z * y1.z + w1.w * y1.w;
+      }
+      x[j] = c;
+    }
+    __syncwarp();
+    if (b.attends()) {
+      const float2 s = __ldg((const float2*)(scale + col));
+      send_columns(b, M_X, b.x0() + item.tile, item.n,
+                   make_float4(x[j].x * s.x, x[j].y * s.x, x[j].z * s.y, x[j].w * s.y), BAR_X, item.real);
+    }
+  }
+  if (b.attends()) send_squares(b, x, BAR_X);
+}
+
+// Final norm, action_out_proj and the Euler step. Each rank's slice gives partial sums of v_t, which go to all ranks.
+// Region X is free for them: every rank's hidden units have come, so no gate|up sums are still being read there.
+__device__ __forceinline__ void advance(Block& b, Actions& actions, const float4 (&x)[ITEMS_X], const float* scale,
+                                        int step) {
+  float* xs = (float*)(b.smem + M_X + X_XS);
+#pragma unroll
+  for (int j = 0; j < ITEMS_X; ++j) {
+    const Item item = stream_item(b, j);
+    const float2 s = __ldg((const float2*)(scale + (b.x0() + item.tile) * 16 + 2 * b.g()));
+    float* p = xs + (item.tile * 16 + 2 * b.g()) * T + item.token;
+    if (item.real) p[0] = x[j].x * s.x, p[T] = x[j].z * s.y;
+    if (item.real && item.token + 1 < T) p[1] = x[j].y * s.x, p[T + 1] = x[j].w * s.y;
+  }
+  send_squares(b, x, BAR_V);
+  float sum[HELD];
+#pragma unroll
+  for (int i = 0; i < HELD; ++i) sum[i] = 0;
+  const bool active = actions.group < GROUPS && actions.group < T;
+  const u32 mine = (b.rank * T + actions.group) * A + actions.out;
+  if (active) {
+    const float* w = b.a.out_w + size_t(b.x0()) * 16 * A + actions.out;
+#pragma unroll(HELD == 1 ? 32 : 8)
+    for (int c = 0; c < b.xn() * 16; ++c) {
+      const float v = __ldg(w + c * A);
+#pragma unroll
+      for (int i = 0; i < HELD; ++i) sum[i] += v * xs[c * T + min(actions.group + i * GROUPS, T - 1)];
+    }
+#pragma unroll
+    for (int i = 0; i < HELD; ++i)
+      if (actions.group + i * GROUPS < T)
+#pragma unroll
+        for (int d = 0; d < S; ++d)
+          send(at_rank(b.base + M_X + X_VPART + (mine + i * GROUPS * A) * 4, d), __float_as_uint(sum[i]),
+               at_rank(b.bar(BAR_V), d));
+  }
+  receive(b, BAR_V, step, S * T * (A + 1) * 4, WAIT_V);
+  if (active) {
+    const float* parts = (const float*)(b.smem + M_X + X_VPART);
+    const float* squares = (const float*)(b.smem + M_SSQ);
+    const float shift = __ldg(b.a.out_shift + step * A + actions.out);
+#pragma unroll
+    for (int i = 0; i < HELD; ++i) {
+      const int token = actions.group + i * GROUPS, at = token * A + actions.out;
+      if (token < T) {
+        float v = 0, q = 0;
+#pragma unroll
+        for (int s = 0; s < S; ++s) v += parts[s * T * A + at], q += squares[s * NT * 8 + token];
+        v = v * rsqrtf(q * (1.0f / D) + b.a.eps) + shift;
+        actions.x[i] = __fadd_rn(actions.x[i], __fmul_rn(b.a.dt, v));
+        if (blockIdx.x == 0) {
+          b.a.v_t[size_t(step) * T * A + at] = v;
+          b.a.x_t[size_t(step + 1) * T * A + at] = actions.x[i];
+        }
+      }
+    }
+  }
+  if (step + 1 < b.a.steps) {  // a peer's next slice lands where this rank has read the partial sums
+    consumers_sync();
+    if (threadIdx.x < S)
+      asm volatile(
+          "mbarrier.arrive.release.cluster.shared::cluster.b64 _, [%0];" ::"r"(at_rank(b.bar(BAR_GO), threadIdx.x))
+          : "memory");
+    note(b, WAIT_GO);
+    mbar_wait(b.bar(BAR_GO), step & 1);
+  }
+}
+
+__device__ __forceinline__ u32 hidden_bytes(const Block& b) { return b.hn() * 16 * T * 2 + (IDLE ? S * 4 : 0); }
+
+__device__ __forceinline__ void consume(Block& b) {
+  const Args& a = b.a;
+  const int prefix = int(*a.length), cta = b.cluster * S + b.rank;
+  Actions actions;
+  actions.out = threadIdx.x % A, actions.group = threadIdx.x / A;
+#pragma unroll
+  for (int i = 0; i < HELD; ++i) {
+    const int token = actions.group + i * GROUPS, at = token * A + actions.out;
+    actions.x[i] = 0;
+    if (actions.group < GROUPS && token < T) {
+      actions.x[i] = a.noise[at];
+      if (blockIdx.x == 0) a.x_t[at] = actions.x[i];
+    }
+  }
+  float2 rope[ITEMS_Q][2];
+  make_rope(b, prefix, rope);
+  float4 x[ITEMS_X];
+  const u32 expect_hidden = hidden_bytes(b);
+#ifdef TP_TRACE
+  if (threadIdx.x < 64) ((u32*)(b.smem + M_RING - 256))[threadIdx.x] = threadIdx.x ? 0 : u32(clock64());
+  consumers_sync();
+#endif
+#pragma unroll 1
+  for (int step = 0; step < a.steps; ++step) {
+    const float* table = a.table + size_t(step) * (2 * L + 1) * 3 * D;
+    embed(b, actions, x, table);
+    MARK(19)
+#pragma unroll 1
+    for (int l = 0; l < L; ++l, ++b.n, table += 6 * D) {
+      const float* shifted = a.shifted + ((size_t(step) * L + l) * (NC * S) + cta) * TILES * 16;
+      const u32 bit = flag(b.n);
+#pragma unroll 1
+      for (int half = 0; half < 2; ++half) {  // attention, feed-forward; what they share is one piece of code
+        b.forget();
+        uint4* const buffer = a.scratch + (half ? B_X1 : B_X2) + (b.n & 1) * N_STREAM;
+        if (half || b.attends()) {
+          receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
+          b.x_parity ^= 1;
+          MARK(half ? 13 : 0)
+          if (half) {
+            gate_up(b, shifted);
+            MARK(16)
+            receive(b, BAR_HID, b.n, expect_hidden, WAIT_HID);
+            MARK(17)
+          } else {
+            float* const kv = (float*)(a.scratch + B_KV + (b.n & 1) * N_KV);
+            project(b, shifted, kv, bit, rope);
+            MARK(2)
+            attend(b, kv, bit, prefix);
+          }
+        }
+        float2 gates[ITEMS_X], scales[ITEMS_X];
+        load_columns(b, gates, table + (half ? 5 : 2) * D);
+        load_columns(b, scales, table + (half ? 6 : 3) * D);  // of the next norm, the final one behind the last layer
+        if (half || b.attends())
+          residual_product(b, b.smem + M_H + (half ? 0 : H_ATT), half ? b.hn() : QT, buffer, bit);
+        MARK(half ? 18 : 11)
+        note(b, half ? WAIT_X1 : WAIT_X2);
+        gather(b, x, buffer, half ? NC : NH, bit, gates, scales, !half || (l + 1 < L && b.attends()));
+        MARK(half ? 14 : 12)
+      }
+    }
+    advance(b, actions, x, table, step);
+    MARK(20)
+  }
+  note(b, FINISHED);
+#ifdef TP_TRACE
+  consumers_sync();
+  if (threadIdx.x < 64) a.trace[blockIdx.x * 64 + threadIdx.x] = ((u32*)(b.smem + M_RING - 256))[threadIdx.x];
+#endif
+}
+
+extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 1)
+    turbopi_denoise(const __grid_constant__ Args args) {
+  extern __shared__ __align__(128) byte smem[];
+  Block b(args, smem);
+  if (threadIdx.x == 0) {
+    note(b, WAIT_NONE);
+    for (u32 i = 0; i < STAGES; ++i) mbar_init(b.full(i), 1), mbar_init(b.empty(i), W);
+    for (int i = BAR_X; i <= BAR_V; ++i) mbar_init(b.bar(i), 1);
+    mbar_init(b.bar(BAR_GO), S);
+    asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
+    mbar_expect(b.bar(BAR_X), X_EXPECT);
+    mbar_expect(b.bar(BAR_Q), HD * T * 2);
+    mbar_expect(b.bar(BAR_COMB), S * T * 8 + S * b.qn() * ((T + 1) / 2) * 128);
+    mbar_expect(b.bar(BAR_ATT), HD * T * 2);
+    mbar_expect(b.bar(BAR_HID), hidden_bytes(b));
+    mbar_expect(b.bar(BAR_V), S * T * (A + 1) * 4);
+  }
+  __syncthreads();
+  cluster_sync();
+  if (b.warp < W) {  // 4 x 112 + 32 registers on each quarter of the multiprocessor are what 5 x 96 were at launch
+    asm volatile("setmaxnreg.inc.sync.aligned.u32 112;");
+    consume(b);
+  } else {
+    asm volatile("setmaxnreg.dec.sync.aligned.u32 32;");
+    if (b.warp == W) {
+      Producer producer(b);
+      producer.run();
+    } else if (b.warp == W + 1) {
+      watch(b);
+    }
+  }
+  __syncwarp();
+  cluster_sync();  // nobody leaves while a peer may still write to it
+}

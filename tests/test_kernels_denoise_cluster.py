@@ -1,0 +1,265 @@
+"""The denoising kernel of clusters: its packing on the CPU, its results on a GPU against the loop in plain PyTorch."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from denoise_helpers import CONFIGS, FULL, GPU, Problem, has_nvrtc, ordinary_bf16, plain, problem, relative
+from torch import Tensor
+
+from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.kernels import denoise, nvrtc
+from turbopi.kernels import denoise_cluster as dc
+
+CPU = torch.device("cpu")
+
+# ---- on the CPU
+
+
+# as many clusters as heads, and numbers that divide nothing
+ARRANGEMENTS = [(name, n) for name in ("golden", "tiny", "odd") for n in (CONFIGS[name].expert.num_heads, 9, 15)]
+
+
+@pytest.mark.parametrize(("name", "clusters"), ARRANGEMENTS)
+def test_packing_keeps_every_weight(name: str, clusters: int) -> None:
+    p = problem(name, 1, 1, 3, 0, CPU)
+    packed = dc.PackedExpert.pack(p.config, p.layers, clusters)
+    for i, layer in enumerate(p.layers):
+        matrices = layer.qkv, layer.out, layer.gate_up, layer.down
+        assert all(torch.equal(a, b) for a, b in zip(packed.matrices(i), matrices, strict=True))
+
+
+@pytest.mark.parametrize(("name", "clusters"), ARRANGEMENTS)
+def test_every_row_has_one_owner(name: str, clusters: int) -> None:
+    a = dc.Arrangement(CONFIGS[name], clusters)
+    g = a.config.expert
+    ctas = [(cluster, rank) for cluster in range(clusters) for rank in range(dc.RANKS)]
+    qkv = torch.cat([rows(*cta).flatten() for cta in ctas for rows in (a.query_rows, a.key_value_rows)])
+    assert sorted(qkv.tolist()) == list(range((g.num_heads + 2) * g.head_dim))
+    gate_up = torch.cat([a.gate_up_rows(*cta).flatten() for cta in ctas])
+    assert sorted(gate_up.tolist()) == list(range(2 * g.mlp_dim))
+    stream = torch.cat([a.stream_rows(rank).flatten() for rank in range(dc.RANKS)])
+    assert sorted(stream.tolist()) == list(range(g.width))
+    assert [unit for cluster in range(clusters) for unit in a.hidden(cluster)] == list(range(g.mlp_dim))
+
+
+def test_a_fragment_has_a_lanes_rows_and_columns_as_the_tensor_cores_take_them() -> None:
+    matrix = torch.arange(16 * 32).view(1, 16, 32)
+    lanes = dc.fragments(matrix, 1, True, -1)[: 2 * 256].view(2, 8, 4, 8)  # [block][g][t][values]
+    block, g, t = 1, 5, 2
+    columns = (block * 16 + 4 * t + torch.tensor([0, 1])).tolist()
+    expected = [matrix[0, row, c + half] for half in (0, 2) for row in (g, g + 8) for c in columns]
+    assert lanes[block, g, t].tolist() == [int(x) for x in expected]
+
+
+def multiply(stream: Tensor, x: Tensor, tiles: int, max_tiles: int, wide: bool) -> tuple[Tensor, int]:
+    """What a CTA makes of its next product: ([tiles, 16] sums, elements read). Reads as denoise_product.cu does."""
+    blocks = len(x) // 16
+    sums, at = torch.zeros(max_tiles, 16, dtype=torch.float64), 0
+    first = 0
+    while first < tiles:
+        size = next(n for n in (8, 4, 2, 1) if max_tiles - first >= n)
+        per_warp = 2 if wide and size == 8 else 1
+        rows, parts = size // per_warp, 16 * per_warp // size
+        for step in range(-(-blocks // parts)):
+            for j in range(per_warp):
+                for warp in range(16):
+                    fragment = stream[at : at + 256].view(8, 4, 2, 2, 2).double()  # [g][t][half][g or g + 8][2]
+                    at += 256
+                    tile, block = first + j * rows + warp // parts, step * parts + warp % parts
+                    if block < blocks:
+                        columns = x[block * 16 : block * 16 + 16].view(4, 2, 2)  # [t][half][2]
+                        sums[tile] += torch.einsum("gthrj,thj->rg", fragment, columns).reshape(16)
+        first += size
+    return sums[:tiles], at
+
+
+@pytest.mark.parametrize(("name", "clusters"), [("golden", 8), ("odd", 4), ("odd", 9)])
+def test_ctas_products_add_up_to_the_layers(name: str, clusters: int) -> None:
+    p = problem(name, 1, 1, 3, 0, CPU)
+    g, layer = p.config.expert, p.layers[1]
+    packed = dc.PackedExpert.pack(p.config, p.layers, clusters)
+    a = packed.arrangement
+    gen = torch.Generator().manual_seed(1)
+    x, attended, hidden = (torch.randn(n, generator=gen).double() for n in (g.width, 4096, g.mlp_dim))
+    attended = attended[: g.num_heads * g.head_dim]
+    queries, keys_values, gates, slice_tiles = a.max_tiles
+    qkv, gate_up = (torch.full((len(m),), torch.nan).double() for m in (layer.qkv, layer.gate_up))
+    out, down = torch.zeros(g.width).double(), torch.zeros(g.width).double()
+    ends = [*packed.starts.tolist()[1:], packed.weights.stride(0) * 2]
+    for cta, (start, end) in enumerate(zip(packed.starts.tolist(), ends, strict=True)):
+        cluster, rank = divmod(cta, dc.RANKS)
+        stream = packed.weights[1, start // 2 : end // 2]
+        rows, units = a.stream_rows(rank), a.hidden(cluster)
+        if cluster < g.num_heads:
+            for mine, most in ((a.query_rows(cluster, rank), queries), (a.key_value_rows(cluster, rank), keys_values)):
+                qkv[mine], read = multiply(stream, x, len(mine), most, True)
+                stream = stream[read:]
+            sums, read = multiply(stream, attended[a.out_columns(cluster)], len(rows), slice_tiles, False)
+            out[rows] += sums
+            stream = stream[read:]
+        mine = a.gate_up_rows(cluster, rank)
+        gate_up[mine], read = multiply(stream, x, len(mine), gates, True)
+        stream = stream[read:]
+        sums, read = multiply(stream, hidden[units.start : units.stop], len(rows), slice_tiles, False)
+        down[rows] += sums
+        assert read == len(stream)
+    torch.testing.assert_close(qkv, layer.qkv.double() @ x)
+    torch.testing.assert_close(gate_up, layer.gate_up.double() @ x)
+    torch.testing.assert_close(out, layer.out.double() @ attended)
+    torch.testing.assert_close(down, layer.down.double() @ hidden)
+
+
+def test_shift_table_is_the_shift_through_the_matrices() -> None:
+    p = problem("tiny", 2, 1, 3, 1, CPU)
+    packed = dc.PackedExpert.pack(p.config, p.layers)
+    a = packed.arrangement
+    shifted = dc.shifted_rows(packed, p.table)
+    rows = a.gate_up_rows(5, 3)
+    expected = p.layers[4].gate_up.float()[rows] @ p.table[1, 9, 1]
+    first = a.max_tiles[0] + a.max_tiles[1]
+    torch.testing.assert_close(shifted[1, 4, 5 * dc.RANKS + 3, first : first + len(rows)], expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"width": 1000}, "multiples of 16: width 1000"),
+        ({"head_dim": 40, "num_heads": 4}, "multiple of 16 up to 256, it is 40"),
+        ({"head_dim": 512}, "multiple of 16 up to 256, it is 512"),
+    ],
+)
+def test_sizes_it_does_not_cover_are_named(changes: dict[str, int], text: str) -> None:
+    g = dataclasses.replace(FULL.expert, **changes)
+    vlm = dataclasses.replace(FULL.vlm, head_dim=g.head_dim, num_heads=g.num_heads)
+    with pytest.raises(BackendError, match=text):
+        dc.PackedExpert.pack(dataclasses.replace(FULL, expert=g, vlm=vlm), [])
+
+
+def test_pi0_is_refused_by_name() -> None:
+    with pytest.raises(BackendError, match="this model is pi0"):
+        dc.PackedExpert.pack(dataclasses.replace(FULL, kind="pi0"), [])
+
+
+def test_fewer_clusters_than_heads_are_refused() -> None:
+    p = problem("golden", 1, 1, 3, 0, CPU)
+    with pytest.raises(BackendError, match="7 clusters are fewer than the model's 8 heads"):
+        dc.PackedExpert.pack(p.config, p.layers, 7)
+
+
+def test_a_machine_without_gpu_is_refused() -> None:
+    p = problem("golden", 1, 4, 3, 0, CPU)
+    with pytest.raises(BackendUnavailable, match="needs an NVIDIA GPU"):
+        dc.DenoiseKernel(p.config, p.layers, p.small, p.table, cache_rows=10, suffix=4, device=CPU)
+
+
+@pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
+@pytest.mark.parametrize(("name", "clusters", "suffix"), [("golden", 8, 10), ("odd", 9, 33), ("full", 8, 10)])
+def test_the_source_compiles_for_hopper(tmp_path: Path, name: str, clusters: int, suffix: int) -> None:
+    arrangement = dc.Arrangement(CONFIGS[name], clusters)
+    sizes = dc.kernel_sizes(arrangement, cache_rows=968, suffix=suffix, shared_bytes=232448)
+    assert nvrtc.compile_cubin(dc.source(), "sm_90a", sizes, folder=tmp_path)
+
+
+# ---- on a GPU
+
+
+def run(p: Problem, kernel: dc.DenoiseKernel) -> tuple[Tensor, Tensor]:
+    """Both outputs, poisoned before."""
+    steps, chunk = p.table.shape[0], p.noise.shape
+    x_t = torch.full((steps + 1, *chunk), torch.nan, device=GPU)
+    v_t = torch.full((steps, *chunk), torch.nan, device=GPU)
+    length = torch.tensor([p.length], device=GPU)
+    kernel.launch(p.noise, p.cache_k, p.cache_v, length, x_t, v_t)
+    torch.cuda.synchronize()
+    return x_t, v_t
+
+
+def kernel_of(p: Problem, clusters: int | None = None) -> dc.DenoiseKernel:
+    packed = dc.PackedExpert.pack(p.config, p.layers, clusters)
+    rows, suffix = p.cache_k.shape[1], p.noise.shape[0]
+    return dc.DenoiseKernel(p.config, packed, p.small, p.table, cache_rows=rows, suffix=suffix, device=GPU)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    ("name", "steps", "suffix", "length", "clusters"),
+    [
+        ("golden", 3, 10, 37, None),
+        ("golden", 1, 1, 5, None),
+        ("golden", 10, 50, 77, None),
+        ("tiny", 3, 10, 300, None),
+        ("odd", 3, 16, 101, None),
+        ("odd", 2, 33, 256, 9),
+        ("shallow", 1, 1, 304, None),
+        ("shallow", 3, 10, 571, None),
+        ("shallow", 3, 10, 571, 15),
+        ("shallow", 2, 16, 968, None),
+        ("shallow", 2, 17, 77, None),
+        ("shallow", 2, 24, 968, None),
+        ("shallow", 3, 50, 968, None),
+        ("shallow", 1, 56, 1000, None),
+        ("shallow", 3, 10, 1, None),
+        ("full", 10, 10, 559, None),
+        ("full", 3, 50, 560, None),
+    ],
+)
+@pytest.mark.parametrize("outliers", [False, True])
+def test_kernel_is_as_exact_as_ordinary_bf16(
+    name: str, steps: int, suffix: int, length: int, clusters: int | None, outliers: bool
+) -> None:
+    p = problem(name, steps, suffix, length, steps * 1000 + suffix, GPU, outliers=outliers)
+    x_t, v_t = run(p, kernel_of(p, clusters))
+    reference, _ = plain(p, torch.float64)
+    assert x_t.isfinite().all() and v_t.isfinite().all()
+    assert torch.equal(x_t[0], p.noise)
+    torch.testing.assert_close(x_t[1:], denoise.euler_step(x_t[:-1], v_t, steps), rtol=0, atol=0)
+    assert relative(x_t[-1], reference[-1]) <= 1.1 * relative(ordinary_bf16(p), reference[-1])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("suffix", [10, 33, 50])
+def test_it_repeats_itself_bit_by_bit(suffix: int) -> None:
+    p = problem("shallow", 2, suffix, 600, 5, GPU)
+    kernel = kernel_of(p)
+    first = run(p, kernel)
+    assert all(torch.equal(a, b) for _ in range(20) for a, b in zip(first, run(p, kernel), strict=True))
+
+
+@pytest.mark.gpu
+def test_one_kernel_serves_many_lengths() -> None:
+    p = problem("shallow", 3, 10, 600, 5, GPU)
+    kernel = kernel_of(p)
+    for p.length in (600, 1, 7, 8, 15, 16, 17, 128, 304, 512, 513, 599):
+        p.noise = torch.randn_like(p.noise)
+        assert relative(run(p, kernel)[0][-1], plain(p, torch.float64)[0][-1]) < 0.01
+
+
+@pytest.mark.gpu
+def test_replays_of_a_captured_graph_read_inputs_anew() -> None:
+    p = problem("shallow", 3, 10, 500, 6, GPU)
+    kernel, length = kernel_of(p), torch.tensor([500], device=GPU)
+    x_t, v_t = torch.empty(4, 10, 32, device=GPU), torch.empty(3, 10, 32, device=GPU)
+    stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+    with torch.cuda.stream(stream):
+        kernel.launch(p.noise, p.cache_k, p.cache_v, length, x_t, v_t)
+    stream.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream):
+        kernel.launch(p.noise, p.cache_k, p.cache_v, length, x_t, v_t)
+    for p.length in (500, 123):
+        p.noise.normal_()
+        length.fill_(p.length)
+        x_t.fill_(torch.nan)
+        graph.replay()
+        torch.cuda.synchronize()
+        assert torch.equal(x_t, run(p, kernel)[0])
+        assert relative(x_t[-1], plain(p, torch.float64)[0][-1]) < 0.01
+
+
+@pytest.mark.gpu
+def test_too_many_suffix_tokens_are_refused() -> None:
+    p = problem("golden", 1, 57, 3, 0, GPU)
+    with pytest.raises(BackendError, match="1 to 56 suffix tokens, not 57"):
+        kernel_of(p)
