@@ -2,20 +2,35 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
 
+from turbopi.bench import barrier, profile
 from turbopi.bench.floors import Floors
-from turbopi.bench.measure import Latency, Observations, bench_policy, error_against
-from turbopi.bench.run import stage_floors
+from turbopi.bench.measure import (
+    FEWEST,
+    Latency,
+    Observations,
+    answers,
+    at_horizon,
+    bench_policy,
+    error_against,
+    measure_calls,
+)
+from turbopi.bench.ready import Start, empty_caches, measure_ready
+from turbopi.bench.report import report
+from turbopi.bench.run import Plan, stage_floors
+from turbopi.bench.summary import linear_models
 from turbopi.bench.work import Job, Work, floor_ms, stage_work
 from turbopi.checkpoint import random_checkpoint
 from turbopi.cli import app
 from turbopi.config import ModelConfig
-from turbopi.errors import ConfigError
+from turbopi.errors import BackendError, BackendUnavailable, ConfigError
+from turbopi.kernels.nvrtc import bindings, compile_cubin
 from turbopi.policy import UnifiedPolicy
 
 CPU = torch.device("cpu")
@@ -72,6 +87,11 @@ def test_an_impossible_number_of_cameras_is_refused(policy: UnifiedPolicy) -> No
         Observations(policy, Job(cameras=4))
 
 
+def test_a_prompt_longer_than_the_model_reads_is_refused(policy: UnifiedPolicy) -> None:
+    with pytest.raises(ConfigError, match="reads 1 to 200 prompt tokens; a job can't have 201"):
+        Observations(policy, Job(prompt_tokens=201))
+
+
 def test_percentiles() -> None:
     latency = Latency.of([float(value) for value in range(1, 101)])
     assert latency.calls == 100
@@ -79,30 +99,151 @@ def test_percentiles() -> None:
     assert latency.percentiles[99] == pytest.approx(99.01)
 
 
+def test_a_measurement_ends_early_but_has_its_fewest_calls(policy: UnifiedPolicy) -> None:
+    job, done = Job(cameras=1, prompt_tokens=3, steps=1), []
+    latency = measure_calls(policy, job, 1000, seconds=0.0, advance=lambda: done.append(1))
+    assert latency["total"].calls == FEWEST
+    assert len(done) == FEWEST + 3
+
+
+def test_another_horizon_shares_the_backend(policy: UnifiedPolicy) -> None:
+    other = at_horizon(policy, 7)
+    assert other.backend is policy.backend
+    assert answers(other, Job(cameras=1, horizon=7, steps=1), observations=1).shape[:2] == (1, 7)
+    assert answers(policy, Job(cameras=1, steps=1), observations=1).shape[:2] == (1, 10)
+
+
 def test_the_oracle_has_no_error_against_itself(policy: UnifiedPolicy) -> None:
-    assert error_against(policy, policy, Job(steps=1), observations=1)["max"] == 0
+    exact = answers(policy, Job(steps=1), observations=1)
+    assert error_against(answers(policy, Job(steps=1), observations=1), exact)["max"] == 0
     rounded = bench_policy(random_checkpoint("pi05_tiny"), "pytorch", "bf16", CPU, Job(steps=1))
-    assert 1e-4 < error_against(rounded, policy, Job(steps=1), observations=1)["relative_rms"] < 0.1
+    error = error_against(answers(rounded, Job(steps=1), observations=1), exact)
+    assert 1e-4 < error["relative_rms"] < 0.1
+
+
+TABLE = Plan(["fused"], ["bf16"], (1, 2, 3), (48, 200), (10, 50), (1, 2, 3, 5, 10), beside=["pytorch"])
+
+
+def test_the_table_has_sixty_jobs_and_the_others_run_the_main_one() -> None:
+    assert TABLE.main == Job()
+    assert [(name, len(jobs)) for _, name, jobs in TABLE.policies()] == [("fused", 60), ("pytorch", 1)]
+    assert TABLE.total_calls == 61 * 103
+    assert sum(map(TABLE.judges, TABLE.jobs())) == 10  # five numbers of steps, two horizons
+
+
+def test_many_calls_are_for_the_main_job_of_the_main_backends() -> None:
+    plan = Plan(["fused"], ["bf16"], steps=(1, 10), beside=["pytorch"], calls=5, main_calls=50)
+    assert plan.calls_of("fused", plan.main) == 50
+    assert plan.calls_of("pytorch", plan.main) == plan.calls_of("fused", Job(steps=1)) == 5
+
+
+def test_the_main_job_is_the_usual_one_or_the_nearest() -> None:
+    assert Plan(["x"], ["bf16"], (1, 3), (7, 48), (5,), (1, 3)).main == Job(1, 48, 5, 3)
+
+
+def test_a_backend_is_left_out_only_in_one_of_several_precisions() -> None:
+    both = Plan(["pytorch"], ["bf16", "f32"], beside=["onnx"])
+    assert [(precision, name) for precision, name, _ in both.policies()] == [
+        ("bf16", "pytorch"),
+        ("f32", "pytorch"),
+        ("f32", "onnx"),
+    ]
+    both.check(CPU)
+    with pytest.raises(ConfigError, match="onnx"):
+        Plan(["onnx"], ["bf16"]).check(CPU)
+
+
+def test_the_line_over_steps_is_found() -> None:
+    results = [
+        {
+            "backend": "x",
+            "precision": "bf16",
+            "job": {"cameras": 2, "prompt_tokens": 48, "horizon": 10, "steps": steps},
+            "milliseconds": {"total": {"p50": 5 + 0.25 * steps}},
+        }
+        for steps in (1, 3, 10)
+    ]
+    (line,) = linear_models(results)
+    assert (line["a_ms"], line["b_ms"]) == pytest.approx((5, 0.25))
+    assert line["worst_ms"] == pytest.approx(0, abs=1e-9)
+    assert linear_models(results[:1]) == []
+
+
+def test_kernels_that_wait_for_each_other_are_counted_once() -> None:
+    """The second one was launched early and waited until 10: it added 5 of its 12 microseconds."""
+    ran = profile.in_turn([("a", 0.0, 10.0), ("b", 3.0, 15.0), ("c", 20.0, 21.0), ("inside", 4.0, 9.0)])
+    assert {one.name: one.busy_us for one in ran} == {"inside": 5.0, "a": 1.0, "b": 5.0, "c": 1.0}
+
+
+def test_kernels_belong_to_the_stage_in_which_they_ran() -> None:
+    ran = [profile.Ran(name, start, 1.0) for name, start in (("v", 0.0), ("p", 10.0), ("d", 20.0), ("after", 99.0))]
+    parts = profile.split(ran, [0.0, 9.0, 19.0, 30.0])
+    assert [[one.name for one in part] for part in parts] == [["v"], ["p"], ["d", "after"]]
+    top = profile.top([profile.Ran("x", 0, 300.0), profile.Ran("x", 1, 100.0), profile.Ran("y", 2, 100.0)], 2, 1)
+    assert (top["busy_ms"], top["launches"]) == (0.25, 1.5)
+    assert top["kernels"] == [{"kernel": "x", "ms_per_call": 0.2, "launches_per_call": 1.0, "share": 0.8}]
+
+
+def has_nvrtc() -> bool:
+    try:
+        bindings("nvrtc").nvrtcVersion()
+    except (BackendUnavailable, RuntimeError):
+        return False
+    return True
+
+
+@pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
+@pytest.mark.parametrize("arch", ["sm_80", "sm_90"])
+def test_the_barrier_kernel_compiles(arch: str, tmp_path: Path) -> None:
+    assert b"turbopi_barriers" in compile_cubin(barrier.SOURCE, arch, {}, folder=tmp_path)
+
+
+def test_ready_is_measured_in_a_process_of_its_own() -> None:
+    start = Start(None, "pi05_tiny", 0, None, "pytorch", "bf16", "cpu", 1, None)
+    with empty_caches():
+        measured = measure_ready(start)
+    assert set(measured) == {"cold", "cached"}
+    for one in measured.values():
+        assert one["ready"] == pytest.approx(one["import"] + one["load"] + one["warmup"], abs=0.02)
+        assert one["import"] > 0
+
+
+def test_a_start_that_fails_says_why() -> None:
+    start = Start(None, "pi05_tiny", 0, None, "warp", "bf16", "cpu", 1, None)
+    with pytest.raises(BackendError, match="unknown backend 'warp'"):
+        measure_ready(start)
 
 
 def test_the_command_writes_a_complete_document(tmp_path: Path) -> None:
-    options = "--random-weights pi05_tiny --calls 2 --steps 1,2 --cameras 1 --device cpu --profile --json"
-    result = CliRunner().invoke(app, ["bench", *options.split(), "--report", str(tmp_path)])
+    options = "--random-weights pi05_tiny --calls 2 --main-calls 3 --steps 1,2 --cameras 1 --horizons 7,10 --device cpu"
+    more = ["--beside", "pytorch", "--profile", "--json", "--report", str(tmp_path)]
+    result = CliRunner().invoke(app, ["bench", *options.split(), *more])
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
     assert document["random_weights"] is True
     assert document["provenance"]["commit"]
-    assert [one["job"]["steps"] for one in document["results"]] == [1, 2]
+    assert [(one["job"]["horizon"], one["job"]["steps"]) for one in document["results"]] == [
+        (7, 1),
+        (7, 2),
+        (10, 1),
+        (10, 2),
+    ]
     for one in document["results"]:
         times = one["milliseconds"]
-        assert one["calls"] == 2
+        assert one["calls"] == (3 if one["job"] == document["main_job"] else 2)
         assert times["device"]["p50"] <= times["infer"]["p50"] <= times["total"]["p50"]
         assert one["times_floor"] == pytest.approx(times["total"]["p50"] / one["floor_ms"]["total"])
         assert 1e-4 < one["error_against_f32"]["relative_rms"] < 0.1
-    assert document["profile"][0]["kernels"][0]["ms_per_call"] > 0
+    stages = document["profile"][0]["stages"]
+    assert set(stages) == {"vision", "prefix", "denoise"}
+    assert all(stage["kernels"][0]["ms_per_call"] > 0 for stage in stages.values())
+    assert [line["horizon"] for line in document["linear"]] == [7, 10]
     assert json.loads((tmp_path / "results.json").read_text())["floors"] == document["floors"]
-    assert (tmp_path / "stages.png").stat().st_size > 5000
-    assert (tmp_path / "steps.png").stat().st_size > 5000
+    for plot in ("stages.png", "steps.png", "roofline.png"):
+        assert (tmp_path / plot).stat().st_size > 5000
+    page = (tmp_path / "report.md").read_text()
+    assert page == report(document)
+    assert f"{document['results'][3]['milliseconds']['total']['p50']:.2f}" in page
 
 
 @pytest.mark.parametrize(
@@ -118,3 +259,27 @@ def test_wrong_options_are_refused(arguments: list[str], message: str) -> None:
     result = CliRunner().invoke(app, ["bench", "--random-weights", "pi05_tiny", "--device", "cpu", *arguments])
     assert result.exit_code == 2
     assert message in result.output
+
+
+def test_a_backend_that_breaks_is_named_and_costs_no_other_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    from turbopi.bench import run as bench_run
+
+    whole = bench_run._policy
+
+    def without_bf16(checkpoint: Any, plan: Any, backend: str, precision: Any, device: Any) -> UnifiedPolicy:
+        if precision == "bf16":
+            raise BackendError("the workspace is too small")
+        return whole(checkpoint, plan, backend, precision, device)
+
+    monkeypatch.setattr(bench_run, "_policy", without_bf16)
+    command = "bench --random-weights pi05_tiny --device cpu --calls 2 --steps 1 --no-error --json --precisions"
+    result = CliRunner().invoke(app, [*command.split(), "bf16,f32"])
+    assert result.exit_code == 1
+    document = json.loads(result.stdout)
+    assert document["failed"] == [
+        {"backend": "pytorch", "precision": "bf16", "error": "the workspace is too small"},
+    ]
+    assert [one["precision"] for one in document["results"]] == ["f32"]
+    result = CliRunner().invoke(app, [*command.split(), "bf16"])
+    assert result.exit_code == 2
+    assert "the workspace is too small" in result.output

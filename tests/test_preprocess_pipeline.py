@@ -15,6 +15,7 @@ from turbopi.checkpoint.norm_stats import FeatureStats, NormStats, load_norm_sta
 from turbopi.config import CAMERAS, PRESETS, ModelConfig, Normalization, PolicyConfig, preset
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.images import resize_unit_into
+from turbopi.observation import Observation
 from turbopi.preprocess import Pipeline
 from turbopi.robots import Robot, RobotInputs
 from turbopi.tokenizer import PromptTokenizer, prompt_texts
@@ -419,3 +420,38 @@ def test_examples_are_the_same_for_the_same_seed_only() -> None:
     edges = pipeline(LIBERO)
     np.testing.assert_equal(edges.example(4), edges.example(4))
     assert (edges.example(4)["observation/image"] != edges.example(5)["observation/image"]).any()
+
+
+@pytest.mark.parametrize("resize", ["openpi", "lerobot"])
+def test_every_pixel_is_written(resize: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Padding and missing cameras are black, whatever the memory held before."""
+    config = dataclasses.replace(PLAIN, image_resize=resize)
+    wide = np.full((60, 224, 3), 200, np.uint8)
+    observation = {"images": {CAMERAS[0]: wide, CAMERAS[1]: np.full((224, 224, 3), 9, np.uint8)}, "state": np.zeros(8)}
+    clean = pipeline(config, default_prompt="x").before(observation)[0].images
+    empty = np.empty
+
+    def poisoned(*args: Any, **options: Any) -> np.ndarray:
+        out = empty(*args, **options)
+        out.fill(77)
+        return out
+
+    monkeypatch.setattr(np, "empty", poisoned)
+    images = pipeline(config, default_prompt="x").before(observation)[0].images
+    np.testing.assert_array_equal(images, clean)
+    black = 0 if resize == "openpi" else -1
+    assert (images[2] == black).all()
+    assert (images[0, :60] == black).all()
+    assert not (images[0, 112] == black).any()
+
+
+def test_a_single_observation_isnt_copied_and_several_are() -> None:
+    inputs, _ = pipeline(PLAIN, default_prompt="x").before(
+        {"images": {CAMERAS[0]: np.zeros((8, 8, 3), np.uint8)}, "state": np.zeros(8)}
+    )
+    one, two = Observation.stack([inputs]), Observation.stack([inputs, inputs])
+    assert np.shares_memory(one.images.numpy(), inputs.images)
+    assert not np.shares_memory(two.images.numpy(), inputs.images)
+    for name in ("images", "image_mask", "tokens", "token_mask", "state"):
+        np.testing.assert_array_equal(getattr(one, name).numpy()[0], getattr(inputs, name))
+        np.testing.assert_array_equal(getattr(two, name).numpy()[1], getattr(inputs, name))

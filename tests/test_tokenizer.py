@@ -208,3 +208,11 @@ def test_the_script_makes_the_same_file_each_time() -> None:
 
 def test_the_tiny_tokenizer_is_part_of_the_package() -> None:
     assert TINY_TOKENIZER.parent.parent == Path(tokenizer.__file__).parent
+
+
+def test_the_newline_behind_a_prompt_is_encoded_once() -> None:
+    encoder = ByteTokenizer()
+    prompts = PromptTokenizer(encoder, vocab_size=512)
+    ids = [prompts.encode(prompt) for prompt in ("open", "close")]
+    assert encoder.calls == [["open", True], ["\n", False], ["close", True]]
+    assert ids == [[*encoder.encode(prompt, True), *encoder.encode("\n", False)] for prompt in ("open", "close")]

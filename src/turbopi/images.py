@@ -59,7 +59,7 @@ def check_image(value: Any, name: str) -> np.ndarray:
         image = np.asarray(value)
     except Exception as error:
         raise ObservationError(f"{name} isn't a picture: {error}") from error
-    if image.dtype != np.uint8 and not np.issubdtype(image.dtype, np.floating):
+    if image.dtype != np.uint8 and image.dtype.kind != "f":
         raise ObservationError(f"{name} has dtype {image.dtype}; send uint8 in [0, 255] or float in [0, 1]")
     if image.ndim != 3:
         raise ObservationError(

@@ -133,5 +133,8 @@ def _shifted(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool], sign:
 
 def pad_last(x: np.ndarray, width: int) -> np.ndarray:
     """[..., d] padded with zeros to [..., width]; wider stays as it is. The dtype is kept."""
-    missing = width - x.shape[-1]
-    return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)]) if missing > 0 else x
+    if x.shape[-1] >= width:
+        return x
+    out = np.zeros((*x.shape[:-1], width), x.dtype)  # as np.pad, which takes 20 us
+    out[..., : x.shape[-1]] = x
+    return out

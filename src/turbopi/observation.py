@@ -49,10 +49,16 @@ class Observation:
 
     @classmethod
     def stack(cls, inputs: Sequence[ModelInputs], device: torch.device | str = "cpu") -> "Observation":
-        """Batch one or more preprocessed observations and put them on `device`."""
+        """Batch one or more preprocessed observations and put them on `device`.
+
+        One on the host stays where it is: its tensors share the memory of its arrays.
+        """
 
         def stacked(name: str) -> Tensor:
-            return torch.from_numpy(np.stack([getattr(item, name) for item in inputs])).to(device)
+            arrays = [getattr(item, name) for item in inputs]
+            batch = arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
+            tensor = torch.from_numpy(batch)
+            return tensor if device == "cpu" else tensor.to(device)
 
         return cls(*(stacked(name) for name in ("images", "image_mask", "tokens", "token_mask", "state")))
 

@@ -155,12 +155,16 @@ class Pipeline:
         size = self.config.model.vision.image_size
         shape = (len(cameras), size, size, 3)
         unit = self.config.image_resize == "lerobot"
-        sample.images = np.full(shape, -1, np.float32) if unit else np.zeros(shape, np.uint8)  # black
+        black, dtype = (-1, np.float32) if unit else (0, np.uint8)
+        sample.images = np.empty(shape, dtype)
         sample.image_mask = np.array([present.get(camera, camera in pictures) for camera in cameras], np.bool_)
         for camera, valid, out in zip(cameras, sample.image_mask, sample.images, strict=True):
             if not valid:
+                out.fill(black)
                 continue
             picture = check_hwc(pictures.get(camera), camera)
+            if picture.shape != out.shape:
+                out.fill(black)  # what stays of it is the padding
             if unit:
                 resize_unit_into(picture, out)
             else:

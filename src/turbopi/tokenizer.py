@@ -63,6 +63,7 @@ class PromptTokenizer:
     def __init__(self, encoder: Encoder, *, vocab_size: int, source: str = "given object") -> None:
         self.encoder, self.vocab_size, self.source = encoder, vocab_size, source
         self._truncated_prompt: str | None = None  # warned about last
+        self._newline: list[int] | None = None  # Pi0's, which is encoded by itself: always the same
 
     def encode(self, prompt: str, state: np.ndarray | None = None) -> list[int]:
         """All ids of `prompt`, neither padded nor truncated. `state` [d], normalised, goes into the text.
@@ -75,16 +76,21 @@ class PromptTokenizer:
             prompt.encode()
         except UnicodeEncodeError as error:
             raise ObservationError(f"the prompt isn't valid Unicode text: {error}") from error
-        ids = [
-            int(token) for text, bos in prompt_texts(prompt, state) for token in self.encoder.encode(text, add_bos=bos)
-        ]
-        wrong = [token for token in ids if not 0 <= token < self.vocab_size]
-        if wrong:
+        (text, bos), *newline = prompt_texts(prompt, state)
+        ids = self._ids(text, bos)
+        if newline:
+            self._newline = self._newline or self._ids(*newline[0])
+            ids += self._newline
+        if ids and not 0 <= min(ids) <= max(ids) < self.vocab_size:
+            wrong = next(token for token in ids if not 0 <= token < self.vocab_size)
             raise TokenizerError(
-                f"the tokenizer ({self.source}) gave id {wrong[0]}, but the model's vocabulary has {self.vocab_size} "
+                f"the tokenizer ({self.source}) gave id {wrong}, but the model's vocabulary has {self.vocab_size} "
                 f"entries; use the tokenizer that the model was trained with"
             )
         return ids
+
+    def _ids(self, text: str, add_bos: bool) -> list[int]:
+        return list(map(int, self.encoder.encode(text, add_bos=add_bos)))
 
     def tokenize(
         self, prompt: str, state: np.ndarray | None = None, *, max_tokens: int

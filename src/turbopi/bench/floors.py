@@ -1,10 +1,14 @@
-"""What this machine can do, measured on the spot: memory bandwidth, matrix rate, the cost of a launch."""
+"""What this machine can do, measured on the spot: memory bandwidth, matrix rate, the cost of a launch and a barrier."""
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+
+from turbopi.bench.barrier import barrier_us
+
+_DTYPES = {"bf16": torch.bfloat16, "f32": torch.float32, "fp8": torch.float8_e4m3fn, "fp8-mlp": torch.float8_e4m3fn}
 
 
 @dataclass(frozen=True)
@@ -13,14 +17,16 @@ class Floors:
 
     copy_bytes_per_second: float  # a large device copy, read and written bytes both counted
     matmul_flops_per_second: float
-    launch_us: float | None  # one dependent tiny kernel inside a CUDA graph; None on a CPU
+    launch_us: float | None = None  # one dependent tiny kernel inside a CUDA graph; None on a CPU
+    barrier_us: float | None = None  # one grid-wide barrier inside a cooperative kernel; None on a CPU
 
 
-def measure_floors(device: torch.device, dtype: torch.dtype) -> Floors:
+def measure_floors(device: torch.device, precision: str) -> Floors:
     """Medians over a few repetitions, on random data. Takes about a second."""
     if device.type == "cuda":
-        return Floors(_copy_rate(device, 1 << 31), _matmul_rate(device, dtype, 8192), _launch_us(device))
-    return Floors(_copy_rate(device, 1 << 28), _matmul_rate(device, dtype, 1024), None)
+        copied, rate = _copy_rate(device, 1 << 31), _matmul_rate(device, _DTYPES[precision], 8192)
+        return Floors(copied, rate, _launch_us(device), barrier_us(device))
+    return Floors(_copy_rate(device, 1 << 28), _matmul_rate(device, _DTYPES[precision], 1024))
 
 
 def median_seconds(run: Callable[[], object], device: torch.device, repeats: int = 10) -> float:
@@ -51,7 +57,14 @@ def _copy_rate(device: torch.device, size: int) -> float:
 
 def _matmul_rate(device: torch.device, dtype: torch.dtype, n: int) -> float:
     a, b = (torch.randn(n, n, device=device).to(dtype) for _ in range(2))
-    return 2 * n**3 / median_seconds(lambda: a @ b, device)
+
+    def product() -> torch.Tensor:
+        if dtype != torch.float8_e4m3fn:
+            return a @ b
+        one = torch.ones((), device=device)
+        return torch._scaled_mm(a, b.t(), one, one, out_dtype=torch.bfloat16, use_fast_accum=True)
+
+    return 2 * n**3 / median_seconds(product, device)
 
 
 def _launch_us(device: torch.device, kernels: int = 1000) -> float:

@@ -1,6 +1,8 @@
 """Timing a policy's calls: every call a fresh observation, prompt and noise, from host to host."""
 
+import copy
 import dataclasses
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -8,21 +10,30 @@ from typing import Any
 import numpy as np
 import torch
 
+from turbopi.backends import Tier
 from turbopi.bench.work import Job
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import CAMERAS, Normalization
 from turbopi.errors import ConfigError
-from turbopi.model.reference import Precision
 from turbopi.policy import UnifiedPolicy
 
 _WORDS = "pick up the red black white bowl mug plate and place put it on in left right drawer stove open a to of"
 WORDS = _WORDS.split()
 PROMPTS = 16  # different ones, taken in turn
 PERCENTILES = (5, 50, 95, 99)
+WARMING = 3  # calls before those that count
+FEWEST = 20  # calls that a measurement has, however slow they are
 
 
 def bench_policy(
-    checkpoint: Checkpoint, backend: str, precision: Precision, device: torch.device, job: Job, tokenizer: Any = None
+    checkpoint: Checkpoint,
+    backend: str,
+    precision: Tier,
+    device: torch.device,
+    job: Job,
+    *,
+    tokenizer: Any = None,
+    quantization: str | None = None,
 ) -> UnifiedPolicy:
     """The checkpoint's policy for a job: its model with the `plain` robot, so that cameras and prompt can be chosen.
 
@@ -39,7 +50,15 @@ def bench_policy(
         num_denoising_steps=job.steps,
         device=device,
         tokenizer=tokenizer,
+        quantization=quantization if precision.startswith("fp8") else None,
     )
+
+
+def at_horizon(policy: UnifiedPolicy, horizon: int) -> UnifiedPolicy:
+    """The same policy, weights and captured graphs with another number of actions in a chunk."""
+    other = copy.copy(policy)
+    other.config = policy.config.with_model(action_horizon=horizon)
+    return other
 
 
 class Observations:
@@ -48,6 +67,9 @@ class Observations:
     def __init__(self, policy: UnifiedPolicy, job: Job, seed: int = 0) -> None:
         if not 1 <= job.cameras <= len(CAMERAS):
             raise ConfigError(f"a job has 1 to {len(CAMERAS)} cameras, not {job.cameras}")
+        most = policy.config.model.max_prompt_tokens
+        if not 1 <= job.prompt_tokens <= most:
+            raise ConfigError(f"this model reads 1 to {most} prompt tokens; a job can't have {job.prompt_tokens}")
         self._rng = np.random.default_rng(seed)
         self._cameras = CAMERAS[: job.cameras]
         self._policy = policy
@@ -62,15 +84,14 @@ class Observations:
         pictures = {camera: self._rng.integers(0, 256, (224, 224, 3), dtype=np.uint8) for camera in self._cameras}
         return {"images": pictures, "state": self._rng.uniform(-1, 1, 7), "prompt": prompt}
 
-    def _tokens(self, prompt: str) -> int:
-        return int(self._policy.prepare(self._observation(prompt)).token_mask.sum())
-
     def _prompt(self, tokens: int) -> str:
-        """A random prompt of exactly that many tokens."""
+        """A random prompt of exactly that many tokens; `bench_policy` keeps the state out of it."""
+        tokenizer = self._policy.pipeline.tokenizer
         for _ in range(100):
             words: list[str] = []
-            while (count := self._tokens(" ".join(words))) < tokens:
-                words.append(str(self._rng.choice(WORDS)))
+            while (count := len(tokenizer.encode(" ".join(words)))) < tokens:
+                more = max(1, (tokens - count) // 8)  # a word takes fewer than eight tokens, or the next try finds one
+                words += map(str, self._rng.choice(WORDS, more))
             if count == tokens:
                 return " ".join(words)
         raise ConfigError(f"found no prompt of exactly {tokens} tokens with this tokenizer; try another number")
@@ -97,15 +118,28 @@ class Latency:
 
 
 def measure_calls(
-    policy: UnifiedPolicy, job: Job, calls: int, *, seed: int = 0, advance: Callable[[], None] = lambda: None
+    policy: UnifiedPolicy,
+    job: Job,
+    calls: int,
+    *,
+    seed: int = 0,
+    seconds: float = float("inf"),
+    advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Latency]:
-    """Latency of "total", "infer", the stages, and "device", their sum, over `calls` calls after three for warm-up."""
+    """Latency of "total", "infer", the stages, and "device", their sum, over `calls` calls after three for warm-up.
+
+    Ends early after `seconds`, though not before 20 calls.
+    """
     observations = Observations(policy, job, seed)
     timings: dict[str, list[float]] = {}
-    for i in range(calls + 3):
+    for _ in range(WARMING):
+        policy.infer(next(observations), num_steps=job.steps)
+        advance()
+    end = time.perf_counter() + seconds
+    for i in range(calls):
+        if i >= FEWEST and time.perf_counter() > end:
+            break
         timing = policy.infer(next(observations), num_steps=job.steps)["policy_timing"]
-        if i < 3:
-            continue
         stages = [timing[f"{stage}_ms"] for stage in ("vision", "prefix", "denoise") if f"{stage}_ms" in timing]
         if stages:
             timing["device_ms"] = sum(stages)
@@ -115,22 +149,25 @@ def measure_calls(
     return {name: Latency.of(values) for name, values in timings.items()}
 
 
-def error_against(policy: UnifiedPolicy, oracle: UnifiedPolicy, job: Job, *, observations: int = 4) -> dict[str, float]:
-    """The model's actions of a policy against the float32 reference's, on the same observations and noise.
+def answers(policy: UnifiedPolicy, job: Job, *, observations: int = 4) -> np.ndarray:
+    """float64[observations, H, action_dim]: actions on observations and noise that are the same for every policy."""
+    source = Observations(policy, job, seed=1)
+    shape = (job.horizon, policy.config.model.action_dim)
+    chunks = []
+    for seed in range(observations):
+        noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
+        chunks.append(policy.infer(next(source), noise=noise, num_steps=job.steps)["actions"])
+    return np.stack(chunks)
+
+
+def error_against(ours: np.ndarray, exact: np.ndarray) -> dict[str, float]:
+    """The error of a policy's `answers` against the float32 reference's.
 
     Relative rms is of the whole set; max is the worst single value.
     """
-    source = Observations(policy, job, seed=1)
-    shape = (job.horizon, policy.config.model.action_dim)
-    differences, exact = [], []
-    for seed in range(observations):
-        obs, noise = next(source), np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
-        ours, theirs = (p.infer(obs, noise=noise, num_steps=job.steps)["actions"] for p in (policy, oracle))
-        differences.append(ours - theirs)
-        exact.append(theirs)
-    difference, scale = np.stack(differences), np.stack(exact)
+    difference = ours - exact
     return {
-        "relative_rms": float(np.sqrt(np.mean(difference**2) / np.mean(scale**2))),
+        "relative_rms": float(np.sqrt(np.mean(difference**2) / np.mean(exact**2))),
         "max": float(np.abs(difference).max()),
-        "observations": observations,
+        "observations": len(exact),
     }

@@ -1,4 +1,4 @@
-"""Plots of a benchmark document: stages beside their floors, and latency by the number of steps."""
+"""Plots of a benchmark document: stages beside their floors, latency by the number of steps, the roofline."""
 
 from pathlib import Path
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+SHAPE = ("cameras", "prompt_tokens", "horizon")
 STAGES = {"vision": "#4c72b0", "prefix": "#dd8452", "denoise": "#55a868"}
 
 
@@ -18,17 +19,21 @@ def job_label(job: dict[str, int]) -> str:
 
 
 def write_plots(document: dict[str, Any], folder: Path) -> list[Path]:
-    """stages.png for the job with the most steps, steps.png where several numbers of steps were measured."""
-    written = [_stages(document, folder / "stages.png")]
+    """stages.png and roofline.png of the main job, steps.png where several numbers of steps were measured."""
+    written = [_stages(document, folder / "stages.png"), _roofline(document, folder / "roofline.png")]
     if len({result["job"]["steps"] for result in document["results"]}) > 1:
         written.append(_steps(document, folder / "steps.png"))
     return written
 
 
+def main_results(document: dict[str, Any]) -> list[dict[str, Any]]:
+    """The results of the main job."""
+    return [result for result in document["results"] if result["job"] == document["main_job"]]
+
+
 def _stages(document: dict[str, Any], path: Path) -> Path:
     """One bar a backend, stacked by stage; the floor as a bar of its own."""
-    job = max((result["job"] for result in document["results"]), key=lambda job: job["steps"])
-    results = [result for result in document["results"] if result["job"] == job]
+    job, results = document["main_job"], main_results(document)
     figure = Figure(figsize=(9, 1.6 + 0.5 * 2 * len(results)), layout="constrained")
     axes = figure.subplots()
     names: list[str] = []
@@ -42,13 +47,19 @@ def _stages(document: dict[str, Any], path: Path) -> Path:
                 width = milliseconds.get(stage, 0.0)
                 axes.barh(name, width, left=left, color=color, label=stage if not names else None)
                 left += width
-            axes.text(left, len(names), f" {milliseconds['total']:.1f}", va="center")
+            end = max(left, milliseconds["total"])
+            if name == label(result):  # the whole call, and its 5th and 95th percentile
+                total = result["milliseconds"]["total"]
+                sides = [[max(end - total["p5"], 0)], [max(total["p95"] - end, 0)]]
+                axes.errorbar(end, len(names), xerr=sides, fmt="|", color="black", capsize=3)
+                end = max(end, total["p95"])
+            axes.text(end, len(names), f"  {milliseconds['total']:.1f}", va="center")
             names.append(name)
     axes.invert_yaxis()
-    axes.set_xlabel("milliseconds on the device, median; the number is the whole call")
+    axes.set_xlabel("milliseconds on the device, medians; number and whiskers: the whole call, p5 to p95")
     axes.set_title(f"{document['model']}: {job_label(job)}", fontsize=10)
-    axes.legend(loc="lower right")
-    axes.margins(x=0.12)
+    axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+    axes.margins(x=0.08)
     figure.savefig(path, dpi=110)
     return path
 
@@ -58,23 +69,60 @@ def _medians(result: dict[str, Any]) -> dict[str, float]:
 
 
 def _steps(document: dict[str, Any], path: Path) -> Path:
-    """Median of the whole call by steps, with the line a + b * steps through it."""
+    """Median of the whole call by steps (bars: 5th to 95th percentile), with the line a + b * steps through it."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
-    series: dict[str, dict[int, float]] = {}
-    first = {key: value for key, value in document["results"][0]["job"].items() if key != "steps"}
-    for result in document["results"]:
-        if {key: value for key, value in result["job"].items() if key != "steps"} == first:
-            series.setdefault(label(result), {})[result["job"]["steps"]] = _medians(result)["total"]
-    for index, (name, points) in enumerate(series.items()):
-        steps, values = np.array(sorted(points)), np.array([points[step] for step in sorted(points)])
-        slope, start = np.polyfit(steps, values, 1)
-        axes.plot(steps, values, "o", color=f"C{index}", label=f"{name}: {start:.1f} + {slope:.2f} · steps")
-        axes.plot([0, steps[-1]], [start, start + slope * steps[-1]], color=f"C{index}", linewidth=1)
+    main = document["main_job"]
+    lines = [line for line in document["linear"] if all(line[key] == main[key] for key in SHAPE[:2])]
+    for index, line in enumerate(lines):
+        wanted = {key: line[key] for key in ("backend", "precision")}, {key: line[key] for key in SHAPE}
+        results = [result for result in document["results"] if _is_of(result, *wanted)]
+        steps = np.array([result["job"]["steps"] for result in results])
+        total = [result["milliseconds"]["total"] for result in results]
+        median = np.array([one["p50"] for one in total])
+        spread = [median - [one["p5"] for one in total], np.array([one["p95"] for one in total]) - median]
+        text = f"{label(line)}, H={line['horizon']}: {line['a_ms']:.2f} + {line['b_ms']:.3f} · steps"
+        axes.errorbar(steps, median, np.maximum(spread, 0), fmt="o", color=f"C{index}", capsize=3, label=text)
+        ends = np.array([0, steps.max()])
+        axes.plot(ends, line["a_ms"] + line["b_ms"] * ends, color=f"C{index}", linewidth=1)
     axes.set_xlabel("denoising steps")
     axes.set_ylabel("whole call, median [ms]")
     axes.set_ylim(bottom=0)
-    axes.set_title(f"{document['model']}: {job_label({**first, 'steps': 0}).rsplit(',', 1)[0]}", fontsize=10)
+    axes.set_title(f"{document['model']}: {main['cameras']} cameras, {main['prompt_tokens']} tokens", fontsize=10)
     axes.legend()
+    figure.savefig(path, dpi=110)
+    return path
+
+
+def _is_of(result: dict[str, Any], policy: dict[str, str], shape: dict[str, int]) -> bool:
+    return all(result[key] == value for key, value in policy.items()) and all(
+        result["job"][key] == value for key, value in shape.items()
+    )
+
+
+def _roofline(document: dict[str, Any], path: Path) -> Path:
+    """Each stage's rate over its operations a byte, below what bandwidth and matrix rate allow."""
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
+    intensities = np.logspace(0, 4, 200)
+    for index, (precision, floor) in enumerate(document["floors"].items()):
+        rate, bandwidth = floor["matmul_flops_per_second"], floor["copy_bytes_per_second"]
+        roof = np.minimum(intensities * bandwidth, rate) / 1e12
+        text = f"{precision}: {rate / 1e12:.3g} TFLOP/s, {bandwidth / 1e12:.3g} TB/s"
+        axes.loglog(intensities, roof, color="0.3", linestyle=("-", "--", ":")[index % 3], label=text)
+    for marker, result in zip("osD^vP*X", main_results(document), strict=False):
+        for stage, color in STAGES.items():
+            if stage not in result["milliseconds"]:
+                continue
+            work, seconds = result["work"][stage], result["milliseconds"][stage]["p50"] / 1e3
+            x, y = work["flops"] / work["bytes"], work["flops"] / seconds / 1e12
+            axes.loglog(x, y, marker, color=color, markersize=8)
+        axes.loglog([], [], marker, color="0.6", label=label(result))
+    for stage, color in STAGES.items():
+        axes.loglog([], [], "s", color=color, label=stage)
+    axes.set_xlabel("least operations / least bytes [FLOP/byte]")
+    axes.set_ylabel("least operations / median time [TFLOP/s]")
+    axes.set_title(f"{document['model']}: {job_label(document['main_job'])}", fontsize=10)
+    axes.legend(fontsize=8)
     figure.savefig(path, dpi=110)
     return path

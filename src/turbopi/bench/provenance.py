@@ -4,6 +4,7 @@ import os
 import platform
 import subprocess
 from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ def provenance(device: torch.device) -> dict[str, Any]:
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
         "python": platform.python_version(),
         "torch": torch.__version__,
+        **{name: _version(name) for name in ("triton", "numpy", "sentencepiece")},
         "commit": _commit(),
         "device": str(device),
     }
@@ -44,6 +46,13 @@ def _nvidia_smi(device: torch.device) -> dict[str, str]:
     ]
     values = _output(command).split(", ")
     return dict(zip(_GPU_FIELDS, values, strict=True)) if len(values) == len(_GPU_FIELDS) else {}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def _commit() -> str:

@@ -1,22 +1,28 @@
-"""One benchmark run: floors, then every backend on every job, as one plain document."""
+"""One benchmark run: floors, then every backend on every job, then the errors, as one plain document."""
 
 import gc
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from turbopi import backends
+from turbopi.backends import PRECISIONS, Tier
 from turbopi.bench.floors import Floors, measure_floors
-from turbopi.bench.measure import bench_policy, error_against, measure_calls
+from turbopi.bench.measure import WARMING, Observations, answers, at_horizon, bench_policy, error_against, measure_calls
+from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.provenance import provenance
+from turbopi.bench.summary import linear_models
 from turbopi.bench.work import Job, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
-from turbopi.model.reference import Precision
+from turbopi.errors import TurboPiError
 from turbopi.policy import UnifiedPolicy
+
+Answered = tuple[dict[str, Any], Job, np.ndarray]  # a result, its job, and the policy's `answers`
 
 
 @dataclass(frozen=True)
@@ -24,26 +30,64 @@ class Plan:
     """What to measure: all backends and precisions on all jobs."""
 
     backends: Sequence[str]
-    precisions: Sequence[Precision]
+    precisions: Sequence[Tier]
     cameras: Sequence[int] = (2,)
     prompt_tokens: Sequence[int] = (48,)
     horizons: Sequence[int] = (10,)
     steps: Sequence[int] = (10,)
     calls: int = 100
-    error: bool = True  # also against the float32 reference, which must fit beside the policy
+    error: bool = True  # also against the float32 reference
     tokenizer: str | None = None
+    beside: Sequence[str] = ()  # further backends, on the main job alone
+    main_calls: int | None = None  # of `backends` on the main job; None: as all others
+    seconds: float = 60.0  # one measurement ends after them, though not before 20 calls
+    profile: bool = False
+    quantization: str | None = None  # what the FP8 precisions need
 
-    def jobs(self, horizon: int) -> Iterator[Job]:
-        for cameras, tokens, steps in itertools.product(self.cameras, self.prompt_tokens, self.steps):
-            yield Job(cameras, tokens, horizon, steps)
+    @property
+    def main(self) -> Job:
+        """The job that counts, as far as its numbers are in the plan; elsewhere the plan's first, and most steps."""
+        usual = Job()
+
+        def pick(values: Sequence[int], preferred: int) -> int:
+            return preferred if preferred in values else values[0]
+
+        return Job(
+            pick(self.cameras, usual.cameras),
+            pick(self.prompt_tokens, usual.prompt_tokens),
+            pick(self.horizons, usual.horizon),
+            usual.steps if usual.steps in self.steps else max(self.steps),
+        )
+
+    def check(self, device: torch.device) -> None:
+        """Raise ConfigError or BackendUnavailable for a backend or precision that can't run, before anything is run."""
+        for precision, name in itertools.product(self.precisions, [*self.backends, *self.beside]):
+            if len(self.precisions) == 1 or precision not in PRECISIONS or precision in backends.precisions(name):
+                backends.check(name, device, precision)
+
+    def jobs(self) -> Iterator[Job]:
+        for horizon, cameras, tokens in itertools.product(self.horizons, self.cameras, self.prompt_tokens):
+            for steps in self.steps:
+                yield Job(cameras, tokens, horizon, steps)
+
+    def policies(self) -> Iterator[tuple[Tier, str, list[Job]]]:
+        """Tier, backend, and the jobs it runs. A backend without one of several precisions is left out there."""
+        for precision, name in itertools.product(self.precisions, [*self.backends, *self.beside]):
+            if len(self.precisions) == 1 or precision in backends.precisions(name):
+                yield precision, name, list(self.jobs()) if name in self.backends else [self.main]
+
+    def calls_of(self, backend: str, job: Job) -> int:
+        if self.main_calls is None or job != self.main or backend not in self.backends:
+            return self.calls
+        return self.main_calls
+
+    def judges(self, job: Job) -> bool:
+        """Whether the error is measured on a job: every number of steps and horizon of the main job."""
+        return self.error and replace(job, steps=self.main.steps, horizon=self.main.horizon) == self.main
 
     @property
     def total_calls(self) -> int:
-        sizes = (self.backends, self.precisions, self.cameras, self.prompt_tokens, self.horizons, self.steps)
-        count = self.calls + 3
-        for size in sizes:
-            count *= len(size)
-        return count
+        return sum(self.calls_of(name, job) + WARMING for _, name, jobs in self.policies() for job in jobs)
 
 
 @dataclass
@@ -55,38 +99,54 @@ class Progress:
 
 
 def run(checkpoint: Checkpoint, plan: Plan, device: torch.device, progress: Progress | None = None) -> dict[str, Any]:
-    """Measure everything in the plan. Raises what UnifiedPolicy raises, for a backend before anything is measured."""
+    """Measure everything in the plan.
+
+    A backend that refuses or breaks on its jobs is named under `failed`, and the others go on; if none is left, its
+    error is raised. What can be refused beforehand is, before anything is measured (`Plan.check`).
+    """
     progress = progress or Progress()
-    for precision, backend in itertools.product(plan.precisions, plan.backends):
-        backends.check(backend, device, precision)
+    plan.check(device)
     progress.doing("measuring this machine's floors")
-    dtypes: dict[Precision, torch.dtype] = {"bf16": torch.bfloat16, "f32": torch.float32}
-    floors = {precision: measure_floors(device, dtypes[precision]) for precision in plan.precisions}
-    results = []
-    for horizon in plan.horizons:
-        oracle = (
-            bench_policy(checkpoint, "pytorch", "f32", device, Job(horizon=horizon), plan.tokenizer)
-            if plan.error
-            else None
-        )
-        for precision, backend in itertools.product(plan.precisions, plan.backends):
-            progress.doing(f"{backend} {precision}, H={horizon}: loading")
-            results += _measure(
-                checkpoint, plan, device, backend, precision, horizon, floors[precision], oracle, progress
-            )
-        del oracle
+    floors = {precision: measure_floors(device, precision) for precision in plan.precisions}
+    _free(device)
+    before = provenance(device)
+    results: list[dict[str, Any]] = []
+    answered: list[Answered] = []
+    failed: list[dict[str, str]] = []
+    for precision, backend, jobs in plan.policies():
+        progress.doing(f"{backend} {precision}: loading")
+        floor = floors[precision]
+        try:
+            results += _measure(checkpoint, plan, device, backend, precision, jobs, floor, answered, progress)
+        except TurboPiError as error:
+            failed.append({"backend": backend, "precision": precision, "error": str(error)})
+            last = error
         _free(device)
-    weights = (
-        checkpoint.info()["config_source"] if checkpoint.format == "random" else str(Path(str(checkpoint.path)).name)
-    )
-    return {
-        "provenance": provenance(device),
+    if not results:
+        raise last
+    if answered:
+        progress.doing("the float32 reference's answers")
+        _judge(checkpoint, plan, device, answered)
+    document = {
+        "provenance": {**before, "clocks_at_the_end": provenance(device).get("gpu", {})},
         "model": checkpoint.config.name,
-        "weights": weights,
+        "weights": _weights_name(checkpoint),
         "random_weights": checkpoint.format == "random",
+        "observations_seed": 0,
+        "main_job": asdict(plan.main),
         "floors": {precision: asdict(floor) for precision, floor in floors.items()},
         "results": results,
+        "failed": failed,
+        "linear": linear_models(results),
     }
+    if plan.profile:
+        document["profile"] = [
+            _profile(checkpoint, plan, device, backend, precision, progress)
+            for precision, backend, _ in plan.policies()
+            if backend in plan.backends
+            and not any((one["backend"], one["precision"]) == (backend, precision) for one in failed)
+        ]
+    return document
 
 
 def _measure(
@@ -94,52 +154,97 @@ def _measure(
     plan: Plan,
     device: torch.device,
     backend: str,
-    precision: Precision,
-    horizon: int,
+    precision: Tier,
+    jobs: list[Job],
     floors: Floors,
-    oracle: UnifiedPolicy | None,
+    answered: list[Answered],
     progress: Progress,
 ) -> list[dict[str, Any]]:
-    """All jobs of one horizon with one backend in one precision."""
+    """One backend in one precision on its jobs. What it answers where errors are wanted goes to `answered`."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     before = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
-    policy = bench_policy(checkpoint, backend, precision, device, Job(horizon=horizon), plan.tokenizer)
+    policy = _policy(checkpoint, plan, backend, precision, device)
     results = []
-    for job in plan.jobs(horizon):
+    for job in jobs:
         progress.doing(f"{backend} {precision}: {job}")
-        warmup = policy.warmup(job.steps)
-        latency = measure_calls(policy, job, plan.calls, advance=progress.advance)
-        floor = stage_floors(policy, job, floors)
+        shaped = at_horizon(policy, job.horizon)
+        first = shaped.infer(next(Observations(shaped, job, seed=2)), num_steps=job.steps)["policy_timing"]["total_ms"]
+        latency = measure_calls(
+            shaped, job, plan.calls_of(backend, job), seconds=plan.seconds, advance=progress.advance
+        )
+        floor = stage_floors(shaped, job, floors)
         result: dict[str, Any] = {
             "backend": policy.backend.name,
             "precision": precision,
             "job": asdict(job),
             "calls": latency["total"].calls,
             "load_seconds": policy.metadata["load_seconds"],
-            "warmup_seconds": round(warmup, 2),
+            "first_call_seconds": round(first / 1e3, 3),  # compiles and captures what only this job needs
             "milliseconds": {name: values.as_dict() for name, values in latency.items()},
             "floor_ms": floor,
             "times_floor": latency["total"].median / floor["total"],
+            "work": {stage: asdict(one) for stage, one in _work(shaped, job).items()},
             "memory": _memory(device, before),
         }
-        if oracle is not None and (policy.backend.name, precision) != ("pytorch", "f32"):
-            result["error_against_f32"] = error_against(policy, oracle, job)
+        if plan.judges(job) and (policy.backend.name, precision) != ("pytorch", "f32"):
+            answered.append((result, job, answers(shaped, job)))
         results.append(result)
-    del policy
+    results[-1]["backend_details"] = policy.metadata["backend_details"]
+    del policy, shaped
     _free(device)
     return results
 
 
+def _judge(checkpoint: Checkpoint, plan: Plan, device: torch.device, answered: list[Answered]) -> None:
+    """Write the error against the float32 reference into the results. The reference answers each job once."""
+    oracle = _policy(checkpoint, plan, "pytorch", "f32", device)
+    exact: dict[Job, np.ndarray] = {}
+    for result, job, actions in answered:
+        if job not in exact:
+            exact[job] = answers(at_horizon(oracle, job.horizon), job)
+        result["error_against_f32"] = error_against(actions, exact[job])
+    del oracle
+    _free(device)
+
+
+def _profile(
+    checkpoint: Checkpoint, plan: Plan, device: torch.device, backend: str, precision: Tier, progress: Progress
+) -> dict[str, Any]:
+    """The main job's kernels, with a policy of its own: graphs captured before the profiler runs may be dark to it."""
+    progress.doing(f"{backend} {precision}: profile")
+    start_profiler(device)
+    policy = _policy(checkpoint, plan, backend, precision, device)
+    stages = stage_kernels(policy, plan.main)
+    del policy
+    _free(device)
+    return {"backend": backend, "precision": precision, "job": asdict(plan.main), "stages": stages}
+
+
 def stage_floors(policy: UnifiedPolicy, job: Job, floors: Floors) -> dict[str, float]:
     """Milliseconds under which no implementation gets, by stage and in all."""
-    size = 2 if policy.backend.precision == "bf16" else 4
-    work = stage_work(policy.config.model, job, size)
     stages = {
         stage: floor_ms(one, floors.matmul_flops_per_second, floors.copy_bytes_per_second)
-        for stage, one in work.items()
+        for stage, one in _work(policy, job).items()
     }
     return {**stages, "total": sum(stages.values())}
+
+
+def _work(policy: UnifiedPolicy, job: Job) -> dict[str, Any]:
+    return stage_work(policy.config.model, job, {"f32": 4, "bf16": 2}.get(policy.backend.precision, 1))
+
+
+def _policy(checkpoint: Checkpoint, plan: Plan, backend: str, precision: Tier, device: torch.device) -> UnifiedPolicy:
+    """A policy that runs any job of the plan with `at_horizon`."""
+    return bench_policy(
+        checkpoint, backend, precision, device, plan.main, tokenizer=plan.tokenizer, quantization=plan.quantization
+    )
+
+
+def _weights_name(checkpoint: Checkpoint) -> str:
+    if checkpoint.format == "random":
+        return str(checkpoint.info()["config_source"])
+    return Path(str(checkpoint.path)).name
 
 
 def _memory(device: torch.device, before: int) -> dict[str, int]:

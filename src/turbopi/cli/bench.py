@@ -1,6 +1,8 @@
 """`turbopi bench`: the machine's floors, then the policy's calls beside them."""
 
 import json
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,10 +15,10 @@ from turbopi.cli.options import CheckpointArgument, WeightOptions
 from turbopi.errors import ConfigError
 
 if TYPE_CHECKING:
-    import torch
-
     from turbopi.bench.run import Plan
-    from turbopi.checkpoint import Checkpoint
+
+_ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps": "10"}
+_TABLE = {"--cameras": "1,2,3", "--prompt-tokens": "48,200", "--horizons": "10,50", "--steps": "1,2,3,5,10"}
 
 
 def _numbers(option: str, text: str) -> list[int]:
@@ -26,7 +28,16 @@ def _numbers(option: str, text: str) -> list[int]:
         raise ConfigError(f"{option} is {text!r}; expected whole numbers with commas between, such as 1,5,10") from None
     if min(values) < 1:
         raise ConfigError(f"{option} has {min(values)}; expected whole numbers from 1")
-    return values
+    return list(dict.fromkeys(values))
+
+
+def _axis(option: str, given: str | None, table: bool) -> list[int]:
+    """What was given, else the table's numbers or the usual one."""
+    return _numbers(option, (_TABLE if table else _ONE)[option] if given is None else given)
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
 
 
 @command(
@@ -35,60 +46,106 @@ def _numbers(option: str, text: str) -> list[int]:
     examples=(
         "turbopi bench --random-weights pi05_tiny --calls 20",
         "turbopi bench --random-weights pi05_libero --backends pytorch,cuda_graph --steps 1,3,10",
-        "turbopi bench checkpoints/pi05_libero --profile --report bench-report",
+        "turbopi bench checkpoints/pi05_libero --table --main-calls 2000 --ready --profile --report bench-report",
     ),
 )
 def bench(
     options: WeightOptions,
     checkpoint: CheckpointArgument = None,
     backends: Annotated[str, typer.Option(metavar="NAME,NAME,…", help="From `turbopi backends`.")] = "auto",
-    precisions: Annotated[str, typer.Option(metavar="bf16,f32")] = "bf16",
-    cameras: Annotated[str, typer.Option(metavar="N,N,…", help="Valid cameras, of three.")] = "2",
-    prompt_tokens: Annotated[str, typer.Option(metavar="N,N,…", help="Valid prompt tokens.")] = "48",
-    horizons: Annotated[str, typer.Option(metavar="N,N,…", help="Actions in a chunk.")] = "10",
-    steps: Annotated[str, typer.Option(metavar="N,N,…", help="Denoising steps.")] = "10",
+    beside: Annotated[
+        str, typer.Option(metavar="NAME,NAME,…", help="Backends that are measured on the main job alone.")
+    ] = "",
+    precisions: Annotated[str, typer.Option(metavar="bf16,f32,fp8,fp8-mlp")] = "bf16",
+    table: Annotated[
+        bool, typer.Option("--table", help="1, 2, 3 cameras × 48, 200 tokens × H 10, 50 × 1, 2, 3, 5, 10 steps.")
+    ] = False,
+    cameras: Annotated[str | None, typer.Option(metavar="N,N,…", help="Valid cameras, of three; else 2.")] = None,
+    prompt_tokens: Annotated[str | None, typer.Option(metavar="N,N,…", help="Valid prompt tokens; else 48.")] = None,
+    horizons: Annotated[str | None, typer.Option(metavar="N,N,…", help="Actions in a chunk; else 10.")] = None,
+    steps: Annotated[str | None, typer.Option(metavar="N,N,…", help="Denoising steps; else 10.")] = None,
     calls: Annotated[int, typer.Option(min=1, help="Calls of each measurement, after three for warm-up.")] = 100,
-    error: Annotated[bool, typer.Option(help="Also measure the error against the float32 reference.")] = True,
-    profile: Annotated[bool, typer.Option("--profile", help="Name the kernels that take longest.")] = False,
+    main_calls: Annotated[
+        int | None,
+        typer.Option(min=1, help="Calls of the main job (2 cameras, 48 tokens, H = 10, 10 steps, or the nearest)."),
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option(min=0, help="A measurement ends after them, though not before 20 calls.")
+    ] = 60,
+    error: Annotated[
+        bool, typer.Option(help="Also the error against the float32 reference, for the main job's cameras and prompt.")
+    ] = True,
+    ready: Annotated[bool, typer.Option("--ready", help="Also the time from a program's start to its answer.")] = False,
+    profile: Annotated[bool, typer.Option("--profile", help="Name the kernels that take longest, by stage.")] = False,
     device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     tokenizer: Annotated[str | None, typer.Option(metavar="FILE", help="SentencePiece model.")] = None,
-    report: Annotated[Path | None, typer.Option(metavar="DIR", help="Write results.json and plots there.")] = None,
+    quantization: Annotated[
+        str | None, typer.Option(metavar="FILE", help="What `turbopi calibrate` wrote, for fp8 and fp8-mlp.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write results.json, report.md and plots there.")
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Measure the policy's latency, each stage beside the floor that this machine sets.
 
     Every call gets new pictures, another prompt and new noise, and is timed from host to host.
     """
-    from turbopi import backends as registry
-    from turbopi.bench.plots import write_plots
-    from turbopi.bench.run import Plan, run
+    from turbopi.bench.ready import empty_caches
 
-    output = Output(as_json)
-    opened = options.open(checkpoint)
-    options.tell_if_random(opened, output)
-    resolved = registry.resolve_device(device)
-    names = [registry.choose(resolved)[0] if name == "auto" else name for name in backends.split(",")]
-    plan = Plan(
-        names,
-        precisions.split(","),  # type: ignore[arg-type]  # checked when a backend is created
-        _numbers("--cameras", cameras),
-        _numbers("--prompt-tokens", prompt_tokens),
-        _numbers("--horizons", horizons),
-        _numbers("--steps", steps),
-        calls,
-        error,
-        tokenizer,
-    )
-    document = _run_with_bar(lambda progress: run(opened, plan, resolved, progress), plan, output)
-    if profile:
-        document["profile"] = _profiles(opened, plan, resolved)
+    # before Triton is imported and looks for its cache: what the measured starts compile serves this process, too
+    with empty_caches() if ready else nullcontext():
+        from turbopi import backends as registry
+        from turbopi.bench.run import Plan, run
+
+        output = Output(as_json)
+        opened = options.open(checkpoint)
+        options.tell_if_random(opened, output)
+        resolved = registry.resolve_device(device)
+        names = [registry.choose(resolved)[0] if name == "auto" else name for name in _names(backends)]
+        plan = Plan(
+            names,
+            _names(precisions),  # type: ignore[arg-type]  # checked when a backend is created
+            cameras=_axis("--cameras", cameras, table),
+            prompt_tokens=_axis("--prompt-tokens", prompt_tokens, table),
+            horizons=_axis("--horizons", horizons, table),
+            steps=_axis("--steps", steps, table),
+            calls=calls,
+            error=error,
+            tokenizer=tokenizer,
+            beside=[name for name in _names(beside) if name not in names],
+            main_calls=main_calls,
+            seconds=seconds,
+            profile=profile,
+            quantization=quantization,
+        )
+        plan.check(resolved)
+        starts = _starts(checkpoint, options, plan, str(resolved)) if ready else []
+        document = _run_with_bar(lambda progress: run(opened, plan, resolved, progress), plan, output)
+    document["provenance"]["command"] = ["turbopi", *sys.argv[1:]]
+    if ready:
+        document["ready"] = starts
     _show(document, output)
     if report is not None:
-        report.mkdir(parents=True, exist_ok=True)
-        (report / "results.json").write_text(json.dumps(document, indent=1) + "\n")
-        written = [report / "results.json", *write_plots(document, report)]
+        written = _write(document, report)
         output.line(f"wrote {', '.join(str(path) for path in written)}")
     output.document(document)
+    if document["failed"]:
+        raise typer.Exit(1)
+
+
+def _starts(checkpoint: str | None, options: WeightOptions, plan: "Plan", device: str) -> list[dict[str, Any]]:
+    """How long a program with each of the plan's main backends takes until its first answer."""
+    from turbopi.bench.ready import Start, measure_ready
+
+    seed, steps = options.weights_seed or 0, plan.main.steps
+    starts = []
+    for precision, name, _ in plan.policies():
+        if name in plan.backends:
+            weights = (checkpoint, options.random_weights, seed, options.config)
+            start = Start(*weights, name, precision, device, steps, plan.tokenizer, plan.quantization)
+            starts.append({"backend": name, "precision": precision, **measure_ready(start)})
+    return starts
 
 
 def _run_with_bar(work: Any, plan: "Plan", output: Output) -> dict[str, Any]:
@@ -103,66 +160,77 @@ def _run_with_bar(work: Any, plan: "Plan", output: Output) -> dict[str, Any]:
     return document
 
 
-def _profiles(checkpoint: "Checkpoint", plan: "Plan", device: "torch.device") -> list[dict[str, Any]]:
-    from turbopi.bench.measure import bench_policy
-    from turbopi.bench.profile import top_kernels
+def _write(document: dict[str, Any], folder: Path) -> list[Path]:
+    from turbopi.bench.plots import write_plots
+    from turbopi.bench.report import report
 
-    profiles = []
-    for precision in plan.precisions:
-        for name in plan.backends:
-            job = next(plan.jobs(plan.horizons[0]))
-            policy = bench_policy(checkpoint, name, precision, device, job, plan.tokenizer)
-            policy.warmup(job.steps)
-            profiles.append({"backend": name, "precision": precision, "kernels": top_kernels(policy, job)})
-    return profiles
+    folder.mkdir(parents=True, exist_ok=True)
+    results, page = folder / "results.json", folder / "report.md"
+    results.write_text(json.dumps(document, indent=1) + "\n")
+    page.write_text(report(document))
+    return [results, page, *write_plots(document, folder)]
 
 
 def _show(document: dict[str, Any], output: Output) -> None:
+    from turbopi.bench.report import floors_line
+
     for precision, floor in document["floors"].items():
-        launch = "" if floor["launch_us"] is None else f", a launch in a graph {floor['launch_us']:.2f} us"
-        output.line(
-            f"floors, {precision}: copy {floor['copy_bytes_per_second'] / 1e12:.3f} TB/s, "
-            f"matrix product {floor['matmul_flops_per_second'] / 1e12:.3f} TFLOP/s{launch}"
-        )
+        output.line(floors_line(precision, floor))
     table = Table(title=f"{document['model']}, {document['weights']}: milliseconds, medians", title_justify="left")
     for column in ("backend", "job"):
         table.add_column(column)
-    columns = ("vision", "prefix", "denoise", "device", "total", "p95", "p99", "floor", "x floor", "error")
+    columns = ("vision", "prefix", "denoise", "device", "total", "p5", "p95", "p99", "floor", "x floor", "error")
     for column in columns:
         table.add_column(column, justify="right")
     for result in document["results"]:
         table.add_row(*_row(result))
     output.table(table)
+    for one in document["failed"]:
+        output.line(f"{one['backend']} {one['precision']} failed: {one['error']}", "red")
     output.line("device: the stages' sum; total: host to host; error: relative rms of the actions against float32")
+    for line in document["linear"]:
+        output.line(
+            f"{line['backend']} {line['precision']}, {line['cameras']} cameras, {line['prompt_tokens']} tokens, "
+            f"H={line['horizon']}: {line['a_ms']:.2f} + {line['b_ms']:.3f} x steps ms, off by {line['worst_ms']:.2f}"
+        )
+    for one in document.get("ready", ()):
+        for kind in ("cold", "cached"):
+            parts = ", ".join(f"{name} {one[kind][name]:.1f}" for name in ("import", "load", "warmup"))
+            name = f"{one['backend']} {one['precision']}, kernels {kind}"
+            output.line(f"{name}: ready in {one[kind]['ready']:.1f} s ({parts})")
     for one in document.get("profile", ()):
-        output.table(_profile_table(one))
+        if not one["stages"]:
+            output.line(f"{one['backend']} {one['precision']}: the profiler saw no kernels", "yellow")
+        for stage, part in one["stages"].items():
+            output.table(_profile_table(one, stage, part))
 
 
 def _row(result: dict[str, Any]) -> list[str]:
+    from turbopi.bench.report import error_of
+
     times, job = result["milliseconds"], result["job"]
 
     def median(stage: str) -> str:
         return f"{times[stage]['p50']:.2f}" if stage in times else "-"
 
-    error = result.get("error_against_f32")
     return [
         f"{result['backend']} {result['precision']}",
         f"{job['cameras']} cam, {job['prompt_tokens']} tok, H={job['horizon']}, {job['steps']} steps",
         *(median(stage) for stage in ("vision", "prefix", "denoise", "device", "total")),
-        f"{times['total']['p95']:.2f}",
-        f"{times['total']['p99']:.2f}",
+        *(f"{times['total'][percentile]:.2f}" for percentile in ("p5", "p95", "p99")),
         f"{result['floor_ms']['total']:.2f}",
         f"{result['times_floor']:.1f}",
-        f"{error['relative_rms']:.4f}" if error else "-",
+        error_of(result),
     ]
 
 
-def _profile_table(profile: dict[str, Any]) -> Table:
-    table = Table(title=f"top kernels of {profile['backend']} {profile['precision']}", title_justify="left")
+def _profile_table(profile: dict[str, Any], stage: str, part: dict[str, Any]) -> Table:
+    title = f"{profile['backend']} {profile['precision']}, {stage}: kernels {part['busy_ms']:.2f} ms"
+    table = Table(title=f"{title} in {part['launches']:.0f} launches", title_justify="left")
     table.add_column("kernel", max_width=80)
     for column in ("ms a call", "launches a call", "share"):
         table.add_column(column, justify="right")
-    for kernel in profile["kernels"]:
+    for kernel in part["kernels"]:
         numbers = (f"{kernel['ms_per_call']:.3f}", f"{kernel['launches_per_call']:.0f}", f"{kernel['share']:.1%}")
         table.add_row(kernel["kernel"], *numbers)
     return table

@@ -5,7 +5,7 @@ in one copy out of one pinned buffer, actions come back in one.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -43,6 +43,16 @@ class CallShape:
     def prefix_slots(self, config: ModelConfig) -> int:
         return self.cameras * config.vision.num_tokens + self.prompt_slots
 
+    def suffix_tokens(self, config: ModelConfig) -> int:
+        return self.horizon + (config.kind == "pi0")
+
+    def cache_rows(self, config: ModelConfig) -> int:
+        """Keys of the suffix's attention: the prefix's slots, rows that nothing sees, the suffix's.
+
+        A multiple of 16, since the library's products take 16 bytes at a time or a kernel half as fast.
+        """
+        return -(-(self.prefix_slots(config) + self.suffix_tokens(config)) // 16) * 16
+
 
 @dataclass(frozen=True)
 class Inputs:
@@ -73,6 +83,10 @@ class Inputs:
             views[name] = flat[start : start + sizes[name]].view(dtype).view(dims)
             start += padded[name]
         return cls(flat, **views)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The same memory as NumPy's arrays, by name; of a buffer on the host only. Writing through them is cheap."""
+        return {name: getattr(self, name).numpy() for name in ("images", "noise", "state", "tokens", "length")}
 
 
 @dataclass(frozen=True)
@@ -105,10 +119,10 @@ class StaticCall:
         self.config, self.weights, self.ops, self.shape = config, weights, ops, shape
         device = cache.k.device
         on_gpu = device.type == "cuda"
-        suffix = shape.horizon + (config.kind == "pi0")
-        rows = shape.prefix_slots(config) + suffix
+        suffix, rows = shape.suffix_tokens(config), shape.cache_rows(config)
         assert rows <= cache.k.shape[1], f"{shape} needs {rows} cache rows, there are {cache.k.shape[1]}"
         self.cache_k, self.cache_v = cache.k[:, :rows], cache.v[:, :rows]
+        self._unseen = slice(shape.prefix_slots(config), rows - suffix)
         self.table, self.denoiser = table, denoiser
         self.rope = forward.rope_of_all_positions(config, rows, device)
         self.suffix_offsets = torch.arange(suffix, device=device)
@@ -117,21 +131,27 @@ class StaticCall:
         times = time_grid(shape.num_steps, config.time_grid)
         self.time_embs = time_embedding(times, config.expert.width).to(device)  # Pi0's
         self.host = Inputs.allocate(config, shape, torch.device("cpu"), pinned=on_gpu)
+        self._arrays = self.host.arrays()
         self.inputs = Inputs.allocate(config, shape, device, pinned=False)
         chunk = (shape.horizon, config.action_dim)
         self.x_t = torch.empty(shape.num_steps + 1, *chunk, device=device)
         self.v_t = torch.empty(shape.num_steps, *chunk, device=device)
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
+        self.actions_array = self.actions.numpy()
 
-    def write_inputs(self, images: np.ndarray, noise: np.ndarray, state: np.ndarray, tokens: np.ndarray) -> None:
-        """Put one observation, compacted, into the host buffer: valid pictures and valid tokens only."""
-        self.host.images.numpy()[:] = images
-        self.host.noise.numpy()[:] = noise
-        self.host.state.numpy()[:] = state
-        padded = self.host.tokens.numpy()
+    def write_inputs(
+        self, images: Iterable[np.ndarray], noise: np.ndarray, state: np.ndarray, tokens: np.ndarray
+    ) -> None:
+        """Put one observation, compacted, into the host buffer: valid pictures, one by one, and valid tokens only."""
+        arrays = self._arrays
+        for target, picture in zip(arrays["images"], images, strict=True):
+            target[:] = picture
+        arrays["noise"][:] = noise
+        arrays["state"][:] = state
+        padded = arrays["tokens"]
         padded[: len(tokens)] = tokens
         padded[len(tokens) :] = 0
-        self.host.length[0] = self.shape.cameras * self.config.vision.num_tokens + len(tokens)
+        arrays["length"][0] = self.shape.cameras * self.config.vision.num_tokens + len(tokens)
 
     def run(self, mark: Mark = lambda stage: None) -> None:
         """All kernels of the call, in order. `mark` is told the end of each stage."""
@@ -166,6 +186,8 @@ class StaticCall:
         mark("denoise")
 
     def _denoise_by_operations(self) -> None:
+        for cache in (self.cache_k, self.cache_v):
+            cache[:, self._unseen] = 0  # masked, but 0 * NaN is NaN
         positions = self.inputs.length + self.suffix_offsets
         rope = (self.rope[0][positions], self.rope[1][positions])
         self.x_t[0] = self.inputs.noise

@@ -4,6 +4,7 @@ A robot names its cameras, state and prompt in its own keys, and cuts the model'
 reader raises ObservationError with the key, what was found and what was expected; none changes the observation.
 """
 
+import functools
 import itertools
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
@@ -141,9 +142,9 @@ def read_state(value: Any, key: str, width: int | None) -> np.ndarray:
         state = np.asarray(value)
     except Exception as error:
         raise ObservationError(f"{key} isn't an array of numbers: {error}") from error
-    if np.issubdtype(state.dtype, np.integer):
+    if state.dtype.kind in "iu":
         state = state.astype(np.float64)
-    if not np.issubdtype(state.dtype, np.floating):
+    if state.dtype.kind != "f":
         raise ObservationError(f"{key} has dtype {state.dtype}; send floats")
     if state.ndim == 0 and width == 1:
         state = state[None]
@@ -189,7 +190,12 @@ def with_missing_cameras(images: dict[str, np.ndarray], like: str) -> tuple[dict
 
 def black_like(image: np.ndarray) -> np.ndarray:
     """A read-only black picture of the shape and dtype of `image`, without its memory."""
-    return np.broadcast_to(np.zeros((), image.dtype), image.shape)
+    return _black(image.shape, image.dtype)
+
+
+@functools.lru_cache(maxsize=16)  # the same few in every call
+def _black(shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray:
+    return np.broadcast_to(np.zeros((), dtype), shape)
 
 
 def random_image(rng: np.random.Generator, size: int = 224) -> np.ndarray:
