@@ -205,4 +205,4 @@ def test_backends_are_listed_with_reasons_and_what_auto_takes(monkeypatch: Any) 
 
 def test_backends_refuses_what_it_cannot_list() -> None:
     assert "unknown device 'tpu'" in refusal(turbopi("backends", "--device", "tpu"))
-    assert "unknown precision 'fp8'; choose one of bf16, f32" in refusal(turbopi("backends", "--precision", "fp8"))
+    assert "unknown precision 'fp7'; choose one of bf16, f32" in refusal(turbopi("backends", "--precision", "fp7"))

@@ -101,7 +101,7 @@ def test_an_unknown_preset_lists_the_choices() -> None:
     ("option", "value", "expected"),
     [
         ("--backend", "cuda", "unknown backend 'cuda'; choose one of pytorch, pytorch_compile"),
-        ("--precision", "fp8", "unknown precision 'fp8'; choose one of bf16, f32"),
+        ("--precision", "fp7", "unknown precision 'fp7'; choose one of bf16, f32"),
         ("--steps", "0", "the number of denoising steps is 0; it should be a whole number from 1"),
         ("--device", "tpu", "unknown device 'tpu'; use 'auto', 'cpu', 'cuda' or 'cuda:N'"),
         ("--tokenizer", "nowhere.model", "there is no tokenizer at nowhere.model"),

@@ -1,14 +1,18 @@
 """The engine's static forward pass equals the reference on the CPU: every golden case, odd prompts, 0 to 3 cameras."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from conftest import golden_cases, golden_model
 from torch import Tensor
 
+from turbopi import backends
+from turbopi.backends.cuda_graph import HostRow
 from turbopi.config import Kind
 from turbopi.engine.call import Cache, CallShape, StaticCall
-from turbopi.engine.ops import PLAIN
+from turbopi.engine.ops import PLAIN, Ops, compiled, geglu, geglu_by_sigmoid, gelu, gelu_by_sigmoid
 from turbopi.engine.weights import modulation, pack
 from turbopi.model.reference import Precision
 from turbopi.observation import Observation
@@ -18,12 +22,12 @@ CPU = torch.device("cpu")
 CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
 
 
-def static_call(kind: Kind, shape: CallShape, precision: Precision = "f32") -> StaticCall:
+def static_call(kind: Kind, shape: CallShape, precision: Precision = "f32", ops: Ops = PLAIN) -> StaticCall:
     model = golden_model(kind, precision)
     weights = pack(model.config, dict(model.state_dict()))
     cache = Cache.allocate(model.config, shape.prefix_slots(model.config) + 64, CPU, weights.embed_tokens.dtype)
     return StaticCall(
-        model.config, weights, PLAIN, shape, cache, modulation(model.config, weights.conditioning, shape.num_steps)
+        model.config, weights, ops, shape, cache, modulation(model.config, weights.conditioning, shape.num_steps)
     )
 
 
@@ -110,3 +114,55 @@ def test_the_host_buffer_holds_valid_pictures_and_tokens_only() -> None:
     np.testing.assert_array_equal(call.host.tokens.numpy()[:5], observation.tokens[0, :5].numpy())
     assert not call.host.tokens[5:].any()
     assert call.host.length.item() == 2 * call.config.vision.num_tokens + 5
+
+
+@pytest.mark.parametrize("horizon", [6, 7, 16])
+def test_rows_between_prefix_and_suffix_are_seen_by_nobody(horizon: int) -> None:
+    observation, _ = made_up("pi05", 1, 19)
+    noise = torch.randn(1, horizon, 32, generator=torch.Generator().manual_seed(horizon))
+    call = static_call("pi05", shape_of(observation, noise, 2))
+    assert call.cache_k.shape[1] % 16 == 0
+    for poison in (torch.nan, torch.inf):
+        call.cache_k[:, -horizon - 3 :], call.cache_v[:, -horizon - 3 :] = poison, poison
+        expected = golden_model("pi05").sample(observation, noise, 2)[0]
+        torch.testing.assert_close(answer(call, observation, noise), expected, atol=5e-6, rtol=1e-5)
+
+
+def test_every_valid_picture_must_be_given() -> None:
+    observation, noise = made_up("pi05", 2, 5)
+    call = static_call("pi05", shape_of(observation, noise, 1))
+    with pytest.raises(ValueError, match="shorter"):
+        call.write_inputs(observation.images[0, :1].numpy(), noise[0].numpy(), observation.state[0].numpy(), np.ones(5))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_gelu_by_sigmoid_is_gelu(dtype: torch.dtype) -> None:
+    x = torch.linspace(-40, 40, 40_000).to(dtype).view(2, -1)
+    atol, rtol = (1e-6, 1e-6) if dtype == torch.float32 else (1e-5, 2**-7)
+    torch.testing.assert_close(gelu_by_sigmoid(x), gelu(x), atol=atol, rtol=rtol)
+    torch.testing.assert_close(geglu_by_sigmoid(x), geglu(x), atol=atol, rtol=rtol)
+
+
+@pytest.mark.filterwarnings("default")  # the compiler's own
+@pytest.mark.skipif(
+    backends.availability("pytorch_compile", CPU) is not None, reason="torch.compile needs a C++ compiler"
+)
+def test_compiled_operations_equal_the_reference_and_compile_little_for_other_buckets() -> None:
+    """Both stacks' widths are known to the compiler: a second width must not make them unknown."""
+    ops = compiled()
+    for cameras, tokens in ((1, 5), (2, 20), (1, 40)):
+        observation, noise = made_up("pi05", cameras, tokens)
+        call = static_call("pi05", shape_of(observation, noise, 2), ops=ops)
+        expected = golden_model("pi05").sample(observation, noise, 2)[0]
+        with torch.compiler.set_stance("fail_on_recompile" if tokens == 40 else "default"):
+            torch.testing.assert_close(answer(call, observation, noise), expected, atol=5e-6, rtol=1e-5)
+
+
+def test_a_row_on_the_host_has_valid_cameras_and_tokens_only() -> None:
+    observation, _ = made_up("pi05", 2, 5)
+    mask = torch.tensor([[True, False, True]])
+    row = HostRow.of(dataclasses.replace(observation, image_mask=mask), 0)
+    assert len(row.images) == 2
+    np.testing.assert_array_equal(row.images[1], observation.images[0, 2].numpy())
+    np.testing.assert_array_equal(row.tokens, observation.tokens[0, :5].numpy())
+    np.testing.assert_array_equal(row.state, observation.state[0].numpy())

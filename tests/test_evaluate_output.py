@@ -11,7 +11,7 @@ import pytest
 from evaluate_fakes import SeekingPolicy, run
 
 from turbopi.errors import ConfigError
-from turbopi.evaluate.compare import cells, compare, write_comparison
+from turbopi.evaluate.compare import HEADS, cells, compare, write_comparison
 from turbopi.evaluate.episode import Frame
 from turbopi.evaluate.plan import VideoPlan, parse_numbers
 from turbopi.evaluate.sources import LocalPolicy
@@ -100,11 +100,21 @@ def test_comparing_pairs_the_common_episodes(tmp_path: Path) -> None:
     paired = compared[1].paired
     assert paired is not None
     assert (paired.both, paired.only_first, paired.only_second, paired.neither) == (2, 1, 0, 0)
-    assert cells(compared[1])[1] == "66.7 % [20.8, 93.9]"
-    assert cells(compared[1])[3:5] == ["1 : 0", "1.000"]
+    assert cells(compared[1])[2] == "66.7 % [20.8, 93.9]"
+    assert cells(compared[1])[4:6] == ["1 : 0", "1.000"]
     written = write_comparison(tmp_path / "c", compared)
     assert json.loads(written[0].read_text())["runs"][1]["paired_with_first"]["only_first"] == 1
     assert "aborted" in written[2].read_text()
+
+
+def test_a_comparison_tells_the_precision_and_calibration_on_noise(tmp_path: Path) -> None:
+    exact, rounded = SeekingPolicy(), SeekingPolicy()
+    exact.metadata["precision"], rounded.metadata["precision"] = "f32", "fp8"
+    rounded.metadata["backend_details"] = {"fp8": {"observations": "random-noise"}}
+    runs = [run(tmp_path / name, policy, states=(0,)) for name, policy in (("a", exact), ("b", rounded))]
+    compared = compare(runs)
+    assert [cells(one)[HEADS.index("precision")] for one in compared] == ["f32", "fp8, random noise"]
+    assert [one.as_json()["precision"] for one in compared] == ["f32", "fp8, random noise"]
 
 
 def test_runs_of_another_protocol_are_not_compared(tmp_path: Path) -> None:

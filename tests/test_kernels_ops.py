@@ -4,7 +4,6 @@ Without a GPU in float32 through Triton's interpreter (its bfloat16 products are
 outliers: the kernel's error may be twice the twin's, both against the twin in float32 on the same numbers.
 """
 
-import os
 from collections.abc import Callable
 
 import pytest
@@ -12,8 +11,6 @@ import torch
 from torch import Tensor
 
 ON_GPU = torch.cuda.is_available()
-if not ON_GPU:
-    os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is first imported
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine import ops as plain  # noqa: E402

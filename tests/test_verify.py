@@ -264,6 +264,7 @@ def test_the_stated_bounds() -> None:
     assert Rule.of("pytorch_compile", "f32").limit(control=0.5) == 1e-5
     assert Rule.of("fused", "bf16").limit(control=0.02) == pytest.approx(0.025)
     assert Rule.of("pytorch", "bf16").limit(control=0.02) == pytest.approx(0.1)
+    assert Rule.of("pytorch", "bf16", trained=True).limit(control=0.02) == pytest.approx(0.2)
 
 
 def tiny_policy() -> UnifiedPolicy:

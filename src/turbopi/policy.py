@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 import torch
 
 from turbopi import backends
+from turbopi.backends import Tier
+from turbopi.calibrate.artifact import Quantization, for_policy
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.config import PolicyConfig
 from turbopi.errors import ConfigError, ObservationError
@@ -33,7 +36,9 @@ class UnifiedPolicy:
         config: what no checkpoint records (robot, statistics, horizon, …): a preset's name, a .json, a PolicyConfig, or
             "auto" for LeRobot's own config or the `turbopi.json` beside the weights.
         backend: a name from `turbopi backends`; "auto" takes the fastest one available and says which in `metadata`.
-        precision: "bf16" as openpi serves it, or "f32".
+        precision: "bf16" as openpi serves it, "f32", or with a calibration "fp8" or "fp8-mlp" (docs/quantization.md).
+        quantization: what `turbopi calibrate` wrote for this checkpoint, for the FP8 precisions alone. None: the
+            `turbopi_fp8.json` beside the weights.
         num_denoising_steps: Euler steps a call, unless `infer` is told otherwise. openpi's default is 10.
         device: "auto", "cpu", "cuda" or "cuda:N".
         tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
@@ -42,7 +47,8 @@ class UnifiedPolicy:
         robot: instead of the config's: a name, the path of a robot's .json, or your own `Robot` (docs/robots.md).
         progress: show a bar while the weights load.
 
-    Raises ConfigError, CheckpointError, TokenizerError or BackendUnavailable, each with what to do about it.
+    Raises ConfigError, CheckpointError, CalibrationError, TokenizerError or BackendUnavailable, each with what to do
+    about it.
     Calls from several threads are served one at a time.
     """
 
@@ -52,7 +58,8 @@ class UnifiedPolicy:
         *,
         config: str | Path | PolicyConfig = "auto",
         backend: str = "auto",
-        precision: Precision = "bf16",
+        precision: Tier = "bf16",
+        quantization: str | Path | Quantization | None = None,
         num_denoising_steps: int = 10,
         device: str | torch.device = "auto",
         tokenizer: Any = None,
@@ -84,7 +91,10 @@ class UnifiedPolicy:
             self._loading = {"load_seconds": round(loaded.seconds, 3), "weight_bytes": loaded.bytes}
             return loaded.state
 
-        self.backend = backends.create(name, self.config.model, load, device=self._device, precision=precision)
+        fp8 = for_policy(quantization, precision, checkpoint)
+        self.backend = backends.create(
+            name, self.config.model, load, device=self._device, precision=precision, quantization=fp8
+        )
         self._generator = np.random.default_rng()
         self._lock = threading.Lock()
         self._backend_reason = why
@@ -151,6 +161,56 @@ class UnifiedPolicy:
             "total_ms": (end - start) * 1e3,
         }
         return [result | {"policy_timing": dict(timing)} for result in results]
+
+    def submit(
+        self,
+        obs: Mapping[str, Any],
+        *,
+        noise: np.ndarray | None = None,
+        seed: int | None = None,
+        num_steps: int | None = None,
+        serially: bool = False,
+    ) -> "Future[dict[str, Any]]":
+        """`infer` that returns at once, with a Future of what `infer` returns; several may be in flight.
+
+        For the pipelined backends, which encode one observation while another is denoised. Other backends raise
+        ConfigError, unless `serially` says that running it now, before returning, will do.
+        """
+        if not hasattr(self.backend, "submit"):
+            if not serially:
+                raise ConfigError(
+                    f"backend {self.backend.name!r} runs one observation at a time: take backend 'tensorrt_pipelined', "
+                    "or submit(…, serially=True) to run it before submit returns"
+                )
+            done: Future[dict[str, Any]] = Future()
+            done.set_result(self.infer(obs, noise=noise, seed=seed, num_steps=num_steps))
+            return done
+        start = time.perf_counter()
+        steps = self._num_steps if num_steps is None else _checked_steps(num_steps, ObservationError)
+        inputs, state = self._pipeline.before(obs)
+        x_1 = torch.from_numpy(self._noise(1, None if noise is None else [noise], seed))
+        infer_start = time.perf_counter()
+        running: Future[backends.Sample] = self.backend.submit(Observation.stack([inputs]), x_1, steps)
+        answer: Future[dict[str, Any]] = Future()
+
+        def finish(ran: "Future[backends.Sample]") -> None:
+            try:
+                sample = ran.result()
+                infer_end = time.perf_counter()
+                result = self._pipeline.after(sample.actions.numpy()[0], state)
+                timing = {
+                    "infer_ms": (infer_end - infer_start) * 1e3,
+                    "preprocess_ms": (infer_start - start) * 1e3,
+                    **{f"{stage}_ms": milliseconds for stage, milliseconds in sample.stage_ms.items()},
+                    "postprocess_ms": (time.perf_counter() - infer_end) * 1e3,
+                    "total_ms": (time.perf_counter() - start) * 1e3,
+                }
+                answer.set_result(result | {"policy_timing": timing})
+            except BaseException as error:
+                answer.set_exception(error)
+
+        running.add_done_callback(finish)
+        return answer
 
     def warmup(self, num_steps: int | None = None) -> float:
         """Make the first real call as fast as later ones: compile, allocate, capture. Returns the seconds it took."""

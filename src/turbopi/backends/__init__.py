@@ -9,14 +9,24 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi.backends.base import Backend, LoadState, Sample
+from turbopi.backends.base import Backend, LoadState, Sample, Tier
+from turbopi.calibrate.artifact import TIERS, Quantization
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.model.reference import Precision
 
-__all__ = ["BACKENDS", "Backend", "LoadState", "Sample", "availability", "choose", "create", "resolve_device"]
+__all__ = [
+    "BACKENDS",
+    "Backend",
+    "LoadState",
+    "Sample",
+    "Tier",
+    "availability",
+    "choose",
+    "create",
+    "resolve_device",
+]
 
-PRECISIONS: tuple[Precision, ...] = ("bf16", "f32")
+PRECISIONS: tuple[Tier, ...] = ("bf16", "f32", *TIERS)
 
 
 @dataclass(frozen=True)
@@ -47,13 +57,31 @@ _SPECS = (
         "fused",
         "turbopi.backends.fused",
         "FusedBackend",
-        "cuda_graph with kernels of our own, bf16: NVIDIA GPUs from compute capability 8.0",
+        "cuda_graph with kernels of our own: NVIDIA GPUs from compute capability 8.0; in FP8 9.0",
     ),
     BackendSpec(
         "onnx",
         "turbopi.backends.onnx",
         "OnnxBackend",
         "the exported ONNX graphs in ONNX Runtime, f32: CPUs",
+    ),
+    BackendSpec(
+        "tensorrt",
+        "turbopi.backends.tensorrt",
+        "TensorRTBackend",
+        "TensorRT engines for vision, prefix MLPs and denoising: NVIDIA GPUs from compute capability 8.0",
+    ),
+    BackendSpec(
+        "tensorrt_fp8",
+        "turbopi.backends.tensorrt_fp8",
+        "TensorRTFp8Backend",
+        "tensorrt with calibrated E4M3 MLPs in the prefix: NVIDIA GPUs from compute capability 8.9",
+    ),
+    BackendSpec(
+        "tensorrt_pipelined",
+        "turbopi.backends.tensorrt_pipelined",
+        "TensorRTPipelinedBackend",
+        "tensorrt with two observations in flight: throughput, not latency",
     ),
 )
 _FASTEST_FIRST = ("fused", "cuda_graph", "pytorch_compile")
@@ -86,8 +114,10 @@ def availability(name: str, device: torch.device) -> str | None:
     return _backend_class(name).unavailable(device)
 
 
-def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, str]:
+def choose(device: torch.device, precision: Tier = "bf16") -> tuple[str, str]:
     """The backend that "auto" stands for on a device in a precision, and why."""
+    if precision in TIERS:
+        return "fused", f"auto: the only backend that runs in {precision}"
     if device.type == "cpu":
         return "pytorch", "auto: on a CPU the eager reference starts at once and compiling gains little"
     reasons: list[str] = []
@@ -110,7 +140,7 @@ def _unproven(name: str, device: torch.device) -> str | None:
     return f"it was never run on compute capability {major}.{minor}; try it with backend={name!r}"
 
 
-def check(name: str, device: torch.device, precision: Precision) -> None:
+def check(name: str, device: torch.device, precision: Tier) -> None:
     """Raise ConfigError for an unknown name or precision, BackendUnavailable where the backend can't run."""
     if precision not in PRECISIONS:
         raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(PRECISIONS)}")
@@ -120,15 +150,30 @@ def check(name: str, device: torch.device, precision: Precision) -> None:
     reason = cls.unavailable(device)
     if reason is not None:
         raise BackendUnavailable(f"backend {name!r} can't run on {device}: {reason}")
+    reason = cls.unavailable_in(device, precision) if precision in TIERS else None  # type: ignore[attr-defined]
+    if reason is not None:
+        raise BackendUnavailable(f"backend {name!r} can't run in {precision} on {device}: {reason}")
 
 
-def create(name: str, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> Backend:
-    """Build the backend called `name` around a checkpoint's tensors. Raises what `check` raises."""
+def create(
+    name: str,
+    config: ModelConfig,
+    load: LoadState,
+    *,
+    device: torch.device,
+    precision: Tier,
+    quantization: Quantization | None = None,
+) -> Backend:
+    """Build the backend called `name` around a checkpoint's tensors. Raises what `check` raises.
+
+    quantization   for the FP8 tiers alone: the calibration of this very checkpoint
+    """
     check(name, device, precision)
-    return _backend_class(name)(config, load, device=device, precision=precision)
+    more = {} if quantization is None else {"quantization": quantization}
+    return _backend_class(name)(config, load, device=device, precision=precision, **more)
 
 
-def precisions(name: str) -> tuple[Precision, ...]:
+def precisions(name: str) -> tuple[Tier, ...]:
     """The precisions a backend runs in."""
     return _backend_class(name).precisions
 

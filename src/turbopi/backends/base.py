@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -14,6 +14,10 @@ from turbopi.observation import Observation
 
 # Loads the checkpoint's tensors, by canonical name, to a device in a precision.
 LoadState = Callable[[torch.device, Precision], dict[str, Tensor]]
+
+
+# What a backend may run in. The FP8 tiers load bfloat16 and need a calibration: see `turbopi.calibrate`.
+Tier = Literal["bf16", "f32", "fp8", "fp8-mlp"]
 
 
 @dataclass(frozen=True)
@@ -32,12 +36,12 @@ class Backend(Protocol):
     """
 
     name: ClassVar[str]
-    precisions: ClassVar[tuple[Precision, ...]]
+    precisions: ClassVar[tuple[Tier, ...]]
     config: ModelConfig
     device: torch.device
-    precision: Precision
+    precision: Tier
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Tier) -> None:
         """Load the weights; whatever can be prepared without an observation is prepared here."""
 
     @classmethod

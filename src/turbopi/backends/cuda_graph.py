@@ -9,19 +9,21 @@ import itertools
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample
+from turbopi.backends.base import LoadState, Sample, Tier
 from turbopi.config import ModelConfig
 from turbopi.engine.call import Cache, CallShape, Denoiser, Mark, StaticCall
 from turbopi.engine.ops import Ops, compiled
-from turbopi.engine.weights import modulation, pack
+from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError
 from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Precision, Trace
+from turbopi.model.reference import Trace
 from turbopi.observation import Observation
 
 logger = logging.getLogger(__name__)
@@ -34,10 +36,9 @@ class Graph:
     """A sequence of kernels captured once, with timing events at its start and at every mark."""
 
     def __init__(self, run: Callable[[Mark], None], pool: Any, stream: torch.cuda.Stream) -> None:
-        self._stream = stream
+        self._device = stream.device
         self._events: dict[str, torch.cuda.Event] = {}
         self._graph = torch.cuda.CUDAGraph()
-        self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
         stream.wait_stream(torch.cuda.current_stream(stream.device))
         with torch.cuda.stream(stream):
             for _ in range(2):  # compiles and allocates whatever the kernels need, outside the capture
@@ -48,11 +49,9 @@ class Graph:
             run(self._mark)
 
     def replay(self) -> None:
-        """Run the kernels again on what their input buffers hold now, and wait for them."""
-        with torch.cuda.stream(self._stream):
-            self._graph.replay()
-            self._done.record(self._stream)
-        self._done.synchronize()
+        """Run the kernels again on what their input buffers hold now, on the current stream, and wait for them."""
+        self._graph.replay()
+        torch.cuda.current_stream(self._device).synchronize()
 
     def stage_ms(self) -> dict[str, float]:
         """Device time of the last replay: each mark's milliseconds since the one before."""
@@ -65,17 +64,35 @@ class Graph:
         self._events[stage] = event
 
 
+@dataclass(frozen=True)
+class HostRow:
+    """One row of an observation on the host, compacted: NumPy's views, since a small torch operation costs 3 us."""
+
+    images: list[np.ndarray]  # the valid cameras' (uint8|float32)[224, 224, 3]
+    tokens: np.ndarray  # int64[valid prompt tokens]
+    state: np.ndarray  # float32[action_dim]
+
+    @classmethod
+    def of(cls, observation: Observation, row: int) -> "HostRow":
+        def on_host(tensor: Tensor) -> np.ndarray:
+            return tensor[row].cpu().numpy() if tensor.is_cuda else tensor.numpy()[row]
+
+        images, mask = on_host(observation.images), on_host(observation.image_mask)
+        tokens = on_host(observation.tokens)[on_host(observation.token_mask)]
+        return cls([images[camera] for camera in np.flatnonzero(mask)], tokens, on_host(observation.state))
+
+
 class CudaGraphBackend:
     """The engine's forward pass with PyTorch's kernels, those between the matrix products fused by Inductor."""
 
     name: ClassVar[str] = "cuda_graph"
-    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
+    precisions: ClassVar[tuple[Tier, ...]] = ("bf16", "f32")
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Tier) -> None:
         if config.vlm.num_kv_heads != 1:
             raise BackendError(f"{self.name} needs one key/value head, this model has {config.vlm.num_kv_heads}")
         self.config, self.device, self.precision = config, device, precision
-        self._weights = pack(config, load(device, precision))
+        self._weights = self._pack(load)
         self._ops = self._make_ops()
         rows = MAX_CAMERAS * config.vision.num_tokens + _bucket(config.max_prompt_tokens) + config.action_horizon + 64
         self._cache = Cache.allocate(config, rows, device, self._weights.embed_tokens.dtype)
@@ -96,16 +113,16 @@ class CudaGraphBackend:
 
     def warmup(self, observation: Observation, num_steps: int) -> None:
         """Capture the whole call for every prompt length, with this observation's number of cameras."""
-        shape = self._shape(observation, 0, self.config.action_horizon, num_steps)
+        shape = self._shape(observation, HostRow.of(observation, 0), self.config.action_horizon, num_steps)
         for slots in range(BUCKET, _bucket(self.config.max_prompt_tokens) + 1, BUCKET):
             self._graph(CallShape(shape.cameras, slots, shape.horizon, num_steps, shape.float_images), "call")
 
     def prefix(self, observation: Observation) -> KVCache:
         if observation.batch_size != 1:
             raise BackendError(f"{self.name} holds the cache of one observation, not of {observation.batch_size}")
-        shape = self._shape(observation, 0, self.config.action_horizon, 1)
-        noise = torch.zeros(1, shape.horizon, self.config.action_dim)
-        call = self._run(shape, "prefix", observation, noise, 0)
+        row = HostRow.of(observation, 0)
+        shape = self._shape(observation, row, self.config.action_horizon, 1)
+        call, _ = self._run(shape, "prefix", row, np.zeros((shape.horizon, self.config.action_dim), np.float32))
         length = int(call.host.length[0])
         return KVCache(
             call.cache_k[:, None, None, :length].clone(),
@@ -133,12 +150,14 @@ class CudaGraphBackend:
         return call.x_t[-1:].clone()
 
     def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
-        actions, stages = [], []
-        for row in range(observation.batch_size):
-            shape = self._shape(observation, row, noise.shape[1], num_steps)
-            actions.append(self._run(shape, "call", observation, noise, row).actions.clone())
-            stages.append(self._graph(shape, "call").stage_ms())
-        return Sample(torch.stack(actions), {name: sum(one[name] for one in stages) for name in stages[0]})
+        x_1 = noise.cpu().numpy()
+        actions, stages = np.empty_like(x_1), []
+        for i in range(observation.batch_size):
+            row = HostRow.of(observation, i)
+            call, graph = self._run(self._shape(observation, row, x_1.shape[1], num_steps), "call", row, x_1[i])
+            actions[i] = call.actions_array
+            stages.append(graph.stage_ms())
+        return Sample(torch.from_numpy(actions), {name: sum(one[name] for one in stages) for name in stages[0]})
 
     def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
         rows = [self._trace_row(observation, noise, row, num_steps) for row in range(observation.batch_size)]
@@ -151,6 +170,9 @@ class CudaGraphBackend:
             "operations": dict(self._ops.origin),
         }
 
+    def _pack(self, load: LoadState) -> Weights:
+        return pack(self.config, load(self.device, "f32" if self.precision == "f32" else "bf16"))
+
     def _make_ops(self) -> Ops:
         return compiled()
 
@@ -158,8 +180,8 @@ class CudaGraphBackend:
         """None: the engine's operations one by one."""
         return None
 
-    def _shape(self, observation: Observation, row: int, horizon: int, num_steps: int) -> CallShape:
-        cameras, tokens = int(observation.image_mask[row].sum()), int(observation.token_mask[row].sum())
+    def _shape(self, observation: Observation, row: HostRow, horizon: int, num_steps: int) -> CallShape:
+        cameras, tokens = len(row.images), len(row.tokens)
         if cameras > MAX_CAMERAS or tokens > self.config.max_prompt_tokens or cameras + tokens == 0:
             raise BackendError(
                 f"{self.name} takes up to {MAX_CAMERAS} cameras and {self.config.max_prompt_tokens} prompt tokens, "
@@ -167,17 +189,12 @@ class CudaGraphBackend:
             )
         return CallShape(cameras, _bucket(tokens), horizon, num_steps, observation.images.dtype == torch.float32)
 
-    def _run(self, shape: CallShape, part: str, observation: Observation, noise: Tensor, row: int) -> StaticCall:
-        """Replay (a part of) the call of one row's shape on its data, compacted on the host."""
+    def _run(self, shape: CallShape, part: str, row: HostRow, noise: np.ndarray) -> tuple[StaticCall, Graph]:
+        """Replay (a part of) the call of one row's shape on its data and noise float32[H, action_dim]."""
         graph, call = self._graph(shape, part), self._calls[shape]
-        call.write_inputs(
-            observation.images[row].cpu().numpy()[observation.image_mask[row].cpu().numpy()],
-            noise[row].cpu().numpy(),
-            observation.state[row].cpu().numpy(),
-            observation.tokens[row].cpu().numpy()[observation.token_mask[row].cpu().numpy()],
-        )
+        call.write_inputs(row.images, noise, row.state, row.tokens)
         graph.replay()
-        return call
+        return call, graph
 
     def _graph(self, shape: CallShape, part: str) -> Graph:
         """The graph of a shape: the whole "call", or one half of it. Captured on first use."""
@@ -194,7 +211,7 @@ class CudaGraphBackend:
             table = modulation(self.config, self._weights.conditioning, shape.num_steps)
             self._tables[shape.num_steps] = None if table is None else table.to(self.device)
         if shape not in self._calls:
-            rows = shape.prefix_slots(self.config) + shape.horizon + 1
+            rows = shape.cache_rows(self.config)
             if rows > self._cache.k.shape[1]:
                 raise BackendError(f"{self.name} has {self._cache.k.shape[1]} cache rows, {shape} needs {rows}")
             table = self._tables[shape.num_steps]
@@ -204,7 +221,8 @@ class CudaGraphBackend:
 
     def _trace_row(self, observation: Observation, noise: Tensor, row: int, num_steps: int) -> Trace:
         """One row's intermediates in golden layouts: the cache goes back to its padded slots."""
-        call = self._run(self._shape(observation, row, noise.shape[1], num_steps), "call", observation, noise, row)
+        one, x_1 = HostRow.of(observation, row), noise[row].cpu().numpy()
+        call, _ = self._run(self._shape(observation, one, len(x_1), num_steps), "call", one, x_1)
         length, per_image = int(call.host.length[0]), self.config.vision.num_tokens
         cameras = observation.image_mask[row].repeat_interleave(per_image)
         valid = torch.cat((cameras, observation.token_mask[row])).cpu()

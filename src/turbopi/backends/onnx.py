@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample
+from turbopi.backends.base import LoadState, Sample, Tier
 from turbopi.backends.timing import StageTimer
 from turbopi.config import ModelConfig
 from turbopi.errors import CheckpointError, ObservationError
@@ -37,6 +37,8 @@ class Sessions:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # four pools, one works at a time
+        # it would fuse FP8 pairs into an integer product, and then refuse that (1.30)
+        options.add_session_config_entry("session.disable_quant_qdq", "1")
         options.log_severity_level = 3  # errors
         self._sessions = {}
         for name in GRAPHS:
@@ -57,7 +59,7 @@ class OnnxBackend:
     """Exports the weights into a temporary folder and runs that, or runs a folder exported before (`open`)."""
 
     name: ClassVar[str] = "onnx"
-    precisions: ClassVar[tuple[Precision, ...]] = ("f32",)
+    precisions: ClassVar[tuple[Tier, ...]] = ("f32",)
 
     def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
         model = Pi0Model.from_state(config, load(device, precision))

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample
+from turbopi.backends.base import LoadState, Sample, Tier
 from turbopi.backends.timing import StageTimer
 from turbopi.config import ModelConfig
 from turbopi.model.kv_cache import KVCache
@@ -17,13 +17,13 @@ class PyTorchBackend:
     """Runs `Pi0Model`; a batch of one is compacted exactly, larger ones as far as their masks allow."""
 
     name: ClassVar[str] = "pytorch"
-    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
+    precisions: ClassVar[tuple[Tier, ...]] = ("bf16", "f32")
     model_class: ClassVar[type[Pi0Model]] = Pi0Model
 
     def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
         self.config = config
         self.device = device
-        self.precision = precision
+        self.precision: Tier = precision
         self.model = self.model_class.from_state(config, load(device, precision))
 
     @classmethod

@@ -1,7 +1,7 @@
 """The command line.
 
-turbopi demo | infer | serve | bench | verify | eval |
-    compare | inspect | convert | export | backends | doctor
+turbopi demo | infer | serve | bench | calibrate | verify | eval |
+    compare | inspect | convert | export | build | study | backends | doctor
 """
 
 from importlib import metadata
@@ -11,7 +11,22 @@ import typer
 
 # Importing a module declares its commands, in the order of --help
 # isort: off
-from turbopi.cli import demo, infer, serve, bench, verify, evaluate, compare, checkpoints, export, backends, doctor  # noqa: F401
+from turbopi.cli import (  # noqa: F401
+    demo,
+    infer,
+    serve,
+    bench,
+    calibrate,
+    verify,
+    evaluate,
+    compare,
+    checkpoints,
+    export,
+    build,
+    study,
+    backends,
+    doctor,
+)
 from turbopi.cli.framework import app
 # isort: on
 

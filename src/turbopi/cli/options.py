@@ -114,8 +114,32 @@ class PolicyOptions(WeightOptions):
         str, _option("--backend", panel=_RUNNING, metavar="NAME", help="One of `turbopi backends`, or auto.")
     ] = "auto"
     precision: Annotated[
-        str, _option("--precision", panel=_RUNNING, metavar="bf16|f32", help="bf16 as openpi serves it, or f32.")
+        str,
+        _option(
+            "--precision",
+            panel=_RUNNING,
+            metavar="bf16|f32|fp8|fp8-mlp",
+            help="bf16 as openpi serves it, f32, or calibrated.",
+        ),
     ] = "bf16"
+    quantization: Annotated[
+        str | None,
+        _option(
+            "--quantization",
+            panel=_RUNNING,
+            metavar="FILE",
+            help="What `turbopi calibrate` wrote, for fp8 and fp8-mlp. Unless given: turbopi_fp8.json beside them.",
+        ),
+    ] = None
+    fp8_parts: Annotated[
+        str | None,
+        _option(
+            "--fp8-parts",
+            panel=_RUNNING,
+            metavar="PART,PART",
+            help="FP8 in these parts alone: vision, prefix, expert. Unless given, in all that the calibration allows.",
+        ),
+    ] = None
     steps: Annotated[int, _option("--steps", panel=_RUNNING, metavar="N", help="Denoising steps of an inference.")] = 10
     device: Annotated[
         str,
@@ -152,6 +176,7 @@ class PolicyOptions(WeightOptions):
         return {
             "backend": self.backend,
             "precision": self.precision,
+            "quantization": self._quantization(),
             "num_denoising_steps": self.steps,
             "device": self.device,
             "tokenizer": self.tokenizer,
@@ -174,6 +199,16 @@ class PolicyOptions(WeightOptions):
         )
         output.line(f"backend: {about['backend']} ({about['backend_reason']})")
         return policy
+
+    def _quantization(self) -> Any:
+        """What UnifiedPolicy takes as `quantization`."""
+        if self.fp8_parts is None:
+            return self.quantization
+        if self.quantization is None:
+            raise ConfigError("--fp8-parts narrows a calibration: name it with --quantization FILE")
+        from turbopi.calibrate.artifact import Quantization
+
+        return Quantization.load(self.quantization).only(self.fp8_parts.split(","))
 
     def _robot(self) -> Any:
         """What UnifiedPolicy takes as `robot`; "module:Class" runs that module's code, as was asked for."""

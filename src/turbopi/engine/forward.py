@@ -6,6 +6,7 @@ or the state changes. The mathematics is `turbopi.model.reference`'s; only its o
 
   - matrices that share an input are one product; adaRMS comes from a table of all steps;
   - a residual is added together with the norm behind it;
+  - where the next matrix is an `Fp8Matrix`, an operation's result is rounded to E4M3 for it;
   - logits leave their product in float32 and keys beyond `length` get -inf before the softmax.
 
 Shapes: V cameras, S prefix slots of the bucket, H suffix tokens, D width, K head_dim, n query heads.
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
+from turbopi.engine.fp8 import input_of
 from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights
 from turbopi.model.layers import rope_tables
@@ -29,12 +31,12 @@ def vision_tokens(config: ModelConfig, weights: Weights, ops: Ops, images: Tenso
     x = ops.embed_patches(images, weights.patch, weights.position, out.dtype)  # [V * 256, W]
     y = None
     for layer in weights.vision:
-        x, normed = ops.residual_layer_norm(x, y, *layer.norm1, v.layer_norm_eps)
-        attended = ops.vision_attention(ops.linear(normed, *layer.qkv), n, v.num_heads)
+        x, normed = ops.residual_layer_norm(x, y, *layer.norm1, v.layer_norm_eps, **input_of(layer.qkv[0]))
+        attended = ops.vision_attention(ops.linear(normed, *layer.qkv), n, v.num_heads, **input_of(layer.out[0]))
         x, normed = ops.residual_layer_norm(
-            x, ops.residual_linear(attended, *layer.out), *layer.norm2, v.layer_norm_eps
+            x, ops.residual_linear(attended, *layer.out), *layer.norm2, v.layer_norm_eps, **input_of(layer.fc1[0])
         )
-        y = ops.residual_linear(ops.linear_gelu(normed, *layer.fc1), *layer.fc2)
+        y = ops.residual_linear(ops.linear_gelu(normed, *layer.fc1, **input_of(layer.fc2[0])), *layer.fc2)
     _, normed = ops.residual_layer_norm(x, y, *weights.post_layernorm, v.layer_norm_eps)
     ops.linear(normed, *weights.projector, out)
 
@@ -54,14 +56,15 @@ def prefix_cache(
     y = None
     for i, layer in enumerate(weights.vlm):
         k, v = cache_k[i, :slots], cache_v[i, :slots]
-        x, normed = ops.residual_rms_norm(x, y, None, layer.norm1, None, eps)
+        x, normed = ops.residual_rms_norm(x, y, None, layer.norm1, None, eps, **input_of(layer.qkv))
         if i + 1 == len(weights.vlm):  # nothing but K and V of the last layer is ever used
             ops.rope_split(ops.linear(normed, layer.qkv[-2 * g.head_dim :]), *rope, k, v)
             return
         q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, k, v)
-        attended = ops.attention(q, k, v, length, slots, g.num_heads)
-        x, normed = ops.residual_rms_norm(x, ops.residual_linear(attended, layer.out), None, layer.norm2, None, eps)
-        y = ops.residual_linear(ops.linear_geglu(normed, layer.gate_up), layer.down)
+        attended = ops.attention(q, k, v, length, slots, g.num_heads, **input_of(layer.out))
+        y = ops.residual_linear(attended, layer.out)
+        x, normed = ops.residual_rms_norm(x, y, None, layer.norm2, None, eps, **input_of(layer.gate_up))
+        y = ops.residual_linear(ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down)), layer.down)
 
 
 def expert_output(

@@ -4,6 +4,9 @@
 own kernels must equal `PLAIN`. Reductions and nonlinear functions are float32 inside; results have the activations'
 dtype.
 
+Where the product behind an operation is an `Fp8Matrix`, the operation gets that input's `inverse` scale, and its result
+is E4M3, rounded once from float32.
+
 Shapes: D, W widths, F hidden width of an MLP, K head_dim, n query heads over one key/value head.
 """
 
@@ -16,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from turbopi.engine.fp8 import Fp8Matrix, Matrix, to_e4m3
 from turbopi.model.layers import apply_rope, rms_normalize
 from turbopi.model.vision import normalize_images
 
@@ -34,10 +38,10 @@ class Ops:
     residual_layer_norm: Callable[..., tuple[Tensor, Tensor]]
     linear: Callable[..., Tensor]
     residual_linear: Callable[..., Tensor]
-    linear_gelu: Callable[[Tensor, Tensor, Tensor], Tensor]
-    linear_geglu: Callable[[Tensor, Tensor], Tensor]
+    linear_gelu: Callable[..., Tensor]
+    linear_geglu: Callable[..., Tensor]
     rope_split: Callable[..., Tensor]
-    vision_attention: Callable[[Tensor, int, int], Tensor]
+    vision_attention: Callable[..., Tensor]
     attention: Callable[..., Tensor]
     origin: Mapping[str, str] = field(default_factory=dict)
 
@@ -64,7 +68,13 @@ def embed_prompt(tokens: Tensor, table: Tensor, out: Tensor) -> None:
 
 
 def residual_rms_norm(
-    x: Tensor, y: Tensor | None, gate: Tensor | None, scale: Tensor, shift: Tensor | None, eps: float
+    x: Tensor,
+    y: Tensor | None,
+    gate: Tensor | None,
+    scale: Tensor,
+    shift: Tensor | None,
+    eps: float,
+    inverse: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """(x + y * gate, its RMSNorm * scale + shift). x, y [tokens, D]; gate, scale, shift float32[D]; None: left out.
 
@@ -73,20 +83,44 @@ def residual_rms_norm(
     if y is not None:
         x = x + (y if gate is None else y * gate.to(x.dtype))
     normed = rms_normalize(x, eps) * scale
-    return x, (normed if shift is None else normed + shift).to(x.dtype)
+    normed = normed if shift is None else normed + shift
+    return x, normed.to(x.dtype) if inverse is None else to_e4m3(normed, inverse)
 
 
-def residual_layer_norm(x: Tensor, y: Tensor | None, weight: Tensor, bias: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+def residual_layer_norm(
+    x: Tensor, y: Tensor | None, weight: Tensor, bias: Tensor, eps: float, inverse: float | None = None
+) -> tuple[Tensor, Tensor]:
     """(x + y, its LayerNorm). x, y [tokens, W]."""
     if y is not None:
         x = x + y
+    if inverse is not None:
+        return x, to_e4m3(F.layer_norm(x.float(), (x.shape[-1],), weight.float(), bias.float(), eps), inverse)
     return x, F.layer_norm(x, (x.shape[-1],), weight, bias, eps)
 
 
-def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+def linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
     """x @ weightᵀ + bias, into `out` if it is given."""
-    result = F.linear(x, weight, bias)
+    result = weight.product(x, bias).to(weight.dtype) if isinstance(weight, Fp8Matrix) else F.linear(x, weight, bias)
     return result if out is None else out.copy_(result)
+
+
+def linear_gelu(x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None) -> Tensor:
+    """gelu(x @ weightᵀ + bias). An Fp8Matrix's product isn't rounded before."""
+    if not isinstance(weight, Fp8Matrix):
+        return _as_input(gelu(F.linear(x, weight, bias)), x.dtype, inverse)
+    return _as_input(gelu(weight.product(x, bias)), weight.dtype, inverse)
+
+
+def linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None) -> Tensor:
+    """[tokens, D] times [2F, D], gate rows before up rows -> gelu(gate) * up [tokens, F]."""
+    if not isinstance(gate_up, Fp8Matrix):
+        return _as_input(geglu(F.linear(x, gate_up)), x.dtype, inverse)
+    return _as_input(geglu(gate_up.product(x)), gate_up.dtype, inverse)
+
+
+def _as_input(x: Tensor, dtype: torch.dtype, inverse: float | None) -> Tensor:
+    """x for the product behind it: E4M3 if it asks for that."""
+    return x.to(dtype) if inverse is None else to_e4m3(x, inverse)
 
 
 def gelu(x: Tensor) -> Tensor:
@@ -99,6 +133,18 @@ def geglu(gate_up: Tensor) -> Tensor:
     return F.gelu(gate, approximate="tanh") * up
 
 
+def gelu_by_sigmoid(x: Tensor) -> Tensor:
+    """`gelu`, as (1 + tanh u) / 2 = sigmoid(2 u): one exponential, where a compiled tanh also takes a polynomial."""
+    y = x.float()
+    return (y * torch.sigmoid(1.5957691216057308 * y * (1 + 0.044715 * y * y))).to(x.dtype)  # 2 * sqrt(2 / pi)
+
+
+def geglu_by_sigmoid(gate_up: Tensor) -> Tensor:
+    """`geglu`, with `gelu_by_sigmoid`."""
+    gate, up = gate_up.chunk(2, dim=-1)
+    return gelu_by_sigmoid(gate) * up
+
+
 def rope_split(qkv: Tensor, cos: Tensor, sin: Tensor, k_out: Tensor, v_out: Tensor) -> Tensor:
     """Split [tokens, (n + 2) * K]; write rotated keys and values [tokens, K]; return rotated queries [tokens * n, K].
 
@@ -106,17 +152,17 @@ def rope_split(qkv: Tensor, cos: Tensor, sin: Tensor, k_out: Tensor, v_out: Tens
     """
     head_dim = k_out.shape[-1]
     parts = qkv.view(qkv.shape[0], -1, head_dim)
-    rotated = apply_rope(parts[:, :-1], cos[:, None], sin[:, None])
-    k_out.copy_(rotated[:, -1])
+    k_out.copy_(apply_rope(parts[:, -2], cos, sin))  # apart from the queries: Inductor would write both, then copy
     v_out.copy_(parts[:, -1])
-    return rotated[:, :-1].reshape(-1, head_dim)
+    return apply_rope(parts[:, :-2], cos[:, None], sin[:, None]).reshape(-1, head_dim)
 
 
-def vision_attention(qkv: Tensor, images: int, heads: int) -> Tensor:
+def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:
     """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W]."""
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     q, k, v = qkv.view(images, -1, 3, heads, width // heads).permute(2, 0, 3, 1, 4)
-    return F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(rows, width)
+    attended = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(rows, width)
+    return _as_input(attended, qkv.dtype, inverse)
 
 
 def masked_softmax(
@@ -141,6 +187,7 @@ def attention(
     state_token: bool = False,
     *,
     softmax: Callable[..., Tensor] = masked_softmax,
+    inverse: float | None = None,
 ) -> Tensor:
     """softmax(q kᵀ / √K) v over keys [0, length) and [slots, …): q [tokens * n, K] -> [tokens, n * K].
 
@@ -150,7 +197,7 @@ def attention(
     """
     logits = _matmul_f32(q, k.t())
     probabilities = softmax(logits, length, slots, heads, state_token, q.shape[1] ** -0.5, v.dtype)
-    return (probabilities @ v).view(-1, heads * q.shape[1])
+    return _as_input((probabilities @ v).view(-1, heads * q.shape[1]), q.dtype, inverse)
 
 
 def _matmul_f32(a: Tensor, b: Tensor) -> Tensor:
@@ -169,8 +216,8 @@ PLAIN = Ops(
     residual_layer_norm=residual_layer_norm,
     linear=linear,
     residual_linear=linear,
-    linear_gelu=lambda x, weight, bias: gelu(F.linear(x, weight, bias)),
-    linear_geglu=lambda x, gate_up: geglu(F.linear(x, gate_up)),
+    linear_gelu=linear_gelu,
+    linear_geglu=linear_geglu,
     rope_split=rope_split,
     vision_attention=vision_attention,
     attention=attention,
@@ -181,8 +228,8 @@ PLAIN = Ops(
 _DYNAMIC_AXES: dict[Callable[..., Any], dict[str, tuple[int, ...]]] = {
     residual_rms_norm: {"x": (0,), "y": (0,)},
     residual_layer_norm: {"x": (0,), "y": (0,)},
-    gelu: {"x": (0,)},
-    geglu: {"gate_up": (0,)},
+    gelu_by_sigmoid: {"x": (0,)},
+    geglu_by_sigmoid: {"gate_up": (0,)},
     rope_split: {"qkv": (0,), "cos": (0,), "sin": (0,), "k_out": (0,), "v_out": (0,)},
     masked_softmax: {"logits": (0, 1)},
 }
@@ -191,7 +238,8 @@ _RECOMPILE_LIMIT = 64  # one compilation per width and per set of optional argum
 
 def compiled() -> Ops:
     """The same operations with torch.compile between the matrix products, for any number of tokens and keys."""
-    softmax, compiled_gelu, compiled_geglu = _compiled(masked_softmax), _compiled(gelu), _compiled(geglu)
+    softmax = _compiled(masked_softmax)
+    compiled_gelu, compiled_geglu = _compiled(gelu_by_sigmoid), _compiled(geglu_by_sigmoid)
 
     def compiled_attention(*args: Any) -> Tensor:
         return attention(*args, softmax=softmax)
@@ -216,12 +264,14 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     jitted = torch.compile(function, fullgraph=True)
     names = list(inspect.signature(function).parameters)
     dynamic_axes = _DYNAMIC_AXES[function]
+    # elsewhere a second width would make widths unknown, too, and every index a division
+    unknown_numbers = function is masked_softmax  # `slots` differs from bucket to bucket
 
     def call(*args: Any) -> Any:
         for name, arg in zip(names, args, strict=False):
             for axis in dynamic_axes.get(name, ()) if arg is not None else ():
                 torch._dynamo.maybe_mark_dynamic(arg, axis)
-        with torch._dynamo.config.patch(recompile_limit=_RECOMPILE_LIMIT):
+        with torch._dynamo.config.patch(recompile_limit=_RECOMPILE_LIMIT, automatic_dynamic_shapes=unknown_numbers):
             return jitted(*args)
 
     return call

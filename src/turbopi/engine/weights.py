@@ -3,38 +3,43 @@
 Packing takes tensors out of the state as it goes, so that the device never holds more than one layer twice.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ModelConfig
+from turbopi.engine.fp8 import Matrix
 from turbopi.model.denoise import time_embedding, time_grid
 
 State = dict[str, Tensor]
 Affine = tuple[Tensor, Tensor]  # weight [out, in], bias [out]; of a LayerNorm: weight, bias [W]
+AffineMatrix = tuple[Matrix, Tensor]
+AnyMatrix = TypeVar("AnyMatrix", bound=Matrix)
+MakeMatrix = Callable[[str, Tensor], Matrix]  # by its place, such as "vision.3.fc1" or "prefix.0.qkv"
 
 
 @dataclass(frozen=True)
 class VisionLayer:
     norm1: Affine
-    qkv: Affine  # [3W, W], [3W]
-    out: Affine
+    qkv: AffineMatrix  # [3W, W], [3W]
+    out: AffineMatrix
     norm2: Affine
-    fc1: Affine
-    fc2: Affine
+    fc1: AffineMatrix
+    fc2: AffineMatrix
 
 
 @dataclass(frozen=True)
-class GemmaLayer:
+class GemmaLayer(Generic[AnyMatrix]):
     """One layer of either stack. The norms are float32[D], 1 + scale; None where adaRMS replaces them."""
 
-    qkv: Tensor  # [(heads + 2) * K, D]
-    out: Tensor  # [D, heads * K]
-    gate_up: Tensor  # [2F, D]: gate rows, then up rows
-    down: Tensor  # [D, F]
+    qkv: AnyMatrix  # [(heads + 2) * K, D]
+    out: AnyMatrix  # [D, heads * K]
+    gate_up: AnyMatrix  # [2F, D]: gate rows, then up rows
+    down: AnyMatrix  # [D, F]
     norm1: Tensor | None
     norm2: Tensor | None
 
@@ -49,15 +54,18 @@ class Weights:
     post_layernorm: Affine
     projector: Affine
     embed_tokens: Tensor  # [vocab, D]
-    vlm: list[GemmaLayer]
-    expert: list[GemmaLayer]
+    vlm: list[GemmaLayer[Matrix]]
+    expert: list[GemmaLayer[Tensor]]
     expert_norm: Tensor | None  # float32[D], 1 + scale; None: adaRMS
     small: State  # action, state and time projections, float32
     conditioning: State  # Pi0.5: time MLP and adaRMS matrices, float32, on the host: see `modulation`
 
 
-def pack(config: ModelConfig, state: State) -> Weights:
-    """Pack a checkpoint's tensors (canonical names); `state` is emptied."""
+def pack(config: ModelConfig, state: State, make: MakeMatrix = lambda place, matrix: matrix) -> Weights:
+    """Pack a checkpoint's tensors (canonical names); `state` is emptied.
+
+    `make` may turn the vision tower's and the prefix's packed matrices into others, one by one.
+    """
 
     def affine(name: str) -> Affine:
         return state.pop(f"{name}.weight"), state.pop(f"{name}.bias")
@@ -72,12 +80,12 @@ def pack(config: ModelConfig, state: State) -> Weights:
     weights = Weights(
         patch=patch_weight.flatten(1),
         position=state.pop("vision.position_embedding.weight") + patch_bias,
-        vision=list(_vision_layers(config, state)),
+        vision=list(_vision_layers(config, state, make)),
         post_layernorm=affine("vision.post_layernorm"),
         projector=affine("projector"),
         embed_tokens=state.pop("vlm.embed_tokens.weight"),
-        vlm=list(_gemma_layers(config, state, "vlm")),
-        expert=list(_gemma_layers(config, state, "expert")),
+        vlm=list(_gemma_layers(config, state, "vlm", make)),
+        expert=list(_gemma_layers(config, state, "expert", lambda place, matrix: matrix)),
         expert_norm=_scale(state, "expert.norm"),
         small={name: state.pop(name) for name in list(state) if name.startswith(("action_", "state_proj."))},
         conditioning=conditioning,
@@ -86,7 +94,7 @@ def pack(config: ModelConfig, state: State) -> Weights:
     return weights
 
 
-def _vision_layers(config: ModelConfig, state: State) -> Iterator[VisionLayer]:
+def _vision_layers(config: ModelConfig, state: State, make: MakeMatrix) -> Iterator[VisionLayer]:
     for i in range(config.vision.depth):
         prefix = f"vision.layers.{i}"
         projections = [f"{prefix}.self_attn.{p}_proj" for p in "qkv"]
@@ -94,27 +102,35 @@ def _vision_layers(config: ModelConfig, state: State) -> Iterator[VisionLayer]:
         def affine(name: str, prefix: str = prefix) -> Affine:
             return state.pop(f"{prefix}.{name}.weight"), state.pop(f"{prefix}.{name}.bias")
 
+        def matrix(kind: str, name: str, i: int = i) -> AffineMatrix:
+            weight, bias = affine(name)
+            return make(f"vision.{i}.{kind}", weight), bias
+
         yield VisionLayer(
             norm1=affine("layer_norm1"),
             qkv=(
-                torch.cat([state.pop(f"{p}.weight") for p in projections]),
+                make(f"vision.{i}.qkv", torch.cat([state.pop(f"{p}.weight") for p in projections])),
                 torch.cat([state.pop(f"{p}.bias") for p in projections]),
             ),
-            out=affine("self_attn.out_proj"),
+            out=matrix("out", "self_attn.out_proj"),
             norm2=affine("layer_norm2"),
-            fc1=affine("mlp.fc1"),
-            fc2=affine("mlp.fc2"),
+            fc1=matrix("fc1", "mlp.fc1"),
+            fc2=matrix("fc2", "mlp.fc2"),
         )
 
 
-def _gemma_layers(config: ModelConfig, state: State, stack: str) -> Iterator[GemmaLayer]:
+def _gemma_layers(
+    config: ModelConfig, state: State, stack: str, make: Callable[[str, Tensor], AnyMatrix]
+) -> Iterator[GemmaLayer[AnyMatrix]]:
     for i in range(config.vlm.depth):
-        prefix = f"{stack}.layers.{i}"
+        prefix, place = f"{stack}.layers.{i}", f"prefix.{i}"
+        qkv = torch.cat([state.pop(f"{prefix}.self_attn.{p}_proj.weight") for p in "qkv"])
+        gate_up = torch.cat([state.pop(f"{prefix}.mlp.{p}_proj.weight") for p in ("gate", "up")])
         yield GemmaLayer(
-            qkv=torch.cat([state.pop(f"{prefix}.self_attn.{p}_proj.weight") for p in "qkv"]),
-            out=state.pop(f"{prefix}.self_attn.o_proj.weight"),
-            gate_up=torch.cat([state.pop(f"{prefix}.mlp.{p}_proj.weight") for p in ("gate", "up")]),
-            down=state.pop(f"{prefix}.mlp.down_proj.weight"),
+            qkv=make(f"{place}.qkv", qkv),
+            out=make(f"{place}.out", state.pop(f"{prefix}.self_attn.o_proj.weight")),
+            gate_up=make(f"{place}.gate_up", gate_up),
+            down=make(f"{place}.down", state.pop(f"{prefix}.mlp.down_proj.weight")),
             norm1=_scale(state, f"{prefix}.input_layernorm"),
             norm2=_scale(state, f"{prefix}.post_attention_layernorm"),
         )

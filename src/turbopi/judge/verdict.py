@@ -6,6 +6,7 @@ from typing import Any, Literal
 import numpy as np
 
 from turbopi import demo
+from turbopi.calibrate.artifact import TIERS
 from turbopi.errors import BackendError, ConfigError
 from turbopi.judge.intermediates import Errors, ErrorsBy, Place, Suspect, Tensors, first_suspect, in_order
 from turbopi.judge.verify_inputs import Call
@@ -14,6 +15,8 @@ from turbopi.plots import action_groups
 ACTIONS = Place("actions")
 F32_BOUND = 1e-5  # relative rms of the actions
 BF16_FACTOR = 1.25  # times the bf16 control's
+FP8_BOUND = 0.0707  # relative rms of the actions: a cosine of 0.9975, what calibration aims at
+FP8_STEP = 2.0**5  # E4M3's rounding is so much coarser than bfloat16's, and so may intermediates be
 SUSPECT_FACTOR = 3.0  # times the control's, on an intermediate
 JUMP = 10.0  # times the layer or step before
 FLOAT32_ROUNDING = 1e-6  # relative rms: where the control stays in float32 it may have no error at all
@@ -32,7 +35,15 @@ class Rule:
     overridden: bool = False
 
     @classmethod
-    def of(cls, backend: str, precision: str, bound: float | None = None, factor: float | None = None) -> "Rule":
+    def of(
+        cls,
+        backend: str,
+        precision: str,
+        bound: float | None = None,
+        factor: float | None = None,
+        *,
+        trained: bool = False,
+    ) -> "Rule":
         """The stated rule, or the user's own. Raises ConfigError for bounds that make no sense."""
         if bound is not None and factor is not None:
             raise ConfigError("--bound and --factor were both given; give one of them")
@@ -44,9 +55,12 @@ class Rule:
             return cls(control, bound, factor, "given by the user", overridden=True)
         if precision == "f32":
             return cls(control, F32_BOUND, None, "two float32 implementations differ by less, TF32 by more")
+        if precision in TIERS:
+            return cls(control, FP8_BOUND, None, "a cosine of about 0.9975 to float32, what calibration aims at")
         if control == "jitter":
-            reason = "rounding activations besides weights was seen to cost up to 3.2 times rounding weights alone"
-            return cls(control, None, demo.BOUND_FACTORS["bf16"], reason)
+            factors, seen = (demo.TRAINED_FACTORS, "5.5") if trained else (demo.BOUND_FACTORS, "3.2")
+            reason = f"rounding activations besides weights was seen to cost up to {seen} times rounding weights alone"
+            return cls(control, None, factors["bf16"], reason)
         return cls(control, None, BF16_FACTOR, "no worse than PyTorch's own bfloat16, with room for chance")
 
     def limit(self, control: float) -> float:
@@ -57,6 +71,8 @@ class Rule:
         """What an intermediate may be off before it is suspect."""
         if precision == "f32":
             return F32_BOUND if self.bound is None else self.bound
+        if precision in TIERS:
+            return max(FP8_STEP * control, FLOAT32_ROUNDING)
         return max(self.suspect_factor * control, FLOAT32_ROUNDING)
 
     @property
@@ -140,7 +156,7 @@ def judge(
             "factor_of_control": None if rule.bound is not None else rule.factor,
             "reason": rule.reason,
             "overridden": rule.overridden,
-            "suspect_factor": None if precision == "f32" else rule.suspect_factor,
+            "suspect_factor": None if precision == "f32" else FP8_STEP if precision in TIERS else rule.suspect_factor,
             "jump": JUMP,
         },
         "first_off": None if suspect is None else _suspect_json(suspect),

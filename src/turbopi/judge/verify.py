@@ -51,7 +51,7 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
     precision = arguments["precision"]
     name = backends.choose(device, precision)[0] if arguments["backend"] == "auto" else arguments["backend"]
     backends.check(name, device, precision)
-    rule = Rule.of(name, precision, plan.bound, plan.factor)
+    rule = Rule.of(name, precision, plan.bound, plan.factor, trained=checkpoint.format != "random")
     check_observations(plan)
     if arguments.get("robot") is None:
         checkpoint = demo.with_libero_stats(checkpoint)

@@ -9,16 +9,16 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.launch import dependent_launch, launch_dependents, wait_for_producer
+from turbopi.kernels.launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 
 LOG2_E = 1.4426950408889634
 
 
 @triton.jit
 def _vision_kernel(
-    qkv, out, tokens, heads, scale,
+    qkv, out, tokens, heads, scale, inverse,
     DIM: tl.constexpr, BLOCK_A: tl.constexpr, BLOCK_B: tl.constexpr,
-    BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr,
+    BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SCALED: tl.constexpr,
 ):  # fmt: skip
     """One head's BLOCK_M queries of one picture. A head's columns come as BLOCK_A (a power of two) and BLOCK_B more."""
     image, head = tl.program_id(1) // heads, tl.program_id(1) % heads
@@ -55,6 +55,8 @@ def _vision_kernel(
         if BLOCK_B > 0:
             v_b = tl.load(v + b[None, :], valid[:, None] & (b < DIM)[None, :], 0.0)
             acc_b = tl.dot(p, v_b, acc_b * shrink[:, None], input_precision="ieee")
+    if SCALED:
+        total /= inverse
     to = out + (image * tokens + m)[:, None] * width + head * DIM
     dtype = out.dtype.element_ty
     tl.store(to + a[None, :], (acc_a / total[:, None]).to(dtype), (m < tokens)[:, None])
@@ -63,20 +65,23 @@ def _vision_kernel(
         tl.store(to + b[None, :], (acc_b / total[:, None]).to(dtype), stored)
 
 
-def vision_attention(qkv: Tensor, images: int, heads: int) -> Tensor:
-    """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W]."""
+def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:
+    """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
+
+    With `inverse` the result leaves as E4M3: see `engine.fp8`.
+    """
     assert qkv.is_contiguous(), "qkv is read as it lies in memory"
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     tokens, dim = rows // images, width // heads
     block_a = 1 << (dim.bit_length() - 1)
     assert block_a >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     block_b = 0 if block_a == dim else max(16, triton.next_power_of_2(dim - block_a))
-    out = qkv.new_empty(rows, width)
+    out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse))
     block_m, block_n, warps, stages = VISION_TILE
     # launched early, several blocks would crowd onto each of the few SMs that the product before leaves idle
     _vision_kernel[(triton.cdiv(tokens, block_m), images * heads)](
-        qkv, out, tokens, heads, dim**-0.5 * LOG2_E, DIM=dim, BLOCK_A=block_a, BLOCK_B=block_b,
-        BLOCK_M=block_m, BLOCK_N=block_n, num_warps=warps, num_stages=stages,
+        qkv, out, tokens, heads, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim, BLOCK_A=block_a, BLOCK_B=block_b,
+        BLOCK_M=block_m, BLOCK_N=block_n, SCALED=inverse is not None, num_warps=warps, num_stages=stages,
     )  # fmt: skip
     return out
 
@@ -86,8 +91,9 @@ VISION_TILE = (64, 64, 4, 3)
 
 @triton.jit
 def _prefix_kernel(
-    q, k, v, length, out, rows, scale,
-    DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, PDL: tl.constexpr,
+    q, k, v, length, out, rows, scale, inverse,
+    DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SCALED: tl.constexpr,
+    PDL: tl.constexpr,
 ):  # fmt: skip
     """BLOCK_M rows of queries (of any head: they share the keys) over the first `length` keys."""
     m = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
@@ -114,22 +120,27 @@ def _prefix_kernel(
         top = new_top
         values = tl.load(v + at, loaded, 0.0)
         acc = tl.dot(p.to(values.dtype), values, acc * shrink[:, None], input_precision="ieee")
+    if SCALED:
+        total /= inverse
     tl.store(out + m[:, None] * DIM + d[None, :], (acc / total[:, None]).to(out.dtype.element_ty), inside)
 
 
-def prefix_attention(q: Tensor, k: Tensor, v: Tensor, length: Tensor, heads: int) -> Tensor:
+def prefix_attention(
+    q: Tensor, k: Tensor, v: Tensor, length: Tensor, heads: int, inverse: float | None = None
+) -> Tensor:
     """Rows q [tokens * n, K] over the first `length` (int64[1], on the device, at least 1) keys -> [tokens, n * K].
 
-    k, v [keys, K]; what lies beyond `length` is never read.
+    k, v [keys, K]; what lies beyond `length` is never read. With `inverse` the result leaves as E4M3.
     """
     assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
-    out = q.new_empty(rows // heads, heads * dim)
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
     block_m, block_n, warps, stages = PREFIX_TILE
     _prefix_kernel[(triton.cdiv(rows, block_m),)](
-        q, k, v, length, out, rows, dim**-0.5 * LOG2_E, DIM=dim, BLOCK_D=triton.next_power_of_2(dim),
-        BLOCK_M=block_m, BLOCK_N=block_n, num_warps=warps, num_stages=stages, **dependent_launch(q),
+        q, k, v, length, out, rows, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim, BLOCK_D=triton.next_power_of_2(dim),
+        BLOCK_M=block_m, BLOCK_N=block_n, SCALED=inverse is not None, num_warps=warps, num_stages=stages,
+        **dependent_launch(q),
     )  # fmt: skip
     return out
 

@@ -1,6 +1,10 @@
 // out[M, N] = epilogue(a[M, K] @ w[N, K]^T) in bfloat16 with float32 sums: TMA feeds shared memory, wgmma multiplies.
 // For compute capability 9.0. gemm.py sets the TP_ constants and writes `mma` for the tile's width.
 //
+// TP_FP8: a and w are E4M3; `scale` (of each output channel, times the input's) multiplies the sums before bias and
+// nonlinearity. The tensor cores keep only some 14 bits of sums of E4M3 products: after every TP_PROMOTE blocks of K
+// (0: never) they are added up in float32 registers. TP_OUT_FP8: the result leaves as E4M3, times `inverse`.
+//
 // A CTA has one producer warp and TP_WGS consumer warpgroups of 64 rows each, and walks over its tiles
 // (grid = SMs, not tiles), so the next tile's loads run during an epilogue. TP_CM x TP_CN CTAs form a cluster of
 // neighbouring tiles: those of a row share their part of `a` and those of a column theirs of `w`; each loads its share
@@ -17,9 +21,16 @@ struct alignas(64) TensorMap { char bytes[128]; };
 
 constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
 constexpr int EPILOGUE = TP_EPILOGUE, CLUSTER = CM * CN;
-constexpr int BM = 64 * WGS, BK = 64, TILE_N = EPILOGUE == 3 ? BN / 2 : BN;
-constexpr int A_BYTES = BM * BK * 2, B_BYTES = BN * BK * 2, STAGE_BYTES = A_BYTES + B_BYTES;
-constexpr bool BIASED = EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4;
+constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
+#if TP_OUT_FP8
+typedef unsigned char Element;
+#else
+typedef u16 Element;
+#endif
+constexpr int ROW_BYTES = 128;  // of a block of an operand: as much as a swizzle spans
+constexpr int BM = 64 * WGS, BK = FP8 ? ROW_BYTES : ROW_BYTES / 2, TILE_N = EPILOGUE == 3 ? BN / 2 : BN;
+constexpr int A_BYTES = BM * ROW_BYTES, B_BYTES = BN * ROW_BYTES, STAGE_BYTES = A_BYTES + B_BYTES;
+constexpr bool BIASED = !FP8 && (EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4);  // E4M3: see Factors
 constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
 constexpr int PRODUCER_REGISTERS = WGS == 1 ? 40 : WGS == 2 ? 40 : 24;
 
@@ -88,6 +99,39 @@ __device__ __forceinline__ uint4 transpose_quad(u32 p0, u32 p1, u32 p2, u32 p3, 
     return high ? make_uint4(s0, s1, y0, y1) : make_uint4(x0, x1, s0, s1);
 }
 
+__device__ __forceinline__ u32 pack_e4m3(float low, float high) {  // saturates; NaN stays NaN
+    u16 both;
+    asm("cvt.rn.satfinite.e4m3x2.f32 %0, %1, %2;" : "=h"(both) : "f"(high), "f"(low));
+    return both;
+}
+
+// A tile's scales and biases by column of `w`. Each thread of a warpgroup fetches some of them long before they are
+// needed; once the sums are there they go through shared memory to whom they belong.
+struct Factors {
+    static constexpr int OWN = (BN + 127) / 128;
+    float scale[OWN], bias[OWN];
+
+    __device__ __forceinline__ void fetch(const float* scales, const u16* biases, int n, int N, bool with_bias) {
+#pragma unroll
+        for (int i = 0; i < OWN; ++i) {
+            const int c = threadIdx.x % 128 + 128 * i, part = c / TILE_N, col = n + c % TILE_N;
+            const bool inside = c < BN && col < N;
+            scale[i] = inside ? scales[part * N + col] : 0.0f;
+            bias[i] = inside && with_bias ? __uint_as_float((u32)biases[col] << 16) : 0.0f;
+        }
+    }
+    __device__ __forceinline__ void share(float* shared, int warpgroup) const {
+        const auto sync = [&] { asm volatile("bar.sync %0, 128;" ::"r"(warpgroup + 1) : "memory"); };
+        sync();  // the last tile's have been read
+#pragma unroll
+        for (int i = 0; i < OWN; ++i) {
+            const int c = threadIdx.x % 128 + 128 * i;
+            if (c < BN) shared[c] = scale[i], shared[BN + c] = bias[i];
+        }
+        sync();
+    }
+};
+
 struct Tile {
     int m, n, k, k_end, split;
 };
@@ -105,6 +149,9 @@ __device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, in
 
 extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), 1)
 gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap map_w, void* out, const u32* bias,
+#if TP_FP8
+     const float* scale, float inverse,
+#endif
      int M, int N, int k_blocks, int m_groups, int n_groups) {
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
@@ -138,7 +185,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                 const u32 bar = full + 8 * s;
                 barrier_expect(bar, STAGE_BYTES);
                 for (int part = 0; part < PARTS; ++part) {
-                    const u32 to = base + s * STAGE_BYTES + A_BYTES + (part * CM + cm) * ROWS * BK * 2;
+                    const u32 to = base + s * STAGE_BYTES + A_BYTES + (part * CM + cm) * ROWS * ROW_BYTES;
                     load<(CM > 1)>(to, &map_w, k * BK, part * N + n + cm * ROWS, bar, same_column);
                 }
             };
@@ -177,9 +224,21 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             }
         };
         int step = 0;
+#if TP_PROMOTE
+        float parts[BN / 2] = {};  // of the sums: what the tensor cores have not handed over yet
+#endif
         for (int unit = first; unit < units; unit += stride) {
             const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
             float sums[BN / 2];
+#if TP_FP8
+            Factors factors;
+            factors.fetch(scale, (const u16*)bias, t.n, N, bias && t.split == 0);
+            float* const shared = (float*)(raw + (empty + 8 * STAGES - shared_address(raw))) + group * 2 * BN;
+#if TP_PROMOTE
+#pragma unroll
+            for (int i = 0; i < BN / 2; ++i) sums[i] = 0.0f;
+#endif
+#endif
             u32 offsets[BIASED ? BN / 8 : 1];  // the bias of this lane's columns, read long before it is needed
             if (BIASED) {
 #pragma unroll
@@ -188,6 +247,26 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     offsets[j] = bias && col < N && t.split == 0 ? bias[col / 2] : 0;
                 }
             }
+#if TP_PROMOTE
+            for (int k = t.k; k < t.k_end;) {
+                const int start = k, stop = min(k + TP_PROMOTE, t.k_end);
+                for (; k < stop; ++k, ++step) {
+                    const int s = step % STAGES;
+                    barrier_wait(full + 8 * s, (step / STAGES) & 1);
+                    const u32 a = base + s * STAGE_BYTES + group * 8192, b = base + s * STAGE_BYTES + A_BYTES;
+                    asm volatile("wgmma.fence.sync.aligned;" ::: "memory");
+#pragma unroll
+                    for (int j = 0; j < 4; ++j)
+                        mma(parts, operand(a + j * 32), operand(b + j * 32), k > start || j > 0);
+                    asm volatile("wgmma.commit_group.sync.aligned;\nwgmma.wait_group.sync.aligned 1;" ::: "memory");
+                    if (k > start) release(step - 1);
+                }
+                asm volatile("wgmma.wait_group.sync.aligned 0;" ::: "memory");
+                release(step - 1);
+#pragma unroll
+                for (int i = 0; i < BN / 2; ++i) sums[i] += parts[i];
+            }
+#else
             for (int k = t.k; k < t.k_end; ++k, ++step) {
                 const int s = step % STAGES;
                 barrier_wait(full + 8 * s, (step / STAGES) & 1);
@@ -201,6 +280,20 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             }
             asm volatile("wgmma.wait_group.sync.aligned 0;" ::: "memory");
             release(step - 1);
+#endif
+#if TP_FP8
+            factors.share(shared, group);
+#pragma unroll
+            for (int j = 0; j < BN / 8; ++j) {  // sums of whole numbers become what they stand for
+                const float2 by = *(const float2*)(shared + j * 8 + lane % 4 * 2);
+                const float2 plus = *(const float2*)(shared + BN + j * 8 + lane % 4 * 2);
+#pragma unroll
+                for (int half = 0; half < 2; ++half) {
+                    float &x = sums[4 * j + 2 * half], &y = sums[4 * j + 2 * half + 1];
+                    x = fmaf(x, by.x, plus.x), y = fmaf(y, by.y, plus.y);
+                }
+            }
+#endif
 
 #pragma unroll
             for (int half = 0; half < 2; ++half) {
@@ -213,11 +306,11 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     for (int j = 0; j < BLOCKS; ++j) {
                         const int col = t.n + j * 8 + lane % 4 * 2;
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
-                        x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
+                        if (BIASED) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
                         if (inside && col < N) *(float2*)(to + col) = make_float2(x, y);
                     }
                 } else {
-                    u16* to = (u16*)out + (size_t)row * N;
+                    Element* to = (Element*)out + (size_t)row * N;
                     auto value = [&](int j) -> u32 {
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
                         if (BIASED) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
@@ -226,19 +319,28 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                             x = gelu(x) * sums[BN / 4 + 4 * j + 2 * half];
                             y = gelu(y) * sums[BN / 4 + 4 * j + 2 * half + 1];
                         }
+#if TP_FP8
+                        if (OUT_FP8) return pack_e4m3(x * inverse, y * inverse);
+#endif
                         return pack(x, y);
                     };
 #pragma unroll
                     for (int j = 0; j + 3 < BLOCKS; j += 4) {
                         const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
                         const int col = t.n + (j + lane % 4) * 8;
-                        if (inside && col < N) *(uint4*)(to + col) = v;
+                        if (inside && col < N) {
+                            if (OUT_FP8) *(uint2*)(to + col) = make_uint2(v.x | v.y << 16, v.z | v.w << 16);
+                            else *(uint4*)(to + col) = v;
+                        }
                     }
 #pragma unroll
                     for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
                         const int col = t.n + j * 8 + lane % 4 * 2;
                         const u32 v = value(j);
-                        if (inside && col < N) *(u32*)(to + col) = v;
+                        if (inside && col < N) {
+                            if (OUT_FP8) *(u16*)(to + col) = (u16)v;
+                            else *(u32*)(to + col) = v;
+                        }
                     }
                 }
             }

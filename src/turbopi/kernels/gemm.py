@@ -20,6 +20,7 @@ Epilogue = Literal["plain", "bias", "gelu", "geglu", "partial"]
 EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, "partial": 4}
 SHARED_BYTES = 227 * 1024
 DEPTH = 64  # of a step along the inner axis
+BF16 = {"TP_FP8": 0, "TP_OUT_FP8": 0, "TP_PROMOTE": 0}  # gemm_fp8.py has the others
 
 
 @dataclass(frozen=True)
@@ -69,14 +70,14 @@ def matmul(
     m_groups, n_groups = -(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n))
     kernel = _kernel(tile, epilogue, a.device)
     arguments = (
-        _tensor_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
-        _tensor_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
+        tensor_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
+        tensor_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
         ctypes.c_void_p(out.data_ptr()),
         ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
         *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), m_groups, n_groups)),
     )
     clusters = min(m_groups * n_groups * tile.splits, kernel.max_clusters)
-    kernel.launch(clusters * tile.cluster, arguments)
+    kernel.launch_dependent(clusters * tile.cluster, arguments)
     return out
 
 
@@ -96,7 +97,7 @@ class DependentKernel(Kernel):
         status, self.max_clusters = d.cuOccupancyMaxActiveClusters(self._function, self._config(cluster))
         assert int(status) == 0 and self.max_clusters > 0, f"no room for clusters of {cluster}: {status!r}"
 
-    def launch(self, blocks: int, arguments: tuple[Any, ...]) -> None:
+    def launch_dependent(self, blocks: int, arguments: tuple[Any, ...]) -> None:
         """Launch on PyTorch's current stream; `arguments` are ctypes values."""
         pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(value) for value in arguments))
         config = self._config(blocks)
@@ -123,6 +124,7 @@ def _kernel(tile: Tile, epilogue: Epilogue, device: torch.device) -> DependentKe
         "TP_CN": tile.cluster_n,
         "TP_SPLITS": tile.splits,
         "TP_EPILOGUE": EPILOGUES[epilogue],
+        **BF16,
     }
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile.columns), "sm_90a", sizes)
@@ -130,17 +132,18 @@ def _kernel(tile: Tile, epilogue: Epilogue, device: torch.device) -> DependentKe
         return DependentKernel(cubin, "gemm", SHARED_BYTES, threads, tile.cluster)
 
 
-def source(columns: int) -> str:
+def source(columns: int, fp8: bool = False) -> str:
     """gemm.cu with the instruction for tiles of that many columns: its operands can't be written generically."""
     assert columns % 8 == 0 and columns <= 256
     count = columns // 2
     registers = ", ".join(f"%{i}" for i in range(count))
     outputs = ", ".join(f'"+f"(d[{i}])' for i in range(count))
+    form, transposed = ("k32.f32.e4m3.e4m3", "") if fp8 else ("k16.f32.bf16.bf16", ", 0, 0")
     instruction = (
         f"__device__ __forceinline__ void mma(float (&d)[{count}], u64 a, u64 b, int keep) {{\n"
         f'asm volatile("{{ .reg .pred p; setp.ne.b32 p, %{count + 2}, 0;\\n"\n'
-        f'"wgmma.mma_async.sync.aligned.m64n{columns}k16.f32.bf16.bf16 {{{registers}}}, %{count}, %{count + 1},"\n'
-        f'" p, 1, 1, 0, 0; }}" : {outputs} : "l"(a), "l"(b), "r"(keep)); }}'
+        f'"wgmma.mma_async.sync.aligned.m64n{columns}{form} {{{registers}}}, %{count}, %{count + 1},"\n'
+        f'" p, 1, 1{transposed}; }}" : {outputs} : "l"(a), "l"(b), "r"(keep)); }}'
     )
     text = (files("turbopi.kernels") / "gemm.cu").read_text()
     return re.sub(r"^TP_MMA.*$", lambda _: instruction, text, flags=re.MULTILINE)
@@ -151,16 +154,18 @@ class _TensorMap(ctypes.Structure):
 
 
 @lru_cache(maxsize=65536)
-def _tensor_map(address: int, rows: int, width: int, box_rows: int) -> _TensorMap:
-    """How TMA finds blocks of box_rows x 64 of a bfloat16 matrix [rows, width]: outside it, it reads zeros."""
+def tensor_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> _TensorMap:
+    """How TMA finds blocks of box_rows x 128 bytes of a bfloat16 or E4M3 matrix [rows, width], with zeros beyond it."""
     d = bindings("driver")
+    size = 1 if fp8 else 2
+    types = d.CUtensorMapDataType
     status, encoded = d.cuTensorMapEncodeTiled(
-        d.CUtensorMapDataType.CU_TENSOR_MAP_DATA_TYPE_BFLOAT16,
+        types.CU_TENSOR_MAP_DATA_TYPE_UINT8 if fp8 else types.CU_TENSOR_MAP_DATA_TYPE_BFLOAT16,
         2,
         address,
         [d.cuuint64_t(width), d.cuuint64_t(rows)],
-        [d.cuuint64_t(width * 2)],
-        [d.cuuint32_t(DEPTH), d.cuuint32_t(box_rows)],
+        [d.cuuint64_t(width * size)],
+        [d.cuuint32_t(128 // size), d.cuuint32_t(box_rows)],
         [d.cuuint32_t(1), d.cuuint32_t(1)],
         d.CUtensorMapInterleave.CU_TENSOR_MAP_INTERLEAVE_NONE,
         d.CUtensorMapSwizzle.CU_TENSOR_MAP_SWIZZLE_128B,

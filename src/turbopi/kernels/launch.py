@@ -13,6 +13,8 @@ import triton.language as tl
 from torch import Tensor
 from triton.language.extra.cuda import gdc_launch_dependents, gdc_wait
 
+from turbopi.engine.fp8 import E4M3
+
 
 @triton.jit
 def wait_for_producer(PDL: tl.constexpr):
@@ -31,6 +33,11 @@ def dependent_launch(x: Tensor) -> dict[str, Any]:
     if x.is_cuda and capability(x.device)[0] >= 9:
         return {"PDL": True, "launch_pdl": True}
     return {"PDL": False}
+
+
+def result_dtype(x: Tensor, inverse: float | None) -> torch.dtype:
+    """x's, or E4M3 where a result is scaled for it. Triton's interpreter can't round to E4M3: it keeps float32."""
+    return x.dtype if inverse is None else E4M3 if x.is_cuda else torch.float32
 
 
 @lru_cache

@@ -1,7 +1,8 @@
 """Residual addition and the norm behind it in one pass: one row a program.
 
 Twins: `engine.ops.residual_rms_norm`, `engine.ops.residual_layer_norm`. `y` may also be float32[splits, tokens, D]: the
-partial sums of a product split over its inner axis, added up here (rounded once less than the twin).
+partial sums of a product split over its inner axis, added up here (rounded once less than the twin). With `inverse`
+the norm leaves as E4M3, rounded once from float32: see `engine.fp8`.
 """
 
 import torch
@@ -9,7 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.launch import dependent_launch, launch_dependents, wait_for_producer
+from turbopi.kernels.launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 
 
 @triton.jit
@@ -32,9 +33,9 @@ def _add_residual(x, y, gate, out, row, rows, cols, width, mask, SPLITS, HAS_GAT
 
 @triton.jit
 def _rms_norm_kernel(
-    x, y, gate, scale, shift, out, normed, rows, width, eps,
+    x, y, gate, scale, shift, out, normed, rows, width, eps, inverse,
     HAS_Y: tl.constexpr, SPLITS: tl.constexpr, HAS_GATE: tl.constexpr, HAS_SHIFT: tl.constexpr,
-    BLOCK: tl.constexpr, PDL: tl.constexpr,
+    SCALED: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     row = tl.program_id(0)
     cols = tl.arange(0, BLOCK)
@@ -49,13 +50,15 @@ def _rms_norm_kernel(
     result = a * tl.rsqrt(tl.sum(a * a, 0) / width + eps) * factor
     if HAS_SHIFT:
         result += tl.load(shift + cols, mask, 0.0)
+    if SCALED:
+        result *= inverse
     tl.store(normed + row * width + cols, result.to(normed.dtype.element_ty), mask)
 
 
 @triton.jit
 def _layer_norm_kernel(
-    x, y, weight, bias, out, normed, rows, width, eps,
-    HAS_Y: tl.constexpr, SPLITS: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
+    x, y, weight, bias, out, normed, rows, width, eps, inverse,
+    HAS_Y: tl.constexpr, SPLITS: tl.constexpr, SCALED: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     row = tl.program_id(0)
     cols = tl.arange(0, BLOCK)
@@ -70,6 +73,8 @@ def _layer_norm_kernel(
         a = tl.load(x + row * width + cols, mask, 0.0).to(tl.float32)
     centred = tl.where(mask, a - tl.sum(a, 0) / width, 0.0)
     result = centred * tl.rsqrt(tl.sum(centred * centred, 0) / width + eps) * factor + offset
+    if SCALED:
+        result *= inverse
     tl.store(normed + row * width + cols, result.to(normed.dtype.element_ty), mask)
 
 
@@ -80,27 +85,31 @@ def residual_rms_norm(
     scale: Tensor,
     shift: Tensor | None,
     eps: float,
+    inverse: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """(x + y * gate, its RMSNorm * scale + shift). x [tokens, D] contiguous."""
     rows, width = _checked(x, y)
-    out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x)
+    out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x, dtype=result_dtype(x, inverse))
     block = triton.next_power_of_2(width)
     _rms_norm_kernel[(rows,)](
-        x, _or(y, x), _or(gate, scale), scale, _or(shift, scale), out, normed, rows, width, eps,
+        x, _or(y, x), _or(gate, scale), scale, _or(shift, scale), out, normed, rows, width, eps, inverse or 1.0,
         HAS_Y=y is not None, SPLITS=_splits(y), HAS_GATE=gate is not None,
-        HAS_SHIFT=shift is not None, BLOCK=block, num_warps=_warps(block), **dependent_launch(x),
+        HAS_SHIFT=shift is not None, SCALED=inverse is not None, BLOCK=block, num_warps=_warps(block),
+        **dependent_launch(x),
     )  # fmt: skip
     return out, normed
 
 
-def residual_layer_norm(x: Tensor, y: Tensor | None, weight: Tensor, bias: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+def residual_layer_norm(
+    x: Tensor, y: Tensor | None, weight: Tensor, bias: Tensor, eps: float, inverse: float | None = None
+) -> tuple[Tensor, Tensor]:
     """(x + y, its LayerNorm). x [tokens, W] contiguous."""
     rows, width = _checked(x, y)
-    out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x)
+    out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x, dtype=result_dtype(x, inverse))
     block = triton.next_power_of_2(width)
     _layer_norm_kernel[(rows,)](
-        x, _or(y, x), weight, bias, out, normed, rows, width, eps,
-        HAS_Y=y is not None, SPLITS=_splits(y), BLOCK=block, num_warps=_warps(block),
+        x, _or(y, x), weight, bias, out, normed, rows, width, eps, inverse or 1.0,
+        HAS_Y=y is not None, SPLITS=_splits(y), SCALED=inverse is not None, BLOCK=block, num_warps=_warps(block),
         **dependent_launch(x),
     )  # fmt: skip
     return out, normed

@@ -1,4 +1,7 @@
-"""The engine's operations with our kernels where they win and the library's elsewhere, for NVIDIA GPUs in bfloat16."""
+"""The engine's operations with our kernels where they win and the library's elsewhere, for NVIDIA GPUs.
+
+Activations are bfloat16; with an `Fp8Matrix` (on Hopper only) they are E4M3 between it and the operation before it.
+"""
 
 from functools import lru_cache
 from typing import Any
@@ -8,9 +11,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.engine import ops as plain
+from turbopi.engine.fp8 import Fp8Matrix, Matrix, to_e4m3
 from turbopi.engine.ops import Ops
 from turbopi.kernels import activations, attention, embedding, norms, rope
-from turbopi.kernels.gemm import Tile, matmul
+from turbopi.kernels.gemm import Epilogue, Tile, matmul
+from turbopi.kernels.gemm_fp8 import best_tile, matmul_fp8
 from turbopi.kernels.launch import capability
 
 GEGLU_TILES = (Tile(3, 192), Tile(2, 256))
@@ -100,35 +105,69 @@ def _tile(x: Tensor, weight: Tensor) -> Tile | None:
     return VISION_TILES.get((x.shape[0], weight.shape[0], weight.shape[1]))
 
 
-def tuned_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+def tuned_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+    if isinstance(weight, Fp8Matrix):
+        return _fp8(x, weight, "plain" if bias is None else "bias", bias, out)
     tile = _tile(x, weight)
     if tile is None or bias is None:
         return linear(x, weight, bias, out)
     return matmul(x, weight, tile, "bias", bias, out)
 
 
-def tuned_residual_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+def tuned_residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor:
     """The product, or float32 parts of it that the norms add up."""
+    if isinstance(weight, Fp8Matrix):
+        return _fp8(x, weight, "partial", bias)
     tile = _tile(x, weight)
     if tile is None or bias is None:
         return linear(x, weight, bias)
     return matmul(x, weight, tile, "partial" if tile.splits > 1 else "bias", bias)
 
 
-def tuned_linear_gelu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def tuned_linear_gelu(x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None) -> Tensor:
+    if isinstance(weight, Fp8Matrix):
+        return _fp8(x, weight, "gelu", bias, inverse=inverse)
     tile = _tile(x, weight)
-    return linear_gelu(x, weight, bias) if tile is None else matmul(x, weight, tile, "gelu", bias)
+    result = linear_gelu(x, weight, bias) if tile is None else matmul(x, weight, tile, "gelu", bias)
+    return _as_input(result, inverse)
 
 
-def tuned_linear_geglu(x: Tensor, gate_up: Tensor) -> Tensor:
+def tuned_linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None) -> Tensor:
+    if isinstance(gate_up, Fp8Matrix):
+        return _fp8(x, gate_up, "geglu", inverse=inverse)
     tile = _geglu_tile(x.shape[0], gate_up.shape[0] // 2, x.device)
-    return linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu")
+    return _as_input(linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu"), inverse)
+
+
+def _as_input(x: Tensor, inverse: float | None) -> Tensor:
+    """x, rounded to E4M3 in a pass of its own where only the product behind this one is in E4M3."""
+    return x if inverse is None else to_e4m3(x, inverse)
+
+
+def _fp8(
+    x: Tensor,
+    weight: Fp8Matrix,
+    epilogue: Epilogue,
+    bias: Tensor | None = None,
+    out: Tensor | None = None,
+    inverse: float | None = None,
+) -> Tensor:
+    n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
+    tile = best_tile(x.shape[0], n, weight.shape[1], epilogue, _num_sms(x.device))
+    if epilogue == "partial" and tile.splits == 1:
+        epilogue = "bias"
+    return matmul_fp8(x, weight, tile, epilogue, bias, out, inverse)
+
+
+@lru_cache
+def _num_sms(device: torch.device) -> int:
+    return torch.cuda.get_device_properties(device).multi_processor_count
 
 
 @lru_cache
 def _geglu_tile(rows: int, hidden: int, device: torch.device) -> Tile | None:
     """The tile that wastes least on the matrix's ragged edges and on the last wave of tiles, if that is little."""
-    sms = torch.cuda.get_device_properties(device).multi_processor_count
+    sms = _num_sms(device)
 
     def fill(tile: Tile) -> float:
         tiles = -(-rows // tile.rows) * -(-2 * hidden // tile.columns)
@@ -138,7 +177,17 @@ def _geglu_tile(rows: int, hidden: int, device: torch.device) -> Tile | None:
     return best if fill(best) > GEGLU_FILL else None
 
 
-def attend(q: Tensor, k: Tensor, v: Tensor, length: Tensor, slots: int, heads: int, *state_token: Any) -> Tensor:
+def attend(
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    length: Tensor,
+    slots: int,
+    heads: int,
+    *state_token: Any,
+    inverse: float | None = None,
+) -> Tensor:
     if k.shape[0] == slots:  # no suffix behind the prefix
-        return attention.prefix_attention(q, k, v, length, heads)
+        return attention.prefix_attention(q, k, v, length, heads, inverse)
+    assert inverse is None, "the suffix's activations stay as they are"
     return plain.attention(q, k, v, length, slots, heads, *state_token, softmax=attention.masked_softmax)

@@ -1,0 +1,226 @@
+"""What calibration leaves behind: one JSON file that says which products run in FP8, with which scales, and why.
+
+It holds for one set of weights (by the hash of all of them), one model and one version of this format; everything else
+is refused. What was measured to get there is kept in it and goes with it into every policy's metadata.
+"""
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from turbopi.calibrate.sites import MLP_KINDS, PARTS, Part, Site, sites
+from turbopi.checkpoint import Checkpoint
+from turbopi.config import ModelConfig
+from turbopi.errors import CalibrationError, ConfigError
+
+logger = logging.getLogger(__name__)
+
+FORMAT, VERSION = "turbopi-quantization", 1
+RANDOM_NOISE = "random-noise"  # instead of observations: has to be asked for by this name
+Tier = Literal["fp8", "fp8-mlp"]
+TIERS: tuple[Tier, ...] = get_args(Tier)
+
+
+@dataclass(frozen=True)
+class SiteScale:
+    """A site's share of the file.
+
+    scale       of its activation: x ≈ e4m3 * scale; None where only weights are rounded
+    largest     |x| seen in calibration
+    saturated   part of the held-out values beyond the largest number
+    error       relative rms of its products on held-out observations, rounded against not
+    kept        why it stays in bfloat16; None: it doesn't
+    """
+
+    scale: float | None
+    largest: float
+    saturated: float
+    error: float
+    kept: str | None = None
+
+
+@dataclass(frozen=True)
+class Quantization:
+    """A calibrated checkpoint's FP8: read with `load`, checked with `check`, narrowed with `only`."""
+
+    fingerprint: str
+    shapes: Mapping[str, Any]
+    sites: Mapping[str, SiteScale]
+    report: Mapping[str, Any]  # observations, method, held-out errors, warnings
+    parts: tuple[Part, ...] = PARTS
+    source: str = field(default="", compare=False)  # where it was read from
+
+    @property
+    def on_random_noise(self) -> bool:
+        return self.report["observations"]["source"] == RANDOM_NOISE
+
+    @property
+    def warnings(self) -> list[str]:
+        """What every output should say."""
+        noise = ["calibrated on random noise, not on observations: its errors say nothing"]
+        return [*(noise if self.on_random_noise else []), *self.report.get("warnings", [])]
+
+    def only(self, parts: Sequence[str]) -> "Quantization":
+        """The same with FP8 in these parts of the model alone. Raises ConfigError for a part that doesn't exist."""
+        for part in parts:
+            if part not in PARTS:
+                raise ConfigError(f"unknown part {part!r} for FP8; choose of {', '.join(PARTS)}")
+        if not parts:
+            raise ConfigError("FP8 in no part at all; use precision 'bf16'")
+        return replace(self, parts=tuple(part for part in PARTS if part in parts))
+
+    def check(self, config: ModelConfig, fingerprint: str) -> None:
+        """Raise CalibrationError unless this was made for these weights and this model."""
+        where = self.source or "this calibration"
+        wrong = [
+            f"{name} is {ours!r} there and {self.shapes.get(name)!r} here"[:200]
+            for name, ours in shapes_of(config).items()
+            if self.shapes.get(name) != ours
+        ]
+        if wrong:
+            raise CalibrationError(
+                f"{where} was made for a model of other shapes: {'; '.join(wrong)}. Run `turbopi calibrate` on this one"
+            )
+        missing = [str(site) for site in sites(config) if str(site) not in self.sites]
+        if missing:
+            raise CalibrationError(f"{where} has no scale for {', '.join(missing[:5])}: it is damaged")
+        if fingerprint != self.fingerprint:
+            raise CalibrationError(
+                f"{where} was made for other weights: their hash is {self.fingerprint[:16]}…, that of these weights "
+                f"{fingerprint[:16]}…. Run `turbopi calibrate` on this checkpoint"
+            )
+
+    def plan(self, config: ModelConfig, tier: str) -> "Plan":
+        """What runs in FP8 in a tier, and why the rest doesn't."""
+        if tier not in TIERS:
+            raise ConfigError(f"{tier!r} is no FP8 tier; choose one of {', '.join(TIERS)}")
+        chosen: dict[str, float] = {}
+        kept: dict[str, str] = {}
+        for site in sites(config):
+            entry = self.sites[str(site)]
+            reason = _reason(site, entry, tier, self.parts)
+            if reason is None:
+                chosen[str(site)] = 1.0 if entry.scale is None else entry.scale
+            else:
+                kept[str(site)] = reason
+        return Plan(tier, chosen, kept)
+
+    # -- the file ------------------------------------------------------------------------------------------------------
+
+    def save(self, file: Path) -> None:
+        """Write it, whole or not at all."""
+        temporary = file.with_name(f".{file.name}.part")
+        temporary.write_text(json.dumps(self.as_json(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        temporary.replace(file)
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "weights_sha256": self.fingerprint,
+            "shapes": dict(self.shapes),
+            "sites": {name: asdict(site) for name, site in self.sites.items()},
+            "report": dict(self.report),
+        }
+
+    @classmethod
+    def load(cls, file: str | Path) -> "Quantization":
+        """Read what `save` wrote. Raises CalibrationError if it isn't that, or of another version."""
+        path = Path(file)
+        if not path.is_file():
+            raise CalibrationError(f"there is no file {path}; make it with `turbopi calibrate CKPT --out {path}`")
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if content["format"] != FORMAT:
+                raise CalibrationError(f"{path} is {content['format']!r}, not {FORMAT}")
+            if content["version"] != VERSION:
+                raise CalibrationError(
+                    f"{path} has version {content['version']} of {FORMAT}, this Turbo-Pi reads version {VERSION}. "
+                    "Run `turbopi calibrate` again"
+                )
+            found = {name: SiteScale(**values) for name, values in content["sites"].items()}
+            for name, site in found.items():
+                if site.scale is not None and not (0 < site.scale < float("inf")):
+                    raise CalibrationError(f"{path} has the scale {site.scale} for {name}; it should be above 0")
+            return cls(content["weights_sha256"], content["shapes"], found, content["report"], source=str(path))
+        except CalibrationError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise CalibrationError(f"{path} isn't a calibration that `turbopi calibrate` wrote: {error!r}") from error
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A tier's choice: site -> scale of its activation, and site -> why it stays in bfloat16."""
+
+    tier: str
+    scales: Mapping[str, float]
+    kept: Mapping[str, str]
+
+    @property
+    def expert_weights(self) -> Literal["fp8", "bf16"]:
+        """The denoising kernel takes all of the expert's matrices in one precision: FP8 only if none is to be kept."""
+        return "bf16" if any(name.startswith("expert.") for name in self.kept) else "fp8"
+
+    def describe(self) -> dict[str, Any]:
+        """Which sites run in what, by group, and why the others don't."""
+        by_group: dict[str, dict[str, list[str]]] = {}
+        for name in [*self.scales, *self.kept]:
+            part, layer, kind = name.split(".")
+            state = "fp8" if name in self.scales else f"bf16: {self.kept[name]}"
+            by_group.setdefault(f"{part}.{kind}", {}).setdefault(state, []).append(layer)
+        return {
+            group: next(iter(states))
+            if len(states) == 1
+            else {state: f"layers {', '.join(layers)}" for state, layers in states.items()}
+            for group, states in sorted(by_group.items())
+        }
+
+
+def _reason(site: Site, entry: SiteScale, tier: str, parts: Sequence[str]) -> str | None:
+    """Why a site stays in bfloat16."""
+    if site.part not in parts:
+        return f"FP8 is switched off in the {site.part}"
+    if tier == "fp8-mlp" and (site.kind not in MLP_KINDS or site.part == "expert"):
+        return "fp8-mlp takes the feed-forward products of vision and prefix alone"
+    return site.refusal or entry.kept
+
+
+def shapes_of(config: ModelConfig) -> dict[str, Any]:
+    """The sizes that scales depend on, as JSON gives them back. Horizon and prompt length aren't among them."""
+    return {
+        "kind": config.kind,
+        "vision": asdict(config.vision),
+        "vlm": asdict(config.vlm),
+        "expert": asdict(config.expert),
+        "action_dim": config.action_dim,
+    }
+
+
+BESIDE = "turbopi_fp8.json"  # in a checkpoint's folder: found there unless another file is named
+
+
+def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:
+    """The calibration that a policy in this precision runs with, checked against its checkpoint; None: it needs none.
+
+    Hashes all weights, which takes some seconds. Raises ConfigError if there is none, CalibrationError if it doesn't
+    fit.
+    """
+    if tier not in TIERS:
+        return None
+    if given is None:
+        beside = None if checkpoint.path is None else checkpoint.path / BESIDE
+        if beside is None or not beside.is_file():
+            raise ConfigError(
+                f"precision {tier!r} needs a calibration: run `turbopi calibrate` on this checkpoint and give the file "
+                f"that it writes (--quantization FILE, or as {BESIDE} beside the weights)"
+            )
+        given = beside
+    quantization = given if isinstance(given, Quantization) else Quantization.load(given)
+    quantization.check(checkpoint.config.model, checkpoint.fingerprint())
+    for warning in quantization.warnings:
+        logger.warning("FP8: %s", warning)
+    return quantization

@@ -1,0 +1,87 @@
+"""The reference with its sites rounded: plain PyTorch, float32 between the roundings, exact in what is rounded.
+
+The oracle of the engine's FP8, and the instrument that says what FP8 does to a checkpoint's actions, on any device.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from turbopi.calibrate.sites import Site, linears
+from turbopi.engine.fp8 import Fp8Matrix, to_e4m3
+from turbopi.model.reference import Pi0Model
+
+Round = Callable[[Tensor], Tensor]
+
+
+def round_activation(x: Tensor, scale: float) -> Tensor:
+    """x as E4M3 with a scale holds it, in x's dtype."""
+    return (to_e4m3(x, 1 / scale).float() * scale).to(x.dtype)
+
+
+def round_weight(weight: Tensor) -> Tensor:
+    """A matrix [out, in] as E4M3 with a scale an output channel holds it, in its dtype."""
+    return Fp8Matrix.quantize(weight, 1.0).dequantized().to(weight.dtype)
+
+
+@contextmanager
+def rounded(model: Pi0Model, scales: Mapping[Site, float]) -> Iterator[None]:
+    """For a while, products of these sites are of E4M3 numbers; a `weights_only` site's scale is ignored.
+
+    Weights are rounded anew in every product, so that nothing is held twice, but for the expert's: they are needed in
+    every step.
+    """
+    held: dict[int, Tensor] = {}
+
+    def once(weight: Tensor) -> Tensor:
+        if id(weight) not in held:
+            held[id(weight)] = round_weight(weight)
+        return held[id(weight)]
+
+    changes: list[tuple[nn.Linear, Round, Round]] = []
+    for site, scale in scales.items():
+
+        def inputs(x: Tensor, site: Site = site, scale: float = scale) -> Tensor:
+            return x if site.weights_only else round_activation(x, scale)
+
+        weights = once if site.weights_only else round_weight
+        changes += [(linear, inputs, weights) for linear in linears(model, site)]
+    with replaced(changes):
+        yield
+
+
+@contextmanager
+def replaced(changes: list[tuple[nn.Linear, Round, Round]]) -> Iterator[None]:
+    """For a while, these products are of what the two functions make of their input and of their weight."""
+    try:
+        for linear, inputs, weights in changes:
+
+            def forward(
+                x: Tensor, linear: nn.Linear = linear, inputs: Round = inputs, weights: Round = weights
+            ) -> Tensor:
+                return F.linear(inputs(x), weights(linear.weight), linear.bias)
+
+            linear.__dict__["forward"] = forward
+        yield
+    finally:
+        for linear, _, _ in changes:
+            linear.__dict__.pop("forward", None)
+
+
+# -- errors of actions -------------------------------------------------------------------------------------------------
+
+
+def delta_cosine(actions: Tensor, exact: Tensor, noise: Tensor) -> float:
+    """Cosine of what denoising did (actions less noise) with what it should have done, over all given rows."""
+    ours, theirs = (actions - noise).double().flatten(), (exact - noise).double().flatten()
+    return float(torch.dot(ours, theirs) / (ours.norm() * theirs.norm()))
+
+
+def relative_rms(actions: Tensor, exact: Tensor) -> float:
+    """rms of the difference over rms of the exact actions; infinite if anything isn't finite."""
+    if not bool(actions.isfinite().all()):
+        return float("inf")
+    return float((actions - exact).double().norm() / exact.double().norm())

@@ -1,0 +1,74 @@
+"""Formats that no kernel here computes with, emulated exactly, to know what they would cost in error."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+import turbopi.model.gemma
+import turbopi.model.vision
+from turbopi.engine.fp8 import E4M3_MAX, to_e4m3
+from turbopi.model.layers import attention
+
+# NVFP4 (Blackwell): E2M1 numbers in blocks of 16 with an E4M3 scale each, and one float32 scale for the tensor.
+E2M1 = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
+BLOCK = 16
+
+
+def round_e2m1(x: Tensor) -> Tensor:
+    """To the nearest of ±E2M1, halves to the one with an even mantissa, beyond 6 to 6."""
+    x = x.clamp(-E2M1[-1], E2M1[-1])
+    magnitude = x.abs()
+    step = torch.where(magnitude < 2, 0.5, torch.where(magnitude < 4, 1.0, 2.0))  # between E2M1's numbers
+    return torch.round(x / step) * step
+
+
+def round_nvfp4(x: Tensor) -> Tensor:
+    """x [rows, K] as NVFP4 holds it, K a multiple of 16; scales from its own values."""
+    blocks = x.float().view(*x.shape[:-1], -1, BLOCK)
+    largest = blocks.abs().amax(-1, keepdim=True)
+    whole = largest.max() / (E2M1[-1] * E4M3_MAX)
+    if whole == 0:
+        return x
+    scale = to_e4m3(largest / E2M1[-1], 1 / whole).float() * whole
+    rounded = torch.where(scale > 0, round_e2m1(blocks / scale.clamp(min=1e-30)) * scale, 0.0)
+    return rounded.flatten(-2).to(x.dtype)
+
+
+@contextmanager
+def attention_in_fp8(*stacks: str) -> Iterator[None]:
+    """For a while, both matrix products of the attention in these stacks ("vision", "gemma") are of E4M3 numbers.
+
+    Queries, keys and values with a scale for each tensor, from its own values; probabilities times 448.
+    """
+    modules: dict[str, ModuleType] = {"vision": turbopi.model.vision, "gemma": turbopi.model.gemma}
+    chosen = [modules[stack] for stack in stacks]
+    try:
+        for module in chosen:
+            module.attention = _attention_fp8  # type: ignore[attr-defined]
+        yield
+    finally:
+        for module in chosen:
+            module.attention = attention  # type: ignore[attr-defined]
+
+
+def _attention_fp8(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
+    """`layers.attention` in float32 with rounded operands."""
+    q, k, v = (_rounded(x, float(x.abs().amax()) / E4M3_MAX) for x in (q, k, v))
+    b, h, s, dim = q.shape
+    groups = k.shape[1]
+    folded = q.reshape(b, groups, h // groups * s, dim)
+    if mask is not None and mask.shape[-2] != 1:
+        mask = mask.repeat(1, 1, h // groups, 1)
+    logits = folded @ k.transpose(-1, -2) * dim**-0.5
+    if mask is not None:
+        logits = logits.masked_fill(~mask, torch.finfo(torch.float32).min)
+    probabilities = logits.softmax(-1)
+    # the sum stays exact: it is taken before rounding, as fused kernels do
+    return (_rounded(probabilities, 1 / E4M3_MAX) @ v).reshape(b, h, s, dim)
+
+
+def _rounded(x: Tensor, scale: float) -> Tensor:
+    return to_e4m3(x, 1 / scale).float() * scale if scale > 0 else x

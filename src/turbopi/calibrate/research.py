@@ -1,0 +1,180 @@
+"""What numbers of eight and four bits do to actions: `python -m turbopi.calibrate.research --out FILE`.
+
+Emulated exactly in float32 (emulate.py, formats.py) on three sets of full-size weights: Turbo-Pi's random ones, normal
+ones of standard deviation 0.02, and these with 1 % of the channels behind every norm 20 times as large.
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbopi import backends, demo
+from turbopi.bench.provenance import provenance
+from turbopi.calibrate.emulate import Round, delta_cosine, relative_rms, replaced, rounded
+from turbopi.calibrate.formats import attention_in_fp8, round_nvfp4
+from turbopi.calibrate.observations import Batch, Sample, batches, calls
+from turbopi.calibrate.sites import MLP_KINDS, PARTS, Site, linears, sites
+from turbopi.calibrate.statistics import collect
+from turbopi.checkpoint import random_checkpoint
+from turbopi.model.reference import Pi0Model, parameter_shapes
+from turbopi.preprocess import Pipeline
+from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
+
+STD = 0.02
+OUTLIERS, OUTLIER_FACTOR = 0.01, 20.0
+WEIGHTS = ("turbopi", "std 0.02", "std 0.02 with outliers")
+
+
+def set_weights(model: Pi0Model, kind: str, seed: int = 0) -> None:
+    """Replace a model's parameters in place, all on its device."""
+    generator = torch.Generator(model.device).manual_seed(seed)
+    for name, parameter in model.named_parameters():
+        if parameter.dim() > 1:
+            parameter.data.normal_(0.0, STD, generator=generator)
+        elif name.endswith("bias"):
+            parameter.data.zero_()
+        else:  # LayerNorm's weight is the factor itself, RMSNorm's is added to 1
+            vision = name.startswith("vision.")
+            parameter.data.fill_(1.0 if vision else 0.0)
+            if kind == "std 0.02 with outliers":
+                chosen = torch.rand(parameter.shape, generator=generator, device=model.device) < OUTLIERS
+                parameter.data[chosen] = OUTLIER_FACTOR - (0.0 if vision else 1.0)
+
+
+def errors(
+    model: Pi0Model, made: list[Batch], steps: int, formats: Sequence[str] | None = None
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """Formats and places, all or some, each with the actions' error."""
+    noise = torch.cat([noise for _, noise in made])
+    exact = _actions(model, made, steps)
+    every = [site for site in sites(model.config) if site.refusal is None]
+    histograms = collect(model, every, made, steps)
+    scales = {site: histograms[str(site)].scale("headroom") for site in every}
+
+    def of(*parts: str, mlp: bool = False) -> dict[Site, float]:
+        return {s: x for s, x in scales.items() if s.part in parts and (not mlp or s.kind in MLP_KINDS)}
+
+    cases: dict[str, Callable[[], AbstractContextManager[None]]] = {
+        "FP8": lambda: rounded(model, of(*PARTS)),
+        "FP8, vision and prefix": lambda: rounded(model, of("vision", "prefix")),
+        "FP8, feed-forward of vision and prefix": lambda: rounded(model, of("vision", "prefix", mlp=True)),
+        **{f"FP8, {part}": lambda part=part: rounded(model, of(part)) for part in PARTS},  # type: ignore[misc]
+        "FP8 attention, vision": lambda: attention_in_fp8("vision"),
+        "FP8 attention, prefix and expert": lambda: attention_in_fp8("gemma"),
+        "NVFP4": lambda: in_nvfp4(model, of(*PARTS), activations=True),
+        "NVFP4, weights alone": lambda: in_nvfp4(model, of(*PARTS), activations=False),
+        "NVFP4, weights of the expert alone": lambda: in_nvfp4(model, of("expert"), activations=False),
+    }
+    for name, context in cases.items():
+        if formats is not None and name not in formats:
+            continue
+        with context():
+            actions = _actions(model, made, steps)
+        yield (
+            name,
+            {"relative_rms": relative_rms(actions, exact), "delta_cosine": delta_cosine(actions, exact, noise)},
+        )
+
+
+@contextmanager
+def in_nvfp4(model: Pi0Model, scales: dict[Site, float], *, activations: bool) -> Iterator[None]:
+    """For a while, these sites' products are of NVFP4 numbers, the expert's activations too if any are."""
+
+    held: dict[int, Tensor] = {}  # the expert's weights, needed in every step
+
+    def same(x: Tensor) -> Tensor:
+        return x
+
+    def once(weight: Tensor) -> Tensor:
+        if id(weight) not in held:
+            held[id(weight)] = round_nvfp4(weight)
+        return held[id(weight)]
+
+    inputs = round_nvfp4 if activations else same
+    changes: list[tuple[torch.nn.Linear, Round, Round]] = [
+        (linear, inputs, once if site.weights_only else round_nvfp4)
+        for site in scales
+        for linear in linears(model, site)
+    ]
+    with replaced(changes):
+        yield
+
+
+def _observation(frame: demo.Frame, prompt: str) -> dict[str, Any]:
+    return {
+        "observation/image": frame.base,
+        "observation/wrist_image": frame.wrist,
+        "observation/state": frame.state,
+        "prompt": prompt,
+    }
+
+
+def _actions(model: Pi0Model, made: list[Batch], steps: int) -> Tensor:
+    return torch.cat([model.sample(observation, noise, steps) for observation, noise in made])
+
+
+def run(
+    preset: str,
+    device: torch.device,
+    count: int,
+    steps: int,
+    out: Path,
+    kinds: Sequence[str] = WEIGHTS,
+    formats: Sequence[str] | None = None,
+) -> dict[str, Any]:
+    """All errors, on LIBERO pictures: by weights and format; written to `out` as they come."""
+    checkpoint = demo.with_libero_stats(random_checkpoint(preset))
+    sizes = checkpoint.config.model
+    if WEIGHTS[0] in kinds:
+        state = checkpoint.load(device, "f32").state
+    else:
+        state = {name: torch.empty(shape, device=device) for name, shape in parameter_shapes(sizes).items()}
+    model = Pi0Model.from_state(sizes, state)
+    tokenizer = load_tokenizer(TINY_TOKENIZER, checkpoint_dir=None, candidates=(), vocab_size=sizes.vocab_size)
+    pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, tokenizer)
+    frames = demo.load_frames()[:count]
+    samples = [  # one prompt, so that they are one batch
+        Sample(f"LIBERO frame {i}", pipeline.before(_observation(frame, frames[0].prompt))[0])
+        for i, frame in enumerate(frames)
+    ]
+    shape = (model.config.action_horizon, model.config.action_dim)
+    made = [batch for _, batch in batches(calls(samples, shape, 1, 0), 8, device)]
+    about = {"provenance": provenance(device), "preset": preset, "steps": steps, "observations": len(samples)}
+    results: dict[str, Any] = {}
+    for kind in kinds:
+        if kind != WEIGHTS[0]:
+            set_weights(model, kind)
+        results[kind] = {}
+        for name, error in errors(model, made, steps, formats):
+            results[kind][name] = error
+            print(
+                f"{kind}: {name:42} relative rms {error['relative_rms']:.2e}  cosine {error['delta_cosine']:.6f}",
+                flush=True,
+            )
+            out.write_text(json.dumps({**about, "errors": results}, indent=1) + "\n", encoding="utf-8")
+    return results
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", default="pi05_libero")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--count", type=int, default=6, help="observations")
+    parser.add_argument("--steps", type=int, default=10)
+    parser.add_argument("--weights", choices=WEIGHTS, action="append", help="one of the three; may be given again")
+    parser.add_argument("--format", action="append", help="one of what is printed; may be given again")
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    device = backends.resolve_device(options.device)
+    kinds = options.weights or WEIGHTS
+    run(options.preset, device, options.count, options.steps, options.out, kinds, options.format)
+
+
+if __name__ == "__main__":
+    main()

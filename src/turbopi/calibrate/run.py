@@ -1,0 +1,338 @@
+"""A calibration from beginning to end: statistics, the best of several ways to choose scales, the sites that stay in
+bfloat16, and a report on observations that had no say in any of it.
+
+Everything is measured with the emulated reference (emulate.py) against the float32 one, so it needs no FP8 hardware.
+"""
+
+import gc
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbopi import backends, demo
+from turbopi.calibrate import observations as observed
+from turbopi.calibrate.artifact import RANDOM_NOISE, Quantization, SiteScale, shapes_of
+from turbopi.calibrate.emulate import delta_cosine, relative_rms, rounded
+from turbopi.calibrate.observations import Batch, Call
+from turbopi.calibrate.product_errors import product_errors
+from turbopi.calibrate.sites import KINDS, MLP_KINDS, PARTS, Site, sites
+from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
+from turbopi.checkpoint import Checkpoint
+from turbopi.errors import CheckpointError
+from turbopi.model.reference import Pi0Model, parameter_dtype
+from turbopi.policy import UnifiedPolicy
+
+TARGET = 0.9975  # cosine of the actions' deltas that automatic choice of sites aims at
+SATURATION_LIMIT = 0.01  # part of a site's held-out values beyond the largest number: more is told loudly
+SITE_LIMIT = 0.25  # relative rms of a site's products beyond which it stays in bfloat16 whatever the actions say
+SELECTION = 8  # calls that ways to choose scales and groups of sites are compared on
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to calibrate on and for. `arguments` are UnifiedPolicy's besides the checkpoint, backend and precision."""
+
+    arguments: Mapping[str, Any]
+    observations: str | None = None  # see observations.read_samples
+    count: int = 64
+    noises: int = 1
+    seed: int = 0
+    target: float = TARGET
+    batch: int = 8
+    methods: Sequence[Method] = METHODS
+
+
+@dataclass
+class Progress:
+    """How a run tells what it is doing; by default it doesn't."""
+
+    begin: Callable[[str, int], None] = field(default=lambda text, total: None)
+    advance: Callable[[], None] = field(default=lambda: None)
+
+
+def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | None = None) -> Quantization:
+    """Choose scales and sites for a checkpoint. Raises ObservationError for observations that can't be used,
+    CheckpointError where the reference itself isn't finite.
+    """
+    progress, started = progress or Progress(), time.perf_counter()
+    if settings.arguments.get("robot") is None:
+        checkpoint = demo.with_libero_stats(checkpoint)
+    arguments = dict(settings.arguments) | {"backend": "pytorch", "precision": "f32"}
+    arguments["device"] = backends.resolve_device(arguments.get("device", "auto"))
+    policy = UnifiedPolicy(checkpoint, **arguments)
+    source, samples = observed.read_samples(policy, settings.observations, settings.count)
+    chosen, held = observed.split(samples)
+    config = policy.config.model
+    shape = (config.action_horizon, config.action_dim)
+    calibration = observed.calls(chosen, shape, settings.noises, settings.seed)
+    held_out = observed.calls(held, shape, settings.noises, settings.seed + len(calibration))
+    model: Pi0Model = policy.backend.model  # type: ignore[attr-defined]
+    steps = int(policy.metadata["num_denoising_steps"])
+    loaded = time.perf_counter()
+    result = calibrate_model(model, calibration, held_out, steps, settings, progress)
+    finished = time.perf_counter()
+    report = {
+        "turbopi": _version(),
+        "model": checkpoint.config.name,
+        "random_weights": checkpoint.format == "random",
+        "device": policy.metadata["device_name"],
+        "observations": {
+            "source": source,
+            "count": len(samples),
+            "noises": settings.noises,
+            "seed": settings.seed,
+            "calibration": {sample.source: sample.sha256 for sample in chosen},
+            "held_out": {sample.source: sample.sha256 for sample in held},
+        },
+        **result.report,
+    }
+    if source == RANDOM_NOISE:
+        report["target_reached"] = None
+    fingerprint = checkpoint.fingerprint()
+    report["seconds"] = {
+        "loading": round(loaded - started, 2),
+        "measuring": round(finished - loaded, 2),
+        "hashing the weights": round(time.perf_counter() - finished, 2),
+    }
+    del model, policy
+    _free(arguments["device"])
+    return Quantization(fingerprint, shapes_of(config), result.sites, report)
+
+
+@dataclass(frozen=True)
+class Measured:
+    sites: dict[str, SiteScale]
+    report: dict[str, Any]
+
+
+def calibrate_model(
+    model: Pi0Model,
+    calibration: Sequence[Call],
+    held_out: Sequence[Call],
+    steps: int,
+    settings: Settings,
+    progress: Progress | None = None,
+) -> Measured:
+    """The same for a reference model and calls that are given. Raises what `calibrate` raises."""
+    progress = progress or Progress()
+    everywhere = sites(model.config)
+    eligible = [site for site in everywhere if site.refusal is None]
+
+    def statistics(text: str, calls: Sequence[Call]) -> dict[str, Histogram]:
+        made = list(observed.batches(calls, settings.batch, model.device))
+        progress.begin(text, len(made))
+
+        def ticking() -> Any:
+            for _, batch in made:
+                yield batch
+                progress.advance()
+
+        return collect(model, everywhere, ticking(), steps)
+
+    histograms = statistics("what every site sees", calibration)
+    unseen = statistics("what held-out ones see", held_out)
+    selection = _Trials(model, calibration[:SELECTION], steps, settings.batch, progress)
+    method, methods = _best_method(eligible, histograms, selection, settings.methods, progress)
+    scales = {site: histograms[str(site)].scale(method) for site in everywhere}
+
+    progress.begin("products of every site", 1)
+    products = product_errors(model, {site: scales[site] for site in eligible}, selection.batches, steps)
+    progress.advance()
+    kept = {str(site): f"not possible: {site.refusal}" for site in everywhere if site.refusal is not None}
+    kept |= {
+        name: f"its products alone are off by {error:.0%}" for name, error in products.items() if error > SITE_LIMIT
+    }
+    groups = _groups(eligible, scales, kept, selection, progress)
+    kept |= _keep_groups(eligible, scales, kept, groups, selection, settings.target, progress)
+
+    entries, warnings = {}, []
+    for site in everywhere:
+        name, scale = str(site), scales[site]
+        saturated = unseen[name].error(scale)[1]
+        if saturated > SATURATION_LIMIT and not site.weights_only:
+            warnings.append(f"{saturated:.1%} of the held-out values of {name} saturate: more observations may help")
+        entries[name] = SiteScale(
+            None if site.weights_only else scale,
+            histograms[name].largest,
+            saturated if not site.weights_only else 0.0,
+            products.get(name, 0.0),
+            kept.get(name),
+        )
+    final = _Trials(model, held_out, steps, settings.batch, progress)
+    on_held_out = _held_out(model, eligible, scales, kept, final, progress)
+    reached = on_held_out["fp8"]["delta_cosine"]
+    if reached < settings.target:
+        warnings.append(f"the held-out actions' cosine is {reached:.5f}, below the target {settings.target}")
+    report = {
+        "steps": steps,
+        "method": method,
+        "methods": methods,
+        "groups_alone": groups,
+        "kept_in_bf16": kept,
+        "target": settings.target,
+        "target_reached": reached >= settings.target,
+        "held_out": on_held_out,
+        "warnings": warnings,
+    }
+    return Measured(entries, report)
+
+
+class _Trials:
+    """The same calls again and again with other sites rounded, against what float32 made of them."""
+
+    def __init__(self, model: Pi0Model, calls: Sequence[Call], steps: int, size: int, progress: Progress) -> None:
+        self._model, self._steps = model, steps
+        self._made = list(observed.batches(calls, size, model.device))
+        progress.begin("float32 reference", len(self._made))
+        self.exact: list[Tensor] = []
+        for _, (observation, noise) in self._made:
+            self.exact.append(model.sample(observation, noise, steps))
+            progress.advance()
+            if not bool(self.exact[-1].isfinite().all()):
+                raise CheckpointError("the float32 reference itself gives actions that aren't finite; damaged weights?")
+
+    @property
+    def batches(self) -> list[Batch]:
+        return [batch for _, batch in self._made]
+
+    @property
+    def calls(self) -> list[Call]:
+        return [call for calls, _ in self._made for call in calls]
+
+    def actions(self, scales: Mapping[Site, float], model: Pi0Model | None = None) -> list[Tensor]:
+        """Of every batch, with these sites rounded."""
+        used = model or self._model
+        with rounded(used, scales):
+            return [used.sample(observation, noise, self._steps) for observation, noise in self.batches]
+
+    def error(self, actions: Sequence[Tensor], against: Sequence[Tensor] | None = None) -> dict[str, float]:
+        """How far actions are from float32's, or from others."""
+        ours, exact = torch.cat(list(actions)), torch.cat(list(against or self.exact))
+        noise = torch.cat([noise for _, noise in self.batches])
+        return {
+            "relative_rms": relative_rms(ours, exact),
+            "delta_cosine": delta_cosine(ours, exact, noise),
+            "max": float((ours - exact).abs().max()),
+        }
+
+
+def _best_method(
+    eligible: Sequence[Site],
+    histograms: Mapping[str, Histogram],
+    trials: _Trials,
+    methods: Sequence[Method],
+    progress: Progress,
+) -> tuple[Method, dict[str, Any]]:
+    """The way to choose scales whose actions are best; among those within 5 % the one that leaves most room."""
+    progress.begin("ways to choose scales", len(methods))
+    measured: dict[str, Any] = {}
+    for method in methods:
+        scales = {site: histograms[str(site)].scale(method) for site in eligible}
+        measured[method] = trials.error(trials.actions(scales))
+        progress.advance()
+    least = min(one["relative_rms"] for one in measured.values())
+    good = [method for method in methods if measured[method]["relative_rms"] <= 1.05 * least]
+
+    def room(method: Method) -> float:
+        return sum(histograms[str(site)].scale(method) / histograms[str(site)].scale("max") for site in eligible)
+
+    return max(good, key=room), measured
+
+
+def _groups(
+    eligible: Sequence[Site],
+    scales: Mapping[Site, float],
+    kept: Mapping[str, str],
+    trials: _Trials,
+    progress: Progress,
+) -> dict[str, Any]:
+    """The actions' error with one group of sites in FP8 alone."""
+    names = [f"{part}.{kind}" for part in PARTS for kind in KINDS[part]]
+    progress.begin("groups of sites", len(names))
+    measured = {}
+    for name in names:
+        own = {site: scales[site] for site in eligible if site.group == name and str(site) not in kept}
+        if own:
+            measured[name] = trials.error(trials.actions(own))
+        progress.advance()
+    return measured
+
+
+def _keep_groups(
+    eligible: Sequence[Site],
+    scales: Mapping[Site, float],
+    kept: Mapping[str, str],
+    groups: Mapping[str, Mapping[str, float]],
+    trials: _Trials,
+    target: float,
+    progress: Progress,
+) -> dict[str, str]:
+    """Take groups back to bfloat16, those first that hurt most for the work they do, until the target is met."""
+    work = {name: sum(site.width * site.outputs for site in eligible if site.group == name) for name in groups}
+    hurting = sorted(groups, key=lambda name: -(groups[name]["relative_rms"] ** 2) / work[name])
+    progress.begin("which sites to keep in bfloat16", len(hurting))
+    more: dict[str, str] = {}
+    for name in hurting:
+        used = {site: scales[site] for site in eligible if str(site) not in kept and str(site) not in more}
+        if not used or trials.error(trials.actions(used))["delta_cosine"] >= target:
+            break
+        reason = f"the actions' cosine is below {target} with it; alone it costs {groups[name]['relative_rms']:.2%}"
+        whole = name.startswith("expert.")  # its kernel takes all matrices in one precision
+        more |= {str(site): reason for site in used if site.group == name or (whole and site.part == "expert")}
+        progress.advance()
+    return more
+
+
+def _held_out(
+    model: Pi0Model,
+    eligible: Sequence[Site],
+    scales: Mapping[Site, float],
+    kept: Mapping[str, str],
+    trials: _Trials,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Errors of tiers, parts and plain bfloat16 on observations that chose nothing."""
+    used = {site: scale for site, scale in scales.items() if site in set(eligible) and str(site) not in kept}
+    cases: dict[str, dict[Site, float]] = {
+        "fp8": used,
+        "fp8-mlp": {s: scale for s, scale in used.items() if s.kind in MLP_KINDS and s.part != "expert"},
+        **{f"fp8 in the {part} alone": {s: used[s] for s in used if s.part == part} for part in PARTS},
+    }
+    progress.begin("held-out observations", len(cases) + 1)
+    report: dict[str, Any] = {}
+    actions = {}
+    for name, own in cases.items():
+        actions[name] = trials.actions(own)
+        report[name] = trials.error(actions[name])
+        progress.advance()
+    state = {name: tensor.to(parameter_dtype(name, "bf16")) for name, tensor in model.state_dict().items()}
+    plain = trials.actions({}, Pi0Model.from_state(model.config, state))
+    report["bf16"] = trials.error(plain)
+    report["fp8 against bf16"] = trials.error(actions["fp8"], plain)
+    progress.advance()
+    by_call = [
+        relative_rms(ours, exact)
+        for ours, exact in zip(torch.cat(actions["fp8"]), torch.cat(trials.exact), strict=True)
+    ]
+    worst = max(range(len(by_call)), key=by_call.__getitem__)
+    call = trials.calls[worst]
+    report["worst"] = {"observation": call.sample.source, "seed": call.seed, "relative_rms": by_call[worst]}
+    return report
+
+
+def _version() -> str:
+    try:
+        return metadata.version("turbopi")
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _free(device: torch.device) -> None:
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()

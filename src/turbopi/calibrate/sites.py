@@ -1,0 +1,96 @@
+"""The places where a policy's numbers may be rounded to E4M3: a site is an activation and the matrices that read it.
+
+    vision.3.fc1    part, layer, kind
+
+Of vision and prefix both the activation and the weights are rounded. The expert's products are bound by their weights'
+bytes, so there only the weights are.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from torch import nn
+
+from turbopi.config import ModelConfig
+from turbopi.engine.fp8 import ALIGNMENT
+from turbopi.model.reference import Pi0Model
+
+Part = Literal["vision", "prefix", "expert"]
+PARTS: tuple[Part, ...] = get_args(Part)
+KINDS = {
+    "vision": ("qkv", "out", "fc1", "fc2"),
+    "prefix": ("qkv", "out", "gate_up", "down"),
+    "expert": ("qkv", "out", "gate_up", "down"),
+}
+MLP_KINDS = ("fc1", "fc2", "gate_up", "down")
+
+
+@dataclass(frozen=True)
+class Site:
+    part: Part
+    layer: int
+    kind: str
+    width: int  # of the activation
+    outputs: int  # of all matrices that read it
+
+    def __str__(self) -> str:
+        return f"{self.part}.{self.layer}.{self.kind}"
+
+    @property
+    def group(self) -> str:
+        """The site without its layer: sites of a group are alike in what they cost and gain."""
+        return f"{self.part}.{self.kind}"
+
+    @property
+    def weights_only(self) -> bool:
+        return self.part == "expert"
+
+    @property
+    def refusal(self) -> str | None:
+        """Why its products can't be of E4M3 numbers, or None."""
+        for name, size in (("input", self.width), ("output", self.outputs)):
+            if size % ALIGNMENT:
+                return f"its {name} is {size} wide, not a multiple of {ALIGNMENT}"
+        return None
+
+
+def sites(config: ModelConfig) -> list[Site]:
+    """All sites of a model, in the order of the data. The prefix's last layer has keys and values alone."""
+    found = []
+    v, g, e = config.vision, config.vlm, config.expert
+    sizes = {"qkv": (v.width, 3 * v.width), "out": (v.width, v.width), "fc1": (v.width, v.mlp_dim)}
+    sizes["fc2"] = (v.mlp_dim, v.width)
+    for layer in range(v.depth):
+        found += [Site("vision", layer, kind, *sizes[kind]) for kind in KINDS["vision"]]
+    stacks: tuple[tuple[Part, int, int, int], ...] = (
+        ("prefix", g.depth, g.width, g.mlp_dim),
+        ("expert", e.depth, e.width, e.mlp_dim),
+    )
+    for part, depth, width, hidden in stacks:
+        heads, kv = g.num_heads * g.head_dim, 2 * g.num_kv_heads * g.head_dim
+        sizes = {"qkv": (width, heads + kv), "out": (heads, width), "gate_up": (width, 2 * hidden)}
+        sizes["down"] = (hidden, width)
+        for layer in range(depth):
+            last = part == "prefix" and layer + 1 == depth
+            found += [Site(part, layer, kind, *sizes[kind]) for kind in (("qkv",) if last else KINDS[part])]
+    return found
+
+
+def linears(model: Pi0Model, site: Site) -> Iterator[nn.Linear]:
+    """The reference's matrices of a site."""
+    stacks: dict[Part, Any] = {"vision": model.vision, "prefix": model.vlm, "expert": model.expert}
+    stack = stacks[site.part]
+    layer = stack.layers[site.layer]
+    attention, mlp = layer.self_attn, layer.mlp
+    modules: dict[str, Callable[[], tuple[nn.Linear, ...]]] = {
+        "qkv": lambda: (attention.q_proj, attention.k_proj, attention.v_proj),
+        "out": lambda: (attention.out_proj if site.part == "vision" else attention.o_proj,),
+        "gate_up": lambda: (mlp.gate_proj, mlp.up_proj),
+        "down": lambda: (mlp.down_proj,),
+        "fc1": lambda: (mlp.fc1,),
+        "fc2": lambda: (mlp.fc2,),
+    }
+    found = modules[site.kind]()
+    last = site.part == "prefix" and site.layer + 1 == len(stack.layers)
+    yield from found[1:] if last else found  # nothing asks for the last layer's queries

@@ -1,0 +1,127 @@
+"""What a site's activation looks like over many calls, and the scales that follow from it.
+
+Values are counted by their first 16 bits as float32, sign aside: 128 bins an octave, over the whole range. That is fine
+enough to say what any rounding to E4M3 (8 numbers an octave) would cost, without keeping a value.
+"""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor
+
+from turbopi.calibrate.sites import Site, linears
+from turbopi.engine.fp8 import E4M3_MAX, to_e4m3
+from turbopi.errors import ObservationError
+from turbopi.model.reference import Pi0Model
+from turbopi.observation import Observation
+
+BINS = 0x7F80  # the bins above hold infinities and NaN
+HEADROOM = 2.0  # of what was seen; costs a floating-point format only some of its smallest numbers
+PERCENTILE = 99.99
+
+Method = Literal["max", "headroom", "percentile", "mse"]
+METHODS: tuple[Method, ...] = get_args(Method)
+
+
+class Histogram:
+    """Counts of |x| on the host; `largest` is exact. counts float64[BINS]"""
+
+    def __init__(self, counts: Tensor, largest: float) -> None:
+        used = counts.nonzero().squeeze(1)  # a few thousand: the octaves that occur
+        self.largest = largest
+        self._bins, self._counts, self._values = used, counts[used], _centres()[used]
+        self._scales: dict[Method, float] = {}
+
+    def error(self, scale: float) -> tuple[float, float]:
+        """(relative rms error of rounding to E4M3 with a scale, part of the values that saturates)."""
+        values = self._values.double()
+        rounded = to_e4m3(self._values, 1 / scale).float().double() * scale
+        squares = float((self._counts * values**2).sum())
+        wrong = float((self._counts * (rounded - values) ** 2).sum())
+        beyond = float(self._counts[values > E4M3_MAX * scale].sum() / max(float(self._counts.sum()), 1.0))
+        return (wrong / squares) ** 0.5 if squares else 0.0, beyond
+
+    def percentile(self, percent: float) -> float:
+        """The upper edge of the bin under which so many values are."""
+        cumulated = self._counts.cumsum(0)
+        index = int(torch.searchsorted(cumulated, cumulated[-1] * percent / 100))
+        return float(_from_bits(min(int(self._bins[index]) + 1, BINS - 1) << 16))
+
+    def scale(self, method: Method) -> float:
+        """The scale that a method chooses; 1 where everything is 0."""
+        if method not in self._scales:
+            self._scales[method] = self._scale(method)
+        return self._scales[method]
+
+    def _scale(self, method: Method) -> float:
+        if self.largest == 0:
+            return 1.0
+        if method == "max":
+            return self.largest / E4M3_MAX
+        if method == "headroom":
+            return self.largest * HEADROOM / E4M3_MAX
+        if method == "percentile":
+            return max(self.percentile(PERCENTILE), self.largest / 1e6) / E4M3_MAX
+        tried = [self.largest / E4M3_MAX * 2 ** (-step / 8) for step in range(-8, 41)]
+        return min(tried, key=lambda scale: self.error(scale)[0])
+
+
+def collect(
+    model: Pi0Model, sites: Iterable[Site], batches: Iterable[tuple[Observation, Tensor]], steps: int
+) -> dict[str, Histogram]:
+    """Run the reference on (observations, noise) and count what every site sees, over all denoising steps.
+
+    The observations of a batch must have the same masks, as padding would be counted, too. Raises ObservationError if
+    a site sees values that aren't finite.
+    """
+    counts: dict[str, Tensor] = {}
+    largest: dict[str, Tensor] = {}
+    with _watched(model, sites, counts, largest):
+        for observation, noise in batches:
+            assert bool((observation.token_mask == observation.token_mask[:1]).all())
+            assert bool((observation.image_mask == observation.image_mask[:1]).all())
+            model.sample(observation, noise, steps)
+    found = {}
+    for name, bins in counts.items():
+        on_host = bins.cpu().double()
+        if on_host[BINS:].any():
+            raise ObservationError(f"{name} sees values that aren't finite; are these weights or pictures damaged?")
+        found[name] = Histogram(on_host[:BINS], float(largest[name]))
+    return found
+
+
+@contextmanager
+def _watched(
+    model: Pi0Model, sites: Iterable[Site], counts: dict[str, Tensor], largest: dict[str, Tensor]
+) -> Iterator[None]:
+    handles = []
+
+    def watch(name: str) -> Any:
+        def hook(module: torch.nn.Module, inputs: tuple[Tensor, ...]) -> None:
+            x = inputs[0].detach().float().abs().flatten()
+            bins = torch.bincount(x.view(torch.int32) >> 16, minlength=0x8000)
+            top = x.amax()
+            counts[name] = counts[name] + bins if name in counts else bins
+            largest[name] = torch.maximum(largest[name], top) if name in largest else top
+
+        return hook
+
+    try:
+        for site in sites:
+            first = next(linears(model, site))  # its siblings read the same
+            handles.append(first.register_forward_pre_hook(watch(str(site))))
+        yield
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+def _centres() -> Tensor:
+    """float32[BINS]: the middle of every bin."""
+    return ((torch.arange(BINS, dtype=torch.int32) << 16) | 0x8000).view(torch.float32)
+
+
+def _from_bits(bits: int) -> Tensor:
+    return torch.tensor(bits, dtype=torch.int32).view(torch.float32)

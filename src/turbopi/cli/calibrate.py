@@ -1,0 +1,145 @@
+"""`turbopi calibrate`: FP8 scales for one's own checkpoint, from one's own observations."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from turbopi.cli.files import check_writable
+from turbopi.cli.framework import JsonFlag, Output, command, new_console
+from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.errors import ConfigError
+
+if TYPE_CHECKING:
+    from turbopi.calibrate.artifact import Quantization
+
+
+@command(
+    "calibrate",
+    shared=WeightOptions,
+    examples=(
+        "turbopi calibrate checkpoints/pi05_droid --config pi05_droid --observations recordings/20260101T120000Z",
+        "turbopi calibrate checkpoints/pi05_libero --config pi05_libero --out libero_fp8.json",
+        "turbopi calibrate --random-weights pi05_tiny --out tiny_fp8.json --noises 2",
+    ),
+)
+def calibrate(
+    options: WeightOptions,
+    checkpoint: CheckpointArgument = None,
+    observations: Annotated[
+        str | None,
+        typer.Option(
+            "--observations",
+            metavar="PATH",
+            help="What `turbopi serve --record` wrote, a folder of observations, or an .npz. Unless given: LIBERO "
+            "pictures, for that robot. random-noise: none at all, which every output of the policy will say.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="Where it goes.", show_default="turbopi_fp8.json beside the weights"
+        ),
+    ] = None,
+    count: Annotated[int, typer.Option("--count", min=2, metavar="N", help="At most so many observations.")] = 64,
+    noises: Annotated[int, typer.Option("--noises", min=1, metavar="M", help="Noises for each of them.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the first noise.")] = 0,
+    target: Annotated[
+        float,
+        typer.Option(
+            "--target",
+            min=0,
+            max=1,
+            metavar="X",
+            help="Cosine of what denoising does, against float32: sites are kept in bf16 until it is met.",
+        ),
+    ] = 0.9975,
+    steps: Annotated[int, typer.Option("--steps", min=1, metavar="N", help="Denoising steps.")] = 10,
+    batch: Annotated[
+        int, typer.Option("--batch", min=1, metavar="N", help="Observations at once; fewer take less memory.")
+    ] = 8,
+    device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
+    tokenizer: Annotated[str | None, typer.Option("--tokenizer", metavar="FILE", help="SentencePiece model.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Prepare a checkpoint for FP8: scales of every activation, and which products had better stay in bf16.
+
+    Runs the float32 policy on your observations over all denoising steps, tries several ways to choose scales, and
+    reports on observations held out from all of that what FP8 does to the actions. The file it writes holds for these
+    weights alone. Needs no FP8 hardware.
+    """
+    output = Output(as_json)
+    if out is None and (checkpoint is None or options.random_weights is not None):
+        raise ConfigError("there is no checkpoint's folder to write beside: name a file with --out FILE")
+    from turbopi.calibrate.artifact import BESIDE
+
+    out = out or Path(str(checkpoint)) / BESIDE
+    check_writable(out)
+    opened = options.open(checkpoint)
+    options.tell_if_random(opened, output)
+    from turbopi.calibrate.run import Settings
+    from turbopi.calibrate.run import calibrate as run
+
+    arguments = {"num_denoising_steps": steps, "device": device, "tokenizer": tokenizer}
+    settings = Settings(arguments, observations, count, noises, seed, target, batch)
+    result = _with_bar(lambda progress: run(opened, settings, progress), output)
+    result.save(out)
+    _show(result, output)
+    output.line(f"wrote {out}")
+    output.document({"out": out, **result.as_json()})
+
+
+def _with_bar(work: Any, output: Output) -> Any:
+    from turbopi.calibrate.run import Progress as Told
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = new_console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not output.shows_progress) as bar:
+        task = bar.add_task("", total=None)
+
+        def begin(text: str, total: int) -> None:
+            bar.reset(task, description=text, total=total)
+
+        return work(Told(begin, lambda: bar.advance(task)))
+
+
+def _show(result: "Quantization", output: Output) -> None:
+    report = result.report
+    seen = report["observations"]
+    output.line(
+        f"{report['model']}: {len(seen['calibration'])} observations ({seen['source']}), {len(seen['held_out'])} more "
+        f"held out; {seen['noises']} noises, {report['steps']} steps, on {report['device']}"
+    )
+    methods = ", ".join(f"{name} {error['relative_rms']:.4f}" for name, error in report["methods"].items())
+    output.line(f"scales by {report['method']} (actions' relative rms: {methods})")
+    output.table(_table("one group of sites in FP8 alone, calibration observations", report["groups_alone"]))
+    held = {name: error for name, error in report["held_out"].items() if name != "worst"}
+    output.table(_table("held-out observations, against float32", held))
+    worst = report["held_out"]["worst"]
+    output.line(
+        f"worst: {worst['observation']}, noise seed {worst['seed']}: relative rms {worst['relative_rms']:.4f}; "
+        f"largest saturation {max(site.saturated for site in result.sites.values()):.2e}"
+    )
+    kept: dict[str, list[str]] = {}
+    for name, site in result.sites.items():
+        if site.kept is not None:
+            kept.setdefault(site.kept, []).append(name)
+    for reason, names in kept.items():
+        shown = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        output.line(f"stays in bf16: {shown}: {reason}", "yellow")
+    for warning in result.warnings:
+        output.line(f"WARNING: {warning}", "bold yellow")
+    took = ", ".join(f"{what} {seconds:.1f} s" for what, seconds in report["seconds"].items())
+    output.line(took, "dim")
+
+
+def _table(title: str, errors: dict[str, dict[str, float]]) -> Table:
+    table = Table(title=title, title_justify="left")
+    table.add_column("")
+    for column in ("relative rms of the actions", "cosine of the deltas", "max"):
+        table.add_column(column, justify="right")
+    for name, error in errors.items():
+        table.add_row(name, f"{error['relative_rms']:.4f}", f"{error['delta_cosine']:.5f}", f"{error['max']:.3f}")
+    return table

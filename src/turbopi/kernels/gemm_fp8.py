@@ -1,0 +1,171 @@
+"""Matrix products of E4M3 numbers, for compute capability 9.0: gemm.cu compiled for them.
+
+Twins: `engine.ops`' products with an `Fp8Matrix`. The results are bfloat16, E4M3 for a product that reads them next
+(`inverse`), or float32 parts of the sums ("partial") for the norms of `norms.py` to add up.
+"""
+
+import ctypes
+from dataclasses import replace
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from turbopi.engine.fp8 import ALIGNMENT, E4M3, Fp8Matrix
+from turbopi.kernels.gemm import EPILOGUES, SHARED_BYTES, DependentKernel, Epilogue, Tile, source, tensor_map
+from turbopi.kernels.nvrtc import compile_cubin
+
+DEPTH = 128  # of a step along the inner axis
+PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are added up in float32
+# Of sums shorter than these steps the tensor cores lose too little to matter: 2e-3 of 8192 random products, where
+# rounding to E4M3 costs 4e-2; products of one sign lose more, so longer sums are promoted.
+UNPROMOTED_STEPS = 16
+PROMOTED_COLUMNS = {1: 184, 2: 184, 3: 112}  # by warpgroups: of wider tiles the sums don't fit registers twice
+
+
+def stages(tile: Tile) -> int:
+    """As many as fit beside alignment, barriers, and scales and biases for each warpgroup."""
+    room = SHARED_BYTES - 2048 - 8 * tile.warpgroups * tile.columns
+    return min(16, room // ((tile.rows + tile.columns) * 128))
+
+
+def promotion(tile: Tile, k: int) -> int:
+    """Steps between two promotions of sums over k values; 0: none is needed, or the tile is too wide."""
+    return 0 if _short(tile, k) or tile.columns > PROMOTED_COLUMNS[tile.warpgroups] else PROMOTE
+
+
+def matmul_fp8(
+    a: Tensor,
+    weight: Fp8Matrix,
+    tile: Tile,
+    epilogue: Epilogue,
+    bias: Tensor | None = None,
+    out: Tensor | None = None,
+    inverse: float | None = None,
+    promote: int | None = None,
+) -> Tensor:
+    """a e4m3[M, K] @ weightᵀ with the epilogue -> bfloat16[M, N], or with `inverse` e4m3[M, N] = round(… * inverse);
+    "partial" -> float32[splits, M, N].
+
+    weight [N, K], for "geglu" [2N, K]; bias bfloat16[N] of any epilogue but "geglu". All contiguous, K a multiple of
+    16, N of 8.
+    """
+    m, k = a.shape
+    n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
+    assert a.dtype == weight.data.dtype == E4M3 and a.is_contiguous() and weight.data.is_contiguous()
+    assert k % ALIGNMENT == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
+    pieces = tile.cluster_m * (2 if epilogue == "geglu" else 1)
+    assert tile.columns % (8 * pieces) == 0 and tile.rows % (8 * tile.cluster_n) == 0, "a share is whole groups of 8"
+    partial = epilogue == "partial"
+    assert tile.splits == 1 or partial, "only partial sums can be split"
+    assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu"))
+    if out is None:
+        shape = (tile.splits, m, n) if partial else (m, n)
+        out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)
+    assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
+    columns = tile.columns // 2 if epilogue == "geglu" else tile.columns
+    m_groups, n_groups = -(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n))
+    kernel = _kernel(tile, epilogue, inverse is not None, promotion(tile, k) if promote is None else promote, a.device)
+    arguments = (
+        tensor_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
+        tensor_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
+        ctypes.c_void_p(out.data_ptr()),
+        ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
+        ctypes.c_void_p(weight.scale.data_ptr()),
+        ctypes.c_float(1.0 if inverse is None else inverse),
+        *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), m_groups, n_groups)),
+    )
+    clusters = min(m_groups * n_groups * tile.splits, kernel.max_clusters)
+    kernel.launch_dependent(clusters * tile.cluster, arguments)
+    return out
+
+
+def _result_dtype(partial: bool, inverse: float | None) -> torch.dtype:
+    return torch.float32 if partial else torch.bfloat16 if inverse is None else E4M3
+
+
+def constants(tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int) -> dict[str, int]:
+    """What gemm.cu is compiled with."""
+    return {
+        "TP_WGS": tile.warpgroups,
+        "TP_BN": tile.columns,
+        "TP_STAGES": stages(tile),
+        "TP_CM": tile.cluster_m,
+        "TP_CN": tile.cluster_n,
+        "TP_SPLITS": tile.splits,
+        "TP_EPILOGUE": EPILOGUES[epilogue],
+        "TP_FP8": 1,
+        "TP_OUT_FP8": int(out_fp8),
+        "TP_PROMOTE": promote,
+    }
+
+
+@cache
+def _kernel(tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, device: torch.device) -> DependentKernel:
+    with torch.cuda.device(device):
+        cubin = compile_cubin(source(tile.columns, fp8=True), "sm_90a", constants(tile, epilogue, out_fp8, promote))
+        threads = 128 * (tile.warpgroups + 1)
+        return DependentKernel(cubin, "gemm", SHARED_BYTES, threads, tile.cluster)
+
+
+# -- which tile --------------------------------------------------------------------------------------------------------
+
+# Clock cycles, fitted to 200 measurements on an H200 (median error 5 %): of a product besides its tiles, of a tile for
+# each of its results (with GELU twice as many), of a step, and of its loads for each byte. A step's products take
+# rows * columns / 32. Partial sums cost as much again in the norm that adds them up.
+FIXED, WRITING, STEP, LOADING, ADDING = 2300, 0.098, 205, 0.013, 0.00042
+
+# The fastest of some 25 tiles each, by [rows, out, in]. Rows count in whole 64, the least that a tile has: so fewer
+# kernels are compiled for all the prompt lengths.
+MEASURED = {
+    (512, 3456, 1152): Tile(2, 112, cluster_m=2),
+    (512, 1152, 1152): Tile(1, 96),
+    (512, 4304, 1152): Tile(2, 144),
+    (512, 1152, 4304): Tile(1, 80, cluster_m=2),  # a little slower than three parts, whose sum costs the norm 4 us
+    (576, 2560, 2048): Tile(3, 64),
+    (576, 2048, 2048): Tile(1, 160),
+    (576, 16384, 2048): Tile(3, 192, cluster_n=2),
+    (576, 2048, 16384): Tile(3, 96, splits=2),
+    (576, 512, 2048): Tile(1, 80),
+}
+
+
+def candidates(epilogue: Epilogue) -> list[Tile]:
+    """All that may be worth trying."""
+    unit = 16 if epilogue == "geglu" else 8
+    found = [
+        Tile(warpgroups, columns, splits=splits)
+        for warpgroups in (1, 2, 3)
+        for columns in range(2 * unit, 257, unit)
+        if 64 * warpgroups * columns <= 192 * 192
+        for splits in ((1, 2, 3, 4) if epilogue == "partial" else (1,))
+    ]
+    return [tile for tile in found if stages(tile) >= 3]
+
+
+def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> float:
+    """Estimated clock cycles of a product."""
+    columns = tile.columns // 2 if epilogue == "geglu" else tile.columns
+    waves = -(-(-(-m // tile.rows) * -(-n // columns) * tile.splits) // sms)
+    steps = -(-k // DEPTH) / tile.splits
+    step = max(tile.rows * tile.columns / 32, (tile.rows + tile.columns) * DEPTH * LOADING) + STEP
+    writing = tile.rows * tile.columns * WRITING * (2 if epilogue in ("gelu", "geglu") else 1)
+    adding = 8 * m * n * tile.splits * ADDING if tile.splits > 1 else 0
+    return waves * (steps * step + writing) + FIXED + adding
+
+
+@cache
+def best_tile(m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> Tile:
+    """The measured tile for a @ weightᵀ of [m, k] and [n, k] (GeGLU: [2n, k]), else that of least estimated cost."""
+    m = -(-m // 64) * 64
+    if (m, n, k) in MEASURED:
+        return MEASURED[m, n, k]
+    fitting = [tile for tile in candidates(epilogue) if tile.splits <= -(-k // DEPTH)]
+    if -(-k // DEPTH) > UNPROMOTED_STEPS:  # long sums need room for promotion
+        fitting = [tile for tile in fitting if _short(tile, k) or promotion(tile, k)]
+    best = min(fitting, key=lambda tile: cost(tile, m, n, k, epilogue, sms))
+    return replace(best, cluster_n=2) if epilogue == "geglu" else best
+
+
+def _short(tile: Tile, k: int) -> bool:
+    return -(-k // DEPTH) <= UNPROMOTED_STEPS * tile.splits

@@ -1,0 +1,403 @@
+"""Calibration: what it measures, what it chooses, what it writes, and everything it refuses."""
+
+import dataclasses
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cli_helpers import refusal, turbopi
+from conftest import golden_cases, golden_folder, golden_model
+
+from turbopi import backends
+from turbopi.calibrate import formats
+from turbopi.calibrate.artifact import BESIDE, VERSION, Quantization, SiteScale, for_policy, shapes_of
+from turbopi.calibrate.observations import calls, read_samples, split
+from turbopi.calibrate.run import Settings, calibrate_model
+from turbopi.calibrate.sites import sites
+from turbopi.calibrate.statistics import Histogram, collect
+from turbopi.checkpoint import random_checkpoint
+from turbopi.cli.options import PolicyOptions
+from turbopi.config import preset
+from turbopi.engine.fp8 import E4M3_MAX, to_e4m3
+from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, ObservationError
+from turbopi.judge.check_golden import check_case, golden_calibration, golden_calls
+from turbopi.judge.verdict import Rule
+from turbopi.policy import UnifiedPolicy
+from turbopi.serve.record import Call as RecordedCall
+from turbopi.serve.record import save_call
+
+TINY = preset("pi05_tiny").model
+
+
+@lru_cache
+def tiny_policy() -> UnifiedPolicy:
+    return UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu", precision="f32")
+
+
+def made_up(**more: Any) -> Quantization:
+    """A calibration of pi05_tiny's shapes with made-up scales."""
+    entries = {str(s): SiteScale(None if s.weights_only else 0.01, 4.0, 0.0, 0.03) for s in sites(TINY)}
+    report = {"observations": {"source": "recordings"}, "warnings": []}
+    fingerprint = random_checkpoint("pi05_tiny").fingerprint()
+    return dataclasses.replace(Quantization(fingerprint, shapes_of(TINY), entries, report), **more)
+
+
+# Sites and statistics
+
+
+def test_every_product_has_a_site_and_the_last_prefix_layer_keys_and_values_alone() -> None:
+    names = [str(site) for site in sites(TINY)]
+    assert len(names) == len(set(names)) == 6 * 4 + 5 * 4 + 1 + 6 * 4
+    assert [name for name in names if name.startswith("prefix.5")] == ["prefix.5.qkv"]
+    assert all(site.weights_only == (site.part == "expert") for site in sites(TINY))
+
+
+def test_a_site_of_odd_width_says_why_it_cannot() -> None:
+    odd = dataclasses.replace(TINY, vision=dataclasses.replace(TINY.vision, mlp_dim=500))
+    refusals = {str(site): site.refusal for site in sites(odd)}
+    assert refusals["vision.0.fc2"] == "its input is 500 wide, not a multiple of 16"
+    assert refusals["vision.0.fc1"] == "its output is 500 wide, not a multiple of 16"
+    assert refusals["vision.0.qkv"] is None
+
+
+def histogram_of(x: torch.Tensor) -> Histogram:
+    bins = torch.bincount(x.abs().view(torch.int32) >> 16, minlength=0x8000)
+    return Histogram(bins[:0x7F80].double(), float(x.abs().max()))
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01, 0.0037, 1e-3])
+def test_a_histogram_knows_the_error_of_rounding(scale: float) -> None:
+    x = torch.randn(200_000, generator=torch.Generator().manual_seed(0))
+    exact = to_e4m3(x, 1 / scale).float() * scale
+    error, beyond = histogram_of(x).error(scale)
+    assert error == pytest.approx(float((exact - x).norm() / x.norm()), rel=0.03)
+    assert beyond == pytest.approx(float((x.abs() > E4M3_MAX * scale).float().mean()), abs=0.003)
+
+
+def test_the_ways_to_choose_a_scale() -> None:
+    x = torch.randn(200_000, generator=torch.Generator().manual_seed(0))
+    x[0] = 500.0
+    histogram = histogram_of(x)
+    assert histogram.scale("max") == pytest.approx(500 / E4M3_MAX)
+    assert histogram.scale("headroom") == pytest.approx(1000 / E4M3_MAX)
+    assert 3.5 < histogram.scale("percentile") * E4M3_MAX < 4.5
+    least = histogram.error(histogram.scale("mse"))[0]
+    assert all(least <= histogram.error(histogram.scale(m))[0] for m in ("max", "headroom", "percentile"))
+    assert histogram_of(torch.zeros(10)).scale("mse") == 1
+
+
+def test_statistics_see_every_step_and_the_largest_value() -> None:
+    model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
+    seen: list[torch.Tensor] = []
+    handle = model.expert.layers[1].mlp.down_proj.register_forward_pre_hook(lambda _, x: seen.append(x[0].clone()))
+    found = collect(model, sites(model.config), [(case.observation, case.noise)], 3)
+    handle.remove()
+    assert len(seen) == 3
+    assert found["expert.1.down"].largest == float(torch.cat(seen).abs().max())
+    assert set(found) == {str(site) for site in sites(model.config)}
+
+
+def test_values_that_are_not_finite_are_refused_by_site() -> None:
+    model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
+    noise = case.noise.clone()
+    noise[0, 0, 0] = torch.nan
+    with pytest.raises(ObservationError, match=r"expert\.0\.qkv sees values that aren't finite"):
+        collect(model, sites(model.config), [(case.observation, noise)], 1)
+
+
+# What is chosen
+
+
+def test_sites_stay_in_bf16_until_the_target_is_met() -> None:
+    model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
+    own = golden_calls(case)
+
+    def measured(target: float) -> Any:
+        return calibrate_model(model, own, own, 1, Settings({}, target=target, batch=1, methods=("headroom",)))
+
+    loose, tight = measured(0.0), measured(0.9985)
+    assert all(site.kept is None for site in loose.sites.values())
+    kept = {name.split(".")[0] + "." + name.split(".")[2] for name, site in tight.sites.items() if site.kept}
+    assert kept and kept != {f"{s.part}.{s.kind}" for s in sites(model.config)}
+    assert tight.report["held_out"]["fp8"]["delta_cosine"] > loose.report["held_out"]["fp8"]["delta_cosine"]
+    assert tight.report["target_reached"] == (tight.report["held_out"]["fp8"]["delta_cosine"] >= 0.9985)
+    held = loose.report["held_out"]
+    assert held["bf16"]["relative_rms"] < held["fp8-mlp"]["relative_rms"] < held["fp8"]["relative_rms"] < 0.3
+    assert held["worst"]["observation"] == "b_third_masked 0"
+    assert all(0.02 < site.error < 0.06 for site in loose.sites.values())
+    assert set(loose.report["groups_alone"]) == {site.group for site in sites(model.config)}
+
+
+def test_saturation_is_told_and_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("turbopi.calibrate.statistics.PERCENTILE", 90.0)  # a tenth of the values is beyond
+    model, own = golden_model("pi05"), golden_calls(golden_cases()["b_third_masked"])
+    settings = Settings({}, target=0.0, batch=1, methods=("percentile",))
+    found = calibrate_model(model, own, own, 1, settings)
+    told = [warning for warning in found.report["warnings"] if "of vision.0.qkv saturate" in warning]
+    assert len(told) == 1 and 0.05 < found.sites["vision.0.qkv"].saturated < 0.15
+    assert all(site.saturated == 0 for name, site in found.sites.items() if name.startswith("expert."))
+    settings = dataclasses.replace(settings, methods=("headroom",))
+    assert not [w for w in calibrate_model(model, own, own, 1, settings).report["warnings"] if "saturate" in w]
+
+
+# Observations
+
+
+def test_random_noise_has_to_be_asked_for_and_is_told() -> None:
+    described, samples = read_samples(tiny_policy(), "random-noise", 3)
+    assert described == "random-noise" and len(samples) == 3
+    noisy = made_up(report={"observations": {"source": described}, "warnings": []})
+    assert "random noise" in noisy.warnings[0]
+    assert made_up().warnings == []
+
+
+def test_every_fourth_observation_is_held_out() -> None:
+    _, samples = read_samples(tiny_policy(), None, 6)
+    chosen, held = split(samples)
+    assert [sample.source for sample in held] == ["LIBERO frame 3"]
+    assert len(chosen) == 5
+    assert [sample.source for sample in split(samples[:2])[1]] == ["LIBERO frame 1"]
+    made = calls(samples, (10, 32), 2, 5)
+    assert [call.seed for call in made] == list(range(5, 17))
+    expected = np.random.default_rng(7).standard_normal((1, 10, 32), dtype=np.float32)
+    np.testing.assert_array_equal(made[2].noise.numpy(), expected)
+
+
+def test_a_recording_is_read_and_what_cannot_be_used_is_named(tmp_path: Path) -> None:
+    for number in range(3):
+        observation = tiny_policy().example_observation(number)
+        save_call(tmp_path / f"{number:06d}.npz", RecordedCall(observation, {"actions": np.zeros((10, 7))}, 0.0))
+    _, samples = read_samples(tiny_policy(), str(tmp_path), 64)
+    assert [sample.source for sample in samples] == ["000000.npz", "000001.npz", "000002.npz"]
+    assert len({sample.sha256 for sample in samples}) == 3
+    observation["observation/state"] = np.full(8, np.nan)
+    save_call(tmp_path / "000002.npz", RecordedCall(observation, {"actions": np.zeros((10, 7))}, 0.0))
+    with pytest.raises(ObservationError, match=r"^000002\.npz: .*finite"):
+        read_samples(tiny_policy(), str(tmp_path), 64)
+    with pytest.raises(ObservationError, match="needs two observations or more"):
+        read_samples(tiny_policy(), str(tmp_path / "000000.npz"), 64)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ObservationError, match="holds no recording"):
+        read_samples(tiny_policy(), str(tmp_path / "empty"), 64)
+    with pytest.raises(ObservationError, match="doesn't exist"):
+        read_samples(tiny_policy(), str(tmp_path / "nowhere"), 64)
+
+
+# The file
+
+
+def test_a_file_comes_back_as_it_was(tmp_path: Path) -> None:
+    made_up().save(tmp_path / "q.json")
+    back = Quantization.load(tmp_path / "q.json")
+    assert back == made_up()
+    back.check(TINY, random_checkpoint("pi05_tiny").fingerprint())
+
+
+def test_other_weights_shapes_and_versions_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "q.json"
+    made_up().save(file)
+    calibration = Quantization.load(file)
+    with pytest.raises(CalibrationError, match=r"q\.json was made for other weights: their hash is .*calibrate"):
+        calibration.check(TINY, random_checkpoint("pi05_tiny", 1).fingerprint())
+    wider = dataclasses.replace(TINY, expert=dataclasses.replace(TINY.expert, mlp_dim=512))
+    with pytest.raises(CalibrationError, match="a model of other shapes: expert is"):
+        calibration.check(wider, calibration.fingerprint)
+    content = json.loads(file.read_text())
+    for change, message in (
+        ({"version": VERSION + 1}, "this Turbo-Pi reads version"),
+        ({"format": "something"}, "is 'something', not turbopi-quantization"),
+        ({"sites": {"vision.0.qkv": {"scale": -1, "largest": 1, "saturated": 0, "error": 0}}}, "the scale -1"),
+        ({"sites": {"vision.0.qkv": {"size": 1}}}, "isn't a calibration that"),
+    ):
+        file.write_text(json.dumps(content | change))
+        with pytest.raises(CalibrationError, match=message):
+            Quantization.load(file)
+    file.write_text("{")
+    with pytest.raises(CalibrationError, match="isn't a calibration that"):
+        Quantization.load(file)
+    with pytest.raises(CalibrationError, match="there is no file"):
+        Quantization.load(tmp_path / "nothing.json")
+
+
+def test_a_policy_finds_the_file_beside_its_weights(tmp_path: Path) -> None:
+    checkpoint = dataclasses.replace(random_checkpoint("pi05_tiny"), path=tmp_path)
+    assert for_policy(None, "bf16", checkpoint) is None
+    with pytest.raises(ConfigError, match="needs a calibration: run `turbopi calibrate`"):
+        for_policy(None, "fp8", checkpoint)
+    made_up().save(tmp_path / BESIDE)
+    found = for_policy(None, "fp8", checkpoint)
+    assert found is not None and found.source == str(tmp_path / BESIDE)
+    with pytest.raises(CalibrationError, match="other weights"):
+        for_policy(made_up(fingerprint="0" * 64), "fp8", checkpoint)
+
+
+def test_warnings_are_logged_wherever_a_policy_is_made(caplog: pytest.LogCaptureFixture) -> None:
+    noisy = made_up(report={"observations": {"source": "random-noise"}, "warnings": ["2 % of x saturate"]})
+    for_policy(noisy, "fp8", random_checkpoint("pi05_tiny"))
+    assert "calibrated on random noise" in caplog.text and "2 % of x saturate" in caplog.text
+
+
+# The plan
+
+
+def test_tiers_and_parts_choose_sites_and_say_why_not() -> None:
+    whole = made_up().plan(TINY, "fp8")
+    assert len(whole.scales) == len(sites(TINY)) and not whole.kept
+    assert whole.expert_weights == "fp8"
+    mlp = made_up().plan(TINY, "fp8-mlp")
+    assert {name.split(".")[2] for name in mlp.scales} == {"fc1", "fc2", "gate_up", "down"}
+    assert mlp.expert_weights == "bf16"
+    assert "feed-forward" in mlp.kept["vision.0.qkv"]
+    one_kept = dict(made_up().sites)
+    one_kept["expert.3.out"] = dataclasses.replace(one_kept["expert.3.out"], kept="it hurts")
+    assert made_up(sites=one_kept).plan(TINY, "fp8").expert_weights == "bf16"  # the kernel takes all of them or none
+    vision = made_up().only(["vision"]).plan(TINY, "fp8")
+    assert {name.split(".")[0] for name in vision.scales} == {"vision"}
+    assert vision.kept["prefix.0.qkv"] == "FP8 is switched off in the prefix"
+    with pytest.raises(ConfigError, match="unknown part 'head'"):
+        made_up().only(["head"])
+    with pytest.raises(ConfigError, match="is no FP8 tier"):
+        made_up().plan(TINY, "bf16")
+
+
+def test_a_kept_site_is_described_with_its_reason() -> None:
+    entries = dict(made_up().sites)
+    entries["vision.2.fc1"] = dataclasses.replace(entries["vision.2.fc1"], kept="it hurts")
+    described = made_up(sites=entries).plan(TINY, "fp8").describe()
+    assert described["vision.fc1"] == {"fp8": "layers 0, 1, 3, 4, 5", "bf16: it hurts": "layers 2"}
+    assert described["vision.fc2"] == "fp8"
+
+
+# Backends and verdicts
+
+
+@pytest.mark.parametrize(
+    ("capability", "reason"),
+    [((8, 0), "no FP8: that begins with 8.9"), ((8, 9), "written for compute capability 9.0"), ((10, 0), "9.0")],
+)
+def test_gpus_without_our_fp8_are_refused(
+    capability: tuple[int, int], reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from turbopi.backends.fused import FusedBackend
+
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    monkeypatch.setattr(FusedBackend, "unavailable", classmethod(lambda cls, device: None))
+    with pytest.raises(BackendUnavailable, match=rf"can't run in fp8 on cuda:0: .*{reason}"):
+        backends.check("fused", torch.device("cuda", 0), "fp8")
+    backends.check("fused", torch.device("cuda", 0), "bf16")
+
+
+def test_fp8_without_a_calibration_and_the_reverse_are_refused() -> None:
+    from turbopi.backends.fused import FusedBackend
+
+    def load(to: torch.device, precision: str) -> dict[str, torch.Tensor]:
+        raise AssertionError("nothing should be loaded")
+
+    device = torch.device("cpu")
+    with pytest.raises(ConfigError, match="precision 'fp8' needs FP8 calibration"):
+        FusedBackend(TINY, load, device=device, precision="fp8")
+    with pytest.raises(ConfigError, match="precision 'bf16' takes no FP8 calibration"):
+        FusedBackend(TINY, load, device=device, precision="bf16", quantization=made_up())
+
+
+def test_other_backends_have_no_fp8() -> None:
+    with pytest.raises(ConfigError, match="backend 'pytorch' runs in bf16 or f32, not in 'fp8'"):
+        backends.check("pytorch", torch.device("cpu"), "fp8")
+    assert backends.choose(torch.device("cpu"), "fp8")[0] == "fused"
+
+
+def test_fp8_is_held_to_the_cosine_that_calibration_aims_at() -> None:
+    rule = Rule.of("fused", "fp8")
+    assert rule.limit(control=0.004) == pytest.approx(0.0707)
+    assert rule.allowed("fp8", control=0.002) == pytest.approx(0.064)
+    assert Rule.of("fused", "fp8-mlp", bound=0.02).limit(control=1.0) == 0.02
+
+
+# Formats without kernels
+
+
+def test_e2m1_rounds_to_its_numbers_and_halves_to_even() -> None:
+    numbers = torch.tensor(formats.E2M1)
+    assert torch.equal(formats.round_e2m1(numbers), numbers)
+    halves = torch.tensor([0.25, 0.75, 1.25, 1.75, 2.5, 3.5, 5.0, 7.0, -0.75])
+    assert formats.round_e2m1(halves).tolist() == [0, 1, 1, 2, 2, 4, 4, 6, -1]
+    x = torch.rand(1000, generator=torch.Generator().manual_seed(0)) * 6
+    nearest = (x[:, None] - numbers).abs().amin(1)
+    assert torch.equal((formats.round_e2m1(x) - x).abs(), nearest)
+
+
+def test_nvfp4_scales_blocks_of_sixteen() -> None:
+    x = torch.randn(8, 64, generator=torch.Generator().manual_seed(0))
+    x[:, :16] *= 1000
+    error = (formats.round_nvfp4(x) - x).view(8, 4, 16).norm(dim=-1) / x.view(8, 4, 16).norm(dim=-1)
+    assert float(error.max()) < 0.2 and float(error.mean()) > 0.05
+    assert torch.equal(formats.round_nvfp4(torch.zeros(2, 32)), torch.zeros(2, 32))
+
+
+def test_fp8_attention_changes_a_little_and_goes_away() -> None:
+    model, case = golden_model("pi05"), golden_cases()["b_third_masked"]
+    exact = model.sample(case.observation, case.noise, 2)
+    with formats.attention_in_fp8("vision", "gemma"):
+        rounded = model.sample(case.observation, case.noise, 2)
+    assert 1e-4 < float((rounded - exact).norm() / exact.norm()) < 0.2
+    assert torch.equal(model.sample(case.observation, case.noise, 2), exact)
+
+
+def test_golden_cases_calibrate_themselves_and_hold_fp8_to_its_cosine() -> None:
+    calibration = golden_calibration(golden_folder(), "pi0", torch.device("cpu"), 0.0)
+    assert calibration.report["observations"]["source"] == "the golden cases themselves"
+    calibration.check(golden_folder().checkpoint("pi0").config.model, golden_folder().checkpoint("pi0").fingerprint())
+    case = golden_cases()["p0_pi0_state"]
+    checkpoint = golden_folder().checkpoint("pi0")
+    runner = backends.create(
+        "pytorch",
+        checkpoint.config.model,
+        lambda to, mode: checkpoint.load(to, mode).state,
+        device=torch.device("cpu"),
+        precision="bf16",
+    )
+    runner.precision = "fp8"  # what is judged is another backend's; its rule is what is tested
+    judged = [one for one in check_case(case, runner) if one.ok is not None]
+    assert [(one.tensor, one.precision, one.ok) for one in judged] == [("actions", "fp8", True)]
+    assert judged[0].bound == pytest.approx(0.0316, abs=1e-4)
+
+
+# The command
+
+
+def test_the_command_writes_a_file_that_this_checkpoint_alone_takes(tmp_path: Path) -> None:
+    out = tmp_path / "tiny_fp8.json"
+    quick = ("--count", 2, "--steps", 1, "--device", "cpu", "--target", 0, "--json")
+    result = turbopi("calibrate", "--random-weights", "pi05_tiny", "--out", out, *quick)
+    assert result.exit_code == 0, (result.output, result.exception)
+    document = json.loads(result.stdout)
+    report = document["report"]
+    assert len(report["observations"]["calibration"]) == len(report["observations"]["held_out"]) == 1
+    assert report["random_weights"] is True and report["target_reached"] is True
+    assert set(report["methods"]) == {"max", "headroom", "percentile", "mse"}
+    assert set(report["held_out"]) >= {"fp8", "fp8-mlp", "bf16", "fp8 against bf16", "worst"}
+    calibration = Quantization.load(out)
+    calibration.check(TINY, random_checkpoint("pi05_tiny").fingerprint())
+    assert not calibration.plan(TINY, "fp8").kept
+    arguments = {"precision": "fp8", "quantization": out, "device": "cpu"}
+    with pytest.raises(BackendUnavailable, match=r"backend 'fused' can't run on cpu: .*NVIDIA GPU"):
+        UnifiedPolicy(random_checkpoint("pi05_tiny"), **arguments)  # type: ignore[arg-type]
+    with pytest.raises(CalibrationError, match="made for other weights"):
+        UnifiedPolicy(random_checkpoint("pi05_tiny", 1), **arguments)  # type: ignore[arg-type]
+
+
+def test_the_command_needs_a_place_to_write() -> None:
+    assert "name a file with --out FILE" in refusal(turbopi("calibrate", "--random-weights", "pi05_tiny"))
+    assert "no weights" in refusal(turbopi("calibrate", "--out", "x.json"))
+
+
+def test_parts_narrow_a_named_calibration_alone(tmp_path: Path) -> None:
+    made_up().save(tmp_path / "q.json")
+    narrowed = PolicyOptions(quantization=str(tmp_path / "q.json"), fp8_parts="vision,prefix").policy_arguments()
+    assert narrowed["quantization"].parts == ("vision", "prefix")
+    with pytest.raises(ConfigError, match="name it with --quantization"):
+        PolicyOptions(fp8_parts="vision").policy_arguments()

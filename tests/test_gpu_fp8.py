@@ -1,0 +1,99 @@
+"""FP8 of the `fused` backend on a real GPU: what the emulated reference says, on openpi's golden cases."""
+
+from functools import lru_cache
+
+import pytest
+import torch
+from conftest import golden_cases, golden_folder, golden_model
+from torch import Tensor
+
+from turbopi import backends
+from turbopi.backends import Tier
+from turbopi.calibrate.artifact import Quantization
+from turbopi.calibrate.emulate import delta_cosine, relative_rms, rounded
+from turbopi.calibrate.sites import sites
+from turbopi.config import Kind
+from turbopi.judge.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
+from turbopi.judge.golden import Case
+from turbopi.model.reference import Pi0Model
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(
+        not torch.cuda.is_available() or torch.cuda.get_device_capability() != (9, 0),
+        reason="needs an NVIDIA GPU of compute capability 9.0",
+    ),
+]
+CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
+STEPS = 10
+
+
+@lru_cache
+def on_gpu(kind: Kind) -> Pi0Model:
+    state = {name: tensor.to("cuda") for name, tensor in golden_model(kind).state_dict().items()}
+    return Pi0Model.from_state(golden_model(kind).config, state)
+
+
+@lru_cache
+def quantization(kind: Kind, target: float) -> Quantization:
+    return golden_calibration(golden_folder(), kind, torch.device("cuda", 0), target)
+
+
+@lru_cache
+def backend(kind: Kind, precision: Tier, target: float = 0.0) -> backends.Backend:
+    checkpoint = golden_folder().checkpoint(kind)
+    return backends.create(
+        "fused",
+        checkpoint.config.model,
+        lambda to, mode: checkpoint.load(to, mode).state,
+        device=torch.device("cuda", 0),
+        precision=precision,
+        quantization=quantization(kind, target),
+    )
+
+
+def emulated(case: Case, precision: Tier, target: float) -> tuple[Tensor, Tensor]:
+    """(float32, float32 with the plan's sites rounded), on the host."""
+    model, chosen = on_gpu(case.kind), quantization(case.kind, target)
+    plan = chosen.plan(model.config, precision).scales
+    used = {site: plan[str(site)] for site in sites(model.config) if str(site) in plan and not site.weights_only}
+    observation, noise = case.observation.to("cuda"), case.noise.to("cuda")
+    exact = model.sample(observation, noise, STEPS)
+    with rounded(model, used):
+        return exact.cpu(), model.sample(observation, noise, STEPS).cpu()
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("precision", ["fp8", "fp8-mlp"])
+def test_the_engine_is_as_far_from_float32_as_its_emulation(case: str, precision: Tier) -> None:
+    one = golden_cases()[case]
+    exact, expected = emulated(one, precision, 0.0)
+    ours = backend(one.kind, precision).sample(one.observation, one.noise, STEPS).actions
+    print(
+        f"{case} {precision}: {relative_rms(ours, exact):.4f} of float32, emulated {relative_rms(expected, exact):.4f}"
+    )
+    assert relative_rms(ours, exact) < 1.3 * relative_rms(expected, exact) + 0.01
+    assert relative_rms(ours, expected) < 0.75 * relative_rms(expected, exact) + 0.02
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_sites_kept_in_bf16_reach_the_target(case: str) -> None:
+    one = golden_cases()[case]
+    exact, _ = emulated(one, "fp8", FP8_TARGET)
+    runner = backend(one.kind, "fp8", FP8_TARGET)
+    ours = runner.sample(one.observation, one.noise, STEPS).actions
+    cosine, difference = delta_cosine(ours, exact, torch.zeros_like(exact)), ours - exact
+    print(
+        f"{case}: cosine {cosine:.6f}, max {float(difference.abs().max()):.4f}, "
+        f"rms {float(difference.square().mean().sqrt()):.5f}, plan {runner.describe()['fp8']['plan']}"
+    )
+    assert cosine >= FP8_COSINE
+
+
+@pytest.mark.parametrize("precision", ["fp8", "fp8-mlp"])
+def test_repetition_is_bit_identical(precision: Tier) -> None:
+    case = golden_cases()["b_third_masked"]
+    runner = backend("pi05", precision)
+    first = runner.sample(case.observation, case.noise, STEPS).actions
+    for _ in range(5):
+        assert torch.equal(runner.sample(case.observation, case.noise, STEPS).actions, first)
