@@ -11,6 +11,7 @@ from turbopi.cli.options import WeightOptions
 from turbopi.errors import BackendUnavailable, ConfigError
 
 FORMATS = ("onnx",)
+PRECISIONS = ("f32", "fp8")
 
 
 class _ExportCommand(CheckpointThen):
@@ -26,6 +27,7 @@ class _ExportCommand(CheckpointThen):
         "turbopi export onnx checkpoints/pi05_libero pi05_libero_onnx",
         "turbopi export onnx checkpoints/pi05_droid_jax droid_onnx --config pi05_droid --json",
         "turbopi export onnx --random-weights pi05_tiny tiny_onnx",
+        "turbopi export onnx checkpoints/pi05_libero fp8_onnx --precision fp8 --calibration recording/",
     ),
 )
 def export(
@@ -39,13 +41,32 @@ def export(
             show_default=False,
         ),
     ],
+    precision: Annotated[
+        str, typer.Option(metavar="f32|fp8", help="fp8: quantise/dequantise nodes around the prefix's MLPs.")
+    ] = "f32",
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="For fp8: an observation or a recording (as for `turbopi infer`), or the file of `turbopi calibrate`. "
+            "Unless given, the LIBERO pictures that come with Turbo-Pi.",
+        ),
+    ] = None,
+    method: Annotated[
+        str, typer.Option(metavar="modelopt|max", help="Who measures the scales: NVIDIA's ModelOpt, or Turbo-Pi.")
+    ] = "max",
     as_json: JsonFlag = False,
 ) -> None:
     """Write a model for another runtime: as float32 ONNX graphs of vision, prompt, prefix and denoising step.
 
-    A full-size model needs 14 GB of disk and of memory.
+    A full-size model needs 14 GB of disk and of memory. With --precision fp8 the prefix's MLPs are FP8 (E4M3), with
+    scales that observations bring about in the model.
     """
     output = Output(as_json)
+    if precision not in PRECISIONS:
+        raise ConfigError(f"unknown precision {precision!r} for an export; choose one of {', '.join(PRECISIONS)}")
+    if precision == "f32" and calibration is not None:
+        raise ConfigError("--calibration is for --precision fp8")
     if format not in FORMATS:
         raise ConfigError(f"unknown format {format!r}; choose one of {', '.join(FORMATS)}")
     source, target = options.split("export onnx", paths, "new folder")
@@ -53,14 +74,25 @@ def export(
     from turbopi.model.reference import Pi0Model
 
     check_target(Path(target).expanduser())  # before minutes of loading
-    missing = missing_library(EXPORT_NEEDS)
+    from turbopi.tensorrt.calibrate import unavailable
+
+    missing = missing_library(EXPORT_NEEDS) or (unavailable(method) if precision == "fp8" else None)
     if missing is not None:
         raise BackendUnavailable(f"can't export to ONNX: {missing}")
     checkpoint = options.open(source)
     options.tell_if_random(checkpoint, output)
     started = time.perf_counter()
+    found = None
+    if precision == "fp8":
+        from turbopi.cli.build import measure_scales
+        from turbopi.policy import UnifiedPolicy
+
+        policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu")
+        found = measure_scales(policy, calibration, method, output)
+        del policy  # ModelOpt changes its model
     state = checkpoint.load("cpu", "f32", progress=output.shows_progress).state
-    written = export_onnx(Pi0Model.from_state(checkpoint.config.model, state), target, report=output.line)
+    model = Pi0Model.from_state(checkpoint.config.model, state)
+    written = export_onnx(model, target, calibration=found, report=output.line)
     seconds = time.perf_counter() - started
-    output.line(f"{checkpoint.format} -> {written.folder}: {written.bytes / 1e9:.3f} GB in f32, {seconds:.1f} s")
+    output.line(f"{checkpoint.format} -> {written.folder}: {written.bytes / 1e9:.3f} GB, {precision}, {seconds:.1f} s")
     output.document({"folder": written.folder, "bytes": written.bytes, "seconds": seconds, **written.manifest})

@@ -1,6 +1,7 @@
 """A model as a folder of ONNX files, written at once or not at all, and read back with checks.
 
-<graph>.onnx         vision, prompt, prefix and denoise_step: the graphs of turbopi.export.graphs, float32
+<graph>.onnx         vision, prompt, prefix and denoise_step: the graphs of turbopi.export.graphs, float32, or with a
+                     calibration FP8 in the prefix's MLPs
 <graph>.onnx.data    its weights, as a file of protobuf holds 2 GB at most
 turbopi_onnx.json    sizes, inputs and outputs, versions, the weights' hash
 """
@@ -10,7 +11,7 @@ import importlib.util
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -23,8 +24,11 @@ from torch import Tensor
 from turbopi.config import GemmaConfig, ModelConfig, VisionConfig
 from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError
 from turbopi.export.graphs import Graph, graphs
+from turbopi.export.quantized import quantize_mlps
 from turbopi.folders import new_folder
 from turbopi.model.reference import Pi0Model
+from turbopi.tensorrt.calibrate import Calibration
+from turbopi.tensorrt.networks import Fp8Scales
 
 MANIFEST = "turbopi_onnx.json"
 GRAPHS = ("vision", "prompt", "prefix", "denoise_step")
@@ -62,8 +66,16 @@ def check_target(dst: Path) -> None:
         raise CheckpointError(f"{dst} exists and isn't an empty folder; give a new one")
 
 
-def export_onnx(model: Pi0Model, dst: str | Path, *, report: Callable[[str], None] = lambda line: None) -> Export:
+def export_onnx(
+    model: Pi0Model,
+    dst: str | Path,
+    *,
+    calibration: Calibration | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> Export:
     """Write the four graphs of a float32 model on the CPU into the folder `dst`; `report` hears of each one.
+
+    With a calibration, the prefix's MLPs are FP8, between standard quantise and dequantise nodes.
 
     Raises CheckpointError if `dst` exists and isn't an empty folder, BackendUnavailable if a library is missing,
     ConfigError for a model in another precision.
@@ -79,11 +91,13 @@ def export_onnx(model: Pi0Model, dst: str | Path, *, report: Callable[[str], Non
     with new_folder(dst) as folder:
         for graph in graphs(model):
             report(f"exporting {graph.name}")
-            signatures[graph.name] = _write(graph, folder)
+            quantize = calibration.scales if calibration is not None and graph.name == "prefix" else None
+            signatures[graph.name] = _write(graph, folder, quantize)
         manifest = {
             "format_version": FORMAT_VERSION,
             "kind": model.config.kind,
-            "precision": "f32",
+            "precision": "f32" if calibration is None else "fp8 (E4M3) in the prefix's MLPs, f32 elsewhere",
+            **({} if calibration is None else {"calibration": calibration.about()}),
             "opset": OPSET,
             "sizes": asdict(model.config),
             "graphs": signatures,
@@ -135,7 +149,7 @@ def weights_sha256(state: Mapping[str, Tensor]) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def _write(graph: Graph, folder: Path) -> dict[str, Any]:
+def _write(graph: Graph, folder: Path, scales: Sequence[Fp8Scales | None] | None = None) -> dict[str, Any]:
     """Export one graph; returns its inputs and outputs as name -> dtype and shape, free axes by name."""
     with _quiet_exporter():
         program = torch.onnx.export(
@@ -149,6 +163,8 @@ def _write(graph: Graph, folder: Path) -> dict[str, Any]:
             verbose=False,
         )
     assert program is not None
+    if scales is not None:
+        quantize_mlps(program.model.graph, scales)
     for node in program.model.graph.all_nodes():
         node.metadata_props.pop("pkg.torch.onnx.stack_trace", None)  # paths on the machine that exported
     program.save(str(folder / f"{graph.name}.onnx"), external_data=True)

@@ -1,0 +1,168 @@
+"""`turbopi build`."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from turbopi.cli.framework import JsonFlag, Output, command, new_console
+from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.errors import BackendUnavailable, ConfigError
+
+if TYPE_CHECKING:
+    from turbopi.observation import Observation
+    from turbopi.policy import UnifiedPolicy
+    from turbopi.tensorrt.calibrate import Calibration
+
+PRECISIONS = ("bf16", "fp8")
+
+
+@command(
+    "build",
+    shared=WeightOptions,
+    examples=(
+        "turbopi build checkpoints/pi05_libero --cameras 2 --prompt-tokens 48",
+        "turbopi build checkpoints/pi05_libero --precision fp8 --method modelopt --calibration recording/",
+        "turbopi build --random-weights pi05_libero --cameras 2 --json",
+    ),
+)
+def build(
+    options: WeightOptions,
+    checkpoint: CheckpointArgument = None,
+    cameras: Annotated[int, typer.Option(min=0, max=4, help="Valid cameras of an observation.")] = 2,
+    prompt_tokens: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Longest prompt; the model's own limit unless given.")
+    ] = None,
+    horizon: Annotated[int | None, typer.Option(min=1, metavar="N", help="Actions in a chunk; the model's.")] = None,
+    precision: Annotated[
+        str, typer.Option(metavar="bf16|fp8", help="Of the prefix's MLPs: for backend tensorrt, or tensorrt_fp8.")
+    ] = "bf16",
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="For fp8: an observation or a recording (as for `turbopi infer`), or the file of `turbopi calibrate`. "
+            "Unless given, the LIBERO pictures that come with Turbo-Pi.",
+        ),
+    ] = None,
+    method: Annotated[
+        str, typer.Option(metavar="modelopt|max", help="Who measures the scales: NVIDIA's ModelOpt, or Turbo-Pi.")
+    ] = "max",
+    cache: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Engine cache; else $TURBOPI_ENGINES or the user's cache.")
+    ] = None,
+    rebuild: Annotated[bool, typer.Option("--rebuild", help="Build engines anew that are in the cache.")] = False,
+    device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cuda or cuda:N.")] = "auto",
+    as_json: JsonFlag = False,
+) -> None:
+    """Build TensorRT engines for a checkpoint ahead of time, so that its backend starts at once.
+
+    An engine holds for one set of weights, shape, precision, library version and GPU. What is in the cache and still
+    right is kept; what is stale or damaged is named and built again.
+    """
+    output = Output(as_json)
+    if precision not in PRECISIONS:
+        raise ConfigError(f"unknown precision {precision!r} for engines; choose one of {', '.join(PRECISIONS)}")
+    if precision == "bf16" and calibration is not None:
+        raise ConfigError("--calibration is for --precision fp8; bf16 engines need none")
+    from turbopi import backends
+    from turbopi.tensorrt import calibrate, library
+    from turbopi.tensorrt.cache import default_folder
+    from turbopi.tensorrt.engines import for_this_gpu
+    from turbopi.tensorrt.parts import SLOTS, EngineShape, fingerprint
+
+    resolved = backends.resolve_device(device)
+    backend = "tensorrt_fp8" if precision == "fp8" else "tensorrt"
+    for reason in (backends.availability(backend, resolved), calibrate.unavailable(method)):
+        if reason is not None:
+            raise BackendUnavailable(f"can't build engines for {backend}: {reason}")
+    opened = options.open(checkpoint)
+    options.tell_if_random(opened, output)
+    from turbopi.engine.weights import pack
+    from turbopi.policy import UnifiedPolicy
+
+    policy = UnifiedPolicy(opened, backend="pytorch", precision="bf16", device=resolved, progress=output.shows_progress)
+    config = policy.config.model
+    state = dict(policy.backend.model.state_dict())  # type: ignore[attr-defined]
+    weights_hash, folder = fingerprint(state), (cache or default_folder()).expanduser()
+    found = measure_scales(policy, calibration, method, output) if precision == "fp8" else None
+    if found is not None:
+        found.save(folder / weights_hash)
+    slots = -(-(prompt_tokens or config.max_prompt_tokens) // SLOTS) * SLOTS
+    shape = EngineShape(cameras, slots, horizon or config.action_horizon)
+    started = time.perf_counter()
+    engines = for_this_gpu(
+        library(),
+        config,
+        pack(config, state),
+        weights_hash,
+        resolved,
+        folder=folder,
+        scales=None if found is None else found.scales,
+        report=output.line,
+    )
+    del policy
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=new_console(stderr=True), transient=True, disable=not output.shows_progress) as bar:
+        task = bar.add_task("building engines", total=len(engines.specifications(shape)))
+        engines.prepare(
+            shape, rebuild=rebuild, progress=lambda name: bar.update(task, advance=1, description=f"built {name}")
+        )
+    seconds = time.perf_counter() - started
+    counts = {kind: sum(origin == kind for origin in engines.origin.values()) for kind in ("built", "cached")}
+    size = sum(file.stat().st_size for name in engines.origin for file in (engines.cache.folder / name).iterdir())
+    output.line(
+        f"{len(engines.origin)} engines for {shape}: {counts['built']} built, {counts['cached']} from the cache, "
+        f"{size / 1e9:.2f} GB in {engines.cache.folder}, {seconds:.1f} s"
+    )
+    output.document(
+        {
+            "backend": backend,
+            "shape": str(shape),
+            "folder": engines.cache.folder,
+            "bytes": size,
+            "seconds": seconds,
+            "engines": engines.origin,
+            "environment": vars(engines.cache.environment),
+            "calibration": None if found is None else found.about(),
+        }
+    )
+
+
+def measure_scales(policy: "UnifiedPolicy", path: Path | None, method: str, output: Output) -> "Calibration":
+    """Scales from observations, or from a file that `turbopi calibrate` wrote."""
+    from turbopi.tensorrt.calibrate import calibrate, from_quantization
+
+    model: Any = policy.backend.model  # type: ignore[attr-defined]
+    if path is not None and path.suffix == ".json" and path.is_file():
+        from turbopi.calibrate.artifact import Quantization
+
+        quantization = Quantization.load(path)
+        quantization.check(policy.config.model, policy._checkpoint.fingerprint())
+        return from_quantization(model, quantization)
+    observations, source = calibration_observations(policy, path)
+    found = calibrate(model, observations, method=method, source=source)
+    output.line(f"calibrated on {found.observations} observations ({source}), {found.method}")
+    return found
+
+
+def calibration_observations(policy: "UnifiedPolicy", path: Path | None) -> "tuple[list[Observation], str]":
+    """Observations as the policy's model sees them, and where they are from."""
+    from turbopi.observation import Observation
+
+    given, source = given_observations(policy, path)
+    return [Observation.stack([policy.prepare(one)]) for one in given], source
+
+
+def given_observations(policy: "UnifiedPolicy", path: Path | None) -> tuple[list[dict[str, Any]], str]:
+    """Observations under the robot's keys, and where they are from; None: the pictures that come with Turbo-Pi."""
+    if path is None:
+        from turbopi.demo import load_frames, observations
+
+        return observations(policy, load_frames()), "LIBERO pictures that come with Turbo-Pi"
+    from turbopi.cli.infer import _sources
+    from turbopi.serve.record import load_observation
+
+    return [load_observation(one) for one in _sources(path, None)], path.name

@@ -1,0 +1,184 @@
+"""`turbopi study`."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from turbopi.cli.framework import JsonFlag, Output, command
+from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.errors import BackendUnavailable, ConfigError
+
+if TYPE_CHECKING:
+    import torch
+
+    from turbopi.checkpoint import Checkpoint
+    from turbopi.policy import UnifiedPolicy
+
+MASK_STEPS = (1, 10)
+STUDIES = ("precision", "mask", "throughput")
+
+
+@command(
+    "study",
+    shared=WeightOptions,
+    examples=(
+        "turbopi study precision,mask checkpoints/pi05_libero --out study.json",
+        "turbopi study mask --random-weights pi05_tiny --device cpu",
+        "turbopi study throughput checkpoints/pi05_libero --calls 200",
+    ),
+)
+def study(
+    options: WeightOptions,
+    which: Annotated[
+        str, typer.Argument(metavar="precision,mask,throughput", help="What to study.", show_default=False)
+    ],
+    checkpoint: CheckpointArgument = None,
+    observation: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="As for `turbopi infer`; else a LIBERO picture that comes with Turbo-Pi."),
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="Denoising steps of the precision study.")] = 10,
+    calls: Annotated[int, typer.Option(min=1, help="Calls of each measurement of the throughput study.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
+    device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the results there as JSON.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Measure what TensorRT's precisions, masks of the cache, and two observations in flight do.
+
+    precision: the language model's layers as TensorRT engines, fused or written-out attention in float16, bfloat16 and
+    float32, against the float32 reference. mask: the suffix over a compacted, a padded and masked, and a padded and not
+    masked cache, in float32 PyTorch. throughput: backend tensorrt one call at a time, tensorrt_pipelined with calls in
+    flight.
+    """
+    output = Output(as_json)
+    chosen = which.split(",")
+    for name in chosen:
+        if name not in STUDIES:
+            raise ConfigError(f"unknown study {name!r}; choose of {', '.join(STUDIES)}")
+    from turbopi import backends
+
+    resolved = backends.resolve_device(device)
+    for name in chosen:
+        reason = None if name == "mask" else backends.availability("tensorrt", resolved)
+        if reason is not None:
+            raise BackendUnavailable(f"the {name} study needs TensorRT: {reason}")
+    opened = options.open(checkpoint)
+    options.tell_if_random(opened, output)
+    from turbopi.bench.provenance import provenance
+    from turbopi.cli.build import given_observations
+    from turbopi.policy import UnifiedPolicy
+
+    policy = UnifiedPolicy(opened, backend="pytorch", precision="f32", device=resolved, progress=output.shows_progress)
+    given, source = given_observations(policy, observation)
+    document: dict[str, Any] = {
+        "provenance": provenance(resolved),
+        "model": policy.config.name,
+        "random_weights": opened.format == "random",
+        "observations": source,
+        "seed": seed,
+        "steps": steps,
+    }
+    if "precision" in chosen or "mask" in chosen:
+        _errors(policy, given[0], chosen, document, output)
+    del policy
+    if "throughput" in chosen:
+        document["throughput"] = _throughput(opened, given, resolved, steps, calls)
+        output.table(_throughput_table(document["throughput"]))
+    if out is not None:
+        out.write_text(json.dumps(document, indent=1) + "\n")
+        output.line(f"wrote {out}")
+    output.document(document)
+
+
+def _errors(
+    policy: "UnifiedPolicy", given: dict[str, Any], chosen: list[str], document: dict[str, Any], output: Output
+) -> None:
+    """The precision and mask studies on one observation."""
+    import numpy as np
+    import torch
+
+    from turbopi.observation import Observation
+    from turbopi.tensorrt import library, studies
+
+    model: Any = policy.backend.model  # type: ignore[attr-defined]
+    config = policy.config.model
+    one = Observation.stack([policy.prepare(given)]).to(model.device)
+    shape = (1, config.action_horizon, config.action_dim)
+    drawn = np.random.default_rng(document["seed"]).standard_normal(shape, dtype=np.float32)
+    noise = torch.from_numpy(drawn).to(model.device)
+    tokens = int(one.image_mask.sum()) * config.vision.num_tokens + int(one.token_mask.sum())
+    document["prefix_tokens"] = tokens
+    if "precision" in chosen:
+        found = library()
+        document["library"] = f"{found.name} {found.version}"
+        load = studies.builder(found)
+        document["precision"] = studies.attention_study(model, one, noise, document["steps"], load)
+        output.table(_precision_table(document["precision"], document["library"]))
+    if "mask" in chosen:
+        document["mask"] = studies.mask_study(model, one, noise, MASK_STEPS)
+        output.table(_mask_table(document["mask"]))
+
+
+def _throughput(
+    checkpoint: "Checkpoint", given: list[dict[str, Any]], device: "torch.device", steps: int, calls: int
+) -> dict[str, Any]:
+    from turbopi.policy import UnifiedPolicy
+    from turbopi.tensorrt import studies
+
+    policies = []
+    for name in ("tensorrt", "tensorrt_pipelined"):
+        policies.append(UnifiedPolicy(checkpoint, backend=name, device=device, num_denoising_steps=steps))
+        policies[-1].warmup()
+    return studies.throughput_study(policies[0], policies[1], given, calls)
+
+
+def _throughput_table(result: dict[str, Any]) -> Table:
+    table = Table(title="two observations in flight", title_justify="left")
+    table.add_column("how")
+    for column in ("latency, ms, median", "observations a second"):
+        table.add_column(column, justify="right")
+    rows = {f"{name}, one at a time": one for name, one in result["one at a time"].items()}
+    for name, one in {**rows, "in flight": result["in flight"]}.items():
+        table.add_row(name, _number(one["total_ms"], ".2f"), _number(one["per_second"], ".1f"))
+    equal = "equal" if result["actions_equal_bit_for_bit"] else "NOT equal"
+    table.caption = f"actions of all three: {equal}, bit for bit"
+    return table
+
+
+def _number(value: float | None, form: str = ".2e") -> str:
+    return "not finite" if value is None else format(value, form)
+
+
+def _precision_table(results: list[dict[str, Any]], library: str) -> Table:
+    table = Table(title=f"{library} against the float32 reference", title_justify="left")
+    for column in ("attention", "precision"):
+        table.add_column(column)
+    for column in ("K, layer 0", "K, last", "V, last", "V, last, max", "actions", "actions, max", "cosine"):
+        table.add_column(column, justify="right")
+    for one in results:
+        first, last, actions = one["layers"][0], one["layers"][-1], one["actions"]
+        table.add_row(
+            one["attention"],
+            one["precision"],
+            *(_number(value) for value in (first["k_relative"], last["k_relative"], last["v_relative"])),
+            _number(last["v_max"], ".3f"),
+            _number(actions["relative"]),
+            _number(actions["max"], ".4f"),
+            _number(actions["cosine"], ".6f"),
+        )
+    return table
+
+
+def _mask_table(results: list[dict[str, Any]]) -> Table:
+    table = Table(title="the suffix's cache, against the compacted one, float32", title_justify="left")
+    table.add_column("cache")
+    for column in ("slots", "steps", "cosine of actions", "relative error"):
+        table.add_column(column, justify="right")
+    for one in results:
+        numbers = (_number(one["cosine"], ".6f"), _number(one["relative"]))
+        table.add_row(one["cache"], str(one["slots"]), str(one["steps"]), *numbers)
+    return table

@@ -1,0 +1,264 @@
+"""The shim, the engine cache, and the builder where TensorRT-RTX is installed (it builds without a GPU)."""
+
+import dataclasses
+import importlib.util
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from cli_helpers import refusal, turbopi
+from conftest import golden_model
+from tensorrt_fakes import ENVIRONMENT
+
+from turbopi import tensorrt
+from turbopi.config import Kind
+from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.tensorrt.cache import CorruptEngine, EngineCache, StaleEngine
+from turbopi.tensorrt.engine import Input, Specification, build
+from turbopi.tensorrt.networks import Fp8Scales
+from turbopi.tensorrt.ops import NetworkOps, Value
+from turbopi.tensorrt.parts import EngineShape, fingerprint
+
+needs_rtx = pytest.mark.skipif(importlib.util.find_spec("tensorrt_rtx") is None, reason="TensorRT-RTX isn't installed")
+
+
+def specification(name: str = "part", width: int = 4, **about: object) -> Specification:
+    def write(ops: NetworkOps, inputs: dict[str, Value]) -> dict[str, Value]:
+        return {"y": ops.mul(inputs["x"], inputs["x"])}
+
+    return Specification(name, {"x": Input((2, width), "f32")}, write, about)  # type: ignore[arg-type]
+
+
+class Builder:
+    """Counts what it builds."""
+
+    def __init__(self, plan: bytes = b"plan") -> None:
+        self.plan, self.built = plan, list[str]()
+
+    def __call__(self, specification: Specification) -> bytes:
+        self.built.append(specification.name)
+        return self.plan
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> EngineCache:
+    return EngineCache(tmp_path, ENVIRONMENT)
+
+
+def test_an_engine_is_built_once(cache: EngineCache) -> None:
+    builder = Builder()
+    assert cache.get_or_build(specification(), builder) == (b"plan", "built")
+    assert cache.get_or_build(specification(), builder) == (b"plan", "cached")
+    assert builder.built == ["part"] and list(cache.names()) == ["part"]
+    assert cache.get_or_build(specification(), builder, rebuild=True) == (b"plan", "built")
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"library_version": "2.0"}, "library_version '1.0' instead of '2.0'"),
+        ({"library": "tensorrt"}, "library 'tensorrt_rtx' instead of 'tensorrt'"),
+        ({"gpu": "Another"}, "gpu 'A GPU' instead of 'Another'"),
+        ({"compute_capability": "12.0"}, "compute_capability '9.0' instead of '12.0'"),
+        ({"turbopi": "0.2.0"}, "turbopi '0.1.0' instead of '0.2.0'"),
+        ({"networks": "other"}, "networks 'code' instead of 'other'"),
+    ],
+)
+def test_a_stale_engine_is_refused_with_the_reason_and_replaced(
+    cache: EngineCache, changed: dict[str, str], said: str
+) -> None:
+    cache.get_or_build(specification(), Builder(b"old"))
+    later = EngineCache(cache.root, dataclasses.replace(ENVIRONMENT, **changed))
+    with pytest.raises(StaleEngine, match=said):
+        later.get(specification())
+    told: list[str] = []
+    assert later.get_or_build(specification(), Builder(b"new"), told.append) == (b"new", "built")
+    assert len(told) == 1 and said in told[0] and "building it again" in told[0]
+    assert later.get(specification()) == b"new"
+
+
+def test_another_shape_or_calibration_is_stale(cache: EngineCache) -> None:
+    cache.get_or_build(specification(scales=[1.0]), Builder())
+    with pytest.raises(StaleEngine, match=r"inputs .*\[2, 4\].* instead of .*\[2, 8\]"):
+        cache.get(specification(width=8, scales=[1.0]))
+    with pytest.raises(StaleEngine, match=r"scales \[1\.0\] instead of \[2\.0\]"):
+        cache.get(specification(scales=[2.0]))
+
+
+def test_other_weights_share_nothing(cache: EngineCache) -> None:
+    cache.get_or_build(specification(), Builder())
+    other = EngineCache(cache.root, dataclasses.replace(ENVIRONMENT, weights="v" * 16))
+    assert other.get(specification()) is None
+
+
+def test_a_corrupt_engine_is_built_again(cache: EngineCache) -> None:
+    cache.get_or_build(specification(), Builder())
+    plan = cache.folder / "part" / "engine.plan"
+    plan.write_bytes(b"plaN")
+    with pytest.raises(CorruptEngine, match="isn't as it was written"):
+        cache.get(specification())
+    assert cache.get_or_build(specification(), Builder(), lambda line: None)[1] == "built"
+    plan.write_bytes(b"pl")
+    with pytest.raises(CorruptEngine, match="hasn't 4 bytes"):
+        cache.get(specification())
+    (cache.folder / "part" / "engine.json").write_text("{")
+    with pytest.raises(CorruptEngine, match=r"engine\.json can't be read"):
+        cache.get(specification())
+
+
+def test_a_build_that_fails_leaves_nothing_and_keeps_what_was_there(cache: EngineCache) -> None:
+    def fail(specification: Specification) -> bytes:
+        raise BackendError("out of workspace")
+
+    with pytest.raises(BackendError, match="out of workspace"):
+        cache.get_or_build(specification(), fail)
+    assert not cache.folder.exists() or not list(cache.folder.iterdir())
+    cache.get_or_build(specification(), Builder())
+    with pytest.raises(BackendError, match="out of workspace"):
+        cache.get_or_build(specification(), fail, rebuild=True)
+    assert cache.get(specification()) == b"plan"
+
+
+def test_a_write_that_fails_leaves_nothing(cache: EngineCache, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = Path.write_text
+
+    def full(self: Path, *args: object, **more: object) -> int:
+        if self.name == "engine.json":
+            raise OSError(28, "No space left on device")
+        return write(self, *args, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        cache.get_or_build(specification(), Builder())
+    assert list(cache.folder.iterdir()) == []
+
+
+def test_fingerprints_tell_weights_apart() -> None:
+    state = {"a": torch.randn(3, 4), "b": torch.randn(5).bfloat16()}
+    same = {name: tensor.clone() for name, tensor in reversed(state.items())}
+    assert fingerprint(state) == fingerprint(same)
+    swapped = {**state, "a": state["a"].flip(0)}
+    nudged = {**state, "b": torch.nextafter(state["b"].float(), torch.tensor(9.0)).bfloat16() + 0.01}
+    assert len({fingerprint(one) for one in (state, swapped, nudged)}) == 3
+
+
+def test_a_shape_says_what_it_is() -> None:
+    assert str(EngineShape(2, 48, 10)) == "2 cameras, up to 48 prompt tokens, H=10"
+
+
+# -- the shim ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def nothing_imported() -> Iterator[None]:
+    """As in a process that hasn't imported either library."""
+    kept = {name: sys.modules.pop(name) for name in tensorrt.NAMES if name in sys.modules}
+    tensorrt.library.cache_clear()
+    yield
+    for name in tensorrt.NAMES:
+        sys.modules.pop(name, None)
+    sys.modules.update(kept)
+    tensorrt.library.cache_clear()
+
+
+def test_no_library_is_an_error_with_the_command(monkeypatch: pytest.MonkeyPatch, nothing_imported: None) -> None:
+    monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
+    with pytest.raises(
+        BackendUnavailable, match=r"neither tensorrt_rtx nor tensorrt is installed; pip install 'turbopi"
+    ):
+        tensorrt.library()
+
+
+@pytest.mark.parametrize("installed", [("tensorrt_rtx", "tensorrt"), ("tensorrt",)])
+def test_the_first_library_that_is_installed_is_taken(
+    installed: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, nothing_imported: None
+) -> None:
+    for name in installed:
+        (tmp_path / f"{name}.py").write_text("__version__ = '7.7'\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        "turbopi.tensorrt.importlib.util.find_spec", lambda name: found(name) if name in installed else None
+    )
+    library = tensorrt.library()
+    assert (library.name, library.version, library.is_rtx) == (installed[0], "7.7", installed[0] == "tensorrt_rtx")
+
+
+def test_a_library_that_cant_be_loaded_isnt_replaced_by_the_other(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, nothing_imported: None
+) -> None:
+    (tmp_path / "tensorrt_rtx.py").write_text("raise ImportError('libcudart.so.13: cannot open shared object file')\n")
+    (tmp_path / "tensorrt.py").write_text("__version__ = '10.0'\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(BackendUnavailable, match=r"tensorrt_rtx is installed but can't be loaded \(libcudart"):
+        tensorrt.library()
+
+
+# -- the builder -------------------------------------------------------------------------------------------------------
+
+
+@needs_rtx
+def test_an_engine_is_built_without_a_gpu() -> None:
+    plan = build(tensorrt.library(), specification(), compute_capability="SM89")
+    assert len(plan) > 1000
+
+
+@needs_rtx
+@pytest.mark.parametrize("fp8", [False, True])
+@pytest.mark.parametrize("kind", ["pi05", "pi0"])
+def test_every_engine_of_a_model_is_built_without_a_gpu(kind: Kind, fp8: bool, tmp_path: Path) -> None:
+    """FP8 from TensorRT-RTX 1.7 on: 1.4 asks the GPU for something."""
+    if fp8 and tuple(map(int, tensorrt.library().version.split(".")[:2])) < (1, 7):
+        pytest.skip("TensorRT-RTX before 1.7 builds FP8 on a GPU alone")
+    from turbopi.engine.weights import pack
+    from turbopi.tensorrt.engines import ModelEngines
+
+    model = golden_model(kind, "bf16")
+    one_scale = Fp8Scales(*(torch.tensor(0.01) for _ in range(5)))
+    engines = ModelEngines(
+        model.config,
+        pack(model.config, dict(model.state_dict())),
+        EngineCache(tmp_path, ENVIRONMENT),
+        build=lambda one: build(tensorrt.library(), one, compute_capability="SM89"),
+        load=lambda one, plan: None,  # type: ignore[arg-type, return-value]
+        scales=[one_scale] * (model.config.vlm.depth - 1) if fp8 else None,
+    )
+    shape, heard = EngineShape(2, 48, 10), list[str]()
+    engines.prepare(shape, progress=heard.append)
+    assert sorted(heard) == sorted(engines.cache.names())
+    assert len(heard) == 2 + model.config.vlm.depth - 1
+    assert engines.cached_shapes(2, 10) == [shape] and engines.cached_shapes(3, 10) == []
+
+
+@needs_rtx
+def test_a_network_that_cant_be_built_says_why() -> None:
+    def write(ops: NetworkOps, inputs: dict[str, Value]) -> dict[str, Value]:
+        return {"y": ops.reshape(inputs["x"], (3, 5))}
+
+    broken = Specification("broken", {"x": Input((2, 4), "f32")}, write)  # type: ignore[arg-type]
+    with pytest.raises(BackendError, match=r"tensorrt_rtx .* can't build broken: .*"):
+        build(tensorrt.library(), broken, compute_capability="SM89")
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_build_refuses_before_it_loads(monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny = ("--random-weights", "pi05_tiny")
+    assert "unknown precision 'int4' for engines; choose one of bf16, fp8" in refusal(
+        turbopi("build", *tiny, "--precision", "int4")
+    )
+    assert "--calibration is for --precision fp8" in refusal(turbopi("build", *tiny, "--calibration", "x"))
+    monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
+    said = refusal(turbopi("build", *tiny, "--device", "cpu"))
+    assert "can't build engines for tensorrt: neither tensorrt_rtx nor tensorrt is installed; pip install" in said
+
+
+def test_the_manifest_names_everything_an_engine_depends_on(cache: EngineCache) -> None:
+    cache.get_or_build(specification(precision="f16"), Builder())
+    about = json.loads((cache.folder / "part" / "engine.json").read_text())
+    assert about["key"].keys() == {f.name for f in dataclasses.fields(ENVIRONMENT)} | {"name", "inputs", "precision"}
+    assert about["bytes"] == 4 and len(about["sha256"]) == 64

@@ -1,0 +1,83 @@
+"""The studies' arithmetic: engines as twins find the rounding that was put in, and nothing where none was."""
+
+import json
+from concurrent.futures import Future
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cli_helpers import refusal, turbopi
+from conftest import golden_cases, golden_model
+from tensorrt_fakes import Twin
+
+from turbopi.observation import Observation
+from turbopi.tensorrt.studies import attention_study, mask_study, throughput_study
+
+
+def one() -> tuple[Observation, torch.Tensor]:
+    case = golden_cases()["b_third_masked"]
+    o = case.observation
+    return Observation(*(getattr(o, name)[:1] for name in o.__dataclass_fields__)), case.noise[:1]
+
+
+def test_each_style_shows_its_own_rounding() -> None:
+    results = attention_study(golden_model("pi05"), *one(), 3, Twin)
+    errors = {(r["attention"], r["precision"]): r for r in results}
+    assert len(errors) == 6
+    for attention in ("fused", "written out"):
+        f16, bf16, f32 = (errors[attention, dtype]["layers"][-1]["k_relative"] for dtype in ("f16", "bf16", "f32"))
+        assert f32 < 5e-6 < f16 < bf16 < 5e-2
+        assert errors[attention, "f32"]["actions"]["relative"] < 1e-5
+        assert len(errors[attention, "f32"]["layers"]) == golden_model("pi05").config.vlm.depth
+
+
+def test_a_mask_that_is_missing_shows_and_one_that_is_there_doesnt() -> None:
+    results = {(r["cache"], r["steps"]): r for r in mask_study(golden_model("pi05"), *one(), (1, 10))}
+    for steps in (1, 10):
+        assert results["compacted", steps]["relative"] == 0
+        assert results["padded, masked", steps]["relative"] < 1e-5
+        assert results["padded, not masked", steps]["relative"] > 1e-2
+    assert results["padded, masked", 1]["slots"] > results["compacted", 1]["slots"]
+
+
+class InFlight:
+    """A policy's `infer` and `submit` whose answers depend on the seed, and on `wrong`."""
+
+    def __init__(self, name: str, wrong: float = 0.0) -> None:
+        self.backend, self.wrong = SimpleNamespace(name=name), wrong
+
+    def infer(self, obs: float, *, seed: int) -> dict[str, Any]:
+        return {"actions": np.array([obs + seed]), "policy_timing": {"total_ms": 2.0, "infer_ms": 1.0}}
+
+    def submit(self, obs: float, *, seed: int) -> "Future[dict[str, Any]]":
+        done: Future[dict[str, Any]] = Future()
+        done.set_result({**self.infer(obs + self.wrong, seed=seed)})
+        return done
+
+
+@pytest.mark.parametrize(("wrong", "equal"), [(0.0, True), (1e-12, False)])
+def test_throughput_compares_every_answer_bit_for_bit(wrong: float, equal: bool) -> None:
+    pair: Any = InFlight("tensorrt"), InFlight("tensorrt_pipelined", wrong)
+    result = throughput_study(pair[0], pair[1], [1.0, 2.0, 3.0], 7)
+    assert result["actions_equal_bit_for_bit"] is equal
+    assert result["one at a time"].keys() == {"tensorrt", "tensorrt_pipelined"}
+    assert result["in flight"]["total_ms"] == 2.0 and result["in flight"]["per_second"] > 0
+
+
+def test_the_command_writes_what_it_measured(tmp_path: Path) -> None:
+    out = tmp_path / "study.json"
+    result = turbopi("study", "mask", "--random-weights", "pi05_tiny", "--device", "cpu", "--out", out, "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert json.loads(out.read_text()) == document
+    assert [r["steps"] for r in document["mask"]] == [1, 10] * 3 and document["random_weights"]
+
+
+def test_the_command_refuses_what_it_cant_study(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "unknown study 'speed'; choose of precision, mask, throughput" in refusal(turbopi("study", "speed"))
+    monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
+    said = refusal(turbopi("study", "precision", "--random-weights", "pi05_tiny", "--device", "cpu"))
+    assert "the precision study needs TensorRT: neither tensorrt_rtx nor tensorrt is installed" in said
