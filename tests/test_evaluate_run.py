@@ -50,7 +50,8 @@ def test_workers_requests_are_batched_which_changes_nothing(tmp_path: Path, monk
     monkeypatch.setenv("GATHER_COUNT", "3")
     gathering = "evaluate_fakes:GatheringSimulator"
     second = run(tmp_path / "two", batched, simulator=gathering, tasks=(0, 1, 2), states=(0, 1), workers=3, max_batch=2)
-    assert batched.batches[:2] == [1, 2] and max(batched.batches) == 2
+    # three requests in two calls: whether the first finds one or two of them is the machine's choice
+    assert sorted(batched.batches[:2]) == [1, 2] and max(batched.batches) == 2
     assert outcomes(second) == outcomes(first)
     assert sorted(batched.seeds) == sorted(alone.seeds)
     assert second.summary()["mean_batch"] > 1
