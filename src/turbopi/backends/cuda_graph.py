@@ -226,19 +226,24 @@ class CudaGraphBackend:
         length, per_image = int(call.host.length[0]), self.config.vision.num_tokens
         cameras = observation.image_mask[row].repeat_interleave(per_image)
         valid = torch.cat((cameras, observation.token_mask[row])).cpu()
+        return golden_trace(call, length, valid)
 
-        def padded(x: Tensor) -> Tensor:  # [layer, rows, K] -> [layer, 1, S, 1, K]
-            out = torch.zeros(x.shape[0], len(valid), x.shape[-1])
-            out[:, valid] = x[:, :length].float().cpu()
-            return out[:, None, :, None]
 
-        return {
-            "kv_k": padded(call.cache_k),
-            "kv_v": padded(call.cache_v),
-            "x_t": call.x_t[:, None].clone(),
-            "v_t": call.v_t[:, None].clone(),
-            "actions": call.x_t[-1:].clone(),
-        }
+def golden_trace(call: Any, length: int, valid: Tensor) -> Trace:
+    """A call's intermediates in golden layouts: its `length` cache rows go back to the slots in `valid` bool[S]."""
+
+    def padded(x: Tensor) -> Tensor:  # [layer, rows, K] -> [layer, 1, S, 1, K]
+        out = torch.zeros(x.shape[0], len(valid), x.shape[-1])
+        out[:, valid] = x[:, :length].float().cpu()
+        return out[:, None, :, None]
+
+    return {
+        "kv_k": padded(call.cache_k),
+        "kv_v": padded(call.cache_v),
+        "x_t": call.x_t[:, None].clone(),
+        "v_t": call.v_t[:, None].clone(),
+        "actions": call.x_t[-1:].clone(),
+    }
 
 
 def _upload_and_encode(call: StaticCall) -> Callable[[Mark], None]:

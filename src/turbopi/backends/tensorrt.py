@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Sample
-from turbopi.backends.cuda_graph import Graph
+from turbopi.backends.cuda_graph import Graph, golden_trace
 from turbopi.config import ModelConfig
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError
@@ -155,7 +155,7 @@ class TensorRTBackend:
         for b in range(observation.batch_size):
             row = self._row(observation, b)
             call, _ = self._run("call", row, noise[b].cpu().numpy(), num_steps)
-            traces.append(_trace(call, row))
+            traces.append(golden_trace(call, int(call.host_length[0]), torch.from_numpy(row.valid)))
         return {name: torch.cat([one[name] for one in traces], dim=int(name != "actions")) for name in traces[0]}
 
     def describe(self) -> dict[str, Any]:
@@ -275,21 +275,3 @@ class TensorRTBackend:
     def _synchronize(self) -> None:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
-
-
-def _trace(call: EngineCall, row: Row) -> Trace:
-    """One observation's intermediates in golden layouts: the cache goes back to its padded slots."""
-    length, valid = int(call.host_length[0]), torch.from_numpy(row.valid)
-
-    def padded(x: Tensor) -> Tensor:  # [layer, rows, K] -> [layer, 1, S, 1, K]
-        out = torch.zeros(x.shape[0], len(valid), x.shape[-1])
-        out[:, valid] = x[:, :length].float().cpu()
-        return out[:, None, :, None]
-
-    return {
-        "kv_k": padded(call.cache_k),
-        "kv_v": padded(call.cache_v),
-        "x_t": call.x_t[:, None].clone(),
-        "v_t": call.v_t[:, None].clone(),
-        "actions": call.x_t[-1:].clone(),
-    }

@@ -8,7 +8,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
-from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.cli.options import CheckpointArgument, EngineCalibration, ScaleMethod, WeightOptions
 from turbopi.errors import BackendUnavailable, ConfigError
 
 if TYPE_CHECKING:
@@ -39,17 +39,8 @@ def build(
     precision: Annotated[
         str, typer.Option(metavar="bf16|fp8", help="Of the prefix's MLPs: for backend tensorrt, or tensorrt_fp8.")
     ] = "bf16",
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="PATH",
-            help="For fp8: an observation or a recording (as for `turbopi infer`), or the file of `turbopi calibrate`. "
-            "Unless given, the LIBERO pictures that come with Turbo-Pi.",
-        ),
-    ] = None,
-    method: Annotated[
-        str, typer.Option(metavar="modelopt|max", help="Who measures the scales: NVIDIA's ModelOpt, or Turbo-Pi.")
-    ] = "max",
+    calibration: EngineCalibration = None,
+    method: ScaleMethod = "max",
     cache: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Engine cache; else $TURBOPI_ENGINES or the user's cache.")
     ] = None,

@@ -1,15 +1,15 @@
 """`turbopi calibrate`: FP8 scales for one's own checkpoint, from one's own observations."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from turbopi.cli.files import check_writable
-from turbopi.cli.framework import JsonFlag, Output, command, new_console
+from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.cli.progress import with_stages
 from turbopi.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -79,30 +79,16 @@ def calibrate(
     check_writable(out)
     opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
-    from turbopi.calibrate.run import Settings
+    from turbopi.calibrate.run import Progress, Settings
     from turbopi.calibrate.run import calibrate as run
 
     arguments = {"num_denoising_steps": steps, "device": device, "tokenizer": tokenizer}
     settings = Settings(arguments, observations, count, noises, seed, target, batch)
-    result = _with_bar(lambda progress: run(opened, settings, progress), output)
+    result = with_stages(lambda progress: run(opened, settings, progress), Progress, output)
     result.save(out)
     _show(result, output)
     output.line(f"wrote {out}")
     output.document({"out": out, **result.as_json()})
-
-
-def _with_bar(work: Any, output: Output) -> Any:
-    from turbopi.calibrate.run import Progress as Told
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = new_console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not output.shows_progress) as bar:
-        task = bar.add_task("", total=None)
-
-        def begin(text: str, total: int) -> None:
-            bar.reset(task, description=text, total=total)
-
-        return work(Told(begin, lambda: bar.advance(task)))
 
 
 def _show(result: "Quantization", output: Output) -> None:

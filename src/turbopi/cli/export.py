@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
-from turbopi.cli.options import WeightOptions
+from turbopi.cli.options import EngineCalibration, ScaleMethod, WeightOptions
 from turbopi.errors import BackendUnavailable, ConfigError
 
 FORMATS = ("onnx",)
@@ -44,17 +44,8 @@ def export(
     precision: Annotated[
         str, typer.Option(metavar="f32|fp8", help="fp8: quantise/dequantise nodes around the prefix's MLPs.")
     ] = "f32",
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="PATH",
-            help="For fp8: an observation or a recording (as for `turbopi infer`), or the file of `turbopi calibrate`. "
-            "Unless given, the LIBERO pictures that come with Turbo-Pi.",
-        ),
-    ] = None,
-    method: Annotated[
-        str, typer.Option(metavar="modelopt|max", help="Who measures the scales: NVIDIA's ModelOpt, or Turbo-Pi.")
-    ] = "max",
+    calibration: EngineCalibration = None,
+    method: ScaleMethod = "max",
     as_json: JsonFlag = False,
 ) -> None:
     """Write a model for another runtime: as float32 ONNX graphs of vision, prompt, prefix and denoising step.

@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -23,6 +24,19 @@ CHECKPOINT_HELP = "A checkpoint's folder: openpi's (PyTorch or JAX) or LeRobot's
 
 CheckpointArgument = Annotated[
     str | None, typer.Argument(metavar="CHECKPOINT", help=CHECKPOINT_HELP, show_default=False)
+]
+
+# FP8 of engines and graphs (`build`, `export`)
+EngineCalibration = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="PATH",
+        help="For fp8: an observation or a recording (as for `turbopi infer`), or the file of `turbopi calibrate`. "
+        "Unless given, the LIBERO pictures that come with Turbo-Pi.",
+    ),
+]
+ScaleMethod = Annotated[
+    str, typer.Option(metavar="modelopt|max", help="Who measures the scales: NVIDIA's ModelOpt, or Turbo-Pi.")
 ]
 
 

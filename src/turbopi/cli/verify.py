@@ -1,17 +1,16 @@
 """`turbopi verify`: a certificate for a backend on one's own weights."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from turbopi.cli.files import check_folder
-from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console, plain
+from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, plain
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
+from turbopi.cli.progress import with_stages
 
 
 @command(
@@ -67,6 +66,7 @@ def verify(
         check_folder(report)
     output = Output(as_json)
     opened = options.open(checkpoint)
+    from turbopi.judge.verify import Progress
     from turbopi.judge.verify import verify as run
     from turbopi.judge.verify_inputs import Plan
 
@@ -81,7 +81,7 @@ def verify(
         factor=factor,
         fingerprint=not no_hash,
     )
-    document = _with_bar(lambda progress: run(opened, plan, progress), output)
+    document = with_stages(lambda progress: run(opened, plan, progress), Progress, output)
     _show(document, output)
     if report is not None:
         _write(document, report, output)
@@ -89,20 +89,6 @@ def verify(
     output.document(document)
     if not document["ok"]:
         raise typer.Exit(CHECK_FAILED)
-
-
-def _with_bar(work: Callable[[Any], dict[str, Any]], output: Output) -> dict[str, Any]:
-    from turbopi.judge.verify import Progress as Told
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = new_console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not output.shows_progress) as bar:
-        task = bar.add_task("", total=None)
-
-        def begin(text: str, total: int) -> None:
-            bar.reset(task, description=text, total=total)
-
-        return work(Told(begin, lambda: bar.advance(task)))
 
 
 def _write(document: dict[str, Any], folder: Path, output: Output) -> None:

@@ -14,6 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from turbopi.errors import BackendUnavailable
+
 Dtype = Literal["f32", "f16", "bf16", "fp8"]
 Value = Any
 TORCH_DTYPES: dict[str, torch.dtype] = {
@@ -186,7 +188,7 @@ class TensorRTOps:
 
     def attention(self, q: Value, k: Value, v: Value) -> Value:
         if not hasattr(self.network, "add_attention"):
-            raise NotImplementedError(
+            raise BackendUnavailable(
                 "this TensorRT has no attention layer; it needs TensorRT 10.14 or TensorRT-RTX 1.2"
             )
         dtype = next(name for name, value in self.dtypes.items() if value == q.dtype)
