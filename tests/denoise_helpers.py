@@ -10,7 +10,9 @@ from torch import Tensor
 from turbopi.config import GemmaConfig, ModelConfig, preset
 from turbopi.engine.weights import GemmaLayer
 from turbopi.errors import BackendError
-from turbopi.kernels import denoise, nvrtc
+from turbopi.kernels import nvrtc
+from turbopi.kernels.denoise_plain import denoise_plain
+from turbopi.model.denoise import euler_step
 from turbopi.model.layers import apply_rope, rms_normalize, rope_tables
 
 FULL = preset("pi05_libero").model
@@ -99,7 +101,7 @@ def problem(
 
 def plain(p: Problem, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     noise = p.noise.to(dtype)
-    return denoise.denoise_plain(p.config, p.layers, p.small, p.table, noise, p.cache_k, p.cache_v, p.length)
+    return denoise_plain(p.config, p.layers, p.small, p.table, noise, p.cache_k, p.cache_v, p.length)
 
 
 def ordinary_bf16(p: Problem) -> Tensor:
@@ -130,7 +132,7 @@ def ordinary_bf16(p: Problem) -> Tensor:
             up_gate, up = F.linear(y, layer.gate_up).chunk(2, dim=-1)
             x = x + F.linear(F.gelu(up_gate, approximate="tanh") * up, layer.down) * gate
         v_t = affine("action_out_proj", normed(x, modulation[2 * g.depth])[0].float())
-        x_t = denoise.euler_step(x_t, v_t, p.table.shape[0])
+        x_t = euler_step(x_t, v_t, p.table.shape[0])
     return x_t
 
 

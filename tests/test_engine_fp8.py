@@ -1,10 +1,13 @@
 """The engine with FP8 matrices equals the emulated reference, and a calibration decides which matrices those are."""
 
+import dataclasses
+
 import torch
 from conftest import golden_cases, golden_model
 from test_engine import answer, shape_of
 from torch import Tensor
 
+from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.emulate import rounded
 from turbopi.calibrate.sites import Site, sites
 from turbopi.calibrate.statistics import collect
@@ -14,7 +17,7 @@ from turbopi.engine.ops import PLAIN
 from turbopi.engine.weights import modulation, pack
 from turbopi.observation import Observation
 
-CPU = torch.device("cpu")
+CPU, META = torch.device("cpu"), torch.device("meta")
 STEPS = 2
 
 
@@ -82,3 +85,31 @@ def test_nothing_rounded_changes_nothing() -> None:
     with rounded(model, scales_of(case.observation, case.noise)):
         assert not torch.equal(model.sample(case.observation, case.noise, STEPS), before)
     assert torch.equal(model.sample(case.observation, case.noise, STEPS), before)
+
+
+def test_the_experts_first_copy_goes_away_unless_operations_read_it() -> None:
+    backend = FusedBackend.__new__(FusedBackend)
+    state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
+    backend._weights, backend._denoised_by_operations = pack(golden_model("pi05").config, state), {}
+    layers = backend._weights.expert
+
+    def places() -> set[str]:
+        return {x.device.type for layer in layers for x in (layer.qkv, layer.out, layer.gate_up, layer.down)}
+
+    backend._keep_expert_on(META)  # instead of a GPU
+    assert places() == {"meta"} and layers[0].norm1 is None
+    layers[0] = dataclasses.replace(layers[0], qkv=torch.zeros_like(layers[0].qkv, device=CPU))
+    backend._keep_expert_on(META)
+    assert places() == {"meta"}
+    backend._denoised_by_operations["H=60, 10 steps"] = "too many"
+    backend._put_expert_away()
+    assert places() == {"meta"}
+
+
+def test_what_nothing_reads_of_the_last_prefix_layer_is_not_kept() -> None:
+    state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
+    weights = pack(golden_model("pi05").config, state)
+    *others, last = weights.vlm
+    assert (last.out.shape[0], last.gate_up.shape[0], last.down.shape[0]) == (0, 0, 0)
+    assert last.qkv.shape == others[0].qkv.shape
+    assert all(layer.down.shape[0] and layer.out.shape[0] and layer.gate_up.shape[0] for layer in others)

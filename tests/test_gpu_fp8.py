@@ -1,6 +1,7 @@
 """FP8 of the `fused` backend on a real GPU: what the emulated reference says, on openpi's golden cases."""
 
 from functools import lru_cache
+from typing import Any
 
 import pytest
 import torch
@@ -9,12 +10,14 @@ from torch import Tensor
 
 from turbopi import backends
 from turbopi.backends import Tier
+from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.artifact import Quantization
 from turbopi.calibrate.emulate import delta_cosine, relative_rms, rounded
 from turbopi.calibrate.sites import sites
 from turbopi.config import Kind
 from turbopi.judge.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
 from turbopi.judge.golden import Case
+from turbopi.kernels.denoise import MAX_SUFFIX
 from turbopi.model.reference import Pi0Model
 
 pytestmark = [
@@ -88,6 +91,30 @@ def test_sites_kept_in_bf16_reach_the_target(case: str) -> None:
         f"rms {float(difference.square().mean().sqrt()):.5f}, plan {runner.describe()['fp8']['plan']}"
     )
     assert cosine >= FP8_COSINE
+
+
+def test_operations_have_the_expert_again_when_they_need_it() -> None:
+    """The denoising kernel has a copy; the first one waits on the host until a horizon comes that it doesn't cover."""
+    case = golden_cases()["b_third_masked"]
+    long = torch.randn(1, MAX_SUFFIX + 4, case.noise.shape[-1], generator=torch.Generator().manual_seed(0))
+
+    def fresh() -> Any:
+        checkpoint = golden_folder().checkpoint("pi05")
+        return FusedBackend(
+            checkpoint.config.model,
+            lambda to, mode: checkpoint.load(to, mode).state,
+            device=torch.device("cuda", 0),
+            precision="bf16",
+        )
+
+    kernel_first, operations_first = fresh(), fresh()
+    by_kernel = kernel_first.sample(case.observation, case.noise, STEPS).actions
+    assert {layer.qkv.device.type for layer in kernel_first._weights.expert} == {"cpu"}
+    by_operations = operations_first.sample(case.observation, long, STEPS).actions
+    assert torch.equal(kernel_first.sample(case.observation, long, STEPS).actions, by_operations)
+    assert torch.equal(operations_first.sample(case.observation, case.noise, STEPS).actions, by_kernel)
+    assert torch.equal(operations_first.sample(case.observation, long, STEPS).actions, by_operations)
+    assert {layer.qkv.device.type for layer in kernel_first._weights.expert} == {"cuda"}
 
 
 @pytest.mark.parametrize("precision", ["fp8", "fp8-mlp"])

@@ -15,7 +15,7 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine import ops as plain  # noqa: E402
 from turbopi.engine.fp8 import E4M3, E4M3_MAX, Fp8Matrix, input_of, to_e4m3  # noqa: E402
-from turbopi.kernels import attention, gemm_fp8, norms  # noqa: E402
+from turbopi.kernels import attention, attention_hopper, gemm_fp8, norms  # noqa: E402
 from turbopi.kernels.gemm import Epilogue, Tile  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
@@ -158,6 +158,19 @@ def test_attention_leaves_in_e4m3(heads: int, head_dim: int) -> None:
     assert float((ours.float() / 55 - exact).norm() / exact.norm()) < (0.035 if ON_GPU else 1e-5)
 
 
+@on_hopper
+@pytest.mark.parametrize(("heads", "head_dim"), [(2, 24), (16, 72), (8, 256)])
+def test_attention_of_hopper_leaves_in_e4m3(heads: int, head_dim: int) -> None:
+    qkv = random(2 * 50, 3 * heads * head_dim)
+    exact = plain.vision_attention(qkv.float(), 2, heads)
+    ours = attention_hopper.vision_attention(qkv, 2, heads, 55.0)
+    assert ours.dtype == E4M3 and float((ours.float() / 55 - exact).norm() / exact.norm()) < 0.035
+    q, k, v, length = random(80 * heads, head_dim), random(80, head_dim), random(80, head_dim), torch.tensor([77])
+    exact = plain.attention(q.float(), k.float(), v.float(), length.to(DEVICE), 80, heads)
+    ours = attention_hopper.prefix_attention(q, k, v, length.to(DEVICE), heads, 55.0)
+    assert ours.dtype == E4M3 and float((ours.float() / 55 - exact).norm() / exact.norm()) < 0.035
+
+
 # The products
 
 TILES = [Tile(2, 112), Tile(3, 192), Tile(2, 256), Tile(1, 80), Tile(3, 96), Tile(2, 96, cluster_m=2, cluster_n=2)]
@@ -206,9 +219,8 @@ def test_promoted_sums_lose_less_than_the_tensor_cores_own() -> None:
         ours = gemm_fp8.matmul_fp8(x, matrix, Tile(2, 128), "partial", promote=promote)[0]
         return float((ours - exact).norm() / exact.norm())
 
-    print(f"of sums of one sign lost: {error(gemm_fp8.PROMOTE):.1e} promoted, {error(0):.1e} not")
-    assert error(gemm_fp8.PROMOTE) < error(0)
-    assert error(gemm_fp8.PROMOTE) < 5e-3
+    # each product is cut off at the running sum's last bit, so the share that is lost grows with the unpromoted length
+    assert error(gemm_fp8.PROMOTE) < error(0) * gemm_fp8.PROMOTE * gemm_fp8.DEPTH / 16384
 
 
 @on_hopper

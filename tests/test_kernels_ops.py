@@ -14,7 +14,7 @@ ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine import ops as plain  # noqa: E402
-from turbopi.kernels import activations, attention, embedding, norms, rope  # noqa: E402
+from turbopi.kernels import activations, attention, attention_hopper, embedding, norms, rope  # noqa: E402
 from turbopi.kernels import ops as fused  # noqa: E402
 from turbopi.kernels.gemm import Epilogue, Tile, matmul  # noqa: E402
 from turbopi.model.layers import rope_tables  # noqa: E402
@@ -169,6 +169,64 @@ def test_prefix_attention_reads_nothing_beyond_the_length(heads: int, head_dim: 
     assert_as_good(attention.prefix_attention(q, k, v, on_device, heads), twin, exact)
 
 
+on_hopper = pytest.mark.skipif(
+    not ON_GPU or torch.cuda.get_device_capability() != (9, 0), reason="needs compute capability 9.0"
+)
+
+
+@on_hopper
+@pytest.mark.parametrize(("keys", "warpgroups"), [(0, 0), (64, 1), (128, 1), (64, 2), (128, 2)])
+@pytest.mark.parametrize(("heads", "head_dim"), [(4, 16), (4, 32), (16, 72), (2, 24), (3, 64)])
+@pytest.mark.parametrize(("images", "tokens"), [(1, 256), (3, 256), (2, 50)])
+def test_vision_attention_on_hopper(
+    heads: int, head_dim: int, images: int, tokens: int, keys: int, warpgroups: int
+) -> None:
+    qkv = random(images * tokens, 3 * heads * head_dim)
+    qkv[:, ::17] *= 8
+    poison_allocator()
+    tile = attention_hopper.Tile(head_dim, keys, warpgroups) if keys else None
+    ours = attention_hopper.vision_attention(qkv, images, heads, tile=tile)
+    assert_as_good(ours, plain.vision_attention(qkv, images, heads), plain.vision_attention(qkv.float(), images, heads))
+
+
+@on_hopper
+@pytest.mark.parametrize("warpgroups", [0, 1, 2])
+@pytest.mark.parametrize(("heads", "head_dim"), [(8, 16), (8, 32), (8, 256), (4, 48)])
+@pytest.mark.parametrize(
+    ("slots", "length"), [(16, 1), (272, 261), (304, 64), (560, 560), (560, 547), (816, 803), (976, 960)]
+)
+def test_prefix_attention_on_hopper(heads: int, head_dim: int, slots: int, length: int, warpgroups: int) -> None:
+    q, k, v = random(slots * heads, head_dim), random(slots, head_dim), random(slots, head_dim)
+    q[:, ::5] *= 8
+    k[:, ::7] *= 8
+    on_device = torch.tensor([length], device=DEVICE)
+    twin = plain.attention(q, k, v, on_device, slots, heads)
+    exact = plain.attention(q.float(), k.float(), v.float(), on_device, slots, heads)
+    k[length:], v[length:] = torch.nan, torch.nan
+    poison_allocator()
+    tile = attention_hopper.Tile(head_dim, 64, warpgroups) if warpgroups else None
+    first = attention_hopper.prefix_attention(q, k, v, on_device, heads, tile=tile)
+    assert_as_good(first, twin, exact)
+    for _ in range(5):
+        assert torch.equal(attention_hopper.prefix_attention(q, k, v, on_device, heads, tile=tile), first)
+
+
+@on_hopper
+def test_prefix_attention_ends_without_keys() -> None:
+    """Graphs are captured before there is an observation."""
+    q, k = random(64 * 8, 256), random(64, 256)
+    attention_hopper.prefix_attention(q, k, k, torch.tensor([0], device=DEVICE), 8)
+    torch.cuda.synchronize()
+
+
+@on_hopper
+def test_nan_in_a_query_shows() -> None:
+    q, k, v = random(16 * 8, 256), random(16, 256), random(16, 256)
+    q[3, 5] = torch.nan
+    ours = attention_hopper.prefix_attention(q, k, v, torch.tensor([16], device=DEVICE), 8).view(-1, 256)
+    assert bool(ours[3].isnan().all()) and bool(ours[:3].isfinite().all()) and bool(ours[4:].isfinite().all())
+
+
 @pytest.mark.parametrize("state_token", [False, True])
 @pytest.mark.parametrize(("suffix", "slots", "length"), [(10, 560, 549), (51, 16, 1), (1, 272, 272), (7, 0, 0)])
 def test_masked_softmax(suffix: int, slots: int, length: int, state_token: bool) -> None:
@@ -231,9 +289,6 @@ def test_embed_prompt_is_exact(width: int) -> None:
     assert torch.equal(ours, twin)
 
 
-on_hopper = pytest.mark.skipif(
-    not ON_GPU or torch.cuda.get_device_capability() != (9, 0), reason="needs compute capability 9.0"
-)
 TILES = [
     Tile(3, 192),
     Tile(2, 256, cluster_n=2),

@@ -6,9 +6,9 @@ one, and `describe()` says so.
 """
 
 import importlib.util
-import inspect
 import shutil
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -24,13 +24,11 @@ from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, ConfigError
 
 if TYPE_CHECKING:
-    from turbopi.kernels import denoise_cluster
-    from turbopi.kernels.denoise import PackedExpert
+    from turbopi.kernels.denoise_packing import PackedExpert
 
-# Up to how many actions the denoising kernel of clusters is chosen. For ten steps of 10 actions it needs 3.9 ms on an
-# H200, the other one 5.8 ms. But `pytest -m gpu tests/test_kernels_denoise_cluster.py` hasn't run on its last form:
-# 24 once it has, and more when it is timed at more.
-CLUSTERS_UP_TO = 0
+# Whether FP8 tiers have the expert's weights in FP8, too. The denoising kernel takes them, but
+# `pytest -m gpu -k fp8 tests/test_kernels_denoise.py` hasn't run on a GPU: true once it passes and is timed.
+EXPERT_IN_FP8 = False
 
 
 class FusedBackend(CudaGraphBackend):
@@ -56,8 +54,6 @@ class FusedBackend(CudaGraphBackend):
         self._quantization = quantization
         self._plan = None if quantization is None else quantization.plan(config, precision)
         self._packed_expert: PackedExpert | None = None
-        self._cluster_expert: denoise_cluster.PackedExpert | None = None
-        self._clusters_refused: str | None = None
         self._denoisers: dict[tuple[int, int, int], Denoiser] = {}  # by steps, horizon, cache rows
         self._denoised_by_operations: dict[str, str] = {}  # which calls, and why
         super().__init__(config, load, device=device, precision=precision)
@@ -95,21 +91,13 @@ class FusedBackend(CudaGraphBackend):
             described["fp8"] = {
                 "plan": self._plan.describe() | {"expert": self._expert_precision()},
                 "calibration": self._quantization.source or "in memory",
+                "identity": self._quantization.identity,
                 "observations": self._quantization.report["observations"]["source"],
                 "warnings": self._quantization.warnings,
             }
-        described["denoising"] = {
-            name: sorted(
-                {f"H={horizon}, {steps} steps" for (steps, horizon, _), k in self._denoisers.items() if test(k)}
-            )
-            for name, test in (
-                ("one persistent CUDA kernel", lambda k: not _of_clusters(k)),
-                ("one CUDA kernel of clusters", _of_clusters),
-            )
-        }
-        if self._clusters_refused is not None:
-            described["denoising"]["no clusters, as"] = self._clusters_refused
-        described["denoising"] |= {f"operations, as {why}": call for call, why in self._denoised_by_operations.items()}
+        by_kernel = sorted({f"H={horizon}, {steps} steps" for steps, horizon, _ in self._denoisers})
+        by_operations = {f"operations, as {why}": call for call, why in self._denoised_by_operations.items()}
+        described["denoising"] = {"one CUDA kernel": by_kernel, **by_operations}
         return described
 
     def _pack(self, load: LoadState) -> Weights:
@@ -120,20 +108,17 @@ class FusedBackend(CudaGraphBackend):
 
         return pack(self.config, load(self.device, "bf16"), make)
 
-    def _expert_options(self) -> dict[str, str]:
-        """What `PackedExpert.pack` is told besides the layers: FP8 weights, if they are planned and it has them."""
-        from turbopi.kernels.denoise import PackedExpert
-
-        offered = "weights" in inspect.signature(PackedExpert.pack).parameters
-        wanted = self._plan is not None and self._plan.expert_weights == "fp8"
-        return {"weights": "fp8"} if offered and wanted else {}
+    def _expert_weights(self) -> Literal["bf16", "fp8"]:
+        """What the denoising kernel is to have the expert's weights in."""
+        planned = "bf16" if self._plan is None else self._plan.expert_weights
+        return planned if EXPERT_IN_FP8 else "bf16"
 
     def _expert_precision(self) -> str:
         """What the expert's weights are in, openly."""
         if self._plan is None or self._plan.expert_weights == "bf16":
             return "bf16, all of it: its kernel takes one precision"
-        if not self._expert_options():
-            return "bf16: the denoising kernel has no FP8 weights"
+        if not EXPERT_IN_FP8:
+            return "bf16: FP8 weights in the denoising kernel aren't proven on a GPU yet"
         if self._denoised_by_operations:
             return "fp8 weights in the denoising kernel; bf16 where operations denoise"
         return "fp8 weights"
@@ -144,52 +129,48 @@ class FusedBackend(CudaGraphBackend):
         return fused_ops(self.device)
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
-        from turbopi.kernels import denoise
-
+        """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, horizon or GPU."""
         horizon, steps = shape.horizon, shape.num_steps
-        reason = denoise.unavailable(self.device) or denoise.refusal(self.config)
-        if reason is None and horizon > denoise.MAX_SUFFIX:
-            reason = f"the denoising kernel takes up to {denoise.MAX_SUFFIX} actions"
-        if reason is not None or table is None:
-            self._denoised_by_operations[f"H={horizon}, {steps} steps"] = reason or "there is no modulation"
-            return None
-        longest = _bucket(self.config.max_prompt_tokens)
         cameras = min(max(shape.cameras, 3), MAX_CAMERAS)
-        key = (steps, horizon, cameras * self.config.vision.num_tokens + longest)
-        if key not in self._denoisers:
-            self._denoisers[key] = self._cluster_kernel(*key, table) or self._persistent_kernel(*key, table)
-        return self._denoisers[key]
-
-    def _persistent_kernel(self, steps: int, horizon: int, rows: int, table: Tensor) -> Denoiser:
-        from turbopi.kernels.denoise import DenoiseKernel, PackedExpert
-
-        if self._packed_expert is None:
-            self._packed_expert = PackedExpert.pack(self.config, self._weights.expert, **self._expert_options())
-        small = self._weights.small
-        return DenoiseKernel(
-            self.config, self._packed_expert, small, table, cache_rows=rows, suffix=horizon, device=self.device
-        )
-
-    def _cluster_kernel(self, steps: int, horizon: int, rows: int, table: Tensor) -> Denoiser | None:
-        """The kernel of clusters, where it is the faster one and this GPU holds its clusters at once."""
-        from turbopi.kernels.denoise_cluster import DenoiseKernel, PackedExpert, refusal
-
-        if horizon > CLUSTERS_UP_TO or self._clusters_refused is not None:
-            return None
-        self._clusters_refused = refusal(self.config)
-        if self._clusters_refused is not None:
-            return None
-        if self._cluster_expert is None:
-            self._cluster_expert = PackedExpert.pack(self.config, self._weights.expert)
-        small = self._weights.small
+        rows = cameras * self.config.vision.num_tokens + _bucket(self.config.max_prompt_tokens)
+        key = (steps, horizon, rows)
         try:
-            return DenoiseKernel(
-                self.config, self._cluster_expert, small, table, cache_rows=rows, suffix=horizon, device=self.device
-            )
+            if key not in self._denoisers:
+                self._denoisers[key] = self._denoising_kernel(horizon, rows, table)
+            return self._denoisers[key]
         except BackendUnavailable as e:
-            self._clusters_refused, self._cluster_expert = str(e), None
+            if not self._denoisers:
+                self._packed_expert = None
+            self._denoised_by_operations[f"H={horizon}, {steps} steps"] = str(e)
+            self._keep_expert_on(self.device)  # for good: a graph of these operations will point to it
             return None
 
+    def _denoising_kernel(self, horizon: int, rows: int, table: Tensor | None) -> Denoiser:
+        """Raises BackendUnavailable for what it doesn't cover."""
+        from turbopi.kernels.denoise import MAX_SUFFIX, DenoiseKernel, unavailable
+        from turbopi.kernels.denoise_packing import PackedExpert, refusal
 
-def _of_clusters(kernel: Denoiser) -> bool:
-    return type(kernel).__module__.endswith("denoise_cluster")
+        reason = unavailable(self.device) or refusal(self.config)
+        if reason is None and horizon > MAX_SUFFIX:
+            reason = f"the denoising kernel takes up to {MAX_SUFFIX} actions"
+        if reason is not None or table is None:
+            raise BackendUnavailable(reason or "there is no modulation")
+        if self._packed_expert is None:
+            self._keep_expert_on(self.device)
+            self._packed_expert = PackedExpert.pack(self.config, self._weights.expert, weights=self._expert_weights())
+        packed, small = self._packed_expert, self._weights.small
+        kernel = DenoiseKernel(self.config, packed, small, table, cache_rows=rows, suffix=horizon, device=self.device)
+        self._put_expert_away()
+        return kernel
+
+    def _put_expert_away(self) -> None:
+        """A kernel has its own copy of the expert's matrices; the first one, 0.6 GB, waits on the host."""
+        if not self._denoised_by_operations:
+            self._keep_expert_on(torch.device("cpu"))
+
+    def _keep_expert_on(self, device: torch.device) -> None:
+        layers = self._weights.expert
+        for i, layer in enumerate(layers):
+            if layer.qkv.device != device:
+                names = ("qkv", "out", "gate_up", "down")
+                layers[i] = replace(layer, **{name: getattr(layer, name).to(device) for name in names})

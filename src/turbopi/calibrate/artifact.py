@@ -4,6 +4,7 @@ It holds for one set of weights (by the hash of all of them), one model and one 
 is refused. What was measured to get there is kept in it and goes with it into every policy's metadata.
 """
 
+import hashlib
 import json
 import logging
 from collections.abc import Mapping, Sequence
@@ -62,6 +63,13 @@ class Quantization:
         """What every output should say."""
         noise = ["calibrated on random noise, not on observations: its errors say nothing"]
         return [*(noise if self.on_random_noise else []), *self.report.get("warnings", [])]
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 of all that decides a policy's numbers: weights, scales, what stays in bfloat16, parts."""
+        sites = {name: (site.scale, site.kept is None) for name, site in self.sites.items()}
+        decisive = {"weights": self.fingerprint, "sites": sites, "parts": list(self.parts)}
+        return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
 
     def only(self, parts: Sequence[str]) -> "Quantization":
         """The same with FP8 in these parts of the model alone. Raises ConfigError for a part that doesn't exist."""
@@ -206,8 +214,8 @@ BESIDE = "turbopi_fp8.json"  # in a checkpoint's folder: found there unless anot
 def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:
     """The calibration that a policy in this precision runs with, checked against its checkpoint; None: it needs none.
 
-    Hashes all weights, which takes some seconds. Raises ConfigError if there is none, CalibrationError if it doesn't
-    fit.
+    Hashes all weights, which takes some seconds at full size, unless their files were hashed before. Raises
+    ConfigError if there is none, CalibrationError if it doesn't fit.
     """
     if tier not in TIERS:
         return None
@@ -220,7 +228,7 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
             )
         given = beside
     quantization = given if isinstance(given, Quantization) else Quantization.load(given)
-    quantization.check(checkpoint.config.model, checkpoint.fingerprint())
+    quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
     for warning in quantization.warnings:
         logger.warning("FP8: %s", warning)
     return quantization

@@ -1,4 +1,4 @@
-// Part 3 of 4: queries, keys and values of the suffix, and attention. The keys are split over the ranks of the head's
+// Part 5 of 6: queries, keys and values of the suffix, and attention. The keys are split over the ranks of the head's
 // cluster.
 
 __device__ __forceinline__ void ldmatrix(uint4& v, u32 address) {
@@ -37,15 +37,16 @@ __device__ __forceinline__ void make_rope(const Block& b, int prefix, float2 (&r
 
 // q to all ranks (standard order), k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream; queries are sent when all of those have been read, so what a peer sends after it has them may lie there too.
-__device__ __forceinline__ void project(Block& b, const float* shifted, float* kv, u32 bit,
+__device__ __forceinline__ void project(Block& b, const float* shifted, const float* row_scales, float* kv, u32 bit,
                                         const float2 (&rope)[ITEMS_Q][2]) {
   const int qn = b.qn(), kvn = b.kvn();
-  float2 shift[ITEMS_Q];
+  float2 shift[ITEMS_Q], scale[ITEMS_Q];
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
     const int i = b.warp + j * W, k = i - qn * NT;
     const int tile = i >= (qn + kvn) * NT ? 0 : k < 0 ? i % qn : QTL + (KVL == 1 ? 0 : k % kvn);
     shift[j] = make_float2(__ldg(shifted + tile * 16 + b.g()), __ldg(shifted + tile * 16 + b.g() + 8));
+    if (FP8) scale[j] = make_float2(__ldg(row_scales + tile * 16 + b.g()), __ldg(row_scales + tile * 16 + b.g() + 8));
   }
   constexpr int TPW = plan_tpw(QTL, true);
   float acc[TPW + plan_tpw(KVL, true)][NT][4];
@@ -67,8 +68,9 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, float* k
                     : KVL == 1 ? k
                                : k / kvn,
                 kv_tile = KVL == 1 ? 0 : k % kvn, token = n * 8 + 2 * b.t();
-      const float4 c =
+      float4 c =
           k < 0 ? total<QTL, true>(b, b.smem + M_X, i % qn, n) : total<KVL, true>(b, kv_partials, kv_tile, n);
+      if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
       const float2 r = inverse_rms(b, token), u = rope[j][0], v = rope[j][1];
       const float a0 = c.x * r.x + shift[j].x, a1 = c.z * r.x + shift[j].y, c0 = c.y * r.y + shift[j].x,
                   c1 = c.w * r.y + shift[j].y;
@@ -105,35 +107,38 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, float* k
         }
     }
   }
+  if (IDLE_Q && threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_Q), threadIdx.x));
 }
+constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
 
-// Logits of up to 16 keys (rows at `rows`, `count` > 0 of them real) and half of the tokens, times the scale and log2
-// e, to shared memory. Returns a word that needs all the rows, for give_slot.
-constexpr int HALF = (NT + 1) / 2;
-__device__ __forceinline__ u32 score(const Block& b, u32 rows, int count, int half, int first, float scale) {
-  constexpr int CHAINS = HALF <= 2 ? 2 : 1;
+// Logits of 16 keys, times the scale and log2 e, to shared memory. Two warps (`half`) share them: by columns, whose
+// sums softmax adds up, or else by tokens. fetch(k) is the k-th fragment of the keys. Returns a word that needs all it
+// read, for give_slot.
+constexpr int HALF = SPLIT_KEYS ? NT : (NT + 1) / 2;
+template <typename Fetch>
+__device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int half, int first, float scale) {
+  constexpr int CHAINS = HALF <= 2 ? 2 : 1, STEPS = SPLIT_KEYS ? QT / 2 : QT,
+                UNROLL = SPLIT_KEYS ? 4 : HALF <= 2 ? 8 : 2;
+  const int k0 = SPLIT_KEYS ? half * STEPS : 0, n0 = SPLIT_KEYS ? 0 : half * HALF;
   float c[CHAINS][HALF][4];
 #pragma unroll
   for (int i = 0; i < CHAINS; ++i) clear(c[i]);
   u32 seen = 0;
-  const int row = min((b.lane & 7) + (b.lane & 8), count - 1);  // rows beyond the last key hold anything
-  const u32 from = rows + row * RS + (b.lane >> 4) * 16;
-  const byte* q = b.smem + M_H + H_Q + half * HALF * 256 + b.lane * 8;
-#pragma unroll(HALF <= 2 ? 8 : 2)
-  for (int k = 0; k < QT; ++k) {
-    uint4 a;
-    ldmatrix(a, from + k * 32);
+  const byte* q = b.smem + M_H + H_Q + (k0 * NT + n0) * 256 + b.lane * 8;
+#pragma unroll(UNROLL)
+  for (int k = 0; k < STEPS; ++k) {
+    const uint4 a = fetch(k0 + k);
     seen ^= a.x;
 #pragma unroll
     for (int n = 0; n < HALF; ++n)
-      if (half * HALF + n < NT) mma(c[k % CHAINS][n], a, *(const uint2*)(q + (k * NT + n) * 256));
+      if (n0 + n < NT) mma(c[k % CHAINS][n], a, *(const uint2*)(q + (k * NT + n) * 256));
   }
-  float* logits = (float*)(b.smem + M_X + X_LOGITS) + first + b.g();
+  float* logits = (float*)(b.smem + M_X + X_LOGITS) + (SPLIT_KEYS ? half * T * LS : 0) + first + b.g();
 #pragma unroll
   for (int n = 0; n < HALF; ++n)
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
-      const int token = (half * HALF + n) * 8 + 2 * b.t() + (i & 1);
+      const int token = (n0 + n) * 8 + 2 * b.t() + (i & 1);
       float v = c[0][n][i];
       if (CHAINS == 2) v += c[CHAINS - 1][n][i];
       if (token < T) logits[token * LS + (i >> 1) * 8] = v * scale;
@@ -166,7 +171,9 @@ __device__ __forceinline__ void softmax(const Block& b, int prefix, int suffix) 
 #pragma unroll
     for (int i = 0; i < PER; ++i) {
       const int col = i * 32 + b.lane;
-      v[i] = col < prefix || (col >= KT * 16 && col < KT * 16 + suffix) ? row[col] : __int_as_float(0xff800000);
+      v[i] = __int_as_float(0xff800000);
+      if (col < prefix || (col >= KT * 16 && col < KT * 16 + suffix))
+        v[i] = SPLIT_KEYS ? row[col] + row[T * LS + col] : row[col];
       top = fmaxf(top, v[i]);
     }
 #pragma unroll
@@ -188,33 +195,32 @@ __device__ __forceinline__ void softmax(const Block& b, int prefix, int suffix) 
   }
 }
 
-// Probabilities times 16 keys' values, for one tile of columns. Returns a word that needs the values.
-__device__ __forceinline__ u32 weigh(const Block& b, float (&c)[NT][4], u32 rows, int count, int tile, int block) {
-  const int row = min((b.lane & 7) + ((b.lane >> 4) << 3), count - 1);  // the others' probabilities are 0
-  uint4 a;
-  ldmatrix_transposed(a, rows + row * RS + (tile * 16 + (b.lane & 8)) * 2);
+// Probabilities times 16 keys' values, for one tile of columns.
+__device__ __forceinline__ void weigh(const Block& b, float (&c)[NT][4], uint4 values, int block) {
   const byte* p = b.smem + M_X + X_P + block * NT * 256 + b.lane * 8;
 #pragma unroll
-  for (int n = 0; n < NT; ++n) mma(c[n], a, *(const uint2*)(p + n * 256));
-  return a.x;
+  for (int n = 0; n < NT; ++n) mma(c[n], values, *(const uint2*)(p + n * 256));
 }
 
 // Attention of this cluster's head, to region H of all ranks. Everything local lies in region X.
 __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix_all) {
-  const int prefix = share(prefix_all, S, b.rank + 1) - share(prefix_all, S, b.rank), slots = most(prefix, SLOT_KEYS);
+  const int all = most(prefix_all, 16), tile0 = share(all, S, b.rank), tiles = share(all, S, b.rank + 1) - tile0;
+  const int prefix = min(tiles * 16, prefix_all - tile0 * 16), slots = most(tiles, SLOT_TILES);
   const int suffix0 = share(T, S, b.rank), suffix = share(T, S, b.rank + 1) - suffix0;
   const float scale = rsqrtf(float(HD)) * 1.4426950408889634f;
   const int group = b.warp >> 2, half = b.warp & 1;
-  receive(b, BAR_Q, b.n, HD * T * 2, WAIT_Q);
+  receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
   MARK(3)
 #pragma unroll 1
   for (int i = 0; i < slots; ++i) {
     const u32 slot = take_slot(b);
     // this warp's tile of eight, if it is in the slot (a slot has two or four)
-    const int sub = (b.warp >> 1) - i * SLOT_TILES % 8, first = (i * SLOT_TILES + sub) * 16;
+    const int sub = (b.warp >> 1) - i * SLOT_TILES % 8, tile = i * SLOT_TILES + sub;
     u32 seen = 0;
-    if (sub >= 0 && sub < SLOT_TILES && first < prefix && half * HALF < NT)
-      seen = score(b, b.base + M_RING + slot * SLOT + sub * 16 * RS, prefix - first, half, first, scale);
+    if (sub >= 0 && sub < SLOT_TILES && tile < tiles && (SPLIT_KEYS || half * HALF < NT)) {
+      const byte* from = b.ring(slot) + sub * KEY_TILE;
+      seen = score(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); }, half, tile * 16, scale);
+    }
     give_slot(b, slot, seen);
   }
   MARK(4)
@@ -223,7 +229,16 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       fetch_suffix(b, kv, bit, 0, threadIdx.x & 127, suffix0, suffix);
       __syncwarp();
       asm volatile("bar.sync 2, 128;" ::: "memory");
-      if (b.warp < 14 && half * HALF < NT) score(b, b.base + M_X + X_SUFFIX, suffix, half, KT * 16, scale);
+      if (b.warp < 14 && (SPLIT_KEYS || half * HALF < NT)) {
+        const int row = min((b.lane & 7) + (b.lane & 8), suffix - 1);  // rows beyond the last key hold anything
+        const u32 from = b.base + M_X + X_SUFFIX + row * RS + (b.lane >> 4) * 16;
+        auto fetch = [&](int k) {
+          uint4 v;
+          ldmatrix(v, from + k * 32);
+          return v;
+        };
+        score(b, fetch, half, KT * 16, scale);
+      }
     } else if (group == 2) {
       fetch_suffix(b, kv, bit, 1, threadIdx.x & 127, suffix0, suffix);
     }
@@ -238,24 +253,32 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   const bool mine = b.warp < QT;
 #pragma unroll 1
   for (int i = 0; i < slots; ++i) {
-    const u32 slot = take_slot(b), rows = b.base + M_RING + slot * SLOT;
-    const int first = i * SLOT_KEYS;
+    const u32 slot = take_slot(b);
+    const byte* from = b.ring(slot) + b.warp * FRAGMENT;
     u32 seen = 0;
     if (mine) {
 #pragma unroll
       for (int sub = 0; sub < SLOT_TILES; ++sub)
-        if (first + sub * 16 < prefix)
-          seen ^= weigh(b, c, rows + sub * 16 * RS, prefix - first - sub * 16, b.warp, i * SLOT_TILES + sub);
+        if (i * SLOT_TILES + sub < tiles) {
+          const uint4 v = load_fragment(from + sub * KEY_TILE, b.lane);
+          seen ^= fold(v);
+          weigh(b, c, v, i * SLOT_TILES + sub);
+        }
     }
     give_slot(b, slot, seen);
   }
   if (mine) {
-    if (suffix > 0) weigh(b, c, b.base + M_X + X_SUFFIX + SUFFIX * RS, suffix, b.warp, KT);
+    if (suffix > 0) {
+      const int row = min((b.lane & 7) + ((b.lane >> 4) << 3), suffix - 1);  // the others' probabilities are 0
+      uint4 v;
+      ldmatrix_transposed(v, b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (b.warp * 16 + (b.lane & 8)) * 2);
+      weigh(b, c, v, KT);
+    }
     const int owner = ((b.warp + 1) * S - 1) / QT, tile = b.warp - share(QT, S, owner);
 #pragma unroll
     for (int n = 0; n < NT; ++n)
       if (n * 8 + 2 * b.t() < T)
-        send(at_rank(b.base + M_X + X_COMB + (b.rank * QTL + tile) * PARTIAL + n * 512 + b.lane * 16, owner),
+        send(at_rank(b.base + M_X + X_COMB + ((b.rank * QTL + tile) * NT + n) * 512 + b.lane * 16, owner),
              make_float4(c[n][0], c[n][1], c[n][2], c[n][3]), at_rank(b.bar(BAR_COMB), owner));
   }
   MARK(7)
@@ -278,7 +301,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       float4 o = make_float4(0, 0, 0, 0);
 #pragma unroll
       for (int s = 0; s < S; ++s) {
-        const float4 v = *(const float4*)(b.smem + M_X + X_COMB + (s * QTL + tile) * PARTIAL + n * 512 + b.lane * 16);
+        const float4 v = *(const float4*)(b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * 512 + b.lane * 16);
         const float w0 = exp2_approx(ml[s][0].x - top0), w1 = exp2_approx(ml[s][1].x - top1);
         sum0 += w0 * ml[s][0].y, sum1 += w1 * ml[s][1].y;
         o.x += w0 * v.x, o.y += w1 * v.y, o.z += w0 * v.z, o.w += w1 * v.w;

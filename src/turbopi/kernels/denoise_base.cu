@@ -1,5 +1,5 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
-// Part 1 of 4, which denoise_cluster.py puts together: sizes, shared memory, primitives.
+// Part 1 of 6, which denoise.py puts together: sizes, shared memory, a CTA's view.
 //
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
@@ -23,9 +23,14 @@ typedef unsigned char byte;
 
 constexpr int D = TP_D, F = TP_F, L = TP_L, NH = TP_NH, HD = TP_HD, T = TP_T, A = TP_A;
 constexpr int S = TP_S, NC = TP_NC;                                   // CTAs of a cluster, clusters
-constexpr int KEYS = TP_KEYS;                                         // prefix keys of one rank, at most
+constexpr int KEY_TILES = TP_KEY_TILES;                               // tiles of prefix keys, at most
 constexpr int W = 16, CONSUMERS = W * 32, THREADS = CONSUMERS + 128;  // registers are dealt out by warpgroup
 constexpr int NT = (T + 7) / 8;
+constexpr bool FP8 = TP_FP8;         // weights in E4M3, which become float16, and so do the activations they meet
+constexpr int KB = FP8 ? 2 : 1;      // blocks of a fragment of weights
+// Activations are made smaller before they become float16, whose range ends at 65504: the stream isn't divided by its
+// rms yet, and hidden units have outliers. What that costs lies 2^-20 below 1.
+constexpr float SMALLER = FP8 ? 1.0f / TP_DIVISOR : 1;
 constexpr int D16 = D / 16, F16 = F / 16, QT = HD / 16, KVT = HD / 8;
 
 // n things shared out between `parts`: which is the first of part i, and how many a part has at most.
@@ -40,6 +45,8 @@ constexpr int GTL = most(2 * HC, S);       // gate|up tiles of a CTA: 8 hidden u
 constexpr int QTL = most(QT, S);           // query tiles of a CTA: 8 RoPE pairs each
 constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
+constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
+constexpr u32 PATIENCE = FEW ? 600 : 0;    // clock cycles before sums are asked for: polls slow down what they wait for
 constexpr int ITEMS_X = most(DX * NT, W);  // (tile, 8 tokens) of the slice that one warp looks after
 static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NC >= NH && A <= CONSUMERS,
               "sizes");
@@ -49,7 +56,7 @@ static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64
 __host__ __device__ constexpr int group_tiles(int left) { return left >= 8 ? 8 : left >= 4 ? 4 : left >= 2 ? 2 : 1; }
 template <int TILES_, bool WIDE>
 struct Group {
-  static constexpr int TPW = TILES_ == 8 && WIDE ? 2 : 1, MG = TILES_ / TPW, KS = W / MG, PARTIALS = TILES_ * KS;
+  static constexpr int TPW = TILES_ == 8 && WIDE ? 2 : 1, MG = TILES_ / TPW, KS = W / MG;
 };
 __host__ __device__ constexpr int plan_tpw(int mt, bool wide) {  // tiles a warp takes in all groups
   int n = 0;
@@ -57,26 +64,30 @@ __host__ __device__ constexpr int plan_tpw(int mt, bool wide) {  // tiles a warp
   return n;
 }
 __host__ __device__ constexpr int plan_partials(int mt, bool wide) { return plan_tpw(mt, wide) * W; }
-constexpr int PARTIAL = NT * 512;  // bytes of one tile's partial sums
+constexpr int TAIL = (T - (NT - 1) * 8 + 1) / 2;       // pairs of tokens among the last 8
+constexpr int PARTIAL = (NT - 1) * 512 + TAIL * 128;  // bytes of one tile's partial sums
 
 // ---- shared memory
 
-constexpr int RS = HD * 2 + 16;  // bytes of a key's or value's row: no bank conflicts for ldmatrix
+constexpr int RS = HD * 2 + 16;  // bytes of a suffix key's or value's row: no bank conflicts for ldmatrix
 constexpr int FRAGMENT = 512, ROW = W * FRAGMENT, RPS = TP_RPS;  // a row: one fragment per warp; rows per slot
-constexpr int SLOT_TILES = RPS, SLOT_KEYS = SLOT_TILES * 16;
-constexpr int SLOT = up128(imax(RPS * ROW, SLOT_KEYS * RS));
-constexpr int KT = most(KEYS, SLOT_KEYS) * SLOT_TILES;  // tiles of a rank's prefix keys
-constexpr int SUFFIX = most(T, S);                      // suffix keys of a rank, at most 16
+constexpr int SLOT = RPS * ROW;
+constexpr int KEY_TILE = QT * FRAGMENT;     // bytes of 16 keys, or values
+constexpr int SLOT_TILES = RPS;             // of them in a slot
+constexpr int KT = most(KEY_TILES, S);      // tiles of a rank's prefix keys
+constexpr int SUFFIX = most(T, S);          // suffix keys of a rank, at most 16
+static_assert(SLOT_TILES * KEY_TILE <= SLOT && 8 % SLOT_TILES == 0, "a slot's keys");
 static_assert(SUFFIX <= 16, "more suffix keys than a tile");
 // In small models a CTA may have no hidden units. It sends a word in their place, to keep the others from running
 // ahead.
-constexpr bool IDLE = 2 * (F16 / NC) < S;
+constexpr bool IDLE = 2 * (F16 / NC) < S, IDLE_Q = QT < S;  // the same of queries
 constexpr int LS = (KT + 1) * 16 + 4;  // floats of a token's logits
+constexpr bool SPLIT_KEYS = FEW && QT % 2 == 0;  // two warps share a tile of keys by its columns, else by tokens
 
 // A message lands without asking, so its place must be free at every receiver before any sender can have it. What makes
 // it so: a rank goes on only with what it got from all ranks of its cluster, and each sends its part of an exchange
-// when it is done with all before it in the program (the squares of a slice, for one, follow a barrier of the CTA's
-// warps).
+// when all its warps that have work in what goes before are done with it: they each send a part, or follow a barrier of
+// the CTA's warps.
 //
 // Region X holds the stream (operand of qkv and gate|up). When those have read it, their partial sums lie there, then
 // attention's logits, probabilities, suffix keys and values, and the partial outputs that other ranks send.
@@ -84,8 +95,8 @@ constexpr int LS = (KT + 1) * 16 + 4;  // floats of a token's logits
 //   attention's outputs over them: so they land later still; the next slice follows attention's maxima of all ranks
 //   sums of gate|up over the stream: the next slice lands when a peer has this rank's hidden units, made of those sums
 constexpr int X_BYTES = D16 * NT * 256;
-constexpr int X_ML = 0, X_COMB = X_ML + up128(S * T * 8), X_LOGITS = X_COMB + S * QTL * PARTIAL;
-constexpr int X_P = X_LOGITS + up128(T * LS * 4), X_SUFFIX = X_P + (KT + 1) * NT * 256;
+constexpr int X_ML = 0, X_COMB = X_ML + up128(S * T * 8), X_LOGITS = X_COMB + S * QTL * NT * 512;
+constexpr int X_P = X_LOGITS + up128((SPLIT_KEYS ? 2 : 1) * T * LS * 4), X_SUFFIX = X_P + (KT + 1) * NT * 256;
 constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);  // between steps
 constexpr int X_SIZE =
     up128(imax(imax(X_BYTES, X_SUFFIX + 2 * SUFFIX * RS),
@@ -96,10 +107,22 @@ constexpr int X_SIZE =
 constexpr int H_Q = 0, H_ATT = QT * NT * 256, H_BYTES = imax(2 * QT, HC) * NT * 256;
 constexpr int H_SIZE = up128(imax(imax(H_BYTES, plan_partials(DX, false) * PARTIAL), T * A * 4));
 
-constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + H_SIZE;  // M_SSQ: float32[S][NT * 8], sums of squares by slice
-constexpr int M_PART = M_SSQ + up128(S * NT * 32);                // the same of this slice, by tile
+// Sums of squares of the stream, float32[SQ][NT * 8]: by tile if tokens are few, else by slice.
+constexpr int SQ = FEW ? S * DX : S;
+__host__ __device__ constexpr int plan_slots(int mt, bool wide, int blocks) {
+  int n = 0;
+  for (; mt > 0; mt -= group_tiles(mt)) {
+    const int size = group_tiles(mt), tpw = plan_tpw(size, wide);
+    n += most(tpw * most(most(blocks, KB), W / (size / tpw)), RPS);
+  }
+  return n;
+}
+constexpr int MAX_SLOTS = plan_slots(QTL, true, D16) + plan_slots(KVL, true, D16) + 2 * most(KT, SLOT_TILES) +
+                          plan_slots(DX, false, QT) + plan_slots(GTL, true, D16) + plan_slots(DX, false, HC);
+constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + H_SIZE;
+constexpr int M_PART = M_SSQ + up128(SQ * NT * 32);  // of this slice, by tile
 constexpr int M_BAR = M_PART + up128(DX * NT * 32), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
-              M_RING = M_BAR + 512;
+              M_LIST = M_BAR + 512, M_RING = M_LIST + up128(MAX_SLOTS * 8);
 constexpr int STAGES = (TP_SMEM - M_RING) / SLOT < 12 ? (TP_SMEM - M_RING) / SLOT : 12;
 static_assert(STAGES >= 2, "too little shared memory");
 
@@ -110,7 +133,7 @@ enum Barrier { BAR_X, BAR_Q, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RING
 constexpr size_t N_STREAM = size_t(NC) * D16 * NT * 32;  // partial sums of the stream, of all clusters
 constexpr size_t N_KV = size_t(T) * HD / 2;              // suffix keys and values, float32[T][2 HD]
 constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM, SCRATCH = B_KV + 2 * N_KV;
-static_assert(SCRATCH == TP_SCRATCH, "denoise_cluster.py disagrees on the scratch memory");
+static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");
 
 struct Args {
   const byte* weights;      // fragments [L][layer_bytes], a CTA's in the order in which it uses them
@@ -124,6 +147,7 @@ struct Args {
   const float* inv_freq;    // [HD/2]
   const byte* cache_k;      // bf16 [L][rows][HD], layer_stride bytes from layer to layer
   const byte* cache_v;
+  byte* keys;               // bf16 [L][2][KEY_TILES][QT] fragments: the same, as the tensor cores take it
   const long long* length;  // valid rows
   const float* noise;       // [T][A]
   float* x_t;               // [N+1][T][A]
@@ -134,7 +158,8 @@ struct Args {
   long long layer_stride, layer_bytes;
   int steps;
   float dt, eps;
-  u32 zero;  // 0, which the compiler doesn't know
+  u32 zero;                 // 0, which the compiler doesn't know
+  const float* row_scales;  // [L][NC * S][TILES][16]: of FP8 weights; those of out and down are in the table's gates
 };
 
 // ---- a CTA's view
@@ -181,13 +206,14 @@ struct Block {
 };
 
 // Cycles up to each mark, summed up: 0 stream here, 1 qkv multiplied, 2 sent, 3 queries here, 4 prefix scored, 5 suffix
-// scored, 6 softmax, 7 values weighed, 8 outputs here, 9 combined, 10 attention here, 11 out, 12 gathered, 13 stream
-// here, 15 gate|up multiplied, 16 sent, 17 hidden here, 18 down, 14 gathered, 19 embedded, 20 step done.
+// scored, 6 softmax, 7 values weighed, 8 outputs here, 9 combined, 10 attention here, 11 out, 12 sent, 13 stream
+// here, 15 gate|up multiplied, 16 sent, 17 hidden here, 18 down, 14 sent, 19 embedded, 20 step done. Before 12 and 14:
+// 21 and 22 partial sums here.
 #ifdef TP_TRACE
 #define MARK(i)                              \
   if (threadIdx.x == 0) {                    \
     const u32 now_ = u32(clock64());         \
-    u32* m_ = (u32*)(b.smem + M_RING - 256); \
+    u32* m_ = (u32*)(b.smem + M_BAR + 256); \
     m_[1 + (i)] += now_ - m_[0];             \
     m_[0] = now_;                            \
   }
@@ -195,198 +221,3 @@ struct Block {
 #define MARK(i)
 #endif
 
-// ---- waiting
-
-// Waits are short loops without an end of their own; a spare warp watches instead. Where the first thread waits is a
-// word in shared memory, and if that stays the same for seconds the kernel says where (in memory of the host, which
-// outlives the trap; [NC * S] words: 1 << 31 | what << 20 | layer) and traps.
-enum What {
-  WAIT_NONE,
-  WAIT_X,
-  WAIT_Q,
-  WAIT_KV,
-  WAIT_COMB,
-  WAIT_ATT,
-  WAIT_X2,
-  WAIT_HID,
-  WAIT_X1,
-  WAIT_V,
-  WAIT_GO,
-  FINISHED
-};
-__device__ __forceinline__ void note(const Block& b, int what) {
-  if (threadIdx.x == 0) *(volatile u32*)(b.smem + M_PROGRESS) = u32(what) << 20 | u32(b.n);
-}
-// What the norms of layer n need, to L2: it is read once, by everybody at the same time, while memory is busy with
-// weights.
-__device__ __forceinline__ void prefetch(const Block& b, int n) {
-  const int step = n / L, l = n % L;
-  if (step >= b.a.steps) return;
-  auto lines = [&](const float* from, int floats) {
-#pragma unroll 1
-    for (int i = b.lane * 32; i < floats; i += 32 * 32) asm volatile("prefetch.global.L2 [%0];" ::"l"(from + i));
-  };
-  const float* table = b.a.table + (size_t(step) * (2 * L + 1) + 2 * l) * 3 * D + b.x0() * 16;
-  lines(b.a.shifted + (size_t(n) * (NC * S) + b.cluster * S + b.rank) * TILES * 16, TILES * 16);
-  lines(table + 2 * D, b.xn() * 16), lines(table + 3 * D, b.xn() * 16);
-  lines(table + 5 * D, b.xn() * 16), lines(table + 6 * D, b.xn() * 16);
-}
-__device__ __forceinline__ void watch(const Block& b) {
-  u32 last = 0, layer = ~0u;
-  long long since = clock64();
-  prefetch(b, 0);
-#pragma unroll 1
-  for (u32 now = 0; now >> 20 != FINISHED; __nanosleep(500)) {
-    now = *(volatile u32*)(b.smem + M_PROGRESS);
-    if ((now & 0xfffff) != layer) layer = now & 0xfffff, prefetch(b, int(layer) + 1);
-    if (now != last) {
-      last = now, since = clock64();
-    } else if (clock64() - since > 4000000000ll) {
-      *(volatile u32*)(b.a.hang + blockIdx.x) = 1u << 31 | now;
-      __threadfence_system();
-      const long long end = clock64() + 1000000000ll;  // for the other CTAs to say where they are
-#pragma unroll 1
-      while (clock64() < end) __nanosleep(10000);
-      __trap();
-    }
-  }
-}
-
-__device__ __forceinline__ void mbar_wait(u32 bar, u32 parity) {
-  asm volatile(
-      "{\n"
-      ".reg .pred p;\n"
-      "AGAIN:\n"
-      "mbarrier.try_wait.parity.shared::cta.b64 p, [%0], %1;\n"
-      "@p bra DONE;\n"
-      "bra AGAIN;\n"
-      "DONE:\n"
-      "}" ::"r"(bar),
-      "r"(parity)
-      : "memory");
-}
-__device__ __forceinline__ void mbar_init(u32 bar, u32 count) {
-  asm volatile("mbarrier.init.shared::cta.b64 [%0], %1;" ::"r"(bar), "r"(count) : "memory");
-}
-__device__ __forceinline__ void mbar_arrive(u32 bar) {
-  asm volatile("mbarrier.arrive.shared::cta.b64 _, [%0];" ::"r"(bar) : "memory");
-}
-__device__ __forceinline__ void mbar_expect(u32 bar, u32 bytes) {
-  asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(bar), "r"(bytes) : "memory");
-}
-// All threads wait for use n of an exchange in the cluster; one of them arms the barrier for the next.
-__device__ __forceinline__ void receive(const Block& b, int bar, int n, u32 bytes, int what) {
-  note(b, what);
-  mbar_wait(b.bar(bar), n & 1);
-  __syncwarp();
-  if (threadIdx.x == 0) mbar_expect(b.bar(bar), bytes);
-}
-__device__ __forceinline__ void consumers_sync() {
-  __syncwarp();  // lanes leave a wait one by one, and this barrier counts warps
-  asm volatile("bar.sync 1, %0;" ::"n"(CONSUMERS) : "memory");
-}
-__device__ __forceinline__ void cluster_sync() {
-  asm volatile("barrier.cluster.arrive.release.aligned;\nbarrier.cluster.wait.acquire.aligned;" ::: "memory");
-}
-
-// ---- moving data
-
-__device__ __forceinline__ u32 at_rank(u32 address, int rank) {
-  u32 x;
-  asm volatile("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(x) : "r"(address), "r"(rank));
-  return x;
-}
-// An address at all ranks. All of them first, as a send reads its registers late.
-struct Everyone {
-  u32 at[S];
-  __device__ __forceinline__ explicit Everyone(u32 address) {
-#pragma unroll
-    for (int d = 0; d < S; ++d) at[d] = at_rank(address, d);
-  }
-};
-__device__ __forceinline__ void send(u32 to, u32 v, u32 bar) {
-  asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.b32 [%0], %1, [%2];" ::"r"(to), "r"(v),
-               "r"(bar)
-               : "memory");
-}
-__device__ __forceinline__ void send(u32 to, u32 v, u32 w, u32 bar) {
-  asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v2.b32 [%0], {%1, %2}, [%3];" ::"r"(to),
-               "r"(v), "r"(w), "r"(bar)
-               : "memory");
-}
-__device__ __forceinline__ void send(u32 to, float4 v, u32 bar) {
-  asm volatile(
-      "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.b32 [%0], {%1, %2, %3, %4}, [%5];" ::"r"(to),
-      "r"(__float_as_uint(v.x)), "r"(__float_as_uint(v.y)), "r"(__float_as_uint(v.z)), "r"(__float_as_uint(v.w)),
-      "r"(bar)
-      : "memory");
-}
-__device__ __forceinline__ void bulk_load(u32 to, const void* from, u32 bytes, u32 bar, u64 policy) {
-  asm volatile(
-      "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes.L2::cache_hint [%0], [%1], %2, [%3], %4;" ::
-          "r"(to),
-      "l"(from), "r"(bytes), "r"(bar), "l"(policy)
-      : "memory");
-}
-
-// Words through L2 whose lowest bit is their flag. Use n of a double buffer carries bit `flag(n)`: 1, 1, 0, 0, 1, ...
-__device__ __forceinline__ u32 flag(int n) { return ((n >> 1) & 1) ^ 1; }
-__device__ __forceinline__ u32 flagged(float v, u32 bit) { return (__float_as_uint(v) & ~1u) | bit; }
-__device__ __forceinline__ uint4 peek(const uint4* p) {
-  uint4 v;
-  asm volatile("ld.relaxed.gpu.global.v4.u32 {%0, %1, %2, %3}, [%4];"
-               : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w)
-               : "l"(p)
-               : "memory");
-  return v;
-}
-__device__ __forceinline__ bool missing(uint4 v, u32 bit) {
-  return ((v.x ^ bit) | (v.y ^ bit) | (v.z ^ bit) | (v.w ^ bit)) & 1;
-}
-__device__ __forceinline__ void publish(uint4* p, float4 v, u32 bit) {
-  asm volatile("st.relaxed.gpu.global.v4.u32 [%0], {%1, %2, %3, %4};" ::"l"(p), "r"(flagged(v.x, bit)),
-               "r"(flagged(v.y, bit)), "r"(flagged(v.z, bit)), "r"(flagged(v.w, bit))
-               : "memory");
-}
-__device__ __forceinline__ void publish(float* p, float v, u32 bit) {
-  asm volatile("st.relaxed.gpu.global.u32 [%0], %1;" ::"l"(p), "r"(flagged(v, bit)) : "memory");
-}
-// v[i] = p[i * stride], asked for until it is there.
-template <int N>
-__device__ __forceinline__ void poll(uint4 (&v)[N], const uint4* p, size_t stride, u32 bit) {
-#pragma unroll
-  for (int i = 0; i < N; ++i) v[i] = peek(p + i * stride);
-#pragma unroll 1
-  for (;;) {
-    bool again = false;
-#pragma unroll
-    for (int i = 0; i < N; ++i)
-      if (missing(v[i], bit)) v[i] = peek(p + i * stride), again = true;
-    if (!again) return;
-  }
-}
-
-// ---- arithmetic
-
-__device__ __forceinline__ u32 pack(float lo, float hi) {
-  u32 v;
-  asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(v) : "f"(hi), "f"(lo));
-  return v;
-}
-__device__ __forceinline__ void mma(float (&c)[4], uint4 a, uint2 b) {
-  asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
-      : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
-      : "r"(a.x), "r"(a.y), "r"(a.z), "r"(a.w), "r"(b.x), "r"(b.y));
-}
-template <int N>
-__device__ __forceinline__ void clear(float (&c)[N][4]) {
-#pragma unroll
-  for (int i = 0; i < N; ++i) c[i][0] = c[i][1] = c[i][2] = c[i][3] = 0;
-}
-__device__ __forceinline__ float exp2_approx(float x) {
-  float y;
-  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
-  return y;
-}
-__device__ __forceinline__ float exchange(float v, int mask) { return __shfl_xor_sync(~0u, v, mask); }
-__device__ __forceinline__ u32 exchange(u32 v, int mask) { return __shfl_xor_sync(~0u, v, mask); }

@@ -1,4 +1,4 @@
-// Part 4 of 4: between steps, the loop, the kernel.
+// Part 6 of 6: between steps, the loop, the kernel.
 
 constexpr int GROUPS = CONSUMERS / A, HELD = most(T, GROUPS);  // threads per action number, tokens each of them keeps
 
@@ -49,6 +49,8 @@ __device__ __forceinline__ void embed(const Block& b, const Actions& actions, fl
   if (b.attends()) send_squares(b, x, BAR_X);
 }
 
+constexpr u32 V_EXPECT = S * T * A * 4 + SQUARES_EXPECT;
+
 // Final norm, action_out_proj and the Euler step. Each rank's slice gives partial sums of v_t, which go to all ranks.
 // Region X is free for them: every rank's hidden units have come, so no gate|up sums are still being read there.
 __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4 (&x)[ITEMS_X], const float* scale,
@@ -63,6 +65,7 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
     if (item.real && item.token + 1 < T) p[1] = x[j].y * s.x, p[T + 1] = x[j].w * s.y;
   }
   send_squares(b, x, BAR_V);
+  if (FEW) consumers_sync();
   float sum[HELD];
 #pragma unroll
   for (int i = 0; i < HELD; ++i) sum[i] = 0;
@@ -84,7 +87,7 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
           send(at_rank(b.base + M_X + X_VPART + (mine + i * GROUPS * A) * 4, d), __float_as_uint(sum[i]),
                at_rank(b.bar(BAR_V), d));
   }
-  receive(b, BAR_V, step, S * T * (A + 1) * 4, WAIT_V);
+  receive(b, BAR_V, step, V_EXPECT, WAIT_V);
   if (active) {
     const float* parts = (const float*)(b.smem + M_X + X_VPART);
     const float* squares = (const float*)(b.smem + M_SSQ);
@@ -95,7 +98,9 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
       if (token < T) {
         float v = 0, q = 0;
 #pragma unroll
-        for (int s = 0; s < S; ++s) v += parts[s * T * A + at], q += squares[s * NT * 8 + token];
+        for (int s = 0; s < S; ++s) v += parts[s * T * A + at];
+#pragma unroll
+        for (int s = 0; s < SQ; ++s) q += squares[s * NT * 8 + token];
         v = v * rsqrtf(q * (1.0f / D) + b.a.eps) + shift;
         actions.x[i] = __fadd_rn(actions.x[i], __fmul_rn(b.a.dt, v));
         if (blockIdx.x == 0) {
@@ -137,7 +142,7 @@ __device__ __forceinline__ void consume(Block& b) {
   float4 x[ITEMS_X];
   const u32 expect_hidden = hidden_bytes(b);
 #ifdef TP_TRACE
-  if (threadIdx.x < 64) ((u32*)(b.smem + M_RING - 256))[threadIdx.x] = threadIdx.x ? 0 : u32(clock64());
+  if (threadIdx.x < 64) ((u32*)(b.smem + M_BAR + 256))[threadIdx.x] = threadIdx.x ? 0 : u32(clock64());
   consumers_sync();
 #endif
 #pragma unroll 1
@@ -148,6 +153,7 @@ __device__ __forceinline__ void consume(Block& b) {
 #pragma unroll 1
     for (int l = 0; l < L; ++l, ++b.n, table += 6 * D) {
       const float* shifted = a.shifted + ((size_t(step) * L + l) * (NC * S) + cta) * TILES * 16;
+      const float* row_scales = FP8 ? a.row_scales + (size_t(l) * (NC * S) + cta) * TILES * 16 : nullptr;
       const u32 bit = flag(b.n);
 #pragma unroll 1
       for (int half = 0; half < 2; ++half) {  // attention, feed-forward; what they share is one piece of code
@@ -158,13 +164,13 @@ __device__ __forceinline__ void consume(Block& b) {
           b.x_parity ^= 1;
           MARK(half ? 13 : 0)
           if (half) {
-            gate_up(b, shifted);
+            gate_up(b, shifted, row_scales);
             MARK(16)
             receive(b, BAR_HID, b.n, expect_hidden, WAIT_HID);
             MARK(17)
           } else {
             float* const kv = (float*)(a.scratch + B_KV + (b.n & 1) * N_KV);
-            project(b, shifted, kv, bit, rope);
+            project(b, shifted, row_scales, kv, bit, rope);
             MARK(2)
             attend(b, kv, bit, prefix);
           }
@@ -176,7 +182,8 @@ __device__ __forceinline__ void consume(Block& b) {
           residual_product(b, b.smem + M_H + (half ? 0 : H_ATT), half ? b.hn() : QT, buffer, bit);
         MARK(half ? 18 : 11)
         note(b, half ? WAIT_X1 : WAIT_X2);
-        gather(b, x, buffer, half ? NC : NH, bit, gates, scales, !half || (l + 1 < L && b.attends()));
+        gather(b, x, buffer, half ? NC : NH, bit, gates, scales,
+               !half || (l + 1 < L && b.attends()), half);
         MARK(half ? 14 : 12)
       }
     }
@@ -186,7 +193,7 @@ __device__ __forceinline__ void consume(Block& b) {
   note(b, FINISHED);
 #ifdef TP_TRACE
   consumers_sync();
-  if (threadIdx.x < 64) a.trace[blockIdx.x * 64 + threadIdx.x] = ((u32*)(b.smem + M_RING - 256))[threadIdx.x];
+  if (threadIdx.x < 64) a.trace[blockIdx.x * 64 + threadIdx.x] = ((u32*)(b.smem + M_BAR + 256))[threadIdx.x];
 #endif
 }
 
@@ -201,11 +208,11 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     mbar_init(b.bar(BAR_GO), S);
     asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     mbar_expect(b.bar(BAR_X), X_EXPECT);
-    mbar_expect(b.bar(BAR_Q), HD * T * 2);
+    mbar_expect(b.bar(BAR_Q), Q_EXPECT);
     mbar_expect(b.bar(BAR_COMB), S * T * 8 + S * b.qn() * ((T + 1) / 2) * 128);
     mbar_expect(b.bar(BAR_ATT), HD * T * 2);
     mbar_expect(b.bar(BAR_HID), hidden_bytes(b));
-    mbar_expect(b.bar(BAR_V), S * T * (A + 1) * 4);
+    mbar_expect(b.bar(BAR_V), V_EXPECT);
   }
   __syncthreads();
   cluster_sync();
@@ -215,8 +222,10 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
   } else {
     asm volatile("setmaxnreg.dec.sync.aligned.u32 32;");
     if (b.warp == W) {
-      Producer producer(b);
-      producer.run();
+      if (b.lane == 0) {
+        Producer producer(b);
+        producer.run();
+      }
     } else if (b.warp == W + 1) {
       watch(b);
     }

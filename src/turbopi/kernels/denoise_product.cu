@@ -1,93 +1,4 @@
-// Part 2 of 4: the producer of weights, keys and values, and matrix products.
-
-// ---- producer: one warp, which never waits for activations
-
-struct Producer {
-  Block& b;
-  u64 once, keep;  // L2 policies: weights are read once a step; keys and values by every cluster, every step
-  const byte* w;
-
-  __device__ explicit Producer(Block& block) : b(block) {
-    asm volatile("createpolicy.fractional.L2::evict_first.b64 %0, 1.0;" : "=l"(once));
-    asm volatile("createpolicy.fractional.L2::evict_last.b64 %0, 1.0;" : "=l"(keep));
-  }
-  __device__ __forceinline__ void acquire() {  // the next slot, when its last contents have been read
-    if (b.lane == 0) mbar_wait(b.empty(b.slot), b.phase ^ 1);
-  }
-  __device__ __forceinline__ void next() {
-    if (++b.slot == STAGES) b.slot = 0, b.phase ^= 1;
-  }
-  template <int MT, bool WIDE, int FIRST = 0>
-  __device__ __forceinline__ void product(int blocks, int tiles) {
-    if constexpr (FIRST < MT) {
-      constexpr int N = group_tiles(MT - FIRST);
-      using G = Group<N, WIDE>;
-      if (FIRST < tiles) {
-        const int rows = G::TPW * most(blocks, G::KS);
-#pragma unroll 1
-        for (int r = 0; r < rows; r += RPS) {
-          const u32 bytes = min(RPS, rows - r) * ROW;
-          acquire();
-          if (b.lane == 0) {
-            mbar_expect(b.full(b.slot), bytes);
-            bulk_load(b.base + M_RING + b.slot * SLOT, w, bytes, b.full(b.slot), once);
-          }
-          w += bytes;
-          next();
-        }
-        product<MT, WIDE, FIRST + N>(blocks, tiles);
-      }
-    }
-  }
-  // Rows of keys or values, to rows that are RS bytes apart. All lanes load: the bulk copies of 70 rows would cost this
-  // warp some 70 x 100 cycles, as it has to issue them one by one.
-  __device__ __forceinline__ void keys(const byte* rows, int count) {
-    constexpr int PIECES = HD / 8;  // of 16 bytes in a row
-#pragma unroll 1
-    for (int k = 0; k < count; k += SLOT_KEYS) {
-      const int pieces = min(SLOT_KEYS, count - k) * PIECES;
-      const u32 to = b.base + M_RING + b.slot * SLOT, full = b.full(b.slot);
-      const byte* from = rows + size_t(k) * HD * 2;
-      acquire();
-      __syncwarp();
-      u32 at = to + b.lane / PIECES * RS + b.lane % PIECES * 16;
-      from += b.lane * 16;
-#pragma unroll 1
-      for (int i = b.lane; i < pieces; i += 32, from += 512) {
-        if (32 % PIECES != 0) at = to + i / PIECES * RS + i % PIECES * 16;
-        asm volatile("cp.async.cg.shared.global.L2::cache_hint [%0], [%1], 16, %2;" ::"r"(at), "l"(from), "l"(keep)
-                     : "memory");
-        at += 32 / PIECES * RS;
-      }
-      // each lane arrives when its loads are here (and is expected from now on), the first one for the slot as a whole
-      asm volatile("cp.async.mbarrier.arrive.shared::cta.b64 [%0];" ::"r"(full) : "memory");
-      __syncwarp();
-      if (b.lane == 0) mbar_arrive(full);
-      next();
-    }
-  }
-  __device__ void run() {
-    const int prefix = int(*b.a.length), first = share(prefix, S, b.rank), count = share(prefix, S, b.rank + 1) - first;
-    const byte* mine = b.a.weights + b.a.starts[b.cluster * S + b.rank];
-#pragma unroll 1
-    for (int step = 0; step < b.a.steps; ++step)
-#pragma unroll 1
-      for (int l = 0; l < L; ++l, ++b.n) {
-        w = mine + l * b.a.layer_bytes;
-        if (b.attends()) {
-          product<QTL, true>(D16, b.qn());
-          product<KVL, true>(D16, b.kvn());
-          keys(b.a.cache_k + l * b.a.layer_stride + size_t(first) * HD * 2, count);
-          keys(b.a.cache_v + l * b.a.layer_stride + size_t(first) * HD * 2, count);
-          product<DX, false>(QT, b.xn());
-        }
-        product<GTL, true>(D16, b.gn());
-        product<DX, false>(b.hn(), b.xn());
-      }
-  }
-};
-
-// ---- products
+// Part 4 of 6: matrix products and the residual stream.
 
 __device__ __forceinline__ u32 take_slot(Block& b) {
   const u32 slot = b.slot;
@@ -112,34 +23,51 @@ template <int TILES_, bool WIDE, int EVEN>
 __device__ __forceinline__ void multiply_group(Block& b, const byte* x, int blocks, float (*acc)[NT][4]) {
   using G = Group<TILES_, WIDE>;
   constexpr int TPW = G::TPW, KS = G::KS, KPS = RPS / TPW;  // steps along the reduction in one slot
-  constexpr bool EXACT = EVEN % (KS * KPS) == 0;
-  const int ks = b.warp % KS, slots = most(most(blocks, KS), KPS);
+  static_assert(KPS > 0, "a slot holds a step");
+  constexpr bool EXACT = EVEN % (KB * KS * KPS) == 0;
+  constexpr bool ROOM = !FP8 || FEW;  // registers for a slot's activations
+  const int ks = b.warp % KS, slots = most(most(most(blocks, KB), KS), KPS);
 #pragma unroll
   for (int i = 0; i < TPW; ++i) clear(acc[i]);
-  const byte* mine = x + ks * NT * 256 + b.lane * 8;
+  const byte* mine = x + ks * KB * NT * 256 + b.lane * 8;
 #pragma unroll 1
   for (int s0 = 0; s0 < slots; ++s0) {
     uint4 w[KPS][TPW];
-    uint2 v[KPS][NT];
+    uint2 v[KPS][KB][NT];
+    auto exists = [&](int k, int h) { return EXACT || ((s0 * KPS + k) * KS + ks) * KB + h < blocks; };
+    auto activation = [&](int k, int h, int n) {
+      return *(const uint2*)(mine + (((s0 * KPS + k) * KS * KB + h) * NT + n) * 256);
+    };
+    auto load_activations = [&] {
+#pragma unroll
+      for (int k = 0; k < KPS; ++k)
+#pragma unroll
+        for (int h = 0; h < KB; ++h)
+          if (exists(k, h))
+#pragma unroll
+            for (int n = 0; n < NT; ++n) v[k][h][n] = activation(k, h, n);
+    };
+    if (FEW) load_activations();  // they don't wait for the slot
     const u32 slot = take_slot(b);
     const byte* from = b.ring(slot) + b.warp * FRAGMENT;
-    u32 seen = 0;
 #pragma unroll
     for (int k = 0; k < KPS; ++k)
 #pragma unroll
       for (int j = 0; j < TPW; ++j) w[k][j] = load_fragment(from + (k * TPW + j) * ROW, b.lane);
+    if (!FEW && ROOM) load_activations();
+    u32 seen = 0;
 #pragma unroll
     for (int k = 0; k < KPS; ++k)
-      if (EXACT || (s0 * KPS + k) * KS + ks < blocks) {
 #pragma unroll
-        for (int n = 0; n < NT; ++n) v[k][n] = *(const uint2*)(mine + ((s0 * KPS + k) * KS * NT + n) * 256);
+      for (int h = 0; h < KB; ++h)
+        if (exists(k, h)) {
 #pragma unroll
-        for (int j = 0; j < TPW; ++j) {
-          seen ^= fold(w[k][j]);
+          for (int j = 0; j < TPW; ++j) {
+            if (h == 0) seen ^= fold(w[k][j]);
 #pragma unroll
-          for (int n = 0; n < NT; ++n) mma(acc[j][n], w[k][j], v[k][n]);
+            for (int n = 0; n < NT; ++n) mma_weights(acc[j][n], w[k][j], h, ROOM ? v[k][h][n] : activation(k, h, n));
+          }
         }
-      }
     give_slot(b, slot, seen);
   }
 }
@@ -156,6 +84,10 @@ __device__ __forceinline__ void multiply(Block& b, const byte* x, int blocks, in
   }
 }
 
+// Where a lane's partial sums of 8 tokens lie. Of the last 8 only pairs that exist are kept.
+__device__ __forceinline__ int partial_place(const Block& b, int n) {
+  return n * 512 + (TAIL == 4 || n + 1 < NT ? b.lane : b.g() * TAIL + min(b.t(), TAIL - 1)) * 16;
+}
 // The warps' partial sums to shared memory, and a tile's total back, always in the same order.
 template <int MT, bool WIDE, int FIRST = 0, int AT = 0>
 __device__ __forceinline__ void store_partials(const Block& b, byte* to, int tiles, float (*acc)[NT][4]) {
@@ -168,8 +100,9 @@ __device__ __forceinline__ void store_partials(const Block& b, byte* to, int til
 #pragma unroll
         for (int n = 0; n < NT; ++n) {
           const int tile = j * G::MG + b.warp / G::KS, part = AT * W + tile * G::KS + b.warp % G::KS;
-          *(float4*)(to + part * PARTIAL + n * 512 + b.lane * 16) =
-              make_float4(acc[AT + j][n][0], acc[AT + j][n][1], acc[AT + j][n][2], acc[AT + j][n][3]);
+          if (n + 1 < NT || b.t() < TAIL)
+            *(float4*)(to + part * PARTIAL + partial_place(b, n)) =
+                make_float4(acc[AT + j][n][0], acc[AT + j][n][1], acc[AT + j][n][2], acc[AT + j][n][3]);
         }
       store_partials<MT, WIDE, FIRST + N, AT + G::TPW>(b, to, tiles, acc);
     }
@@ -181,7 +114,7 @@ __device__ __forceinline__ float4 total(const Block& b, const byte* from, int ti
   using G = Group<N, WIDE>;
   if constexpr (FIRST + N < MT)
     if (tile >= FIRST + N) return total<MT, WIDE, FIRST + N, AT + G::TPW>(b, from, tile, n);
-  const byte* p = from + (AT * W + (tile - FIRST) * G::KS) * PARTIAL + n * 512 + b.lane * 16;
+  const byte* p = from + (AT * W + (tile - FIRST) * G::KS) * PARTIAL + partial_place(b, n);
   float4 v[G::KS];
 #pragma unroll
   for (int i = 0; i < G::KS; ++i) v[i] = *(const float4*)(p + i * PARTIAL);
@@ -209,7 +142,7 @@ __device__ __forceinline__ Item stream_item(const Block& b, int j) {
 // ranks.
 __device__ __forceinline__ void send_columns(const Block& b, int region, int block, int n, float4 v, int bar,
                                              bool real) {
-  const u32 w0 = pack(v.x, v.z), w1 = pack(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
+  const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
   const int token = 2 * b.t() + (b.g() & 1);
   const u32 to = b.base + region + (block * NT + n) * 256 + (token * 4 + (b.g() >> 1)) * 8;
   if (real && n * 8 + token < T) {
@@ -219,8 +152,28 @@ __device__ __forceinline__ void send_columns(const Block& b, int region, int blo
     for (int d = 0; d < S; ++d) send(data.at[d], lo, hi, bars.at[d]);
   }
 }
-// Sums of squares of this slice, to all ranks.
+// Sums of squares to all ranks, which add them up. If tokens are few every warp sends those of its tiles, as soon as it
+// has them; else they are added up for the slice before.
+__device__ __forceinline__ void send_tile_squares(const Block& b, float4 x, int i, int bar) {
+  const int xn = b.xn(), absent = i - xn * NT;  // tiles that a rank lacks are sent as zeros
+  if (i >= DX * NT) return;
+  const int lacks = imax(DX - xn, 1);
+  const int tile = absent < 0 ? i % xn : xn + absent % lacks, n = absent < 0 ? i / xn : absent / lacks;
+  float q0 = x.x * x.x + x.z * x.z, q1 = x.y * x.y + x.w * x.w;
+#pragma unroll
+  for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
+  if (absent >= 0) q0 = q1 = 0;
+  static_assert(S == 8, "lane g serves rank g");
+  const u32 to = b.base + M_SSQ + ((b.rank * DX + tile) * NT * 8 + n * 8 + 2 * b.t()) * 4;
+  if (n * 8 + 2 * b.t() < T)
+    send(at_rank(to, b.g()), __float_as_uint(q0), __float_as_uint(q1), at_rank(b.bar(bar), b.g()));
+}
 __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[ITEMS_X], int bar) {
+  if constexpr (FEW) {
+#pragma unroll
+    for (int j = 0; j < ITEMS_X; ++j) send_tile_squares(b, x[j], b.warp + j * W, bar);
+    return;
+  }
   float* part = (float*)(b.smem + M_PART);
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
@@ -241,17 +194,21 @@ __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[I
     send(at_rank(b.base + M_SSQ + (b.rank * NT * 8 + token) * 4, d), __float_as_uint(sum), at_rank(b.bar(bar), d));
   }
 }
-// 1 / rms of tokens `token` and `token` + 1 (even), when all slices' sums are here.
+constexpr u32 SQUARES_EXPECT = FEW ? SQ * ((T + 1) / 2) * 8 : SQ * T * 4;
+// 1 / rms of tokens `token` and `token` + 1 (even; the same in lanes of equal t), when all sums are here.
 __device__ __forceinline__ float2 inverse_rms(const Block& b, int token) {
   float2 sum = make_float2(0, 0);
 #pragma unroll
-  for (int s = 0; s < S; ++s) {
+  for (int s = FEW ? b.g() : 0; s < SQ; s += FEW ? 8 : 1) {
     const float2 v = *(const float2*)(b.smem + M_SSQ + (s * NT * 8 + token) * 4);
     sum.x += v.x, sum.y += v.y;
   }
+  if (FEW)
+#pragma unroll
+    for (int o = 4; o < 32; o *= 2) sum.x += exchange(sum.x, o), sum.y += exchange(sum.y, o);
   return make_float2(rsqrtf(sum.x * (1.0f / D) + b.a.eps), rsqrtf(sum.y * (1.0f / D) + b.a.eps));
 }
-constexpr u32 X_EXPECT = D16 * T * 32 + S * T * 4;
+constexpr u32 X_EXPECT = D16 * T * 32 + SQUARES_EXPECT;
 
 // A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
 __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X], const float* row) {
@@ -263,12 +220,14 @@ __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X
 // Fetch `parts` clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
 // slice times the next norm's scale to all ranks. buffer: [NC][D16][NT][32] 16-byte words.
 __device__ __forceinline__ void gather(const Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
-                                       const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on) {
-  constexpr int FETCH = NC < 8 ? NC : 8;
+                                       const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
+                                       int half) {
+  constexpr int FETCH = NH < 8 ? NH : 8;  // no more than there ever are
   constexpr size_t STRIDE = size_t(D16) * NT * 32;
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
+    for (const u32 since = u32(clock64()); u32(clock64()) - since < PATIENCE;);
     if (item.real) {
       float4 sum = make_float4(0, 0, 0, 0);
 #pragma unroll 1
@@ -287,6 +246,9 @@ __device__ __forceinline__ void gather(const Block& b, float4 (&x)[ITEMS_X], con
           x[j].w += gates[j].y * sum.w;
     }
     __syncwarp();
+    if (j == 0) {
+      MARK(21 + half)
+    }
     if (send_on) {
       const float4 y =
           make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
@@ -324,15 +286,16 @@ __device__ __forceinline__ float gelu(float x) {
 
 // gate|up and GeGLU: a tile has 8 units' gate rows, then their up rows. Its partial sums lie over the stream in region
 // X, where the next slice arrives only when a peer has all of this rank's hidden units.
-__device__ __forceinline__ void gate_up(Block& b, const float* shifted) {
+__device__ __forceinline__ void gate_up(Block& b, const float* shifted, const float* row_scales) {
   constexpr int ITEMS = most(GTL * NT, W);
   const int gn = b.gn();
-  float2 shift[ITEMS];
+  float2 shift[ITEMS], scale[ITEMS];
 #pragma unroll
   for (int j = 0; j < ITEMS; ++j) {
     const int i = b.warp + j * W;
-    const float* p = shifted + (QTL + KVL + (i < gn * NT ? i % gn : 0)) * 16 + b.g();
-    shift[j] = make_float2(__ldg(p), __ldg(p + 8));
+    const int row = (QTL + KVL + (i < gn * NT ? i % gn : 0)) * 16 + b.g();
+    shift[j] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
+    if (FP8) scale[j] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
   }
   float acc[plan_tpw(GTL, true)][NT][4];
   multiply<GTL, true, D16>(b, b.smem + M_X, D16, gn, acc);
@@ -345,12 +308,13 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted) {
     const int i = b.warp + j * W;
     if (i < gn * NT) {
       const int tile = i % gn, n = i / gn, at = b.g0() + tile, token = 2 * b.t() + (b.g() & 1);
-      const float4 c = total<GTL, true>(b, b.smem + M_X, tile, n);
+      float4 c = total<GTL, true>(b, b.smem + M_X, tile, n);
+      if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
       const float2 r = inverse_rms(b, n * 8 + 2 * b.t());
       const float h0 = gelu(c.x * r.x + shift[j].x) * (c.z * r.x + shift[j].y),
                   h1 = gelu(c.y * r.y + shift[j].x) * (c.w * r.y + shift[j].y);
       const float got = exchange(b.g() & 1 ? h0 : h1, 4);
-      const u32 word = b.g() & 1 ? pack(got, h1) : pack(h0, got),
+      const u32 word = b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got),
                 other = exchange(word, 8);  // units g & ~1.. and the next two
       const u32 to = b.base + M_H + ((at >> 1) * NT + n) * 256 + (token * 4 + (at & 1) * 2 + (b.g() >> 2)) * 8;
       if (n * 8 + token < T) {  // two lanes have the same 8 bytes: they share the ranks

@@ -14,11 +14,6 @@
 // Epilogues: 0 plain, 1 + bias, 2 gelu(+ bias), 3 GeGLU (w has N gate rows, then N up rows), 4 float32 sums of a part
 // of K each (+ bias in the first) as out[split, M, N].
 
-typedef unsigned int u32;
-typedef unsigned long long u64;
-typedef unsigned short u16;
-struct alignas(64) TensorMap { char bytes[128]; };
-
 constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
 constexpr int EPILOGUE = TP_EPILOGUE, CLUSTER = CM * CN;
 constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
@@ -34,28 +29,6 @@ constexpr bool BIASED = !FP8 && (EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4
 constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
 constexpr int PRODUCER_REGISTERS = WGS == 1 ? 40 : WGS == 2 ? 40 : 24;
 
-__device__ __forceinline__ u32 shared_address(const void* p) { return (u32)__cvta_generic_to_shared(p); }
-
-__device__ __forceinline__ void barrier_init(u32 bar, u32 count) {
-    asm volatile("mbarrier.init.shared::cta.b64 [%0], %1;" ::"r"(bar), "r"(count));
-}
-__device__ __forceinline__ void barrier_expect(u32 bar, u32 bytes) {
-    asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(bar), "r"(bytes) : "memory");
-}
-__device__ __forceinline__ void barrier_arrive(u32 bar, u32 cta) {
-    asm volatile(
-        "{ .reg .b32 remote; mapa.shared::cluster.u32 remote, %0, %1;"
-        "mbarrier.arrive.shared::cluster.b64 _, [remote]; }" ::"r"(bar), "r"(cta) : "memory");
-}
-__device__ __forceinline__ void barrier_arrive(u32 bar) {
-    asm volatile("mbarrier.arrive.shared::cta.b64 _, [%0];" ::"r"(bar) : "memory");
-}
-__device__ __forceinline__ void barrier_wait(u32 bar, u32 parity) {
-    asm volatile(
-        "{ .reg .pred done;\n"
-        "again: mbarrier.try_wait.parity.shared::cta.b64 done, [%0], %1;\n"
-        "@!done bra again; }" ::"r"(bar), "r"(parity) : "memory");
-}
 // into the CTAs of `mask`, at the same place in each
 template <bool MULTICAST>
 __device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int row, u32 bar, u32 mask) {
@@ -69,42 +42,11 @@ __device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int ro
             "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3}], [%4];"
             ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar) : "memory");
 }
-__device__ __forceinline__ void cluster_sync() {
-    asm volatile("barrier.cluster.arrive.relaxed;\nbarrier.cluster.wait;" ::: "memory");
-}
-// K-major operand in shared memory, rows of 128 bytes, swizzled; groups of 8 rows lie 1024 bytes apart
-__device__ __forceinline__ u64 operand(u32 address) {
-    return ((u64)(address & 0x3ffff) >> 4) | (1ull << 16) | (64ull << 32) | (1ull << 62);
-}
-
 TP_MMA  // mma(float (&sums)[BN / 2], u64 a, u64 b, int keep)
 
 __device__ __forceinline__ float gelu(float x) {  // tanh's, as x * sigmoid
     return __fdividef(x, 1.0f + exp2f(x * (-2.302208198f - 0.1029432397f * x * x)));
 }
-__device__ __forceinline__ u32 pack(float low, float high) {
-    u32 both;
-    asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
-    return both;
-}
-__device__ __forceinline__ float bf16_low(u32 both) { return __uint_as_float(both << 16); }
-__device__ __forceinline__ float bf16_high(u32 both) { return __uint_as_float(both & 0xffff0000u); }
-
-// A quad holds 4 blocks of 8 columns of one row, 2 columns of each block a lane; afterwards lane i holds block i.
-__device__ __forceinline__ uint4 transpose_quad(u32 p0, u32 p1, u32 p2, u32 p3, int lane) {
-    const bool odd = lane & 1, high = lane & 2;
-    const u32 r0 = __shfl_xor_sync(~0u, odd ? p0 : p1, 1), r1 = __shfl_xor_sync(~0u, odd ? p2 : p3, 1);
-    const u32 x0 = odd ? r0 : p0, x1 = odd ? p1 : r0, y0 = odd ? r1 : p2, y1 = odd ? p3 : r1;
-    const u32 s0 = __shfl_xor_sync(~0u, high ? x0 : y0, 2), s1 = __shfl_xor_sync(~0u, high ? x1 : y1, 2);
-    return high ? make_uint4(s0, s1, y0, y1) : make_uint4(x0, x1, s0, s1);
-}
-
-__device__ __forceinline__ u32 pack_e4m3(float low, float high) {  // saturates; NaN stays NaN
-    u16 both;
-    asm("cvt.rn.satfinite.e4m3x2.f32 %0, %1, %2;" : "=h"(both) : "f"(high), "f"(low));
-    return both;
-}
-
 // A tile's scales and biases by column of `w`. Each thread of a warpgroup fetches some of them long before they are
 // needed; once the sums are there they go through shared memory to whom they belong.
 struct Factors {

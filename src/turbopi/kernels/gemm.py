@@ -5,20 +5,19 @@ which the norms in `norms.py` do.
 """
 
 import ctypes
-import re
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from importlib.resources import files
+from functools import cache
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from turbopi.kernels.nvrtc import Kernel, bindings, compile_cubin
+from turbopi.kernels import hopper
+from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
+from turbopi.kernels.nvrtc import compile_cubin
 
 Epilogue = Literal["plain", "bias", "gelu", "geglu", "partial"]
 EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, "partial": 4}
-SHARED_BYTES = 227 * 1024
 DEPTH = 64  # of a step along the inner axis
 BF16 = {"TP_FP8": 0, "TP_OUT_FP8": 0, "TP_PROMOTE": 0}  # gemm_fp8.py has the others
 
@@ -70,8 +69,8 @@ def matmul(
     m_groups, n_groups = -(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n))
     kernel = _kernel(tile, epilogue, a.device)
     arguments = (
-        tensor_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
-        tensor_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
+        matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
+        matrix_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
         ctypes.c_void_p(out.data_ptr()),
         ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
         *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), m_groups, n_groups)),
@@ -81,42 +80,9 @@ def matmul(
     return out
 
 
-class DependentKernel(Kernel):
-    """A kernel whose blocks may start before the kernel ahead of it ends (it waits for its results itself)."""
-
-    def __init__(self, cubin: bytes, name: str, shared_bytes: int, threads: int, cluster: int) -> None:
-        super().__init__(cubin, name, shared_bytes)
-        d = self._driver
-        dependent, clusters = d.CUlaunchAttribute(), d.CUlaunchAttribute()
-        dependent.id = d.CUlaunchAttributeID.CU_LAUNCH_ATTRIBUTE_PROGRAMMATIC_STREAM_SERIALIZATION
-        dependent.value.programmaticStreamSerializationAllowed = 1
-        clusters.id = d.CUlaunchAttributeID.CU_LAUNCH_ATTRIBUTE_CLUSTER_DIMENSION
-        clusters.value.clusterDim.x, clusters.value.clusterDim.y, clusters.value.clusterDim.z = cluster, 1, 1
-        self._attributes = [dependent, clusters]
-        self._threads = threads
-        status, self.max_clusters = d.cuOccupancyMaxActiveClusters(self._function, self._config(cluster))
-        assert int(status) == 0 and self.max_clusters > 0, f"no room for clusters of {cluster}: {status!r}"
-
-    def launch_dependent(self, blocks: int, arguments: tuple[Any, ...]) -> None:
-        """Launch on PyTorch's current stream; `arguments` are ctypes values."""
-        pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(value) for value in arguments))
-        config = self._config(blocks)
-        (status,) = self._driver.cuLaunchKernelEx(config, self._function, ctypes.addressof(pointers), 0)
-        assert int(status) == 0, f"launch failed: {status!r}"
-
-    def _config(self, blocks: int) -> Any:
-        config = self._driver.CUlaunchConfig()
-        config.gridDimX, config.gridDimY, config.gridDimZ = blocks, 1, 1
-        config.blockDimX, config.blockDimY, config.blockDimZ = self._threads, 1, 1
-        config.sharedMemBytes = self._shared
-        config.hStream = torch.cuda.current_stream().cuda_stream
-        config.attrs, config.numAttrs = self._attributes, len(self._attributes)
-        return config
-
-
-@cache
-def _kernel(tile: Tile, epilogue: Epilogue, device: torch.device) -> DependentKernel:
-    sizes = {
+def constants(tile: Tile, epilogue: Epilogue) -> dict[str, int]:
+    """What gemm.cu is compiled with."""
+    return {
         "TP_WGS": tile.warpgroups,
         "TP_BN": tile.columns,
         "TP_STAGES": tile.stages,
@@ -126,53 +92,21 @@ def _kernel(tile: Tile, epilogue: Epilogue, device: torch.device) -> DependentKe
         "TP_EPILOGUE": EPILOGUES[epilogue],
         **BF16,
     }
+
+
+@cache
+def _kernel(tile: Tile, epilogue: Epilogue, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
-        cubin = compile_cubin(source(tile.columns), "sm_90a", sizes)
+        cubin = compile_cubin(source(tile.columns), "sm_90a", constants(tile, epilogue))
         threads = 128 * (tile.warpgroups + 1)
         return DependentKernel(cubin, "gemm", SHARED_BYTES, threads, tile.cluster)
 
 
 def source(columns: int, fp8: bool = False) -> str:
-    """gemm.cu with the instruction for tiles of that many columns: its operands can't be written generically."""
-    assert columns % 8 == 0 and columns <= 256
-    count = columns // 2
-    registers = ", ".join(f"%{i}" for i in range(count))
-    outputs = ", ".join(f'"+f"(d[{i}])' for i in range(count))
-    form, transposed = ("k32.f32.e4m3.e4m3", "") if fp8 else ("k16.f32.bf16.bf16", ", 0, 0")
-    instruction = (
-        f"__device__ __forceinline__ void mma(float (&d)[{count}], u64 a, u64 b, int keep) {{\n"
-        f'asm volatile("{{ .reg .pred p; setp.ne.b32 p, %{count + 2}, 0;\\n"\n'
-        f'"wgmma.mma_async.sync.aligned.m64n{columns}{form} {{{registers}}}, %{count}, %{count + 1},"\n'
-        f'" p, 1, 1{transposed}; }}" : {outputs} : "l"(a), "l"(b), "r"(keep)); }}'
-    )
-    text = (files("turbopi.kernels") / "gemm.cu").read_text()
-    return re.sub(r"^TP_MMA.*$", lambda _: instruction, text, flags=re.MULTILINE)
+    """gemm.cu with the instruction for tiles of that many columns."""
+    return hopper.source("gemm.cu", hopper.wgmma("mma", columns, fp8=fp8))
 
 
-class _TensorMap(ctypes.Structure):
-    _fields_ = (("bytes", ctypes.c_char * 128),)
-
-
-@lru_cache(maxsize=65536)
-def tensor_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> _TensorMap:
-    """How TMA finds blocks of box_rows x 128 bytes of a bfloat16 or E4M3 matrix [rows, width], with zeros beyond it."""
-    d = bindings("driver")
-    size = 1 if fp8 else 2
-    types = d.CUtensorMapDataType
-    status, encoded = d.cuTensorMapEncodeTiled(
-        types.CU_TENSOR_MAP_DATA_TYPE_UINT8 if fp8 else types.CU_TENSOR_MAP_DATA_TYPE_BFLOAT16,
-        2,
-        address,
-        [d.cuuint64_t(width), d.cuuint64_t(rows)],
-        [d.cuuint64_t(width * size)],
-        [d.cuuint32_t(128 // size), d.cuuint32_t(box_rows)],
-        [d.cuuint32_t(1), d.cuuint32_t(1)],
-        d.CUtensorMapInterleave.CU_TENSOR_MAP_INTERLEAVE_NONE,
-        d.CUtensorMapSwizzle.CU_TENSOR_MAP_SWIZZLE_128B,
-        d.CUtensorMapL2promotion.CU_TENSOR_MAP_L2_PROMOTION_L2_256B,
-        d.CUtensorMapFloatOOBfill.CU_TENSOR_MAP_FLOAT_OOB_FILL_NONE,
-    )
-    assert int(status) == 0, f"no tensor map for {rows} x {width} at {address:#x}: {status!r}"
-    result = _TensorMap()
-    ctypes.memmove(ctypes.addressof(result), encoded.getPtr(), 128)
-    return result
+def matrix_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> Any:
+    """TMA's map of blocks of box_rows x 128 bytes of a bfloat16 or E4M3 matrix [rows, width]."""
+    return hopper.tensor_map(address, (width, rows), (width,), (128 if fp8 else 64, box_rows), fp8)

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from turbopi.engine.fp8 import ALIGNMENT, E4M3, Fp8Matrix
-from turbopi.kernels.gemm import EPILOGUES, SHARED_BYTES, DependentKernel, Epilogue, Tile, source, tensor_map
+from turbopi.kernels.gemm import EPILOGUES, Epilogue, Tile, matrix_map, source
+from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
 from turbopi.kernels.nvrtc import compile_cubin
 
 DEPTH = 128  # of a step along the inner axis
@@ -67,8 +68,8 @@ def matmul_fp8(
     m_groups, n_groups = -(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n))
     kernel = _kernel(tile, epilogue, inverse is not None, promotion(tile, k) if promote is None else promote, a.device)
     arguments = (
-        tensor_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
-        tensor_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
+        matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
+        matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
         ctypes.c_void_p(out.data_ptr()),
         ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
         ctypes.c_void_p(weight.scale.data_ptr()),

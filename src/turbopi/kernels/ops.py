@@ -13,7 +13,7 @@ from torch import Tensor
 from turbopi.engine import ops as plain
 from turbopi.engine.fp8 import Fp8Matrix, Matrix, to_e4m3
 from turbopi.engine.ops import Ops
-from turbopi.kernels import activations, attention, embedding, norms, rope
+from turbopi.kernels import activations, attention, attention_hopper, embedding, norms, rope
 from turbopi.kernels.gemm import Epilogue, Tile, matmul
 from turbopi.kernels.gemm_fp8 import best_tile, matmul_fp8
 from turbopi.kernels.launch import capability
@@ -51,14 +51,13 @@ def fused_ops(device: torch.device) -> Ops:
         linear_gelu=tuned_linear_gelu if hopper else linear_gelu,
         linear_geglu=tuned_linear_geglu if hopper else linear_geglu,
         rope_split=rope.rope_split,
-        vision_attention=attention.vision_attention,
-        attention=attend,
+        vision_attention=vision_attention_on_hopper if hopper else attention.vision_attention,
+        attention=attend_on_hopper if hopper else attend,
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
             "vision products": f"CUDA for {_rows_covered()} rows, else cuBLAS" if hopper else "cuBLAS",
             "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS" if hopper else "Triton",
-            "vision attention": "Triton",
-            "prefix attention": "Triton",
+            "vision and prefix attention": "CUDA, Triton for odd heads" if hopper else "Triton",
             "suffix attention": "cuBLAS and Triton's softmax",
             "norms, GeGLU of the suffix, RoPE, patches, prompt embedding": "Triton",
         },
@@ -191,3 +190,23 @@ def attend(
         return attention.prefix_attention(q, k, v, length, heads, inverse)
     assert inverse is None, "the suffix's activations stay as they are"
     return plain.attention(q, k, v, length, slots, heads, *state_token, softmax=attention.masked_softmax)
+
+
+def attend_on_hopper(
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    length: Tensor,
+    slots: int,
+    heads: int,
+    *state_token: Any,
+    inverse: float | None = None,
+) -> Tensor:
+    if k.shape[0] == slots and attention_hopper.takes(q.shape[1]):
+        return attention_hopper.prefix_attention(q, k, v, length, heads, inverse)
+    return attend(q, k, v, length, slots, heads, *state_token, inverse=inverse)
+
+
+def vision_attention_on_hopper(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:
+    ours = attention_hopper if attention_hopper.takes(qkv.shape[1] // 3 // heads) else attention
+    return ours.vision_attention(qkv, images, heads, inverse)

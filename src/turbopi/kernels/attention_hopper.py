@@ -1,0 +1,135 @@
+"""Attention without materialised logits through wgmma and TMA, for compute capability 9.0: see attention.cu.
+
+Twins: `engine.ops.vision_attention`, and `engine.ops.attention` without a suffix. The kernels for all other GPUs, and
+for heads that this one doesn't take, are in attention.py.
+"""
+
+import ctypes
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from turbopi.kernels import hopper
+from turbopi.kernels.attention import LOG2_E
+from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
+from turbopi.kernels.launch import result_dtype
+from turbopi.kernels.nvrtc import compile_cubin
+
+
+@dataclass(frozen=True)
+class Tile:
+    """How attention is cut: 64 query rows a CTA, `keys` keys at a time for each of one or two warpgroups."""
+
+    dim: int  # columns of a head
+    keys: int
+    warpgroups: int = 2
+
+    @property
+    def stages(self) -> int:
+        """Tiles of keys or values in flight: as many as fit, beside the queries, 1 KB of alignment and the barriers."""
+        panels = -(-self.dim // 64)
+        return min(12, (SHARED_BYTES - 2048 - 64 * panels * 128) // (self.keys * panels * 128))
+
+
+def takes(dim: int) -> bool:
+    """Whether there is a kernel for heads of that many columns."""
+    return dim % 8 == 0 and 16 <= dim <= 256
+
+
+def prefix_attention(
+    q: Tensor, k: Tensor, v: Tensor, length: Tensor, heads: int, inverse: float | None = None, tile: Tile | None = None
+) -> Tensor:
+    """Rows q [tokens * n, K] over the first `length` (int64[1], on the device, at least 1) keys -> [tokens, n * K].
+
+    k, v [keys, K]; what lies beyond `length` has no influence. With `inverse` the result leaves as E4M3. All bfloat16
+    and contiguous.
+    """
+    assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
+    rows, dim = q.shape
+    tile = tile or Tile(dim, keys=64)
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
+    _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, length, rows, k.shape[0], 1, inverse)
+    return out
+
+
+def vision_attention(
+    qkv: Tensor, images: int, heads: int, inverse: float | None = None, tile: Tile | None = None
+) -> Tensor:
+    """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
+
+    bfloat16, contiguous. With `inverse` the result leaves as E4M3.
+    """
+    assert qkv.is_contiguous() and qkv.dtype == torch.bfloat16
+    rows, width = qkv.shape[0], qkv.shape[1] // 3
+    tokens, dim = rows // images, width // heads
+    out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse))
+    places, tile = (3 * heads,) * 3, tile or Tile(dim, keys=128 if dim <= 128 else 64)
+    _launch(tile, (qkv,) * 3, places, (0, heads, 2 * heads), out, None, tokens, tokens, images * heads, inverse)
+    return out
+
+
+def _launch(
+    tile: Tile,
+    matrices: tuple[Tensor, ...],
+    heads: tuple[int, ...],
+    first: tuple[int, ...],
+    out: Tensor,
+    length: Tensor | None,
+    rows: int,
+    keys: int,
+    groups: int,
+    inverse: float | None,
+) -> None:
+    """matrices q, k, v of `heads` heads side by side, theirs beginning with the `first`; groups of pictures and heads.
+
+    rows and keys: of one picture.
+    """
+    count = out.shape[-1] // tile.dim if length is None else 1  # query heads beside each other
+    boxes = (64, tile.keys, tile.keys)
+    maps = [
+        hopper.tensor_map(
+            matrix.data_ptr(),
+            (tile.dim, width, matrix.numel() // (width * tile.dim)),
+            (tile.dim, width * tile.dim),
+            (64, 1, box),
+        )
+        for matrix, width, box in zip(matrices, heads, boxes, strict=True)
+    ]
+    tiles = -(-rows // 64)
+    kernel = _kernel(tile, inverse is not None, out.device)
+    arguments = (
+        *maps,
+        ctypes.c_void_p(out.data_ptr()),
+        ctypes.c_void_p(None if length is None else length.data_ptr()),
+        *(ctypes.c_int(value) for value in (rows, keys, count, first[1], first[2], tiles)),
+        ctypes.c_float(tile.dim**-0.5 * LOG2_E),
+        ctypes.c_float(1.0 if inverse is None else inverse),
+    )
+    kernel.launch_dependent(tiles * groups, arguments)
+
+
+def constants(tile: Tile, out_fp8: bool) -> dict[str, int]:
+    """What attention.cu is compiled with."""
+    return {
+        "TP_DIM": tile.dim,
+        "TP_WGS": tile.warpgroups,
+        "TP_KEYS": tile.keys,
+        "TP_STAGES": tile.stages,
+        "TP_OUT_FP8": int(out_fp8),
+    }
+
+
+def source(tile: Tile) -> str:
+    """attention.cu with the instructions for a tile."""
+    logits = hopper.wgmma("mma_logits", tile.keys)
+    values = hopper.wgmma("mma_values", tile.dim, from_registers=True, across=True)
+    return hopper.source("attention.cu", f"{logits}\n{values}")
+
+
+@cache
+def _kernel(tile: Tile, out_fp8: bool, device: torch.device) -> DependentKernel:
+    with torch.cuda.device(device):
+        cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8))
+        return DependentKernel(cubin, "attention", SHARED_BYTES, 128 * (tile.warpgroups + 1), cluster=1)

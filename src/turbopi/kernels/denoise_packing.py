@@ -1,0 +1,301 @@
+"""The action expert's weights in the order in which the denoising kernel reads them: see denoise_base.cu.
+
+Shapes: N steps, L layers, D width, F feed-forward width, n query heads of K columns.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.engine.fp8 import E4M3, E4M3_MAX, to_e4m3
+from turbopi.engine.weights import GemmaLayer
+from turbopi.errors import BackendError
+
+BLOCK = 16  # rows of a tile, columns of a block
+WARPS = 16  # that multiply
+RANKS = 8  # CTAs of a cluster
+DIVISOR = 16  # of activations before they become float16 to meet FP8 weights
+
+Precision = Literal["bf16", "fp8"]
+
+
+def refusal(config: ModelConfig) -> str | None:
+    """Why the kernel can't run this model, or None if it can."""
+    g = config.expert
+    if config.kind != "pi05":
+        return f"it covers Pi0.5, this model is {config.kind}"
+    if g.num_kv_heads != 1:
+        return f"it needs one key/value head, this model has {g.num_kv_heads}"
+    if g.width % BLOCK or g.mlp_dim % BLOCK:
+        return f"widths must be multiples of {BLOCK}: width {g.width}, mlp_dim {g.mlp_dim}"
+    if g.head_dim % BLOCK or g.head_dim > 256:
+        return f"head_dim must be a multiple of {BLOCK} up to 256, it is {g.head_dim}"
+    if config.action_dim % 4 or config.action_dim > WARPS * 32:
+        return f"action_dim must be a multiple of 4 up to {WARPS * 32}, it is {config.action_dim}"
+    return None
+
+
+def share(count: int, parts: int, index: int) -> range:
+    """Which of `count` things part `index` of `parts` has."""
+    return range(count * index // parts, count * (index + 1) // parts)
+
+
+def most(count: int, parts: int) -> int:
+    return -(-count // parts)
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Who does what: see denoise_base.cu."""
+
+    config: ModelConfig
+    clusters: int
+
+    @property
+    def blocks(self) -> int:
+        return self.clusters * RANKS
+
+    @property
+    def max_tiles(self) -> tuple[int, int, int, int]:
+        """A CTA's tiles at most: queries, keys and values, gate|up, and of a product back into the stream."""
+        g = self.config.expert
+        hidden = most(g.mlp_dim // BLOCK, self.clusters)
+        kv = most(g.head_dim // 8, g.num_heads * RANKS)
+        return most(g.head_dim // BLOCK, RANKS), kv, most(2 * hidden, RANKS), most(g.width // BLOCK, RANKS)
+
+    def query_rows(self, cluster: int, rank: int) -> Tensor:
+        """int64[tiles, 16] rows of q|k|v: of a tile 8 columns of the head's first half, then RoPE's partners."""
+        if cluster >= self.config.expert.num_heads:
+            return torch.empty(0, BLOCK, dtype=torch.int64)
+        head_dim = self.config.expert.head_dim
+        tiles = torch.tensor(share(head_dim // BLOCK, RANKS, rank), dtype=torch.int64)
+        return cluster * head_dim + _rope_rows(tiles, head_dim)
+
+    def key_value_rows(self, cluster: int, rank: int) -> Tensor:
+        """int64[tiles, 16] rows of q|k|v: keys in RoPE's pairs, values as they are."""
+        g = self.config.expert
+        if cluster >= g.num_heads:
+            return torch.empty(0, BLOCK, dtype=torch.int64)
+        mine = torch.tensor(share(g.head_dim // 8, g.num_heads * RANKS, cluster * RANKS + rank), dtype=torch.int64)
+        keys, values = mine[mine < g.head_dim // BLOCK], mine[mine >= g.head_dim // BLOCK] - g.head_dim // BLOCK
+        value_rows = (g.num_heads + 1) * g.head_dim + values[:, None] * BLOCK + torch.arange(BLOCK)
+        return torch.cat((g.num_heads * g.head_dim + _rope_rows(keys, g.head_dim), value_rows))
+
+    def hidden(self, cluster: int) -> range:
+        units = share(self.config.expert.mlp_dim // BLOCK, self.clusters, cluster)
+        return range(units.start * BLOCK, units.stop * BLOCK)
+
+    def gate_up_rows(self, cluster: int, rank: int) -> Tensor:
+        """int64[tiles, 16] rows of gate|up: of a tile 8 units' gate, then their up."""
+        hidden = self.hidden(cluster)
+        tiles = torch.tensor(share(len(hidden) // 8, RANKS, rank), dtype=torch.int64)
+        units = hidden.start + tiles[:, None] * 8 + torch.arange(8)
+        return torch.cat((units, units + self.config.expert.mlp_dim), dim=1)
+
+    def stream_rows(self, rank: int) -> Tensor:
+        """int64[tiles, 16] columns of the stream: of a tile the even ones, then the odd ones."""
+        tiles = torch.tensor(share(self.config.expert.width // BLOCK, RANKS, rank), dtype=torch.int64)
+        return tiles[:, None] * BLOCK + torch.cat((torch.arange(0, BLOCK, 2), torch.arange(1, BLOCK, 2)))
+
+    def out_columns(self, cluster: int) -> Tensor:
+        """int64[K] columns of a head's attention in the order in which they are kept: i and i + 8 in turn."""
+        head_dim = self.config.expert.head_dim
+        pairs = torch.stack((torch.arange(8), torch.arange(8) + 8), dim=1).flatten()
+        return cluster * head_dim + (torch.arange(0, head_dim, BLOCK)[:, None] + pairs).flatten()
+
+
+def _rope_rows(tiles: Tensor, head_dim: int) -> Tensor:
+    first = tiles[:, None] * 8 + torch.arange(8)
+    return torch.cat((first, first + head_dim // 2), dim=1)
+
+
+def _groups(tiles: int, wide: bool) -> list[tuple[int, int, int]]:
+    """(tiles, tiles of one warp, parts of the reduction) of each group that a product is multiplied in."""
+    groups = []
+    while tiles > 0:
+        size = next(n for n in (8, 4, 2, 1) if tiles >= n)
+        per_warp = 2 if size == 8 and wide else 1
+        groups.append((size, per_warp, WARPS // (size // per_warp)))
+        tiles -= size
+    return groups
+
+
+def fragments(tiles: Tensor, max_tiles: int, wide: bool, padding: int, weights: Precision = "bf16") -> Tensor:
+    """[tiles, 16, columns] -> flat, in the order in which a CTA's warps read it; filled up with `padding`."""
+    count, _, columns = tiles.shape
+    if weights == "bf16":
+        # a fragment is 32 lanes (g, t) x 8 values: rows g and g + 8 of columns 4t, 4t + 1, then of 4t + 2, 4t + 3
+        blocks, size = columns // BLOCK, 256
+        order = tiles.view(count, 2, 8, blocks, 4, 2, 2).permute(0, 3, 2, 4, 5, 1, 6)
+    else:  # of two blocks: x 16 values, columns 4t.. of rows g and g + 8 of the first, then of the second
+        blocks, size = most(columns, 2 * BLOCK), 512
+        tiles = torch.cat((tiles, tiles.new_full((count, BLOCK, blocks * 2 * BLOCK - columns), padding)), dim=2)
+        order = tiles.view(count, 2, 8, blocks, 2, 4, 4).permute(0, 3, 2, 5, 4, 1, 6)
+    ordered = order.reshape(count, blocks, size)
+    out, first = [], 0
+    for room, per_warp, parts in _groups(max_tiles, wide):
+        if first >= count:
+            break
+        steps = most(blocks, parts)
+        padded = tiles.new_full((room, steps * parts, size), padding)
+        here = ordered[first : first + room]
+        padded[: len(here), :blocks] = here
+        shape = per_warp, room // per_warp, steps, parts, size
+        out.append(padded.view(shape).permute(2, 0, 1, 3, 4).flatten())
+        first += room
+    return torch.cat(out) if out else tiles.new_empty(0)
+
+
+@dataclass(frozen=True)
+class PackedExpert:
+    """The expert's matrices in the kernel's order. One serves kernels of any number of steps and suffix tokens."""
+
+    arrangement: Arrangement
+    weights: Tensor  # bfloat16 or e4m3[L, elements]: of a layer each CTA's qkv, out, gate|up, down
+    index: Tensor  # int32[elements]: which element of qkv, out, gate|up, down, 0 each is
+    starts: Tensor  # int64[CTAs + 1]: where a CTA's begin in a layer, bytes, and the layer's end
+    scales: Tensor  # float32[L, rows of qkv, out, gate|up, down] of E4M3 weights; [L, 0] of others
+
+    @classmethod
+    def pack(
+        cls,
+        config: ModelConfig,
+        layers: list[GemmaLayer],
+        clusters: int | None = None,
+        weights: Precision = "bf16",
+    ) -> "PackedExpert":
+        """`clusters`: at least one per head, which is also the default. `weights` "fp8": E4M3 with a scale for each
+        output channel; activations aren't quantised, so no calibration is needed.
+
+        Raises BackendError for sizes that the kernel doesn't cover.
+        """
+        reason = refusal(config)
+        if reason is not None:
+            raise BackendError(f"the denoising kernel can't run this model: {reason}")
+        heads = config.expert.num_heads
+        arrangement = Arrangement(config, clusters or heads)
+        if arrangement.clusters < heads:
+            raise BackendError(f"{clusters} clusters are fewer than the model's {heads} heads; give {heads} or more")
+        streams = _streams(arrangement, weights)
+        device, size = layers[0].qkv.device, 1 if weights == "fp8" else 2
+        index = torch.cat(streams).to(device)
+        starts = np.cumsum([0, *(size * len(stream) for stream in streams)])
+        packed, scales = torch.empty(len(layers), len(index) * size, dtype=torch.uint8, device=device), []
+        for row, layer in zip(packed, layers, strict=True):
+            parts = layer.qkv, layer.out, layer.gate_up, layer.down
+            if weights == "fp8":
+                largest = [part.abs().amax(dim=1).float() for part in parts]
+                scale = [torch.where(m > 0, m / E4M3_MAX, torch.ones_like(m)) for m in largest]
+                bits = [to_e4m3(m, 1 / s[:, None]).view(torch.uint8) for m, s in zip(parts, scale, strict=True)]
+                scales.append(torch.cat(scale))
+            else:
+                bits = [part.to(torch.bfloat16).contiguous().view(torch.int16) for part in parts]
+                scales.append(torch.empty(0, device=device))
+            flat = torch.cat([*(part.flatten() for part in bits), bits[0].new_zeros(1)])
+            torch.index_select(flat, 0, index, out=row.view(flat.dtype))
+        typed = packed.view(E4M3 if weights == "fp8" else torch.bfloat16)
+        return cls(arrangement, typed, index, torch.from_numpy(starts).to(device), torch.stack(scales))
+
+    @property
+    def fp8(self) -> bool:
+        return self.weights.dtype == E4M3
+
+    def row_scales(self, layer: int) -> tuple[Tensor, ...]:
+        """float32 of the output channels of a layer's qkv, out, gate|up and down; E4M3 weights alone have them."""
+        return torch.split(self.scales[layer], [rows for rows, _ in _shapes(self.arrangement.config)])
+
+    def matrices(self, layer: int) -> tuple[Tensor, ...]:
+        """A layer's qkv, out, gate|up and down as they were before packing; of E4M3 weights what they stand for, in
+        float32.
+        """
+        shapes = _shapes(self.arrangement.config)
+        sizes = [rows * columns for rows, columns in shapes]
+        values = self.weights[layer].float() if self.fp8 else self.weights[layer]
+        flat = values.new_zeros(sum(sizes) + 1)
+        flat[self.index] = values
+        parts = [part.view(shape) for part, shape in zip(torch.split(flat[:-1], sizes), shapes, strict=True)]
+        if self.fp8:
+            parts = [part * scale[:, None] for part, scale in zip(parts, self.row_scales(layer), strict=True)]
+        return tuple(parts)
+
+
+def _shapes(config: ModelConfig) -> list[tuple[int, int]]:
+    g = config.expert
+    width = g.num_heads * g.head_dim
+    return [(width + 2 * g.head_dim, g.width), (g.width, width), (2 * g.mlp_dim, g.width), (g.width, g.mlp_dim)]
+
+
+def _streams(a: Arrangement, weights: Precision) -> list[Tensor]:
+    """int32 of each CTA: the elements of qkv, out, gate|up, down in the order in which it reads them."""
+    shapes = _shapes(a.config)
+    offsets = np.cumsum([0, *(rows * columns for rows, columns in shapes)]).tolist()
+    padding = offsets[-1]
+    qkv, out, gate_up, down = (
+        torch.arange(start, start + rows * columns, dtype=torch.int32).view(rows, columns)
+        for start, (rows, columns) in zip(offsets[:-1], shapes, strict=True)
+    )
+    queries, keys_values, gates, slice_tiles = a.max_tiles
+    streams = []
+    for cluster in range(a.clusters):
+        hidden = a.hidden(cluster)
+        for rank in range(RANKS):
+            rows = a.stream_rows(rank)
+            products = []
+            if cluster < a.config.expert.num_heads:
+                columns = a.out_columns(cluster)
+                products = [
+                    fragments(qkv[a.query_rows(cluster, rank)], queries, True, padding, weights),
+                    fragments(qkv[a.key_value_rows(cluster, rank)], keys_values, True, padding, weights),
+                    fragments(out[rows][:, :, columns], slice_tiles, False, padding, weights),
+                ]
+            products += [
+                fragments(gate_up[a.gate_up_rows(cluster, rank)], gates, True, padding, weights),
+                fragments(down[rows][:, :, hidden.start : hidden.stop], slice_tiles, False, padding, weights),
+            ]
+            streams.append(torch.cat(products))
+    return streams
+
+
+def _row_index(a: Arrangement) -> Tensor:
+    """int64[CTAs, tiles, 16]: which row of qkv, then of gate|up, a CTA's rows are; those it lacks are beyond both."""
+    queries, keys_values, gates, _ = a.max_tiles
+    num_qkv = _shapes(a.config)[0][0]
+    index = torch.full((a.blocks, queries + keys_values + gates, BLOCK), num_qkv + 2 * a.config.expert.mlp_dim)
+    for cta in range(a.blocks):
+        cluster, rank = divmod(cta, RANKS)
+        first = 0
+        for rows, room in (
+            (a.query_rows(cluster, rank), queries),
+            (a.key_value_rows(cluster, rank), keys_values),
+            (a.gate_up_rows(cluster, rank) + num_qkv, gates),
+        ):
+            index[cta, first : first + len(rows)] = rows
+            first += room
+    return index
+
+
+def shifted_rows(packed: PackedExpert, table: Tensor) -> Tensor:
+    """float32[N, L, CTAs, tiles, 16]: what the norms' shifts add to the products behind them."""
+    index, layers = _row_index(packed.arrangement).to(table.device), []
+    for i in range(packed.arrangement.config.expert.depth):
+        qkv, _, gate_up, _ = packed.matrices(i)
+        products = [table[:, 2 * i + j, 1].double() @ m.double().T for j, m in enumerate((qkv, gate_up))]
+        layers.append(torch.cat((*products, products[0].new_zeros(len(table), 1)), dim=1).float()[:, index])
+    return torch.stack(layers, dim=1).contiguous()
+
+
+def undo_scales(packed: PackedExpert, table: Tensor) -> tuple[Tensor, Tensor]:
+    """What E4M3 weights leave to do: (float32[L, CTAs, tiles, 16] for the rows of qkv and gate|up, the table with its
+    gates times the scales of out and down). Both undo DIVISOR, too.
+    """
+    index, rows, table = _row_index(packed.arrangement).to(table.device), [], table.clone()
+    for i in range(packed.arrangement.config.expert.depth):
+        qkv, out, gate_up, down = (scale * DIVISOR for scale in packed.row_scales(i))
+        rows.append(torch.cat((qkv, gate_up, qkv.new_zeros(1)))[index])
+        table[:, 2 * i, 2] *= out
+        table[:, 2 * i + 1, 2] *= down
+    return torch.stack(rows).contiguous(), table

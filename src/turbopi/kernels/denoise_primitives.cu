@@ -1,0 +1,223 @@
+// Part 2 of 6: waiting, moving data, arithmetic.
+
+// ---- waiting
+
+// Waits are short loops without an end of their own; a spare warp watches instead. Where the first thread waits is a
+// word in shared memory, and if that stays the same for seconds the kernel says where (in memory of the host, which
+// outlives the trap; [NC * S] words: 1 << 31 | what << 20 | layer) and traps.
+enum What {
+  WAIT_NONE,
+  WAIT_X,
+  WAIT_Q,
+  WAIT_KV,
+  WAIT_COMB,
+  WAIT_ATT,
+  WAIT_X2,
+  WAIT_HID,
+  WAIT_X1,
+  WAIT_V,
+  WAIT_GO,
+  FINISHED
+};
+__device__ __forceinline__ void note(const Block& b, int what) {
+  if (threadIdx.x == 0) *(volatile u32*)(b.smem + M_PROGRESS) = u32(what) << 20 | u32(b.n);
+}
+// What the norms of layer n need, to L2: it is read once, by everybody at the same time, while memory is busy with
+// weights.
+__device__ __forceinline__ void prefetch(const Block& b, int n) {
+  const int step = n / L, l = n % L;
+  if (step >= b.a.steps) return;
+  auto lines = [&](const float* from, int floats) {
+#pragma unroll 1
+    for (int i = b.lane * 32; i < floats; i += 32 * 32) asm volatile("prefetch.global.L2 [%0];" ::"l"(from + i));
+  };
+  const float* table = b.a.table + (size_t(step) * (2 * L + 1) + 2 * l) * 3 * D + b.x0() * 16;
+  lines(b.a.shifted + (size_t(n) * (NC * S) + b.cluster * S + b.rank) * TILES * 16, TILES * 16);
+  lines(table + 2 * D, b.xn() * 16), lines(table + 3 * D, b.xn() * 16);
+  lines(table + 5 * D, b.xn() * 16), lines(table + 6 * D, b.xn() * 16);
+}
+__device__ __forceinline__ void watch(const Block& b) {
+  u32 last = 0, layer = ~0u;
+  long long since = clock64();
+  prefetch(b, 0);
+#pragma unroll 1
+  for (u32 now = 0; now >> 20 != FINISHED; __nanosleep(500)) {
+    now = *(volatile u32*)(b.smem + M_PROGRESS);
+    if ((now & 0xfffff) != layer) layer = now & 0xfffff, prefetch(b, int(layer) + 1);
+    if (now != last) {
+      last = now, since = clock64();
+    } else if (clock64() - since > 4000000000ll) {
+      *(volatile u32*)(b.a.hang + blockIdx.x) = 1u << 31 | now;
+      __threadfence_system();
+      const long long end = clock64() + 1000000000ll;  // for the other CTAs to say where they are
+#pragma unroll 1
+      while (clock64() < end) __nanosleep(10000);
+      __trap();
+    }
+  }
+}
+
+__device__ __forceinline__ void mbar_wait(u32 bar, u32 parity) {
+  asm volatile(
+      "{\n"
+      ".reg .pred p;\n"
+      "AGAIN:\n"
+      "mbarrier.try_wait.parity.shared::cta.b64 p, [%0], %1;\n"
+      "@p bra DONE;\n"
+      "bra AGAIN;\n"
+      "DONE:\n"
+      "}" ::"r"(bar),
+      "r"(parity)
+      : "memory");
+}
+__device__ __forceinline__ void mbar_init(u32 bar, u32 count) {
+  asm volatile("mbarrier.init.shared::cta.b64 [%0], %1;" ::"r"(bar), "r"(count) : "memory");
+}
+__device__ __forceinline__ void mbar_arrive(u32 bar) {
+  asm volatile("mbarrier.arrive.shared::cta.b64 _, [%0];" ::"r"(bar) : "memory");
+}
+__device__ __forceinline__ void mbar_expect(u32 bar, u32 bytes) {
+  asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(bar), "r"(bytes) : "memory");
+}
+// All threads wait for use n of an exchange in the cluster; one of them arms the barrier for the next.
+__device__ __forceinline__ void receive(const Block& b, int bar, int n, u32 bytes, int what) {
+  note(b, what);
+  mbar_wait(b.bar(bar), n & 1);
+  __syncwarp();
+  if (threadIdx.x == 0) mbar_expect(b.bar(bar), bytes);
+}
+__device__ __forceinline__ void consumers_sync() {
+  __syncwarp();  // lanes leave a wait one by one, and this barrier counts warps
+  asm volatile("bar.sync 1, %0;" ::"n"(CONSUMERS) : "memory");
+}
+__device__ __forceinline__ void cluster_sync() {
+  asm volatile("barrier.cluster.arrive.release.aligned;\nbarrier.cluster.wait.acquire.aligned;" ::: "memory");
+}
+
+// ---- moving data
+
+__device__ __forceinline__ u32 at_rank(u32 address, int rank) {
+  u32 x;
+  asm volatile("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(x) : "r"(address), "r"(rank));
+  return x;
+}
+// An address at all ranks. All of them first, as a send reads its registers late.
+struct Everyone {
+  u32 at[S];
+  __device__ __forceinline__ explicit Everyone(u32 address) {
+#pragma unroll
+    for (int d = 0; d < S; ++d) at[d] = at_rank(address, d);
+  }
+};
+__device__ __forceinline__ void send(u32 to, u32 v, u32 bar) {
+  asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.b32 [%0], %1, [%2];" ::"r"(to), "r"(v),
+               "r"(bar)
+               : "memory");
+}
+__device__ __forceinline__ void send(u32 to, u32 v, u32 w, u32 bar) {
+  asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v2.b32 [%0], {%1, %2}, [%3];" ::"r"(to),
+               "r"(v), "r"(w), "r"(bar)
+               : "memory");
+}
+__device__ __forceinline__ void send(u32 to, float4 v, u32 bar) {
+  asm volatile(
+      "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.b32 [%0], {%1, %2, %3, %4}, [%5];" ::"r"(to),
+      "r"(__float_as_uint(v.x)), "r"(__float_as_uint(v.y)), "r"(__float_as_uint(v.z)), "r"(__float_as_uint(v.w)),
+      "r"(bar)
+      : "memory");
+}
+__device__ __forceinline__ void bulk_load(u32 to, const void* from, u32 bytes, u32 bar, u64 policy) {
+  asm volatile(
+      "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes.L2::cache_hint [%0], [%1], %2, [%3], %4;" ::
+          "r"(to),
+      "l"(from), "r"(bytes), "r"(bar), "l"(policy)
+      : "memory");
+}
+
+// Words through L2 whose lowest bit is their flag. Use n of a double buffer carries bit `flag(n)`: 1, 1, 0, 0, 1, ...
+__device__ __forceinline__ u32 flag(int n) { return ((n >> 1) & 1) ^ 1; }
+__device__ __forceinline__ u32 flagged(float v, u32 bit) { return (__float_as_uint(v) & ~1u) | bit; }
+__device__ __forceinline__ uint4 peek(const uint4* p) {
+  uint4 v;
+  asm volatile("ld.relaxed.gpu.global.v4.u32 {%0, %1, %2, %3}, [%4];"
+               : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w)
+               : "l"(p)
+               : "memory");
+  return v;
+}
+__device__ __forceinline__ bool missing(uint4 v, u32 bit) {
+  return ((v.x ^ bit) | (v.y ^ bit) | (v.z ^ bit) | (v.w ^ bit)) & 1;
+}
+__device__ __forceinline__ void publish(uint4* p, float4 v, u32 bit) {
+  asm volatile("st.relaxed.gpu.global.v4.u32 [%0], {%1, %2, %3, %4};" ::"l"(p), "r"(flagged(v.x, bit)),
+               "r"(flagged(v.y, bit)), "r"(flagged(v.z, bit)), "r"(flagged(v.w, bit))
+               : "memory");
+}
+__device__ __forceinline__ void publish(float* p, float v, u32 bit) {
+  asm volatile("st.relaxed.gpu.global.u32 [%0], %1;" ::"l"(p), "r"(flagged(v, bit)) : "memory");
+}
+// v[i] = p[i * stride], asked for until it is there.
+template <int N>
+__device__ __forceinline__ void poll(uint4 (&v)[N], const uint4* p, size_t stride, u32 bit) {
+#pragma unroll
+  for (int i = 0; i < N; ++i) v[i] = peek(p + i * stride);
+#pragma unroll 1
+  for (;;) {
+    bool again = false;
+#pragma unroll
+    for (int i = 0; i < N; ++i)
+      if (missing(v[i], bit)) v[i] = peek(p + i * stride), again = true;
+    if (!again) return;
+  }
+}
+
+// ---- arithmetic
+
+__device__ __forceinline__ u32 pack(float lo, float hi) {
+  u32 v;
+  asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(v) : "f"(hi), "f"(lo));
+  return v;
+}
+// Two numbers that meet weights.
+__device__ __forceinline__ u32 pack_operand(float lo, float hi) {
+  if (!FP8) return pack(lo, hi);
+  u32 v;
+  asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(v) : "f"(hi * SMALLER), "f"(lo * SMALLER));
+  return v;
+}
+__device__ __forceinline__ void mma(float (&c)[4], uint4 a, uint2 b) {
+  asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+      : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
+      : "r"(a.x), "r"(a.y), "r"(a.z), "r"(a.w), "r"(b.x), "r"(b.y));
+}
+__device__ __forceinline__ uint2 from_e4m3(u32 v) {  // four numbers
+  uint2 h;
+  asm("{.reg .b16 lo, hi; mov.b32 {lo, hi}, %2; cvt.rn.f16x2.e4m3x2 %0, lo; cvt.rn.f16x2.e4m3x2 %1, hi;}"
+      : "=r"(h.x), "=r"(h.y)
+      : "r"(v));
+  return h;
+}
+// A tile's weights of a fragment's block `half` times activations. In E4M3 a lane has columns 4t.. of row g, then of
+// row g + 8, of the first block and then of the second.
+__device__ __forceinline__ void mma_weights(float (&c)[4], uint4 a, int half, uint2 b) {
+  if constexpr (FP8) {
+    const uint2 top = from_e4m3(half ? a.z : a.x), bottom = from_e4m3(half ? a.w : a.y);
+    asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+        : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
+        : "r"(top.x), "r"(bottom.x), "r"(top.y), "r"(bottom.y), "r"(b.x), "r"(b.y));
+  } else {
+    mma(c, a, b);
+  }
+}
+template <int N>
+__device__ __forceinline__ void clear(float (&c)[N][4]) {
+#pragma unroll
+  for (int i = 0; i < N; ++i) c[i][0] = c[i][1] = c[i][2] = c[i][3] = 0;
+}
+__device__ __forceinline__ float exp2_approx(float x) {
+  float y;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+__device__ __forceinline__ float exchange(float v, int mask) { return __shfl_xor_sync(~0u, v, mask); }
+__device__ __forceinline__ u32 exchange(u32 v, int mask) { return __shfl_xor_sync(~0u, v, mask); }

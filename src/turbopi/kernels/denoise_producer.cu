@@ -1,0 +1,96 @@
+// Part 3 of 6: what brings weights, keys and values.
+
+// One thread of a CTA, which never waits for activations. What it loads is the same in every layer, so a list of it is
+// made first: 100 cycles more for a slot are a microsecond in a layer.
+struct Producer {
+  Block& b;
+  uint2* list;  // of slots: where from, bytes; an odd number of bytes: of keys or values, else of weights
+  int slots = 0;
+  u32 at = 0;
+
+  __device__ explicit Producer(Block& block) : b(block), list((uint2*)(block.smem + M_LIST)) {}
+  __device__ __forceinline__ void add(u32 from, u32 bytes, bool keys) {
+    list[slots++] = make_uint2(from, bytes | keys);
+  }
+  template <int MT, bool WIDE, int FIRST = 0>
+  __device__ __forceinline__ void product(int blocks, int tiles) {
+    if constexpr (FIRST < MT) {
+      constexpr int N = group_tiles(MT - FIRST);
+      using G = Group<N, WIDE>;
+      if (FIRST < tiles) {
+        const int rows = G::TPW * most(most(blocks, KB), G::KS);
+#pragma unroll 1
+        for (int r = 0; r < rows; r += RPS) add(at + r * ROW, min(RPS, rows - r) * ROW, false);
+        at += rows * ROW;
+        product<MT, WIDE, FIRST + N>(blocks, tiles);
+      }
+    }
+  }
+  __device__ __forceinline__ void keys(u32 from, int count) {  // or values
+#pragma unroll 1
+    for (int k = 0; k < count; k += SLOT_TILES) add(from + k * KEY_TILE, min(SLOT_TILES, count - k) * KEY_TILE, true);
+  }
+  __device__ void run() {
+    const int tiles = most(int(*b.a.length), 16), first = share(tiles, S, b.rank);
+    const int count = share(tiles, S, b.rank + 1) - first;
+    if (b.attends()) {
+      product<QTL, true>(D16, b.qn());
+      product<KVL, true>(D16, b.kvn());
+      keys(0, count);
+      keys(KEY_TILES * KEY_TILE, count);
+      product<DX, false>(QT, b.xn());
+    }
+    product<GTL, true>(D16, b.gn());
+    product<DX, false>(b.hn(), b.xn());
+    u64 once, keep;  // L2 policies: weights are read once a step; keys and values by every cluster, every step
+    asm volatile("createpolicy.fractional.L2::evict_first.b64 %0, 1.0;" : "=l"(once));
+    asm volatile("createpolicy.fractional.L2::evict_last.b64 %0, 1.0;" : "=l"(keep));
+    u32 slot = 0, free = 1;
+#pragma unroll 1
+    for (int step = 0; step < b.a.steps; ++step) {
+      const byte* weights = b.a.weights + b.a.starts[b.cluster * S + b.rank];
+      const byte* keys = b.a.keys + size_t(first) * KEY_TILE;
+#pragma unroll 1
+      for (int l = 0; l < L; ++l, weights += b.a.layer_bytes, keys += size_t(2 * KEY_TILES) * KEY_TILE)
+#pragma unroll 1
+        for (int i = 0; i < slots; ++i) {
+          const uint2 what = list[i];
+          const bool key = what.y & 1;
+          const u32 bytes = what.y & ~1u, full = b.full(slot);
+          mbar_wait(full + 8, free);  // until its last contents have been read
+          mbar_expect(full, bytes);
+          bulk_load(b.base + M_RING + slot * SLOT, (key ? keys : weights) + what.x, bytes, full, key ? keep : once);
+          if (++slot == STAGES) slot = 0, free ^= 1;
+        }
+    }
+  }
+};
+
+// Before the loop, in L * KEY_TILES blocks: puts the valid keys and values into the order in which the tensor cores
+// take them (zeros fill up the last tile), once instead of in every step, and zeroes the scratch memory, as no exchange
+// has been used yet.
+extern "C" __global__ void __launch_bounds__(256) turbopi_denoise_prepare(const __grid_constant__ Args a) {
+  const int first = blockIdx.x * 256 + threadIdx.x;
+  for (size_t at = first; at < SCRATCH; at += size_t(gridDim.x) * 256) a.scratch[at] = make_uint4(0, 0, 0, 0);
+  const int l = blockIdx.x / KEY_TILES, tile = blockIdx.x % KEY_TILES, length = int(*a.length);
+  if (tile * 16 >= length) return;
+  typedef unsigned short half;
+  const half* k = (const half*)(a.cache_k + l * a.layer_stride);
+  const half* v = (const half*)(a.cache_v + l * a.layer_stride);
+  uint4* to = (uint4*)(a.keys + (size_t(2 * l) * KEY_TILES + tile) * KEY_TILE);
+#pragma unroll 4
+  for (int i = threadIdx.x; i < QT * 32; i += 256) {
+    const int g = (i >> 2) & 7, t = i & 3, column = i / 32 * 16;
+    auto key = [&](int row, int col) {
+      return tile * 16 + row < length ? *(const u32*)(k + size_t(tile * 16 + row) * HD + column + col) : 0;
+    };
+    auto value = [&](int row, int col) {
+      return tile * 16 + row < length ? u32(v[size_t(tile * 16 + row) * HD + column + col]) : 0;
+    };
+    auto pair = [&](int row, int col) { return value(row, col) | value(row + 1, col) << 16; };
+    to[i] = make_uint4(key(g, 2 * t), key(g + 8, 2 * t), key(g, 2 * t + 8), key(g + 8, 2 * t + 8));
+    to[KEY_TILES * (KEY_TILE / 16) + i] =
+        make_uint4(pair(2 * t, g), pair(2 * t, g + 8), pair(2 * t + 8, g), pair(2 * t + 8, g + 8));
+  }
+}
+

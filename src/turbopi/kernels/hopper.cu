@@ -1,0 +1,65 @@
+// What kernels for compute capability 9.0 share: TMA and its barriers, operands of wgmma, results on their way out.
+// Put in front of a kernel's source by hopper.py.
+
+typedef unsigned int u32;
+typedef unsigned long long u64;
+typedef unsigned short u16;
+struct alignas(64) TensorMap { char bytes[128]; };
+
+__device__ __forceinline__ u32 shared_address(const void* p) { return (u32)__cvta_generic_to_shared(p); }
+
+__device__ __forceinline__ void barrier_init(u32 bar, u32 count) {
+    asm volatile("mbarrier.init.shared::cta.b64 [%0], %1;" ::"r"(bar), "r"(count));
+}
+__device__ __forceinline__ void barrier_expect(u32 bar, u32 bytes) {
+    asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(bar), "r"(bytes) : "memory");
+}
+__device__ __forceinline__ void barrier_arrive(u32 bar, u32 cta) {
+    asm volatile(
+        "{ .reg .b32 remote; mapa.shared::cluster.u32 remote, %0, %1;"
+        "mbarrier.arrive.shared::cluster.b64 _, [remote]; }" ::"r"(bar), "r"(cta) : "memory");
+}
+__device__ __forceinline__ void barrier_arrive(u32 bar) {
+    asm volatile("mbarrier.arrive.shared::cta.b64 _, [%0];" ::"r"(bar) : "memory");
+}
+__device__ __forceinline__ void barrier_wait(u32 bar, u32 parity) {
+    asm volatile(
+        "{ .reg .pred done;\n"
+        "again: mbarrier.try_wait.parity.shared::cta.b64 done, [%0], %1;\n"
+        "@!done bra again; }" ::"r"(bar), "r"(parity) : "memory");
+}
+__device__ __forceinline__ void cluster_sync() {
+    asm volatile("barrier.cluster.arrive.relaxed;\nbarrier.cluster.wait;" ::: "memory");
+}
+// K-major operand in shared memory, rows of 128 bytes, swizzled; groups of 8 rows lie 1024 bytes apart
+__device__ __forceinline__ u64 operand(u32 address) {
+    return ((u64)(address & 0x3ffff) >> 4) | (1ull << 16) | (64ull << 32) | (1ull << 62);
+}
+
+__device__ __forceinline__ u32 pack(float low, float high) {
+    u32 both;
+    asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
+    return both;
+}
+__device__ __forceinline__ float bf16_low(u32 both) { return __uint_as_float(both << 16); }
+__device__ __forceinline__ float bf16_high(u32 both) { return __uint_as_float(both & 0xffff0000u); }
+
+__device__ __forceinline__ float sum_of_quad(float x) {
+    x += __shfl_xor_sync(~0u, x, 1);
+    return x + __shfl_xor_sync(~0u, x, 2);
+}
+
+// A quad holds 4 blocks of 8 columns of one row, 2 columns of each block a lane; afterwards lane i holds block i.
+__device__ __forceinline__ uint4 transpose_quad(u32 p0, u32 p1, u32 p2, u32 p3, int lane) {
+    const bool odd = lane & 1, high = lane & 2;
+    const u32 r0 = __shfl_xor_sync(~0u, odd ? p0 : p1, 1), r1 = __shfl_xor_sync(~0u, odd ? p2 : p3, 1);
+    const u32 x0 = odd ? r0 : p0, x1 = odd ? p1 : r0, y0 = odd ? r1 : p2, y1 = odd ? p3 : r1;
+    const u32 s0 = __shfl_xor_sync(~0u, high ? x0 : y0, 2), s1 = __shfl_xor_sync(~0u, high ? x1 : y1, 2);
+    return high ? make_uint4(s0, s1, y0, y1) : make_uint4(x0, x1, s0, s1);
+}
+
+__device__ __forceinline__ u32 pack_e4m3(float low, float high) {  // saturates; NaN stays NaN
+    u16 both;
+    asm("cvt.rn.satfinite.e4m3x2.f32 %0, %1, %2;" : "=h"(both) : "f"(high), "f"(low));
+    return both;
+}
