@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,32 @@ class FakePolicy:
         if prompt == "mutate":
             obs.clear()
         return {"actions": np.stack([state, state]), "policy_timing": {"infer_ms": 1.0}, "prompt": prompt}
+
+
+class PipelinedFakePolicy(FakePolicy):
+    """Answers submitted observations on a thread of its own; `in_flight` of them wait there or are at work."""
+
+    pipelined = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.in_flight = 0
+        self._counting = threading.Lock()
+        self._executor = ThreadPoolExecutor(1)
+        self.submitters: set[int] = set()
+
+    def submit(self, obs: dict[str, Any]) -> "Future[dict[str, Any]]":
+        self.submitters.add(threading.get_ident())
+        if "refused at once" in str(obs.get("prompt")):
+            raise ObservationError("refused at once")
+        self._count(1)
+        future = self._executor.submit(self.infer, obs)
+        future.add_done_callback(lambda done: self._count(-1))
+        return future
+
+    def _count(self, change: int) -> None:
+        with self._counting:
+            self.in_flight += change
 
 
 def observation(prompt: str = "") -> dict[str, Any]:

@@ -56,6 +56,7 @@ def test_engines_are_built_once_and_then_found(build: Callable[..., dict[str, An
     assert first["shape"] == "2 cameras, up to 32 prompt tokens, H=10"
     assert len(first["engines"]) == 2 + 5 and first["calibration"] is None
     assert "7 engines for 2 cameras, up to 32 prompt tokens, H=10: 7 built, 0 from the cache" in first["said"]
+    assert first["load_seconds"] > 0  # loading compiles kernels, and keeps them
     assert Path(first["folder"]).parent == tmp_path
     assert set(build("--rebuild")["engines"].values()) == {"built"}
 

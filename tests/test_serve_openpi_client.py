@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from serve_fakes import FakePolicy
+from serve_fakes import FakePolicy, PipelinedFakePolicy
 
 from turbopi.serve import running
 
@@ -24,8 +24,8 @@ PYTHON = Path(
 API_KEY = "secret-123"
 
 
-@pytest.fixture(scope="module")
-def seen() -> dict[str, Any]:
+@pytest.fixture(scope="module", params=[FakePolicy, PipelinedFakePolicy])
+def seen(request: pytest.FixtureRequest) -> dict[str, Any]:
     """What openpi-client saw, in one session against one server."""
     if not PYTHON.is_file():
         hint = (
@@ -35,7 +35,7 @@ def seen() -> dict[str, Any]:
         if os.environ.get("TURBOPI_REQUIRE_OPENPI_CLIENT"):
             pytest.fail(hint)
         pytest.skip(hint)
-    policy = FakePolicy()
+    policy: FakePolicy = request.param()
     with running(policy, api_key=API_KEY, max_message_mb=4) as server:
         client = subprocess.run(
             [PYTHON, Path(__file__).parent / "openpi_client" / "drive.py", str(server.port), API_KEY],

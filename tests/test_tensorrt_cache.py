@@ -6,6 +6,8 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -17,7 +19,7 @@ from turbopi import tensorrt
 from turbopi.config import Kind
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.tensorrt.cache import CorruptEngine, EngineCache, StaleEngine
-from turbopi.tensorrt.engine import Input, Specification, build
+from turbopi.tensorrt.engine import Input, Kernels, Specification, build
 from turbopi.tensorrt.networks import Fp8Scales
 from turbopi.tensorrt.ops import NetworkOps, Value
 from turbopi.tensorrt.parts import EngineShape, fingerprint
@@ -262,3 +264,93 @@ def test_the_manifest_names_everything_an_engine_depends_on(cache: EngineCache) 
     about = json.loads((cache.folder / "part" / "engine.json").read_text())
     assert about["key"].keys() == {f.name for f in dataclasses.fields(ENVIRONMENT)} | {"name", "inputs", "precision"}
     assert about["bytes"] == 4 and len(about["sha256"]) == 64
+
+
+@needs_rtx
+def test_an_engine_that_doesnt_fit_its_workspace_is_refused(
+    cache: EngineCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("turbopi.tensorrt.engine.WORKSPACE", 1024)
+
+    def write(ops: NetworkOps, inputs: dict[str, Value]) -> dict[str, Value]:
+        return {"y": ops.matmul(inputs["x"], inputs["x"])}
+
+    large = Specification("large", {"x": Input((512, 512), "bf16")}, write)  # type: ignore[arg-type]
+    with pytest.raises(BackendError, match=r"can't build large: .*workspace.* if memory ran out, free some"):
+        cache.get_or_build(large, lambda one: build(tensorrt.library(), one, compute_capability="SM89"))
+    assert not list(cache.root.iterdir())
+
+
+# -- compiled kernels --------------------------------------------------------------------------------------------------
+
+
+class FakeRuntimeCache:
+    """The library's: knows its own bytes, and gets one more kernel for each engine."""
+
+    def __init__(self, refuses: bool) -> None:
+        self.kernels, self._refuses = b"kernels", refuses
+
+    def deserialize(self, content: bytes) -> bool:
+        if not self._refuses:
+            self.kernels = content
+        return not self._refuses
+
+    def serialize(self) -> bytes:
+        return self.kernels
+
+
+class FakeEngine:
+    """Whose context compiles a kernel unless the cache has it."""
+
+    def __init__(self, refuses: bool = False) -> None:
+        self.cache = FakeRuntimeCache(refuses)
+        self.compiled = 0
+
+    def create_runtime_config(self) -> Any:
+        return SimpleNamespace(create_runtime_cache=lambda: self.cache, set_runtime_cache=lambda cache: None)
+
+    def create_execution_context(self, *config: Any) -> str:
+        if config and b"mine" not in self.cache.kernels:
+            self.cache.kernels += b" mine"
+            self.compiled += 1
+        return "context"
+
+
+def started(file: Path, *, refuses: bool = False, name: str = "tensorrt_rtx") -> tuple[int, bool]:
+    """How many kernels a process compiles, and whether it found some."""
+    kernels, engine = Kernels(tensorrt.Library(name, "1.0", None), file), FakeEngine(refuses)
+    assert kernels.context(engine, "runtime") == "context"
+    kernels.keep()
+    return engine.compiled, kernels.found
+
+
+def test_the_next_start_finds_the_compiled_kernels(tmp_path: Path) -> None:
+    file = tmp_path / "weights" / "kernels.bin"
+    assert started(file) == (1, False)
+    written = file.stat().st_mtime_ns
+    assert started(file) == (0, True)
+    assert file.stat().st_mtime_ns == written and list(file.parent.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("harm", ["cut off", "another library's"])
+def test_kernels_that_cant_be_used_are_compiled_again_and_replaced(
+    harm: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "kernels.bin"
+    started(file)
+    if harm == "cut off":
+        file.write_bytes(file.read_bytes()[:-1])
+    assert started(file, refuses=harm != "cut off") == (1, False)
+    assert "kernels are compiled again" in caplog.text
+    assert started(file) == (0, True)
+
+
+def test_a_cache_that_cant_be_written_costs_no_start(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert started(tmp_path / "file" / "kernels.bin") == (1, False)
+    assert "compiled kernels aren't kept" in caplog.text
+
+
+def test_tensorrt_itself_keeps_kernels_in_its_engines(tmp_path: Path) -> None:
+    assert started(tmp_path / "kernels.bin", name="tensorrt") == (0, False)
+    assert not (tmp_path / "kernels.bin").exists()

@@ -13,8 +13,10 @@ from cli_helpers import refusal, turbopi
 from conftest import golden_cases, golden_model
 from tensorrt_fakes import Twin
 
+from turbopi import UnifiedPolicy
+from turbopi.checkpoint import random_checkpoint
 from turbopi.observation import Observation
-from turbopi.tensorrt.studies import attention_study, mask_study, throughput_study
+from turbopi.tensorrt.studies import actions_study, attention_study, mask_study, throughput_study
 
 
 def one() -> tuple[Observation, torch.Tensor]:
@@ -41,6 +43,23 @@ def test_a_mask_that_is_missing_shows_and_one_that_is_there_doesnt() -> None:
         assert results["padded, masked", steps]["relative"] < 1e-5
         assert results["padded, not masked", steps]["relative"] > 1e-2
     assert results["padded, masked", 1]["slots"] > results["compacted", 1]["slots"]
+
+
+def test_the_actions_study_finds_the_error_that_was_put_in() -> None:
+    checkpoint = random_checkpoint("pi05_tiny")
+    exact, judged = (UnifiedPolicy(checkpoint, backend="pytorch", precision=p, device="cpu") for p in ("f32", "bf16"))
+    observations = {"some": [exact.example_observation(seed) for seed in range(2)]}
+    (same,) = actions_study(exact, exact, observations, 2)
+    approx = pytest.approx
+    assert same == {
+        "backend": "pytorch",
+        "observations": "some",
+        "count": 2,
+        "worst_cosine": approx(1),
+        "worst_relative": 0,
+    }
+    (found,) = actions_study(exact, judged, observations, 2)
+    assert 1e-4 < found["worst_relative"] < 0.05 and 0.999 < found["worst_cosine"] < 1
 
 
 class InFlight:
@@ -77,7 +96,7 @@ def test_the_command_writes_what_it_measured(tmp_path: Path) -> None:
 
 
 def test_the_command_refuses_what_it_cant_study(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "unknown study 'speed'; choose of precision, mask, throughput" in refusal(turbopi("study", "speed"))
+    assert "unknown study 'speed'; choose of precision, mask, actions, throughput" in refusal(turbopi("study", "speed"))
     monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
     said = refusal(turbopi("study", "precision", "--random-weights", "pi05_tiny", "--device", "cpu"))
     assert "the precision study needs TensorRT: neither tensorrt_rtx nor tensorrt is installed" in said

@@ -231,6 +231,11 @@ class UnifiedPolicy:
         return self._pipeline.example(seed)
 
     @property
+    def pipelined(self) -> bool:
+        """Whether `submit` overlaps observations; the server uses it then."""
+        return hasattr(self.backend, "submit")
+
+    @property
     def pipeline(self) -> Pipeline:
         """What happens before and after the model."""
         return self._pipeline

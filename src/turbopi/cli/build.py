@@ -102,11 +102,14 @@ def build(
             shape, rebuild=rebuild, progress=lambda name: bar.update(task, advance=1, description=f"built {name}")
         )
     seconds = time.perf_counter() - started
+    started = time.perf_counter()
+    engines.parts(shape)  # TensorRT-RTX compiles an engine's kernels when it is loaded, and they are kept
+    loading = time.perf_counter() - started
     counts = {kind: sum(origin == kind for origin in engines.origin.values()) for kind in ("built", "cached")}
     size = sum(file.stat().st_size for name in engines.origin for file in (engines.cache.folder / name).iterdir())
     output.line(
         f"{len(engines.origin)} engines for {shape}: {counts['built']} built, {counts['cached']} from the cache, "
-        f"{size / 1e9:.2f} GB in {engines.cache.folder}, {seconds:.1f} s"
+        f"{size / 1e9:.2f} GB in {engines.cache.folder}, {seconds:.1f} s, and {loading:.1f} s to load them"
     )
     output.document(
         {
@@ -115,6 +118,7 @@ def build(
             "folder": engines.cache.folder,
             "bytes": size,
             "seconds": seconds,
+            "load_seconds": loading,
             "engines": engines.origin,
             "environment": vars(engines.cache.environment),
             "calibration": None if found is None else found.about(),

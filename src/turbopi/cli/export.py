@@ -61,6 +61,9 @@ def export(
     if format not in FORMATS:
         raise ConfigError(f"unknown format {format!r}; choose one of {', '.join(FORMATS)}")
     source, target = options.split("export onnx", paths, "new folder")
+    import torch
+
+    from turbopi.backends import resolve_device
     from turbopi.export.onnx import EXPORT_NEEDS, check_target, export_onnx, missing_library
     from turbopi.model.reference import Pi0Model
 
@@ -81,7 +84,10 @@ def export(
         policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu")
         found = measure_scales(policy, calibration, method, output)
         del policy  # ModelOpt changes its model
-    state = checkpoint.load("cpu", "f32", progress=output.shows_progress).state
+    # random weights are made there, much faster on a GPU, and are the same
+    maker = resolve_device("auto") if checkpoint.format == "random" else torch.device("cpu")
+    loaded = checkpoint.load(maker, "f32", progress=output.shows_progress).state
+    state = {name: loaded.pop(name).cpu() for name in list(loaded)}
     model = Pi0Model.from_state(checkpoint.config.model, state)
     written = export_onnx(model, target, calibration=found, report=output.line)
     seconds = time.perf_counter() - started

@@ -12,6 +12,8 @@ from turbopi.cli.ports import why_not_free
 from turbopi.errors import ConfigError
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     from turbopi.policy import UnifiedPolicy
 
 
@@ -90,5 +92,12 @@ class _Cold:
     def metadata(self) -> dict[str, Any]:
         return self._policy.metadata
 
+    @property
+    def pipelined(self) -> bool:
+        return self._policy.pipelined
+
     def infer(self, obs: dict[str, Any], /) -> dict[str, Any]:
         return self._policy.infer(obs)
+
+    def submit(self, obs: dict[str, Any], /) -> "Future[dict[str, Any]]":
+        return self._policy.submit(obs)

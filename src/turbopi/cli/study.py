@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from turbopi.policy import UnifiedPolicy
 
 MASK_STEPS = (1, 10)
-STUDIES = ("precision", "mask", "throughput")
+STUDIES = ("precision", "mask", "actions", "throughput")
+ACTION_BACKENDS = ("pytorch", "tensorrt", "tensorrt_fp8")
+RANDOM_OBSERVATIONS = 8
 
 
 @command(
@@ -33,7 +35,7 @@ STUDIES = ("precision", "mask", "throughput")
 def study(
     options: WeightOptions,
     which: Annotated[
-        str, typer.Argument(metavar="precision,mask,throughput", help="What to study.", show_default=False)
+        str, typer.Argument(metavar="precision,mask,actions,throughput", help="What to study.", show_default=False)
     ],
     checkpoint: CheckpointArgument = None,
     observation: Annotated[
@@ -51,7 +53,9 @@ def study(
 
     precision: the language model's layers as TensorRT engines, fused or written-out attention in float16, bfloat16 and
     float32, against the float32 reference. mask: the suffix over a compacted, a padded and masked, and a padded and not
-    masked cache, in float32 PyTorch. throughput: backend tensorrt one call at a time, tensorrt_pipelined with calls in
+    masked cache, in float32 PyTorch. actions: those of pytorch in bfloat16, tensorrt and tensorrt_fp8 (which needs
+    `turbopi build --precision fp8`) against the float32 reference's, on the observations and on random ones.
+    throughput: backend tensorrt one call at a time, tensorrt_pipelined with calls in
     flight.
     """
     output = Output(as_json)
@@ -84,6 +88,9 @@ def study(
     }
     if "precision" in chosen or "mask" in chosen:
         _errors(policy, given[0], chosen, document, output)
+    if "actions" in chosen:
+        document["actions"] = _actions(opened, policy, {source: given}, steps)
+        output.table(_actions_table(document["actions"]))
     del policy
     if "throughput" in chosen:
         document["throughput"] = _throughput(opened, given, resolved, steps, calls)
@@ -121,6 +128,33 @@ def _errors(
     if "mask" in chosen:
         document["mask"] = studies.mask_study(model, one, noise, MASK_STEPS)
         output.table(_mask_table(document["mask"]))
+
+
+def _actions(
+    checkpoint: "Checkpoint", exact: "UnifiedPolicy", observations: dict[str, list[Any]], steps: int
+) -> list[dict[str, Any]]:
+    from turbopi.policy import UnifiedPolicy
+    from turbopi.tensorrt import studies
+
+    observations["random"] = [exact.example_observation(seed) for seed in range(RANDOM_OBSERVATIONS)]
+    results = []
+    for name in ACTION_BACKENDS:
+        judged = UnifiedPolicy(checkpoint, backend=name, device=exact.backend.device)
+        results += studies.actions_study(exact, judged, observations, steps)
+        del judged
+    return results
+
+
+def _actions_table(results: list[dict[str, Any]]) -> Table:
+    table = Table(title="actions against the float32 reference", title_justify="left")
+    for column in ("backend", "observations"):
+        table.add_column(column)
+    for column in ("count", "worst cosine", "worst relative error"):
+        table.add_column(column, justify="right")
+    for one in results:
+        errors = (_number(one["worst_cosine"], ".6f"), _number(one["worst_relative"]))
+        table.add_row(one["backend"], one["observations"], str(one["count"]), *errors)
+    return table
 
 
 def _throughput(

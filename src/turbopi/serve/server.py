@@ -16,7 +16,6 @@ import asyncio
 import contextlib
 import logging
 import math
-import signal
 import threading
 import time
 import traceback
@@ -34,6 +33,7 @@ from turbopi.errors import ConfigError, ObservationError
 from turbopi.serve.gate import Gate
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.record import Recorder
+from turbopi.serve.signals import stop_signals
 from turbopi.serve.wire import WireError, pack, unpack
 from turbopi.serve.worker import Busy, Stopping, Worker
 
@@ -46,7 +46,11 @@ MAX_TEXT = 4000  # characters of an error message; one that quotes its input sho
 
 
 class Policy(Protocol):
-    """What can be served. `warmup()` is called once before the first client, if there is one."""
+    """What can be served. `warmup()` is called once before the first client, if there is one.
+
+    With a true `pipelined`, requests go to `submit(obs)` instead, which returns a Future of what `infer` returns: the
+    next request is handed over while the one before it is still computed.
+    """
 
     @property
     def metadata(self) -> dict[str, Any]: ...
@@ -104,6 +108,7 @@ class PolicyServer:
         self.host, self.port = host, port
         self.metrics = Metrics()
         self._policy = policy
+        self._pipelined = bool(getattr(policy, "pipelined", False))
         self._gate = Gate(api_key, self.metrics)
         self._max_bytes = int(max_message_mb * 2**20)
         self._record_dir = None if record_dir is None else Path(record_dir)
@@ -196,7 +201,7 @@ class PolicyServer:
 
         async def main() -> None:
             await self.start()
-            with _stop_signals() as stop:
+            with stop_signals() as stop:
                 try:
                     on_ready(self)
                     await stop.wait()
@@ -304,7 +309,12 @@ class PolicyServer:
             self.metrics.queue_seconds.observe(time.perf_counter() - asked)
             return self._call_policy(observation)
 
-        work = asyncio.ensure_future(self._worker.call(call, observation))
+        def submit(observation: dict[str, Any]) -> Future[_Outcome]:
+            self.metrics.queue_seconds.observe(time.perf_counter() - asked)
+            return self._submit_to_policy(observation)
+
+        turn = self._worker.begin(submit, observation) if self._pipelined else self._worker.call(call, observation)
+        work = asyncio.ensure_future(turn)
         gone = asyncio.ensure_future(connection.wait_closed())
         try:
             await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
@@ -316,10 +326,25 @@ class PolicyServer:
             work.cancel()
 
     def _call_policy(self, observation: dict[str, Any]) -> _Outcome:
-        """Call the policy, on the worker's thread. Never raises: an exception couldn't tell whose fault it is."""
+        """Call the policy, on the worker's thread."""
+        return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation))
+
+    def _submit_to_policy(self, observation: dict[str, Any]) -> "Future[_Outcome]":
+        """Hand the observation to a pipelined policy, on the worker's thread. The Future never holds an exception."""
         started = time.perf_counter()
+        outcome: Future[_Outcome] = Future()
         try:
-            result = self._policy.infer(observation)
+            answer: Future[dict[str, Any]] = self._policy.submit(observation)  # type: ignore[attr-defined]
+        except BaseException as error:
+            answer = Future()
+            answer.set_exception(error)
+        answer.add_done_callback(lambda done: outcome.set_result(self._outcome(started, done.result)))
+        return outcome
+
+    def _outcome(self, started: float, get: Callable[[], dict[str, Any]]) -> _Outcome:
+        """What `get` returns or raises. Never raises: an exception couldn't tell whose fault it is."""
+        try:
+            result = get()
             if not isinstance(result, dict) or "actions" not in result:
                 raise TypeError(f'the policy\'s result must be a dict with "actions", not {type(result).__name__}')
             return _Outcome(time.perf_counter() - started, result=result)
@@ -342,33 +367,6 @@ def _decode(message: str | bytes, max_bytes: int) -> dict[str, Any]:
     if not all(isinstance(key, str) for key in observation):
         raise WireError("the keys of an observation are strings (msgpack str), not bytes (msgpack bin)")
     return observation
-
-
-@contextlib.contextmanager
-def _stop_signals() -> Iterator[asyncio.Event]:
-    """An event that the first SIGINT or SIGTERM sets; the next one kills, since an inference may hang.
-
-    Only the main thread may handle signals: in any other the event is simply never set.
-    """
-    stop = asyncio.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    loop = asyncio.get_running_loop()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def on_signal(*_: object) -> None:
-        for number in before:
-            signal.signal(number, signal.SIG_DFL)
-        loop.call_soon_threadsafe(stop.set)
-
-    for number in before:
-        signal.signal(number, on_signal)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

@@ -4,7 +4,9 @@ An engine's inputs and outputs are bound by name and checked against its shapes 
 the engine wasn't built for is an error, never another code path.
 """
 
+import hashlib
 import logging
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -136,28 +138,66 @@ def _build(library: Library, name: str, write: Callable[..., None], compute_capa
     if serialised is None:
         said = "; ".join(log.errors[-3:]) or "it gave no reason"
         raise BackendError(
-            f"{library.name} {library.version} can't build {name}: {said}. If memory ran out, free some of the GPU's"
+            f"{library.name} {library.version} can't build {name}: {said}. It may use {WORKSPACE >> 30} GB beside the "
+            f"weights: if memory ran out, free some of the GPU's"
         )
     logger.info("built %s in %.1f s", name, time.perf_counter() - started)
     return bytes(serialised)
 
 
 class Kernels:
-    """TensorRT-RTX's compiled kernels, shared by engines: the layers' MLPs have the same ones. Empty for TensorRT."""
+    """TensorRT-RTX's compiled kernels, shared by engines: the layers' MLPs have the same ones. Empty for TensorRT.
 
-    def __init__(self, library: Library) -> None:
-        self._library = library
+    Compiling takes seconds an engine, so they are kept in `file`: its SHA-256, then what the library serialises. It
+    says itself whether such bytes suit it and this GPU; ones that don't are compiled again.
+    """
+
+    def __init__(self, library: Library, file: Path | None = None) -> None:
+        self._library, self._file = library, file
         self._cache: Any = None
+        self._owner: Any = None  # the library's cache crashes once the engine that it was made with is gone
+        self._stored = b""
+        self.found = False  # whether they were read, and not all compiled here
 
-    def context(self, engine: Any) -> Any:
+    def context(self, engine: Any, runtime: Any) -> Any:
         """An execution context of an engine whose kernels are taken from here, and added if they are new."""
         if not self._library.is_rtx:
             return engine.create_execution_context()
         config = engine.create_runtime_config()
         if self._cache is None:
-            self._cache = config.create_runtime_cache()
+            self._cache, self._owner = config.create_runtime_cache(), (config, engine, runtime)
+            self._read()
         config.set_runtime_cache(self._cache)
         return engine.create_execution_context(config)
+
+    def keep(self) -> None:
+        """Write the file if there are other kernels than it has. One that can't be written costs time, no answer."""
+        if self._file is None or self._cache is None:
+            return
+        content = bytes(self._cache.serialize())
+        if content == self._stored:
+            return
+        temporary = self._file.with_name(f".{self._file.name}.{os.getpid()}")
+        try:
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_bytes(hashlib.sha256(content).digest() + content)
+            temporary.replace(self._file)
+        except OSError as error:
+            logger.warning("compiled kernels aren't kept: %s", error)
+            return
+        self._stored = content
+
+    def _read(self) -> None:
+        if self._file is None or not self._file.is_file():
+            return
+        whole = self._file.read_bytes()
+        digest, content = whole[:32], whole[32:]
+        if hashlib.sha256(content).digest() != digest:
+            logger.warning("%s isn't as it was written; kernels are compiled again", self._file)
+        elif not self._cache.deserialize(content):
+            logger.warning("%s is of another %s or GPU; kernels are compiled again", self._file, self._library.name)
+        else:
+            self._stored, self.found = content, True
 
 
 class Engine:
@@ -173,7 +213,7 @@ class Engine:
             raise BackendError(f"{library.name} can't load the engine {name}: {'; '.join(self._log.errors[-3:])}")
         self._engine = engine
         self._kernels = kernels or Kernels(library)  # must outlive the context
-        self._context = self._kernels.context(engine)
+        self._context = self._kernels.context(engine, self._runtime)
         if self._context is None:
             raise BackendError(f"{library.name} can't run the engine {name}: {'; '.join(self._log.errors[-3:])}")
         names = [engine.get_tensor_name(i) for i in range(engine.num_io_tensors)]

@@ -43,12 +43,13 @@ class ModelEngines:
         scales: Sequence[Fp8Scales | None] | None = None,
         vision_dtype: Dtype = "f16",
         report: Report = logger.warning,
+        loaded: Callable[[], None] = lambda: None,  # called once further engines have been loaded
     ) -> None:
         self.config, self.cache, self.scales, self.vision_dtype = config, cache, scales, vision_dtype
         self.report = report
         self.origin: dict[str, str] = {}  # engine -> "cached" or "built"
         self._weights: Weights | None = weights
-        self._build, self._load = build, load
+        self._build, self._load, self._after_loading = build, load, loaded
         self._loaded: dict[str, Part] = {}
         self._dtype: Dtype = "f32" if weights.embed_tokens.dtype == torch.float32 else "bf16"
 
@@ -82,6 +83,8 @@ class ModelEngines:
         for one, (plan, origin) in zip(missing, plans, strict=True):
             self.origin.setdefault(one.name, origin)
             self._loaded[one.name] = self._load(one, plan)
+        if missing:
+            self._after_loading()
         loaded = self._loaded
         return Parts(loaded[vision[0].name] if vision else None, [loaded[one.name] for one in mlps], loaded[step.name])
 
@@ -145,12 +148,13 @@ def for_this_gpu(
         networks=networks_hash(),
     )
     cache = EngineCache(folder or default_folder(), environment)
-    kernels = Kernels(library)
+    kernels = Kernels(library, cache.folder / f"kernels-{properties.name.replace(' ', '_')}-{library.version}.bin")
     return ModelEngines(
         config,
         weights,
         cache,
         build=lambda specification: build(library, specification),
         load=lambda specification, plan: Engine(library, specification.name, plan, kernels=kernels),
+        loaded=kernels.keep,
         **options,
     )

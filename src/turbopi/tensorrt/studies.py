@@ -1,10 +1,11 @@
-"""Three questions about TensorRT, answered on any checkpoint.
+"""Four questions about TensorRT, answered on any checkpoint.
 
 attention   The language model's layers as engines, {fused attention, written out} × {float16, bfloat16, float32}: how
             far K and V of every layer, and the actions made from them, are from the float32 reference. Each engine is
             one layer whose weights are inputs, so a style is one engine for all layers.
 mask        The suffix's attention over a cache that is compacted, padded and masked, or padded and not masked: cosine
             of the actions with the compacted reference's, for some numbers of steps. It needs no TensorRT.
+actions     Backends' actions against the float32 reference's: cosine and relative error, on any observations.
 throughput  Observations one at a time through `tensorrt`, and several in flight through `tensorrt_pipelined`.
 """
 
@@ -66,6 +67,32 @@ def mask_study(model: Pi0Model, observation: Observation, noise: Tensor, steps: 
             truth = model.denoise(compacted, noise, count)
             errors = _errors(model.denoise(cache, noise, count), truth)
             results.append({"cache": name, "slots": cache.k.shape[3], "steps": count, **errors})
+    return results
+
+
+def actions_study(
+    exact: UnifiedPolicy, judged: UnifiedPolicy, observations: Mapping[str, Sequence[Any]], num_steps: int
+) -> list[dict[str, Any]]:
+    """The model's actions (all of its dimensions, before the robot's units) through one policy against another's.
+
+    One result for each group of observations, with the worst observation's cosine and relative error; the i-th one of
+    a group gets the noise of seed i.
+    """
+    results = []
+    for group, given in observations.items():
+        errors = []
+        for seed, obs in enumerate(given):
+            one = Observation.stack([exact.prepare(obs)])
+            shape = (1, exact.config.model.action_horizon, exact.config.model.action_dim)
+            noise = torch.from_numpy(np.random.default_rng(seed).standard_normal(shape, dtype=np.float32))
+            ours, truth = (policy.backend.sample(one, noise, num_steps).actions for policy in (judged, exact))
+            errors.append(_errors(ours.cpu(), truth.cpu()))
+        finite = all(one["cosine"] is not None for one in errors)
+        worst = {
+            "worst_cosine": min(one["cosine"] for one in errors) if finite else None,  # type: ignore[type-var]
+            "worst_relative": max(one["relative"] for one in errors) if finite else None,  # type: ignore[type-var]
+        }
+        results.append({"backend": judged.backend.name, "observations": group, "count": len(errors), **worst})
     return results
 
 
