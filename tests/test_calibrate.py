@@ -19,13 +19,16 @@ from turbopi.calibrate.observations import calls, read_samples, split
 from turbopi.calibrate.run import Settings, calibrate_model
 from turbopi.calibrate.sites import sites
 from turbopi.calibrate.statistics import Histogram, collect
+from turbopi.calibrate.studied import WEIGHTS, studied_checkpoint
 from turbopi.checkpoint import random_checkpoint
 from turbopi.cli.options import PolicyOptions
 from turbopi.config import preset
 from turbopi.engine.fp8 import E4M3_MAX, to_e4m3
 from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, ObservationError
 from turbopi.judge.check_golden import check_case, golden_calibration, golden_calls
-from turbopi.judge.verdict import Rule
+from turbopi.judge.verdict import ACTIONS, Compared, Repetition, Rule, judge
+from turbopi.judge.verify_inputs import Call, Sample
+from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
 from turbopi.serve.record import Call as RecordedCall
 from turbopi.serve.record import save_call
@@ -315,6 +318,69 @@ def test_fp8_is_held_to_the_cosine_that_calibration_aims_at() -> None:
     assert rule.limit(control=0.004) == pytest.approx(0.0707)
     assert rule.allowed("fp8", control=0.002) == pytest.approx(0.064)
     assert Rule.of("fused", "fp8-mlp", bound=0.02).limit(control=1.0) == 0.02
+    assert rule.cosine == 0.9975
+    assert Rule.of("fused", "fp8", bound=0.02).cosine is None and Rule.of("fused", "bf16").cosine is None
+
+
+@pytest.mark.parametrize(("off", "passes"), [(0.06, True), (0.08, False)])
+def test_fp8_is_held_to_what_denoising_did_where_the_noise_hides_it(off: float, passes: bool) -> None:
+    """Actions that are nearly the noise they began from: their own error says little."""
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((1, 10, 32)).astype(np.float32)
+    did, wrong = (0.1 * rng.standard_normal((2, 10, 32))).astype(np.float32)
+    inputs = ModelInputs(np.zeros(1), np.ones(1, bool), np.zeros(1), np.ones(1, bool), np.zeros(1))
+    call = Call(0, Sample("one", inputs, np.zeros(8)), 0, torch.from_numpy(noise), first=True)
+    compared = Compared()
+    exact, ours = {ACTIONS: noise[0] + did}, {ACTIONS: noise[0] + did + off * wrong}
+    compared.add(call, ours, exact, ours[ACTIONS], exact[ACTIONS])
+    checks = judge(Rule.of("fused", "fp8"), "fp8", "plain", compared, compared, Repetition())["checks"]
+    assert [check["ok"] for check in checks if check["name"] == "actions"] == [True]
+    assert [check["ok"] for check in checks if check["name"] == "deltas"] == [passes]
+
+
+# Weights to study
+
+
+def test_weights_to_study_are_what_they_are_called() -> None:
+    plain, outliers = (
+        studied_checkpoint(kind, "pi05_tiny", "cpu").load("cpu", "f32").state
+        for kind in ("std 0.02", "std 0.02 with outliers")
+    )
+    for name, values in plain.items():
+        if values.dim() > 1:
+            assert float(values.std()) == pytest.approx(0.02, rel=0.2), name
+            assert torch.equal(values, outliers[name])
+    factors = torch.cat([1 + x for name, x in outliers.items() if name.startswith("vlm.") and x.dim() == 1])
+    assert set(factors.tolist()) == {1.0, 20.0}
+    assert 0 < float((factors == 20).float().mean()) < 0.03
+    assert set(torch.cat([x for n, x in outliers.items() if "layer_norm1.weight" in n]).tolist()) == {1.0, 20.0}
+    assert not any(bool(values.any()) for name, values in plain.items() if name.endswith("bias"))
+
+
+def test_weights_to_study_have_fingerprints_of_their_own() -> None:
+    kinds = [studied_checkpoint(kind, "pi05_tiny", "cpu", seed) for kind in WEIGHTS for seed in (0, 1)]
+    assert len({checkpoint.fingerprint() for checkpoint in kinds}) == 6
+
+
+# Identity
+
+
+def test_a_calibration_is_told_by_what_it_decides_alone() -> None:
+    one = made_up()
+    name = "prefix.0.down"
+    assert made_up(source="elsewhere", report={**one.report, "warnings": ["w"]}).identity == one.identity
+    others = [
+        dataclasses.replace(one, sites={**one.sites, name: dataclasses.replace(one.sites[name], scale=0.02)}),
+        dataclasses.replace(one, sites={**one.sites, name: dataclasses.replace(one.sites[name], kept="hurts")}),
+        one.only(["prefix"]),
+        dataclasses.replace(one, fingerprint="0" * 64),
+    ]
+    assert len({other.identity for other in (one, *others)}) == 5
+
+
+def test_a_file_keeps_its_identity(tmp_path: Path) -> None:
+    made_up().save(tmp_path / "fp8.json")
+    assert Quantization.load(tmp_path / "fp8.json").identity == made_up().identity
 
 
 # Formats without kernels

@@ -11,6 +11,7 @@ from typer.testing import CliRunner, Result
 from turbopi import serve
 from turbopi.cli import app
 from turbopi.cli.options import PolicyOptions
+from turbopi.serve.record import load_call, recorded_files
 from turbopi.sim import libero
 
 QUICK = "--random-weights pi05_tiny --precision f32 --steps 1 --camera-px 64 --image-px 64 --videos none"
@@ -53,6 +54,25 @@ def test_eval_writes_its_folder_and_continues_it(tmp_path: Path) -> None:
         (2, 0, 2),
         (2, 1, 2),
     ]
+
+
+@pytest.mark.usefixtures("seeking")
+def test_what_the_policy_sees_is_recorded(tmp_path: Path) -> None:
+    command = f"eval reacher {QUICK} --tasks 0 --trials 2 --max-steps 6 --out {tmp_path / 'run'}"
+    result = turbopi(command, "--record", tmp_path / "seen")
+    assert result.exit_code == 0, result.output
+    assert "recorded 4 observations in" in result.output
+    calls = [load_call(file) for file in recorded_files(tmp_path / "seen")]
+    assert [(c.result["episode"]["initial_state"], c.result["episode"]["step"]) for c in calls] == [
+        (0, 0),
+        (0, 5),
+        (1, 0),
+        (1, 5),
+    ]
+    assert calls[0].result["actions"].shape == (10, 7)
+    assert calls[0].observation["observation/image"].shape == (64, 64, 3)
+    turbopi(command, "--record", tmp_path / "again")
+    assert not (tmp_path / "again").exists()  # nothing was left to run
 
 
 def test_a_server_is_evaluated(tmp_path: Path) -> None:

@@ -117,6 +117,30 @@ def test_a_comparison_tells_the_precision_and_calibration_on_noise(tmp_path: Pat
     assert [one.as_json()["precision"] for one in compared] == ["f32", "fp8, random noise"]
 
 
+def in_fp8(calibration: str) -> SeekingPolicy:
+    policy = SeekingPolicy()
+    policy.metadata |= {"precision": "fp8", "backend_details": {"fp8": {"identity": calibration}}}
+    return policy
+
+
+def test_runs_of_two_calibrations_are_only_compared_on_purpose(tmp_path: Path) -> None:
+    policies = {"exact": SeekingPolicy(), "one": in_fp8("aaaaaaaaaaaa"), "other": in_fp8("bbbbbbbbbbbb")}
+    exact, one, other = (run(tmp_path / name, policy, states=(0,)) for name, policy in policies.items())
+    assert len(compare([exact, one])) == 2
+    with pytest.raises(ConfigError, match=r"different calibrations \(aaaaaaaa and bbbbbbbb\): .*--across-calibrations"):
+        compare([exact, one, other])
+    compared = compare([exact, one, other], across_calibrations=True)
+    assert [run.precision for run in compared] == ["f32", "fp8, aaaaaaaa", "fp8, bbbbbbbb"]
+    assert [run.as_json()["calibration"] for run in compared] == [None, "aaaaaaaaaaaa", "bbbbbbbbbbbb"]
+
+
+def test_a_run_is_not_continued_with_another_calibration(tmp_path: Path) -> None:
+    run(tmp_path, in_fp8("aaaaaaaaaaaa"), states=(0,))
+    run(tmp_path, in_fp8("aaaaaaaaaaaa"), states=(0, 1))
+    with pytest.raises(ConfigError, match=r"policy\.calibration = 'aaaaaaaaaaaa', but this one has 'bbbbbbbbbbbb'"):
+        run(tmp_path, in_fp8("bbbbbbbbbbbb"), states=(0, 1))
+
+
 def test_runs_of_another_protocol_are_not_compared(tmp_path: Path) -> None:
     first = run(tmp_path / "a", SeekingPolicy(), states=(0,))
     second = run(tmp_path / "b", SeekingPolicy(), states=(0,), replan=3)

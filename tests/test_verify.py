@@ -14,6 +14,7 @@ from cli_helpers import refusal, turbopi
 from turbopi import backends
 from turbopi.checkpoint import random_checkpoint
 from turbopi.errors import CheckpointError
+from turbopi.judge import certificates
 from turbopi.judge.intermediates import Errors, Place, first_suspect, in_order, tensors_of
 from turbopi.judge.verdict import ACTIONS, Rule
 from turbopi.judge.verify import verify
@@ -208,6 +209,28 @@ def refusal_of(*arguments: object) -> str:
 
 def test_no_weights_are_refused() -> None:
     assert "no weights" in refusal(turbopi("verify"))
+
+
+# Certificates for tables
+
+
+def test_a_certificate_is_condensed_to_the_worst_of_every_name() -> None:
+    document = certified("pytorch", "--precision", "bf16")
+    condensed = certificates.condensed(document)
+    rows = [row for row in document["intermediates"] if row["name"] == "kv_k"]
+    worst = max(rows, key=lambda row: row["relative_rms"])
+    assert condensed["intermediates"]["kv_k"]["at"] == worst["index"]
+    assert condensed["intermediates"]["kv_k"]["relative_rms"] == pytest.approx(worst["relative_rms"], rel=1e-3)
+    assert condensed["verdict"] == document["verdict"]
+    assert len(json.dumps(condensed, allow_nan=False)) < len(json.dumps(document)) / 2
+
+
+def test_varied_observations_are_no_two_alike_and_come_again() -> None:
+    first, again, other = (list(certificates.varied(seed, 8)) for seed in (0, 0, 1))
+    pictures = [one["observation/image"].tobytes() for one in (*first, *other)]
+    assert len(set(pictures)) == 16
+    assert [one["observation/image"].tobytes() for one in again] == pictures[:8]
+    assert tiny_policy().prepare(first[7]).token_mask.any()
 
 
 # The numbers themselves

@@ -1,7 +1,6 @@
 """What numbers of eight and four bits do to actions: `python -m turbopi.calibrate.research --out FILE`.
 
-Emulated exactly in float32 (emulate.py, formats.py) on three sets of full-size weights: Turbo-Pi's random ones, normal
-ones of standard deviation 0.02, and these with 1 % of the channels behind every norm 20 times as large.
+Emulated exactly in float32 (emulate.py, formats.py) on three sets of full-size weights (studied.py).
 """
 
 import argparse
@@ -21,30 +20,11 @@ from turbopi.calibrate.formats import attention_in_fp8, round_nvfp4
 from turbopi.calibrate.observations import Batch, Sample, batches, calls
 from turbopi.calibrate.sites import MLP_KINDS, PARTS, Site, linears, sites
 from turbopi.calibrate.statistics import collect
+from turbopi.calibrate.studied import WEIGHTS, Weights, studied_checkpoint
 from turbopi.checkpoint import random_checkpoint
-from turbopi.model.reference import Pi0Model, parameter_shapes
+from turbopi.model.reference import Pi0Model
 from turbopi.preprocess import Pipeline
 from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
-
-STD = 0.02
-OUTLIERS, OUTLIER_FACTOR = 0.01, 20.0
-WEIGHTS = ("turbopi", "std 0.02", "std 0.02 with outliers")
-
-
-def set_weights(model: Pi0Model, kind: str, seed: int = 0) -> None:
-    """Replace a model's parameters in place, all on its device."""
-    generator = torch.Generator(model.device).manual_seed(seed)
-    for name, parameter in model.named_parameters():
-        if parameter.dim() > 1:
-            parameter.data.normal_(0.0, STD, generator=generator)
-        elif name.endswith("bias"):
-            parameter.data.zero_()
-        else:  # LayerNorm's weight is the factor itself, RMSNorm's is added to 1
-            vision = name.startswith("vision.")
-            parameter.data.fill_(1.0 if vision else 0.0)
-            if kind == "std 0.02 with outliers":
-                chosen = torch.rand(parameter.shape, generator=generator, device=model.device) < OUTLIERS
-                parameter.data[chosen] = OUTLIER_FACTOR - (0.0 if vision else 1.0)
 
 
 def errors(
@@ -125,17 +105,12 @@ def run(
     count: int,
     steps: int,
     out: Path,
-    kinds: Sequence[str] = WEIGHTS,
+    kinds: Sequence[Weights] = WEIGHTS,
     formats: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """All errors, on LIBERO pictures: by weights and format; written to `out` as they come."""
     checkpoint = demo.with_libero_stats(random_checkpoint(preset))
     sizes = checkpoint.config.model
-    if WEIGHTS[0] in kinds:
-        state = checkpoint.load(device, "f32").state
-    else:
-        state = {name: torch.empty(shape, device=device) for name, shape in parameter_shapes(sizes).items()}
-    model = Pi0Model.from_state(sizes, state)
     tokenizer = load_tokenizer(TINY_TOKENIZER, checkpoint_dir=None, candidates=(), vocab_size=sizes.vocab_size)
     pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, tokenizer)
     frames = demo.load_frames()[:count]
@@ -143,13 +118,12 @@ def run(
         Sample(f"LIBERO frame {i}", pipeline.before(_observation(frame, frames[0].prompt))[0])
         for i, frame in enumerate(frames)
     ]
-    shape = (model.config.action_horizon, model.config.action_dim)
+    shape = (sizes.action_horizon, sizes.action_dim)
     made = [batch for _, batch in batches(calls(samples, shape, 1, 0), 8, device)]
     about = {"provenance": provenance(device), "preset": preset, "steps": steps, "observations": len(samples)}
     results: dict[str, Any] = {}
     for kind in kinds:
-        if kind != WEIGHTS[0]:
-            set_weights(model, kind)
+        model = Pi0Model.from_state(sizes, studied_checkpoint(kind, preset, device).load(device, "f32").state)
         results[kind] = {}
         for name, error in errors(model, made, steps, formats):
             results[kind][name] = error
@@ -158,6 +132,7 @@ def run(
                 flush=True,
             )
             out.write_text(json.dumps({**about, "errors": results}, indent=1) + "\n", encoding="utf-8")
+        del model
     return results
 
 

@@ -28,6 +28,7 @@ from turbopi.model.reference import Pi0Model, parameter_dtype
 from turbopi.policy import UnifiedPolicy
 
 TARGET = 0.9975  # cosine of the actions' deltas that automatic choice of sites aims at
+ROOM = 0.8  # of the error that the target allows, on the few calls that sites are chosen on: others may be harder
 SATURATION_LIMIT = 0.01  # part of a site's held-out values beyond the largest number: more is told loudly
 SITE_LIMIT = 0.25  # relative rms of a site's products beyond which it stays in bfloat16 whatever the actions say
 SELECTION = 8  # calls that ways to choose scales and groups of sites are compared on
@@ -277,11 +278,12 @@ def _keep_groups(
     hurting = sorted(groups, key=lambda name: -(groups[name]["relative_rms"] ** 2) / work[name])
     progress.begin("which sites to keep in bfloat16", len(hurting))
     more: dict[str, str] = {}
+    wanted = 1 - ROOM * (1 - target)
     for name in hurting:
         used = {site: scales[site] for site in eligible if str(site) not in kept and str(site) not in more}
-        if not used or trials.error(trials.actions(used))["delta_cosine"] >= target:
+        if not used or trials.error(trials.actions(used))["delta_cosine"] >= wanted:
             break
-        reason = f"the actions' cosine is below {target} with it; alone it costs {groups[name]['relative_rms']:.2%}"
+        reason = f"the actions' cosine is below {wanted:.5g} with it; alone it costs {groups[name]['relative_rms']:.2%}"
         whole = name.startswith("expert.")  # its kernel takes all matrices in one precision
         more |= {str(site): reason for site in used if site.group == name or (whole and site.part == "expert")}
         progress.advance()

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from torch import Tensor
 
+from turbopi.checkpoint import known_hashes
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, WeightSource
 from turbopi.config import PolicyConfig
@@ -72,19 +73,28 @@ class Checkpoint:
         total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
         return Loaded(state, time.perf_counter() - began, total)
 
-    def fingerprint(self) -> str:
+    def fingerprint(self, *, trust_files: bool = False) -> str:
         """SHA-256 of the weights: of every parameter's canonical name, shape and float32 bytes (little endian).
 
         The format and the stored dtype don't enter it: the same numbers have the same fingerprint in any of them.
-        Random weights are hashed by what they are made from. Reads everything, once per object.
+        Random weights are hashed by what they are made from. Reads everything, once per object, unless `trust_files`:
+        then what was read earlier holds for files that look unchanged (known_hashes.py).
         """
-        return self._fingerprint
+        if not trust_files or "_fingerprint" in self.__dict__:
+            return self._fingerprint
+        key = self._files_key()
+        return (None if key is None else known_hashes.look_up(key)) or self._fingerprint
+
+    def _files_key(self) -> str | None:
+        files = getattr(self.source, "files", ())
+        return known_hashes.key_of(files, getattr(self.source, "variant", ""))
 
     @cached_property
     def _fingerprint(self) -> str:
         recipe = getattr(self.source, "recipe", None)  # random weights
         if recipe is not None:
             return hashlib.sha256(str(recipe).encode()).hexdigest()
+        key = self._files_key()
         hashes = {name: hashlib.sha256() for name in self.source.shapes}
         for piece in self.source.pieces(torch.device("cpu")):
             values = piece.values.to(torch.float32).contiguous()
@@ -92,7 +102,10 @@ class Checkpoint:
         lines = [
             f"{name} {list(self.source.shapes[name])} {digest.hexdigest()}" for name, digest in sorted(hashes.items())
         ]
-        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+        fingerprint = hashlib.sha256("\n".join(lines).encode()).hexdigest()
+        if key is not None and key == self._files_key():  # nobody changed them meanwhile
+            known_hashes.remember(key, fingerprint)
+        return fingerprint
 
     @property
     def stored_bytes(self) -> int:

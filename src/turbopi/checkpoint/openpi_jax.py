@@ -48,6 +48,8 @@ class JaxSource:
         kernel = arrays.get(VISION_QUERY, ())
         self.vision_heads: int | None = kernel[-2] if len(kernel) == 4 else None
         self.notes = [self._adapter_note()] if adapters else []
+        self.files = sorted(path for path in folder.rglob("*") if path.is_file())
+        self.variant = repr(lora) if adapters else ""
 
     def native_name(self, name: str) -> str:
         return path_of(name) or name

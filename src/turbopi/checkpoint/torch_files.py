@@ -62,6 +62,7 @@ class TorchSource:
             )
         self.shapes = {name: stored.shape for name, stored in self._stored.items()}
         self.dtypes = {name: stored.dtype for name, stored in self._stored.items()}
+        self.files = sorted({stored.file for stored in self._stored.values()})
 
     def native_name(self, name: str) -> str:
         return self._stored[name].key if name in self._stored else self._prefix + to_openpi(name)

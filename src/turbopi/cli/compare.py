@@ -40,6 +40,12 @@ def compare_command(
     simulator: Annotated[
         str, typer.Option("--simulator", metavar="NAME", help="Where ways to run are evaluated.")
     ] = "libero",
+    across_calibrations: Annotated[
+        bool,
+        typer.Option(
+            "--across-calibrations", help="FP8 runs of the same weights may come from different calibrations."
+        ),
+    ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """The same episodes through several policies, in one table, paired with the first.
@@ -57,14 +63,15 @@ def compare_command(
     folders = [(Path(run) / FILE).exists() for run in runs]
     if all(folders):
         out = options.out
-        compared = compare([load_results(Path(run)) for run in runs])
+        loaded = [load_results(Path(run)) for run in runs]
+        compared = compare(loaded, across_calibrations=across_calibrations)
     elif any(Path(run).is_dir() for run in runs):
         named = ", ".join(run for run, is_folder in zip(runs, folders, strict=True) if not is_folder)
         raise ConfigError(f"runs are all folders of evaluations, or all ways to run; not a folder with {FILE}: {named}")
     else:
         out = options.out or Path("turbopi-compare")
         results, errors = _run_variants(options, runs, checkpoint, simulator, out, output)
-        compared = compare(results, errors)
+        compared = compare(results, errors, across_calibrations=across_calibrations)
     table = Table(
         title=f"{compared[0].results.protocol['suite']}: {compared[0].rate.trials} episodes", title_justify="left"
     )

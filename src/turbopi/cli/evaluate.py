@@ -113,6 +113,15 @@ class EvalOptions(PolicyOptions):
         Path | None, _option("--out", panel=_OUTPUT, metavar="DIR", help="Where results go, and continue; see below.")
     ] = None
     restart: Annotated[bool, _option("--restart", panel=_OUTPUT, help="Forget what the folder holds.")] = False
+    record: Annotated[
+        Path | None,
+        _option(
+            "--record",
+            panel=_OUTPUT,
+            metavar="DIR",
+            help="Keep what the policy sees, in a new folder there: for `turbopi calibrate` and `turbopi verify`.",
+        ),
+    ] = None
 
     def simulator(self, name: str, output: Output) -> "Simulator":
         """Checked, with its warnings printed."""
@@ -153,7 +162,7 @@ class EvalOptions(PolicyOptions):
         self.tell_if_random(opened, output)
         policy = self.make_policy(opened, output)
         policy.warmup()
-        return LocalPolicy(policy, opened.fingerprint())
+        return LocalPolicy(policy, opened.fingerprint(trust_files=True))
 
 
 @command(
@@ -246,27 +255,39 @@ def run_with_progress(
     """Check that the policy fits, then run with a bar, or a line an episode where nobody watches."""
     from turbopi.evaluate.run import default_workers, evaluate, pending, prepare
     from turbopi.evaluate.sources import check_fit
+    from turbopi.evaluate.visited import Recording
 
     check_fit(source, simulator, protocol.sim, protocol.image_px, protocol.replan)
     results = prepare(folder, protocol, source, simulator, jobs, restart=options.restart)
     left = len(pending(results, jobs))
+    recording = None if options.record is None or not left else Recording(options.record, source)
+    hooks = [hook for hook in (on_answer, recording) if hook is not None]
     workers = min(options.workers or default_workers(), max(1, left))
     output.line(f"{protocol.suite}: {len(jobs)} episodes with {source.label} into {folder}")
     if left < len(jobs):
         output.line(f"{len(jobs) - left} of them are finished already; {left} to go")
-    with _told(output, len(jobs), len(jobs) - left) as on_episode:
-        return evaluate(
-            results,
-            protocol,
-            source,
-            simulator,
-            jobs,
-            num_workers=workers,
-            max_batch=options.max_batch or max_batch or workers,
-            videos=options.video_plan(),
-            on_episode=on_episode,
-            on_answer=on_answer,
-        )
+
+    def answered(*request: Any) -> None:
+        for hook in hooks:
+            hook(*request)
+
+    try:
+        with _told(output, len(jobs), len(jobs) - left) as on_episode:
+            return evaluate(
+                results,
+                protocol,
+                source,
+                simulator,
+                jobs,
+                num_workers=workers,
+                max_batch=options.max_batch or max_batch or workers,
+                videos=options.video_plan(),
+                on_episode=on_episode,
+                on_answer=answered if hooks else None,
+            )
+    finally:
+        if recording is not None:
+            output.line(recording.close())
 
 
 @contextmanager

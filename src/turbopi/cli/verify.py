@@ -123,6 +123,8 @@ def _show(document: dict[str, Any], output: Output) -> None:
     for title, key in ((subject, "backend"), (document["oracle"], "oracle")):
         time = times[key]
         output.line(f"latency of {title}: median {time['p50']:.2f} ms, p95 {time['p95']:.2f} ms, {time['calls']} calls")
+    if document["gpu_bytes"] is not None:
+        output.line(f"GPU memory of {subject}, weights and all that stays: {document['gpu_bytes'] / 1e9:.2f} GB")
     gpu = document["provenance"].get("gpu", {})
     if "clocks.sm" in gpu:
         output.line(

@@ -52,12 +52,15 @@ class Compared:
         precision = str(self.results.policy.get("identity", {}).get("precision") or "-")
         details = self.results.policy.get("about", {}).get("backend_details") or {}
         noisy = isinstance(details, dict) and details.get("fp8", {}).get("observations") == RANDOM_NOISE
-        return f"{precision}, random noise" if noisy else precision
+        calibration = _calibration(self.results)
+        told = [precision, *([] if calibration is None else [calibration[:8]]), *(["random noise"] if noisy else [])]
+        return ", ".join(told)
 
     def as_json(self) -> dict[str, Any]:
         return {
             "label": self.label,
             "precision": self.precision,
+            "calibration": _calibration(self.results),
             "folder": str(self.results.folder),
             "success": self.rate.as_json(),
             "paired_with_first": None if self.paired is None else self.paired.as_json(),
@@ -70,12 +73,20 @@ class Compared:
         }
 
 
-def compare(runs: Sequence[Results], errors: Sequence[dict[str, float] | None] | None = None) -> list[Compared]:
+def compare(
+    runs: Sequence[Results],
+    errors: Sequence[dict[str, float] | None] | None = None,
+    *,
+    across_calibrations: bool = False,
+) -> list[Compared]:
     """Every run on the episodes that all of them have a verdict for, paired with the first.
 
-    Raises ConfigError if the protocols differ, or if there is no common episode.
+    Raises ConfigError if the protocols differ, if there is no common episode, or if FP8 runs of the same weights come
+    from different calibrations, unless those are what is compared.
     """
     check_same_protocol(runs)
+    if not across_calibrations:
+        check_same_calibration(runs)
     common = sorted(set.intersection(*({e.key for e in run.episodes.values() if e.judged} for run in runs)))
     if not common:
         names = ", ".join(str(run.folder) for run in runs)
@@ -110,6 +121,27 @@ def check_same_protocol(runs: Sequence[Results]) -> None:
                     f"{first.folder} and {run.folder} aren't comparable: "
                     f"{name} is {mine!r} in one and {theirs!r} in the other"
                 )
+
+
+def check_same_calibration(runs: Sequence[Results]) -> None:
+    """Two FP8 runs that differ in backend or steps should differ in nothing else without anybody's noticing."""
+    first: dict[str, Results] = {}
+    for run in runs:
+        calibration = _calibration(run)
+        if calibration is None:
+            continue
+        other = first.setdefault(str(run.policy.get("identity", {}).get("weights")), run)
+        if _calibration(other) != calibration:
+            raise ConfigError(
+                f"{other.folder} and {run.folder} are FP8 of the same weights by different calibrations "
+                f"({str(_calibration(other))[:8]} and {calibration[:8]}): run one of them again with the other's "
+                "--quantization, or give --across-calibrations if that is what you compare"
+            )
+
+
+def _calibration(run: Results) -> str | None:
+    found = run.policy.get("identity", {}).get("calibration")
+    return None if found is None else str(found)
 
 
 def document(compared: Sequence[Compared]) -> dict[str, Any]:

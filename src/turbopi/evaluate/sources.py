@@ -61,7 +61,8 @@ class LocalPolicy:
         about = dict(policy.metadata)
         names = ("config", "backend", "precision", "num_denoising_steps", "robot", "device")
         self._policy, self.about = policy, about
-        self.identity = {"weights": weights} | {name: about.get(name) for name in names}
+        self.identity = {"weights": weights, "calibration": calibration_of(about)}
+        self.identity |= {name: about.get(name) for name in names}
         default = f"{about.get('backend')} {about.get('precision')} {about.get('num_denoising_steps')} steps"
         self.label = label or default
 
@@ -71,6 +72,13 @@ class LocalPolicy:
 
     def close(self) -> None:
         self._policy = None
+
+
+def calibration_of(metadata: Mapping[str, Any]) -> str | None:
+    """Which calibration a policy runs with (`Quantization.identity`), where its metadata tells; None: not in FP8."""
+    details = metadata.get("backend_details")
+    fp8 = details.get("fp8") if isinstance(details, Mapping) else None
+    return fp8.get("identity") if isinstance(fp8, Mapping) else None
 
 
 class RemotePolicy:
@@ -107,7 +115,8 @@ class RemotePolicy:
         metadata = _unpacked(greeting, self._where)
         volatile = ("load_seconds", "backend_details", "backend_reason")
         self.about = {"server": self._where, "metadata": metadata}
-        self.identity = {"server": {name: value for name, value in metadata.items() if name not in volatile}}
+        server = {name: value for name, value in metadata.items() if name not in volatile}
+        self.identity = {"server": server, "calibration": calibration_of(metadata)}
         described = " ".join(str(metadata[name]) for name in ("config", "backend", "precision") if name in metadata)
         self.label = f"{self._where} {described}".strip()
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from turbopi.evaluate.plan import Job
 from turbopi.evaluate.sources import Answer, PolicySource
+from turbopi.serve.record import Recorder
 
 FILE = "visited.npz"
 KEPT = 48
@@ -47,6 +48,26 @@ class Visited:
         stored = {f"{row}|{name}": value for row, entry in enumerate(self.entries) for name, value in entry.items()}
         self._path.parent.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(self._path, seen=self.seen, count=len(self.entries), **stored)
+
+
+class Recording:
+    """All requests of a run, as `turbopi serve --record` writes them: to calibrate and to verify on."""
+
+    def __init__(self, folder: Path, source: PolicySource) -> None:
+        """Into a new folder below `folder`. Raises ConfigError if it can't be made."""
+        self._recorder = Recorder(folder, {"label": source.label, "identity": source.identity})
+
+    def __call__(self, job: Job, step: int, observation: dict[str, Any], seed: int, answer: Answer) -> None:
+        size = sum(value.nbytes for value in observation.values() if isinstance(value, np.ndarray))
+        where = {"task": job.task.index, "initial_state": job.initial_state, "step": step, "seed": str(seed)}
+        self._recorder.put(observation, {"actions": answer.actions, "episode": where}, size=size)
+
+    def close(self) -> str:
+        """Write what waits. Returns what to tell."""
+        self._recorder.close()
+        missing = self._recorder.dropped + self._recorder.failed
+        lost = f"; {missing} more could not be written" if missing else ""
+        return f"recorded {self._recorder.written} observations in {self._recorder.folder}{lost}"
 
 
 def action_error(entries: Sequence[dict[str, Any]], reference: PolicySource) -> dict[str, float] | None:

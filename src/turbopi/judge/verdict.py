@@ -15,7 +15,8 @@ from turbopi.plots import action_groups
 ACTIONS = Place("actions")
 F32_BOUND = 1e-5  # relative rms of the actions
 BF16_FACTOR = 1.25  # times the bf16 control's
-FP8_BOUND = 0.0707  # relative rms of the actions: a cosine of 0.9975, what calibration aims at
+FP8_BOUND = 0.0707  # relative rms of the actions: a cosine of 0.9975
+FP8_COSINE = 0.9975  # of what denoising did (actions less noise): what calibration aims at
 FP8_STEP = 2.0**5  # E4M3's rounding is so much coarser than bfloat16's, and so may intermediates be
 SUSPECT_FACTOR = 3.0  # times the control's, on an intermediate
 JUMP = 10.0  # times the layer or step before
@@ -33,6 +34,7 @@ class Rule:
     factor: float | None
     reason: str
     overridden: bool = False
+    cosine: float | None = None  # the least cosine of what denoising did (actions less noise); None: no bound on it
 
     @classmethod
     def of(
@@ -56,7 +58,8 @@ class Rule:
         if precision == "f32":
             return cls(control, F32_BOUND, None, "two float32 implementations differ by less, TF32 by more")
         if precision in TIERS:
-            return cls(control, FP8_BOUND, None, "a cosine of about 0.9975 to float32, what calibration aims at")
+            reason = "a cosine of 0.9975 to float32, what calibration aims at"
+            return cls(control, FP8_BOUND, None, reason, cosine=FP8_COSINE)
         if control == "jitter":
             factors, seen = (demo.TRAINED_FACTORS, "5.5") if trained else (demo.BOUND_FACTORS, "3.2")
             reason = f"rounding activations besides weights was seen to cost up to {seen} times rounding weights alone"
@@ -93,6 +96,7 @@ class Compared:
     by_place: ErrorsBy = field(default_factory=dict)
     by_dimension: list[Errors] = field(default_factory=list)  # robot units
     by_call: list[tuple[Call, Errors]] = field(default_factory=list)  # actions
+    deltas: Errors = field(default_factory=Errors)  # what denoising did: actions less noise
 
     def add(self, call: Call, tensors: Tensors, exact: Tensors, robot: np.ndarray, exact_robot: np.ndarray) -> None:
         """One call's tensors, and its actions [H, d] in the robot's units."""
@@ -106,6 +110,8 @@ class Compared:
         of_call = Errors()
         of_call.add(tensors[ACTIONS], exact[ACTIONS])
         self.by_call.append((call, of_call))
+        noise = call.noise[0].numpy()
+        self.deltas.add(tensors[ACTIONS] - noise, exact[ACTIONS] - noise)
         self.by_dimension = self.by_dimension or [Errors() for _ in range(robot.shape[1])]
         for index, errors in enumerate(self.by_dimension):
             errors.add(robot[:, index], exact_robot[:, index])
@@ -155,6 +161,7 @@ def judge(
             "actions_relative_rms": limit,
             "factor_of_control": None if rule.bound is not None else rule.factor,
             "reason": rule.reason,
+            "deltas_cosine": rule.cosine,
             "overridden": rule.overridden,
             "suspect_factor": None if precision == "f32" else FP8_STEP if precision in TIERS else rule.suspect_factor,
             "jump": JUMP,
@@ -189,8 +196,17 @@ def _checks(
         text = "the actions aren't finite"
     wrong = [place for place in in_order(compared.by_place) if not compared.by_place[place].finite]
     same = repetition.identical == repetition.calls
+    cosine = compared.deltas.cosine
+    of_deltas = {
+        "name": "deltas",
+        "ok": bool(cosine >= (rule.cosine or 0.0)),
+        "value": cosine,
+        "bound": rule.cosine,
+        "text": f"cosine of what denoising did is {cosine:.5f}, at least {rule.cosine} is stated",
+    }
     return [
         {"name": "actions", "ok": ok, "value": error, "bound": limit, "text": text},
+        *([] if rule.cosine is None else [of_deltas]),
         {
             "name": "finite",
             "ok": not wrong,
@@ -219,7 +235,8 @@ def _actions(robot: str, compared: Compared, control: Compared) -> dict[str, Any
     }
     return {
         **compared.actions.as_json(),
-        "control": control.actions.as_json(),
+        "deltas": {"cosine": compared.deltas.cosine, "relative_rms": compared.deltas.relative_rms},
+        "control": control.actions.as_json() | {"deltas_cosine": control.deltas.cosine},
         "worst": {"observation": call.sample.source, "seed": call.seed, **errors.as_json()},
         "dimensions": [
             {

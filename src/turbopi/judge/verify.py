@@ -66,6 +66,7 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
     warmup = subject.warmup()
     compared = reference.compare(subject, progress)
     repetition = _repeat(subject, calls, steps, progress)
+    memory = torch.cuda.memory_allocated(device) if device.type == "cuda" else None
     about = provenance(device)  # clocks while the GPU is warm
     details = subject.metadata
     del subject
@@ -83,6 +84,7 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
         "not_exposed": sorted(reference.names - exposed),
         "latency_ms": {"backend": _latency(repetition.milliseconds), "oracle": _latency(reference.milliseconds)},
         "warmup_seconds": round(warmup, 3),
+        "gpu_bytes": memory,  # after all calls: weights, and all else that stays
         "observations": reference.describe(plan),
         "weights": {
             "path": None if checkpoint.path is None else str(checkpoint.path),
