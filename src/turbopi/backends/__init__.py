@@ -60,6 +60,12 @@ _SPECS = (
         "cuda_graph with kernels of our own: NVIDIA GPUs from compute capability 8.0; in FP8 9.0",
     ),
     BackendSpec(
+        "emulated_fp8",
+        "turbopi.backends.emulated_fp8",
+        "EmulatedFp8Backend",
+        "the reference with a calibration's FP8 roundings, exact and slow, to judge FP8 by: any device",
+    ),
+    BackendSpec(
         "onnx",
         "turbopi.backends.onnx",
         "OnnxBackend",
@@ -117,7 +123,7 @@ def availability(name: str, device: torch.device) -> str | None:
 def choose(device: torch.device, precision: Tier = "bf16") -> tuple[str, str]:
     """The backend that "auto" stands for on a device in a precision, and why."""
     if precision in TIERS:
-        return "fused", f"auto: the only backend that runs in {precision}"
+        return "fused", f"auto: the fast one of those that run in {precision}"
     if device.type == "cpu":
         return "pytorch", "auto: on a CPU the eager reference starts at once and compiling gains little"
     reasons: list[str] = []

@@ -88,13 +88,8 @@ class FusedBackend(CudaGraphBackend):
     def describe(self) -> dict[str, Any]:
         described = super().describe()
         if self._plan is not None and self._quantization is not None:
-            described["fp8"] = {
-                "plan": self._plan.describe() | {"expert": self._expert_precision()},
-                "calibration": self._quantization.source or "in memory",
-                "identity": self._quantization.identity,
-                "observations": self._quantization.report["observations"]["source"],
-                "warnings": self._quantization.warnings,
-            }
+            described["fp8"] = self._quantization.describe(self._plan)
+            described["fp8"]["plan"] |= {"expert": self._expert_precision()}
         by_kernel = sorted({f"H={horizon}, {steps} steps" for steps, horizon, _ in self._denoisers})
         by_operations = {f"operations, as {why}": call for call, why in self._denoised_by_operations.items()}
         described["denoising"] = {"one CUDA kernel": by_kernel, **by_operations}

@@ -116,6 +116,16 @@ class Quantization:
                 kept[str(site)] = reason
         return Plan(tier, chosen, kept)
 
+    def describe(self, plan: "Plan") -> dict[str, Any]:
+        """What goes into the metadata of a policy that runs with it."""
+        return {
+            "plan": plan.describe(),
+            "calibration": self.source or "in memory",
+            "identity": self.identity,
+            "observations": self.report["observations"]["source"],
+            "warnings": self.warnings,
+        }
+
     # -- the file ------------------------------------------------------------------------------------------------------
 
     def save(self, file: Path) -> None:

@@ -1,0 +1,64 @@
+"""Backend `emulated_fp8`: the float32 reference in which all that a calibration has in E4M3 is rounded, on any device.
+
+For judging FP8 where no GPU with FP8 is at hand, closed loop included. It is slower than the reference, so `auto` never
+takes it. Everything that isn't rounded to E4M3 is float32 here, bfloat16 in `fused`.
+"""
+
+from functools import partial
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from turbopi.backends.base import LoadState, Tier
+from turbopi.backends.pytorch import PyTorchBackend
+from turbopi.calibrate.artifact import TIERS, Quantization
+from turbopi.calibrate.emulate import round_activation, round_weight
+from turbopi.calibrate.sites import linears, sites
+from turbopi.config import ModelConfig
+from turbopi.errors import ConfigError
+
+
+class EmulatedFp8Backend(PyTorchBackend):
+    """Rounds weights once, with a scale for each output channel, and activations whenever a product reads them."""
+
+    name: ClassVar[str] = "emulated_fp8"
+    precisions: ClassVar[tuple[Tier, ...]] = TIERS
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        load: LoadState,
+        *,
+        device: torch.device,
+        precision: Tier,
+        quantization: Quantization | None = None,
+    ) -> None:
+        if quantization is None:
+            raise ConfigError(
+                f"precision {precision!r} needs FP8 calibration; make one with `turbopi calibrate` and give it as "
+                "`quantization`"
+            )
+        super().__init__(config, load, device=device, precision="f32")
+        self.precision = precision
+        self._quantization, self._plan = quantization, quantization.plan(config, precision)
+        for site in sites(config):
+            scale = self._plan.scales.get(str(site))
+            for linear in () if scale is None else linears(self.model, site):
+                linear.weight.data = round_weight(linear.weight.data)
+                if scale is not None and not site.weights_only:
+                    linear.register_forward_pre_hook(partial(_round_input, scale=scale))
+
+    @classmethod
+    def unavailable_in(cls, device: torch.device, precision: Tier) -> str | None:
+        return None
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "attention": "explicit float32",
+            "fp8": {"emulated": "in float32", **self._quantization.describe(self._plan)},
+        }
+
+
+def _round_input(module: nn.Module, inputs: tuple[Tensor, ...], *, scale: float) -> tuple[Tensor, ...]:
+    return round_activation(inputs[0], scale), *inputs[1:]
