@@ -37,6 +37,13 @@ def golden_model(kind: Kind, precision: Precision = "f32") -> Pi0Model:
     return Pi0Model.from_state(checkpoint.config.model, checkpoint.load(torch.device("cpu"), precision).state)
 
 
+@pytest.fixture(autouse=True)
+def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the user's cache remembers of weights stays out of tests."""
+    folder = tmp_path_factory.getbasetemp() / "cache"
+    monkeypatch.setattr("turbopi.checkpoint.known_hashes.cache_folder", lambda: folder)
+
+
 @pytest.fixture(scope="session")
 def golden() -> Path:
     return GOLDEN

@@ -20,7 +20,7 @@ WEIGHTS = "model.safetensors"
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A checkpoint whose files have been as they are for a minute, and an empty cache."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(known_hashes, "cache_folder", lambda: tmp_path / "cache" / "turbopi")
     copied = tmp_path / "checkpoint"
     shutil.copytree(SMALL, copied)
     settle(copied / WEIGHTS, 60)

@@ -1,9 +1,11 @@
 """The engine with FP8 matrices equals the emulated reference, and a calibration decides which matrices those are."""
 
 import dataclasses
+from typing import NoReturn
 
+import pytest
 import torch
-from conftest import golden_cases, golden_model
+from conftest import golden_cases, golden_folder, golden_model
 from test_engine import answer, shape_of
 from torch import Tensor
 
@@ -11,10 +13,12 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.emulate import rounded
 from turbopi.calibrate.sites import Site, sites
 from turbopi.calibrate.statistics import collect
-from turbopi.engine.call import Cache, StaticCall
+from turbopi.engine.call import Cache, CallShape, StaticCall
 from turbopi.engine.fp8 import Fp8Matrix, Matrix
 from turbopi.engine.ops import PLAIN
 from turbopi.engine.weights import modulation, pack
+from turbopi.errors import BackendUnavailable
+from turbopi.judge.check_golden import golden_calibration
 from turbopi.observation import Observation
 
 CPU, META = torch.device("cpu"), torch.device("meta")
@@ -101,9 +105,45 @@ def test_the_experts_first_copy_goes_away_unless_operations_read_it() -> None:
     layers[0] = dataclasses.replace(layers[0], qkv=torch.zeros_like(layers[0].qkv, device=CPU))
     backend._keep_expert_on(META)
     assert places() == {"meta"}
+    moved: list[torch.device] = []
+    backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
+    backend._put_expert_away()
+    assert moved == [CPU]
     backend._denoised_by_operations["H=60, 10 steps"] = "too many"
     backend._put_expert_away()
-    assert places() == {"meta"}
+    assert moved == [CPU]
+
+
+def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in() -> None:
+    backend, calibration = FusedBackend.__new__(FusedBackend), golden_calibration(golden_folder(), "pi05", CPU)
+    everything = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}
+    calibration = dataclasses.replace(calibration, sites=everything)
+    backend._quantization, backend._plan = calibration, calibration.plan(golden_model("pi05").config, "fp8")
+    backend._calls, backend._ops, backend._denoisers = {}, PLAIN, {}
+    backend._denoised_by_operations = {"H=60, 5 steps": "too many", "H=60, 10 steps": "too many"}
+    told = backend.describe()
+    assert told["denoising"] == {"operations, as too many": ["H=60, 5 steps", "H=60, 10 steps"]}
+    plan = told["fp8"]["plan"]
+    assert plan["prefix.down"] == "fp8"
+    assert (
+        plan["expert.qkv"] == plan["expert"] == "bf16: FP8 weights in the denoising kernel aren't proven on a GPU yet"
+    )
+
+
+def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    backend, tried = FusedBackend.__new__(FusedBackend), []
+    backend.config, backend.device = golden_model("pi05").config, CPU
+    backend._denoisers, backend._refused, backend._denoised_by_operations = {}, {}, {}
+    backend._packed_expert = None
+    monkeypatch.setattr(backend, "_keep_expert_on", lambda device: None)
+
+    def refuse(horizon: int, rows: int, table: Tensor | None) -> NoReturn:
+        tried.append(horizon)
+        raise BackendUnavailable("it holds 3 clusters")
+
+    monkeypatch.setattr(backend, "_denoising_kernel", refuse)
+    assert all(backend._make_denoiser(CallShape(2, slots, 10, 5), None) is None for slots in (16, 32, 48))
+    assert tried == [10] and backend._denoised_by_operations == {"H=10, 5 steps": "it holds 3 clusters"}
 
 
 def test_what_nothing_reads_of_the_last_prefix_layer_is_not_kept() -> None:

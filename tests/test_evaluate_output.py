@@ -134,6 +134,17 @@ def test_runs_of_two_calibrations_are_only_compared_on_purpose(tmp_path: Path) -
     assert [run.as_json()["calibration"] for run in compared] == [None, "aaaaaaaaaaaa", "bbbbbbbbbbbb"]
 
 
+def test_what_servers_tell_stands_for_their_weights(tmp_path: Path) -> None:
+    one, other = (run(tmp_path / name, in_fp8(name * 12), states=(0,)) for name in "ab")
+    for results, config in ((one, "pi05_base"), (other, "pi05_libero")):
+        calibration = results.policy["identity"]["calibration"]
+        results.policy = {**results.policy, "identity": {"server": {"config": config}, "calibration": calibration}}
+    assert len(compare([one, other])) == 2
+    other.policy = {**other.policy, "identity": {**other.policy["identity"], "server": {"config": "pi05_base"}}}
+    with pytest.raises(ConfigError, match="FP8 of one model by different calibrations"):
+        compare([one, other])
+
+
 def test_a_run_is_not_continued_with_another_calibration(tmp_path: Path) -> None:
     run(tmp_path, in_fp8("aaaaaaaaaaaa"), states=(0,))
     run(tmp_path, in_fp8("aaaaaaaaaaaa"), states=(0, 1))

@@ -21,8 +21,8 @@ MATRICES = "qkv", "out", "gate_up", "down"
 # ---- on the CPU
 
 
-# as many clusters as heads, and numbers that divide nothing
 WEIGHTS = pytest.mark.parametrize("weights", ["bf16", "fp8"])
+# as many clusters as heads, and numbers that divide nothing
 ARRANGEMENTS = [(name, n) for name in ("golden", "tiny", "odd") for n in (CONFIGS[name].expert.num_heads, 9, 15)]
 
 
@@ -125,7 +125,7 @@ def test_ctas_products_add_up_to_the_layers(name: str, clusters: int, weights: p
     queries, keys_values, gates, slice_tiles = a.max_tiles
     qkv, gate_up = (torch.full((len(m),), torch.nan).double() for m in (layer.qkv, layer.gate_up))
     out, down = torch.zeros(g.width).double(), torch.zeros(g.width).double()
-    assert packed.starts[-1] == packed.weights.stride(0) * size
+    assert packed.starts[-1] == packed.layer_bytes == len(packed.weights[1]) * size
     for cta, (start, end) in enumerate(itertools.pairwise(packed.starts.tolist())):
         cluster, rank = divmod(cta, packing.RANKS)
         stream = packed.weights[1, start // size : end // size]
@@ -189,7 +189,15 @@ def test_fewer_clusters_than_heads_are_refused() -> None:
 def test_a_machine_without_gpu_is_refused() -> None:
     p = problem("golden", 1, 4, 3, 0, CPU)
     with pytest.raises(BackendUnavailable, match="needs an NVIDIA GPU"):
-        denoise.DenoiseKernel(p.config, p.layers, p.small, p.table, cache_rows=10, suffix=4, device=CPU)
+        denoise.DenoiseKernel(
+            p.config,
+            packing.PackedExpert.pack(p.config, p.layers),
+            p.small,
+            p.table,
+            cache_rows=10,
+            suffix=4,
+            device=CPU,
+        )
 
 
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
@@ -217,6 +225,20 @@ def test_a_source_that_does_not_compile_shows_the_compilers_log(tmp_path: Path) 
     with pytest.raises(BackendError, match=r"SIZE=3.*\n.*undefined_thing"):
         nvrtc.compile_cubin("__global__ void f() { undefined_thing(); }", "sm_90a", {"SIZE": 3}, folder=tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_other_gpus_are_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (12, 0))
+    assert denoise.unavailable(GPU) == "the denoising kernel is written for compute capability 9.0, this GPU has 12.0"
+
+
+def test_blocks_that_gave_up_say_where() -> None:
+    names = (Path(denoise.__file__).parent / "denoise_primitives.cu").read_text()
+    what = names[names.index("enum What {") :].split("}")[0].count(",") + 1
+    assert len(denoise.WAITS) == what
+    assert denoise.stuck([0, 0]) is None
+    word = (1 << 31 | 4 << 20 | 37) - (1 << 32)  # as int32
+    assert str(denoise.stuck([0, word, word])).endswith("layer 37 for outputs")
 
 
 # ---- on a GPU
@@ -342,3 +364,9 @@ def test_too_many_suffix_tokens_are_refused() -> None:
     p = problem("golden", 1, 57, 3, 0, GPU)
     with pytest.raises(BackendError, match="1 to 56 suffix tokens, not 57"):
         kernel_of(p)
+
+
+@pytest.mark.gpu
+def test_more_clusters_than_fit_are_refused() -> None:
+    with pytest.raises(BackendUnavailable, match="needs 32 clusters of 8 multiprocessors at once"):
+        kernel_of(problem("shallow", 1, 10, 77, 0, GPU), clusters=32)

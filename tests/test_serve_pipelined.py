@@ -89,7 +89,25 @@ def test_a_failure_in_flight_sends_its_traceback_and_costs_only_its_client() -> 
     served(test)
 
 
-def test_stopping_waits_for_what_is_in_flight_even_if_its_client_left() -> None:
+def test_stopping_waits_for_what_is_in_flight_though_its_client_left() -> None:
+    async def main() -> None:
+        policy = PipelinedFakePolicy()
+        server = PolicyServer(policy, port=0)
+        await server.start()
+        async with client(server) as leaving:
+            await leaving.send(pack(observation("hold")))
+            await eventually(policy.started.is_set)
+        stop = asyncio.create_task(server.stop())
+        await asyncio.sleep(0.2)
+        assert not stop.done()
+        policy.release.set()
+        await asyncio.wait_for(stop, 10)
+        assert policy.in_flight == 0
+
+    asyncio.run(main())
+
+
+def test_stopping_answers_what_is_in_flight() -> None:
     async def main() -> None:
         policy = PipelinedFakePolicy()
         server = PolicyServer(policy, port=0)

@@ -1,10 +1,16 @@
-"""Folders that appear whole or not at all."""
+"""Folders that appear whole or not at all, and the one for what can be made again."""
 
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+
+def cache_folder() -> Path:
+    """For compiled kernels, engines and fingerprints: $XDG_CACHE_HOME/turbopi or ~/.cache/turbopi."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "turbopi"
 
 
 @contextmanager

@@ -44,9 +44,11 @@ class EmulatedFp8Backend(PyTorchBackend):
         self._quantization, self._plan = quantization, quantization.plan(config, precision)
         for site in sites(config):
             scale = self._plan.scales.get(str(site))
-            for linear in () if scale is None else linears(self.model, site):
+            if scale is None:
+                continue
+            for linear in linears(self.model, site):
                 linear.weight.data = round_weight(linear.weight.data)
-                if scale is not None and not site.weights_only:
+                if not site.weights_only:
                     linear.register_forward_pre_hook(partial(_round_input, scale=scale))
 
     @classmethod

@@ -1,8 +1,8 @@
 """Backend `fused`: the call of `cuda_graph` with kernels of our own where they beat PyTorch's.
 
-Nothing is compiled by Inductor. From compute capability 9.0 on, the feed-forward products of the prefix and the whole
-denoising loop are CUDA C++ kernels; a model, horizon or GPU that they don't cover takes the engine's operations one by
-one, and `describe()` says so.
+Nothing is compiled by Inductor. On compute capability 9.0 the whole denoising loop, attention of vision and prefix, the
+prefix's feed-forward and many of vision's products are CUDA C++ kernels; a model, horizon or GPU that they don't cover
+takes the engine's operations one by one, and `describe()` says so.
 """
 
 import importlib.util
@@ -10,20 +10,22 @@ import shutil
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Tier
-from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, _bucket
+from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, Graph, HostRow, _bucket
 from turbopi.calibrate.artifact import TIERS, Quantization
 from turbopi.config import ModelConfig
-from turbopi.engine.call import CallShape, Denoiser
+from turbopi.engine.call import CallShape, Denoiser, StaticCall
 from turbopi.engine.fp8 import Fp8Matrix, Matrix
 from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights, pack
-from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.errors import BackendError, BackendUnavailable, ConfigError
 
 if TYPE_CHECKING:
+    from turbopi.kernels.denoise import DenoiseKernel
     from turbopi.kernels.denoise_packing import PackedExpert
 
 # Whether FP8 tiers have the expert's weights in FP8, too. The denoising kernel takes them, but
@@ -54,7 +56,8 @@ class FusedBackend(CudaGraphBackend):
         self._quantization = quantization
         self._plan = None if quantization is None else quantization.plan(config, precision)
         self._packed_expert: PackedExpert | None = None
-        self._denoisers: dict[tuple[int, int, int], Denoiser] = {}  # by steps, horizon, cache rows
+        self._denoisers: dict[tuple[int, int, int], DenoiseKernel] = {}  # by steps, horizon, cache rows
+        self._refused: dict[tuple[int, int, int], str] = {}  # the same, and why
         self._denoised_by_operations: dict[str, str] = {}  # which calls, and why
         super().__init__(config, load, device=device, precision=precision)
 
@@ -89,10 +92,16 @@ class FusedBackend(CudaGraphBackend):
         described = super().describe()
         if self._plan is not None and self._quantization is not None:
             described["fp8"] = self._quantization.describe(self._plan)
-            described["fp8"]["plan"] |= {"expert": self._expert_precision()}
+            expert, plan = self._expert_precision(), described["fp8"]["plan"]
+            for name, what in plan.items():
+                if name.startswith("expert.") and what == "fp8" and not expert.startswith("fp8"):
+                    plan[name] = expert  # its kernel takes one precision
+            plan["expert"] = expert
         by_kernel = sorted({f"H={horizon}, {steps} steps" for steps, horizon, _ in self._denoisers})
-        by_operations = {f"operations, as {why}": call for call, why in self._denoised_by_operations.items()}
-        described["denoising"] = {"one CUDA kernel": by_kernel, **by_operations}
+        by_operations: dict[str, list[str]] = {}
+        for call, why in self._denoised_by_operations.items():
+            by_operations.setdefault(f"operations, as {why}", []).append(call)
+        described["denoising"] = ({"one CUDA kernel": by_kernel} if by_kernel else {}) | by_operations
         return described
 
     def _pack(self, load: LoadState) -> Weights:
@@ -111,7 +120,9 @@ class FusedBackend(CudaGraphBackend):
     def _expert_precision(self) -> str:
         """What the expert's weights are in, openly."""
         if self._plan is None or self._plan.expert_weights == "bf16":
-            return "bf16, all of it: its kernel takes one precision"
+            kept = {} if self._plan is None else self._plan.kept
+            why = next((reason for site, reason in kept.items() if site.startswith("expert.")), "it isn't planned")
+            return f"bf16, all of it, as its kernel takes one precision; {why}"
         if not EXPERT_IN_FP8:
             return "bf16: FP8 weights in the denoising kernel aren't proven on a GPU yet"
         if self._denoised_by_operations:
@@ -129,18 +140,20 @@ class FusedBackend(CudaGraphBackend):
         cameras = min(max(shape.cameras, 3), MAX_CAMERAS)
         rows = cameras * self.config.vision.num_tokens + _bucket(self.config.max_prompt_tokens)
         key = (steps, horizon, rows)
-        try:
-            if key not in self._denoisers:
+        if key not in self._denoisers and key not in self._refused:
+            try:
                 self._denoisers[key] = self._denoising_kernel(horizon, rows, table)
+            except BackendUnavailable as e:
+                self._refused[key] = str(e)
+        if key in self._denoisers:
             return self._denoisers[key]
-        except BackendUnavailable as e:
-            if not self._denoisers:
-                self._packed_expert = None
-            self._denoised_by_operations[f"H={horizon}, {steps} steps"] = str(e)
-            self._keep_expert_on(self.device)  # for good: a graph of these operations will point to it
-            return None
+        if not self._denoisers:
+            self._packed_expert = None
+        self._denoised_by_operations[f"H={horizon}, {steps} steps"] = self._refused[key]
+        self._keep_expert_on(self.device)  # for good: a graph of these operations will point to it
+        return None
 
-    def _denoising_kernel(self, horizon: int, rows: int, table: Tensor | None) -> Denoiser:
+    def _denoising_kernel(self, horizon: int, rows: int, table: Tensor | None) -> "DenoiseKernel":
         """Raises BackendUnavailable for what it doesn't cover."""
         from turbopi.kernels.denoise import MAX_SUFFIX, DenoiseKernel, unavailable
         from turbopi.kernels.denoise_packing import PackedExpert, refusal
@@ -157,6 +170,18 @@ class FusedBackend(CudaGraphBackend):
         kernel = DenoiseKernel(self.config, packed, small, table, cache_rows=rows, suffix=horizon, device=self.device)
         self._put_expert_away()
         return kernel
+
+    def _run(self, shape: CallShape, part: str, row: HostRow, noise: np.ndarray) -> tuple[StaticCall, Graph]:
+        try:
+            return super()._run(shape, part, row, noise)
+        except RuntimeError as error:
+            for kernel in self._denoisers.values():
+                if (why := kernel.why_it_trapped()) is not None:
+                    raise BackendError(
+                        f"{why}. This process can't use the GPU any more: start it again, and free the GPU of other "
+                        "work; if that doesn't help, use backend 'cuda_graph'"
+                    ) from error
+            raise
 
     def _put_expert_away(self) -> None:
         """A kernel has its own copy of the expert's matrices; the first one, 0.6 GB, waits on the host."""

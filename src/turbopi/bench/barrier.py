@@ -1,4 +1,4 @@
-"""What one barrier of the whole grid costs inside a cooperative kernel: the floor of a persistent kernel's phases."""
+"""What one barrier of the whole grid costs in a cooperative kernel: a floor where blocks wait for one another."""
 
 import ctypes
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from turbopi.kernels.nvrtc import cache_folder
+from turbopi.folders import cache_folder
 
 _SETTLED_S = 2.0  # a file that was changed since may be changed again within the clock's tick: not remembered
 _VERSION = 1  # of what a fingerprint is made from

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     examples=(
         "turbopi demo",
         "turbopi demo --episodes 10",
-        "turbopi demo --backend pytorch_compile --steps 5 --report /tmp/report",
+        "turbopi demo --backend pytorch_compile --steps 5 --report report",
         "turbopi demo checkpoints/pi05_libero --config pi05_libero",
         "turbopi demo --random-weights pi05_libero --frames 1",
     ),

@@ -84,8 +84,11 @@ def export(
         policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu")
         found = measure_scales(policy, calibration, method, output)
         del policy  # ModelOpt changes its model
-    # random weights are made there, much faster on a GPU, and are the same
-    maker = resolve_device("auto") if checkpoint.format == "random" else torch.device("cpu")
+    # random weights are the same wherever they are made: on a GPU, much faster, if they fit there
+    maker = torch.device("cpu")
+    room = torch.cuda.mem_get_info()[0] if torch.cuda.is_available() else 0
+    if checkpoint.format == "random" and room > 1.2 * checkpoint.stored_bytes:
+        maker = resolve_device("auto")
     loaded = checkpoint.load(maker, "f32", progress=output.shows_progress).state
     state = {name: loaded.pop(name).cpu() for name in list(loaded)}
     model = Pi0Model.from_state(checkpoint.config.model, state)

@@ -40,11 +40,14 @@ def study(
     checkpoint: CheckpointArgument = None,
     observation: Annotated[
         Path | None,
-        typer.Option(metavar="PATH", help="As for `turbopi infer`; else a LIBERO picture that comes with Turbo-Pi."),
+        typer.Option(
+            metavar="PATH",
+            help="As for `turbopi infer`; else Turbo-Pi's LIBERO pictures (precision, mask: the first).",
+        ),
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Denoising steps of the precision study.")] = 10,
+    steps: Annotated[int, typer.Option(min=1, help="Denoising steps; the mask study has its own.")] = 10,
     calls: Annotated[int, typer.Option(min=1, help="Calls of each measurement of the throughput study.")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the precision and mask studies' noise.")] = 0,
     device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the results there as JSON.")] = None,
     as_json: JsonFlag = False,
@@ -55,8 +58,7 @@ def study(
     float32, against the float32 reference. mask: the suffix over a compacted, a padded and masked, and a padded and not
     masked cache, in float32 PyTorch. actions: those of pytorch in bfloat16, tensorrt and tensorrt_fp8 (which needs
     `turbopi build --precision fp8`) against the float32 reference's, on the observations and on random ones.
-    throughput: backend tensorrt one call at a time, tensorrt_pipelined with calls in
-    flight.
+    throughput: backend tensorrt one call at a time, tensorrt_pipelined with several in flight.
     """
     output = Output(as_json)
     chosen = which.split(",")

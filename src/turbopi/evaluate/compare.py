@@ -130,10 +130,13 @@ def check_same_calibration(runs: Sequence[Results]) -> None:
         calibration = _calibration(run)
         if calibration is None:
             continue
-        other = first.setdefault(str(run.policy.get("identity", {}).get("weights")), run)
+        # a server doesn't tell its weights: what it tells besides stands for them
+        identity = run.policy.get("identity", {})
+        told = identity.get("weights") or identity.get("server", {}).get("config")
+        other = first.setdefault(str(told), run)
         if _calibration(other) != calibration:
             raise ConfigError(
-                f"{other.folder} and {run.folder} are FP8 of the same weights by different calibrations "
+                f"{other.folder} and {run.folder} are FP8 of one model by different calibrations "
                 f"({str(_calibration(other))[:8]} and {calibration[:8]}): run one of them again with the other's "
                 "--quantization, or give --across-calibrations if that is what you compare"
             )

@@ -61,6 +61,8 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
     control = reference.control(rule, checkpoint, arguments, progress)
     steps, calls = reference.steps, reference.calls
     reference.release()
+    # before the policy is made: its calibration is then checked against what was read
+    fingerprint = checkpoint.fingerprint() if plan.fingerprint else None
     subject = UnifiedPolicy(checkpoint, **arguments)
     progress.begin(f"{name} {precision}", 3 * len(calls))
     warmup = subject.warmup()
@@ -90,7 +92,7 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
             "path": None if checkpoint.path is None else str(checkpoint.path),
             "format": checkpoint.format,
             "random": checkpoint.format == "random",
-            "fingerprint": checkpoint.fingerprint() if plan.fingerprint else None,
+            "fingerprint": fingerprint,
         },
         "policy": details,
         "provenance": about,

@@ -23,6 +23,7 @@ constexpr int PANELS = (DIM + 63) / 64;  // of 64 columns, 128 bytes: as much as
 constexpr int ROW_BYTES = 128, Q_PANEL = 64 * ROW_BYTES, KEY_PANEL = KEYS * ROW_BYTES;
 constexpr int Q_BYTES = PANELS * Q_PANEL, STAGE_BYTES = PANELS * KEY_PANEL;
 constexpr int BLOCKS = DIM / 8, FOURS = (BLOCKS + 3) / 4, DEPTH = (DIM + 15) / 16, THREADS = 128 * WGS;
+static_assert(STAGES >= 2 * WGS, "a warpgroup would wait for a slot that it holds");
 constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : 232, PRODUCER_REGISTERS = 40;
 // which warpgroup ends up with a block of 8 columns; blocks go in fours, as that many leave together
 __device__ constexpr int owner(int block) { return block / 4 * WGS / FOURS; }

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.engine.weights import GemmaLayer, State
+from turbopi.engine.weights import State
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.denoise_packing import (
     BLOCK,
@@ -35,6 +35,11 @@ from turbopi.kernels.nvrtc import Kernel, compile_cubin
 
 PARTS = tuple(f"denoise_{part}.cu" for part in ("base", "primitives", "producer", "product", "attention", "loop"))
 THREADS = (WARPS + 4) * 32
+# `What` of denoise_primitives.cu
+WAITS = (
+    *("nothing", "the stream", "queries", "suffix keys", "outputs", "attention", "attention's sums", "hidden units"),
+    *("feed-forward sums", "v_t", "the next step", "its end"),
+)
 MAX_SUFFIX = 56  # beyond it too little shared memory is left for weights on their way
 
 
@@ -43,8 +48,8 @@ def unavailable(device: torch.device) -> str | None:
     if device.type != "cuda":
         return "the denoising kernel needs an NVIDIA GPU"
     major, minor = torch.cuda.get_device_capability(device)
-    if major < 9:
-        return f"the denoising kernel needs compute capability 9.0 or newer, this GPU has {major}.{minor}"
+    if (major, minor) != (9, 0):
+        return f"the denoising kernel is written for compute capability 9.0, this GPU has {major}.{minor}"
     return None
 
 
@@ -84,7 +89,7 @@ def kernel_sizes(
         "TP_KEY_TILES": most(cache_rows, BLOCK),
         "TP_FP8": int(fp8),
         "TP_DIVISOR": DIVISOR,
-        "TP_RPS": 4 if suffix <= 24 else 2,
+        "TP_RPS": 4 if suffix <= 24 else 2,  # larger slots of weights are faster, if enough of them fit
         "TP_SMEM": shared_bytes,
         "TP_SCRATCH": 4 * stream + suffix * g.head_dim,
     }
@@ -108,6 +113,13 @@ def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) ->
         ) from e
 
 
+def stuck(words: list[int]) -> str | None:
+    """What the blocks' words of `watch` (denoise_primitives.cu) say, or None: none has said anything."""
+    waits = sorted({(word & 0xFFFFF, word >> 20 & 0x7FF) for word in words if word})
+    where = ", ".join(f"layer {layer} for {WAITS[what]}" for layer, what in waits[:8])
+    return f"blocks of the denoising kernel waited for seconds (counted over all steps): {where}" if waits else None
+
+
 class DenoiseKernel:
     """The loop for a fixed number of steps and suffix tokens; capturable in a CUDA graph.
 
@@ -119,7 +131,7 @@ class DenoiseKernel:
     def __init__(
         self,
         config: ModelConfig,
-        packed: PackedExpert | list[GemmaLayer],
+        packed: PackedExpert,
         small: State,
         table: Tensor,
         *,
@@ -133,7 +145,7 @@ class DenoiseKernel:
         if not 1 <= suffix <= MAX_SUFFIX:
             raise BackendError(f"the denoising kernel takes 1 to {MAX_SUFFIX} suffix tokens, not {suffix}")
         self._config = config
-        self._packed = packed if isinstance(packed, PackedExpert) else PackedExpert.pack(config, packed)
+        self._packed = packed
         arrangement = self._packed.arrangement
         g, properties = config.expert, torch.cuda.get_device_properties(device)
         assert table.shape[1:] == (2 * g.depth + 1, 3, g.width), table.shape
@@ -144,6 +156,18 @@ class DenoiseKernel:
             fp8=self._packed.fp8,
             shared_bytes=properties.shared_memory_per_block_optin,  # type: ignore[attr-defined]
         )
+        with torch.cuda.device(device):
+            arch = f"sm_{properties.major}{properties.minor}a"
+            cubin = compiled(arch, sizes)
+            self._kernel = Kernel(cubin, "turbopi_denoise", sizes["TP_SMEM"])
+            self._prepare = Kernel(cubin, "turbopi_denoise_prepare", 0)
+            self._tiles = g.depth * sizes["TP_KEY_TILES"]
+            fitting = self._kernel.max_active_clusters(RANKS, THREADS)
+            if fitting < arrangement.clusters:
+                raise BackendUnavailable(
+                    f"the denoising kernel needs {arrangement.clusters} clusters of {RANKS} multiprocessors at once, "
+                    f"{torch.cuda.get_device_name(device)} holds {fitting}"
+                )
         self._suffix, self._blocks = suffix, arrangement.blocks
         self._table = table.to(device).float().contiguous()
         row_scales, gated = torch.empty(0, device=device), self._table
@@ -164,21 +188,9 @@ class DenoiseKernel:
                 g.depth * 2 * sizes["TP_KEY_TILES"] * BLOCK * g.head_dim, dtype=torch.bfloat16, device=device
             ),
             "scratch": torch.empty(4 * sizes["TP_SCRATCH"], dtype=torch.int32, device=device),
-            "hang": torch.zeros(self._blocks, dtype=torch.int32, pin_memory=True),  # where they waited
-            "trace": torch.zeros(self._blocks, 64, dtype=torch.int32, device=device),
+            "hang": torch.zeros(self._blocks, dtype=torch.int32, pin_memory=True),  # see `why_it_trapped`
+            "trace": torch.zeros(self._blocks, 64, dtype=torch.int32, device=device),  # cycles by phase, with TP_TRACE
         }
-        with torch.cuda.device(device):
-            arch = f"sm_{properties.major}{properties.minor}a"
-            cubin = compiled(arch, sizes)
-            self._kernel = Kernel(cubin, "turbopi_denoise", sizes["TP_SMEM"])
-            self._prepare = Kernel(cubin, "turbopi_denoise_prepare", 0)
-            self._tiles = g.depth * sizes["TP_KEY_TILES"]
-            fitting = self._kernel.max_active_clusters(RANKS, THREADS)
-            if fitting < arrangement.clusters:
-                raise BackendUnavailable(
-                    f"the denoising kernel needs {arrangement.clusters} clusters of {RANKS} multiprocessors at once, "
-                    f"{torch.cuda.get_device_name(device)} holds {fitting}"
-                )
 
     def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
         """Denoise on the current stream.
@@ -196,7 +208,7 @@ class DenoiseKernel:
         args = _Args(
             **pointers,
             layer_stride=cache_k.stride(0) * 2,
-            layer_bytes=self._packed.weights.stride(0) * 2,
+            layer_bytes=self._packed.layer_bytes,
             steps=steps,
             dt=float(np.float32(-1.0 / steps)),
             eps=self._config.rms_norm_eps,
@@ -204,3 +216,7 @@ class DenoiseKernel:
         )
         self._prepare.launch(self._tiles, 256, args)
         self._kernel.launch(self._blocks, THREADS, args)
+
+    def why_it_trapped(self) -> str | None:
+        """After a launch that failed: where blocks waited for seconds before they gave up, or None."""
+        return stuck(self._tensors["hang"].tolist())

@@ -10,6 +10,8 @@
 // the receiver: no cluster barriers). What crosses clusters are sums over heads or over hidden units, two exchanges a
 // layer between the CTAs of equal rank, and the suffix's keys and values. Those words go through L2 and carry their own
 // flag: the lowest bit of a float32 tells its use of the buffer, so the reader asks for a word until that bit is right.
+// So all clusters must run at once. The host asks whether they fit on an idle GPU; work of other streams or processes
+// that never ends would leave them waiting (see `watch`), work that ends only delays them.
 //
 // Units: a "block" is 16 columns of a reduction axis, a "tile" 16 output rows, a "fragment" one tile x one block of a
 // weight matrix in the order in which a warp's lanes feed it to the tensor cores (operand A; tokens are operand B).

@@ -201,6 +201,10 @@ class PackedExpert:
         return cls(arrangement, typed, index, torch.from_numpy(starts).to(device), torch.stack(scales))
 
     @property
+    def layer_bytes(self) -> int:
+        return self.weights.stride(0) * self.weights.element_size()
+
+    @property
     def fp8(self) -> bool:
         return self.weights.dtype == E4M3
 

@@ -15,13 +15,9 @@ from typing import Any
 import torch
 
 from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.folders import cache_folder
 
 logger = logging.getLogger(__name__)
-
-
-def cache_folder() -> Path:
-    """Where compiled kernels are kept: $XDG_CACHE_HOME/turbopi or ~/.cache/turbopi."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "turbopi"
 
 
 def bindings(name: str) -> Any:

@@ -57,7 +57,9 @@ def fused_ops(device: torch.device) -> Ops:
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
             "vision products": f"CUDA for {_rows_covered()} rows, else cuBLAS" if hopper else "cuBLAS",
             "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS" if hopper else "Triton",
-            "vision and prefix attention": "CUDA, Triton for odd heads" if hopper else "Triton",
+            "vision and prefix attention": "CUDA; Triton where head_dim isn't a multiple of 8 from 16 to 256"
+            if hopper
+            else "Triton",
             "suffix attention": "cuBLAS and Triton's softmax",
             "norms, GeGLU of the suffix, RoPE, patches, prompt embedding": "Triton",
         },

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from turbopi.errors import BackendError
-from turbopi.folders import new_folder
+from turbopi.folders import cache_folder, new_folder
 from turbopi.tensorrt.engine import Specification
 
 logger = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ def default_folder() -> Path:
     """$TURBOPI_ENGINES, else turbopi/engines in the user's cache."""
     if os.environ.get(FOLDER_VARIABLE):
         return Path(os.environ[FOLDER_VARIABLE]).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "turbopi" / "engines"
+    return cache_folder() / "engines"
 
 
 def networks_hash() -> str:

@@ -139,7 +139,7 @@ def _build(library: Library, name: str, write: Callable[..., None], compute_capa
         said = "; ".join(log.errors[-3:]) or "it gave no reason"
         raise BackendError(
             f"{library.name} {library.version} can't build {name}: {said}. It may use {WORKSPACE >> 30} GB beside the "
-            f"weights: if memory ran out, free some of the GPU's"
+            f"weights: if memory ran out, free some of it on the GPU"
         )
     logger.info("built %s in %.1f s", name, time.perf_counter() - started)
     return bytes(serialised)
