@@ -16,6 +16,9 @@ from turbopi.kernels import denoise_packing as packing
 from turbopi.model.denoise import euler_step
 
 CPU = torch.device("cpu")
+on_hopper = pytest.mark.skipif(
+    not torch.cuda.is_available() or torch.cuda.get_device_capability() != (9, 0), reason="needs compute capability 9.0"
+)
 MATRICES = "qkv", "out", "gate_up", "down"
 
 # ---- on the CPU
@@ -286,6 +289,7 @@ SHAPES = pytest.mark.parametrize(
 
 
 @pytest.mark.gpu
+@on_hopper
 @SHAPES
 @pytest.mark.parametrize("outliers", [False, True])
 def test_kernel_is_as_exact_as_ordinary_bf16(
@@ -301,6 +305,7 @@ def test_kernel_is_as_exact_as_ordinary_bf16(
 
 
 @pytest.mark.gpu
+@on_hopper
 @SHAPES
 @pytest.mark.parametrize("outliers", [False, True])
 def test_with_fp8_weights_it_is_as_exact_as_ordinary_bf16_with_what_they_stand_for(
@@ -319,6 +324,7 @@ def test_with_fp8_weights_it_is_as_exact_as_ordinary_bf16_with_what_they_stand_f
 
 
 @pytest.mark.gpu
+@on_hopper
 @WEIGHTS
 @pytest.mark.parametrize("suffix", [10, 33, 50])
 def test_it_repeats_itself_bit_by_bit(suffix: int, weights: packing.Precision) -> None:
@@ -329,6 +335,7 @@ def test_it_repeats_itself_bit_by_bit(suffix: int, weights: packing.Precision) -
 
 
 @pytest.mark.gpu
+@on_hopper
 def test_one_kernel_serves_many_lengths() -> None:
     p = problem("shallow", 3, 10, 600, 5, GPU)
     kernel = kernel_of(p)
@@ -338,6 +345,7 @@ def test_one_kernel_serves_many_lengths() -> None:
 
 
 @pytest.mark.gpu
+@on_hopper
 def test_replays_of_a_captured_graph_read_inputs_anew() -> None:
     p = problem("shallow", 3, 10, 500, 6, GPU)
     kernel, length = kernel_of(p), torch.tensor([500], device=GPU)
@@ -360,6 +368,7 @@ def test_replays_of_a_captured_graph_read_inputs_anew() -> None:
 
 
 @pytest.mark.gpu
+@on_hopper
 def test_too_many_suffix_tokens_are_refused() -> None:
     p = problem("golden", 1, 57, 3, 0, GPU)
     with pytest.raises(BackendError, match="1 to 56 suffix tokens, not 57"):
@@ -367,6 +376,7 @@ def test_too_many_suffix_tokens_are_refused() -> None:
 
 
 @pytest.mark.gpu
+@on_hopper
 def test_more_clusters_than_fit_are_refused() -> None:
     with pytest.raises(BackendUnavailable, match="needs 32 clusters of 8 multiprocessors at once"):
         kernel_of(problem("shallow", 1, 10, 77, 0, GPU), clusters=32)
