@@ -4,6 +4,7 @@ import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: spinning threads slow a busy machine
 
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -19,6 +20,12 @@ from turbopi.model.reference import Pi0Model, Precision
 
 GOLDEN = Path(__file__).parent / "golden"
 torch.set_num_threads(2)
+
+
+def on_hopper(test: Callable[..., None]) -> Callable[..., None]:
+    """A GPU test of kernels that are written for compute capability 9.0."""
+    other = torch.cuda.is_available() and torch.cuda.get_device_capability() != (9, 0)
+    return pytest.mark.gpu(pytest.mark.skipif(other, reason="needs compute capability 9.0")(test))
 
 
 @lru_cache

@@ -94,7 +94,7 @@ def test_nothing_rounded_changes_nothing() -> None:
 def test_the_experts_first_copy_goes_away_unless_operations_read_it() -> None:
     backend = FusedBackend.__new__(FusedBackend)
     state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
-    backend._weights, backend._denoised_by_operations = pack(golden_model("pi05").config, state), {}
+    backend._weights, backend._refused = pack(golden_model("pi05").config, state), {}
     layers = backend._weights.expert
 
     def places() -> set[str]:
@@ -109,7 +109,7 @@ def test_the_experts_first_copy_goes_away_unless_operations_read_it() -> None:
     backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
     backend._put_expert_away()
     assert moved == [CPU]
-    backend._denoised_by_operations["H=60, 10 steps"] = "too many"
+    backend._refused[10, 60, 968] = "too many"
     backend._put_expert_away()
     assert moved == [CPU]
 
@@ -120,7 +120,7 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     calibration = dataclasses.replace(calibration, sites=everything)
     backend._quantization, backend._plan = calibration, calibration.plan(golden_model("pi05").config, "fp8")
     backend._calls, backend._ops, backend._denoisers = {}, PLAIN, {}
-    backend._denoised_by_operations = {"H=60, 5 steps": "too many", "H=60, 10 steps": "too many"}
+    backend._refused = {(5, 60, 968): "too many", (10, 60, 968): "too many", (10, 60, 1224): "too many"}
     told = backend.describe()
     assert told["denoising"] == {"operations, as too many": ["H=60, 5 steps", "H=60, 10 steps"]}
     plan = told["fp8"]["plan"]
@@ -133,7 +133,7 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
 def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     backend, tried = FusedBackend.__new__(FusedBackend), []
     backend.config, backend.device = golden_model("pi05").config, CPU
-    backend._denoisers, backend._refused, backend._denoised_by_operations = {}, {}, {}
+    backend._denoisers, backend._refused = {}, {}
     backend._packed_expert = None
     monkeypatch.setattr(backend, "_keep_expert_on", lambda device: None)
 
@@ -143,7 +143,8 @@ def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(backend, "_denoising_kernel", refuse)
     assert all(backend._make_denoiser(CallShape(2, slots, 10, 5), None) is None for slots in (16, 32, 48))
-    assert tried == [10] and backend._denoised_by_operations == {"H=10, 5 steps": "it holds 3 clusters"}
+    assert tried == [10]
+    assert [(key[:2], why) for key, why in backend._refused.items()] == [((5, 10), "it holds 3 clusters")]
 
 
 def test_what_nothing_reads_of_the_last_prefix_layer_is_not_kept() -> None:

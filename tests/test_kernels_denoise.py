@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import on_hopper
 from denoise_helpers import CONFIGS, FULL, GPU, Problem, has_nvrtc, ordinary_bf16, plain, problem, relative
 from torch import Tensor
 
@@ -16,9 +17,6 @@ from turbopi.kernels import denoise_packing as packing
 from turbopi.model.denoise import euler_step
 
 CPU = torch.device("cpu")
-on_hopper = pytest.mark.skipif(
-    not torch.cuda.is_available() or torch.cuda.get_device_capability() != (9, 0), reason="needs compute capability 9.0"
-)
 MATRICES = "qkv", "out", "gate_up", "down"
 
 # ---- on the CPU
@@ -288,7 +286,6 @@ SHAPES = pytest.mark.parametrize(
 )
 
 
-@pytest.mark.gpu
 @on_hopper
 @SHAPES
 @pytest.mark.parametrize("outliers", [False, True])
@@ -304,7 +301,6 @@ def test_kernel_is_as_exact_as_ordinary_bf16(
     assert relative(x_t[-1], reference[-1]) <= 1.1 * relative(ordinary_bf16(p), reference[-1])
 
 
-@pytest.mark.gpu
 @on_hopper
 @SHAPES
 @pytest.mark.parametrize("outliers", [False, True])
@@ -323,7 +319,6 @@ def test_with_fp8_weights_it_is_as_exact_as_ordinary_bf16_with_what_they_stand_f
     assert relative(x_t[-1], reference) <= 1.1 * relative(ordinary_bf16(p), reference)
 
 
-@pytest.mark.gpu
 @on_hopper
 @WEIGHTS
 @pytest.mark.parametrize("suffix", [10, 33, 50])
@@ -334,7 +329,6 @@ def test_it_repeats_itself_bit_by_bit(suffix: int, weights: packing.Precision) -
     assert all(torch.equal(a, b) for _ in range(20) for a, b in zip(first, run(p, kernel), strict=True))
 
 
-@pytest.mark.gpu
 @on_hopper
 def test_one_kernel_serves_many_lengths() -> None:
     p = problem("shallow", 3, 10, 600, 5, GPU)
@@ -344,7 +338,6 @@ def test_one_kernel_serves_many_lengths() -> None:
         assert relative(run(p, kernel)[0][-1], plain(p, torch.float64)[0][-1]) < 0.01
 
 
-@pytest.mark.gpu
 @on_hopper
 def test_replays_of_a_captured_graph_read_inputs_anew() -> None:
     p = problem("shallow", 3, 10, 500, 6, GPU)
@@ -367,7 +360,6 @@ def test_replays_of_a_captured_graph_read_inputs_anew() -> None:
         assert relative(x_t[-1], plain(p, torch.float64)[0][-1]) < 0.01
 
 
-@pytest.mark.gpu
 @on_hopper
 def test_too_many_suffix_tokens_are_refused() -> None:
     p = problem("golden", 1, 57, 3, 0, GPU)
@@ -375,7 +367,6 @@ def test_too_many_suffix_tokens_are_refused() -> None:
         kernel_of(p)
 
 
-@pytest.mark.gpu
 @on_hopper
 def test_more_clusters_than_fit_are_refused() -> None:
     with pytest.raises(BackendUnavailable, match="needs 32 clusters of 8 multiprocessors at once"):

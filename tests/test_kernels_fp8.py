@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from conftest import on_hopper
 from torch import Tensor
 
 ON_GPU = torch.cuda.is_available()
@@ -28,13 +29,6 @@ pytestmark = (
         pytest.mark.filterwarnings("ignore::DeprecationWarning"),
     ]
 )
-
-
-def on_hopper(test: Callable[..., None]) -> Callable[..., None]:
-    other = ON_GPU and torch.cuda.get_device_capability() != (9, 0)
-    return pytest.mark.gpu(pytest.mark.skipif(other, reason="needs compute capability 9.0")(test))
-
-
 seeds = iter(range(10**6))
 
 

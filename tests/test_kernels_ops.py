@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from conftest import on_hopper
 from torch import Tensor
 
 ON_GPU = torch.cuda.is_available()
@@ -153,11 +154,10 @@ def test_vision_attention(heads: int, head_dim: int, images: int, tokens: int) -
     assert_as_good(ours, plain.vision_attention(qkv, images, heads), plain.vision_attention(qkv.float(), images, heads))
 
 
-@pytest.mark.parametrize(("heads", "head_dim"), [(8, 16), (8, 32), (8, 256), (4, 48)])
-@pytest.mark.parametrize(("slots", "length"), [(16, 1), (272, 261), (560, 560), (816, 803)])
-def test_prefix_attention_reads_nothing_beyond_the_length(heads: int, head_dim: int, slots: int, length: int) -> None:
-    if not ON_GPU and slots > 16:
-        slots, length, heads = slots // 8, length // 8, 2
+def prefix_problem(
+    heads: int, head_dim: int, slots: int, length: int
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], Tensor, Tensor]:
+    """Queries, keys, values (NaN beyond the length) and the length; what the twin makes of them, and float32."""
     q, k, v = random(slots * heads, head_dim), random(slots, head_dim), random(slots, head_dim)
     q[:, ::5] *= 8
     k[:, ::7] *= 8
@@ -166,12 +166,16 @@ def test_prefix_attention_reads_nothing_beyond_the_length(heads: int, head_dim: 
     exact = plain.attention(q.float(), k.float(), v.float(), on_device, slots, heads)
     k[length:], v[length:] = torch.nan, torch.nan
     poison_allocator()
-    assert_as_good(attention.prefix_attention(q, k, v, on_device, heads), twin, exact)
+    return (q, k, v, on_device), twin, exact
 
 
-on_hopper = pytest.mark.skipif(
-    not ON_GPU or torch.cuda.get_device_capability() != (9, 0), reason="needs compute capability 9.0"
-)
+@pytest.mark.parametrize(("heads", "head_dim"), [(8, 16), (8, 32), (8, 256), (4, 48)])
+@pytest.mark.parametrize(("slots", "length"), [(16, 1), (272, 261), (560, 560), (816, 803)])
+def test_prefix_attention_reads_nothing_beyond_the_length(heads: int, head_dim: int, slots: int, length: int) -> None:
+    if not ON_GPU and slots > 16:
+        slots, length, heads = slots // 8, length // 8, 2
+    inputs, twin, exact = prefix_problem(heads, head_dim, slots, length)
+    assert_as_good(attention.prefix_attention(*inputs, heads), twin, exact)
 
 
 @on_hopper
@@ -196,19 +200,12 @@ def test_vision_attention_on_hopper(
     ("slots", "length"), [(16, 1), (272, 261), (304, 64), (560, 560), (560, 547), (816, 803), (976, 960)]
 )
 def test_prefix_attention_on_hopper(heads: int, head_dim: int, slots: int, length: int, warpgroups: int) -> None:
-    q, k, v = random(slots * heads, head_dim), random(slots, head_dim), random(slots, head_dim)
-    q[:, ::5] *= 8
-    k[:, ::7] *= 8
-    on_device = torch.tensor([length], device=DEVICE)
-    twin = plain.attention(q, k, v, on_device, slots, heads)
-    exact = plain.attention(q.float(), k.float(), v.float(), on_device, slots, heads)
-    k[length:], v[length:] = torch.nan, torch.nan
-    poison_allocator()
+    inputs, twin, exact = prefix_problem(heads, head_dim, slots, length)
     tile = attention_hopper.Tile(head_dim, 64, warpgroups) if warpgroups else None
-    first = attention_hopper.prefix_attention(q, k, v, on_device, heads, tile=tile)
+    first = attention_hopper.prefix_attention(*inputs, heads, tile=tile)
     assert_as_good(first, twin, exact)
     for _ in range(5):
-        assert torch.equal(attention_hopper.prefix_attention(q, k, v, on_device, heads, tile=tile), first)
+        assert torch.equal(attention_hopper.prefix_attention(*inputs, heads, tile=tile), first)
 
 
 @on_hopper

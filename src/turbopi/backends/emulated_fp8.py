@@ -12,11 +12,10 @@ from torch import Tensor, nn
 
 from turbopi.backends.base import LoadState, Tier
 from turbopi.backends.pytorch import PyTorchBackend
-from turbopi.calibrate.artifact import TIERS, Quantization
+from turbopi.calibrate.artifact import TIERS, Quantization, check_given
 from turbopi.calibrate.emulate import round_activation, round_weight
 from turbopi.calibrate.sites import linears, sites
 from turbopi.config import ModelConfig
-from turbopi.errors import ConfigError
 
 
 class EmulatedFp8Backend(PyTorchBackend):
@@ -34,11 +33,8 @@ class EmulatedFp8Backend(PyTorchBackend):
         precision: Tier,
         quantization: Quantization | None = None,
     ) -> None:
-        if quantization is None:
-            raise ConfigError(
-                f"precision {precision!r} needs FP8 calibration; make one with `turbopi calibrate` and give it as "
-                "`quantization`"
-            )
+        check_given(precision, quantization)
+        assert quantization is not None  # every precision here is a tier
         super().__init__(config, load, device=device, precision="f32")
         self.precision = precision
         self._quantization, self._plan = quantization, quantization.plan(config, precision)

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from turbopi.backends.base import LoadState, Tier
 from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, Graph, HostRow, _bucket
-from turbopi.calibrate.artifact import TIERS, Quantization
+from turbopi.calibrate.artifact import TIERS, Quantization, check_given
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape, Denoiser, StaticCall
 from turbopi.engine.fp8 import Fp8Matrix, Matrix
 from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights, pack
-from turbopi.errors import BackendError, BackendUnavailable, ConfigError
+from turbopi.errors import BackendError, BackendUnavailable
 
 if TYPE_CHECKING:
     from turbopi.kernels.denoise import DenoiseKernel
@@ -48,17 +48,12 @@ class FusedBackend(CudaGraphBackend):
         precision: Tier,
         quantization: Quantization | None = None,
     ) -> None:
-        if (precision in TIERS) != (quantization is not None):
-            raise ConfigError(
-                f"precision {precision!r} {'needs' if precision in TIERS else 'takes no'} FP8 calibration; "
-                "make one with `turbopi calibrate` and give it as `quantization`"
-            )
+        check_given(precision, quantization)
         self._quantization = quantization
         self._plan = None if quantization is None else quantization.plan(config, precision)
         self._packed_expert: PackedExpert | None = None
         self._denoisers: dict[tuple[int, int, int], DenoiseKernel] = {}  # by steps, horizon, cache rows
-        self._refused: dict[tuple[int, int, int], str] = {}  # the same, and why
-        self._denoised_by_operations: dict[str, str] = {}  # which calls, and why
+        self._refused: dict[tuple[int, int, int], str] = {}  # what operations denoise, and why
         super().__init__(config, load, device=device, precision=precision)
 
     @classmethod
@@ -99,8 +94,10 @@ class FusedBackend(CudaGraphBackend):
             plan["expert"] = expert
         by_kernel = sorted({f"H={horizon}, {steps} steps" for steps, horizon, _ in self._denoisers})
         by_operations: dict[str, list[str]] = {}
-        for call, why in self._denoised_by_operations.items():
-            by_operations.setdefault(f"operations, as {why}", []).append(call)
+        for (steps, horizon, _), why in self._refused.items():
+            calls = by_operations.setdefault(f"operations, as {why}", [])
+            if (call := f"H={horizon}, {steps} steps") not in calls:
+                calls.append(call)
         described["denoising"] = ({"one CUDA kernel": by_kernel} if by_kernel else {}) | by_operations
         return described
 
@@ -125,7 +122,7 @@ class FusedBackend(CudaGraphBackend):
             return f"bf16, all of it, as its kernel takes one precision; {why}"
         if not EXPERT_IN_FP8:
             return "bf16: FP8 weights in the denoising kernel aren't proven on a GPU yet"
-        if self._denoised_by_operations:
+        if self._refused:
             return "fp8 weights in the denoising kernel; bf16 where operations denoise"
         return "fp8 weights"
 
@@ -149,7 +146,6 @@ class FusedBackend(CudaGraphBackend):
             return self._denoisers[key]
         if not self._denoisers:
             self._packed_expert = None
-        self._denoised_by_operations[f"H={horizon}, {steps} steps"] = self._refused[key]
         self._keep_expert_on(self.device)  # for good: a graph of these operations will point to it
         return None
 
@@ -185,7 +181,7 @@ class FusedBackend(CudaGraphBackend):
 
     def _put_expert_away(self) -> None:
         """A kernel has its own copy of the expert's matrices; the first one, 0.6 GB, waits on the host."""
-        if not self._denoised_by_operations:
+        if not self._refused:
             self._keep_expert_on(torch.device("cpu"))
 
     def _keep_expert_on(self, device: torch.device) -> None:

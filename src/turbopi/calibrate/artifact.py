@@ -218,6 +218,15 @@ def shapes_of(config: ModelConfig) -> dict[str, Any]:
     }
 
 
+def check_given(precision: str, quantization: Quantization | None) -> None:
+    """Raise ConfigError unless a calibration is given exactly where the precision needs one."""
+    if (precision in TIERS) != (quantization is not None):
+        raise ConfigError(
+            f"precision {precision!r} {'needs' if precision in TIERS else 'takes no'} FP8 calibration; "
+            "make one with `turbopi calibrate` and give it as `quantization`"
+        )
+
+
 BESIDE = "turbopi_fp8.json"  # in a checkpoint's folder: found there unless another file is named
 
 

@@ -3,7 +3,7 @@
 Activations are bfloat16; with an `Fp8Matrix` (on Hopper only) they are E4M3 between it and the operation before it.
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
@@ -52,7 +52,7 @@ def fused_ops(device: torch.device) -> Ops:
         linear_geglu=tuned_linear_geglu if hopper else linear_geglu,
         rope_split=rope.rope_split,
         vision_attention=vision_attention_on_hopper if hopper else attention.vision_attention,
-        attention=attend_on_hopper if hopper else attend,
+        attention=partial(attend, hopper=hopper),
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
             "vision products": f"CUDA for {_rows_covered()} rows, else cuBLAS" if hopper else "cuBLAS",
@@ -187,26 +187,13 @@ def attend(
     heads: int,
     *state_token: Any,
     inverse: float | None = None,
+    hopper: bool = False,
 ) -> Tensor:
     if k.shape[0] == slots:  # no suffix behind the prefix
-        return attention.prefix_attention(q, k, v, length, heads, inverse)
+        ours = attention_hopper if hopper and attention_hopper.takes(q.shape[1]) else attention
+        return ours.prefix_attention(q, k, v, length, heads, inverse)
     assert inverse is None, "the suffix's activations stay as they are"
     return plain.attention(q, k, v, length, slots, heads, *state_token, softmax=attention.masked_softmax)
-
-
-def attend_on_hopper(
-    q: Tensor,
-    k: Tensor,
-    v: Tensor,
-    length: Tensor,
-    slots: int,
-    heads: int,
-    *state_token: Any,
-    inverse: float | None = None,
-) -> Tensor:
-    if k.shape[0] == slots and attention_hopper.takes(q.shape[1]):
-        return attention_hopper.prefix_attention(q, k, v, length, heads, inverse)
-    return attend(q, k, v, length, slots, heads, *state_token, inverse=inverse)
 
 
 def vision_attention_on_hopper(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:
