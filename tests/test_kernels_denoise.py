@@ -64,52 +64,44 @@ def test_every_row_has_one_owner(name: str, clusters: int) -> None:
     assert [unit for cluster in range(clusters) for unit in a.hidden(cluster)] == list(range(g.mlp_dim))
 
 
-def test_a_fragment_has_a_lanes_rows_and_columns_as_the_tensor_cores_take_them() -> None:
+def test_a_fragment_consists_of_the_tensor_cores_core_matrices() -> None:
     matrix = torch.arange(16 * 32).view(1, 16, 32)
-    lanes = packing.fragments(matrix, 1, True, -1)[: 2 * 256].view(2, 8, 4, 8)  # [block][g][t][values]
-    block, g, t = 1, 5, 2
-    columns = (block * 16 + 4 * t + torch.tensor([0, 1])).tolist()
-    expected = [matrix[0, row, c + half] for half in (0, 2) for row in (g, g + 8) for c in columns]
-    assert lanes[block, g, t].tolist() == [int(x) for x in expected]
+    cores = packing.fragments(matrix, 1, -1)[: 2 * 256].view(2, 2, 2, 8, 8)  # [block][8 rows][8 columns][row][column]
+    assert torch.equal(cores[1, 0, 1], matrix[0, :8, 24:])
+    assert torch.equal(cores[1, 1, 0], matrix[0, 8:, 16:24])
 
 
 def test_a_fragment_of_fp8_has_two_blocks_as_the_tensor_cores_take_them() -> None:
     matrix = torch.arange(16 * 48).view(1, 16, 48)
-    lanes = packing.fragments(matrix, 1, True, -1, "fp8")[: 2 * 512].view(
-        2, 8, 4, 2, 2, 4
-    )  # [pair][g][t][block][row][4]
+    # [pair][g][t][block][row][8 columns][2]
+    lanes = packing.fragments(matrix, 1, -1, "fp8")[: 2 * 512].view(2, 8, 4, 2, 2, 2, 2)
     g, t = 5, 2
     for pair, block in ((0, 0), (0, 1), (1, 0)):
-        column = (2 * pair + block) * 16 + 4 * t
-        expected = [[int(x) for x in matrix[0, row, column : column + 4]] for row in (g, g + 8)]
+        column = (2 * pair + block) * 16 + 2 * t
+        expected = [[matrix[0, row, c : c + 2].tolist() for c in (column, column + 8)] for row in (g, g + 8)]
         assert lanes[pair, g, t, block].tolist() == expected
     assert (lanes[1, :, :, 1] == -1).all()  # three blocks make two pairs
 
 
-def multiply(stream: Tensor, x: Tensor, tiles: int, max_tiles: int, wide: bool) -> tuple[Tensor, int]:
+def multiply(stream: Tensor, x: Tensor, tiles: int, max_tiles: int) -> tuple[Tensor, int]:
     """What a CTA makes of its next product: ([tiles, 16] sums, elements read). Reads as denoise_product.cu does."""
     per = 2 if stream.dtype == torch.float8_e4m3fn else 1  # blocks of a fragment
-    x = torch.cat((x, x.new_zeros(-len(x) % (16 * per))))
-    units = len(x) // (16 * per)
+    units = -(-len(x) // (16 * per))
     sums, at = torch.zeros(max_tiles, 16, dtype=torch.float64), 0
-    first = 0
-    while first < tiles:
-        size = next(n for n in (8, 4, 2, 1) if max_tiles - first >= n)
-        per_warp = 2 if wide and size == 8 else 1
-        rows, parts = size // per_warp, 16 * per_warp // size
-        for step in range(-(-units // parts)):
-            for j in range(per_warp):
-                for warp in range(16):
-                    fragment = stream[at : at + 256 * per].double()
-                    at += 256 * per
-                    tile, unit = first + j * rows + warp // parts, step * parts + warp % parts
-                    if unit < units and per == 1:  # [g][t][half][g or g + 8][2]
-                        columns = x[unit * 16 : unit * 16 + 16].view(4, 2, 2)  # [t][half][2]
-                        sums[tile] += torch.einsum("gthrj,thj->rg", fragment.view(8, 4, 2, 2, 2), columns).reshape(16)
-                    elif unit < units:  # [g][t][block][g or g + 8][4]
-                        columns = x[unit * 32 : unit * 32 + 32].view(2, 4, 4)  # [block][t][4]
-                        sums[tile] += torch.einsum("gtbrj,btj->rg", fragment.view(8, 4, 2, 2, 4), columns).reshape(16)
-        first += size
+    for first in range(0, tiles, 8):
+        here, parts = min(tiles - first, 8), 2 if max_tiles - first > 4 else 4
+        for unit in range(-(-units // (4 * parts)) * 4 * parts):
+            for tile in range(first, first + here):
+                fragment = stream[at : at + 256 * per].double()
+                at += 256 * per
+                for block in range(per):  # those that are missing meet the last one's activations
+                    start = min(unit * per + block, len(x) // 16 - 1) * 16
+                    columns = x[start : start + 16]
+                    if per == 1:  # [g or g + 8][8 columns][g][8]
+                        rows = fragment.view(2, 2, 8, 8).permute(0, 2, 1, 3)
+                    else:  # [g][t][block][g or g + 8][8 columns][2]
+                        rows = fragment.view(8, 4, 2, 2, 2, 2)[:, :, block].permute(2, 0, 3, 1, 4)
+                    sums[tile] += rows.reshape(16, 16) @ columns
     return sums[:tiles], at
 
 
@@ -132,16 +124,16 @@ def test_ctas_products_add_up_to_the_layers(name: str, clusters: int, weights: p
         stream = packed.weights[1, start // size : end // size]
         rows, units = a.stream_rows(rank), a.hidden(cluster)
         if cluster < g.num_heads:
-            for mine, most in ((a.query_rows(cluster, rank), queries), (a.key_value_rows(cluster, rank), keys_values)):
-                qkv[mine], read = multiply(stream, x, len(mine), most, True)
-                stream = stream[read:]
-            sums, read = multiply(stream, attended[a.out_columns(cluster)], len(rows), slice_tiles, False)
+            mine = torch.cat((a.query_rows(cluster, rank), a.key_value_rows(cluster, rank)))
+            qkv[mine], read = multiply(stream, x, len(mine), queries + keys_values)
+            stream = stream[read:]
+            sums, read = multiply(stream, attended[a.out_columns(cluster)], len(rows), slice_tiles)
             out[rows] += sums
             stream = stream[read:]
         mine = a.gate_up_rows(cluster, rank)
-        gate_up[mine], read = multiply(stream, x, len(mine), gates, True)
+        gate_up[mine], read = multiply(stream, x, len(mine), gates)
         stream = stream[read:]
-        sums, read = multiply(stream, hidden[units.start : units.stop], len(rows), slice_tiles, False)
+        sums, read = multiply(stream, hidden[units.start : units.stop], len(rows), slice_tiles)
         down[rows] += sums
         assert read == len(stream)
     results, inputs = (qkv, out, gate_up, down), (x, attended, x, hidden)

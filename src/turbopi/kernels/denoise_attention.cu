@@ -1,4 +1,4 @@
-// Part 5 of 6: queries, keys and values of the suffix, and attention. The keys are split over the ranks of the head's
+// Part 6 of 7: queries, keys and values of the suffix, and attention. The keys are split over the ranks of the head's
 // cluster.
 
 __device__ __forceinline__ void ldmatrix(uint4& v, u32 address) {
@@ -48,15 +48,11 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     shift[j] = make_float2(__ldg(shifted + tile * 16 + b.g()), __ldg(shifted + tile * 16 + b.g() + 8));
     if (FP8) scale[j] = make_float2(__ldg(row_scales + tile * 16 + b.g()), __ldg(row_scales + tile * 16 + b.g() + 8));
   }
-  constexpr int TPW = plan_tpw(QTL, true);
-  float acc[TPW + plan_tpw(KVL, true)][NT][4];
-  multiply<QTL, true, D16>(b, b.smem + M_X, D16, qn, acc);
-  multiply<KVL, true, D16>(b, b.smem + M_X, D16, kvn, acc + TPW);
+  float sums[plan_groups(QTL + KVL)][NT * 4];
+  multiply<QTL + KVL, D16>(b, b.base + M_X, D16, qn + kvn, sums);
   MARK(1)
   consumers_sync();
-  byte* const kv_partials = b.smem + M_X + TPW * W * PARTIAL;
-  store_partials<QTL, true>(b, b.smem + M_X, qn, acc);
-  store_partials<KVL, true>(b, kv_partials, kvn, acc + TPW);
+  store_partials<QTL + KVL>(b, b.smem + M_X, qn + kvn, sums);
   consumers_sync();
   u32 first[ITEMS_Q], second[ITEMS_Q];
 #pragma unroll
@@ -68,8 +64,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
                     : KVL == 1 ? k
                                : k / kvn,
                 kv_tile = KVL == 1 ? 0 : k % kvn, token = n * 8 + 2 * b.t();
-      float4 c =
-          k < 0 ? total<QTL, true>(b, b.smem + M_X, i % qn, n) : total<KVL, true>(b, kv_partials, kv_tile, n);
+      float4 c = total<QTL + KVL>(b, b.smem + M_X, k < 0 ? i % qn : qn + kv_tile, n);
       if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
       const float2 r = inverse_rms(b, token), u = rope[j][0], v = rope[j][1];
       const float a0 = c.x * r.x + shift[j].x, a1 = c.z * r.x + shift[j].y, c0 = c.y * r.y + shift[j].x,

@@ -1,5 +1,5 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
-// Part 1 of 6, which denoise.py puts together: sizes, shared memory, a CTA's view.
+// Part 1 of 7, which denoise.py puts together: sizes, shared memory, a CTA's view.
 //
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
@@ -13,11 +13,11 @@
 // So all clusters must run at once. The host asks whether they fit on an idle GPU; work of other streams or processes
 // that never ends would leave them waiting (see `watch`), work that ends only delays them.
 //
-// Units: a "block" is 16 columns of a reduction axis, a "tile" 16 output rows, a "fragment" one tile x one block of a
-// weight matrix in the order in which a warp's lanes feed it to the tensor cores (operand A; tokens are operand B).
-// Activations lie in shared memory as [block][8 tokens][32 lanes][8 bytes], B's order. Inside a block the order of the
-// 16 columns is free as long as both operands agree: "permuted" order gives lane t columns 4t..4t+3 (one 8-byte store),
-// "standard" order 2t, 2t+1, 2t+8, 2t+9, as ldmatrix brings keys and values.
+// Units: a "block" is 16 columns of a reduction axis, a "tile" 16 output rows, a "fragment" 512 bytes of a weight matrix
+// (operand A; tokens are operand B): a tile x one block in bfloat16, as the tensor cores read it from shared memory
+// ([8 rows][8 columns][row][16 bytes]), or a tile x two blocks in E4M3, as a warp's lanes hold them. Activations that
+// meet weights lie as [block][8 tokens][8 columns][token][16 bytes], queries and probabilities in the lanes' order,
+// [block][8 tokens][32 lanes][8 bytes], where lane t has columns 2t, 2t+1, 2t+8, 2t+9.
 
 typedef unsigned int u32;
 typedef unsigned long long u64;
@@ -39,6 +39,7 @@ constexpr int D16 = D / 16, F16 = F / 16, QT = HD / 16, KVT = HD / 8;
 __host__ __device__ constexpr int share(int n, int parts, int i) { return n * i / parts; }
 __host__ __device__ constexpr int most(int n, int parts) { return (n + parts - 1) / parts; }
 __host__ __device__ constexpr int imax(int a, int b) { return a > b ? a : b; }
+__host__ __device__ constexpr int imin(int a, int b) { return a < b ? a : b; }
 __host__ __device__ constexpr int up128(int x) { return (x + 127) / 128 * 128; }
 
 constexpr int DX = most(D16, S);           // blocks (and output tiles) of a slice of the stream
@@ -53,27 +54,31 @@ constexpr int ITEMS_X = most(DX * NT, W);  // (tile, 8 tokens) of the slice that
 static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NC >= NH && A <= CONSUMERS,
               "sizes");
 
-// A product's tiles are multiplied in groups of 8, 4, 2 or 1. In each, the W warps form MG rows of tiles and KS parts
-// of the reduction; WIDE groups of 8 let a warp take two tiles, for half the reads of the activations.
-__host__ __device__ constexpr int group_tiles(int left) { return left >= 8 ? 8 : left >= 4 ? 4 : left >= 2 ? 2 : 1; }
-template <int TILES_, bool WIDE>
-struct Group {
-  static constexpr int TPW = TILES_ == 8 && WIDE ? 2 : 1, MG = TILES_ / TPW, KS = W / MG;
-};
-__host__ __device__ constexpr int plan_tpw(int mt, bool wide) {  // tiles a warp takes in all groups
-  int n = 0;
-  for (; mt > 0; mt -= group_tiles(mt)) n += group_tiles(mt) == 8 && wide ? 2 : 1;
-  return n;
+// A product's tiles are multiplied in groups of up to 8. A warpgroup multiplies 4 tiles at once, a warp one of them; the
+// warpgroups form rows of tiles and `parts` of the reduction. Tiles that are missing are multiplied, too: whatever lies
+// there, it makes rows of its own, which nobody reads.
+__host__ __device__ constexpr int group_tiles(int left) { return left < 8 ? left : 8; }
+__host__ __device__ constexpr int group_parts(int tiles) { return tiles > 4 ? W / 8 : W / 4; }
+__host__ __device__ constexpr int plan_groups(int mt) { return most(mt, 8); }
+__host__ __device__ constexpr int plan_partials(int mt) {
+  return mt <= 0 ? 0 : group_tiles(mt) * group_parts(group_tiles(mt)) + plan_partials(mt - 8);
 }
-__host__ __device__ constexpr int plan_partials(int mt, bool wide) { return plan_tpw(mt, wide) * W; }
 constexpr int TAIL = (T - (NT - 1) * 8 + 1) / 2;       // pairs of tokens among the last 8
 constexpr int PARTIAL = (NT - 1) * 512 + TAIL * 128;  // bytes of one tile's partial sums
 
 // ---- shared memory
 
 constexpr int RS = HD * 2 + 16;  // bytes of a suffix key's or value's row: no bank conflicts for ldmatrix
-constexpr int FRAGMENT = 512, ROW = W * FRAGMENT, RPS = TP_RPS;  // a row: one fragment per warp; rows per slot
-constexpr int SLOT = RPS * ROW;
+constexpr int FRAGMENT = 512, RPS = TP_RPS, SLOT = RPS * W * FRAGMENT;
+// A round: RPS fragments of the reduction for each part of it. Weights are filled up to whole rounds (of 4) with zeros.
+__host__ __device__ constexpr int plan_rounds(int parts, int blocks) {
+  return most(most(blocks, KB), parts * 4) * (4 / RPS);
+}
+__host__ __device__ constexpr int slot_rounds(int parts, int tiles) {  // W / (parts * tiles), for they are few
+  int n = W / parts;
+  for (int i = 1; i < 8; i *= 2) n = i < tiles ? n / 2 : n;
+  return n;
+}
 constexpr int KEY_TILE = QT * FRAGMENT;     // bytes of 16 keys, or values
 constexpr int SLOT_TILES = RPS;             // of them in a slot
 constexpr int KT = most(KEY_TILES, S);      // tiles of a rank's prefix keys
@@ -102,30 +107,31 @@ constexpr int X_P = X_LOGITS + up128((SPLIT_KEYS ? 2 : 1) * T * LS * 4), X_SUFFI
 constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);  // between steps
 constexpr int X_SIZE =
     up128(imax(imax(X_BYTES, X_SUFFIX + 2 * SUFFIX * RS),
-               imax(imax(plan_partials(QTL, true) + plan_partials(KVL, true), plan_partials(GTL, true)) * PARTIAL,
+               imax(imax(plan_partials(QTL + KVL), plan_partials(GTL)) * PARTIAL,
                     X_XS + DX * 16 * T * 4)));
 // Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down; between
 // steps x_t. Hidden units, or queries, land when a peer has this rank's slice, which follows out's, or down's, sums.
 constexpr int H_Q = 0, H_ATT = QT * NT * 256, H_BYTES = imax(2 * QT, HC) * NT * 256;
-constexpr int H_SIZE = up128(imax(imax(H_BYTES, plan_partials(DX, false) * PARTIAL), T * A * 4));
+constexpr int H_SIZE = up128(imax(imax(H_BYTES, plan_partials(DX) * PARTIAL), T * A * 4));
 
 // Sums of squares of the stream, float32[SQ][NT * 8]: by tile if tokens are few, else by slice.
 constexpr int SQ = FEW ? S * DX : S;
-__host__ __device__ constexpr int plan_slots(int mt, bool wide, int blocks) {
+__host__ __device__ constexpr int plan_slots(int mt, int blocks) {
   int n = 0;
-  for (; mt > 0; mt -= group_tiles(mt)) {
-    const int size = group_tiles(mt), tpw = plan_tpw(size, wide);
-    n += most(tpw * most(most(blocks, KB), W / (size / tpw)), RPS);
+  for (; mt > 0; mt -= 8) {
+    const int tiles = group_tiles(mt), parts = group_parts(tiles);
+    n += most(plan_rounds(parts, blocks), slot_rounds(parts, tiles));
   }
   return n;
 }
-constexpr int MAX_SLOTS = plan_slots(QTL, true, D16) + plan_slots(KVL, true, D16) + 2 * most(KT, SLOT_TILES) +
-                          plan_slots(DX, false, QT) + plan_slots(GTL, true, D16) + plan_slots(DX, false, HC);
+constexpr int MAX_SLOTS = plan_slots(QTL + KVL, D16) + 2 * most(KT, SLOT_TILES) + plan_slots(DX, QT) +
+                          plan_slots(GTL, D16) + plan_slots(DX, HC);
 constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + H_SIZE;
 constexpr int M_PART = M_SSQ + up128(SQ * NT * 32);  // of this slice, by tile
 constexpr int M_BAR = M_PART + up128(DX * NT * 32), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
               M_LIST = M_BAR + 512, M_RING = M_LIST + up128(MAX_SLOTS * 8);
-constexpr int STAGES = (TP_SMEM - M_RING) / SLOT < 12 ? (TP_SMEM - M_RING) / SLOT : 12;
+constexpr int BEYOND = 3 * FRAGMENT;  // of a slot: where the missing ones of 4 tiles are read
+constexpr int STAGES = imin((TP_SMEM - M_RING - BEYOND) / SLOT, 12);
 static_assert(STAGES >= 2, "too little shared memory");
 
 enum Barrier { BAR_X, BAR_Q, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RING };  // ring: full and empty, by slot

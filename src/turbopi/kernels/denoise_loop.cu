@@ -1,4 +1,4 @@
-// Part 6 of 6: between steps, the loop, the kernel.
+// Part 7 of 7: between steps, the loop, the kernel.
 
 constexpr int GROUPS = CONSUMERS / A, HELD = most(T, GROUPS);  // threads per action number, tokens each of them keeps
 
@@ -179,7 +179,7 @@ __device__ __forceinline__ void consume(Block& b) {
         load_columns(b, gates, table + (half ? 5 : 2) * D);
         load_columns(b, scales, table + (half ? 6 : 3) * D);  // of the next norm, the final one behind the last layer
         if (half || b.attends())
-          residual_product(b, b.smem + M_H + (half ? 0 : H_ATT), half ? b.hn() : QT, buffer, bit);
+          residual_product(b, b.base + M_H + (half ? 0 : H_ATT), half ? b.hn() : QT, buffer, bit);
         MARK(half ? 18 : 11)
         note(b, half ? WAIT_X1 : WAIT_X2);
         gather(b, x, buffer, half ? NC : NH, bit, gates, scales,

@@ -113,40 +113,25 @@ def _rope_rows(tiles: Tensor, head_dim: int) -> Tensor:
     return torch.cat((first, first + head_dim // 2), dim=1)
 
 
-def _groups(tiles: int, wide: bool) -> list[tuple[int, int, int]]:
-    """(tiles, tiles of one warp, parts of the reduction) of each group that a product is multiplied in."""
-    groups = []
-    while tiles > 0:
-        size = next(n for n in (8, 4, 2, 1) if tiles >= n)
-        per_warp = 2 if size == 8 and wide else 1
-        groups.append((size, per_warp, WARPS // (size // per_warp)))
-        tiles -= size
-    return groups
-
-
-def fragments(tiles: Tensor, max_tiles: int, wide: bool, padding: int, weights: Precision = "bf16") -> Tensor:
-    """[tiles, 16, columns] -> flat, in the order in which a CTA's warps read it; filled up with `padding`."""
+def fragments(tiles: Tensor, max_tiles: int, padding: int, weights: Precision = "bf16") -> Tensor:
+    """[tiles, 16, columns] -> flat, in the order in which a CTA reads it; filled up with `padding`."""
     count, _, columns = tiles.shape
-    if weights == "bf16":
-        # a fragment is 32 lanes (g, t) x 8 values: rows g and g + 8 of columns 4t, 4t + 1, then of 4t + 2, 4t + 3
+    if weights == "bf16":  # [rows g, or g + 8][8 columns][8 rows][8 values]: the tensor cores' core matrices
         blocks, size = columns // BLOCK, 256
-        order = tiles.view(count, 2, 8, blocks, 4, 2, 2).permute(0, 3, 2, 4, 5, 1, 6)
-    else:  # of two blocks: x 16 values, columns 4t.. of rows g and g + 8 of the first, then of the second
+        order = tiles.view(count, 2, 8, blocks, 2, 8).permute(0, 3, 1, 4, 2, 5)
+    else:  # of two blocks, 32 lanes (g, t): [block][rows g, g + 8][columns 2t, 2t + 8][2 values]
         blocks, size = most(columns, 2 * BLOCK), 512
         tiles = torch.cat((tiles, tiles.new_full((count, BLOCK, blocks * 2 * BLOCK - columns), padding)), dim=2)
-        order = tiles.view(count, 2, 8, blocks, 2, 4, 4).permute(0, 3, 2, 5, 4, 1, 6)
+        order = tiles.view(count, 2, 8, blocks, 2, 2, 4, 2).permute(0, 3, 2, 6, 4, 1, 5, 7)
     ordered = order.reshape(count, blocks, size)
-    out, first = [], 0
-    for room, per_warp, parts in _groups(max_tiles, wide):
-        if first >= count:
-            break
-        steps = most(blocks, parts)
-        padded = tiles.new_full((room, steps * parts, size), padding)
-        here = ordered[first : first + room]
-        padded[: len(here), :blocks] = here
-        shape = per_warp, room // per_warp, steps, parts, size
-        out.append(padded.view(shape).permute(2, 0, 1, 3, 4).flatten())
-        first += room
+    out = []
+    for first in range(0, count, 8):
+        # groups of 8 tiles, whose reduction has two parts, else four; in rounds of four
+        rounds = 4 * (2 if max_tiles - first > 4 else 4)
+        here = ordered[first : first + 8]
+        padded = tiles.new_full((most(blocks, rounds) * rounds, len(here), size), padding)
+        padded[:blocks] = here.transpose(0, 1)
+        out.append(padded.flatten())
     return torch.cat(out) if out else tiles.new_empty(0)
 
 
@@ -251,14 +236,14 @@ def _streams(a: Arrangement, weights: Precision) -> list[Tensor]:
             products = []
             if cluster < a.config.expert.num_heads:
                 columns = a.out_columns(cluster)
+                qkv_rows = torch.cat((a.query_rows(cluster, rank), a.key_value_rows(cluster, rank)))
                 products = [
-                    fragments(qkv[a.query_rows(cluster, rank)], queries, True, padding, weights),
-                    fragments(qkv[a.key_value_rows(cluster, rank)], keys_values, True, padding, weights),
-                    fragments(out[rows][:, :, columns], slice_tiles, False, padding, weights),
+                    fragments(qkv[qkv_rows], queries + keys_values, padding, weights),
+                    fragments(out[rows][:, :, columns], slice_tiles, padding, weights),
                 ]
             products += [
-                fragments(gate_up[a.gate_up_rows(cluster, rank)], gates, True, padding, weights),
-                fragments(down[rows][:, :, hidden.start : hidden.stop], slice_tiles, False, padding, weights),
+                fragments(gate_up[a.gate_up_rows(cluster, rank)], gates, padding, weights),
+                fragments(down[rows][:, :, hidden.start : hidden.stop], slice_tiles, padding, weights),
             ]
             streams.append(torch.cat(products))
     return streams

@@ -1,4 +1,4 @@
-// Part 2 of 6: waiting, moving data, arithmetic.
+// Part 2 of 7: waiting, moving data, arithmetic.
 
 // ---- waiting
 
@@ -69,6 +69,15 @@ __device__ __forceinline__ void mbar_wait(u32 bar, u32 parity) {
       "}" ::"r"(bar),
       "r"(parity)
       : "memory");
+}
+__device__ __forceinline__ bool test_wait(u32 bar, u32 parity) {
+  u32 done;
+  asm volatile(
+      "{.reg .pred p; mbarrier.test_wait.parity.shared::cta.b64 p, [%1], %2; selp.u32 %0, 1, 0, p;}"
+      : "=r"(done)
+      : "r"(bar), "r"(parity)
+      : "memory");
+  return done;
 }
 __device__ __forceinline__ void mbar_init(u32 bar, u32 count) {
   asm volatile("mbarrier.init.shared::cta.b64 [%0], %1;" ::"r"(bar), "r"(count) : "memory");
@@ -190,24 +199,14 @@ __device__ __forceinline__ void mma(float (&c)[4], uint4 a, uint2 b) {
       : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
       : "r"(a.x), "r"(a.y), "r"(a.z), "r"(a.w), "r"(b.x), "r"(b.y));
 }
-__device__ __forceinline__ uint2 from_e4m3(u32 v) {  // four numbers
-  uint2 h;
-  asm("{.reg .b16 lo, hi; mov.b32 {lo, hi}, %2; cvt.rn.f16x2.e4m3x2 %0, lo; cvt.rn.f16x2.e4m3x2 %1, hi;}"
-      : "=r"(h.x), "=r"(h.y)
-      : "r"(v));
-  return h;
-}
-// A tile's weights of a fragment's block `half` times activations. In E4M3 a lane has columns 4t.. of row g, then of
-// row g + 8, of the first block and then of the second.
-__device__ __forceinline__ void mma_weights(float (&c)[4], uint4 a, int half, uint2 b) {
-  if constexpr (FP8) {
-    const uint2 top = from_e4m3(half ? a.z : a.x), bottom = from_e4m3(half ? a.w : a.y);
-    asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
-        : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
-        : "r"(top.x), "r"(bottom.x), "r"(top.y), "r"(bottom.y), "r"(b.x), "r"(b.y));
-  } else {
-    mma(c, a, b);
-  }
+// Operand A of a tile x one block: of E4M3 weights a lane has columns 2t, 2t + 1, 2t + 8, 2t + 9 of row g, and of g + 8.
+__device__ __forceinline__ uint4 from_e4m3(u32 row, u32 row_8) {
+  uint4 a;
+  asm("{.reg .b16 lo, hi; mov.b32 {lo, hi}, %4; cvt.rn.f16x2.e4m3x2 %0, lo; cvt.rn.f16x2.e4m3x2 %2, hi;"
+      "mov.b32 {lo, hi}, %5; cvt.rn.f16x2.e4m3x2 %1, lo; cvt.rn.f16x2.e4m3x2 %3, hi;}"
+      : "=r"(a.x), "=r"(a.y), "=r"(a.z), "=r"(a.w)
+      : "r"(row), "r"(row_8));
+  return a;
 }
 template <int N>
 __device__ __forceinline__ void clear(float (&c)[N][4]) {

@@ -1,4 +1,4 @@
-// Part 3 of 6: what brings weights, keys and values.
+// Part 4 of 7: what brings weights, keys and values.
 
 // One thread of a CTA, which never waits for activations. What it loads is the same in every layer, so a list of it is
 // made first: 100 cycles more for a slot are a microsecond in a layer.
@@ -12,17 +12,20 @@ struct Producer {
   __device__ __forceinline__ void add(u32 from, u32 bytes, bool keys) {
     list[slots++] = make_uint2(from, bytes | keys);
   }
-  template <int MT, bool WIDE, int FIRST = 0>
+  template <int MT, int FIRST = 0>
   __device__ __forceinline__ void product(int blocks, int tiles) {
     if constexpr (FIRST < MT) {
-      constexpr int N = group_tiles(MT - FIRST);
-      using G = Group<N, WIDE>;
+      constexpr int N = group_tiles(MT - FIRST), PARTS = group_parts(N);
       if (FIRST < tiles) {
-        const int rows = G::TPW * most(most(blocks, KB), G::KS);
+        const int n = min(tiles - FIRST, N), rounds = plan_rounds(PARTS, blocks), most_rounds = slot_rounds(PARTS, n);
+        const u32 round = PARTS * RPS * n * FRAGMENT;
 #pragma unroll 1
-        for (int r = 0; r < rows; r += RPS) add(at + r * ROW, min(RPS, rows - r) * ROW, false);
-        at += rows * ROW;
-        product<MT, WIDE, FIRST + N>(blocks, tiles);
+        for (int r = 0; r < rounds; r += most_rounds) {
+          const u32 bytes = min(most_rounds, rounds - r) * round;
+          add(at, bytes, false);
+          at += bytes;
+        }
+        product<MT, FIRST + N>(blocks, tiles);
       }
     }
   }
@@ -34,14 +37,13 @@ struct Producer {
     const int tiles = most(int(*b.a.length), 16), first = share(tiles, S, b.rank);
     const int count = share(tiles, S, b.rank + 1) - first;
     if (b.attends()) {
-      product<QTL, true>(D16, b.qn());
-      product<KVL, true>(D16, b.kvn());
+      product<QTL + KVL>(D16, b.qn() + b.kvn());
       keys(0, count);
       keys(KEY_TILES * KEY_TILE, count);
-      product<DX, false>(QT, b.xn());
+      product<DX>(QT, b.xn());
     }
-    product<GTL, true>(D16, b.gn());
-    product<DX, false>(b.hn(), b.xn());
+    product<GTL>(D16, b.gn());
+    product<DX>(b.hn(), b.xn());
     u64 once, keep;  // L2 policies: weights are read once a step; keys and values by every cluster, every step
     asm volatile("createpolicy.fractional.L2::evict_first.b64 %0, 1.0;" : "=l"(once));
     asm volatile("createpolicy.fractional.L2::evict_last.b64 %0, 1.0;" : "=l"(keep));

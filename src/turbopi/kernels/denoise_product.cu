@@ -1,85 +1,111 @@
-// Part 4 of 6: matrix products and the residual stream.
+// Part 5 of 7: matrix products and the residual stream.
 
-__device__ __forceinline__ u32 take_slot(Block& b) {
+__device__ __forceinline__ u32 take_slot(Block& b, bool full = false) {
   const u32 slot = b.slot;
-  mbar_wait(b.full(slot), b.phase);
+  if (!full) mbar_wait(b.full(slot), b.phase);
   __syncwarp();
   if (++b.slot == STAGES) b.slot = 0, b.phase ^= 1;
   return slot;
 }
 // Give a slot back. Not before the loads from it have arrived: the copy engine isn't ordered behind loads that are
 // still on their way (seen as wrong sums). Hence an address that needs what they brought.
-__device__ __forceinline__ void give_slot(const Block& b, u32 slot, u32 seen) {
+__device__ __forceinline__ void give_slot(const Block& b, u32 slot, u32 seen = 0) {
   __syncwarp();
   if (b.lane == 0) mbar_arrive(b.empty(slot) + (seen & b.a.zero));
+}
+
+// The same without a branch, which would make products wait for each other, for what products alone have read.
+__device__ __forceinline__ void give_slot_if(const Block& b, u32 slot, bool really) {
+  asm volatile("{.reg .pred p; setp.ne.u32 p, %1, 0; @p mbarrier.arrive.shared::cta.b64 _, [%0];}" ::"r"(b.empty(slot)),
+               "r"(u32(really && b.lane == 0))
+               : "memory");
 }
 
 __device__ __forceinline__ uint4 load_fragment(const byte* p, int lane) { return *(const uint4*)(p + lane * 16); }
 __device__ __forceinline__ u32 fold(uint4 v) { return v.x; }
 
-// One group of tiles, this warp's share of it. x: activations in shared memory; `blocks` of the reduction, a multiple
-// of EVEN.
-template <int TILES_, bool WIDE, int EVEN>
-__device__ __forceinline__ void multiply_group(Block& b, const byte* x, int blocks, float (*acc)[NT][4]) {
-  using G = Group<TILES_, WIDE>;
-  constexpr int TPW = G::TPW, KS = G::KS, KPS = RPS / TPW;  // steps along the reduction in one slot
-  static_assert(KPS > 0, "a slot holds a step");
-  constexpr bool EXACT = EVEN % (KB * KS * KPS) == 0;
-  constexpr bool ROOM = !FP8 || FEW;  // registers for a slot's activations
-  const int ks = b.warp % KS, slots = most(most(most(blocks, KB), KS), KPS);
-#pragma unroll
-  for (int i = 0; i < TPW; ++i) clear(acc[i]);
-  const byte* mine = x + ks * KB * NT * 256 + b.lane * 8;
-#pragma unroll 1
-  for (int s0 = 0; s0 < slots; ++s0) {
-    uint4 w[KPS][TPW];
-    uint2 v[KPS][KB][NT];
-    auto exists = [&](int k, int h) { return EXACT || ((s0 * KPS + k) * KS + ks) * KB + h < blocks; };
-    auto activation = [&](int k, int h, int n) {
-      return *(const uint2*)(mine + (((s0 * KPS + k) * KS * KB + h) * NT + n) * 256);
-    };
-    auto load_activations = [&] {
-#pragma unroll
-      for (int k = 0; k < KPS; ++k)
-#pragma unroll
-        for (int h = 0; h < KB; ++h)
-          if (exists(k, h))
-#pragma unroll
-            for (int n = 0; n < NT; ++n) v[k][h][n] = activation(k, h, n);
-    };
-    if (FEW) load_activations();  // they don't wait for the slot
-    const u32 slot = take_slot(b);
-    const byte* from = b.ring(slot) + b.warp * FRAGMENT;
-#pragma unroll
-    for (int k = 0; k < KPS; ++k)
-#pragma unroll
-      for (int j = 0; j < TPW; ++j) w[k][j] = load_fragment(from + (k * TPW + j) * ROW, b.lane);
-    if (!FEW && ROOM) load_activations();
-    u32 seen = 0;
-#pragma unroll
-    for (int k = 0; k < KPS; ++k)
-#pragma unroll
-      for (int h = 0; h < KB; ++h)
-        if (exists(k, h)) {
-#pragma unroll
-          for (int j = 0; j < TPW; ++j) {
-            if (h == 0) seen ^= fold(w[k][j]);
-#pragma unroll
-            for (int n = 0; n < NT; ++n) mma_weights(acc[j][n], w[k][j], h, ROOM ? v[k][h][n] : activation(k, h, n));
-          }
-        }
-    give_slot(b, slot, seen);
+// A warp's part in a group of at most TILES_ tiles: its tile, the first of its warpgroup, its part of the reduction.
+template <int TILES_>
+struct Share {
+  static constexpr int PARTS = group_parts(TILES_), ROWS = W / 4 / PARTS;
+  int part, first, tile;
+  __device__ __forceinline__ explicit Share(const Block& b) {
+    const int group = __shfl_sync(~0u, b.warp >> 2, 0);  // which the compiler then knows to be the same in all lanes
+    part = group / ROWS, first = group % ROWS * 4, tile = first + (b.warp & 3);
   }
+};
+
+// One group of tiles, this warp's share of it. x: activations in shared memory; `blocks` of the reduction, a multiple
+// of EVEN. A product is issued when the one before has begun, so what else there is to do stands between two.
+template <int TILES_, int EVEN>
+__device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int tiles, float (&sums)[NT * 4]) {
+  constexpr int PARTS = group_parts(TILES_), COLUMNS = NT * 8;
+  constexpr bool EXACT = EVEN % (KB * PARTS * 4) == 0;
+  const Share<TILES_> my(b);
+  const int rounds = plan_rounds(PARTS, blocks), rounds_of_slot = slot_rounds(PARTS, tiles);
+  const int first = my.first < tiles ? my.first : 0;
+  const u64 weights = operand(b.base + M_RING + (my.part * tiles + first) * FRAGMENT, 256, 128);
+  const u64 all = operand(x, 256, 128);
+  // Of a block's activations; blocks that fill up a round have no weight, their activations are any.
+  auto activations = [&](int unit, int half) {
+    const int block = unit * KB + half;
+    return behind(all, (EXACT ? block : min(block, blocks - 1)) * NT * 256);
+  };
+#pragma unroll
+  for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
+  u32 slot = 0, from = 0, previous = ~0u;
+  int left = 0;  // rounds of the slot
+  bool full = false;
+#pragma unroll 1
+  for (int r = 0; r < rounds; ++r) {
+    if (left == 0) slot = take_slot(b, full), left = rounds_of_slot, from = slot * SLOT, full = false;
+    const int unit = r * RPS * PARTS + my.part;
+    if constexpr (FP8) {
+      const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
+      uint4 w[RPS];
+#pragma unroll
+      for (int i = 0; i < RPS; ++i) w[i] = load_fragment(p + i * PARTS * tiles * FRAGMENT, b.lane);
+#pragma unroll
+      for (int i = 0; i < RPS; ++i) {
+        const uint4 even = from_e4m3(w[i].x, w[i].y), odd = from_e4m3(w[i].z, w[i].w);
+        begin_products();
+        add_product<COLUMNS>(sums, even, activations(unit + i * PARTS, 0), r | i);
+        add_product<COLUMNS>(sums, odd, activations(unit + i * PARTS, 1), 1);
+        commit_products();
+        await_products<1>();
+      }
+      if (--left == 0 || r + 1 == rounds) give_slot(b, slot);
+    } else {
+      begin_products();
+#pragma unroll
+      for (int i = 0; i < RPS; ++i) {
+        add_product<COLUMNS>(sums, behind(weights, from + i * PARTS * tiles * FRAGMENT),
+                             activations(unit + i * PARTS, 0), r | i);
+        if (i == 0) {
+          commit_products();
+          await_products<1>();  // the round before is done
+          give_slot_if(b, previous, previous != ~0u);
+          full = left == 1 && r + 1 < rounds && test_wait(b.full(b.slot), b.phase);
+        }
+      }
+      commit_products();
+      previous = --left == 0 ? slot : ~0u;
+    }
+    from += RPS * PARTS * tiles * FRAGMENT;
+  }
+  await_products<0>();
+  if (!FP8) give_slot(b, slot);
 }
 
-// Up to MT tiles (`tiles` of them; groups that would be empty are left out, in the weights too) times the activations.
-template <int MT, bool WIDE, int EVEN, int FIRST = 0, int AT = 0>
-__device__ __forceinline__ void multiply(Block& b, const byte* x, int blocks, int tiles, float (*acc)[NT][4]) {
+// Up to MT tiles (`tiles` of them) times the activations.
+template <int MT, int EVEN, int FIRST = 0>
+__device__ __forceinline__ void multiply(Block& b, u32 x, int blocks, int tiles, float (*sums)[NT * 4]) {
+  if constexpr (FIRST == 0) show_to_products();
   if constexpr (FIRST < MT) {
     constexpr int N = group_tiles(MT - FIRST);
     if (FIRST < tiles) {
-      multiply_group<N, WIDE, EVEN>(b, x, blocks, acc + AT);
-      multiply<MT, WIDE, EVEN, FIRST + N, AT + Group<N, WIDE>::TPW>(b, x, blocks, tiles, acc);
+      multiply_group<N, EVEN>(b, x, blocks, min(tiles - FIRST, N), sums[FIRST / 8]);
+      multiply<MT, EVEN, FIRST + N>(b, x, blocks, tiles, sums);
     }
   }
 }
@@ -89,39 +115,35 @@ __device__ __forceinline__ int partial_place(const Block& b, int n) {
   return n * 512 + (TAIL == 4 || n + 1 < NT ? b.lane : b.g() * TAIL + min(b.t(), TAIL - 1)) * 16;
 }
 // The warps' partial sums to shared memory, and a tile's total back, always in the same order.
-template <int MT, bool WIDE, int FIRST = 0, int AT = 0>
-__device__ __forceinline__ void store_partials(const Block& b, byte* to, int tiles, float (*acc)[NT][4]) {
+template <int MT, int FIRST = 0>
+__device__ __forceinline__ void store_partials(const Block& b, byte* to, int tiles, float (*sums)[NT * 4]) {
   if constexpr (FIRST < MT) {
     constexpr int N = group_tiles(MT - FIRST);
-    using G = Group<N, WIDE>;
-    if (FIRST < tiles) {
+    const Share<N> my(b);
+    const float* sum = sums[FIRST / 8];
+    if (FIRST + my.tile < tiles && my.tile < N) {
 #pragma unroll
-      for (int j = 0; j < G::TPW; ++j)
-#pragma unroll
-        for (int n = 0; n < NT; ++n) {
-          const int tile = j * G::MG + b.warp / G::KS, part = AT * W + tile * G::KS + b.warp % G::KS;
-          if (n + 1 < NT || b.t() < TAIL)
-            *(float4*)(to + part * PARTIAL + partial_place(b, n)) =
-                make_float4(acc[AT + j][n][0], acc[AT + j][n][1], acc[AT + j][n][2], acc[AT + j][n][3]);
-        }
-      store_partials<MT, WIDE, FIRST + N, AT + G::TPW>(b, to, tiles, acc);
+      for (int n = 0; n < NT; ++n)
+        if (n + 1 < NT || b.t() < TAIL)
+          *(float4*)(to + (plan_partials(FIRST) + my.tile * my.PARTS + my.part) * PARTIAL + partial_place(b, n)) =
+              make_float4(sum[n * 4], sum[n * 4 + 1], sum[n * 4 + 2], sum[n * 4 + 3]);
     }
+    store_partials<MT, FIRST + N>(b, to, tiles, sums);
   }
 }
-template <int MT, bool WIDE, int FIRST = 0, int AT = 0>
+template <int MT, int FIRST = 0>
 __device__ __forceinline__ float4 total(const Block& b, const byte* from, int tile, int n) {
-  constexpr int N = group_tiles(MT - FIRST);
-  using G = Group<N, WIDE>;
+  constexpr int N = group_tiles(MT - FIRST), PARTS = group_parts(N);
   if constexpr (FIRST + N < MT)
-    if (tile >= FIRST + N) return total<MT, WIDE, FIRST + N, AT + G::TPW>(b, from, tile, n);
-  const byte* p = from + (AT * W + (tile - FIRST) * G::KS) * PARTIAL + partial_place(b, n);
-  float4 v[G::KS];
+    if (tile >= FIRST + N) return total<MT, FIRST + N>(b, from, tile, n);
+  const byte* p = from + (plan_partials(FIRST) + (tile - FIRST) * PARTS) * PARTIAL + partial_place(b, n);
+  float4 v[PARTS];
 #pragma unroll
-  for (int i = 0; i < G::KS; ++i) v[i] = *(const float4*)(p + i * PARTIAL);
+  for (int i = 0; i < PARTS; ++i) v[i] = *(const float4*)(p + i * PARTIAL);
 #pragma unroll
-  for (int d = 1; d < G::KS; d *= 2)
+  for (int d = 1; d < PARTS; d *= 2)
 #pragma unroll
-    for (int i = 0; i + d < G::KS; i += 2 * d)
+    for (int i = 0; i + d < PARTS; i += 2 * d)
       v[i].x += v[i + d].x, v[i].y += v[i + d].y, v[i].z += v[i + d].z, v[i].w += v[i + d].w;
   return v[0];
 }
@@ -138,13 +160,12 @@ __device__ __forceinline__ Item stream_item(const Block& b, int j) {
   const int tile = i < xn * NT ? i % xn : 0, n = i < xn * NT ? i / xn : 0;
   return {tile, n, n * 8 + 2 * b.t(), i < xn * NT && n * 8 + 2 * b.t() < T};
 }
-// Permuted order: 8 bytes with the lane pair's four positions 2g.. of one token (even g: 2t, odd g: 2t + 1) to all
-// ranks.
+// 8 bytes with the lane pair's four columns 2g.. of one token (even g: 2t, odd g: 2t + 1) to all ranks.
 __device__ __forceinline__ void send_columns(const Block& b, int region, int block, int n, float4 v, int bar,
                                              bool real) {
   const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
   const int token = 2 * b.t() + (b.g() & 1);
-  const u32 to = b.base + region + (block * NT + n) * 256 + (token * 4 + (b.g() >> 1)) * 8;
+  const u32 to = b.base + region + (block * NT + n) * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8;
   if (real && n * 8 + token < T) {
     const u32 lo = b.g() & 1 ? got : w0, hi = b.g() & 1 ? w1 : got;
     const Everyone data(to), bars(b.bar(bar));
@@ -261,21 +282,21 @@ __device__ __forceinline__ void gather(const Block& b, float4 (&x)[ITEMS_X], con
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
 // sums lie over its own operand, region H. Nothing for region H can arrive before it is read: a peer sends queries or
 // hidden units only when it has this rank's whole slice of the stream, which follows what is published here.
-__device__ __forceinline__ void residual_product(Block& b, const byte* x, int blocks, uint4* buffer, u32 bit) {
-  float acc[plan_tpw(DX, false)][NT][4];
+__device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, uint4* buffer, u32 bit) {
+  float sums[plan_groups(DX)][NT * 4];
   constexpr int EVEN = F16 % NC == 0 && HC % 16 == 0 && QT % 16 == 0 ? 16
-                       : HC % 8 == 0 && F16 % NC == 0 && QT % 8 == 0 ? 8
+                       : F16 % NC == 0 && HC % 8 == 0 && QT % 8 == 0 ? 8
                                                                      : 1;
-  multiply<DX, false, EVEN>(b, x, blocks, b.xn(), acc);
+  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums);
   consumers_sync();
-  store_partials<DX, false>(b, b.smem + M_H, b.xn(), acc);
+  store_partials<DX>(b, b.smem + M_H, b.xn(), sums);
   consumers_sync();
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
     if (item.real)
       publish(buffer + ((size_t(b.cluster) * D16 + b.x0() + item.tile) * NT + item.n) * 32 + b.lane,
-              total<DX, false>(b, b.smem + M_H, item.tile, item.n), bit);
+              total<DX>(b, b.smem + M_H, item.tile, item.n), bit);
   }
 }
 
@@ -297,18 +318,18 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
     shift[j] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
     if (FP8) scale[j] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
   }
-  float acc[plan_tpw(GTL, true)][NT][4];
-  multiply<GTL, true, D16>(b, b.smem + M_X, D16, gn, acc);
+  float sums[plan_groups(GTL)][NT * 4];
+  multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums);
   MARK(15)
   consumers_sync();
-  store_partials<GTL, true>(b, b.smem + M_X, gn, acc);
+  store_partials<GTL>(b, b.smem + M_X, gn, sums);
   consumers_sync();
 #pragma unroll
   for (int j = 0; j < ITEMS; ++j) {
     const int i = b.warp + j * W;
     if (i < gn * NT) {
       const int tile = i % gn, n = i / gn, at = b.g0() + tile, token = 2 * b.t() + (b.g() & 1);
-      float4 c = total<GTL, true>(b, b.smem + M_X, tile, n);
+      float4 c = total<GTL>(b, b.smem + M_X, tile, n);
       if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
       const float2 r = inverse_rms(b, n * 8 + 2 * b.t());
       const float h0 = gelu(c.x * r.x + shift[j].x) * (c.z * r.x + shift[j].y),
@@ -316,7 +337,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
       const float got = exchange(b.g() & 1 ? h0 : h1, 4);
       const u32 word = b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got),
                 other = exchange(word, 8);  // units g & ~1.. and the next two
-      const u32 to = b.base + M_H + ((at >> 1) * NT + n) * 256 + (token * 4 + (at & 1) * 2 + (b.g() >> 2)) * 8;
+      const u32 to = b.base + M_H + ((at >> 1) * NT + n) * 256 + (at & 1) * 128 + token * 16 + (b.g() >> 2) * 8;
       if (n * 8 + token < T) {  // two lanes have the same 8 bytes: they share the ranks
         constexpr int HALF = (S + 1) / 2;
         const u32 lo = b.g() & 2 ? other : word, hi = b.g() & 2 ? word : other;
