@@ -47,10 +47,26 @@ struct Producer {
     u64 once, keep;  // L2 policies: weights are read once a step; keys and values by every cluster, every step
     asm volatile("createpolicy.fractional.L2::evict_first.b64 %0, 1.0;" : "=l"(once));
     asm volatile("createpolicy.fractional.L2::evict_last.b64 %0, 1.0;" : "=l"(keep));
+    const byte* const first_weights = b.a.weights + b.a.starts[b.cluster * S + b.rank];
+    const byte* ahead = first_weights;
+    int next = 0, layer = 0;
+    auto prefetch = [&] {
+      const uint2 what = list[next];
+      if (!(what.y & 1))
+        asm volatile("cp.async.bulk.prefetch.L2.global.L2::cache_hint [%0], %1, %2;" ::"l"(ahead + what.x),
+                     "r"(what.y), "l"(once)
+                     : "memory");
+      if (++next == slots) {
+        next = 0, ahead += b.a.layer_bytes;
+        if (++layer == L) layer = 0, ahead = first_weights;
+      }
+    };
+#pragma unroll 1
+    for (int i = 0; i < AHEAD; ++i) prefetch();
     u32 slot = 0, free = 1;
 #pragma unroll 1
     for (int step = 0; step < b.a.steps; ++step) {
-      const byte* weights = b.a.weights + b.a.starts[b.cluster * S + b.rank];
+      const byte* weights = first_weights;
       const byte* keys = b.a.keys + size_t(first) * KEY_TILE;
 #pragma unroll 1
       for (int l = 0; l < L; ++l, weights += b.a.layer_bytes, keys += size_t(2 * KEY_TILES) * KEY_TILE)
@@ -58,7 +74,12 @@ struct Producer {
         for (int i = 0; i < slots; ++i) {
           const uint2 what = list[i];
           const bool key = what.y & 1;
+#ifdef TP_DRY
+          const u32 bytes = 512, full = b.full(slot);
+#else
           const u32 bytes = what.y & ~1u, full = b.full(slot);
+#endif
+          if (AHEAD) prefetch();
           mbar_wait(full + 8, free);  // until its last contents have been read
           mbar_expect(full, bytes);
           bulk_load(b.base + M_RING + slot * SLOT, (key ? keys : weights) + what.x, bytes, full, key ? keep : once);

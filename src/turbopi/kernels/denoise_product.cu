@@ -58,7 +58,16 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
   bool full = false;
 #pragma unroll 1
   for (int r = 0; r < rounds; ++r) {
-    if (left == 0) slot = take_slot(b, full), left = rounds_of_slot, from = slot * SLOT, full = false;
+    if (left == 0) {
+#ifdef TP_EARLY
+      if (!FP8 && !full) {
+        await_products<0>();
+        give_slot_if(b, previous, previous != ~0u);
+        previous = ~0u;
+      }
+#endif
+      slot = take_slot(b, full), left = rounds_of_slot, from = slot * SLOT, full = false;
+    }
     const int unit = r * RPS * PARTS + my.part;
     if constexpr (FP8) {
       const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
@@ -94,7 +103,7 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
     from += RPS * PARTS * tiles * FRAGMENT;
   }
   await_products<0>();
-  if (!FP8) give_slot(b, slot);
+  if (!FP8 && rounds > 0) give_slot(b, slot);
 }
 
 // Up to MT tiles (`tiles` of them) times the activations.
