@@ -92,7 +92,6 @@ def kernel_sizes(
         "TP_FP8": int(fp8),
         "TP_DIVISOR": DIVISOR,
         "TP_RPS": 4 if suffix <= 24 else 2,  # larger slots of weights are faster, if enough of them fit
-        "TP_AHEAD": 0,
         "TP_SMEM": shared_bytes,
         "TP_SCRATCH": 4 * stream + suffix * g.head_dim,
     }

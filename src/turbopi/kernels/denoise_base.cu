@@ -41,7 +41,6 @@ __host__ __device__ constexpr int most(int n, int parts) { return (n + parts - 1
 __host__ __device__ constexpr int imax(int a, int b) { return a > b ? a : b; }
 __host__ __device__ constexpr int imin(int a, int b) { return a < b ? a : b; }
 __host__ __device__ constexpr int up128(int x) { return (x + 127) / 128 * 128; }
-__host__ __device__ constexpr int up1024(int x) { return (x + 1023) / 1024 * 1024; }
 
 constexpr int DX = most(D16, S);           // blocks (and output tiles) of a slice of the stream
 constexpr int HC = most(F16, NC);          // hidden blocks of a cluster
@@ -127,15 +126,17 @@ __host__ __device__ constexpr int plan_slots(int mt, int blocks) {
 }
 constexpr int MAX_SLOTS = plan_slots(QTL + KVL, D16) + 2 * most(KT, SLOT_TILES) + plan_slots(DX, QT) +
                           plan_slots(GTL, D16) + plan_slots(DX, HC);
-constexpr int M_X = 0, M_H = up1024(M_X + X_SIZE), M_SSQ = M_H + H_SIZE;
+constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + H_SIZE;
 constexpr int M_PART = M_SSQ + up128(SQ * NT * 32);  // of this slice, by tile
 constexpr int M_BAR = M_PART + up128(DX * NT * 32), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
-              M_LIST = M_BAR + 512, M_RING = up1024(M_LIST + MAX_SLOTS * 8);
+              M_LIST = M_BAR + 512, M_RING = M_LIST + up128(MAX_SLOTS * 8);
 constexpr int BEYOND = 3 * FRAGMENT;  // of a slot: where the missing ones of 4 tiles are read
 constexpr int STAGES = imin((TP_SMEM - M_RING - BEYOND) / SLOT, 12);
 static_assert(STAGES >= 2, "too little shared memory");
 
-constexpr int AHEAD = TP_AHEAD;  // slots of weights asked into L2 before they are asked for
+// Slots of weights that are asked into L2 before they are loaded. With few tokens: only those of gate|up that find no
+// slot before it begins, while attention leaves memory idle; at other times they slow down what crosses clusters.
+constexpr int AHEAD = NT > 3 ? 4 : 0;
 
 enum Barrier { BAR_X, BAR_Q, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RING };  // ring: full and empty, by slot
 

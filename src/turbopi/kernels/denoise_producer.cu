@@ -42,27 +42,30 @@ struct Producer {
       keys(KEY_TILES * KEY_TILE, count);
       product<DX>(QT, b.xn());
     }
+    const int gate_up = slots;
     product<GTL>(D16, b.gn());
+    const int gate_up_end = slots;
     product<DX>(b.hn(), b.xn());
     u64 once, keep;  // L2 policies: weights are read once a step; keys and values by every cluster, every step
     asm volatile("createpolicy.fractional.L2::evict_first.b64 %0, 1.0;" : "=l"(once));
     asm volatile("createpolicy.fractional.L2::evict_last.b64 %0, 1.0;" : "=l"(keep));
     const byte* const first_weights = b.a.weights + b.a.starts[b.cluster * S + b.rank];
+    auto prefetch = [&](const byte* weights, uint2 what) {
+      asm volatile("cp.async.bulk.prefetch.L2.global.L2::cache_hint [%0], %1, %2;" ::"l"(weights + what.x), "r"(what.y),
+                   "l"(once)
+                   : "memory");
+    };
     const byte* ahead = first_weights;
     int next = 0, layer = 0;
-    auto prefetch = [&] {
-      const uint2 what = list[next];
-      if (!(what.y & 1))
-        asm volatile("cp.async.bulk.prefetch.L2.global.L2::cache_hint [%0], %1, %2;" ::"l"(ahead + what.x),
-                     "r"(what.y), "l"(once)
-                     : "memory");
+    auto prefetch_next = [&] {
+      if (!(list[next].y & 1)) prefetch(ahead, list[next]);
       if (++next == slots) {
         next = 0, ahead += b.a.layer_bytes;
         if (++layer == L) layer = 0, ahead = first_weights;
       }
     };
 #pragma unroll 1
-    for (int i = 0; i < AHEAD; ++i) prefetch();
+    for (int i = 0; i < AHEAD; ++i) prefetch_next();
     u32 slot = 0, free = 1;
 #pragma unroll 1
     for (int step = 0; step < b.a.steps; ++step) {
@@ -74,12 +77,13 @@ struct Producer {
         for (int i = 0; i < slots; ++i) {
           const uint2 what = list[i];
           const bool key = what.y & 1;
-#ifdef TP_DRY
-          const u32 bytes = 512, full = b.full(slot);
-#else
           const u32 bytes = what.y & ~1u, full = b.full(slot);
-#endif
-          if (AHEAD) prefetch();
+          if (AHEAD > 0) {
+            prefetch_next();
+          } else if (i == gate_up) {
+#pragma unroll 1
+            for (int k = gate_up + STAGES; k < gate_up_end; ++k) prefetch(weights, list[k]);
+          }
           mbar_wait(full + 8, free);  // until its last contents have been read
           mbar_expect(full, bytes);
           bulk_load(b.base + M_RING + slot * SLOT, (key ? keys : weights) + what.x, bytes, full, key ? keep : once);

@@ -58,16 +58,7 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
   bool full = false;
 #pragma unroll 1
   for (int r = 0; r < rounds; ++r) {
-    if (left == 0) {
-#ifdef TP_EARLY
-      if (!FP8 && !full) {
-        await_products<0>();
-        give_slot_if(b, previous, previous != ~0u);
-        previous = ~0u;
-      }
-#endif
-      slot = take_slot(b, full), left = rounds_of_slot, from = slot * SLOT, full = false;
-    }
+    if (left == 0) slot = take_slot(b, full), left = rounds_of_slot, from = slot * SLOT, full = false;
     const int unit = r * RPS * PARTS + my.part;
     if constexpr (FP8) {
       const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
