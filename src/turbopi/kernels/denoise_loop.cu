@@ -209,7 +209,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     mbar_expect(b.bar(BAR_X), X_EXPECT);
     mbar_expect(b.bar(BAR_Q), Q_EXPECT);
-    mbar_expect(b.bar(BAR_COMB), S * T * 8 + S * b.qn() * ((T + 1) / 2) * 128);
+    mbar_expect(b.bar(BAR_TOPS), TOPS_EXPECT);
+    mbar_expect(b.bar(BAR_COMB), outputs_expect(b));
     mbar_expect(b.bar(BAR_ATT), HD * T * 2);
     mbar_expect(b.bar(BAR_HID), hidden_bytes(b));
     mbar_expect(b.bar(BAR_V), V_EXPECT);
