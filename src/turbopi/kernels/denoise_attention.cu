@@ -122,7 +122,7 @@ constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && STAGES >= 2 * most(KT, SLOT_TILES);
 #ifndef TP_HK
-#define TP_HK 4
+#define TP_HK 8
 #endif
 constexpr int HELD_KEYS = QT < TP_HK ? QT : TP_HK;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
@@ -398,11 +398,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       auto load = [&](u32 slot, int i, int j) {
         return load_fragment(b.ring(slot) + i * KEY_TILE + (column + j) * FRAGMENT, b.lane);
       };
-      auto columns = [&](auto use) {  // that exist
-#pragma unroll
-        for (int j = 0; j < CT; ++j)
-          if (QT % WEIGHERS == 0 || column + j < QT) use(j);
-      };
+      auto exists = [&](int j) { return QT % WEIGHERS == 0 || column + j < QT; };
 #pragma unroll
       for (int i = 0; i < SLOT_TILES; ++i)  // or ptxas believes that those of the last layer are still wanted
 #pragma unroll
@@ -412,7 +408,10 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         u32 seen = 0;
 #pragma unroll
         for (int i = 0; i < SLOT_TILES; ++i)
-          if (i < tiles) columns([&](int j) { values[i][j] = load(slot, i, j), seen ^= fold(values[i][j]); });
+          if (i < tiles)
+#pragma unroll
+            for (int j = 0; j < CT; ++j)
+              if (exists(j)) values[i][j] = load(slot, i, j), seen ^= fold(values[i][j]);
         give_slot(b, slot, seen);
       }
       b.forget();
@@ -430,7 +429,10 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       auto weigh = [&](int tile, int j, uint4 v) { mma_tokens(out[j], v, token_address(b, M_X + X_P) + tile * NT * 256); };
 #pragma unroll
       for (int i = 0; i < SLOT_TILES; ++i)
-        if (i < tiles) columns([&](int j) { weigh(i, j, values[i][j]); });
+        if (i < tiles)
+#pragma unroll
+          for (int j = 0; j < CT; ++j)
+            if (exists(j)) weigh(i, j, values[i][j]);
 #pragma unroll 1
       for (int i = 1; i < slots; ++i) {
         const u32 slot = take_slot(b);
@@ -438,11 +440,13 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
 #pragma unroll
         for (int k = 0; k < SLOT_TILES; ++k)
           if (i * SLOT_TILES + k < tiles)
-            columns([&](int j) {
-              const uint4 v = load(slot, k, j);
-              seen ^= fold(v);
-              weigh(i * SLOT_TILES + k, j, v);
-            });
+#pragma unroll
+            for (int j = 0; j < CT; ++j)
+              if (exists(j)) {
+                const uint4 v = load(slot, k, j);
+                seen ^= fold(v);
+                weigh(i * SLOT_TILES + k, j, v);
+              }
         give_slot(b, slot, seen);
       }
       send_outputs(out);
