@@ -122,7 +122,10 @@ constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && STAGES >= 2 * most(KT, SLOT_TILES);
 #ifndef TP_HK
-#define TP_HK 8
+#define TP_HK 12
+#endif
+#ifndef TP_U
+#define TP_U 4
 #endif
 constexpr int HELD_KEYS = QT < TP_HK ? QT : TP_HK;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
@@ -381,8 +384,14 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       clear(c[0]);
       if (b.warp < tiles) {
         const byte* from = b.ring(mine) + b.warp % SLOT_TILES * KEY_TILE;
-        auto fetch = [&](int k) { return k < HELD_KEYS ? keys[k] : load_fragment(from + k * FRAGMENT, b.lane); };
-        const u32 seen = score<QT, QT>(b, fetch, 0, QT, c[0]);
+        float rest[NT][4];
+        score<HELD_KEYS, HELD_KEYS>(b, [&](int k) { return keys[k]; }, 0, QT, c[0]);
+        auto fetch = [&](int k) { return load_fragment(from + (HELD_KEYS + k) * FRAGMENT, b.lane); };
+        const u32 seen = score<QT - HELD_KEYS, TP_U>(b, fetch, HELD_KEYS, QT, rest);
+#pragma unroll
+        for (int n = 0; n < NT; ++n)
+#pragma unroll
+          for (int i = 0; i < 4; ++i) c[0][n][i] += rest[n][i];
         give_slot(b, mine, seen);
       }
       MARK(4)
@@ -394,25 +403,31 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         asm volatile("bar.arrive %0, %1;" ::"n"(WEIGHTS), "n"(CONSUMERS) : "memory");
     } else {
       pass();
-      uint4 values[SLOT_TILES][CT];  // of the first slot
+#ifndef TP_HV
+#define TP_HV 4
+#endif
+      constexpr int HV = TP_HV < SLOT_TILES ? TP_HV : SLOT_TILES;
+      uint4 values[imax(HV, 1)][CT];  // of the first slot
       auto load = [&](u32 slot, int i, int j) {
         return load_fragment(b.ring(slot) + i * KEY_TILE + (column + j) * FRAGMENT, b.lane);
       };
       auto exists = [&](int j) { return QT % WEIGHERS == 0 || column + j < QT; };
 #pragma unroll
-      for (int i = 0; i < SLOT_TILES; ++i)  // or ptxas believes that those of the last layer are still wanted
+      for (int i = 0; i < HV; ++i)  // or ptxas believes that those of the last layer are still wanted
 #pragma unroll
         for (int j = 0; j < CT; ++j) values[i][j] = make_uint4(0, 0, 0, 0);
+      u32 first = 0;
       if (slots > 0) {
-        const u32 slot = take_slot(b);
+        first = take_slot(b);
+        const u32 slot = first;
         u32 seen = 0;
 #pragma unroll
-        for (int i = 0; i < SLOT_TILES; ++i)
+        for (int i = 0; i < HV; ++i)
           if (i < tiles)
 #pragma unroll
             for (int j = 0; j < CT; ++j)
               if (exists(j)) values[i][j] = load(slot, i, j), seen ^= fold(values[i][j]);
-        give_slot(b, slot, seen);
+        if (HV == SLOT_TILES) give_slot(b, slot, seen);
       }
       b.forget();
       fetch_values();
@@ -428,18 +443,18 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       clear_out(out);
       auto weigh = [&](int tile, int j, uint4 v) { mma_tokens(out[j], v, token_address(b, M_X + X_P) + tile * NT * 256); };
 #pragma unroll
-      for (int i = 0; i < SLOT_TILES; ++i)
+      for (int i = 0; i < HV; ++i)
         if (i < tiles)
 #pragma unroll
           for (int j = 0; j < CT; ++j)
             if (exists(j)) weigh(i, j, values[i][j]);
 #pragma unroll 1
-      for (int i = 1; i < slots; ++i) {
-        const u32 slot = take_slot(b);
+      for (int i = HV == SLOT_TILES; i < slots; ++i) {
+        const u32 slot = i ? take_slot(b) : first;
         u32 seen = 0;
 #pragma unroll
         for (int k = 0; k < SLOT_TILES; ++k)
-          if (i * SLOT_TILES + k < tiles)
+          if ((k >= HV || i) && i * SLOT_TILES + k < tiles)
 #pragma unroll
             for (int j = 0; j < CT; ++j)
               if (exists(j)) {
