@@ -15,7 +15,7 @@ __device__ __forceinline__ void ldmatrix_transposed(uint4& v, u32 address) {
 constexpr int ITEMS_Q =
     most((QTL + KVL) * NT, W);  // (tile, 8 tokens) of queries, keys and values that one warp finishes
 
-// Cosine and sine of a warp's items, for tokens 2t and 2t + 1; values aren't turned.
+// Cosine and sine of a warp's items, for tokens 2t and 2t + 1; values aren't turned. To shared memory if there is room.
 __device__ __forceinline__ void make_rope(const Block& b, int prefix, float2 (&rope)[ITEMS_Q][2]) {
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
@@ -33,6 +33,12 @@ __device__ __forceinline__ void make_rope(const Block& b, int prefix, float2 (&r
       rope[j][h] = make_float2(cosine, sine);
     }
   }
+  if (FEW)
+#pragma unroll
+    for (int j = 0; j < ITEMS_Q; ++j)
+      if (b.warp + j * W < (QTL + KVL) * NT)
+        *(float4*)(b.smem + M_ROPE + (b.warp + j * W) * 512 + b.lane * 16) =
+            make_float4(rope[j][0].x, rope[j][0].y, rope[j][1].x, rope[j][1].y);
 }
 
 // Floats as integers of the same order, and back. Even where a rank has no keys, the largest logit is LOWEST.
@@ -76,7 +82,10 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
       float4 c =
           k < 0 ? total<QTL, true>(b, b.smem + M_X, i % qn, n) : total<KVL, true>(b, kv_partials, kv_tile, n);
       if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
-      const float2 r = inverse_rms(b, token), u = rope[j][0], v = rope[j][1];
+      const float2 r = inverse_rms(b, token);
+      float4 turn = make_float4(rope[j][0].x, rope[j][0].y, rope[j][1].x, rope[j][1].y);
+      if (FEW) turn = *(const float4*)(b.smem + M_ROPE + i * 512 + b.lane * 16);
+      const float2 u = make_float2(turn.x, turn.y), v = make_float2(turn.z, turn.w);
       const float a0 = c.x * r.x + shift[j].x, a1 = c.z * r.x + shift[j].y, c0 = c.y * r.y + shift[j].x,
                   c1 = c.w * r.y + shift[j].y;
       const float f0 = a0 * u.x - a1 * u.y, s0 = a1 * u.x + a0 * u.y, f1 = c0 * v.x - c1 * v.y,
@@ -120,7 +129,11 @@ constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
 // share the suffix's keys, a quarter of the columns each; the third warpgroup fetches the suffix's values. If registers
 // allow (HOLD), keys and values are in them before queries come, and scoring warps have no part in the values.
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
-constexpr bool HOLD = FEW && ROUNDS == 1 && STAGES >= 2 * most(KT, SLOT_TILES);
+constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
+#ifndef TP_HV
+#define TP_HV 5
+#endif
+constexpr int HELD_TILES = KT < TP_HV ? KT : TP_HV;
 #ifndef TP_HK
 #define TP_HK 12
 #endif
@@ -171,31 +184,37 @@ __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int
   return seen;
 }
 
-// Four suffix keys' or values' columns at a time, `kind` 0 or 1, from all clusters to shared memory: of `count` rows
-// `quads` quads from quad `first` on, by `threads` threads.
+// Suffix keys (kind 0) or values (1) from all clusters to shared memory: of `rows` of them, from `row0` on, `quads` times
+// four columns from quad `first` on, by `threads` threads.
 template <int MOST>
-__device__ __forceinline__ void fetch_suffix(const Block& b, const float* kv, u32 bit, int kind, int me, int threads,
-                                             int row0, int count, int first, int quads) {
+struct SuffixPart {
+  const float* kv;
+  u32 bit;
+  int kind, me, threads, row0, rows, first, quads;
   uint4 v[MOST];
-  auto item = [&](int i) { return min(me + i * threads, count * quads - 1); };  // the last ones twice
-  auto place = [&](int i) {
+  __device__ __forceinline__ int item(int i) const { return min(me + i * threads, rows * quads - 1); }  // the last twice
+  __device__ __forceinline__ const uint4* place(int i) const {
     return (const uint4*)(kv + size_t(row0 + item(i) / quads) * 2 * HD + kind * HD) + first + item(i) % quads;
-  };
+  }
+  __device__ __forceinline__ void ask() {
 #pragma unroll
-  for (int i = 0; i < MOST; ++i) v[i] = peek(place(i));
+    for (int i = 0; i < MOST; ++i) v[i] = peek(place(i));
+  }
+  __device__ __forceinline__ void keep(const Block& b) {
 #pragma unroll 1
-  for (bool again = true; again;) {
-    again = false;
+    for (bool again = true; again;) {
+      again = false;
+#pragma unroll
+      for (int i = 0; i < MOST; ++i)
+        if (missing(v[i], bit)) v[i] = peek(place(i)), again = true;
+    }
 #pragma unroll
     for (int i = 0; i < MOST; ++i)
-      if (missing(v[i], bit)) v[i] = peek(place(i)), again = true;
+      *(uint2*)(b.smem + M_X + X_SUFFIX + (kind * SUFFIX + item(i) / quads) * RS + (first + item(i) % quads) * 8) =
+          make_uint2(pack(__uint_as_float(v[i].x), __uint_as_float(v[i].y)),
+                     pack(__uint_as_float(v[i].z), __uint_as_float(v[i].w)));
   }
-#pragma unroll
-  for (int i = 0; i < MOST; ++i)
-    *(uint2*)(b.smem + M_X + X_SUFFIX + (kind * SUFFIX + item(i) / quads) * RS + (first + item(i) % quads) * 8) =
-        make_uint2(pack(__uint_as_float(v[i].x), __uint_as_float(v[i].y)),
-                   pack(__uint_as_float(v[i].z), __uint_as_float(v[i].w)));
-}
+};
 
 // Logits of the rank's suffix keys, by the last four warps; SUFFIX_WARP gets them.
 __device__ __forceinline__ void score_suffix(const Block& b, int count, float (&c)[NT][4]) {
@@ -312,15 +331,21 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) give_slot(b, take_slot(b), 0);
   };
-  auto fetch_values = [&] {
-    if (suffix > 0 && b.warp >= SCORERS && !for_suffix)
-      fetch_suffix<most(SUFFIX * HD / 4, 128)>(b, kv, bit, 1, threadIdx.x & 127, 128, suffix0, suffix, 0, HD / 4);
-  };
-  auto fetch_keys = [&] {  // a warp those that it scores
-    const int part = b.warp - SUFFIX_WARP, first = share(QT, 4, part), steps = share(QT, 4, part + 1) - first;
-    if (suffix > 0 && for_suffix && steps > 0)
-      fetch_suffix<most(SUFFIX * SUFFIX_STEPS * 4, 32)>(b, kv, bit, 0, b.lane, 32, suffix0, suffix, first * 4,
-                                                        steps * 4);
+  // Keys: a warp those columns that it scores. Values: a warp those that it weighs, or the third warpgroup all.
+  const int k0 = share(QT, 4, b.warp - SUFFIX_WARP), key_steps = share(QT, 4, b.warp - SUFFIX_WARP + 1) - k0;
+  const bool some_keys = suffix > 0 && for_suffix && key_steps > 0;
+  const bool some_values = suffix > 0 && (HOLD ? column < QT : b.warp >= SCORERS && !for_suffix);
+  SuffixPart<most(SUFFIX * SUFFIX_STEPS * 4, 32)> suffix_keys{kv,      bit,    0,      b.lane,       32,
+                                                              suffix0, suffix, k0 * 4, key_steps * 4};
+  constexpr int VALUE_THREADS = HOLD ? 32 : 128;
+  SuffixPart<most(SUFFIX * (HOLD ? CT * 4 : HD / 4), VALUE_THREADS)> suffix_values{
+      kv,      bit,    1, int(threadIdx.x) & (VALUE_THREADS - 1), VALUE_THREADS,
+      suffix0, suffix, HOLD ? column * 4 : 0, HOLD ? min(CT, QT - column) * 4 : HD / 4};
+  auto fetch_suffix = [&] {
+    if (some_keys) suffix_keys.ask();
+    if (some_values) suffix_values.ask();
+    if (some_keys) suffix_keys.keep(b);
+    if (some_values) suffix_values.keep(b);
     __syncwarp();
   };
   float2 top[NT];
@@ -336,27 +361,35 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
 #pragma unroll
     for (int j = 0; j < CT; ++j) clear(out[j]);
   };
-  auto send_outputs = [&](float (&out)[CT][NT][4]) {  // after the suffix has had its part in them
+  uint4 last[CT];  // of the suffix's values
+  u32 to[CT], to_bar[CT];
+  auto prepare_outputs = [&] {
     const int row = min(((b.lane & 7) + (b.lane >> 4 << 3)) >> 1, suffix - 1);  // the others' weights are 0
 #pragma unroll
     for (int j = 0; j < CT; ++j) {
-      const int tile = column + j, owner = ((tile + 1) * S - 1) / QT;
-      if (tile < QT) {
-        if (suffix > 0) {
-          uint4 v;
-          ldmatrix_transposed(v, b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (tile * 16 + (b.lane & 8)) * 2);
-          mma_tokens(out[j], v, token_address(b, M_X + X_P) + KT * NT * 256);
-        }
-        const u32 to = at_rank(b.base + M_X + X_COMB + (b.rank * QTL + tile - share(QT, S, owner)) * NT * 512 +
-                                   b.lane * 16,
-                               owner),
-                  bar = at_rank(b.bar(BAR_COMB), owner);
+      const int tile = min(column + j, QT - 1), owner = ((tile + 1) * S - 1) / QT, in = tile - share(QT, S, owner);
+      last[j] = make_uint4(0, 0, 0, 0);
+      if (suffix > 0)
+        ldmatrix_transposed(last[j], b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (tile * 16 + (b.lane & 8)) * 2);
+      constexpr bool ONE_OWNER = QT % S == 0 && QTL % CT == 0;
+      if (ONE_OWNER && j > 0) {
+        to[j] = to[0] + j * NT * 512, to_bar[j] = to_bar[0];
+        continue;
+      }
+      to[j] = at_rank(b.base + M_X + X_COMB + (b.rank * QTL + in) * NT * 512 + b.lane * 16, owner);
+      to_bar[j] = at_rank(b.bar(BAR_COMB), owner);
+    }
+  };
+  auto send_outputs = [&](float (&out)[CT][NT][4]) {  // after the suffix has had its part in them
+#pragma unroll
+    for (int j = 0; j < CT; ++j)
+      if (column + j < QT) {
+        if (suffix > 0) mma_tokens(out[j], last[j], token_address(b, M_X + X_P) + KT * NT * 256);
 #pragma unroll
         for (int n = 0; n < NT; ++n)
           if (n * 8 + 2 * b.t() < T)
-            send(to + n * 512, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), bar);
+            send(to[j] + n * 512, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
       }
-    }
   };
   if constexpr (HOLD) {
     if (scorer) {
@@ -403,65 +436,60 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         asm volatile("bar.arrive %0, %1;" ::"n"(WEIGHTS), "n"(CONSUMERS) : "memory");
     } else {
       pass();
-#ifndef TP_HV
-#define TP_HV 4
-#endif
-      constexpr int HV = TP_HV < SLOT_TILES ? TP_HV : SLOT_TILES;
-      uint4 values[imax(HV, 1)][CT];  // of the first slot
+      uint4 values[HELD_TILES][CT];
       auto load = [&](u32 slot, int i, int j) {
         return load_fragment(b.ring(slot) + i * KEY_TILE + (column + j) * FRAGMENT, b.lane);
       };
       auto exists = [&](int j) { return QT % WEIGHERS == 0 || column + j < QT; };
 #pragma unroll
-      for (int i = 0; i < HV; ++i)  // or ptxas believes that those of the last layer are still wanted
+      for (int i = 0; i < HELD_TILES; ++i)  // or ptxas believes that those of the last layer are still wanted
 #pragma unroll
         for (int j = 0; j < CT; ++j) values[i][j] = make_uint4(0, 0, 0, 0);
-      u32 first = 0;
-      if (slots > 0) {
-        first = take_slot(b);
-        const u32 slot = first;
-        u32 seen = 0;
+      u32 slot = 0;
 #pragma unroll
-        for (int i = 0; i < HV; ++i)
-          if (i < tiles)
+      for (int i = 0; i < MOST_SLOTS; ++i)
+        if (i < slots) {
+          slot = take_slot(b);
+          u32 seen = 0;
 #pragma unroll
-            for (int j = 0; j < CT; ++j)
-              if (exists(j)) values[i][j] = load(slot, i, j), seen ^= fold(values[i][j]);
-        if (HV == SLOT_TILES) give_slot(b, slot, seen);
-      }
+          for (int tile = i * SLOT_TILES; tile < HELD_TILES && tile < (i + 1) * SLOT_TILES; ++tile)
+            if (tile < tiles)
+#pragma unroll
+              for (int j = 0; j < CT; ++j)
+                if (exists(j)) values[tile][j] = load(slot, tile % SLOT_TILES, j), seen ^= fold(values[tile][j]);
+          if (i == 0 || tiles <= HELD_TILES) give_slot(b, slot, seen);
+        }
       b.forget();
-      fetch_values();
+      fetch_suffix();
       if (for_suffix) {
-        fetch_keys();
         receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
         of_suffix();
       }
+      prepare_outputs();
       __syncwarp();
       asm volatile("bar.sync %0, %1;" ::"n"(WEIGHTS), "n"(CONSUMERS) : "memory");
-      b.forget();
       float out[CT][NT][4];
       clear_out(out);
-      auto weigh = [&](int tile, int j, uint4 v) { mma_tokens(out[j], v, token_address(b, M_X + X_P) + tile * NT * 256); };
+      auto weigh = [&](int tile, int j, uint4 v) {
+        mma_tokens(out[j], v, token_address(b, M_X + X_P) + tile * NT * 256);
+      };
 #pragma unroll
-      for (int i = 0; i < HV; ++i)
+      for (int i = 0; i < HELD_TILES; ++i)
         if (i < tiles)
 #pragma unroll
           for (int j = 0; j < CT; ++j)
             if (exists(j)) weigh(i, j, values[i][j]);
-#pragma unroll 1
-      for (int i = HV == SLOT_TILES; i < slots; ++i) {
-        const u32 slot = i ? take_slot(b) : first;
+      if (tiles > HELD_TILES) {
         u32 seen = 0;
+#pragma unroll 1
+        for (int i = HELD_TILES; i < tiles; ++i)
 #pragma unroll
-        for (int k = 0; k < SLOT_TILES; ++k)
-          if ((k >= HV || i) && i * SLOT_TILES + k < tiles)
-#pragma unroll
-            for (int j = 0; j < CT; ++j)
-              if (exists(j)) {
-                const uint4 v = load(slot, k, j);
-                seen ^= fold(v);
-                weigh(i * SLOT_TILES + k, j, v);
-              }
+          for (int j = 0; j < CT; ++j)
+            if (exists(j)) {
+              const uint4 v = load(slot, i - SLOT_TILES, j);
+              seen ^= fold(v);
+              weigh(i, j, v);
+            }
         give_slot(b, slot, seen);
       }
       send_outputs(out);
@@ -489,11 +517,8 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       }
     MARK(4)
     if (scorer) weights_of(b, c, b.warp, prefix - b.warp * 16, top);
-    fetch_values();
-    if (for_suffix) {
-      fetch_keys();
-      of_suffix();
-    }
+    fetch_suffix();
+    if (for_suffix) of_suffix();
     consumers_sync();
   }
   MARK(5)
@@ -520,6 +545,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       }
       give_slot(b, slot, seen);
     }
+    prepare_outputs();
     send_outputs(out);
     if (b.warp == LEADER) send_sums(b, tiles, suffix);
   }

@@ -121,12 +121,14 @@ constexpr int MAX_SLOTS = plan_slots(QTL, true, D16) + plan_slots(KVL, true, D16
                           plan_slots(DX, false, QT) + plan_slots(GTL, true, D16) + plan_slots(DX, false, HC);
 constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + H_SIZE;
 constexpr int M_PART = M_SSQ + up128(SQ * NT * 32);  // of this slice, by tile; in attention largest logits
-constexpr int M_BAR = M_PART + up128(DX * NT * 32), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
+constexpr int M_RMS = M_PART + up128(DX * NT * 32);  // 1 / rms of each token
+constexpr int M_ROPE = M_RMS + up128(NT * 32);       // if tokens are few: see `make_rope`
+constexpr int M_BAR = M_ROPE + (FEW ? (QTL + KVL) * NT * 512 : 0), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
               M_LIST = M_BAR + 512, M_RING = M_LIST + up128(MAX_SLOTS * 8);
 constexpr int STAGES = (TP_SMEM - M_RING) / SLOT < 11 ? (TP_SMEM - M_RING) / SLOT : 11;
 static_assert(STAGES >= 2, "too little shared memory");
 
-enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RING };  // ring: full and empty, by slot
+enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };  // ring: full and empty, by slot
 
 // ---- scratch in global memory, in 16-byte words
 
