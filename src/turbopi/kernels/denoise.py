@@ -39,7 +39,7 @@ PARTS = tuple(
 THREADS = (WARPS + 4) * 32
 # `What` of denoise_primitives.cu
 WAITS = (
-    *("nothing", "the stream", "queries", "suffix keys", "outputs", "attention", "attention's sums", "hidden units"),
+    *("nothing", "the stream", "queries", "largest logits", "outputs", "attention", "attention's sums", "hidden units"),
     *("feed-forward sums", "v_t", "the next step", "its end"),
 )
 MAX_SUFFIX = 56  # beyond it too little shared memory is left for weights on their way

@@ -15,7 +15,7 @@ __device__ __forceinline__ void ldmatrix_transposed(uint4& v, u32 address) {
 constexpr int ITEMS_Q =
     most((QTL + KVL) * NT, W);  // (tile, 8 tokens) of queries, keys and values that one warp finishes
 
-// Cosine and sine of a warp's items, for tokens 2t and 2t + 1; values aren't turned.
+// Cosine and sine of a warp's items, for tokens 2t and 2t + 1; values aren't turned. To shared memory if there is room.
 __device__ __forceinline__ void make_rope(const Block& b, int prefix, float2 (&rope)[ITEMS_Q][2]) {
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
@@ -33,9 +33,20 @@ __device__ __forceinline__ void make_rope(const Block& b, int prefix, float2 (&r
       rope[j][h] = make_float2(cosine, sine);
     }
   }
+  if (FEW)
+#pragma unroll
+    for (int j = 0; j < ITEMS_Q; ++j)
+      if (b.warp + j * W < (QTL + KVL) * NT)
+        *(float4*)(b.smem + M_ROPE + (b.warp + j * W) * 512 + b.lane * 16) =
+            make_float4(rope[j][0].x, rope[j][0].y, rope[j][1].x, rope[j][1].y);
 }
 
-// q to all ranks (standard order), k and v to all clusters as float32 with their flags. The partial sums lie over the
+// Floats as integers of the same order, and back. Even where a rank has no keys, the largest logit is LOWEST.
+constexpr float LOWEST = -3e38f;
+__device__ __forceinline__ int ordered(int v) { return v ^ ((v >> 31) & 0x7fffffff); }
+__device__ __forceinline__ int ordered(float v) { return ordered(__float_as_int(v)); }
+
+// q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream; queries are sent when all of those have been read, so what a peer sends after it has them may lie there too.
 __device__ __forceinline__ void project(Block& b, const float* shifted, const float* row_scales, float* kv, u32 bit,
                                         const float2 (&rope)[ITEMS_Q][2]) {
@@ -54,11 +65,11 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   consumers_sync();
   store_partials<QTL + KVL>(b, b.smem + M_X, qn + kvn, sums);
   consumers_sync();
-  u32 first[ITEMS_Q], second[ITEMS_Q];
+  if (threadIdx.x < NT * 8) ((int*)(b.smem + M_PART))[threadIdx.x] = ordered(LOWEST);  // for `weights_of`
+  byte* const staged = b.smem + M_H + H_ATT;  // free until all have what attention sends: [item][half][8 tokens][8]
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
     const int i = b.warp + j * W, k = i - qn * NT;
-    first[j] = second[j] = 0;
     if (i < (qn + kvn) * NT) {
       const int n = k < 0      ? i / qn
                     : KVL == 1 ? k
@@ -66,14 +77,19 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
                 kv_tile = KVL == 1 ? 0 : k % kvn, token = n * 8 + 2 * b.t();
       float4 c = total<QTL + KVL>(b, b.smem + M_X, k < 0 ? i % qn : qn + kv_tile, n);
       if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
-      const float2 r = inverse_rms(b, token), u = rope[j][0], v = rope[j][1];
+      const float2 r = inverse_rms(b, token);
+      float4 turn = make_float4(rope[j][0].x, rope[j][0].y, rope[j][1].x, rope[j][1].y);
+      if (FEW) turn = *(const float4*)(b.smem + M_ROPE + i * 512 + b.lane * 16);
+      const float2 u = make_float2(turn.x, turn.y), v = make_float2(turn.z, turn.w);
       const float a0 = c.x * r.x + shift[j].x, a1 = c.z * r.x + shift[j].y, c0 = c.y * r.y + shift[j].x,
                   c1 = c.w * r.y + shift[j].y;
       const float f0 = a0 * u.x - a1 * u.y, s0 = a1 * u.x + a0 * u.y, f1 = c0 * v.x - c1 * v.y,
                   s1 = c1 * v.x + c0 * v.y;
       if (k < 0) {
-        const float f = exchange(b.g() & 1 ? f0 : f1, 4), s = exchange(b.g() & 1 ? s0 : s1, 4);
-        first[j] = b.g() & 1 ? pack(f, f1) : pack(f0, f), second[j] = b.g() & 1 ? pack(s, s1) : pack(s0, s);
+        const u32 f = pack(f0, f1), s = pack(s0, s1);
+        unsigned short* p = (unsigned short*)(staged + i * 256 + b.t() * 32) + b.g();
+        p[0] = (unsigned short)f, p[8] = (unsigned short)(f >> 16);
+        p[64] = (unsigned short)s, p[72] = (unsigned short)(s >> 16);
       } else {
         const int tile = b.kv0() + kv_tile, col = tile < QT ? tile * 8 + b.g() : HD + (tile - QT) * 16 + b.g(),
                   up = tile < QT ? HD / 2 : 8;
@@ -84,227 +100,482 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     }
   }
   consumers_sync();
+  static_assert(S == 8, "half a warp serves half of the ranks");
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
     const int i = b.warp + j * W;
     if (i < qn * NT) {
-      const int n = i / qn, token = 2 * b.t() + (b.g() & 1), even = (b.q0() + i % qn) * 8 + (b.g() & ~1);
-      const Everyone bars(b.bar(BAR_Q));
+      const int n = i / qn, half = b.lane >> 3 & 1, token = b.lane & 7, d0 = b.lane >> 4 << 2;
+      const float4 v = *(const float4*)(staged + i * 256 + (b.lane & 15) * 16);
+      const u32 to = b.base + M_H + H_Q + ((b.q0() + i % qn + half * QT) * NT + n) * 128 + token * 16;
+      u32 data[4], bars[4];
+#pragma unroll
+      for (int d = 0; d < 4; ++d) data[d] = at_rank(to, d0 + d), bars[d] = at_rank(b.bar(BAR_Q), d0 + d);
       if (n * 8 + token < T)
 #pragma unroll
-        for (int h = 0; h < 2; ++h) {
-          const int col = even + h * (HD / 2), in = col & 15;
-          const u32 to =
-              b.base + M_H + H_Q + ((col >> 4) * NT + n) * 256 + (token * 4 + ((in & 7) >> 1)) * 8 + (in >> 3) * 4;
-          const Everyone data(to);
-#pragma unroll
-          for (int d = 0; d < S; ++d) send(data.at[d], h ? second[j] : first[j], bars.at[d]);
-        }
+        for (int d = 0; d < 4; ++d) send(data[d], v, bars[d]);
     }
   }
   if (IDLE_Q && threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_Q), threadIdx.x));
 }
 constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
 
-// Logits of 16 keys, times the scale and log2 e, to shared memory. Two warps (`half`) share them: by columns, whose
-// sums softmax adds up, or else by tokens. fetch(k) is the k-th fragment of the keys. Returns a word that needs all it
-// read, for give_slot.
-constexpr int HALF = SPLIT_KEYS ? NT : (NT + 1) / 2;
-template <typename Fetch>
-__device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int half, int first, float scale) {
-  constexpr int CHAINS = HALF <= 2 ? 2 : 1, STEPS = SPLIT_KEYS ? QT / 2 : QT,
-                UNROLL = SPLIT_KEYS ? 4 : HALF <= 2 ? 8 : 2;
-  const int k0 = SPLIT_KEYS ? half * STEPS : 0, n0 = SPLIT_KEYS ? 0 : half * HALF;
-  float c[CHAINS][HALF][4];
+// Who does what: the first SCORERS warps take a tile of prefix keys each, and the next, if there are more; the last four
+// share the suffix's keys, a quarter of the columns each; the third warpgroup fetches the suffix's values. If registers
+// allow (HOLD), keys and values are in them before queries come, and scoring warps have no part in the values.
+constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
+constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
+#ifndef TP_HV
+#define TP_HV 5
+#endif
+constexpr int HELD_TILES = KT < TP_HV ? KT : TP_HV;
+#ifndef TP_HK
+#define TP_HK 12
+#endif
+#ifndef TP_U
+#define TP_U 4
+#endif
+constexpr int HELD_KEYS = QT < TP_HK ? QT : TP_HK;
+constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
+constexpr int SUFFIX_STEPS = most(QT, 4);                                   // blocks of columns of a suffix warp
+constexpr int TOPS = 2, SUFFIX_SUMS = 3, WEIGHTS = 4;                       // barriers; 1 is consumers_sync's
+
+// A lane's address for `mma_tokens` in activations [block][half][NT][8 tokens][8 columns], standard order.
+__device__ __forceinline__ u32 token_address(const Block& b, u32 region) {
+  return b.base + region + ((b.lane >> 3 & 1) * NT + (b.lane >> 4)) * 128 + (b.lane & 7) * 16;
+}
+// One block: a tile's rows times all tokens. What is read beyond the last tokens isn't used.
+__device__ __forceinline__ void mma_tokens(float (&c)[NT][4], uint4 a, u32 from) {
 #pragma unroll
-  for (int i = 0; i < CHAINS; ++i) clear(c[i]);
-  u32 seen = 0;
-  const byte* q = b.smem + M_H + H_Q + (k0 * NT + n0) * 256 + b.lane * 8;
-#pragma unroll(UNROLL)
-  for (int k = 0; k < STEPS; ++k) {
-    const uint4 a = fetch(k0 + k);
-    seen ^= a.x;
-#pragma unroll
-    for (int n = 0; n < HALF; ++n)
-      if (n0 + n < NT) mma(c[k % CHAINS][n], a, *(const uint2*)(q + (k * NT + n) * 256));
+  for (int n = 0; n < NT; n += 2) {
+    uint4 v;
+    ldmatrix(v, from + n * 128);
+    mma(c[n], a, make_uint2(v.x, v.y));
+    if (n + 1 < NT) mma(c[n + 1], a, make_uint2(v.z, v.w));
   }
-  float* logits = (float*)(b.smem + M_X + X_LOGITS) + (SPLIT_KEYS ? half * T * LS : 0) + first + b.g();
+}
+
+// Logits of 16 keys over STEPS blocks of columns from block `first` on, `steps` of which exist. fetch(k) is the k-th
+// fragment of the keys. Returns a word that needs all it read, for give_slot.
+template <int STEPS, int UNROLL, typename Fetch>
+__device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int steps, float (&c)[NT][4]) {
+  constexpr int CHAINS = FEW && STEPS > 4 ? 2 : 1;
+  float sums[CHAINS][NT][4];
 #pragma unroll
-  for (int n = 0; n < HALF; ++n)
-#pragma unroll
-    for (int i = 0; i < 4; ++i) {
-      const int token = (n0 + n) * 8 + 2 * b.t() + (i & 1);
-      float v = c[0][n][i];
-      if (CHAINS == 2) v += c[CHAINS - 1][n][i];
-      if (token < T) logits[token * LS + (i >> 1) * 8] = v * scale;
+  for (int i = 0; i < CHAINS; ++i) clear(sums[i]);
+  u32 seen = 0;
+  const u32 q = token_address(b, M_H + H_Q) + first * NT * 256;
+#pragma unroll(UNROLL)
+  for (int k = 0; k < STEPS; ++k)
+    if (QT % 4 == 0 || k < steps) {
+      const uint4 a = fetch(k);
+      seen ^= a.x;
+      mma_tokens(sums[k % CHAINS], a, q + k * NT * 256);
     }
+#pragma unroll
+  for (int n = 0; n < NT; ++n)
+#pragma unroll
+    for (int i = 0; i < 4; ++i) c[n][i] = CHAINS == 2 ? sums[0][n][i] + sums[CHAINS - 1][n][i] : sums[0][n][i];
   return seen;
 }
 
-// Suffix keys (kind 0) or values (1) of this rank, from all clusters, to shared memory; by four warps.
-__device__ __forceinline__ void fetch_suffix(const Block& b, const float* kv, u32 bit, int kind, int me, int first,
-                                             int count) {
-  byte* to = b.smem + M_X + X_SUFFIX + kind * SUFFIX * RS;
+// Suffix keys (kind 0) or values (1) from all clusters to shared memory: of `rows` of them, from `row0` on, `quads` times
+// four columns from quad `first` on, by `threads` threads.
+template <int MOST>
+struct SuffixPart {
+  const float* kv;
+  u32 bit;
+  int kind, me, threads, row0, rows, first, quads;
+  uint4 v[MOST];
+  __device__ __forceinline__ int item(int i) const { return min(me + i * threads, rows * quads - 1); }  // the last twice
+  __device__ __forceinline__ const uint4* place(int i) const {
+    return (const uint4*)(kv + size_t(row0 + item(i) / quads) * 2 * HD + kind * HD) + first + item(i) % quads;
+  }
+  __device__ __forceinline__ void ask() {
+#pragma unroll
+    for (int i = 0; i < MOST; ++i) v[i] = peek(place(i));
+  }
+  __device__ __forceinline__ void keep(const Block& b) {
 #pragma unroll 1
-  for (int i = me; i < count * (HD / 4); i += 128) {
-    const int row = i / (HD / 4), quad = i % (HD / 4);
-    uint4 v[1];
-    poll(v, (const uint4*)(kv + size_t(first + row) * 2 * HD + kind * HD) + quad, 0, bit);
-    *(uint2*)(to + row * RS + quad * 8) = make_uint2(pack(__uint_as_float(v[0].x), __uint_as_float(v[0].y)),
-                                                     pack(__uint_as_float(v[0].z), __uint_as_float(v[0].w)));
+    for (bool again = true; again;) {
+      again = false;
+#pragma unroll
+      for (int i = 0; i < MOST; ++i)
+        if (missing(v[i], bit)) v[i] = peek(place(i)), again = true;
+    }
+#pragma unroll
+    for (int i = 0; i < MOST; ++i)
+      *(uint2*)(b.smem + M_X + X_SUFFIX + (kind * SUFFIX + item(i) / quads) * RS + (first + item(i) % quads) * 8) =
+          make_uint2(pack(__uint_as_float(v[i].x), __uint_as_float(v[i].y)),
+                     pack(__uint_as_float(v[i].z), __uint_as_float(v[i].w)));
+  }
+};
+
+// Logits of the rank's suffix keys, by the last four warps; SUFFIX_WARP gets them.
+__device__ __forceinline__ void score_suffix(const Block& b, int count, float (&c)[NT][4]) {
+  const int part = b.warp - SUFFIX_WARP, first = share(QT, 4, part), steps = share(QT, 4, part + 1) - first;
+  const u32 from = b.base + M_X + X_SUFFIX + min(b.lane & 7, count - 1) * RS + first * 32 + (b.lane >> 4) * 16;
+  auto fetch = [&](int k) {  // rows beyond the last key hold anything
+    uint4 v;
+    ldmatrix(v, from + k * 32);
+    return v;
+  };
+  score<SUFFIX_STEPS, SUFFIX_STEPS>(b, fetch, first, steps, c);
+  float2* sums = (float2*)(b.smem + M_X + X_SUFFIX_SUMS) + b.lane;
+  if (part > 0) {
+#pragma unroll
+    for (int n = 0; n < NT; ++n) sums[((part - 1) * NT + n) * 32] = make_float2(c[n][0], c[n][1]);
+    __syncwarp();
+    asm volatile("bar.arrive %0, 128;" ::"n"(SUFFIX_SUMS) : "memory");
+  } else {
+    __syncwarp();
+    asm volatile("bar.sync %0, 128;" ::"n"(SUFFIX_SUMS) : "memory");
+#pragma unroll
+    for (int i = 0; i < 3; ++i)
+#pragma unroll
+      for (int n = 0; n < NT; ++n) {
+        const float2 v = sums[(i * NT + n) * 32];
+        c[n][0] += v.x, c[n][1] += v.y;
+      }
   }
 }
 
-// Softmax over this rank's keys: unnormalised probabilities (operand B of the next product), and to all ranks each
-// token's maximum and sum.
-__device__ __forceinline__ void softmax(const Block& b, int prefix, int suffix) {
-  constexpr int COLS = (KT + 1) * 16, PER = most(COLS, 32);
-#pragma unroll 1
-  for (int token = b.warp; token < T; token += W) {
-    const float* row = (const float*)(b.smem + M_X + X_LOGITS) + token * LS;
-    float v[PER], top = __int_as_float(0xff800000), sum = 0;
+// From logits of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist, to unnormalised
+// weights in shared memory: operand B of the next product, in which column 2i is row i, column 2i + 1 row i + 8.
+// top: each token's largest logit, times log2 e, in this rank.
+template <int R>
+__device__ __forceinline__ void weights_of(const Block& b, float (&c)[R][NT][4], int tile, int rows,
+                                           float2 (&top)[NT]) {
+  const float scale = rsqrtf(float(HD)) * 1.4426950408889634f, none = __int_as_float(0xff800000);
+  int* const tops = (int*)(b.smem + M_PART) + 2 * b.t();
+  if (rows > 0) {
 #pragma unroll
-    for (int i = 0; i < PER; ++i) {
-      const int col = i * 32 + b.lane;
-      v[i] = __int_as_float(0xff800000);
-      if (col < prefix || (col >= KT * 16 && col < KT * 16 + suffix))
-        v[i] = SPLIT_KEYS ? row[col] + row[T * LS + col] : row[col];
-      top = fmaxf(top, v[i]);
+    for (int n = 0; n < NT; ++n) {
+      float x = none, y = none;
+#pragma unroll
+      for (int r = 0; r < R; ++r) {
+#pragma unroll
+        for (int i = 0; i < 4; ++i)
+          c[r][n][i] = b.g() + (i >> 1) * 8 < rows - r * SCORERS * 16 ? c[r][n][i] * scale : none;
+        x = fmaxf(x, fmaxf(c[r][n][0], c[r][n][2])), y = fmaxf(y, fmaxf(c[r][n][1], c[r][n][3]));
+      }
+#pragma unroll
+      for (int o = 4; o < 32; o *= 2) x = fmaxf(x, exchange(x, o)), y = fmaxf(y, exchange(y, o));
+      if (b.g() < 2) atomicMax(tops + n * 8 + b.g(), ordered(b.g() ? y : x));
     }
-#pragma unroll
-    for (int o = 16; o; o >>= 1) top = fmaxf(top, exchange(top, o));
-#pragma unroll
-    for (int i = 0; i < PER; ++i) {
-      const int col = i * 32 + b.lane, in = col & 15;
-      const u32 p = pack(v[i] == __int_as_float(0xff800000) ? 0.0f : exp2_approx(v[i] - top), 0);
-      sum += __uint_as_float(p << 16);
-      if (col < COLS)
-        *(unsigned short*)(b.smem + M_X + X_P + ((col >> 4) * NT + (token >> 3)) * 256 +
-                           ((token & 7) * 4 + ((in & 7) >> 1)) * 8 + (in >> 3) * 4 + (in & 1) * 2) = (unsigned short)p;
-    }
-#pragma unroll
-    for (int o = 16; o; o >>= 1) sum += exchange(sum, o);
-    if (b.lane < S)
-      send(at_rank(b.base + M_X + X_ML + (b.rank * T + token) * 8, b.lane), __float_as_uint(top), __float_as_uint(sum),
-           at_rank(b.bar(BAR_COMB), b.lane));
   }
+  __syncwarp();
+  asm volatile("bar.sync %0, %1;" ::"n"(TOPS), "n"((SCORERS + 1) * 32) : "memory");
+#pragma unroll
+  for (int n = 0; n < NT; ++n) {
+    const int2 v = *(const int2*)(tops + n * 8);
+    top[n] = make_float2(__int_as_float(ordered(v.x)), __int_as_float(ordered(v.y)));
+  }
+#pragma unroll
+  for (int r = 0; r < R; ++r)
+    if (rows > r * SCORERS * 16) {
+      byte* p = b.smem + M_X + X_P + ((tile + r * SCORERS) * 2 + (b.g() >> 2)) * NT * 128 + b.t() * 32 +
+                (b.g() & 3) * 4;
+#pragma unroll
+      for (int n = 0; n < NT; ++n)
+#pragma unroll
+        for (int i = 0; i < 2; ++i) {
+          const float at = i ? top[n].y : top[n].x;
+          *(u32*)(p + n * 128 + i * 16) = pack(exp2_approx(c[r][n][i] - at), exp2_approx(c[r][n][i + 2] - at));
+        }
+    }
 }
 
-// Probabilities times 16 keys' values, for one tile of columns.
-__device__ __forceinline__ void weigh(const Block& b, float (&c)[NT][4], uint4 values, int block) {
-  const byte* p = b.smem + M_X + X_P + block * NT * 256 + b.lane * 8;
+// Of each token something of this rank, to all ranks.
+__device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[NT], int region, int bar) {
+  const u32 to = at_rank(b.base + M_X + region + (b.rank * NT * 8 + 2 * b.t()) * 4, b.g());
+  const u32 at = at_rank(b.bar(bar), b.g());
 #pragma unroll
-  for (int n = 0; n < NT; ++n) mma(c[n], values, *(const uint2*)(p + n * 256));
+  for (int n = 0; n < NT; ++n)
+    if (n * 8 + 2 * b.t() < T) send(to + n * 32, __float_as_uint(v[n].x), __float_as_uint(v[n].y), at);
+}
+constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
+__device__ __forceinline__ u32 outputs_expect(const Block& b) {
+  return S * ((T + 1) / 2) * 8 + S * b.qn() * ((T + 1) / 2) * 128;
+}
+// The sums of the weights, as rounded: a product with ones.
+__device__ __forceinline__ void send_sums(const Block& b, int tiles, int suffix) {
+  float c[NT][4];
+  clear(c);
+  const u32 p = token_address(b, M_X + X_P), one = 0x3f803f80;
+#pragma unroll
+  for (int tile = 0; tile <= KT; ++tile)
+    if (tile < KT ? tile < tiles : suffix > 0) mma_tokens(c, make_uint4(one, one, one, one), p + tile * NT * 256);
+  float2 sums[NT];
+#pragma unroll
+  for (int n = 0; n < NT; ++n) sums[n] = make_float2(c[n][0], c[n][1]);
+  send_by_token(b, sums, X_SUMS, BAR_COMB);
 }
 
 // Attention of this cluster's head, to region H of all ranks. Everything local lies in region X.
 __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix_all) {
+  b.forget();
+  asm volatile("" : "+r"(prefix_all));
   const int all = most(prefix_all, 16), tile0 = share(all, S, b.rank), tiles = share(all, S, b.rank + 1) - tile0;
   const int prefix = min(tiles * 16, prefix_all - tile0 * 16), slots = most(tiles, SLOT_TILES);
   const int suffix0 = share(T, S, b.rank), suffix = share(T, S, b.rank + 1) - suffix0;
-  const float scale = rsqrtf(float(HD)) * 1.4426950408889634f;
-  const int group = b.warp >> 2, half = b.warp & 1;
-  receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
-  MARK(3)
+  const bool scorer = b.warp < SCORERS, for_suffix = b.warp >= SUFFIX_WARP;
+  const int column = (b.warp - (W - WEIGHERS)) * CT;  // this warp's first tile of them
+  constexpr int MOST_SLOTS = most(KT, SLOT_TILES);
+  auto pass = [&] {  // slots that a warp has no use for
 #pragma unroll 1
-  for (int i = 0; i < slots; ++i) {
-    const u32 slot = take_slot(b);
-    // this warp's tile of eight, if it is in the slot (a slot has two or four)
-    const int sub = (b.warp >> 1) - i * SLOT_TILES % 8, tile = i * SLOT_TILES + sub;
-    u32 seen = 0;
-    if (sub >= 0 && sub < SLOT_TILES && tile < tiles && (SPLIT_KEYS || half * HALF < NT)) {
-      const byte* from = b.ring(slot) + sub * KEY_TILE;
-      seen = score(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); }, half, tile * 16, scale);
-    }
-    give_slot(b, slot, seen);
-  }
-  MARK(4)
-  if (suffix > 0) {
-    if (group == 3) {
-      fetch_suffix(b, kv, bit, 0, threadIdx.x & 127, suffix0, suffix);
-      __syncwarp();
-      asm volatile("bar.sync 2, 128;" ::: "memory");
-      if (b.warp < 14 && (SPLIT_KEYS || half * HALF < NT)) {
-        const int row = min((b.lane & 7) + (b.lane & 8), suffix - 1);  // rows beyond the last key hold anything
-        const u32 from = b.base + M_X + X_SUFFIX + row * RS + (b.lane >> 4) * 16;
-        auto fetch = [&](int k) {
-          uint4 v;
-          ldmatrix(v, from + k * 32);
-          return v;
-        };
-        score(b, fetch, half, KT * 16, scale);
-      }
-    } else if (group == 2) {
-      fetch_suffix(b, kv, bit, 1, threadIdx.x & 127, suffix0, suffix);
-    }
-  }
-  consumers_sync();
-  MARK(5)
-  softmax(b, prefix, suffix);
-  consumers_sync();
-  MARK(6)
-  float c[NT][4];
-  clear(c);
-  const bool mine = b.warp < QT;
-#pragma unroll 1
-  for (int i = 0; i < slots; ++i) {
-    const u32 slot = take_slot(b);
-    const byte* from = b.ring(slot) + b.warp * FRAGMENT;
-    u32 seen = 0;
-    if (mine) {
+    for (int i = 0; i < slots; ++i) give_slot(b, take_slot(b), 0);
+  };
+  // Keys: a warp those columns that it scores. Values: a warp those that it weighs, or the third warpgroup all.
+  const int k0 = share(QT, 4, b.warp - SUFFIX_WARP), key_steps = share(QT, 4, b.warp - SUFFIX_WARP + 1) - k0;
+  const bool some_keys = suffix > 0 && for_suffix && key_steps > 0;
+  const bool some_values = suffix > 0 && (HOLD ? column < QT : b.warp >= SCORERS && !for_suffix);
+  SuffixPart<most(SUFFIX * SUFFIX_STEPS * 4, 32)> suffix_keys{kv,      bit,    0,      b.lane,       32,
+                                                              suffix0, suffix, k0 * 4, key_steps * 4};
+  constexpr int VALUE_THREADS = HOLD ? 32 : 128;
+  SuffixPart<most(SUFFIX * (HOLD ? CT * 4 : HD / 4), VALUE_THREADS)> suffix_values{
+      kv,      bit,    1, int(threadIdx.x) & (VALUE_THREADS - 1), VALUE_THREADS,
+      suffix0, suffix, HOLD ? column * 4 : 0, HOLD ? min(CT, QT - column) * 4 : HD / 4};
+  auto fetch_suffix = [&] {
+    if (some_keys) suffix_keys.ask();
+    if (some_values) suffix_values.ask();
+    if (some_keys) suffix_keys.keep(b);
+    if (some_values) suffix_values.keep(b);
+    __syncwarp();
+  };
+  float2 top[NT];
 #pragma unroll
-      for (int sub = 0; sub < SLOT_TILES; ++sub)
-        if (i * SLOT_TILES + sub < tiles) {
-          const uint4 v = load_fragment(from + sub * KEY_TILE, b.lane);
-          seen ^= fold(v);
-          weigh(b, c, v, i * SLOT_TILES + sub);
+  for (int n = 0; n < NT; ++n) top[n] = make_float2(0, 0);
+  auto of_suffix = [&] {
+    float c[1][NT][4];
+    clear(c[0]);
+    if (suffix > 0) score_suffix(b, suffix, c[0]);
+    if (b.warp == SUFFIX_WARP) weights_of(b, c, KT, suffix, top);
+  };
+  auto clear_out = [&](float (&out)[CT][NT][4]) {
+#pragma unroll
+    for (int j = 0; j < CT; ++j) clear(out[j]);
+  };
+  uint4 last[CT];  // of the suffix's values
+  u32 to[CT], to_bar[CT];
+  auto prepare_outputs = [&] {
+    const int row = min(((b.lane & 7) + (b.lane >> 4 << 3)) >> 1, suffix - 1);  // the others' weights are 0
+#pragma unroll
+    for (int j = 0; j < CT; ++j) {
+      const int tile = min(column + j, QT - 1), owner = ((tile + 1) * S - 1) / QT, in = tile - share(QT, S, owner);
+      last[j] = make_uint4(0, 0, 0, 0);
+      if (suffix > 0)
+        ldmatrix_transposed(last[j], b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (tile * 16 + (b.lane & 8)) * 2);
+      constexpr bool ONE_OWNER = QT % S == 0 && QTL % CT == 0;
+      if (ONE_OWNER && j > 0) {
+        to[j] = to[0] + j * NT * 512, to_bar[j] = to_bar[0];
+        continue;
+      }
+      to[j] = at_rank(b.base + M_X + X_COMB + (b.rank * QTL + in) * NT * 512 + b.lane * 16, owner);
+      to_bar[j] = at_rank(b.bar(BAR_COMB), owner);
+    }
+  };
+  auto send_outputs = [&](float (&out)[CT][NT][4]) {  // after the suffix has had its part in them
+#pragma unroll
+    for (int j = 0; j < CT; ++j)
+      if (column + j < QT) {
+        if (suffix > 0) mma_tokens(out[j], last[j], token_address(b, M_X + X_P) + KT * NT * 256);
+#pragma unroll
+        for (int n = 0; n < NT; ++n)
+          if (n * 8 + 2 * b.t() < T)
+            send(to[j] + n * 512, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
+      }
+  };
+  if constexpr (HOLD) {
+    if (scorer) {
+      uint4 keys[HELD_KEYS];
+#pragma unroll
+      for (int k = 0; k < HELD_KEYS; ++k) keys[k] = make_uint4(0, 0, 0, 0);
+      u32 mine = b.slot;  // the slot of this warp's tile
+#pragma unroll 1
+      for (int i = 0; i < slots; ++i) {
+        const u32 slot = take_slot(b);
+        if (b.warp / SLOT_TILES == i && b.warp < tiles) {
+          mine = slot;
+#pragma unroll
+          for (int k = 0; k < HELD_KEYS; ++k)
+            keys[k] = load_fragment(b.ring(slot) + b.warp % SLOT_TILES * KEY_TILE + k * FRAGMENT, b.lane);
+        } else {
+          give_slot(b, slot, 0);
         }
-    }
-    give_slot(b, slot, seen);
-  }
-  if (mine) {
-    if (suffix > 0) {
-      const int row = min((b.lane & 7) + ((b.lane >> 4) << 3), suffix - 1);  // the others' probabilities are 0
-      uint4 v;
-      ldmatrix_transposed(v, b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (b.warp * 16 + (b.lane & 8)) * 2);
-      weigh(b, c, v, KT);
-    }
-    const int owner = ((b.warp + 1) * S - 1) / QT, tile = b.warp - share(QT, S, owner);
+      }
+      pass();
+      receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
+      b.forget();
+      MARK(3)
+      float c[1][NT][4];
+      clear(c[0]);
+      if (b.warp < tiles) {
+        const byte* from = b.ring(mine) + b.warp % SLOT_TILES * KEY_TILE;
+        float rest[NT][4];
+        score<HELD_KEYS, HELD_KEYS>(b, [&](int k) { return keys[k]; }, 0, QT, c[0]);
+        auto fetch = [&](int k) { return load_fragment(from + (HELD_KEYS + k) * FRAGMENT, b.lane); };
+        const u32 seen = score<QT - HELD_KEYS, TP_U>(b, fetch, HELD_KEYS, QT, rest);
 #pragma unroll
-    for (int n = 0; n < NT; ++n)
-      if (n * 8 + 2 * b.t() < T)
-        send(at_rank(b.base + M_X + X_COMB + ((b.rank * QTL + tile) * NT + n) * 512 + b.lane * 16, owner),
-             make_float4(c[n][0], c[n][1], c[n][2], c[n][3]), at_rank(b.bar(BAR_COMB), owner));
+        for (int n = 0; n < NT; ++n)
+#pragma unroll
+          for (int i = 0; i < 4; ++i) c[0][n][i] += rest[n][i];
+        give_slot(b, mine, seen);
+      }
+      MARK(4)
+      weights_of(b, c, b.warp, prefix - b.warp * 16, top);
+      __syncwarp();
+      if (b.warp == LEADER)
+        asm volatile("bar.sync %0, %1;" ::"n"(WEIGHTS), "n"(CONSUMERS) : "memory");
+      else
+        asm volatile("bar.arrive %0, %1;" ::"n"(WEIGHTS), "n"(CONSUMERS) : "memory");
+    } else {
+      pass();
+      uint4 values[HELD_TILES][CT];
+      auto load = [&](u32 slot, int i, int j) {
+        return load_fragment(b.ring(slot) + i * KEY_TILE + (column + j) * FRAGMENT, b.lane);
+      };
+      auto exists = [&](int j) { return QT % WEIGHERS == 0 || column + j < QT; };
+#pragma unroll
+      for (int i = 0; i < HELD_TILES; ++i)  // or ptxas believes that those of the last layer are still wanted
+#pragma unroll
+        for (int j = 0; j < CT; ++j) values[i][j] = make_uint4(0, 0, 0, 0);
+      u32 slot = 0;
+#pragma unroll
+      for (int i = 0; i < MOST_SLOTS; ++i)
+        if (i < slots) {
+          slot = take_slot(b);
+          u32 seen = 0;
+#pragma unroll
+          for (int tile = i * SLOT_TILES; tile < HELD_TILES && tile < (i + 1) * SLOT_TILES; ++tile)
+            if (tile < tiles)
+#pragma unroll
+              for (int j = 0; j < CT; ++j)
+                if (exists(j)) values[tile][j] = load(slot, tile % SLOT_TILES, j), seen ^= fold(values[tile][j]);
+          if (i == 0 || tiles <= HELD_TILES) give_slot(b, slot, seen);
+        }
+      b.forget();
+      fetch_suffix();
+      if (for_suffix) {
+        receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
+        of_suffix();
+      }
+      prepare_outputs();
+      __syncwarp();
+      asm volatile("bar.sync %0, %1;" ::"n"(WEIGHTS), "n"(CONSUMERS) : "memory");
+      float out[CT][NT][4];
+      clear_out(out);
+      auto weigh = [&](int tile, int j, uint4 v) {
+        mma_tokens(out[j], v, token_address(b, M_X + X_P) + tile * NT * 256);
+      };
+#pragma unroll
+      for (int i = 0; i < HELD_TILES; ++i)
+        if (i < tiles)
+#pragma unroll
+          for (int j = 0; j < CT; ++j)
+            if (exists(j)) weigh(i, j, values[i][j]);
+      if (tiles > HELD_TILES) {
+        u32 seen = 0;
+#pragma unroll 1
+        for (int i = HELD_TILES; i < tiles; ++i)
+#pragma unroll
+          for (int j = 0; j < CT; ++j)
+            if (exists(j)) {
+              const uint4 v = load(slot, i - SLOT_TILES, j);
+              seen ^= fold(v);
+              weigh(i, j, v);
+            }
+        give_slot(b, slot, seen);
+      }
+      send_outputs(out);
+    }
+  } else {
+    receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
+    MARK(3)
+    float c[ROUNDS][NT][4];
+#pragma unroll
+    for (int r = 0; r < ROUNDS; ++r) clear(c[r]);
+#pragma unroll
+    for (int i = 0; i < MOST_SLOTS; ++i)
+      if (i < slots) {
+        const u32 slot = take_slot(b);
+        u32 seen = 0;
+#pragma unroll
+        for (int r = 0; r < ROUNDS; ++r) {
+          const int tile = b.warp + r * SCORERS;
+          if (scorer && tile / SLOT_TILES == i && tile < tiles) {
+            const byte* from = b.ring(slot) + tile % SLOT_TILES * KEY_TILE;
+            seen ^= score<QT, 4>(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); }, 0, QT, c[r]);
+          }
+        }
+        give_slot(b, slot, seen);
+      }
+    MARK(4)
+    if (scorer) weights_of(b, c, b.warp, prefix - b.warp * 16, top);
+    fetch_suffix();
+    if (for_suffix) of_suffix();
+    consumers_sync();
   }
+  MARK(5)
+  if (b.warp == LEADER) {
+    send_by_token(b, top, X_TOPS, BAR_TOPS);
+    if (HOLD) send_sums(b, tiles, suffix);
+  }
+  if constexpr (!HOLD) {
+    float out[CT][NT][4];
+    clear_out(out);
+#pragma unroll 1
+    for (int i = 0; i < slots; ++i) {
+      const u32 slot = take_slot(b);
+      const byte* from = b.ring(slot) + b.warp * FRAGMENT;
+      u32 seen = 0;
+      if (b.warp < QT) {
+#pragma unroll
+        for (int sub = 0; sub < SLOT_TILES; ++sub)
+          if (i * SLOT_TILES + sub < tiles) {
+            const uint4 v = load_fragment(from + sub * KEY_TILE, b.lane);
+            seen ^= fold(v);
+            mma_tokens(out[0], v, token_address(b, M_X + X_P) + (i * SLOT_TILES + sub) * NT * 256);
+          }
+      }
+      give_slot(b, slot, seen);
+    }
+    prepare_outputs();
+    send_outputs(out);
+    if (b.warp == LEADER) send_sums(b, tiles, suffix);
+  }
+  MARK(6)
+  // Ranks' outputs, by their largest logits, which come first.
+  b.forget();
+  static_assert(QTL * NT <= W, "a warp for 8 tokens of a tile");
+  const int qn = b.qn(), tile = b.warp % imax(qn, 1), n = b.warp / imax(qn, 1), token = n * 8 + 2 * b.t();
+  const bool mine = b.warp < qn * NT;
+  float2 w[S];
+  receive(b, BAR_TOPS, b.n, TOPS_EXPECT, WAIT_TOPS);
+  float2 highest = make_float2(LOWEST, LOWEST);
+#pragma unroll
+  for (int s = 0; s < S; ++s) {
+    w[s] = *(const float2*)(b.smem + M_X + X_TOPS + (s * NT * 8 + min(token, NT * 8 - 2)) * 4);
+    highest.x = fmaxf(highest.x, w[s].x), highest.y = fmaxf(highest.y, w[s].y);
+  }
+#pragma unroll
+  for (int s = 0; s < S; ++s)
+    w[s] = make_float2(exp2_approx(w[s].x - highest.x), exp2_approx(w[s].y - highest.y));
   MARK(7)
-  const int qn = b.qn();
-  receive(b, BAR_COMB, b.n, S * T * 8 + S * qn * ((T + 1) / 2) * 128, WAIT_COMB);
+  receive(b, BAR_COMB, b.n, outputs_expect(b), WAIT_COMB);
   MARK(8)
+  if (mine) {
+    float4 o = make_float4(0, 0, 0, 0);
+    float2 sum = make_float2(0, 0);
 #pragma unroll
-  for (int j = 0; j < most(QTL * NT, W); ++j) {
-    const int i = b.warp + j * W;
-    if (i < qn * NT) {
-      const int tile = i % qn, n = i / qn, token = n * 8 + 2 * b.t();
-      float2 ml[S][2];
-      float top0 = __int_as_float(0xff800000), top1 = top0, sum0 = 0, sum1 = 0;
-#pragma unroll
-      for (int s = 0; s < S; ++s) {
-        const float2* p = (const float2*)(b.smem + M_X + X_ML) + s * T;
-        ml[s][0] = p[min(token, T - 1)], ml[s][1] = p[min(token + 1, T - 1)];
-        top0 = fmaxf(top0, ml[s][0].x), top1 = fmaxf(top1, ml[s][1].x);
-      }
-      float4 o = make_float4(0, 0, 0, 0);
-#pragma unroll
-      for (int s = 0; s < S; ++s) {
-        const float4 v = *(const float4*)(b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * 512 + b.lane * 16);
-        const float w0 = exp2_approx(ml[s][0].x - top0), w1 = exp2_approx(ml[s][1].x - top1);
-        sum0 += w0 * ml[s][0].y, sum1 += w1 * ml[s][1].y;
-        o.x += w0 * v.x, o.y += w1 * v.y, o.z += w0 * v.z, o.w += w1 * v.w;
-      }
-      const float i0 = __fdividef(1.0f, sum0), i1 = __fdividef(1.0f, sum1);
-      send_columns(b, M_H + H_ATT, b.q0() + tile, n, make_float4(o.x * i0, o.y * i1, o.z * i0, o.w * i1), BAR_ATT,
-                   true);
+    for (int s = 0; s < S; ++s) {
+      const float4 v = *(const float4*)(b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * 512 + b.lane * 16);
+      const float2 l = *(const float2*)(b.smem + M_X + X_SUMS + (s * NT * 8 + token) * 4);
+      sum.x += w[s].x * l.x, sum.y += w[s].y * l.y;
+      o.x += w[s].x * v.x, o.y += w[s].y * v.y, o.z += w[s].x * v.z, o.w += w[s].y * v.w;
     }
+    const float x = __fdividef(1.0f, sum.x), y = __fdividef(1.0f, sum.y);
+    send_columns(b, M_H + H_ATT, b.q0() + tile, n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y), BAR_ATT, true);
   }
   MARK(9)
   receive(b, BAR_ATT, b.n, HD * T * 2, WAIT_ATT);

@@ -82,14 +82,12 @@ __host__ __device__ constexpr int slot_rounds(int parts, int tiles) {  // W / (p
 constexpr int KEY_TILE = QT * FRAGMENT;     // bytes of 16 keys, or values
 constexpr int SLOT_TILES = RPS;             // of them in a slot
 constexpr int KT = most(KEY_TILES, S);      // tiles of a rank's prefix keys
-constexpr int SUFFIX = most(T, S);          // suffix keys of a rank, at most 16
-static_assert(SLOT_TILES * KEY_TILE <= SLOT && 8 % SLOT_TILES == 0, "a slot's keys");
-static_assert(SUFFIX <= 16, "more suffix keys than a tile");
+constexpr int SUFFIX = most(T, S);          // suffix keys of a rank, at most 8
+static_assert(SLOT_TILES * KEY_TILE <= SLOT, "a slot's keys");
+static_assert(SUFFIX <= 8, "more suffix keys than the first rows of a tile");
 // In small models a CTA may have no hidden units. It sends a word in their place, to keep the others from running
 // ahead.
 constexpr bool IDLE = 2 * (F16 / NC) < S, IDLE_Q = QT < S;  // the same of queries
-constexpr int LS = (KT + 1) * 16 + 4;  // floats of a token's logits
-constexpr bool SPLIT_KEYS = FEW && QT % 2 == 0;  // two warps share a tile of keys by its columns, else by tokens
 
 // A message lands without asking, so its place must be free at every receiver before any sender can have it. What makes
 // it so: a rank goes on only with what it got from all ranks of its cluster, and each sends its part of an exchange
@@ -97,13 +95,13 @@ constexpr bool SPLIT_KEYS = FEW && QT % 2 == 0;  // two warps share a tile of ke
 // the CTA's warps.
 //
 // Region X holds the stream (operand of qkv and gate|up). When those have read it, their partial sums lie there, then
-// attention's logits, probabilities, suffix keys and values, and the partial outputs that other ranks send.
+// attention's weights, suffix keys and values, and the partial outputs that other ranks send.
 //   sums of qkv over the stream: nothing is sent to X before a peer has this rank's queries, sent when they are read
 //   attention's outputs over them: so they land later still; the next slice follows attention's maxima of all ranks
 //   sums of gate|up over the stream: the next slice lands when a peer has this rank's hidden units, made of those sums
 constexpr int X_BYTES = D16 * NT * 256;
-constexpr int X_ML = 0, X_COMB = X_ML + up128(S * T * 8), X_LOGITS = X_COMB + S * QTL * NT * 512;
-constexpr int X_P = X_LOGITS + up128((SPLIT_KEYS ? 2 : 1) * T * LS * 4), X_SUFFIX = X_P + (KT + 1) * NT * 256;
+constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * 512;
+constexpr int X_SUFFIX_SUMS = X_P + (KT + 1) * NT * 256, X_SUFFIX = X_SUFFIX_SUMS + 3 * NT * 256;
 constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);  // between steps
 constexpr int X_SIZE =
     up128(imax(imax(X_BYTES, X_SUFFIX + 2 * SUFFIX * RS),
@@ -127,18 +125,21 @@ __host__ __device__ constexpr int plan_slots(int mt, int blocks) {
 constexpr int MAX_SLOTS = plan_slots(QTL + KVL, D16) + 2 * most(KT, SLOT_TILES) + plan_slots(DX, QT) +
                           plan_slots(GTL, D16) + plan_slots(DX, HC);
 constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + H_SIZE;
-constexpr int M_PART = M_SSQ + up128(SQ * NT * 32);  // of this slice, by tile
-constexpr int M_BAR = M_PART + up128(DX * NT * 32), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
+constexpr int M_PART = M_SSQ + up128(SQ * NT * 32);  // of this slice, by tile; in attention largest logits
+constexpr int M_RMS = M_PART + up128(DX * NT * 32);  // 1 / rms of each token
+constexpr int M_ROPE = M_RMS + up128(NT * 32);       // if tokens are few: see `make_rope`
+constexpr int M_BAR = M_ROPE + (FEW ? (QTL + KVL) * NT * 512 : 0), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
               M_LIST = M_BAR + 512, M_RING = M_LIST + up128(MAX_SLOTS * 8);
 constexpr int BEYOND = 3 * FRAGMENT;  // of a slot: where the missing ones of 4 tiles are read
-constexpr int STAGES = imin((TP_SMEM - M_RING - BEYOND) / SLOT, 12);
+constexpr int STAGES = imin((TP_SMEM - M_RING - BEYOND) / SLOT, 11);
 static_assert(STAGES >= 2, "too little shared memory");
 
 // Slots of weights that are asked into L2 before they are loaded. With few tokens: only those of gate|up that find no
 // slot before it begins, while attention leaves memory idle; at other times they slow down what crosses clusters.
 constexpr int AHEAD = NT > 3 ? 4 : 0;
 
-enum Barrier { BAR_X, BAR_Q, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RING };  // ring: full and empty, by slot
+// ring: full and empty, by slot
+enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };
 
 // ---- scratch in global memory, in 16-byte words
 
@@ -193,7 +194,7 @@ struct Block {
   }
   // Make the compiler forget what these are made of: what it derives from them it would keep in registers, or in local
   // memory, over all layers, and a fetch from there costs more than to derive it again.
-  __device__ __forceinline__ void forget() { asm volatile("" : "+r"(base), "+r"(rank), "+r"(warp), "+r"(lane)); }
+  __device__ __forceinline__ void forget() { asm volatile("" : "+r"(base), "+r"(cluster), "+r"(rank), "+r"(warp), "+r"(lane)); }
   __device__ __forceinline__ int g() const { return lane >> 2; }  // a lane's place in the tensor cores' operands
   __device__ __forceinline__ int t() const { return lane & 3; }
   __device__ __forceinline__ u32 bar(int i) const { return base + M_BAR + i * 8; }
@@ -217,8 +218,8 @@ struct Block {
   __device__ __forceinline__ int kvn() const { return share(KVT, NH * S, cluster * S + rank + 1) - kv0(); }
 };
 
-// Cycles up to each mark, summed up: 0 stream here, 1 qkv multiplied, 2 sent, 3 queries here, 4 prefix scored, 5 suffix
-// scored, 6 softmax, 7 values weighed, 8 outputs here, 9 combined, 10 attention here, 11 out, 12 sent, 13 stream
+// Cycles up to each mark, summed up: 0 stream here, 1 qkv multiplied, 2 sent, 3 queries here, 4 prefix scored, 5 weights
+// here, 6 values weighed, 7 largest logits here, 8 outputs here, 9 combined, 10 attention here, 11 out, 12 sent, 13 stream
 // here, 15 gate|up multiplied, 16 sent, 17 hidden here, 18 down, 14 sent, 19 embedded, 20 step done. Before 12 and 14:
 // 21 and 22 partial sums here.
 #ifdef TP_TRACE

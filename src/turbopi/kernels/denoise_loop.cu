@@ -205,11 +205,12 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     note(b, WAIT_NONE);
     for (u32 i = 0; i < STAGES; ++i) mbar_init(b.full(i), 1), mbar_init(b.empty(i), W);
     for (int i = BAR_X; i <= BAR_V; ++i) mbar_init(b.bar(i), 1);
-    mbar_init(b.bar(BAR_GO), S);
+    mbar_init(b.bar(BAR_GO), S), mbar_init(b.bar(BAR_RMS), 1);
     asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     mbar_expect(b.bar(BAR_X), X_EXPECT);
     mbar_expect(b.bar(BAR_Q), Q_EXPECT);
-    mbar_expect(b.bar(BAR_COMB), S * T * 8 + S * b.qn() * ((T + 1) / 2) * 128);
+    mbar_expect(b.bar(BAR_TOPS), TOPS_EXPECT);
+    mbar_expect(b.bar(BAR_COMB), outputs_expect(b));
     mbar_expect(b.bar(BAR_ATT), HD * T * 2);
     mbar_expect(b.bar(BAR_HID), hidden_bytes(b));
     mbar_expect(b.bar(BAR_V), V_EXPECT);
@@ -228,6 +229,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
       }
     } else if (b.warp == W + 1) {
       watch(b);
+    } else if (b.warp == W + 2) {
+      make_inverse_rms(b);
     }
   }
   __syncwarp();

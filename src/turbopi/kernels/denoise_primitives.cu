@@ -9,7 +9,7 @@ enum What {
   WAIT_NONE,
   WAIT_X,
   WAIT_Q,
-  WAIT_KV,
+  WAIT_TOPS,
   WAIT_COMB,
   WAIT_ATT,
   WAIT_X2,

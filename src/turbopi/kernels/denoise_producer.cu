@@ -114,10 +114,10 @@ extern "C" __global__ void __launch_bounds__(256) turbopi_denoise_prepare(const 
     auto value = [&](int row, int col) {
       return tile * 16 + row < length ? u32(v[size_t(tile * 16 + row) * HD + column + col]) : 0;
     };
-    auto pair = [&](int row, int col) { return value(row, col) | value(row + 1, col) << 16; };
+    auto pair = [&](int row, int col) { return value(row, col) | value(row + 8, col) << 16; };
     to[i] = make_uint4(key(g, 2 * t), key(g + 8, 2 * t), key(g, 2 * t + 8), key(g + 8, 2 * t + 8));
     to[KEY_TILES * (KEY_TILE / 16) + i] =
-        make_uint4(pair(2 * t, g), pair(2 * t, g + 8), pair(2 * t + 8, g), pair(2 * t + 8, g + 8));
+        make_uint4(pair(t, g), pair(t, g + 8), pair(t + 4, g), pair(t + 4, g + 8));
   }
 }
 

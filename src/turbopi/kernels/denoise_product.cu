@@ -160,17 +160,24 @@ __device__ __forceinline__ Item stream_item(const Block& b, int j) {
   const int tile = i < xn * NT ? i % xn : 0, n = i < xn * NT ? i / xn : 0;
   return {tile, n, n * 8 + 2 * b.t(), i < xn * NT && n * 8 + 2 * b.t() < T};
 }
-// 8 bytes with the lane pair's four columns 2g.. of one token (even g: 2t, odd g: 2t + 1) to all ranks.
+// 16 bytes with eight columns of one token (even g: 2t, odd g: 2t + 1) to all ranks. Two lanes come to
+// have the same: they share the ranks.
 __device__ __forceinline__ void send_columns(const Block& b, int region, int block, int n, float4 v, int bar,
                                              bool real) {
-  const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
-  const int token = 2 * b.t() + (b.g() & 1);
-  const u32 to = b.base + region + (block * NT + n) * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8;
+  const bool odd = b.g() & 1, high = b.g() & 2;
+  const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(odd ? w0 : w1, 4);
+  const u32 x = odd ? got : w0, y = odd ? w1 : got, other_x = exchange(x, 8), other_y = exchange(y, 8);
+  const int token = 2 * b.t() + (b.g() & 1), d0 = high ? S / 2 : 0;
+  const u32 to = b.base + region + (block * NT + n) * 256 + (b.g() >> 2) * 128 + token * 16;
+  static_assert(S % 2 == 0, "half of the ranks each");
   if (real && n * 8 + token < T) {
-    const u32 lo = b.g() & 1 ? got : w0, hi = b.g() & 1 ? w1 : got;
-    const Everyone data(to), bars(b.bar(bar));
+    const float4 all = make_float4(__uint_as_float(high ? other_x : x), __uint_as_float(high ? other_y : y),
+                                   __uint_as_float(high ? x : other_x), __uint_as_float(high ? y : other_y));
+    u32 data[S / 2], bars[S / 2];
 #pragma unroll
-    for (int d = 0; d < S; ++d) send(data.at[d], lo, hi, bars.at[d]);
+    for (int d = 0; d < S / 2; ++d) data[d] = at_rank(to, d0 + d), bars[d] = at_rank(b.bar(bar), d0 + d);
+#pragma unroll
+    for (int d = 0; d < S / 2; ++d) send(data[d], all, bars[d]);
   }
 }
 // Sums of squares to all ranks, which add them up. If tokens are few every warp sends those of its tiles, as soon as it
@@ -216,18 +223,26 @@ __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[I
   }
 }
 constexpr u32 SQUARES_EXPECT = FEW ? SQ * ((T + 1) / 2) * 8 : SQ * T * 4;
-// 1 / rms of tokens `token` and `token` + 1 (even; the same in lanes of equal t), when all sums are here.
+// 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a warp that has nothing else to do makes it.
 __device__ __forceinline__ float2 inverse_rms(const Block& b, int token) {
-  float2 sum = make_float2(0, 0);
-#pragma unroll
-  for (int s = FEW ? b.g() : 0; s < SQ; s += FEW ? 8 : 1) {
-    const float2 v = *(const float2*)(b.smem + M_SSQ + (s * NT * 8 + token) * 4);
-    sum.x += v.x, sum.y += v.y;
+  mbar_wait(b.bar(BAR_RMS), b.x_parity ^ 1);
+  return *(const float2*)(b.smem + M_RMS + token * 4);
+}
+__device__ __forceinline__ void make_inverse_rms(const Block& b) {
+  const int uses = b.a.steps * L * (b.attends() ? 2 : 1);
+#pragma unroll 1
+  for (int use = 0; use < uses; ++use) {
+    mbar_wait(b.bar(BAR_X), use & 1);
+#pragma unroll 1
+    for (int token = b.lane; token < NT * 8; token += 32) {
+      float sum = 0;
+#pragma unroll 8
+      for (int s = 0; s < SQ; ++s) sum += *(const float*)(b.smem + M_SSQ + (s * NT * 8 + token) * 4);
+      *(float*)(b.smem + M_RMS + token * 4) = rsqrtf(sum * (1.0f / D) + b.a.eps);
+    }
+    __syncwarp();
+    if (b.lane == 0) mbar_arrive(b.bar(BAR_RMS));
   }
-  if (FEW)
-#pragma unroll
-    for (int o = 4; o < 32; o *= 2) sum.x += exchange(sum.x, o), sum.y += exchange(sum.y, o);
-  return make_float2(rsqrtf(sum.x * (1.0f / D) + b.a.eps), rsqrtf(sum.y * (1.0f / D) + b.a.eps));
 }
 constexpr u32 X_EXPECT = D16 * T * 32 + SQUARES_EXPECT;
 
