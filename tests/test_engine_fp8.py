@@ -1,7 +1,7 @@
 """The engine with FP8 matrices equals the emulated reference, and a calibration decides which matrices those are."""
 
 import dataclasses
-from typing import NoReturn
+from typing import Any, NoReturn, cast
 
 import pytest
 import torch
@@ -125,9 +125,13 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     assert told["denoising"] == {"operations, as too many": ["H=60, 5 steps", "H=60, 10 steps"]}
     plan = told["fp8"]["plan"]
     assert plan["prefix.down"] == "fp8"
-    assert (
-        plan["expert.qkv"] == plan["expert"] == "bf16: FP8 weights in the denoising kernel aren't proven on a GPU yet"
-    )
+    assert plan["expert.qkv"] == plan["expert"] == "bf16, as operations denoise"
+    backend._denoisers = {(10, 10, 968): cast(Any, None)}
+    plan = backend.describe()["fp8"]["plan"]
+    assert plan["expert.qkv"] == "fp8"
+    assert plan["expert"] == "fp8 weights in the denoising kernel; bf16 where operations denoise"
+    backend._refused = {}
+    assert backend.describe()["fp8"]["plan"]["expert"] == "fp8 weights"
 
 
 def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from turbopi.config import Kind
 from turbopi.judge.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
 from turbopi.judge.golden import Case
 from turbopi.kernels.denoise import MAX_SUFFIX
+from turbopi.kernels.denoise_packing import refusal
 from turbopi.model.reference import Pi0Model
 
 pytestmark = [
@@ -59,7 +60,12 @@ def emulated(case: Case, precision: Tier, target: float) -> tuple[Tensor, Tensor
     """(float32, float32 with the plan's sites rounded), on the host."""
     model, chosen = on_gpu(case.kind), quantization(case.kind, target)
     plan = chosen.plan(model.config, precision).scales
-    used = {site: plan[str(site)] for site in sites(model.config) if str(site) in plan and not site.weights_only}
+    in_kernel = refusal(model.config) is None and chosen.plan(model.config, precision).expert_weights == "fp8"
+    used = {
+        site: plan[str(site)]
+        for site in sites(model.config)
+        if str(site) in plan and (in_kernel or not site.weights_only)
+    }
     observation, noise = case.observation.to("cuda"), case.noise.to("cuda")
     exact = model.sample(observation, noise, STEPS)
     with rounded(model, used):

@@ -28,10 +28,6 @@ if TYPE_CHECKING:
     from turbopi.kernels.denoise import DenoiseKernel
     from turbopi.kernels.denoise_packing import PackedExpert
 
-# Whether FP8 tiers have the expert's weights in FP8, too. The denoising kernel takes them, but
-# `pytest -m gpu -k fp8 tests/test_kernels_denoise.py` hasn't run on a GPU: true once it passes and is timed.
-EXPERT_IN_FP8 = False
-
 
 class FusedBackend(CudaGraphBackend):
     """As `cuda_graph`, in bfloat16 or, as a calibration says, partly in FP8; `describe()` says what runs where."""
@@ -111,8 +107,7 @@ class FusedBackend(CudaGraphBackend):
 
     def _expert_weights(self) -> Literal["bf16", "fp8"]:
         """What the denoising kernel is to have the expert's weights in."""
-        planned = "bf16" if self._plan is None else self._plan.expert_weights
-        return planned if EXPERT_IN_FP8 else "bf16"
+        return "bf16" if self._plan is None else self._plan.expert_weights
 
     def _expert_precision(self) -> str:
         """What the expert's weights are in, openly."""
@@ -120,11 +115,11 @@ class FusedBackend(CudaGraphBackend):
             kept = {} if self._plan is None else self._plan.kept
             why = next((reason for site, reason in kept.items() if site.startswith("expert.")), "it isn't planned")
             return f"bf16, all of it, as its kernel takes one precision; {why}"
-        if not EXPERT_IN_FP8:
-            return "bf16: FP8 weights in the denoising kernel aren't proven on a GPU yet"
-        if self._refused:
-            return "fp8 weights in the denoising kernel; bf16 where operations denoise"
-        return "fp8 weights"
+        if not self._refused:
+            return "fp8 weights"
+        if not self._denoisers:
+            return "bf16, as operations denoise"
+        return "fp8 weights in the denoising kernel; bf16 where operations denoise"
 
     def _make_ops(self) -> Ops:
         from turbopi.kernels.ops import fused_ops  # Triton isn't imported for other backends

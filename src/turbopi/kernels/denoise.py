@@ -77,7 +77,7 @@ def kernel_sizes(
 ) -> dict[str, int]:
     """The kernel's compile-time constants."""
     config, g = arrangement.config, arrangement.config.expert
-    stream = arrangement.clusters * (g.width // BLOCK) * most(suffix, 8) * 32
+    stream = most(arrangement.clusters, 2) * (g.width // BLOCK) * most(suffix, 8) * 32
     return {
         "TP_D": g.width,
         "TP_F": g.mlp_dim,

@@ -9,7 +9,7 @@
 // What a cluster's CTAs tell each other goes through distributed shared memory (st.async, counted in by an mbarrier of
 // the receiver: no cluster barriers). What crosses clusters are sums over heads or over hidden units, two exchanges a
 // layer between the CTAs of equal rank, and the suffix's keys and values. Those words go through L2 and carry their own
-// flag: the lowest bit of a float32 tells its use of the buffer, so the reader asks for a word until that bit is right.
+// flag: the lowest bit of 32 tells its use of the buffer, so the reader asks for a word until that bit is right.
 // So all clusters must run at once. The host asks whether they fit on an idle GPU; work of other streams or processes
 // that never ends would leave them waiting (see `watch`), work that ends only delays them.
 //
@@ -49,7 +49,7 @@ constexpr int QTL = most(QT, S);           // query tiles of a CTA: 8 RoPE pairs
 constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
-constexpr u32 PATIENCE = FEW ? 600 : 0;    // clock cycles before sums are asked for: polls slow down what they wait for
+constexpr u32 PATIENCE = FEW ? 400 : 0;    // clock cycles before sums are asked for: polls slow down what they wait for
 constexpr int ITEMS_X = most(DX * NT, W);  // (tile, 8 tokens) of the slice that one warp looks after
 static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NC >= NH && A <= CONSUMERS,
               "sizes");
@@ -143,7 +143,11 @@ enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO
 
 // ---- scratch in global memory, in 16-byte words
 
-constexpr size_t N_STREAM = size_t(NC) * D16 * NT * 32;  // partial sums of the stream, of all clusters
+// Partial sums of the stream, of all clusters: float16, since polls of float32 take twice as long as they must. A lane's
+// four of two clusters lie side by side, so the word's lowest bit, the flag, is the lowest bit of every other number.
+constexpr int PAIRS = most(NC, 2);
+constexpr size_t N_STREAM = size_t(D16) * NT * PAIRS * 32;
+constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;  // against float16's end; E4M3's sums lack their scales
 constexpr size_t N_KV = size_t(T) * HD / 2;              // suffix keys and values, float32[T][2 HD]
 constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM, SCRATCH = B_KV + 2 * N_KV;
 static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");

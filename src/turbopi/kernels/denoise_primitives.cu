@@ -157,13 +157,12 @@ __device__ __forceinline__ uint4 peek(const uint4* p) {
 __device__ __forceinline__ bool missing(uint4 v, u32 bit) {
   return ((v.x ^ bit) | (v.y ^ bit) | (v.z ^ bit) | (v.w ^ bit)) & 1;
 }
-__device__ __forceinline__ void publish(uint4* p, float4 v, u32 bit) {
-  asm volatile("st.relaxed.gpu.global.v4.u32 [%0], {%1, %2, %3, %4};" ::"l"(p), "r"(flagged(v.x, bit)),
-               "r"(flagged(v.y, bit)), "r"(flagged(v.z, bit)), "r"(flagged(v.w, bit))
-               : "memory");
-}
 __device__ __forceinline__ void publish(float* p, float v, u32 bit) {
   asm volatile("st.relaxed.gpu.global.u32 [%0], %1;" ::"l"(p), "r"(flagged(v, bit)) : "memory");
+}
+__device__ __forceinline__ void publish(uint2* p, u32 v, u32 w, u32 bit) {
+  asm volatile("st.relaxed.gpu.global.v2.u32 [%0], {%1, %2};" ::"l"(p), "r"((v & ~1u) | bit), "r"((w & ~1u) | bit)
+               : "memory");
 }
 // v[i] = p[i * stride], asked for until it is there.
 template <int N>
@@ -182,6 +181,18 @@ __device__ __forceinline__ void poll(uint4 (&v)[N], const uint4* p, size_t strid
 
 // ---- arithmetic
 
+__device__ __forceinline__ u32 pack_half(float lo, float hi) {
+  u32 v;
+  asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(v) : "f"(hi), "f"(lo));
+  return v;
+}
+__device__ __forceinline__ float2 unpack_half(u32 v) {
+  float2 f;
+  asm("{.reg .b16 lo, hi; mov.b32 {lo, hi}, %2; cvt.f32.f16 %0, lo; cvt.f32.f16 %1, hi;}"
+      : "=f"(f.x), "=f"(f.y)
+      : "r"(v));
+  return f;
+}
 __device__ __forceinline__ u32 pack(float lo, float hi) {
   u32 v;
   asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(v) : "f"(hi), "f"(lo));
@@ -190,9 +201,7 @@ __device__ __forceinline__ u32 pack(float lo, float hi) {
 // Two numbers that meet weights.
 __device__ __forceinline__ u32 pack_operand(float lo, float hi) {
   if (!FP8) return pack(lo, hi);
-  u32 v;
-  asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(v) : "f"(hi * SMALLER), "f"(lo * SMALLER));
-  return v;
+  return pack_half(lo * SMALLER, hi * SMALLER);
 }
 __device__ __forceinline__ void mma(float (&c)[4], uint4 a, uint2 b) {
   asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"

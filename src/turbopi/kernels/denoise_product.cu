@@ -253,33 +253,60 @@ __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X
     v[j] = __ldg((const float2*)(row + (b.x0() + stream_item(b, j).tile) * 16 + 2 * b.g()));
 }
 
+// Partial sums of an item of the stream from all clusters, two in a word.
+constexpr int FETCH = most(NH, 2) < 4 ? most(NH, 2) : 4;  // words at a time: no more than there ever are
+__device__ __forceinline__ const uint4* partials(const Block& b, const uint4* buffer, Item item) {
+  return buffer + ((b.x0() + item.tile) * NT + item.n) * PAIRS * 32 + b.lane;
+}
+// Asks until what `parts` clusters send is there, in words `first` and on; adds it up, what comes before `from` left out.
+__device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int from, int parts, u32 bit) {
+  uint4 v[FETCH];
+#pragma unroll
+  for (int i = 0; i < FETCH; ++i) v[i] = peek(p + i * 32);
+#pragma unroll 1
+  for (;;) {
+    bool again = false;
+#pragma unroll
+    for (int i = 0; i < FETCH; ++i) {
+      const bool both = (NC % 2 == 0 && NH % 2 == 0) || 2 * (first + i) + 1 < parts;
+      if (((v[i].x ^ bit) | (v[i].y ^ bit) | (both ? (v[i].z ^ bit) | (v[i].w ^ bit) : 0)) & 1)
+        v[i] = peek(p + i * 32), again = true;
+    }
+    if (!again) break;
+  }
+#pragma unroll
+  for (int i = 0; i < FETCH; ++i) {
+    const bool both = (NC % 2 == 0 && NH % 2 == 0) || 2 * (first + i) + 1 < parts;
+    if (PAIRS == FETCH || first + i >= from) {
+      const float2 a = unpack_half(v[i].x), c = unpack_half(v[i].y);
+      sum.x += a.x, sum.y += a.y, sum.z += c.x, sum.w += c.y;
+      if (both) {
+        const float2 a1 = unpack_half(v[i].z), c1 = unpack_half(v[i].w);
+        sum.x += a1.x, sum.y += a1.y, sum.z += c1.x, sum.w += c1.y;
+      }
+    }
+  }
+}
+
 // Fetch `parts` clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
-// slice times the next norm's scale to all ranks. buffer: [NC][D16][NT][32] 16-byte words.
+// slice times the next norm's scale to all ranks. buffer: [D16][NT][PAIRS][32] 16-byte words.
 __device__ __forceinline__ void gather(const Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
                                        int half) {
-  constexpr int FETCH = NH < 8 ? NH : 8;  // no more than there ever are
-  constexpr size_t STRIDE = size_t(D16) * NT * 32;
+  for (const u32 since = u32(clock64()); u32(clock64()) - since < PATIENCE;);
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
-    for (const u32 since = u32(clock64()); u32(clock64()) - since < PATIENCE;);
+    const uint4* p = partials(b, buffer, item);
     if (item.real) {
       float4 sum = make_float4(0, 0, 0, 0);
 #pragma unroll 1
-      for (int c0 = 0; c0 < parts; c0 += FETCH) {
-        uint4 v[FETCH];
-        const int first = min(c0, max(parts - FETCH, 0));  // the last round may ask again for what the one before had
-        poll(v, buffer + first * STRIDE + ((b.x0() + item.tile) * NT + item.n) * 32 + b.lane, STRIDE, bit);
-#pragma unroll
-        for (int i = 0; i < FETCH; ++i)
-          if (NC == FETCH || first + i >= c0) {
-            sum.x += __uint_as_float(v[i].x), sum.y += __uint_as_float(v[i].y);
-            sum.z += __uint_as_float(v[i].z), sum.w += __uint_as_float(v[i].w);
-          }
+      for (int from = 0, words = most(parts, 2); from < words; from += FETCH) {
+        const int first = min(from, max(words - FETCH, 0));  // the last round may ask for what the one before had
+        take(sum, p + first * 32, first, from, parts, bit);
       }
-      x[j].x += gates[j].x * sum.x, x[j].y += gates[j].x * sum.y, x[j].z += gates[j].y * sum.z,
-          x[j].w += gates[j].y * sum.w;
+      const float2 gate = make_float2(gates[j].x / PARTIAL_SCALE, gates[j].y / PARTIAL_SCALE);
+      x[j].x += gate.x * sum.x, x[j].y += gate.x * sum.y, x[j].z += gate.y * sum.z, x[j].w += gate.y * sum.w;
     }
     __syncwarp();
     if (j == 0) {
@@ -309,9 +336,12 @@ __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, ui
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
-    if (item.real)
-      publish(buffer + ((size_t(b.cluster) * D16 + b.x0() + item.tile) * NT + item.n) * 32 + b.lane,
-              total<DX>(b, b.smem + M_H, item.tile, item.n), bit);
+    if (item.real) {
+      const float4 c = total<DX>(b, b.smem + M_H, item.tile, item.n);
+      uint2* const word = (uint2*)(partials(b, buffer, item) + b.cluster / 2 * 32) + (b.cluster & 1);
+      publish(word, pack_half(c.x * PARTIAL_SCALE, c.y * PARTIAL_SCALE),
+              pack_half(c.z * PARTIAL_SCALE, c.w * PARTIAL_SCALE), bit);
+    }
   }
 }
 
