@@ -131,7 +131,7 @@ constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
 #ifndef TP_HV
-#define TP_HV 5
+#define TP_HV 4
 #endif
 constexpr int HELD_TILES = KT < TP_HV ? KT : TP_HV;
 #ifndef TP_HK
