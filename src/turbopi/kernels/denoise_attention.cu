@@ -65,7 +65,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   consumers_sync();
   store_partials<QTL + KVL>(b, b.smem + M_X, qn + kvn, sums);
   consumers_sync();
-  if (threadIdx.x < NT * 8) ((int*)(b.smem + M_PART))[threadIdx.x] = ordered(LOWEST);  // for `weights_of`
+  if (threadIdx.x < NT * 8) ((int*)(b.smem + M_PART))[threadIdx.x] = ordered(LOWEST);  // for `weigh_prefix`
   byte* const staged = b.smem + M_H + H_ATT;  // free until all have what attention sends: [item][half][8 tokens][8]
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
@@ -126,7 +126,7 @@ constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
 #ifndef TP_HV
-#define TP_HV 5
+#define TP_HV 4
 #endif
 constexpr int HELD_TILES = KT < TP_HV ? KT : TP_HV;
 #ifndef TP_HK
@@ -138,7 +138,18 @@ constexpr int HELD_TILES = KT < TP_HV ? KT : TP_HV;
 constexpr int HELD_KEYS = QT < TP_HK ? QT : TP_HK;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
 constexpr int SUFFIX_STEPS = most(QT, 4);                                   // blocks of columns of a suffix warp
-constexpr int TOPS = 2, SUFFIX_SUMS = 3, WEIGHTS = 4;                       // barriers; 1 is consumers_sync's
+// Barriers of some warps; 1 is consumers_sync's.
+constexpr int TOPS = 2, SUFFIX_SUMS = 3, WEIGHTS = 4, WEIGHTS_FOR_SUFFIX = 5, SUFFIX_WEIGHTS = 6;
+template <int BARRIER, int WARPS>
+__device__ __forceinline__ void arrive() {
+  __syncwarp();
+  asm volatile("bar.arrive %0, %1;" ::"n"(BARRIER), "n"(WARPS * 32) : "memory");
+}
+template <int BARRIER, int WARPS>
+__device__ __forceinline__ void sync() {
+  __syncwarp();
+  asm volatile("bar.sync %0, %1;" ::"n"(BARRIER), "n"(WARPS * 32) : "memory");
+}
 
 // A lane's address for `mma_tokens` in activations [block][half][NT][8 tokens][8 columns], standard order.
 __device__ __forceinline__ u32 token_address(const Block& b, u32 region) {
@@ -225,11 +236,9 @@ __device__ __forceinline__ void score_suffix(const Block& b, int count, float (&
   if (part > 0) {
 #pragma unroll
     for (int n = 0; n < NT; ++n) sums[((part - 1) * NT + n) * 32] = make_float2(c[n][0], c[n][1]);
-    __syncwarp();
-    asm volatile("bar.arrive %0, 128;" ::"n"(SUFFIX_SUMS) : "memory");
+    arrive<SUFFIX_SUMS, 4>();
   } else {
-    __syncwarp();
-    asm volatile("bar.sync %0, 128;" ::"n"(SUFFIX_SUMS) : "memory");
+    sync<SUFFIX_SUMS, 4>();
 #pragma unroll
     for (int i = 0; i < 3; ++i)
 #pragma unroll
@@ -240,52 +249,64 @@ __device__ __forceinline__ void score_suffix(const Block& b, int count, float (&
   }
 }
 
-// From logits of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist, to unnormalised
-// weights in shared memory: operand B of the next product, in which column 2i is row i, column 2i + 1 row i + 8.
-// top: each token's largest logit, times log2 e, in this rank.
+// Logits times the scale and log2 e, or -inf in rows that don't exist; the largest of each token.
 template <int R>
-__device__ __forceinline__ void weights_of(const Block& b, float (&c)[R][NT][4], int tile, int rows,
-                                           float2 (&top)[NT]) {
+__device__ __forceinline__ void scale_logits(const Block& b, float (&c)[R][NT][4], int rows, float2 (&top)[NT]) {
   const float scale = rsqrtf(float(HD)) * 1.4426950408889634f, none = __int_as_float(0xff800000);
-  int* const tops = (int*)(b.smem + M_PART) + 2 * b.t();
-  if (rows > 0) {
-#pragma unroll
-    for (int n = 0; n < NT; ++n) {
-      float x = none, y = none;
-#pragma unroll
-      for (int r = 0; r < R; ++r) {
-#pragma unroll
-        for (int i = 0; i < 4; ++i)
-          c[r][n][i] = b.g() + (i >> 1) * 8 < rows - r * SCORERS * 16 ? c[r][n][i] * scale : none;
-        x = fmaxf(x, fmaxf(c[r][n][0], c[r][n][2])), y = fmaxf(y, fmaxf(c[r][n][1], c[r][n][3]));
-      }
-#pragma unroll
-      for (int o = 4; o < 32; o *= 2) x = fmaxf(x, exchange(x, o)), y = fmaxf(y, exchange(y, o));
-      if (b.g() < 2) atomicMax(tops + n * 8 + b.g(), ordered(b.g() ? y : x));
-    }
-  }
-  __syncwarp();
-  asm volatile("bar.sync %0, %1;" ::"n"(TOPS), "n"((SCORERS + 1) * 32) : "memory");
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
-    const int2 v = *(const int2*)(tops + n * 8);
-    top[n] = make_float2(__int_as_float(ordered(v.x)), __int_as_float(ordered(v.y)));
+    top[n] = make_float2(none, none);
+#pragma unroll
+    for (int r = 0; r < R; ++r) {
+#pragma unroll
+      for (int i = 0; i < 4; ++i)
+        c[r][n][i] = b.g() + (i >> 1) * 8 < rows - r * SCORERS * 16 ? c[r][n][i] * scale : none;
+      top[n].x = fmaxf(top[n].x, fmaxf(c[r][n][0], c[r][n][2]));
+      top[n].y = fmaxf(top[n].y, fmaxf(c[r][n][1], c[r][n][3]));
+    }
+#pragma unroll
+    for (int o = 4; o < 32; o *= 2)
+      top[n] = make_float2(fmaxf(top[n].x, exchange(top[n].x, o)), fmaxf(top[n].y, exchange(top[n].y, o)));
   }
+}
+// Unnormalised weights of 16 keys to shared memory: operand B of the next product, in which column 2i is row i, column
+// 2i + 1 row i + 8.
+__device__ __forceinline__ void store_weights(const Block& b, const float (&c)[NT][4], int tile,
+                                              const float2 (&top)[NT]) {
+  byte* p = b.smem + M_X + X_P + (tile * 2 + (b.g() >> 2)) * NT * 128 + b.t() * 32 + (b.g() & 3) * 4;
 #pragma unroll
-  for (int r = 0; r < R; ++r)
-    if (rows > r * SCORERS * 16) {
-      byte* p = b.smem + M_X + X_P + ((tile + r * SCORERS) * 2 + (b.g() >> 2)) * NT * 128 + b.t() * 32 +
-                (b.g() & 3) * 4;
+  for (int n = 0; n < NT; ++n)
 #pragma unroll
-      for (int n = 0; n < NT; ++n)
-#pragma unroll
-        for (int i = 0; i < 2; ++i) {
-          const float at = i ? top[n].y : top[n].x;
-          *(u32*)(p + n * 128 + i * 16) = pack(exp2_approx(c[r][n][i] - at), exp2_approx(c[r][n][i + 2] - at));
-        }
+    for (int i = 0; i < 2; ++i) {
+      const float at = i ? top[n].y : top[n].x;
+      *(u32*)(p + n * 128 + i * 16) = pack(exp2_approx(c[n][i] - at), exp2_approx(c[n][i + 2] - at));
     }
 }
-
+__device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT]) {
+#pragma unroll
+  for (int n = 0; n < NT; ++n) {
+    const int2 v = *(const int2*)(b.smem + M_PART + (n * 8 + 2 * b.t()) * 4);
+    top[n] = make_float2(__int_as_float(ordered(v.x)), __int_as_float(ordered(v.y)));
+  }
+}
+// Scoring warps: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist, by the
+// largest logits of the rank's prefix.
+template <int R>
+__device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4], int tile, int rows) {
+  float2 top[NT];
+  if (rows > 0) {
+    scale_logits(b, c, rows, top);
+#pragma unroll
+    for (int n = 0; n < NT; ++n)
+      if (b.g() < 2)
+        atomicMax((int*)(b.smem + M_PART) + n * 8 + 2 * b.t() + b.g(), ordered(b.g() ? top[n].y : top[n].x));
+  }
+  sync<TOPS, SCORERS>();
+  load_tops(b, top);
+#pragma unroll
+  for (int r = 0; r < R; ++r)
+    if (rows > r * SCORERS * 16) store_weights(b, c[r], tile + r * SCORERS, top);
+}
 // Of each token something of this rank, to all ranks.
 __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[NT], int region, int bar) {
   const u32 to = at_rank(b.base + M_X + region + (b.rank * NT * 8 + 2 * b.t()) * 4, b.g());
@@ -298,14 +319,41 @@ constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
 __device__ __forceinline__ u32 outputs_expect(const Block& b) {
   return S * ((T + 1) / 2) * 8 + S * b.qn() * ((T + 1) / 2) * 128;
 }
+// The suffix's keys come last. Their weights go by the prefix's largest logits, too, unless theirs are so much larger
+// (2^64) that the prefix's weights count for nothing: then those are dropped, which `X_KEEP` says.
+__device__ __forceinline__ void weigh_suffix(const Block& b, float (&c)[1][NT][4], int rows) {
+  float2 own[NT], top[NT];
+  scale_logits(b, c, rows, own);
+  sync<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
+  load_tops(b, top);
+#pragma unroll
+  for (int n = 0; n < NT; ++n) {
+    const bool x = own[n].x <= top[n].x + 64, y = own[n].y <= top[n].y + 64;
+    if (b.g() == 0) *(float2*)(b.smem + M_X + X_KEEP + (n * 8 + 2 * b.t()) * 4) = make_float2(x, y);
+    top[n] = make_float2(x ? top[n].x : own[n].x, y ? top[n].y : own[n].y);
+  }
+  store_weights(b, c[0], KT, top);
+  if (HOLD) arrive<SUFFIX_WEIGHTS, WEIGHERS + 1>();
+  send_by_token(b, top, X_TOPS, BAR_TOPS);
+}
+__device__ __forceinline__ void keep_prefix(const Block& b, float (&c)[NT][4]) {
+#pragma unroll
+  for (int n = 0; n < NT; ++n) {
+    const float2 keep = *(const float2*)(b.smem + M_X + X_KEEP + (n * 8 + 2 * b.t()) * 4);
+    c[n][0] *= keep.x, c[n][1] *= keep.y, c[n][2] *= keep.x, c[n][3] *= keep.y;
+  }
+}
 // The sums of the weights, as rounded: a product with ones.
 __device__ __forceinline__ void send_sums(const Block& b, int tiles, int suffix) {
   float c[NT][4];
   clear(c);
   const u32 p = token_address(b, M_X + X_P), one = 0x3f803f80;
 #pragma unroll
-  for (int tile = 0; tile <= KT; ++tile)
-    if (tile < KT ? tile < tiles : suffix > 0) mma_tokens(c, make_uint4(one, one, one, one), p + tile * NT * 256);
+  for (int tile = 0; tile < KT; ++tile)
+    if (tile < tiles) mma_tokens(c, make_uint4(one, one, one, one), p + tile * NT * 256);
+  if (HOLD) sync<SUFFIX_WEIGHTS, WEIGHERS + 1>();
+  keep_prefix(b, c);
+  if (suffix > 0) mma_tokens(c, make_uint4(one, one, one, one), p + KT * NT * 256);
   float2 sums[NT];
 #pragma unroll
   for (int n = 0; n < NT; ++n) sums[n] = make_float2(c[n][0], c[n][1]);
@@ -336,21 +384,20 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   SuffixPart<most(SUFFIX * (HOLD ? CT * 4 : HD / 4), VALUE_THREADS)> suffix_values{
       kv,      bit,    1, int(threadIdx.x) & (VALUE_THREADS - 1), VALUE_THREADS,
       suffix0, suffix, HOLD ? column * 4 : 0, HOLD ? min(CT, QT - column) * 4 : HD / 4};
-  auto fetch_suffix = [&] {
+  auto ask_suffix = [&] {
     if (some_keys) suffix_keys.ask();
     if (some_values) suffix_values.ask();
-    if (some_keys) suffix_keys.keep(b);
-    if (some_values) suffix_values.keep(b);
-    __syncwarp();
   };
-  float2 top[NT];
-#pragma unroll
-  for (int n = 0; n < NT; ++n) top[n] = make_float2(0, 0);
   auto of_suffix = [&] {
     float c[1][NT][4];
     clear(c[0]);
+    if (some_keys) suffix_keys.keep(b);
+    __syncwarp();
     if (suffix > 0) score_suffix(b, suffix, c[0]);
-    if (b.warp == SUFFIX_WARP) weights_of(b, c, KT, suffix, top);
+    if (b.warp == SUFFIX_WARP)
+      weigh_suffix(b, c, suffix);
+    else
+      sync<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
   };
   auto clear_out = [&](float (&out)[CT][NT][4]) {
 #pragma unroll
@@ -376,9 +423,11 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     }
   };
   auto send_outputs = [&](float (&out)[CT][NT][4]) {  // after the suffix has had its part in them
+    if (HOLD && b.warp != SUFFIX_WARP) sync<SUFFIX_WEIGHTS, WEIGHERS + 1>();
 #pragma unroll
     for (int j = 0; j < CT; ++j)
       if (column + j < QT) {
+        keep_prefix(b, out[j]);
         if (suffix > 0) mma_tokens(out[j], last[j], token_address(b, M_X + X_P) + KT * NT * 256);
 #pragma unroll
         for (int n = 0; n < NT; ++n)
@@ -423,12 +472,14 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         give_slot(b, mine, seen);
       }
       MARK(4)
-      weights_of(b, c, b.warp, prefix - b.warp * 16, top);
-      __syncwarp();
-      if (b.warp == LEADER)
-        asm volatile("bar.sync %0, %1;" ::"n"(WEIGHTS), "n"(CONSUMERS) : "memory");
-      else
-        asm volatile("bar.arrive %0, %1;" ::"n"(WEIGHTS), "n"(CONSUMERS) : "memory");
+      weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
+      arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
+      if (b.warp == LEADER) {
+        sync<WEIGHTS, SCORERS + 4>();
+        send_sums(b, tiles, suffix);
+      } else {
+        arrive<WEIGHTS, SCORERS + 4>();
+      }
     } else {
       pass();
       uint4 values[HELD_TILES][CT];
@@ -455,14 +506,15 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
           if (i == 0 || tiles <= HELD_TILES) give_slot(b, slot, seen);
         }
       b.forget();
-      fetch_suffix();
+      ask_suffix();
       if (for_suffix) {
         receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
         of_suffix();
       }
-      prepare_outputs();
+      if (some_values) suffix_values.keep(b);
       __syncwarp();
-      asm volatile("bar.sync %0, %1;" ::"n"(WEIGHTS), "n"(CONSUMERS) : "memory");
+      prepare_outputs();
+      if (!for_suffix) sync<WEIGHTS, SCORERS + 4>();
       float out[CT][NT][4];
       clear_out(out);
       auto weigh = [&](int tile, int j, uint4 v) {
@@ -511,16 +563,16 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         give_slot(b, slot, seen);
       }
     MARK(4)
-    if (scorer) weights_of(b, c, b.warp, prefix - b.warp * 16, top);
-    fetch_suffix();
+    if (scorer) {
+      weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
+      arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
+    }
+    ask_suffix();
+    if (some_values) suffix_values.keep(b);
     if (for_suffix) of_suffix();
     consumers_sync();
   }
   MARK(5)
-  if (b.warp == LEADER) {
-    send_by_token(b, top, X_TOPS, BAR_TOPS);
-    if (HOLD) send_sums(b, tiles, suffix);
-  }
   if constexpr (!HOLD) {
     float out[CT][NT][4];
     clear_out(out);

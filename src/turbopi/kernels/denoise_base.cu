@@ -101,7 +101,8 @@ constexpr bool IDLE = 2 * (F16 / NC) < S, IDLE_Q = QT < S;  // the same of queri
 //   sums of gate|up over the stream: the next slice lands when a peer has this rank's hidden units, made of those sums
 constexpr int X_BYTES = D16 * NT * 256;
 constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * 512;
-constexpr int X_SUFFIX_SUMS = X_P + (KT + 1) * NT * 256, X_SUFFIX = X_SUFFIX_SUMS + 3 * NT * 256;
+constexpr int X_SUFFIX_SUMS = X_P + (KT + 1) * NT * 256, X_KEEP = X_SUFFIX_SUMS + 3 * NT * 256,
+              X_SUFFIX = X_KEEP + up128(NT * 32);
 constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);  // between steps
 constexpr int X_SIZE =
     up128(imax(imax(X_BYTES, X_SUFFIX + 2 * SUFFIX * RS),
