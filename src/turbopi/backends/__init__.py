@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi.backends.base import Backend, LoadState, Sample, Tier
+from turbopi.backends.base import Backend, Begun, LoadState, Sample, Tier
 from turbopi.calibrate.artifact import TIERS, Quantization
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendUnavailable, ConfigError
@@ -17,6 +17,7 @@ from turbopi.errors import BackendUnavailable, ConfigError
 __all__ = [
     "BACKENDS",
     "Backend",
+    "Begun",
     "LoadState",
     "Sample",
     "Tier",

@@ -7,18 +7,19 @@ takes the engine's operations one by one, and `describe()` says so.
 
 import importlib.util
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Tier
-from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, Graph, HostRow, _bucket
+from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, _bucket
 from turbopi.calibrate.artifact import TIERS, Quantization, check_given
 from turbopi.config import ModelConfig
-from turbopi.engine.call import CallShape, Denoiser, StaticCall
+from turbopi.engine.call import CallShape, Denoiser
 from turbopi.engine.fp8 import Fp8Matrix, Matrix
 from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights, pack
@@ -167,9 +168,10 @@ class FusedBackend(CudaGraphBackend):
         self._put_expert_away()
         return kernel
 
-    def _run(self, shape: CallShape, part: str, row: HostRow, noise: np.ndarray) -> tuple[StaticCall, Graph]:
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
         try:
-            return super()._run(shape, part, row, noise)
+            yield
         except RuntimeError as error:
             for kernel in self._denoisers.values():
                 if (why := kernel.why_it_trapped()) is not None:
