@@ -52,9 +52,9 @@ class OnCpu(CudaGraphBackend):
         return Ran(run, after, self.told.append)
 
 
-def on_cpu(kind: Kind = "pi05") -> OnCpu:
+def on_cpu(kind: Kind = "pi05", cls: type[OnCpu] = OnCpu) -> OnCpu:
     model = golden_model(kind)
-    return OnCpu(model.config, lambda device, precision: dict(model.state_dict()), device=CPU, precision="f32")
+    return cls(model.config, lambda device, precision: dict(model.state_dict()), device=CPU, precision="f32")
 
 
 @pytest.fixture(scope="module")
@@ -187,6 +187,37 @@ def test_one_observation_at_a_time() -> None:
     with pytest.raises(BackendError, match="has finished this observation"):
         second.finish(*rest)
     assert torch.equal(backend.sample(observation, noise, 1).actions, actions)
+
+
+def test_a_begun_observation_is_over_when_the_next_ones_pictures_are_wrong() -> None:
+    backend = on_cpu()
+    observation, noise = made_up("pi05", 2, 5)
+    row = HostRow.of(observation, 0)
+    begun = backend.begin(row.images)
+    with pytest.raises(ValueError, match="broadcast"):
+        backend.begin([row.images[1], row.images[1][:3]])
+    with pytest.raises(BackendError, match="begun another"):
+        begun.finish(row.tokens, row.state, noise[0].numpy(), 1)
+
+
+@pytest.mark.parametrize("part", ["run", "answer"])
+def test_a_backend_may_explain_why_the_gpu_failed_in_either_part(part: str) -> None:
+    class Knowing(OnCpu):
+        def _explain(self, error: RuntimeError) -> None:
+            raise BackendError("a kernel trapped") from error
+
+    backend = on_cpu("pi05", Knowing)
+    observation, noise = made_up("pi05", 2, 5)
+    backend.sample(observation, noise, 1)
+
+    def fail(name: str) -> None:
+        if name == part:
+            raise RuntimeError("CUDA error: unspecified launch failure")
+
+    for graph in backend._graphs.values():
+        graph._tell = fail  # type: ignore[attr-defined]
+    with pytest.raises(BackendError, match="a kernel trapped"):
+        backend.sample(observation, noise, 1)
 
 
 def test_too_many_cameras_or_tokens_or_none_at_all_are_refused() -> None:

@@ -9,8 +9,7 @@ needed, with a log line. Batches run one observation after the other.
 import itertools
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -181,11 +180,14 @@ class CudaGraphBackend:
             raise BackendError(f"{self.name} takes up to {MAX_CAMERAS} cameras, this observation has {len(pictures)}")
         begun = Begun(self, len(pictures), bool(pictures) and pictures[0].dtype == np.float32)
         buffers = self._pictures_of(begun.cameras, begun.float_images)
-        with self._explained():
-            vision = self._graph(buffers, "vision")
-            self._begun = begun
-            buffers.write(pictures)  # one given up may still be read from there: nobody will ask what becomes of it
-            vision.launch()
+        self._begun = None  # one given up may still be read from the buffers, but nobody gets what becomes of it
+        buffers.write(pictures)
+        try:
+            self._graph(buffers, "vision").launch()
+        except RuntimeError as error:
+            self._explain(error)
+            raise
+        self._begun = begun
         return begun
 
     def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
@@ -232,17 +234,18 @@ class CudaGraphBackend:
                 f"{cameras} and {len(tokens)}"
             )
         shape = CallShape(cameras, _bucket(len(tokens)), len(noise), num_steps, begun.float_images)
-        with self._explained():
+        try:
             graph, call = self._graph(shape, part), self._calls[shape]
             call.write_inputs(noise, state, tokens)
             graph.replay()
+        except RuntimeError as error:
+            self._explain(error)
+            raise
         self._begun = None
         return call, graph
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Around what finds out that the GPU failed: a subclass may know why."""
-        yield
+    def _explain(self, error: RuntimeError) -> None:
+        """A subclass that knows why the GPU failed raises a BackendError that says so."""
 
     def _graph(self, of: CallShape | Pictures, part: str) -> Graph:
         """The "vision" of pictures; of a shape the "answer" behind it, or its "prefix" or "denoise" alone.

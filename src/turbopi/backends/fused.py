@@ -7,8 +7,6 @@ takes the engine's operations one by one, and `describe()` says so.
 
 import importlib.util
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -168,18 +166,13 @@ class FusedBackend(CudaGraphBackend):
         self._put_expert_away()
         return kernel
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        try:
-            yield
-        except RuntimeError as error:
-            for kernel in self._denoisers.values():
-                if (why := kernel.why_it_trapped()) is not None:
-                    raise BackendError(
-                        f"{why}. This process can't use the GPU any more: start it again, and free the GPU of other "
-                        "work; if that doesn't help, use backend 'cuda_graph'"
-                    ) from error
-            raise
+    def _explain(self, error: RuntimeError) -> None:
+        for kernel in self._denoisers.values():
+            if (why := kernel.why_it_trapped()) is not None:
+                raise BackendError(
+                    f"{why}. This process can't use the GPU any more: start it again, and free the GPU of other "
+                    "work; if that doesn't help, use backend 'cuda_graph'"
+                ) from error
 
     def _put_expert_away(self) -> None:
         """A kernel has its own copy of the expert's matrices; the first one, 0.6 GB, waits on the host."""
