@@ -258,6 +258,8 @@ class CudaGraphBackend:
                 run = of.run
             else:
                 call = self._call(of)
+                if part != "prefix" and call.denoiser is None:
+                    call.denoiser = self._make_denoiser(of, call.table)
                 run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
                 after = None if part == "denoise" else self._graph(call.pictures, "vision")
             self._graphs[of, part] = self._capture(run, after)
@@ -286,12 +288,8 @@ class CudaGraphBackend:
             rows = shape.cache_rows(self.config)
             if rows > self._cache.k.shape[1]:
                 raise BackendError(f"{self.name} has {self._cache.k.shape[1]} cache rows, {shape} needs {rows}")
-            table = self._tables[shape.num_steps]
-            denoiser = self._make_denoiser(shape, table)
-            pictures = self._pictures_of(shape.cameras, shape.float_images)
-            self._calls[shape] = StaticCall(
-                self.config, self._weights, self._ops, shape, pictures, self._cache, table, denoiser
-            )
+            pictures, table = self._pictures_of(shape.cameras, shape.float_images), self._tables[shape.num_steps]
+            self._calls[shape] = StaticCall(self.config, self._weights, self._ops, shape, pictures, self._cache, table)
         return self._calls[shape]
 
     def _trace_row(self, observation: Observation, noise: Tensor, row: int, num_steps: int) -> Trace:

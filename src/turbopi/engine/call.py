@@ -148,7 +148,6 @@ class StaticCall:
         pictures: Pictures,
         cache: Cache,
         table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation
-        denoiser: Denoiser | None = None,  # in place of the operations of `denoise`
     ) -> None:
         self.config, self.weights, self.ops, self.shape, self.pictures = config, weights, ops, shape, pictures
         assert (pictures.cameras, pictures.float_images) == (shape.cameras, shape.float_images), shape
@@ -158,7 +157,8 @@ class StaticCall:
         assert rows <= cache.k.shape[1], f"{shape} needs {rows} cache rows, there are {cache.k.shape[1]}"
         self.cache_k, self.cache_v = cache.k[:, :rows], cache.v[:, :rows]
         self._unseen = slice(shape.prefix_slots(config), rows - suffix)
-        self.table, self.denoiser = table, denoiser
+        self.table = table
+        self.denoiser: Denoiser | None = None  # in place of the operations of `denoise`
         self.rope = forward.rope_of_all_positions(config, rows, device)
         self.suffix_offsets = torch.arange(suffix, device=device)
         self.embs = pictures.embs[: shape.prefix_slots(config)]
