@@ -13,7 +13,7 @@ from turbopi.engine.fp8 import Fp8Matrix, to_e4m3
 from turbopi.kernels import attention_hopper, norms
 from turbopi.kernels import ops as fused
 from turbopi.kernels.gemm import Folded, Sums, Tile, clusters, matmul
-from turbopi.kernels.gemm_fp8 import matmul_fp8
+from turbopi.kernels.gemm_fp8 import GATHERING_SMS, best_tile, matmul_fp8
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 EPS = 1e-6
@@ -68,9 +68,14 @@ def test_a_tile_is_gathered_at_once_or_not_at_all() -> None:
         clusters(GATHERED[1], 16, 15)
 
 
+def test_smaller_gpus_gather_nothing() -> None:
+    assert best_tile(512, WIDTH, HIDDEN, "partial", GATHERING_SMS).gather
+    assert not best_tile(512, WIDTH, HIDDEN, "partial", GATHERING_SMS - 1).gather
+
+
 @on_hopper
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("tile", [*GATHERED, Tile(1, 144, splits=4, gather=True)])
+@pytest.mark.parametrize("tile", GATHERED)
 def test_sums_gathered_in_a_cluster(shape: tuple[int, int, int], tile: Tile) -> None:
     m, n, k = shape
     x, weight, bias = random(m, k), random(n, k), random(n)

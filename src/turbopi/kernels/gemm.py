@@ -137,9 +137,9 @@ def residual_arguments(residual: Tensor | None, sums_out: Sums | None) -> tuple[
 
 
 def ahead_arguments(ahead: Tensor | None, blocks: int) -> tuple[Any, ...]:
-    if ahead is None:
-        return ctypes.c_void_p(None), ctypes.c_uint(0)
-    return ctypes.c_void_p(ahead.data_ptr()), ctypes.c_uint(ahead.numel() * ahead.element_size() // blocks // 16 * 16)
+    """The matrix that is to be in L2 for the next product, and each block's share of it in bytes."""
+    share = 0 if ahead is None else ahead.numel() * ahead.element_size() // blocks // 16 * 16
+    return ctypes.c_void_p(ahead.data_ptr() if ahead is not None and share else None), ctypes.c_uint(share)
 
 
 def _norm_arguments(folded: Folded | None, sums: Sums | None, width: int, eps: float) -> tuple[Any, ...]:

@@ -139,6 +139,8 @@ def _kernel(
 # rows * columns / 32. Partial sums cost as much again in the norm that adds them up.
 FIXED, WRITING, STEP, LOADING, ADDING = 2300, 0.098, 205, 0.013, 0.00042
 
+GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that gather sums may not all fit at once
+
 # The fastest of some 25 tiles each, by [rows, out, in]. Rows count in whole 64, the least that a tile has: so fewer
 # kernels are compiled for all the prompt lengths.
 MEASURED = {
@@ -182,8 +184,9 @@ def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> fl
 def best_tile(m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> Tile:
     """The measured tile for a @ weightᵀ of [m, k] and [n, k] (GeGLU: [2n, k]), else that of least estimated cost."""
     m = -(-m // 64) * 64
-    if (m, n, k) in MEASURED:
-        return MEASURED[m, n, k]
+    measured = MEASURED.get((m, n, k))
+    if measured is not None and (sms >= GATHERING_SMS or not measured.gather):
+        return measured
     fitting = [tile for tile in candidates(epilogue) if tile.splits <= -(-k // DEPTH)]
     if -(-k // DEPTH) > UNPROMOTED_STEPS:  # long sums need room for promotion
         fitting = [tile for tile in fitting if _short(tile, k) or promotion(tile, k)]

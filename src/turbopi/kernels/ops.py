@@ -16,7 +16,7 @@ from turbopi.engine.fp8 import Fp8Matrix, Matrix, to_e4m3
 from turbopi.engine.ops import Ops
 from turbopi.kernels import activations, attention, attention_hopper, embedding, norms, rope
 from turbopi.kernels.gemm import Epilogue, Folded, Sums, Tile, matmul
-from turbopi.kernels.gemm_fp8 import best_tile, matmul_fp8
+from turbopi.kernels.gemm_fp8 import GATHERING_SMS, best_tile, matmul_fp8
 from turbopi.kernels.launch import capability
 
 GEGLU_TILES = (Tile(3, 192), Tile(2, 256))
@@ -38,10 +38,15 @@ VISION_TILES = {
     (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2),
 }
 
-# The same for products that add their result to the residual stream, in either precision.
+# The same for products that add their result to the residual stream, in either precision. Where sums are gathered, all
+# clusters must be on the GPU at once: an H200 takes 15 of eight blocks and 30 of four.
 RESIDUAL_TILES = {
+    (256, 1152, 1152): Tile(1, 40),
+    (256, 1152, 4304): Tile(1, 96, cluster_m=2, splits=2, gather=True),
     (512, 1152, 1152): Tile(1, 72),
     (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
+    (768, 1152, 1152): Tile(2, 64),
+    (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2, gather=True),
 }
 
 
@@ -151,7 +156,7 @@ class VisionTower:
 
     def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
         tile = RESIDUAL_TILES.get((x.shape[0], weight.shape[0], weight.shape[1]))
-        if tile is None or bias is None:
+        if tile is None or bias is None or _num_sms(x.device) < GATHERING_SMS:
             return tuned_residual_linear(x, weight, bias)
         return Product(x, weight, bias, tile)
 
