@@ -11,7 +11,7 @@ from torch import Tensor
 from turbopi import backends
 from turbopi.backends.cuda_graph import HostRow
 from turbopi.config import Kind
-from turbopi.engine.call import Cache, CallShape, StaticCall
+from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.ops import PLAIN, Ops, compiled, geglu, geglu_by_sigmoid, gelu, gelu_by_sigmoid
 from turbopi.engine.weights import modulation, pack
 from turbopi.model.reference import Precision
@@ -26,14 +26,14 @@ def static_call(kind: Kind, shape: CallShape, precision: Precision = "f32", ops:
     model = golden_model(kind, precision)
     weights = pack(model.config, dict(model.state_dict()))
     cache = Cache.allocate(model.config, shape.prefix_slots(model.config) + 64, CPU, weights.embed_tokens.dtype)
-    return StaticCall(
-        model.config, weights, ops, shape, cache, modulation(model.config, weights.conditioning, shape.num_steps)
-    )
+    pictures = Pictures(model.config, weights, ops, shape.cameras, shape.float_images, shape.prompt_slots)
+    table = modulation(model.config, weights.conditioning, shape.num_steps)
+    return StaticCall(model.config, weights, ops, shape, pictures, cache, table)
 
 
 def answer(call: StaticCall, observation: Observation, noise: Tensor, row: int = 0) -> Tensor:
+    call.pictures.write(observation.images[row][observation.image_mask[row]].numpy())
     call.write_inputs(
-        observation.images[row][observation.image_mask[row]].numpy(),
         noise[row].numpy(),
         observation.state[row].numpy(),
         observation.tokens[row][observation.token_mask[row]].numpy(),
@@ -132,7 +132,7 @@ def test_every_valid_picture_must_be_given() -> None:
     observation, noise = made_up("pi05", 2, 5)
     call = static_call("pi05", shape_of(observation, noise, 1))
     with pytest.raises(ValueError, match="shorter"):
-        call.write_inputs(observation.images[0, :1].numpy(), noise[0].numpy(), observation.state[0].numpy(), np.ones(5))
+        call.pictures.write(observation.images[0, :1].numpy())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

@@ -13,7 +13,7 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.emulate import rounded
 from turbopi.calibrate.sites import Site, sites
 from turbopi.calibrate.statistics import collect
-from turbopi.engine.call import Cache, CallShape, StaticCall
+from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.fp8 import Fp8Matrix, Matrix
 from turbopi.engine.ops import PLAIN
 from turbopi.engine.weights import modulation, pack
@@ -47,7 +47,9 @@ def engine_actions(scales: dict[str, float], observation: Observation, noise: Te
     shape = shape_of(observation, noise, STEPS)
     cache = Cache.allocate(model.config, shape.prefix_slots(model.config) + 64, CPU, torch.float32)
     table = modulation(model.config, weights.conditioning, STEPS)
-    return answer(StaticCall(model.config, weights, PLAIN, shape, cache, table), observation, noise), len(made)
+    pictures = Pictures(model.config, weights, PLAIN, shape.cameras, shape.float_images, shape.prompt_slots)
+    call = StaticCall(model.config, weights, PLAIN, shape, pictures, cache, table)
+    return answer(call, observation, noise), len(made)
 
 
 def relative(ours: Tensor, exact: Tensor) -> float:

@@ -3,14 +3,18 @@
 import dataclasses
 import time
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from conftest import GOLDEN, golden_cases, golden_folder
+from test_engine import made_up, shape_of
 
 from turbopi import backends
+from turbopi.backends.cuda_graph import Graph, HostRow
 from turbopi.config import Kind
+from turbopi.engine.call import StaticCall
 from turbopi.judge.check_golden import check_case
 from turbopi.model.reference import Precision
 from turbopi.observation import Observation
@@ -115,6 +119,53 @@ def test_stage_times_are_within_the_call(name: str, precision: Precision) -> Non
     assert set(sample.stage_ms) == {"vision", "prefix", "denoise"}
     assert all(milliseconds > 0 for milliseconds in sample.stage_ms.values())
     assert sum(sample.stage_ms.values()) <= call * 1.02
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_vision_apart_and_the_rest_equal_one_graph_of_the_whole_call(name: str) -> None:
+    """Bit for bit, whichever prompts and cameras came before, captured when needed and by warm-up."""
+    checkpoint = golden_folder().checkpoint("pi05")
+    runner: Any = backends.create(
+        name,
+        checkpoint.config.model,
+        lambda to, mode: checkpoint.load(to, mode).state,
+        device=torch.device("cuda", 0),
+        precision="bf16",
+    )
+    whole: dict[StaticCall, Graph] = {}
+
+    def in_one(row: HostRow, noise: torch.Tensor) -> torch.Tensor:
+        call = next(c for s, c in runner._calls.items() if s == shape_of(observation, noise, 3))
+        if call not in whole:
+            whole[call] = Graph(call.run, runner._pool, runner._stream)
+        call.pictures.write(row.images)
+        call.write_inputs(noise[0].numpy(), row.state, row.tokens)
+        whole[call].replay()
+        return call.actions.clone()
+
+    horizon = checkpoint.config.model.action_horizon
+    for turn in range(2):
+        for seed, (cameras, tokens) in enumerate([(2, 5), (3, 40), (2, 47), (1, 16), (2, 5), (0, 17), (3, 17)]):
+            observation, _ = made_up("pi05", cameras, tokens, seed)
+            noise = torch.randn(1, horizon, 32, generator=torch.Generator().manual_seed(seed))
+            row = HostRow.of(observation, 0)
+            ours = runner.begin(row.images).finish(row.tokens, row.state, noise[0].numpy(), 3).actions[0]
+            assert ours.isfinite().all()
+            assert torch.equal(ours, in_one(row, noise)), (turn, cameras, tokens)
+            runner.begin(row.images[:1])  # and given up
+        if turn == 0:
+            runner.warmup(made_up("pi05", 2, 5)[0], 3)
+
+
+def test_time_in_which_the_device_waits_for_the_host_is_the_prefixs() -> None:
+    runner: Any = backend("fused", "pi05", "bf16")
+    observation, noise = made_up("pi05", 2, 5)
+    row = HostRow.of(observation, 0)
+    for wait in (0, 0.05):
+        begun = runner.begin(row.images)
+        time.sleep(wait)
+        stage_ms = begun.finish(row.tokens, row.state, noise[0].numpy(), 3).stage_ms
+    assert stage_ms["prefix"] > 40 > stage_ms["vision"]
 
 
 def test_tf32_stays_out_of_the_oracle() -> None:

@@ -455,3 +455,25 @@ def test_a_single_observation_isnt_copied_and_several_are() -> None:
     for name in ("images", "image_mask", "tokens", "token_mask", "state"):
         np.testing.assert_array_equal(getattr(one, name).numpy()[0], getattr(inputs, name))
         np.testing.assert_array_equal(getattr(two, name).numpy()[1], getattr(inputs, name))
+
+
+@pytest.mark.parametrize("resize", ["openpi", "lerobot"])
+def test_vision_is_given_the_valid_pictures_that_before_returns(resize: Any) -> None:
+    """Of any size and layout, in order, one that is fine as it is without a copy; the rest follows with `read`."""
+    edges = pipeline(dataclasses.replace(PLAIN, image_resize=resize), default_prompt="x")
+    rng = np.random.default_rng(0)
+    exact = rng.integers(256, size=(224, 224, 3), dtype=np.uint8)
+    wide, channels_first = (rng.integers(256, size=s, dtype=np.uint8) for s in ((60, 224, 3), (3, 224, 224)))
+    for sent in ([exact, wide], [wide, channels_first, exact], [channels_first]):
+        observation = {"images": dict(zip(CAMERAS, sent, strict=False)), "state": np.full(8, 0.5)}
+        inputs, state = edges.before(observation)
+        seen = edges.see(observation)
+        assert len(seen.pictures) == len(sent)
+        np.testing.assert_array_equal(np.stack(seen.pictures), inputs.images[inputs.image_mask])
+        assert np.stack(seen.pictures).dtype == inputs.images.dtype
+        if resize == "openpi" and sent[-1] is exact:
+            assert np.shares_memory(seen.pictures[-1], exact)
+        edges.read(seen)
+        np.testing.assert_array_equal(seen.state, state)
+        np.testing.assert_array_equal(seen.model_state, inputs.state)
+        np.testing.assert_array_equal(seen.tokens[seen.token_mask], inputs.tokens[inputs.token_mask])

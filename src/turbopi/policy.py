@@ -118,7 +118,9 @@ class UnifiedPolicy:
 
         Returns {"actions": float64[H, d], "policy_timing": {...}} in milliseconds: `infer_ms` is the model alone, from
         inputs on the host to actions on the host, as openpi counts; `total_ms` the whole call; `preprocess_ms`,
-        `vision_ms`, `prefix_ms`, `denoise_ms`, `postprocess_ms` its stages, where the backend can tell them apart.
+        `vision_ms`, `prefix_ms`, `denoise_ms`, `postprocess_ms` its stages, where the backend can tell them apart. A
+        backend with `begin` starts on the pictures: then `infer_ms` begins there, and tokenising, beside it, is in it;
+        `prefix_ms` is from vision's end, so time in which the device waits for the host is in that.
 
         Raises ObservationError for anything wrong with the arguments, naming it.
         """
@@ -141,17 +143,28 @@ class UnifiedPolicy:
         if not observations:
             raise ObservationError("infer_batch was given no observation")
         steps = self._num_steps if num_steps is None else _checked_steps(num_steps, ObservationError)
-        prepared = [self._pipeline.before(obs) for obs in observations]
-        inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
-        x_1 = torch.from_numpy(self._noise(len(observations), noise, seed))
-
-        with self._lock:
-            infer_start = time.perf_counter()
-            sample = self.backend.sample(inputs, x_1, steps)
-            infer_end = time.perf_counter()
+        if len(observations) == 1 and hasattr(self.backend, "begin"):
+            seen = self._pipeline.see(observations[0])
+            with self._lock:
+                infer_start = time.perf_counter()
+                begun: backends.Begun = self.backend.begin(seen.pictures)
+                self._pipeline.read(seen)  # while the device is at the pictures
+                x_1 = self._noise(1, noise, seed)[0]
+                sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps)
+                infer_end = time.perf_counter()
+            states = [seen.state]
+        else:
+            prepared = [self._pipeline.before(obs) for obs in observations]
+            inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
+            states = [state for _, state in prepared]
+            noises = torch.from_numpy(self._noise(len(observations), noise, seed))
+            with self._lock:
+                infer_start = time.perf_counter()
+                sample = self.backend.sample(inputs, noises, steps)
+                infer_end = time.perf_counter()
 
         actions = sample.actions.numpy()
-        results = [self._pipeline.after(chunk, state) for chunk, (_, state) in zip(actions, prepared, strict=True)]
+        results = [self._pipeline.after(chunk, state) for chunk, state in zip(actions, states, strict=True)]
         end = time.perf_counter()
         timing = {
             "infer_ms": (infer_end - infer_start) * 1e3,

@@ -4,6 +4,7 @@ Each edge is a list of steps, in openpi's order; the second undoes the first. Tw
 state goes into the prompt normalised but not padded, and relative actions are added to the un-normalised state.
 """
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,15 +23,22 @@ from turbopi.tokenizer import PromptTokenizer
 
 
 @dataclass
-class _Sample:
-    """One observation on its way in."""
+class Incoming:
+    """One observation on its way in: `Pipeline.see` fills the first half, `Pipeline.read` the rest.
+
+    pictures        (uint8|float32)[224, 224, 3] of each camera that `image_mask` has; some may be the observation's own
+    state           float64[action_dim]  normalised, padded
+    model_state     float32[action_dim]  the same, as the model reads it
+    """
 
     observation: Mapping[str, Any]
     robot: RobotInputs = field(init=False)
     prompt: str = field(init=False)
-    state: np.ndarray = field(init=False)  # float64, normalised, then padded
-    images: np.ndarray = field(init=False)
+    pictures: list[np.ndarray] = field(init=False)
     image_mask: np.ndarray = field(init=False)
+
+    state: np.ndarray = field(init=False)
+    model_state: np.ndarray = field(init=False)
     tokens: np.ndarray = field(init=False)
     token_mask: np.ndarray = field(init=False)
 
@@ -70,11 +78,13 @@ class Pipeline:
         self.state_scale = Normalizer(config.normalization.state, stats.state, "state")
         self.action_scale = Normalizer(config.normalization.actions, stats.actions, "actions")
         self._check()
-        self.before_model: tuple[Callable[[_Sample], None], ...] = (
+        self.before_vision: tuple[Callable[[Incoming], None], ...] = (
             self._read_observation,
             self._choose_prompt,
-            self._normalize_state,
             self._resize_images,
+        )
+        self.before_prefix: tuple[Callable[[Incoming], None], ...] = (
+            self._normalize_state,
             self._tokenize,
             self._pad_state,
         )
@@ -90,18 +100,28 @@ class Pipeline:
         The observation isn't changed, and nothing returned shares memory with it. Raises ObservationError if it can't
         be used.
         """
+        one = self.see(observation)
+        self.read(one)
+        size, (black, dtype) = self.config.model.vision.image_size, self._black
+        images: np.ndarray = np.empty((len(one.image_mask), size, size, 3), dtype)
+        pictures = iter(one.pictures)
+        for valid, image in zip(one.image_mask, images, strict=True):
+            image[:] = next(pictures) if valid else black
+        return ModelInputs(images, one.image_mask, one.tokens, one.token_mask, one.model_state), one.state
+
+    def see(self, observation: Mapping[str, Any]) -> Incoming:
+        """The first half of `before`: all that vision needs. `read` is the other."""
         if not isinstance(observation, Mapping):
             raise ObservationError(f"an observation is a dict, got {type(observation).__name__}")
-        sample = _Sample(observation)
-        for step in self.before_model:
-            step(sample)
-        with np.errstate(over="ignore"):
-            state = sample.state.astype(np.float32)
-        if not np.isfinite(state).all():
-            at = int(np.flatnonzero(~np.isfinite(state))[0])
-            raise ObservationError(f"state value {at} is {sample.state[at]:g} once normalised, too large for the model")
-        inputs = ModelInputs(sample.images, sample.image_mask, sample.tokens, sample.token_mask, state)
-        return inputs, sample.state
+        one = Incoming(observation)
+        for step in self.before_vision:
+            step(one)
+        return one
+
+    def read(self, one: Incoming) -> None:
+        """The second half of `before`: state and prompt."""
+        for step in self.before_prefix:
+            step(one)
 
     def after(self, model_actions: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
         """{"actions": float64[H, d]} in the robot's units.
@@ -134,60 +154,70 @@ class Pipeline:
 
     # Before the model
 
-    def _read_observation(self, sample: _Sample) -> None:
+    def _read_observation(self, sample: Incoming) -> None:
         sample.robot = self.robot.inputs(sample.observation)
 
-    def _choose_prompt(self, sample: _Sample) -> None:
+    def _choose_prompt(self, sample: Incoming) -> None:
         prompt = sample.robot.prompt if sample.robot.prompt is not None else self.default_prompt
         if prompt is None:
             raise ObservationError("the observation has no prompt, and the policy no default prompt; give one of them")
         sample.prompt = read_prompt(prompt)
 
-    def _normalize_state(self, sample: _Sample) -> None:
+    def _normalize_state(self, sample: Incoming) -> None:
         state, limit = read_state(sample.robot.state, "state", self.robot.state_dim), self.config.model.action_dim
         if len(state) > limit:
             raise ObservationError(f"the state has {len(state)} values, but the model takes at most {limit}")
         sample.state = self.state_scale.normalize(state)
 
-    def _resize_images(self, sample: _Sample) -> None:
+    def _resize_images(self, sample: Incoming) -> None:
         pictures, present = sample.robot.images, sample.robot.image_mask
         cameras = list(CAMERAS) if set(pictures) <= set(CAMERAS) else list(pictures)
-        size = self.config.model.vision.image_size
-        shape = (len(cameras), size, size, 3)
-        unit = self.config.image_resize == "lerobot"
-        black, dtype = (-1, np.float32) if unit else (0, np.uint8)
-        sample.images = np.empty(shape, dtype)
-        sample.image_mask = np.array([present.get(camera, camera in pictures) for camera in cameras], np.bool_)
-        for camera, valid, out in zip(cameras, sample.image_mask, sample.images, strict=True):
-            if not valid:
-                out.fill(black)
-                continue
-            picture = check_hwc(pictures.get(camera), camera)
-            if picture.shape != out.shape:
-                out.fill(black)  # what stays of it is the padding
-            if unit:
-                resize_unit_into(picture, out)
-            else:
-                resize_into(to_uint8(picture, camera), out)
+        valid = [present.get(camera, camera in pictures) for camera in cameras]
+        sample.image_mask = np.array(valid, np.bool_)
+        sample.pictures = [self._fitted(pictures.get(camera), camera) for camera in itertools.compress(cameras, valid)]
 
-    def _tokenize(self, sample: _Sample) -> None:
+    def _fitted(self, picture: Any, camera: str) -> np.ndarray:
+        picture, size, (black, dtype) = check_hwc(picture, camera), self.config.model.vision.image_size, self._black
+        unit = dtype == np.float32
+        if not unit:
+            picture = to_uint8(picture, camera)
+            if picture.shape == (size, size, 3) and picture.flags.c_contiguous:
+                return picture
+        out: np.ndarray = np.empty((size, size, 3), dtype)
+        if picture.shape != out.shape:
+            out.fill(black)  # what stays of it is the padding
+        resize = resize_unit_into if unit else resize_into
+        resize(picture, out)
+        return out
+
+    @property
+    def _black(self) -> tuple[int, type]:
+        """What pictures are padded with, and their dtype."""
+        return (-1, np.float32) if self.config.image_resize == "lerobot" else (0, np.uint8)
+
+    def _tokenize(self, sample: Incoming) -> None:
         state = sample.state if self.config.discrete_state_input else None
         sample.tokens, sample.token_mask = self.tokenizer.tokenize(
             sample.prompt, state, max_tokens=self.config.model.max_prompt_tokens
         )
 
-    def _pad_state(self, sample: _Sample) -> None:
+    def _pad_state(self, sample: Incoming) -> None:
         sample.state = pad_last(sample.state, self.config.model.action_dim)
+        with np.errstate(over="ignore"):
+            sample.model_state = sample.state.astype(np.float32)
+        if not np.isfinite(sample.model_state).all():
+            at = int(np.flatnonzero(~np.isfinite(sample.model_state))[0])
+            raise ObservationError(f"state value {at} is {sample.state[at]:g} once normalised, too large for the model")
 
     # After the model
 
     def _unnormalize(self, result: _Result) -> None:
         result.actions = self.action_scale.unnormalize(result.actions)
-        result.state = self.state_scale.unnormalize(result.state)
 
     def _make_absolute(self, result: _Result) -> None:
         if self.robot.delta_mask is not None:
-            result.actions = absolute_actions(result.actions, result.state, self.robot.delta_mask)
+            state = self.state_scale.unnormalize(result.state)
+            result.actions = absolute_actions(result.actions, state, self.robot.delta_mask)
 
     def _write_actions(self, result: _Result) -> None:
         result.actions = self.robot.outputs(result.actions)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi.backends.base import Backend, LoadState, Sample, Tier
+from turbopi.backends.base import Backend, Begun, LoadState, Sample, Tier
 from turbopi.calibrate.artifact import TIERS, Quantization
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendUnavailable, ConfigError
@@ -17,6 +17,7 @@ from turbopi.errors import BackendUnavailable, ConfigError
 __all__ = [
     "BACKENDS",
     "Backend",
+    "Begun",
     "LoadState",
     "Sample",
     "Tier",
@@ -51,7 +52,7 @@ _SPECS = (
         "cuda_graph",
         "turbopi.backends.cuda_graph",
         "CudaGraphBackend",
-        "the whole call in one CUDA graph, PyTorch's kernels: NVIDIA GPUs from compute capability 8.0",
+        "the whole call in two CUDA graphs, PyTorch's kernels: NVIDIA GPUs from compute capability 8.0",
     ),
     BackendSpec(
         "fused",

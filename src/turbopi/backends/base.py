@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,10 +30,30 @@ class Sample:
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 
+class Begun(Protocol):
+    """One observation whose pictures a backend works on already: what a backend's `begin` returns, if it has that.
+
+        def begin(self, pictures: Sequence[np.ndarray]) -> Begun
+
+    `pictures` are the valid ones, (uint8|float32)[224, 224, 3], on the host. They are copied, and `begin` returns
+    without waiting for the device, so that the host can tokenise meanwhile. An observation that never gets to `finish`
+    is given up by the next `begin`, `sample` or `prefix`.
+    """
+
+    def finish(self, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+        """What `sample` of this one observation returns.
+
+        tokens  int64[valid prompt tokens]
+        state   float32[action_dim]
+        noise   float32[H, action_dim]
+        """
+
+
 class Backend(Protocol):
     """A way to run the model. All of them compute what `turbopi.model.reference.Pi0Model` computes.
 
-    Observations and noise may be on the host or on the device; both are moved where they are needed.
+    Observations and noise may be on the host or on the device; both are moved where they are needed. Two methods are
+    optional: `begin`, see `Begun`, and `submit`, see `turbopi.backends.tensorrt_pipelined`.
     """
 
     name: ClassVar[str]

@@ -1,6 +1,7 @@
-"""Backend `cuda_graph`: the whole call in one CUDA graph per prefix-length bucket, with stock PyTorch.
+"""Backend `cuda_graph`: a call is two CUDA graphs, one for pictures and one for all the rest, with stock PyTorch.
 
-A bucket fixes the number of valid cameras and rounds the prompt's length up to a multiple of 16; inside it nothing is
+The first, vision, is for a number of valid cameras; it can start before the prompt is known. The second, prefix and all
+denoising steps, is for a bucket, which rounds the prompt's length up to a multiple of 16, too; inside it nothing is
 captured anew when pictures, prompt, state or noise change. A bucket that warm-up didn't capture is captured when first
 needed, with a log line. Batches run one observation after the other.
 """
@@ -8,7 +9,7 @@ needed, with a log line. Batches run one observation after the other.
 import itertools
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from turbopi.backends.base import LoadState, Sample, Tier
 from turbopi.config import ModelConfig
-from turbopi.engine.call import Cache, CallShape, Denoiser, Mark, StaticCall
+from turbopi.engine.call import Cache, CallShape, Denoiser, Mark, Pictures, StaticCall
 from turbopi.engine.ops import Ops, compiled
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError
@@ -33,11 +34,17 @@ MAX_CAMERAS = 4  # the cache is allocated for them
 
 
 class Graph:
-    """A sequence of kernels captured once, with timing events at its start and at every mark."""
+    """A sequence of kernels captured once, with timing events at its start and at every mark.
 
-    def __init__(self, run: Callable[[Mark], None], pool: Any, stream: torch.cuda.Stream) -> None:
+    after   the graph that is launched before each time this one is: its stages are this one's first, and the next one
+            begins where they end, so that it has in it whatever time the device waits in between for this launch
+    """
+
+    def __init__(
+        self, run: Callable[[Mark], None], pool: Any, stream: torch.cuda.Stream, after: "Graph | None" = None
+    ) -> None:
         self._device = stream.device
-        self._events: dict[str, torch.cuda.Event] = {}
+        self._events: dict[str, torch.cuda.Event] = {} if after is None else dict(after._events)
         self._graph = torch.cuda.CUDAGraph()
         stream.wait_stream(torch.cuda.current_stream(stream.device))
         with torch.cuda.stream(stream):
@@ -45,16 +52,21 @@ class Graph:
                 run(lambda stage: None)
         stream.synchronize()
         with torch.cuda.graph(self._graph, pool=pool, stream=stream):
-            self._mark("start")
+            if after is None:
+                self._mark("start")
             run(self._mark)
 
+    def launch(self) -> None:
+        """Run the kernels again on what their input buffers hold now, on the current stream, without waiting."""
+        self._graph.replay()
+
     def replay(self) -> None:
-        """Run the kernels again on what their input buffers hold now, on the current stream, and wait for them."""
+        """`launch`, and wait for whatever the current stream has to do."""
         self._graph.replay()
         torch.cuda.current_stream(self._device).synchronize()
 
     def stage_ms(self) -> dict[str, float]:
-        """Device time of the last replay: each mark's milliseconds since the one before."""
+        """Device time of the last replay: each mark's milliseconds since the one before. Their sum leaves none out."""
         pairs = itertools.pairwise(self._events.items())
         return {name: start.elapsed_time(end) for (_, start), (name, end) in pairs}
 
@@ -82,6 +94,18 @@ class HostRow:
         return cls([images[camera] for camera in np.flatnonzero(mask)], tokens, on_host(observation.state))
 
 
+class Begun:
+    """What `CudaGraphBackend.begin` returns: the pictures of one observation on their way through vision."""
+
+    def __init__(self, backend: "CudaGraphBackend", cameras: int, float_images: bool) -> None:
+        self.backend, self.cameras, self.float_images = backend, cameras, float_images
+
+    def finish(self, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+        """See `turbopi.backends.base.Begun`."""
+        call, graph = self.backend._continue(self, "answer", tokens, state, noise, num_steps)
+        return Sample(torch.from_numpy(call.actions_array[None].copy()), graph.stage_ms())
+
+
 class CudaGraphBackend:
     """The engine's forward pass with PyTorch's kernels, those between the matrix products fused by Inductor."""
 
@@ -98,9 +122,11 @@ class CudaGraphBackend:
         self._cache = Cache.allocate(config, rows, device, self._weights.embed_tokens.dtype)
         self._tables: dict[int, Tensor | None] = {}
         self._calls: dict[CallShape, StaticCall] = {}
-        self._graphs: dict[tuple[CallShape, str], Graph] = {}
-        self._pool = torch.cuda.graph_pool_handle()
-        self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        self._pictures: dict[tuple[int, bool], Pictures] = {}  # by cameras, and whether they are float
+        self._graphs: dict[tuple[CallShape | Pictures, str], Graph] = {}
+        self._begun: Begun | None = None  # what may be finished
+        self._pool: Any = None
+        self._stream: torch.cuda.Stream | None = None  # that graphs are captured on
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
@@ -113,16 +139,15 @@ class CudaGraphBackend:
 
     def warmup(self, observation: Observation, num_steps: int) -> None:
         """Capture the whole call for every prompt length, with this observation's number of cameras."""
-        shape = self._shape(observation, HostRow.of(observation, 0), self.config.action_horizon, num_steps)
+        cameras, floats = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
         for slots in range(BUCKET, _bucket(self.config.max_prompt_tokens) + 1, BUCKET):
-            self._graph(CallShape(shape.cameras, slots, shape.horizon, num_steps, shape.float_images), "call")
+            self._graph(CallShape(cameras, slots, self.config.action_horizon, num_steps, floats), "answer")
 
     def prefix(self, observation: Observation) -> KVCache:
         if observation.batch_size != 1:
             raise BackendError(f"{self.name} holds the cache of one observation, not of {observation.batch_size}")
-        row = HostRow.of(observation, 0)
-        shape = self._shape(observation, row, self.config.action_horizon, 1)
-        call, _ = self._run(shape, "prefix", row, np.zeros((shape.horizon, self.config.action_dim), np.float32))
+        noise = np.zeros((self.config.action_horizon, self.config.action_dim), np.float32)
+        call, _ = self._run("prefix", HostRow.of(observation, 0), noise, 1)
         length = int(call.host.length[0])
         return KVCache(
             call.cache_k[:, None, None, :length].clone(),
@@ -149,15 +174,27 @@ class CudaGraphBackend:
         graph.replay()
         return call.x_t[-1:].clone()
 
+    def begin(self, pictures: Sequence[np.ndarray]) -> Begun:
+        """See `turbopi.backends.base.Begun`. One observation at a time: this ends the turn of the one before."""
+        if len(pictures) > MAX_CAMERAS:
+            raise BackendError(f"{self.name} takes up to {MAX_CAMERAS} cameras, this observation has {len(pictures)}")
+        begun = Begun(self, len(pictures), bool(pictures) and pictures[0].dtype == np.float32)
+        buffers = self._pictures_of(begun.cameras, begun.float_images)
+        self._begun = None  # one given up may still be read from the buffers, but nobody gets what becomes of it
+        buffers.write(pictures)
+        try:
+            self._graph(buffers, "vision").launch()
+        except RuntimeError as error:
+            self._explain(error)
+            raise
+        self._begun = begun
+        return begun
+
     def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
-        x_1 = noise.cpu().numpy()
-        actions, stages = np.empty_like(x_1), []
-        for i in range(observation.batch_size):
-            row = HostRow.of(observation, i)
-            call, graph = self._run(self._shape(observation, row, x_1.shape[1], num_steps), "call", row, x_1[i])
-            actions[i] = call.actions_array
-            stages.append(graph.stage_ms())
-        return Sample(torch.from_numpy(actions), {name: sum(one[name] for one in stages) for name in stages[0]})
+        x_1, rows = noise.cpu().numpy(), [HostRow.of(observation, row) for row in range(observation.batch_size)]
+        ran = [self.begin(row.images).finish(row.tokens, row.state, x_1[i], num_steps) for i, row in enumerate(rows)]
+        stages = {name: sum(one.stage_ms[name] for one in ran) for name in ran[0].stage_ms}
+        return Sample(torch.cat([one.actions for one in ran]), stages)
 
     def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
         rows = [self._trace_row(observation, noise, row, num_steps) for row in range(observation.batch_size)]
@@ -180,31 +217,68 @@ class CudaGraphBackend:
         """None: the engine's operations one by one."""
         return None
 
-    def _shape(self, observation: Observation, row: HostRow, horizon: int, num_steps: int) -> CallShape:
-        cameras, tokens = len(row.images), len(row.tokens)
-        if cameras > MAX_CAMERAS or tokens > self.config.max_prompt_tokens or cameras + tokens == 0:
-            raise BackendError(
-                f"{self.name} takes up to {MAX_CAMERAS} cameras and {self.config.max_prompt_tokens} prompt tokens, "
-                f"this observation has {cameras} and {tokens}"
-            )
-        return CallShape(cameras, _bucket(tokens), horizon, num_steps, observation.images.dtype == torch.float32)
+    def _run(self, part: str, row: HostRow, noise: np.ndarray, num_steps: int) -> tuple[StaticCall, Graph]:
+        """Replay the call up to a part's end on one row and noise float32[H, action_dim]."""
+        return self._continue(self.begin(row.images), part, row.tokens, row.state, noise, num_steps)
 
-    def _run(self, shape: CallShape, part: str, row: HostRow, noise: np.ndarray) -> tuple[StaticCall, Graph]:
-        """Replay (a part of) the call of one row's shape on its data and noise float32[H, action_dim]."""
-        graph, call = self._graph(shape, part), self._calls[shape]
-        call.write_inputs(row.images, noise, row.state, row.tokens)
-        graph.replay()
+    def _continue(
+        self, begun: Begun, part: str, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int
+    ) -> tuple[StaticCall, Graph]:
+        """Replay a part behind vision, "prefix" or the whole "answer"."""
+        if self._begun is not begun:
+            raise BackendError(f"{self.name} has finished this observation, or begun another one since")
+        cameras, most = begun.cameras, self.config.max_prompt_tokens
+        if len(tokens) > most or cameras + len(tokens) == 0:
+            raise BackendError(
+                f"{self.name} takes up to {MAX_CAMERAS} cameras and {most} prompt tokens, this observation has "
+                f"{cameras} and {len(tokens)}"
+            )
+        shape = CallShape(cameras, _bucket(len(tokens)), len(noise), num_steps, begun.float_images)
+        try:
+            graph, call = self._graph(shape, part), self._calls[shape]
+            call.write_inputs(noise, state, tokens)
+            graph.replay()
+        except RuntimeError as error:
+            self._explain(error)
+            raise
+        self._begun = None
         return call, graph
 
-    def _graph(self, shape: CallShape, part: str) -> Graph:
-        """The graph of a shape: the whole "call", or one half of it. Captured on first use."""
-        if (shape, part) not in self._graphs:
-            start = time.perf_counter()
-            call = self._call(shape)
-            runs = {"call": call.run, "prefix": _upload_and_encode(call), "denoise": call.denoise}
-            self._graphs[shape, part] = Graph(runs[part], self._pool, self._stream)
-            logger.info("captured %s of %s in %.2f s", part, shape, time.perf_counter() - start)
-        return self._graphs[shape, part]
+    def _explain(self, error: RuntimeError) -> None:
+        """A subclass that knows why the GPU failed raises a BackendError that says so."""
+
+    def _graph(self, of: CallShape | Pictures, part: str) -> Graph:
+        """The "vision" of pictures; of a shape the "answer" behind it, or its "prefix" or "denoise" alone.
+
+        Captured on first use.
+        """
+        if (of, part) not in self._graphs:
+            start, after = time.perf_counter(), None
+            if isinstance(of, Pictures):
+                run = of.run
+            else:
+                call = self._call(of)
+                if part != "prefix" and call.denoiser is None:
+                    call.denoiser = self._make_denoiser(of, call.table)
+                run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
+                after = None if part == "denoise" else self._graph(call.pictures, "vision")
+            self._graphs[of, part] = self._capture(run, after)
+            what = f"{of.cameras} cameras" if isinstance(of, Pictures) else of
+            logger.info("captured %s of %s in %.2f s", part, what, time.perf_counter() - start)
+        return self._graphs[of, part]
+
+    def _capture(self, run: Callable[[Mark], None], after: Graph | None) -> Graph:
+        """All graphs share memory, as they run one after the other."""
+        if self._stream is None:
+            self._pool = torch.cuda.graph_pool_handle()
+            self._stream = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
+        return Graph(run, self._pool, self._stream, after)
+
+    def _pictures_of(self, cameras: int, float_images: bool) -> Pictures:
+        key, slots = (cameras, float_images), _bucket(self.config.max_prompt_tokens)
+        if key not in self._pictures:
+            self._pictures[key] = Pictures(self.config, self._weights, self._ops, cameras, float_images, slots)
+        return self._pictures[key]
 
     def _call(self, shape: CallShape) -> StaticCall:
         if shape.num_steps not in self._tables:
@@ -214,15 +288,14 @@ class CudaGraphBackend:
             rows = shape.cache_rows(self.config)
             if rows > self._cache.k.shape[1]:
                 raise BackendError(f"{self.name} has {self._cache.k.shape[1]} cache rows, {shape} needs {rows}")
-            table = self._tables[shape.num_steps]
-            denoiser = self._make_denoiser(shape, table)
-            self._calls[shape] = StaticCall(self.config, self._weights, self._ops, shape, self._cache, table, denoiser)
+            pictures, table = self._pictures_of(shape.cameras, shape.float_images), self._tables[shape.num_steps]
+            self._calls[shape] = StaticCall(self.config, self._weights, self._ops, shape, pictures, self._cache, table)
         return self._calls[shape]
 
     def _trace_row(self, observation: Observation, noise: Tensor, row: int, num_steps: int) -> Trace:
         """One row's intermediates in golden layouts: the cache goes back to its padded slots."""
         one, x_1 = HostRow.of(observation, row), noise[row].cpu().numpy()
-        call, _ = self._run(self._shape(observation, one, len(x_1), num_steps), "call", one, x_1)
+        call, _ = self._run("answer", one, x_1, num_steps)
         length, per_image = int(call.host.length[0]), self.config.vision.num_tokens
         cameras = observation.image_mask[row].repeat_interleave(per_image)
         valid = torch.cat((cameras, observation.token_mask[row])).cpu()
@@ -244,14 +317,6 @@ def golden_trace(call: Any, length: int, valid: Tensor) -> Trace:
         "v_t": call.v_t[:, None].clone(),
         "actions": call.x_t[-1:].clone(),
     }
-
-
-def _upload_and_encode(call: StaticCall) -> Callable[[Mark], None]:
-    def run(mark: Mark) -> None:
-        call.upload()
-        call.encode(mark)
-
-    return run
 
 
 def _bucket(tokens: int) -> int:

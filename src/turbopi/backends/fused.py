@@ -10,15 +10,14 @@ import shutil
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Tier
-from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, Graph, HostRow, _bucket
+from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, _bucket
 from turbopi.calibrate.artifact import TIERS, Quantization, check_given
 from turbopi.config import ModelConfig
-from turbopi.engine.call import CallShape, Denoiser, StaticCall
+from turbopi.engine.call import CallShape, Denoiser
 from turbopi.engine.fp8 import Fp8Matrix, Matrix
 from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights, pack
@@ -162,17 +161,13 @@ class FusedBackend(CudaGraphBackend):
         self._put_expert_away()
         return kernel
 
-    def _run(self, shape: CallShape, part: str, row: HostRow, noise: np.ndarray) -> tuple[StaticCall, Graph]:
-        try:
-            return super()._run(shape, part, row, noise)
-        except RuntimeError as error:
-            for kernel in self._denoisers.values():
-                if (why := kernel.why_it_trapped()) is not None:
-                    raise BackendError(
-                        f"{why}. This process can't use the GPU any more: start it again, and free the GPU of other "
-                        "work; if that doesn't help, use backend 'cuda_graph'"
-                    ) from error
-            raise
+    def _explain(self, error: RuntimeError) -> None:
+        for kernel in self._denoisers.values():
+            if (why := kernel.why_it_trapped()) is not None:
+                raise BackendError(
+                    f"{why}. This process can't use the GPU any more: start it again, and free the GPU of other "
+                    "work; if that doesn't help, use backend 'cuda_graph'"
+                ) from error
 
     def _put_expert_away(self) -> None:
         """A kernel has its own copy of the expert's matrices; the first one, 0.6 GB, waits on the host."""

@@ -1,7 +1,8 @@
 """One whole call with fixed shapes: inputs up, vision, prefix, all denoising steps, actions down.
 
-`StaticCall.run` is that sequence of kernels on fixed buffers; on a GPU it is captured once and replayed. Inputs travel
-in one copy out of one pinned buffer, actions come back in one.
+`StaticCall.run` is that sequence of kernels on fixed buffers; on a GPU it is captured in two parts and replayed:
+`Pictures.run`, which needs nothing but pictures and so starts while the host still tokenises, and `StaticCall.answer`.
+Each part's inputs travel in one copy out of one pinned buffer, actions come back in one.
 """
 
 import math
@@ -56,10 +57,9 @@ class CallShape:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Views into one flat buffer, on the host or on the device. Byte offsets are multiples of 16."""
+    """All but pictures: views into one flat buffer, on the host or on the device. Offsets are multiples of 16 bytes."""
 
     flat: Tensor  # uint8
-    images: Tensor  # (uint8|float32)[V, 224, 224, 3]
     noise: Tensor  # float32[H, action_dim]
     state: Tensor  # float32[action_dim]
     tokens: Tensor  # int64[P]
@@ -67,9 +67,7 @@ class Inputs:
 
     @classmethod
     def allocate(cls, config: ModelConfig, shape: CallShape, device: torch.device, *, pinned: bool) -> "Inputs":
-        size = config.vision.image_size
         fields = {
-            "images": ((shape.cameras, size, size, 3), torch.float32 if shape.float_images else torch.uint8),
             "noise": ((shape.horizon, config.action_dim), torch.float32),
             "state": ((config.action_dim,), torch.float32),
             "tokens": ((shape.prompt_slots,), torch.int64),
@@ -86,7 +84,7 @@ class Inputs:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The same memory as NumPy's arrays, by name; of a buffer on the host only. Writing through them is cheap."""
-        return {name: getattr(self, name).numpy() for name in ("images", "noise", "state", "tokens", "length")}
+        return {name: getattr(self, name).numpy() for name in ("noise", "state", "tokens", "length")}
 
 
 @dataclass(frozen=True)
@@ -103,8 +101,43 @@ class Cache:
         return cls(*(torch.full(size, torch.nan, device=device, dtype=dtype) for _ in range(2)))
 
 
+class Pictures:
+    """The vision stage of every call with so many pictures, whatever its prompt.
+
+    Args:
+        cameras: how many pictures; with none of them the stage is empty.
+        float_images: as `CallShape`'s.
+        prompt_slots: the most of any call: `embs` has the cameras' tokens, then room for the prompt's.
+    """
+
+    def __init__(
+        self, config: ModelConfig, weights: Weights, ops: Ops, cameras: int, float_images: bool, prompt_slots: int
+    ) -> None:
+        self.config, self.weights, self.ops = config, weights, ops
+        self.cameras, self.float_images, self.rows = cameras, float_images, cameras * config.vision.num_tokens
+        table, side = weights.embed_tokens, config.vision.image_size
+        dims, dtype = (cameras, side, side, 3), torch.float32 if float_images else torch.uint8
+        self.host = torch.zeros(dims, dtype=dtype, pin_memory=table.is_cuda)
+        self._array = self.host.numpy()
+        self.images = torch.zeros(dims, dtype=dtype, device=table.device)
+        size = (self.rows + prompt_slots, config.vlm.width)
+        self.embs = torch.full(size, torch.nan, device=table.device, dtype=table.dtype)  # as in `Cache`
+
+    def write(self, images: Iterable[np.ndarray]) -> None:
+        """Put the valid pictures (uint8|float32)[224, 224, 3], one by one, into the host buffer."""
+        for target, picture in zip(self._array, images, strict=True):
+            target[:] = picture
+
+    def run(self, mark: Mark = lambda stage: None) -> None:
+        """Pictures to the first rows of `embs`."""
+        if self.cameras:
+            self.images.copy_(self.host, non_blocking=True)
+            forward.vision_tokens(self.config, self.weights, self.ops, self.images, self.embs[: self.rows])
+        mark("vision")
+
+
 class StaticCall:
-    """A call of one shape on buffers of its own; only `cache` and weights are shared with other shapes."""
+    """A call of one shape on buffers of its own; `pictures`, `cache` and weights are shared with other shapes."""
 
     def __init__(
         self,
@@ -112,22 +145,23 @@ class StaticCall:
         weights: Weights,
         ops: Ops,
         shape: CallShape,
+        pictures: Pictures,
         cache: Cache,
         table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation
-        denoiser: Denoiser | None = None,  # in place of the operations of `denoise`
     ) -> None:
-        self.config, self.weights, self.ops, self.shape = config, weights, ops, shape
+        self.config, self.weights, self.ops, self.shape, self.pictures = config, weights, ops, shape, pictures
+        assert (pictures.cameras, pictures.float_images) == (shape.cameras, shape.float_images), shape
         device = cache.k.device
         on_gpu = device.type == "cuda"
         suffix, rows = shape.suffix_tokens(config), shape.cache_rows(config)
         assert rows <= cache.k.shape[1], f"{shape} needs {rows} cache rows, there are {cache.k.shape[1]}"
         self.cache_k, self.cache_v = cache.k[:, :rows], cache.v[:, :rows]
         self._unseen = slice(shape.prefix_slots(config), rows - suffix)
-        self.table, self.denoiser = table, denoiser
+        self.table = table
+        self.denoiser: Denoiser | None = None  # in place of the operations of `denoise`
         self.rope = forward.rope_of_all_positions(config, rows, device)
         self.suffix_offsets = torch.arange(suffix, device=device)
-        # cameras' tokens, then the prompt's
-        self.embs = torch.empty(shape.prefix_slots(config), config.vlm.width, device=device, dtype=cache.k.dtype)
+        self.embs = pictures.embs[: shape.prefix_slots(config)]
         times = time_grid(shape.num_steps, config.time_grid)
         self.time_embs = time_embedding(times, config.expert.width).to(device)  # Pi0's
         self.host = Inputs.allocate(config, shape, torch.device("cpu"), pinned=on_gpu)
@@ -139,38 +173,32 @@ class StaticCall:
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
         self.actions_array = self.actions.numpy()
 
-    def write_inputs(
-        self, images: Iterable[np.ndarray], noise: np.ndarray, state: np.ndarray, tokens: np.ndarray
-    ) -> None:
-        """Put one observation, compacted, into the host buffer: valid pictures, one by one, and valid tokens only."""
+    def write_inputs(self, noise: np.ndarray, state: np.ndarray, tokens: np.ndarray) -> None:
+        """Put what an observation has beside its pictures into the host buffer: of the tokens the valid ones only."""
         arrays = self._arrays
-        for target, picture in zip(arrays["images"], images, strict=True):
-            target[:] = picture
         arrays["noise"][:] = noise
         arrays["state"][:] = state
         padded = arrays["tokens"]
         padded[: len(tokens)] = tokens
         padded[len(tokens) :] = 0
-        arrays["length"][0] = self.shape.cameras * self.config.vision.num_tokens + len(tokens)
+        arrays["length"][0] = self.pictures.rows + len(tokens)
 
     def run(self, mark: Mark = lambda stage: None) -> None:
         """All kernels of the call, in order. `mark` is told the end of each stage."""
-        self.upload()
+        self.pictures.run(mark)
+        self.answer(mark)
+
+    def answer(self, mark: Mark = lambda stage: None) -> None:
+        """What comes after `pictures.run`: prompt, state and noise to actions on the host."""
         self.encode(mark)
         self.denoise(mark)
 
-    def upload(self) -> None:
-        self.inputs.flat.copy_(self.host.flat, non_blocking=True)
-
     def encode(self, mark: Mark = lambda stage: None) -> None:
-        """Pictures and prompt to the cache's first rows."""
+        """Upload; then the pictures' rows, which are there, and the prompt to the cache's first rows."""
+        self.inputs.flat.copy_(self.host.flat, non_blocking=True)
         config, weights, ops, inputs = self.config, self.weights, self.ops, self.inputs
         slots = self.shape.prefix_slots(config)
-        pictures = slots - self.shape.prompt_slots
-        ops.embed_prompt(inputs.tokens, weights.embed_tokens, self.embs[pictures:])
-        if self.shape.cameras:
-            forward.vision_tokens(config, weights, ops, inputs.images, self.embs[:pictures])
-        mark("vision")
+        ops.embed_prompt(inputs.tokens, weights.embed_tokens, self.embs[self.pictures.rows :])
         rope = (self.rope[0][:slots], self.rope[1][:slots])
         forward.prefix_cache(config, weights, ops, self.embs, inputs.length, self.cache_k, self.cache_v, rope)
         mark("prefix")

@@ -28,16 +28,16 @@ from turbopi.model.vision import normalize_images
 class Ops:
     """Any of them may be exchanged for another implementation; `origin` says whose they are, for metadata.
 
-    `residual_linear` is a product that only the `y` of a residual norm reads; what it returns is a matter between those
-    two.
+    `residual_linear` is a product that only the `y` of a residual norm reads, and such a norm's result only products
+    read; what they hand over is a matter between them.
     """
 
     embed_patches: Callable[..., Tensor]
     embed_prompt: Callable[..., None]
     residual_rms_norm: Callable[..., tuple[Tensor, Tensor]]
-    residual_layer_norm: Callable[..., tuple[Tensor, Tensor]]
+    residual_layer_norm: Callable[..., tuple[Tensor, Any]]
     linear: Callable[..., Tensor]
-    residual_linear: Callable[..., Tensor]
+    residual_linear: Callable[..., Any]
     linear_gelu: Callable[..., Tensor]
     linear_geglu: Callable[..., Tensor]
     rope_split: Callable[..., Tensor]

@@ -6,13 +6,16 @@
 // block 0, those of k at `k_first`, of v at `v_first`. In every one of gridDim.x / tiles groups, a head of a picture or
 // of all there is, `rows` rows of q see `keys` rows of k and v; one query head has one head of keys.
 //
+// TP_SHARING CTAs of one group form a cluster: each loads a share of every tile of keys and values into all of them.
+// All tiles must have room then, as nobody waits for the others to free a slot.
+//
 // A CTA has 64 rows of q, a producer warp and TP_WGS consumer warpgroups, which take tiles of TP_KEYS keys in turn: one
 // multiplies while another weighs. In the end each gets the others' sums of a share of the columns.
 //
 // Numbers are kept as wgmma leaves them: a lane holds columns 2 (lane % 4) and the next one of each block of 8, in rows
 // lane / 4 and lane / 4 + 8 of its warp's 16.
 
-constexpr int WGS = TP_WGS, KEYS = TP_KEYS, STAGES = TP_STAGES, DIM = TP_DIM;
+constexpr int WGS = TP_WGS, KEYS = TP_KEYS, STAGES = TP_STAGES, DIM = TP_DIM, SHARING = TP_SHARING;
 constexpr bool OUT_FP8 = TP_OUT_FP8;
 #if TP_OUT_FP8
 typedef unsigned char Element;
@@ -35,6 +38,13 @@ __device__ __forceinline__ void load(u32 to, const TensorMap* map, int column, i
     asm volatile(
         "cp.async.bulk.tensor.3d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3, %4}], [%5];"
         ::"r"(to), "l"(map), "r"(column), "r"(head), "r"(row), "r"(bar) : "memory");
+}
+// into all CTAs of the cluster, at the same place in each
+__device__ __forceinline__ void load_into_all(u32 to, const TensorMap* map, int column, int head, int row, u32 bar) {
+    asm volatile(
+        "cp.async.bulk.tensor.3d.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster"
+        " [%0], [%1, {%2, %3, %4}], [%5], %6;"
+        ::"r"(to), "l"(map), "r"(column), "r"(head), "r"(row), "r"(bar), "h"((u16)((1 << SHARING) - 1)) : "memory");
 }
 // rows of 128 bytes, swizzled, columns of the product along the row; panels of 64 of them lie KEY_PANEL bytes apart
 __device__ __forceinline__ u64 operand_across(u32 address) {
@@ -76,7 +86,8 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
         for (int s = 0; s < STAGES; ++s) barrier_init(full + 8 * s, 1), barrier_init(empty + 8 * s, 1);
         asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     }
-    __syncthreads();
+    if (SHARING > 1) cluster_sync();
+    else __syncthreads();
     asm volatile("griddepcontrol.launch_dependents;\ngriddepcontrol.wait;" ::: "memory");
 
     // Tiles pass through the ring in rounds: one of keys for each warpgroup, then their values. Each warpgroup's first
@@ -91,15 +102,19 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
                 const u32 s = place % STAGES;
                 if (place >= STAGES) barrier_wait(empty + 8 * s, (place / STAGES + 1) & 1);
                 barrier_expect(full + 8 * s, STAGE_BYTES);
-                for (int p = 0; p < PANELS; ++p)
-                    load(ring + s * STAGE_BYTES + p * KEY_PANEL, map, 64 * p, first + head, group * keys + tile * KEYS,
-                         full + 8 * s);
+                const int part = blockIdx.x % SHARING, from = group * keys + tile * KEYS + part * (KEYS / SHARING);
+                for (int p = 0; p < PANELS; ++p) {
+                    const u32 to = ring + s * STAGE_BYTES + p * KEY_PANEL + part * (KEY_PANEL / SHARING);
+                    if (SHARING > 1) load_into_all(to, map, 64 * p, first + head, from, full + 8 * s);
+                    else load(to, map, 64 * p, first + head, from, full + 8 * s);
+                }
             };
             barrier_expect(q_full, Q_BYTES);
             for (int p = 0; p < PANELS; ++p)
                 load(base + p * Q_PANEL, &map_q, 64 * p, head, group * rows + row, q_full);
             for (int tile = 0; tile < early; ++tile) load_tile(&map_k, k_first, tile, place_of_keys(tile));
             const int valid = length ? (int)*length : keys, last = (valid + KEYS - 1) / KEYS;
+#pragma unroll 1
             for (int round = 0; round < last; round += WGS) {
                 const int end = min(round + WGS, last);
                 for (int tile = max(round, early); tile < end; ++tile)
@@ -284,4 +299,5 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
             }
         }
     }
+    if (SHARING > 1) cluster_sync();  // what this CTA loads for the others may still be on its way
 }

@@ -5,7 +5,7 @@ for heads that this one doesn't take, are in attention.py.
 """
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
@@ -25,12 +25,17 @@ class Tile:
     dim: int  # columns of a head
     keys: int
     warpgroups: int = 2
+    sharing: int = 1  # CTAs in a cluster, which load keys and values together
 
     @property
     def stages(self) -> int:
         """Tiles of keys or values in flight: as many as fit, beside the queries, 1 KB of alignment and the barriers."""
         panels = -(-self.dim // 64)
         return min(12, (SHARED_BYTES - 2048 - 64 * panels * 128) // (self.keys * panels * 128))
+
+    def holds(self, keys: int) -> bool:
+        """Whether shared memory takes so many keys and values at once."""
+        return 2 * self.warpgroups * -(-keys // (self.keys * self.warpgroups)) <= self.stages
 
 
 def takes(dim: int) -> bool:
@@ -65,9 +70,15 @@ def vision_attention(
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     tokens, dim = rows // images, width // heads
     out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse))
-    places, tile = (3 * heads,) * 3, tile or Tile(dim, keys=128 if dim <= 128 else 64)
+    places, tile = (3 * heads,) * 3, tile or _vision_tile(tokens, dim)
     _launch(tile, (qkv,) * 3, places, (0, heads, 2 * heads), out, None, tokens, tokens, images * heads, inverse)
     return out
+
+
+def _vision_tile(tokens: int, dim: int) -> Tile:
+    tile = Tile(dim, keys=128 if dim <= 128 else 64)
+    pair = replace(tile, sharing=2)
+    return pair if -(-tokens // 64) % 2 == 0 and pair.holds(tokens) else tile
 
 
 def _launch(
@@ -87,7 +98,7 @@ def _launch(
     rows and keys: of one picture.
     """
     count = out.shape[-1] // tile.dim if length is None else 1  # query heads beside each other
-    boxes = (64, tile.keys, tile.keys)
+    boxes = (64, tile.keys // tile.sharing, tile.keys // tile.sharing)
     maps = [
         hopper.tensor_map(
             matrix.data_ptr(),
@@ -98,6 +109,7 @@ def _launch(
         for matrix, width, box in zip(matrices, heads, boxes, strict=True)
     ]
     tiles = -(-rows // 64)
+    assert tile.sharing == 1 or (tiles % tile.sharing == 0 and tile.holds(keys)), "who shares never waits for a slot"
     kernel = _kernel(tile, inverse is not None, out.device)
     arguments = (
         *maps,
@@ -118,6 +130,7 @@ def constants(tile: Tile, out_fp8: bool) -> dict[str, int]:
         "TP_KEYS": tile.keys,
         "TP_STAGES": tile.stages,
         "TP_OUT_FP8": int(out_fp8),
+        "TP_SHARING": tile.sharing,
     }
 
 
@@ -132,4 +145,4 @@ def source(tile: Tile) -> str:
 def _kernel(tile: Tile, out_fp8: bool, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8))
-        return DependentKernel(cubin, "attention", SHARED_BYTES, 128 * (tile.warpgroups + 1), cluster=1)
+        return DependentKernel(cubin, "attention", SHARED_BYTES, 128 * (tile.warpgroups + 1), tile.sharing)

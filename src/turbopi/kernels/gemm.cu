@@ -13,9 +13,22 @@
 //
 // Epilogues: 0 plain, 1 + bias, 2 gelu(+ bias), 3 GeGLU (w has N gate rows, then N up rows), 4 float32 sums of a part
 // of K each (+ bias in the first) as out[split, M, N].
+//
+// TP_GATHER: the CTAs that share a tile, each with a part of K, are in one cluster. In the end each gets the others'
+// sums of a share of the tile's columns through distributed shared memory. For one tile a CTA: they go where operands
+// were.
+//
+// LayerNorm between two products without a pass of its own: TP_RESIDUAL adds `residual` [M, N] to the result, and the
+// sum of each row's results and of their squares goes, by tile, to `sums_out`. TP_NORMED (parts of a row's sums, or 0)
+// takes a's LayerNorm for a, whose scale is in w and whose shift in `offset`: as the product is linear, the norm is
+// only made of the sums in the end. `sums_of_w` are of the rounded w, so a mean in a's rows cancels, however large.
+//
+// `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
 
 constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
-constexpr int EPILOGUE = TP_EPILOGUE, CLUSTER = CM * CN;
+constexpr bool GATHER = TP_GATHER;
+constexpr int EPILOGUE = TP_EPILOGUE, PARTS = EPILOGUE == 3 ? 2 : 1;
+constexpr int SHARING = CM * CN, CLUSTER = SHARING * (GATHER ? SPLITS : 1);
 constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
 #if TP_OUT_FP8
 typedef unsigned char Element;
@@ -23,9 +36,9 @@ typedef unsigned char Element;
 typedef u16 Element;
 #endif
 constexpr int ROW_BYTES = 128;  // of a block of an operand: as much as a swizzle spans
-constexpr int BM = 64 * WGS, BK = FP8 ? ROW_BYTES : ROW_BYTES / 2, TILE_N = EPILOGUE == 3 ? BN / 2 : BN;
+constexpr int BM = 64 * WGS, BK = FP8 ? ROW_BYTES : ROW_BYTES / 2, TILE_N = BN / PARTS;
 constexpr int A_BYTES = BM * ROW_BYTES, B_BYTES = BN * ROW_BYTES, STAGE_BYTES = A_BYTES + B_BYTES;
-constexpr bool BIASED = !FP8 && (EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4);  // E4M3: see Factors
+constexpr bool BIASED = !FP8 && !TP_NORMED && (EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4);  // E4M3: see Factors
 constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
 constexpr int PRODUCER_REGISTERS = WGS == 1 ? 40 : WGS == 2 ? 40 : 24;
 
@@ -62,6 +75,15 @@ struct Factors {
             bias[i] = inside && with_bias ? __uint_as_float((u32)biases[col] << 16) : 0.0f;
         }
     }
+    __device__ __forceinline__ void fetch(const float* scales, const float* biases, int n, int N) {
+#pragma unroll
+        for (int i = 0; i < OWN; ++i) {
+            const int c = threadIdx.x % 128 + 128 * i;
+            const bool inside = c < BN && n + c < N;
+            scale[i] = inside ? scales[n + c] : 0.0f;
+            bias[i] = inside ? biases[n + c] : 0.0f;
+        }
+    }
     __device__ __forceinline__ void share(float* shared, int warpgroup) const {
         const auto sync = [&] { asm volatile("bar.sync %0, 128;" ::"r"(warpgroup + 1) : "memory"); };
         sync();  // the last tile's have been read
@@ -74,16 +96,57 @@ struct Factors {
     }
 };
 
+// which of a tile's parts ends up with a block of 8 columns; blocks go in fours, as that many leave together
+__device__ constexpr int owner(int block) { return block / 4 * SPLITS / ((TILE_N / 8 + 3) / 4); }
+
+// Adds up, for the blocks of 8 columns that are this part's, the sums of all parts of a tile.
+__device__ __forceinline__ void gather(float (&sums)[BN / 2], int split, char* raw, u32 base, int rank) {
+    constexpr int BLOCKS = TILE_N / 8, FOURS = (BLOCKS + 3) / 4, THREADS = 128 * WGS;
+    constexpr int FROM_ONE = (FOURS + SPLITS - 1) / SPLITS * 4 * THREADS * 16;  // by block, then by thread
+    static_assert(!GATHER || (SPLITS - 1) * FROM_ONE <= STAGES * STAGE_BYTES, "no room for the others' sums");
+    cluster_sync();  // nobody reads operands any more
+#pragma unroll
+    for (int to = 0; to < SPLITS; ++to) {
+        if (to == split) continue;
+        u32 there = base + (split < to ? split : split - 1) * FROM_ONE + threadIdx.x * 16;
+        asm volatile("mapa.shared::cluster.u32 %0, %0, %1;" : "+r"(there) : "r"(to * SHARING + rank % SHARING));
+        int count = 0;
+#pragma unroll
+        for (int j = 0; j < BLOCKS; ++j)
+            if (owner(j) == to)
+                asm volatile("st.shared::cluster.v4.f32 [%0], {%1, %2, %3, %4};" ::"r"(there + count++ * THREADS * 16),
+                             "f"(sums[4 * j]), "f"(sums[4 * j + 1]), "f"(sums[4 * j + 2]), "f"(sums[4 * j + 3])
+                             : "memory");
+    }
+    cluster_exchange();
+    const float4* const received = (const float4*)(raw + (base - shared_address(raw))) + threadIdx.x;
+#pragma unroll
+    for (int mine = 0; mine < SPLITS; ++mine) {
+        if (mine != split) continue;
+        int count = 0;
+#pragma unroll
+        for (int j = 0; j < BLOCKS; ++j) {
+            if (owner(j) != mine) continue;
+#pragma unroll
+            for (int i = 0; i < SPLITS - 1; ++i) {
+                const float4 x = received[i * (FROM_ONE / 16) + count * THREADS];
+                sums[4 * j] += x.x, sums[4 * j + 1] += x.y, sums[4 * j + 2] += x.z, sums[4 * j + 3] += x.w;
+            }
+            ++count;
+        }
+    }
+}
+
 struct Tile {
     int m, n, k, k_end, split;
 };
 
 __device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, int k_blocks, int rank) {
     Tile t;
-    t.m = (unit % m_groups * CM + rank / CN) * BM;
-    const int rest = unit / m_groups;
-    t.n = (rest % n_groups * CN + rank % CN) * TILE_N;
-    t.split = rest / n_groups;
+    const int place = rank % SHARING, rest = unit / m_groups;
+    t.m = (unit % m_groups * CM + place / CN) * BM;
+    t.n = (rest % n_groups * CN + place % CN) * TILE_N;
+    t.split = GATHER ? rank / SHARING : rest / n_groups;
     t.k = k_blocks * t.split / SPLITS;
     t.k_end = k_blocks * (t.split + 1) / SPLITS;
     return t;
@@ -94,12 +157,19 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #if TP_FP8
      const float* scale, float inverse,
 #endif
-     int M, int N, int k_blocks, int m_groups, int n_groups) {
+#if TP_RESIDUAL
+     const u32* residual, float2* sums_out,
+#endif
+#if TP_NORMED
+     const float2* sums_in, float inverse_width, float eps, const float* sums_of_w, const float* offset,
+#endif
+     int M, int N, int k_blocks, int m_groups, int n_groups, const char* ahead, u32 ahead_bytes) {
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
     const u32 full = base + STAGES * STAGE_BYTES, empty = full + 8 * STAGES;
     const int warpgroup = threadIdx.x / 128, rank = CLUSTER > 1 ? blockIdx.x % CLUSTER : 0;
-    const int units = m_groups * n_groups * SPLITS, stride = gridDim.x / CLUSTER, first = blockIdx.x / CLUSTER;
+    const int units = m_groups * n_groups * (GATHER ? 1 : SPLITS);
+    const int stride = gridDim.x / CLUSTER, first = blockIdx.x / CLUSTER;
 
     if (threadIdx.x == 128 * WGS) {
         asm volatile("prefetch.tensormap [%0];\nprefetch.tensormap [%1];" ::"l"(&map_a), "l"(&map_w));
@@ -118,11 +188,11 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
     if (warpgroup == WGS) {
         asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
         if (threadIdx.x == 128 * WGS) {
-            const int cm = rank / CN, cn = rank % CN;
-            const u32 same_row = ((1u << CN) - 1) << cm * CN;
+            const int cm = rank % SHARING / CN, cn = rank % CN, others = rank / SHARING * SHARING;  // those before
+            const u32 same_row = ((1u << CN) - 1) << (others + cm * CN);
             u32 same_column = 0;
-            for (int i = 0; i < CM; ++i) same_column |= 1u << (i * CN + cn);
-            constexpr int PARTS = EPILOGUE == 3 ? 2 : 1, ROWS = BN / PARTS / CM;
+            for (int i = 0; i < CM; ++i) same_column |= 1u << (others + i * CN + cn);
+            constexpr int ROWS = TILE_N / CM;
             auto load_w = [&](int s, int k, int n) {
                 const u32 bar = full + 8 * s;
                 barrier_expect(bar, STAGE_BYTES);
@@ -152,17 +222,26 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     load_a(s, k, t.m);
                 }
             }
+            if (ahead)
+                asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;"
+                             ::"l"(ahead + (size_t)blockIdx.x * ahead_bytes), "r"(ahead_bytes) : "memory");
+        }
+        if (GATHER) {  // with the consumers
+            __syncwarp();
+            cluster_sync();
+            cluster_exchange();
         }
     } else {
         asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
         const int group = warpgroup, lane = threadIdx.x % 32, warp = threadIdx.x / 32 % 4;
         auto release = [&](int step) {
             const u32 bar = empty + 8 * (step % STAGES);
-            if (CLUSTER == 1) {
+            if (SHARING == 1) {
                 if (threadIdx.x % 128 == 0) barrier_arrive(bar);
             } else {  // all that load into this CTA
-                const int cta = threadIdx.x % 128;
-                if (cta < CLUSTER && (cta / CN == rank / CN || cta % CN == rank % CN)) barrier_arrive(bar, cta);
+                const int place = threadIdx.x % 128, own = rank % SHARING;
+                if (place < SHARING && (place / CN == own / CN || place % CN == own % CN))
+                    barrier_arrive(bar, rank - own + place);
             }
         };
         int step = 0;
@@ -181,12 +260,40 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             for (int i = 0; i < BN / 2; ++i) sums[i] = 0.0f;
 #endif
 #endif
+#if TP_NORMED
+            Factors factors;
+            factors.fetch(sums_of_w, offset, t.n, N);
+            float* const shared = (float*)(raw + (empty + 8 * STAGES - shared_address(raw))) + group * 2 * BN;
+#endif
+#if TP_RESIDUAL || TP_NORMED
+            asm volatile("griddepcontrol.wait;" ::: "memory");
+#endif
+#if TP_NORMED
+            constexpr int OWN_SUMS = (TP_NORMED + 3) / 4;  // of a row's parts: fetched now, needed in the end
+            float2 row_sums[2][OWN_SUMS];
+#pragma unroll
+            for (int i = 0; i < 2 * OWN_SUMS; ++i) {
+                const int row = t.m + group * 64 + warp * 16 + lane / 4 + i % 2 * 8, part = i / 2 * 4 + lane % 4;
+                const bool there = row < M && part < TP_NORMED;
+                row_sums[i % 2][i / 2] = there ? sums_in[(size_t)part * M + row] : make_float2(0.0f, 0.0f);
+            }
+#endif
+#if TP_RESIDUAL
+            u32 before[2][BN / 8];
+#pragma unroll
+            for (int i = 0; i < BN / 4; ++i) {
+                const int half = i % 2, j = i / 2, row = t.m + group * 64 + warp * 16 + lane / 4 + half * 8;
+                const int col = t.n + j * 8 + lane % 4 * 2;
+                const bool needed = row < M && col < N && (!GATHER || owner(j) == t.split);
+                before[half][j] = needed ? residual[((size_t)row * N + col) / 2] : 0;
+            }
+#endif
             u32 offsets[BIASED ? BN / 8 : 1];  // the bias of this lane's columns, read long before it is needed
             if (BIASED) {
 #pragma unroll
                 for (int j = 0; j < BN / 8; ++j) {
                     const int col = t.n + j * 8 + lane % 4 * 2;
-                    offsets[j] = bias && col < N && t.split == 0 ? bias[col / 2] : 0;
+                    offsets[j] = bias && col < N && (GATHER || t.split == 0) ? bias[col / 2] : 0;
                 }
             }
 #if TP_PROMOTE
@@ -237,6 +344,35 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             }
 #endif
 
+#if TP_NORMED
+            factors.share(shared, group);
+            float mean[2], factor[2];
+#pragma unroll
+            for (int half = 0; half < 2; ++half) {
+                float sum = 0.0f, squares = 0.0f;
+#pragma unroll
+                for (int i = 0; i < OWN_SUMS; ++i) sum += row_sums[half][i].x, squares += row_sums[half][i].y;
+                mean[half] = sum_of_quad(sum) * inverse_width;
+                const float variance = sum_of_quad(squares) * inverse_width - mean[half] * mean[half];
+                factor[half] = rsqrtf(fmaxf(variance, 0.0f) + eps);
+            }
+#pragma unroll
+            for (int j = 0; j < BN / 8; ++j) {
+                const float2 of_w = *(const float2*)(shared + j * 8 + lane % 4 * 2);
+                const float2 plus = *(const float2*)(shared + BN + j * 8 + lane % 4 * 2);
+#pragma unroll
+                for (int half = 0; half < 2; ++half) {
+                    float &x = sums[4 * j + 2 * half], &y = sums[4 * j + 2 * half + 1];
+                    x = fmaf(x - mean[half] * of_w.x, factor[half], plus.x);
+                    y = fmaf(y - mean[half] * of_w.y, factor[half], plus.y);
+                }
+            }
+#endif
+
+#if TP_GATHER
+            gather(sums, t.split, raw, base, rank);
+#endif
+
 #pragma unroll
             for (int half = 0; half < 2; ++half) {
                 const int row = t.m + group * 64 + warp * 16 + lane / 4 + half * 8;
@@ -253,6 +389,9 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     }
                 } else {
                     Element* to = (Element*)out + (size_t)row * N;
+#if TP_RESIDUAL
+                    float sum = 0.0f, squares = 0.0f;  // of the row's results
+#endif
                     auto value = [&](int j) -> u32 {
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
                         if (BIASED) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
@@ -261,6 +400,12 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                             x = gelu(x) * sums[BN / 4 + 4 * j + 2 * half];
                             y = gelu(y) * sums[BN / 4 + 4 * j + 2 * half + 1];
                         }
+#if TP_RESIDUAL
+                        const u32 both = pack(x + bf16_low(before[half][j]), y + bf16_high(before[half][j]));
+                        x = bf16_low(both), y = bf16_high(both);
+                        sum += x + y, squares += x * x + y * y;
+                        return both;
+#endif
 #if TP_FP8
                         if (OUT_FP8) return pack_e4m3(x * inverse, y * inverse);
 #endif
@@ -268,6 +413,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     };
 #pragma unroll
                     for (int j = 0; j + 3 < BLOCKS; j += 4) {
+                        if (GATHER && owner(j) != t.split) continue;
                         const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
                         const int col = t.n + (j + lane % 4) * 8;
                         if (inside && col < N) {
@@ -277,6 +423,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     }
 #pragma unroll
                     for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
+                        if (GATHER && owner(j) != t.split) continue;
                         const int col = t.n + j * 8 + lane % 4 * 2;
                         const u32 v = value(j);
                         if (inside && col < N) {
@@ -284,6 +431,12 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                             else *(u32*)(to + col) = v;
                         }
                     }
+#if TP_RESIDUAL
+                    sum = sum_of_quad(sum), squares = sum_of_quad(squares);
+                    const int part = GATHER ? t.n / TILE_N * SPLITS + t.split : t.n / TILE_N;
+                    if (inside && t.n < N && lane % 4 == 0)
+                        sums_out[(size_t)part * M + row] = make_float2(sum, squares);
+#endif
                 }
             }
         }

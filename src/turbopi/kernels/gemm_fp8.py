@@ -12,7 +12,17 @@ import torch
 from torch import Tensor
 
 from turbopi.engine.fp8 import ALIGNMENT, E4M3, Fp8Matrix
-from turbopi.kernels.gemm import EPILOGUES, Epilogue, Tile, matrix_map, source
+from turbopi.kernels.gemm import (
+    EPILOGUES,
+    Epilogue,
+    Sums,
+    Tile,
+    ahead_arguments,
+    clusters,
+    matrix_map,
+    residual_arguments,
+    source,
+)
 from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
 from turbopi.kernels.nvrtc import compile_cubin
 
@@ -20,7 +30,7 @@ DEPTH = 128  # of a step along the inner axis
 PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are added up in float32
 # Of sums shorter than these steps the tensor cores lose too little to matter: 2e-3 of 8192 random products, where
 # rounding to E4M3 costs 4e-2; products of one sign lose more, so longer sums are promoted.
-UNPROMOTED_STEPS = 16
+UNPROMOTED_STEPS = 17
 PROMOTED_COLUMNS = {1: 184, 2: 184, 3: 112}  # by warpgroups: of wider tiles the sums don't fit registers twice
 
 
@@ -44,10 +54,15 @@ def matmul_fp8(
     out: Tensor | None = None,
     inverse: float | None = None,
     promote: int | None = None,
+    *,
+    residual: Tensor | None = None,
+    sums_out: Sums | None = None,
+    ahead: Tensor | None = None,
 ) -> Tensor:
     """a e4m3[M, K] @ weightᵀ with the epilogue -> bfloat16[M, N], or with `inverse` e4m3[M, N] = round(… * inverse);
     "partial" -> float32[splits, M, N].
 
+    With "bias" alone, `residual` bfloat16[M, N] is added and the sums of the result's rows go into `sums_out`.
     weight [N, K], for "geglu" [2N, K]; bias bfloat16[N] of any epilogue but "geglu". All contiguous, K a multiple of
     16, N of 8.
     """
@@ -58,7 +73,7 @@ def matmul_fp8(
     pieces = tile.cluster_m * (2 if epilogue == "geglu" else 1)
     assert tile.columns % (8 * pieces) == 0 and tile.rows % (8 * tile.cluster_n) == 0, "a share is whole groups of 8"
     partial = epilogue == "partial"
-    assert tile.splits == 1 or partial, "only partial sums can be split"
+    assert (tile.splits == 1 or partial) != tile.gather, "only partial sums stay split"
     assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu"))
     if out is None:
         shape = (tile.splits, m, n) if partial else (m, n)
@@ -66,7 +81,9 @@ def matmul_fp8(
     assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
     columns = tile.columns // 2 if epilogue == "geglu" else tile.columns
     m_groups, n_groups = -(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n))
-    kernel = _kernel(tile, epilogue, inverse is not None, promotion(tile, k) if promote is None else promote, a.device)
+    assert residual is None or (epilogue == "bias" and residual.is_contiguous() and sums_out is not None)
+    promote = promotion(tile, k) if promote is None else promote
+    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, a.device)
     arguments = (
         matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
         matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
@@ -74,10 +91,11 @@ def matmul_fp8(
         ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
         ctypes.c_void_p(weight.scale.data_ptr()),
         ctypes.c_float(1.0 if inverse is None else inverse),
+        *residual_arguments(residual, sums_out),
         *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), m_groups, n_groups)),
     )
-    clusters = min(m_groups * n_groups * tile.splits, kernel.max_clusters)
-    kernel.launch_dependent(clusters * tile.cluster, arguments)
+    blocks = clusters(tile, m_groups * n_groups, kernel.max_clusters) * tile.cluster
+    kernel.launch_dependent(blocks, arguments + ahead_arguments(ahead, blocks))
     return out
 
 
@@ -85,7 +103,7 @@ def _result_dtype(partial: bool, inverse: float | None) -> torch.dtype:
     return torch.float32 if partial else torch.bfloat16 if inverse is None else E4M3
 
 
-def constants(tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int) -> dict[str, int]:
+def constants(tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool = False) -> dict[str, int]:
     """What gemm.cu is compiled with."""
     return {
         "TP_WGS": tile.warpgroups,
@@ -94,19 +112,24 @@ def constants(tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int) -> di
         "TP_CM": tile.cluster_m,
         "TP_CN": tile.cluster_n,
         "TP_SPLITS": tile.splits,
+        "TP_GATHER": int(tile.gather),
         "TP_EPILOGUE": EPILOGUES[epilogue],
         "TP_FP8": 1,
         "TP_OUT_FP8": int(out_fp8),
         "TP_PROMOTE": promote,
+        "TP_RESIDUAL": int(residual),
+        "TP_NORMED": 0,
     }
 
 
 @cache
-def _kernel(tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, device: torch.device) -> DependentKernel:
+def _kernel(
+    tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool, device: torch.device
+) -> DependentKernel:
     with torch.cuda.device(device):
-        cubin = compile_cubin(source(tile.columns, fp8=True), "sm_90a", constants(tile, epilogue, out_fp8, promote))
-        threads = 128 * (tile.warpgroups + 1)
-        return DependentKernel(cubin, "gemm", SHARED_BYTES, threads, tile.cluster)
+        sizes = constants(tile, epilogue, out_fp8, promote, residual)
+        cubin = compile_cubin(source(tile.columns, fp8=True), "sm_90a", sizes)
+        return DependentKernel(cubin, "gemm", SHARED_BYTES, 128 * (tile.warpgroups + 1), tile.cluster)
 
 
 # -- which tile --------------------------------------------------------------------------------------------------------
@@ -116,13 +139,15 @@ def _kernel(tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, device:
 # rows * columns / 32. Partial sums cost as much again in the norm that adds them up.
 FIXED, WRITING, STEP, LOADING, ADDING = 2300, 0.098, 205, 0.013, 0.00042
 
+GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that gather sums may not all fit at once
+
 # The fastest of some 25 tiles each, by [rows, out, in]. Rows count in whole 64, the least that a tile has: so fewer
 # kernels are compiled for all the prompt lengths.
 MEASURED = {
     (512, 3456, 1152): Tile(2, 112, cluster_m=2),
     (512, 1152, 1152): Tile(1, 96),
-    (512, 4304, 1152): Tile(2, 144),
-    (512, 1152, 4304): Tile(1, 80, cluster_m=2),  # a little slower than three parts, whose sum costs the norm 4 us
+    (512, 4304, 1152): Tile(2, 136),
+    (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
     (576, 2560, 2048): Tile(3, 64),
     (576, 2048, 2048): Tile(1, 160),
     (576, 16384, 2048): Tile(3, 192, cluster_n=2),
@@ -159,8 +184,9 @@ def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> fl
 def best_tile(m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> Tile:
     """The measured tile for a @ weightᵀ of [m, k] and [n, k] (GeGLU: [2n, k]), else that of least estimated cost."""
     m = -(-m // 64) * 64
-    if (m, n, k) in MEASURED:
-        return MEASURED[m, n, k]
+    measured = MEASURED.get((m, n, k))
+    if measured is not None and (sms >= GATHERING_SMS or not measured.gather):
+        return measured
     fitting = [tile for tile in candidates(epilogue) if tile.splits <= -(-k // DEPTH)]
     if -(-k // DEPTH) > UNPROMOTED_STEPS:  # long sums need room for promotion
         fitting = [tile for tile in fitting if _short(tile, k) or promotion(tile, k)]

@@ -65,8 +65,8 @@ def _layer_norm_kernel(
     mask = cols < width
     factor = tl.load(weight + cols, mask, 0.0).to(tl.float32)
     offset = tl.load(bias + cols, mask, 0.0).to(tl.float32)
-    wait_for_producer(PDL)
     launch_dependents(PDL)
+    wait_for_producer(PDL)
     if HAS_Y:
         a = _add_residual(x, y, x, out, row, rows, cols, width, mask, SPLITS, False)
     else:

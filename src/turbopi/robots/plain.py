@@ -37,9 +37,8 @@ class Plain(Robot):
     name = "plain"
 
     def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
-        folder = self._folder(observation)
+        folder, sent = self._sent(observation)
         keys = (*(f"{folder}/{camera}" for camera in CAMERAS), "state", "prompt")
-        sent = names_in(observation, folder)
         unexpected = sorted(set(sent) - set(CAMERAS))
         if unexpected or not sent:
             got = listed(unexpected) if unexpected else "no camera"
@@ -51,11 +50,12 @@ class Plain(Robot):
         state = read_state(require(observation, "state", keys), "state", None)
         return RobotInputs(images, mask, state, optional_prompt(observation))
 
-    def _folder(self, observation: Mapping[str, Any]) -> str:
-        both = [folder for folder in ("images", "image") if names_in(observation, folder)]
-        if len(both) == 2:
+    def _sent(self, observation: Mapping[str, Any]) -> tuple[str, list[str]]:
+        """The folder that the pictures are in, and their names."""
+        images, image = names_in(observation, "images"), names_in(observation, "image")
+        if images and image:
             raise ObservationError("the observation has pictures in both `images` and `image`; send one of the two")
-        return both[0] if both else "images"
+        return ("image", image) if image else ("images", images)
 
     def outputs(self, actions: np.ndarray) -> np.ndarray:
         return actions
