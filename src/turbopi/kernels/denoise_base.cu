@@ -60,8 +60,12 @@ static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64
 __host__ __device__ constexpr int group_tiles(int left) { return left < 8 ? left : 8; }
 __host__ __device__ constexpr int group_parts(int tiles) { return tiles > 4 ? W / 8 : W / 4; }
 __host__ __device__ constexpr int plan_groups(int mt) { return most(mt, 8); }
+// Partial sums of all tiles, or of all but one part of each.
 __host__ __device__ constexpr int plan_partials(int mt) {
   return mt <= 0 ? 0 : group_tiles(mt) * group_parts(group_tiles(mt)) + plan_partials(mt - 8);
+}
+__host__ __device__ constexpr int plan_others(int mt) {
+  return mt <= 0 ? 0 : group_tiles(mt) * (group_parts(group_tiles(mt)) - 1) + plan_others(mt - 8);
 }
 constexpr int TAIL = (T - (NT - 1) * 8 + 1) / 2;       // pairs of tokens among the last 8
 constexpr int PARTIAL = (NT - 1) * 512 + TAIL * 128;  // bytes of one tile's partial sums
@@ -130,9 +134,13 @@ constexpr int M_PART = M_SSQ + up128(SQ * NT * 32);  // of this slice, by tile; 
 constexpr int M_RMS = M_PART + up128(DX * NT * 32);  // 1 / rms of each token
 constexpr int M_ROPE = M_RMS + up128(NT * 32);       // if tokens are few: see `make_rope`
 constexpr int M_BAR = M_ROPE + (FEW ? (QTL + KVL) * NT * 512 : 0), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
-              M_LIST = M_BAR + 512, M_RING = M_LIST + up128(MAX_SLOTS * 8);
+              M_LIST = M_BAR + 512, M_SUMS = M_LIST + up128(MAX_SLOTS * 8);
 constexpr int BEYOND = 3 * FRAGMENT;  // of a slot: where the missing ones of 4 tiles are read
-constexpr int STAGES = imin((TP_SMEM - M_RING - BEYOND) / SLOT, 11);
+__host__ __device__ constexpr int plan_stages(int ring) { return imin((TP_SMEM - ring - BEYOND) / SLOT, 11); }
+// Partial sums of gate|up, out and down lie in a place of their own unless that costs a slot.
+constexpr int SUMS_SIZE = up128(imax(plan_others(GTL), plan_others(DX)) * PARTIAL);
+constexpr bool APART = plan_stages(M_SUMS) == plan_stages(M_SUMS + SUMS_SIZE);
+constexpr int M_RING = M_SUMS + (APART ? SUMS_SIZE : 0), STAGES = plan_stages(M_RING);
 static_assert(STAGES >= 2, "too little shared memory");
 
 // Slots of weights that are asked into L2 before they are loaded. With few tokens: only those of gate|up that find no

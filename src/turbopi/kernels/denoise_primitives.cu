@@ -135,6 +135,9 @@ __device__ __forceinline__ void send(u32 to, float4 v, u32 bar) {
       "r"(bar)
       : "memory");
 }
+__device__ __forceinline__ void send(u32 to, uint4 v, u32 bar) {
+  send(to, make_float4(__uint_as_float(v.x), __uint_as_float(v.y), __uint_as_float(v.z), __uint_as_float(v.w)), bar);
+}
 __device__ __forceinline__ void bulk_load(u32 to, const void* from, u32 bytes, u32 bar, u64 policy) {
   asm volatile(
       "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes.L2::cache_hint [%0], [%1], %2, [%3], %4;" ::

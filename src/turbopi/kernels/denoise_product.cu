@@ -24,14 +24,13 @@ __device__ __forceinline__ void give_slot_if(const Block& b, u32 slot, bool real
 __device__ __forceinline__ uint4 load_fragment(const byte* p, int lane) { return *(const uint4*)(p + lane * 16); }
 __device__ __forceinline__ u32 fold(uint4 v) { return v.x; }
 
-// A warp's part in a group of at most TILES_ tiles: its tile, the first of its warpgroup, its part of the reduction.
-template <int TILES_>
+// A warp's share of a group whose reduction has so many parts: its tile, the first of its warpgroup, its part.
 struct Share {
-  static constexpr int PARTS = group_parts(TILES_), ROWS = W / 4 / PARTS;
   int part, first, tile;
-  __device__ __forceinline__ explicit Share(const Block& b) {
+  __device__ __forceinline__ Share(const Block& b, int parts) {
     const int group = __shfl_sync(~0u, b.warp >> 2, 0);  // which the compiler then knows to be the same in all lanes
-    part = group / ROWS, first = group % ROWS * 4, tile = first + (b.warp & 3);
+    const int rows = W / 4 / parts;
+    part = group / rows, first = group % rows * 4, tile = first + (b.warp & 3);
   }
 };
 
@@ -41,7 +40,7 @@ template <int TILES_, int EVEN>
 __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int tiles, float (&sums)[NT * 4]) {
   constexpr int PARTS = group_parts(TILES_), COLUMNS = NT * 8;
   constexpr bool EXACT = EVEN % (KB * PARTS * 4) == 0;
-  const Share<TILES_> my(b);
+  const Share my(b, PARTS);
   const int rounds = plan_rounds(PARTS, blocks), rounds_of_slot = slot_rounds(PARTS, tiles);
   const int first = my.first < tiles ? my.first : 0;
   const u64 weights = operand(b.base + M_RING + (my.part * tiles + first) * FRAGMENT, 256, 128);
@@ -118,14 +117,14 @@ __device__ __forceinline__ int partial_place(const Block& b, int n) {
 template <int MT, int FIRST = 0>
 __device__ __forceinline__ void store_partials(const Block& b, byte* to, int tiles, float (*sums)[NT * 4]) {
   if constexpr (FIRST < MT) {
-    constexpr int N = group_tiles(MT - FIRST);
-    const Share<N> my(b);
+    constexpr int N = group_tiles(MT - FIRST), PARTS = group_parts(N);
+    const Share my(b, PARTS);
     const float* sum = sums[FIRST / 8];
     if (FIRST + my.tile < tiles && my.tile < N) {
 #pragma unroll
       for (int n = 0; n < NT; ++n)
         if (n + 1 < NT || b.t() < TAIL)
-          *(float4*)(to + (plan_partials(FIRST) + my.tile * my.PARTS + my.part) * PARTIAL + partial_place(b, n)) =
+          *(float4*)(to + (plan_partials(FIRST) + my.tile * PARTS + my.part) * PARTIAL + partial_place(b, n)) =
               make_float4(sum[n * 4], sum[n * 4 + 1], sum[n * 4 + 2], sum[n * 4 + 3]);
     }
     store_partials<MT, FIRST + N>(b, to, tiles, sums);
@@ -147,6 +146,70 @@ __device__ __forceinline__ float4 total(const Block& b, const byte* from, int ti
       v[i].x += v[i + d].x, v[i].y += v[i + d].y, v[i].z += v[i + d].z, v[i].w += v[i + d].w;
   return v[0];
 }
+
+// Or else: the warps that share a tile divide its tokens, part p has 8 tokens n = p, p + parts, ... An item is (tile, 8
+// tokens), a warp has OWN of them in each group of tiles.
+template <int MT>
+constexpr int OWN = most(NT, group_parts(group_tiles(MT)));
+template <int MT>
+struct Own {
+  float4 sums[plan_groups(MT)][OWN<MT>];
+  int tile[plan_groups(MT)], n[plan_groups(MT)][OWN<MT>];
+  bool mine[plan_groups(MT)][OWN<MT>];
+
+  __device__ __forceinline__ Own(const Block& b, int tiles) {
+#pragma unroll
+    for (int i = 0; i < plan_groups(MT); ++i) {
+      const int size = group_tiles(MT - i * 8), parts = group_parts(size);
+      const Share my(b, parts);
+      tile[i] = i * 8 + my.tile;
+#pragma unroll
+      for (int k = 0; k < OWN<MT>; ++k)
+        n[i][k] = k * parts + my.part, mine[i][k] = my.tile < size && tile[i] < tiles && n[i][k] < NT;
+    }
+  }
+  // To `sums` come all parts' sums of what is mine. They lie over the operand of the product, or APART.
+  __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
+    byte* const place = b.smem + (APART ? M_SUMS : region);
+    auto other = [&](int i, int parts, int part, int n) {
+      return (float4*)(place + (plan_others(i * 8) + (tile[i] & 7) * (parts - 1) + part) * PARTIAL +
+                       partial_place(b, n));
+    };
+    if (!APART) consumers_sync();
+#pragma unroll
+    for (int i = 0; i < plan_groups(MT); ++i) {
+      const int size = group_tiles(MT - i * 8), parts = group_parts(size);
+      const Share my(b, parts);
+#pragma unroll
+      for (int n = 0; n < NT; ++n) {
+        const float4 sum = make_float4(mixed[i][n * 4], mixed[i][n * 4 + 1], mixed[i][n * 4 + 2], mixed[i][n * 4 + 3]);
+        const int owner = n % parts;
+        if (my.part == owner)
+          sums[i][n / parts] = sum;
+        else if (my.tile < size && tile[i] < tiles && (n + 1 < NT || b.t() < TAIL))
+          *other(i, parts, my.part - (my.part > owner), n) = sum;
+      }
+    }
+    if (APART && plan_groups(MT) == 1) {  // for the warps of my tile
+      __syncwarp();
+      asm volatile("bar.sync %0, %1;" ::"r"(8 + (tile[0] & 7)), "n"(group_parts(group_tiles(MT)) * 32) : "memory");
+    } else {
+      consumers_sync();
+    }
+#pragma unroll
+    for (int i = 0; i < plan_groups(MT); ++i) {
+      const int parts = group_parts(group_tiles(MT - i * 8));
+#pragma unroll
+      for (int k = 0; k < OWN<MT>; ++k)
+        if (mine[i][k])
+#pragma unroll
+          for (int part = 0; part + 1 < parts; ++part) {
+            const float4 v = *other(i, parts, part, n[i][k]);
+            sums[i][k].x += v.x, sums[i][k].y += v.y, sums[i][k].z += v.z, sums[i][k].w += v.w;
+          }
+    }
+  }
+};
 
 // ---- the residual stream. An item is (tile, 8 tokens); lane (g, t) has columns 2g, 2g + 1 of tokens 2t, 2t + 1 of it,
 // as x y (first column) and z w (second). A warp keeps its items in registers for good.
@@ -323,19 +386,20 @@ __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, ui
                        : F16 % NC == 0 && HC % 8 == 0 && QT % 8 == 0 ? 8
                                                                      : 1;
   multiply<DX, EVEN>(b, x, blocks, b.xn(), sums);
-  consumers_sync();
-  store_partials<DX>(b, b.smem + M_H, b.xn(), sums);
-  consumers_sync();
+  Own<DX> own(b, b.xn());
+  own.add_up(b, M_H, b.xn(), sums);
 #pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j) {
-    const Item item = stream_item(b, j);
-    if (item.real) {
-      const float4 c = total<DX>(b, b.smem + M_H, item.tile, item.n);
-      uint2* const word = (uint2*)(partials(b, buffer, item) + b.cluster / 2 * 32) + (b.cluster & 1);
-      publish(word, pack_half(c.x * PARTIAL_SCALE, c.y * PARTIAL_SCALE),
-              pack_half(c.z * PARTIAL_SCALE, c.w * PARTIAL_SCALE), bit);
+  for (int i = 0; i < plan_groups(DX); ++i)
+#pragma unroll
+    for (int k = 0; k < OWN<DX>; ++k) {
+      const int n = own.n[i][k];
+      if (own.mine[i][k] && n * 8 + 2 * b.t() < T) {
+        const float4 c = own.sums[i][k];
+        const uint4* const words = buffer + ((b.x0() + own.tile[i]) * NT + n) * PAIRS * 32 + b.lane;
+        publish((uint2*)(words + b.cluster / 2 * 32) + (b.cluster & 1), pack_half(c.x * PARTIAL_SCALE, c.y * PARTIAL_SCALE),
+                pack_half(c.z * PARTIAL_SCALE, c.w * PARTIAL_SCALE), bit);
+      }
     }
-  }
 }
 
 // x (1 + tanh u) / 2 = x / (1 + exp(-2 u))
@@ -343,51 +407,54 @@ __device__ __forceinline__ float gelu(float x) {
   return __fdividef(x, 1.0f + exp2_approx(-2.302208198f * (x + 0.044715f * x * x * x)));  // 2 sqrt(2 / pi) log2 e
 }
 
-// gate|up and GeGLU: a tile has 8 units' gate rows, then their up rows. Its partial sums lie over the stream in region
-// X, where the next slice arrives only when a peer has all of this rank's hidden units.
+// gate|up and GeGLU: a tile has 8 units' gate rows, then their up rows. The next slice of the stream arrives in region X
+// only when a peer has all of this rank's hidden units.
 __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const float* row_scales) {
-  constexpr int ITEMS = most(GTL * NT, W);
+  constexpr int GROUPS_ = plan_groups(GTL);
   const int gn = b.gn();
-  float2 shift[ITEMS], scale[ITEMS];
+  Own<GTL> own(b, gn);
+  float2 shift[GROUPS_], scale[GROUPS_];
 #pragma unroll
-  for (int j = 0; j < ITEMS; ++j) {
-    const int i = b.warp + j * W;
-    const int row = (QTL + KVL + (i < gn * NT ? i % gn : 0)) * 16 + b.g();
-    shift[j] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
-    if (FP8) scale[j] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
+  for (int i = 0; i < GROUPS_; ++i) {
+    const int row = (QTL + KVL + min(own.tile[i], GTL - 1)) * 16 + b.g();
+    shift[i] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
+    if (FP8) scale[i] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
   }
-  float sums[plan_groups(GTL)][NT * 4];
+  float sums[GROUPS_][NT * 4];
   multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums);
   MARK(15)
-  consumers_sync();
-  store_partials<GTL>(b, b.smem + M_X, gn, sums);
-  consumers_sync();
+  own.add_up(b, M_X, gn, sums);
 #pragma unroll
-  for (int j = 0; j < ITEMS; ++j) {
-    const int i = b.warp + j * W;
-    if (i < gn * NT) {
-      const int tile = i % gn, n = i / gn, at = b.g0() + tile, token = 2 * b.t() + (b.g() & 1);
-      float4 c = total<GTL>(b, b.smem + M_X, tile, n);
-      if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
-      const float2 r = inverse_rms(b, n * 8 + 2 * b.t());
-      const float h0 = gelu(c.x * r.x + shift[j].x) * (c.z * r.x + shift[j].y),
-                  h1 = gelu(c.y * r.y + shift[j].x) * (c.w * r.y + shift[j].y);
-      const float got = exchange(b.g() & 1 ? h0 : h1, 4);
-      const u32 word = b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got),
-                other = exchange(word, 8);  // units g & ~1.. and the next two
-      const u32 to = b.base + M_H + ((at >> 1) * NT + n) * 256 + (at & 1) * 128 + token * 16 + (b.g() >> 2) * 8;
-      if (n * 8 + token < T) {  // two lanes have the same 8 bytes: they share the ranks
-        constexpr int HALF = (S + 1) / 2;
-        const u32 lo = b.g() & 2 ? other : word, hi = b.g() & 2 ? word : other;
-        const int d0 = b.g() & 2 ? HALF : 0;
-        u32 data[HALF], bars[HALF];
+  for (int i = 0; i < GROUPS_; ++i)
 #pragma unroll
-        for (int d = 0; d < HALF; ++d) data[d] = at_rank(to, d0 + d), bars[d] = at_rank(b.bar(BAR_HID), d0 + d);
+    for (int k = 0; k < OWN<GTL>; ++k)
+      if (own.mine[i][k]) {
+        const int n = own.n[i][k], at = b.g0() + own.tile[i], token = 2 * b.t() + (b.g() & 1);
+        float4 c = own.sums[i][k];
+        if (FP8) c = make_float4(c.x * scale[i].x, c.y * scale[i].x, c.z * scale[i].y, c.w * scale[i].y);
+        const float2 r = inverse_rms(b, n * 8 + 2 * b.t());
+        const float h0 = gelu(c.x * r.x + shift[i].x) * (c.z * r.x + shift[i].y),
+                    h1 = gelu(c.y * r.y + shift[i].x) * (c.w * r.y + shift[i].y);
+        // first two, then four, then all 8 units of a token in a lane: four lanes have the same, they share the ranks
+        const float got = exchange(b.g() & 1 ? h0 : h1, 4);
+        const u32 two = b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got), next = exchange(two, 8);
+        const u32 lo = b.g() & 2 ? next : two, hi = b.g() & 2 ? two : next;
+        const u32 far_lo = exchange(lo, 16), far_hi = exchange(hi, 16);
+        const uint4 units =
+            b.g() & 4 ? make_uint4(far_lo, far_hi, lo, hi) : make_uint4(lo, hi, far_lo, far_hi);
+        const u32 to = b.base + M_H + ((at >> 1) * NT + n) * 256 + (at & 1) * 128 + token * 16;
+        if (n * 8 + token < T) {
+          constexpr int QUARTER = most(S, 4);
+          u32 data[QUARTER], bars[QUARTER];
 #pragma unroll
-        for (int d = 0; d < HALF; ++d)
-          if (S % 2 == 0 || d0 + d < S) send(data[d], lo, hi, bars[d]);
+          for (int d = 0; d < QUARTER; ++d) {
+            const int rank = (b.g() >> 1) * QUARTER + d;
+            data[d] = at_rank(to, rank), bars[d] = at_rank(b.bar(BAR_HID), rank);
+          }
+          static_assert(S % 4 == 0, "four lanes share the ranks");
+#pragma unroll
+          for (int d = 0; d < QUARTER; ++d) send(data[d], units, bars[d]);
+        }
       }
-    }
-  }
   if (IDLE && threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_HID), threadIdx.x));
 }
