@@ -46,7 +46,7 @@ constexpr float LOWEST = -3e38f;
 __device__ __forceinline__ int ordered(int v) { return v ^ ((v >> 31) & 0x7fffffff); }
 __device__ __forceinline__ int ordered(float v) { return ordered(__float_as_int(v)); }
 
-// q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
+// Awaits the stream. q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream; queries are sent when all of those have been read, so what a peer sends after it has them may lie there too.
 __device__ __forceinline__ void project(Block& b, const float* shifted, const float* row_scales, float* kv, u32 bit,
                                         const float2 (&rope)[ITEMS_Q][2]) {
@@ -59,6 +59,9 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     shift[j] = make_float2(__ldg(shifted + tile * 16 + b.g()), __ldg(shifted + tile * 16 + b.g() + 8));
     if (FP8) scale[j] = make_float2(__ldg(row_scales + tile * 16 + b.g()), __ldg(row_scales + tile * 16 + b.g() + 8));
   }
+  receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
+  b.x_parity ^= 1;
+  MARK(0)
   float sums[plan_groups(QTL + KVL)][NT * 4];
   multiply<QTL + KVL, D16>(b, b.base + M_X, D16, qn + kvn, sums);
   MARK(1)

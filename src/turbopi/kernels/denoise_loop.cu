@@ -159,13 +159,16 @@ __device__ __forceinline__ void consume(Block& b) {
       for (int half = 0; half < 2; ++half) {  // attention, feed-forward; what they share is one piece of code
         b.forget();
         uint4* const buffer = a.scratch + (half ? B_X1 : B_X2) + (b.n & 1) * N_STREAM;
+        float2 gates[ITEMS_X], scales[ITEMS_X];
+        auto load_norm = [&] {
+          load_columns(b, gates, table + (half ? 5 : 2) * D);
+          load_columns(b, scales, table + (half ? 6 : 3) * D);  // of the next norm, the final one behind the last layer
+        };
         if (half || b.attends()) {
-          receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
-          b.x_parity ^= 1;
-          MARK(half ? 13 : 0)
           if (half) {
             gate_up(b, shifted, row_scales);
             MARK(16)
+            load_norm();
             receive(b, BAR_HID, b.n, expect_hidden, WAIT_HID);
             MARK(17)
           } else {
@@ -175,9 +178,7 @@ __device__ __forceinline__ void consume(Block& b) {
             attend(b, kv, bit, prefix);
           }
         }
-        float2 gates[ITEMS_X], scales[ITEMS_X];
-        load_columns(b, gates, table + (half ? 5 : 2) * D);
-        load_columns(b, scales, table + (half ? 6 : 3) * D);  // of the next norm, the final one behind the last layer
+        if (!half) load_norm();
         if (half || b.attends())
           residual_product(b, b.base + M_H + (half ? 0 : H_ATT), half ? b.hn() : QT, buffer, bit);
         MARK(half ? 18 : 11)

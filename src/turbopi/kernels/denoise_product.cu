@@ -28,8 +28,7 @@ __device__ __forceinline__ u32 fold(uint4 v) { return v.x; }
 struct Share {
   int part, first, tile;
   __device__ __forceinline__ Share(const Block& b, int parts) {
-    const int group = __shfl_sync(~0u, b.warp >> 2, 0);  // which the compiler then knows to be the same in all lanes
-    const int rows = W / 4 / parts;
+    const int group = b.warp >> 2, rows = W / 4 / parts;
     part = group / rows, first = group % rows * 4, tile = first + (b.warp & 3);
   }
 };
@@ -407,7 +406,7 @@ __device__ __forceinline__ float gelu(float x) {
   return __fdividef(x, 1.0f + exp2_approx(-2.302208198f * (x + 0.044715f * x * x * x)));  // 2 sqrt(2 / pi) log2 e
 }
 
-// gate|up and GeGLU: a tile has 8 units' gate rows, then their up rows. The next slice of the stream arrives in region X
+// Awaits the stream. gate|up and GeGLU: a tile has 8 units' gate rows, then their up rows. The next slice of the stream arrives in region X
 // only when a peer has all of this rank's hidden units.
 __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const float* row_scales) {
   constexpr int GROUPS_ = plan_groups(GTL);
@@ -420,6 +419,9 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
     shift[i] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
     if (FP8) scale[i] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
   }
+  receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
+  b.x_parity ^= 1;
+  MARK(13)
   float sums[GROUPS_][NT * 4];
   multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums);
   MARK(15)
