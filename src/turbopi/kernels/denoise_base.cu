@@ -13,11 +13,11 @@
 // So all clusters must run at once. The host asks whether they fit on an idle GPU; work of other streams or processes
 // that never ends would leave them waiting (see `watch`), work that ends only delays them.
 //
-// Units: a "block" is 16 columns of a reduction axis, a "tile" 16 output rows, a "fragment" 512 bytes of a weight matrix
-// (operand A; tokens are operand B): a tile x one block in bfloat16, as the tensor cores read it from shared memory
-// ([8 rows][8 columns][row][16 bytes]), or a tile x two blocks in E4M3, as a warp's lanes hold them. Activations that
-// meet weights lie as [block][8 tokens][8 columns][token][16 bytes], queries and probabilities in the lanes' order,
-// [block][8 tokens][32 lanes][8 bytes], where lane t has columns 2t, 2t+1, 2t+8, 2t+9.
+// Units: a "block" is 16 columns of a reduction axis, a "tile" 16 output rows, a "fragment" 512 bytes of a weight
+// matrix (operand A; tokens are operand B): a tile x one block in bfloat16, as the tensor cores read it from shared
+// memory ([8 rows][8 columns][row][16 bytes]), or a tile x two blocks in E4M3, as a warp's lanes hold them. Activations
+// that meet weights lie as [block][8 tokens][8 columns][token][16 bytes], queries and attention's weights as
+// [block][8 columns][8 tokens][token][16 bytes].
 
 typedef unsigned int u32;
 typedef unsigned long long u64;

@@ -1,5 +1,5 @@
-// Part 3 of 7: asynchronous products of the tensor cores (wgmma). The four warps of a warpgroup together add 64 rows x 16
-// columns of operand A, from shared memory or registers, times 16 columns x COLUMNS tokens of operand B, from shared
+// Part 3 of 7: asynchronous products of the tensor cores (wgmma). The four warps of a warpgroup together add 64 rows x
+// 16 columns of operand A, from shared memory or registers, times 16 columns x COLUMNS tokens of operand B, from shared
 // memory, to float32 sums: warp i has rows 16 i.., laid out as those of mma.m16n8k16, 8 tokens after 8.
 //
 // In shared memory an operand consists of core matrices: 8 rows (or tokens) of 16 bytes, one after the other.
