@@ -60,17 +60,16 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
     const int unit = r * RPS * PARTS + my.part;
     if constexpr (FP8) {
       const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
-      uint4 w[RPS];
-#pragma unroll
-      for (int i = 0; i < RPS; ++i) w[i] = load_fragment(p + i * PARTS * tiles * FRAGMENT, b.lane);
-#pragma unroll
+      uint4 w = load_fragment(p, b.lane);
+#pragma unroll 1  // with room for two fragments, others' registers would spill
       for (int i = 0; i < RPS; ++i) {
-        const uint4 even = from_e4m3(w[i].x, w[i].y), odd = from_e4m3(w[i].z, w[i].w);
+        const uint4 even = from_e4m3(w.x, w.y), odd = from_e4m3(w.z, w.w);
+        if (i + 1 < RPS) w = load_fragment(p + (i + 1) * PARTS * tiles * FRAGMENT, b.lane);
         begin_products();
         add_product<COLUMNS>(sums, even, activations(unit + i * PARTS, 0), r | i);
         add_product<COLUMNS>(sums, odd, activations(unit + i * PARTS, 1), 1);
         commit_products();
-        await_products<1>();
+        await_products<0>();  // it reads these registers; other warpgroups multiply meanwhile
       }
       if (--left == 0 || r + 1 == rounds) give_slot(b, slot);
     } else {
