@@ -101,14 +101,6 @@ __device__ __forceinline__ u32 at_rank(u32 address, int rank) {
   asm volatile("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(x) : "r"(address), "r"(rank));
   return x;
 }
-// An address at all ranks. All of them first, as a send reads its registers late.
-struct Everyone {
-  u32 at[S];
-  __device__ __forceinline__ explicit Everyone(u32 address) {
-#pragma unroll
-    for (int d = 0; d < S; ++d) at[d] = at_rank(address, d);
-  }
-};
 __device__ __forceinline__ void send(u32 to, u32 v, u32 bar) {
   asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.b32 [%0], %1, [%2];" ::"r"(to), "r"(v),
                "r"(bar)

@@ -138,18 +138,24 @@ __device__ __forceinline__ Item stream_item(const Block& b, int j) {
   const int tile = i < xn * NT ? i % xn : 0, n = i < xn * NT ? i / xn : 0;
   return {tile, n, n * 8 + 2 * b.t(), i < xn * NT && n * 8 + 2 * b.t() < T};
 }
-// Permuted order: 8 bytes with the lane pair's four positions 2g.. of one token (even g: 2t, odd g: 2t + 1) to all
-// ranks.
+// Permuted order: 16 bytes with eight columns of one token (even g: 2t, odd g: 2t + 1) to all ranks. Two lanes come to
+// have the same: they share the ranks.
 __device__ __forceinline__ void send_columns(const Block& b, int region, int block, int n, float4 v, int bar,
                                              bool real) {
-  const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
-  const int token = 2 * b.t() + (b.g() & 1);
-  const u32 to = b.base + region + (block * NT + n) * 256 + (token * 4 + (b.g() >> 1)) * 8;
+  const bool odd = b.g() & 1, high = b.g() & 2;
+  const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(odd ? w0 : w1, 4);
+  const u32 x = odd ? got : w0, y = odd ? w1 : got, other_x = exchange(x, 8), other_y = exchange(y, 8);
+  const int token = 2 * b.t() + (b.g() & 1), d0 = high ? S / 2 : 0;
+  const u32 to = b.base + region + (block * NT + n) * 256 + token * 32 + (b.g() >> 2) * 16;
+  static_assert(S % 2 == 0, "half of the ranks each");
   if (real && n * 8 + token < T) {
-    const u32 lo = b.g() & 1 ? got : w0, hi = b.g() & 1 ? w1 : got;
-    const Everyone data(to), bars(b.bar(bar));
+    const float4 all = make_float4(__uint_as_float(high ? other_x : x), __uint_as_float(high ? other_y : y),
+                                   __uint_as_float(high ? x : other_x), __uint_as_float(high ? y : other_y));
+    u32 data[S / 2], bars[S / 2];
 #pragma unroll
-    for (int d = 0; d < S; ++d) send(data.at[d], lo, hi, bars.at[d]);
+    for (int d = 0; d < S / 2; ++d) data[d] = at_rank(to, d0 + d), bars[d] = at_rank(b.bar(bar), d0 + d);
+#pragma unroll
+    for (int d = 0; d < S / 2; ++d) send(data[d], all, bars[d]);
   }
 }
 // Sums of squares to all ranks, which add them up. If tokens are few every warp sends those of its tiles, as soon as it
