@@ -125,7 +125,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
 }
 constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
 
-// Who does what: the first SCORERS warps score a tile of prefix keys each, and another, if there are more; the last four
+// Who does what: the first SCORERS warps score a tile of prefix keys each, or two if there are more; the last four
 // score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries. If
 // tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries and
 // weights; else all warps weigh, and the third warpgroup fetches the suffix's values.
@@ -195,7 +195,9 @@ struct SuffixPart {
   u32 bit;
   int kind, me, threads, row0, rows, first, quads;
   uint4 v[MOST];
-  __device__ __forceinline__ int item(int i) const { return min(me + i * threads, rows * quads - 1); }  // the last twice
+  __device__ __forceinline__ int item(int i) const {  // the last more than once
+    return min(me + i * threads, rows * quads - 1);
+  }
   __device__ __forceinline__ const uint4* place(int i) const {
     return (const uint4*)(kv + size_t(row0 + item(i) / quads) * 2 * HD + kind * HD) + first + item(i) % quads;
   }
