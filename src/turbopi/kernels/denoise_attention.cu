@@ -123,22 +123,14 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
 }
 constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
 
-// Who does what: the first SCORERS warps take a tile of prefix keys each, and the next, if there are more; the last four
-// share the suffix's keys, a quarter of the columns each; the third warpgroup fetches the suffix's values. If registers
-// allow (HOLD), keys and values are in them before queries come, and scoring warps have no part in the values.
+// Who does what: the first SCORERS warps score a tile of prefix keys each, or two if there are more; the last four
+// score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries. If
+// tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries and
+// weights; else all warps weigh, and the third warpgroup fetches the suffix's values.
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
-#ifndef TP_HV
-#define TP_HV 4
-#endif
-constexpr int HELD_TILES = KT < TP_HV ? KT : TP_HV;
-#ifndef TP_HK
-#define TP_HK 12
-#endif
-#ifndef TP_U
-#define TP_U 4
-#endif
-constexpr int HELD_KEYS = QT < TP_HK ? QT : TP_HK;
+// Blocks of its keys that a scoring warp holds, tiles of values that a weighing warp does: more would spill.
+constexpr int HELD_KEYS = QT < 12 ? QT : 12, HELD_TILES = KT < 4 ? KT : 4;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
 constexpr int SUFFIX_STEPS = most(QT, 4);                                   // blocks of columns of a suffix warp
 // Barriers of some warps; 1 is consumers_sync's.
@@ -193,15 +185,17 @@ __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int
   return seen;
 }
 
-// Suffix keys (kind 0) or values (1) from all clusters to shared memory: of `rows` of them, from `row0` on, `quads` times
-// four columns from quad `first` on, by `threads` threads.
+// Suffix keys (kind 0) or values (1) from all clusters to shared memory, asked for first and kept later: of `rows` of
+// them, from `row0` on, `quads` times four columns from quad `first` on, by `threads` threads.
 template <int MOST>
 struct SuffixPart {
   const float* kv;
   u32 bit;
   int kind, me, threads, row0, rows, first, quads;
   uint4 v[MOST];
-  __device__ __forceinline__ int item(int i) const { return min(me + i * threads, rows * quads - 1); }  // the last twice
+  __device__ __forceinline__ int item(int i) const {  // the last more than once
+    return min(me + i * threads, rows * quads - 1);
+  }
   __device__ __forceinline__ const uint4* place(int i) const {
     return (const uint4*)(kv + size_t(row0 + item(i) / quads) * 2 * HD + kind * HD) + first + item(i) % quads;
   }
@@ -285,6 +279,7 @@ __device__ __forceinline__ void store_weights(const Block& b, const float (&c)[N
       *(u32*)(p + n * 128 + i * 16) = pack(exp2_approx(c[n][i] - at), exp2_approx(c[n][i + 2] - at));
     }
 }
+// The largest logits of the rank's prefix.
 __device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT]) {
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
@@ -292,8 +287,7 @@ __device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT]) {
     top[n] = make_float2(__int_as_float(ordered(v.x)), __int_as_float(ordered(v.y)));
   }
 }
-// Scoring warps: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist, by the
-// largest logits of the rank's prefix.
+// Scoring warps: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist.
 template <int R>
 __device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4], int tile, int rows) {
   float2 top[NT];
@@ -440,7 +434,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   };
   if constexpr (HOLD) {
     if (scorer) {
-      uint4 keys[HELD_KEYS];
+      uint4 keys[HELD_KEYS];  // zeros at first, or ptxas believes that those of the last layer are still wanted
 #pragma unroll
       for (int k = 0; k < HELD_KEYS; ++k) keys[k] = make_uint4(0, 0, 0, 0);
       u32 mine = b.slot;  // the slot of this warp's tile
@@ -467,7 +461,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         float rest[NT][4];
         score<HELD_KEYS, HELD_KEYS>(b, [&](int k) { return keys[k]; }, 0, QT, c[0]);
         auto fetch = [&](int k) { return load_fragment(from + (HELD_KEYS + k) * FRAGMENT, b.lane); };
-        const u32 seen = score<QT - HELD_KEYS, TP_U>(b, fetch, HELD_KEYS, QT, rest);
+        const u32 seen = score<QT - HELD_KEYS, 4>(b, fetch, HELD_KEYS, QT, rest);
 #pragma unroll
         for (int n = 0; n < NT; ++n)
 #pragma unroll
@@ -485,13 +479,13 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       }
     } else {
       pass();
-      uint4 values[HELD_TILES][CT];
+      uint4 values[HELD_TILES][CT];  // zeros at first, as the keys
       auto load = [&](u32 slot, int i, int j) {
         return load_fragment(b.ring(slot) + i * KEY_TILE + (column + j) * FRAGMENT, b.lane);
       };
       auto exists = [&](int j) { return QT % WEIGHERS == 0 || column + j < QT; };
 #pragma unroll
-      for (int i = 0; i < HELD_TILES; ++i)  // or ptxas believes that those of the last layer are still wanted
+      for (int i = 0; i < HELD_TILES; ++i)
 #pragma unroll
         for (int j = 0; j < CT; ++j) values[i][j] = make_uint4(0, 0, 0, 0);
       u32 slot = 0;

@@ -101,7 +101,8 @@ constexpr bool IDLE = 2 * (F16 / NC) < S, IDLE_Q = QT < S;  // the same of queri
 // Region X holds the stream (operand of qkv and gate|up). When those have read it, their partial sums lie there, then
 // attention's weights, suffix keys and values, and the partial outputs that other ranks send.
 //   sums of qkv over the stream: nothing is sent to X before a peer has this rank's queries, sent when they are read
-//   attention's outputs over them: so they land later still; the next slice follows attention's maxima of all ranks
+//   attention's outputs over them: so they land later still; the next slice follows the attention of all ranks, and
+//   that the outputs of all ranks, which their warps send when they have weighed
 //   sums of gate|up over the stream: the next slice lands when a peer has this rank's hidden units, made of those sums
 constexpr int X_BYTES = D16 * NT * 256;
 constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * 512;
@@ -207,7 +208,9 @@ struct Block {
   }
   // Make the compiler forget what these are made of: what it derives from them it would keep in registers, or in local
   // memory, over all layers, and a fetch from there costs more than to derive it again.
-  __device__ __forceinline__ void forget() { asm volatile("" : "+r"(base), "+r"(cluster), "+r"(rank), "+r"(warp), "+r"(lane)); }
+  __device__ __forceinline__ void forget() {
+    asm volatile("" : "+r"(base), "+r"(cluster), "+r"(rank), "+r"(warp), "+r"(lane));
+  }
   __device__ __forceinline__ int g() const { return lane >> 2; }  // a lane's place in the tensor cores' operands
   __device__ __forceinline__ int t() const { return lane & 3; }
   __device__ __forceinline__ u32 bar(int i) const { return base + M_BAR + i * 8; }
@@ -231,10 +234,10 @@ struct Block {
   __device__ __forceinline__ int kvn() const { return share(KVT, NH * S, cluster * S + rank + 1) - kv0(); }
 };
 
-// Cycles up to each mark, summed up: 0 stream here, 1 qkv multiplied, 2 sent, 3 queries here, 4 prefix scored, 5 weights
-// here, 6 values weighed, 7 largest logits here, 8 outputs here, 9 combined, 10 attention here, 11 out, 12 sent, 13 stream
-// here, 15 gate|up multiplied, 16 sent, 17 hidden here, 18 down, 14 sent, 19 embedded, 20 step done. Before 12 and 14:
-// 21 and 22 partial sums here.
+// Cycles up to each mark, summed up: 0 stream here, 1 qkv multiplied, 2 sent, 3 queries here, 4 prefix scored, 5 its
+// weights stored (beyond 16 tokens: all weights here), 6 sent what this warp has of outputs, 7 largest logits of all
+// ranks here, 8 outputs here, 9 combined, 10 attention here, 11 out, 12 sent, 13 stream here, 15 gate|up multiplied,
+// 16 sent, 17 hidden here, 18 down, 14 sent, 19 embedded, 20 step done. Before 12 and 14: 21 and 22 partial sums here.
 #ifdef TP_TRACE
 #define MARK(i)                              \
   if (threadIdx.x == 0) {                    \

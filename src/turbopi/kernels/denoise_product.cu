@@ -277,7 +277,7 @@ __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[I
   }
 }
 constexpr u32 SQUARES_EXPECT = FEW ? SQ * ((T + 1) / 2) * 8 : SQ * T * 4;
-// 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a warp that has nothing else to do makes it.
+// 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a spare warp makes them.
 __device__ __forceinline__ float2 inverse_rms(const Block& b, int token) {
   mbar_wait(b.bar(BAR_RMS), b.x_parity ^ 1);
   return *(const float2*)(b.smem + M_RMS + token * 4);
