@@ -34,7 +34,11 @@ from turbopi.kernels.denoise_plain import affine, inverse_frequencies
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
 
 PARTS = tuple(
-    f"denoise_{part}.cu" for part in ("base", "primitives", "wgmma", "producer", "product", "attention", "loop")
+    f"denoise_{part}.cu"
+    for part in (
+        *("base", "primitives", "wgmma", "producer", "product", "stream"),
+        *("project", "score", "attention", "loop"),
+    )
 )
 THREADS = (WARPS + 4) * 32
 # `What` of denoise_primitives.cu

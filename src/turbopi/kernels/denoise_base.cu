@@ -1,5 +1,5 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
-// Part 1 of 7, which denoise.py puts together: sizes, shared memory, a CTA's view.
+// Part 1 of 10, which denoise.py puts together: sizes, shared memory, a CTA's view.
 //
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
@@ -54,9 +54,9 @@ constexpr int ITEMS_X = most(DX * NT, W);  // (tile, 8 tokens) of the slice that
 static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NC >= NH && A <= CONSUMERS,
               "sizes");
 
-// A product's tiles are multiplied in groups of up to 8. A warpgroup multiplies 4 tiles at once, a warp one of them; the
-// warpgroups form rows of tiles and `parts` of the reduction. Tiles that are missing are multiplied, too: whatever lies
-// there, it makes rows of its own, which nobody reads.
+// A product's tiles are multiplied in groups of up to 8. A warpgroup multiplies 4 tiles at once, a warp one of them;
+// the warpgroups form rows of tiles and `parts` of the reduction. Tiles that are missing are multiplied, too: whatever
+// lies there, it makes rows of its own, which nobody reads.
 __host__ __device__ constexpr int group_tiles(int left) { return left < 8 ? left : 8; }
 __host__ __device__ constexpr int group_parts(int tiles) { return tiles > 4 ? W / 8 : W / 4; }
 __host__ __device__ constexpr int plan_groups(int mt) { return most(mt, 8); }
@@ -153,11 +153,12 @@ enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO
 
 // ---- scratch in global memory, in 16-byte words
 
-// Partial sums of the stream, of all clusters: float16, since polls of float32 take twice as long as they must. A lane's
-// four of two clusters lie side by side, so the word's lowest bit, the flag, is the lowest bit of every other number.
+// Partial sums of the stream, of all clusters: float16, for half the bytes that polls read. A lane's four of two
+// clusters lie side by side; a word's lowest bit, the flag, is that of every other number.
 constexpr int PAIRS = most(NC, 2);
 constexpr size_t N_STREAM = size_t(D16) * NT * PAIRS * 32;
-constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;  // against float16's end; E4M3's sums lack their scales
+// Keeps them within float16's range; sums of E4M3 weights lack their scales yet.
+constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;
 constexpr size_t N_KV = size_t(T) * HD / 2;              // suffix keys and values, float32[T][2 HD]
 constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM, SCRATCH = B_KV + 2 * N_KV;
 static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");

@@ -1,4 +1,4 @@
-// Part 7 of 7: between steps, the loop, the kernel.
+// Part 10 of 10: between steps, the loop, the kernel.
 
 constexpr int GROUPS = CONSUMERS / A, HELD = most(T, GROUPS);  // threads per action number, tokens each of them keeps
 

@@ -1,4 +1,4 @@
-// Part 2 of 7: waiting, moving data, arithmetic.
+// Part 2 of 10: waiting, moving data, arithmetic.
 
 // ---- waiting
 
@@ -211,7 +211,8 @@ __device__ __forceinline__ void mma(float (&c)[4], uint4 a, uint2 b) {
       : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
       : "r"(a.x), "r"(a.y), "r"(a.z), "r"(a.w), "r"(b.x), "r"(b.y));
 }
-// Operand A of a tile x one block: of E4M3 weights a lane has columns 2t, 2t + 1, 2t + 8, 2t + 9 of row g, and of g + 8.
+// Operand A of a tile x one block: of E4M3 weights a lane has columns 2t, 2t + 1, 2t + 8, 2t + 9 of row g, and of
+// g + 8.
 __device__ __forceinline__ uint4 from_e4m3(u32 row, u32 row_8) {
   uint4 a;
   asm("{.reg .b16 lo, hi; mov.b32 {lo, hi}, %4; cvt.rn.f16x2.e4m3x2 %0, lo; cvt.rn.f16x2.e4m3x2 %2, hi;"

@@ -150,8 +150,9 @@ class VisionTower:
     """Its products. Those in front of a LayerNorm add the residual stream themselves, those behind do the norm."""
 
     def __init__(self) -> None:
-        self._folded: dict[int, Folded] = {}  # by the weight's address, as are the next two
-        self._behind: dict[int, Tensor] = {}  # which matrix came behind it last time
+        # by the weight's address; the weight stays with it, so that no other one can come to lie there
+        self._folded: dict[int, tuple[Tensor, Folded]] = {}
+        self._behind: dict[int, Tensor] = {}  # which matrix came behind the one at this address last time: a hint
         self._last: Tensor | None = None
 
     def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
@@ -203,8 +204,8 @@ class VisionTower:
             return None
         key = weight.data_ptr()
         if key not in self._folded:
-            self._folded[key] = Folded.fold(weight, bias, x.scale, x.shift)
-        folded = self._folded[key]
+            self._folded[key] = weight, Folded.fold(weight, bias, x.scale, x.shift)
+        folded = self._folded[key][1]
         return matmul(x.x, folded, tile, epilogue, sums=x.sums, eps=x.eps, ahead=self._next(folded.data))
 
     def _next(self, matrix: Matrix) -> Tensor | None:

@@ -1,0 +1,254 @@
+// Part 6 of 10: the residual stream, and what goes into it: sums across clusters, GeGLU.
+
+// An item is (tile, 8 tokens); lane (g, t) has columns 2g, 2g + 1 of tokens 2t, 2t + 1 of it, as x y (first column) and
+// z w (second). A warp keeps its items in registers for good.
+
+struct Item {
+  int tile, n, token;  // token: the lane's first
+  bool real;           // of this warp, and tokens that exist
+};
+__device__ __forceinline__ Item stream_item(const Block& b, int j) {
+  const int i = b.warp + j * W, xn = b.xn();
+  const int tile = i < xn * NT ? i % xn : 0, n = i < xn * NT ? i / xn : 0;
+  return {tile, n, n * 8 + 2 * b.t(), i < xn * NT && n * 8 + 2 * b.t() < T};
+}
+// 8 bytes with the lane pair's four columns 2g.. of one token (even g: 2t, odd g: 2t + 1) to all ranks.
+__device__ __forceinline__ void send_columns(const Block& b, int region, int block, int n, float4 v, int bar,
+                                             bool real) {
+  const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
+  const int token = 2 * b.t() + (b.g() & 1);
+  const u32 to = b.base + region + (block * NT + n) * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8;
+  if (real && n * 8 + token < T) {
+    const u32 lo = b.g() & 1 ? got : w0, hi = b.g() & 1 ? w1 : got;
+    const Everyone data(to), bars(b.bar(bar));
+#pragma unroll
+    for (int d = 0; d < S; ++d) send(data.at[d], lo, hi, bars.at[d]);
+  }
+}
+// Sums of squares to all ranks, which add them up. If tokens are few every warp sends those of its tiles, as soon as it
+// has them; else they are added up for the slice before.
+__device__ __forceinline__ void send_tile_squares(const Block& b, float4 x, int i, int bar) {
+  const int xn = b.xn(), absent = i - xn * NT;  // tiles that a rank lacks are sent as zeros
+  if (i >= DX * NT) return;
+  const int lacks = imax(DX - xn, 1);
+  const int tile = absent < 0 ? i % xn : xn + absent % lacks, n = absent < 0 ? i / xn : absent / lacks;
+  float q0 = x.x * x.x + x.z * x.z, q1 = x.y * x.y + x.w * x.w;
+#pragma unroll
+  for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
+  if (absent >= 0) q0 = q1 = 0;
+  static_assert(S == 8, "lane g serves rank g");
+  const u32 to = b.base + M_SSQ + ((b.rank * DX + tile) * NT * 8 + n * 8 + 2 * b.t()) * 4;
+  if (n * 8 + 2 * b.t() < T)
+    send(at_rank(to, b.g()), __float_as_uint(q0), __float_as_uint(q1), at_rank(b.bar(bar), b.g()));
+}
+__device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[ITEMS_X], int bar) {
+  if constexpr (FEW) {
+#pragma unroll
+    for (int j = 0; j < ITEMS_X; ++j) send_tile_squares(b, x[j], b.warp + j * W, bar);
+    return;
+  }
+  float* part = (float*)(b.smem + M_PART);
+#pragma unroll
+  for (int j = 0; j < ITEMS_X; ++j) {
+    const Item item = stream_item(b, j);
+    float q0 = x[j].x * x[j].x + x[j].z * x[j].z, q1 = x[j].y * x[j].y + x[j].w * x[j].w;
+#pragma unroll
+    for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
+    if (item.real && b.g() == 0) *(float2*)(part + (item.tile * NT + item.n) * 8 + 2 * b.t()) = make_float2(q0, q1);
+  }
+  consumers_sync();
+  static_assert(T * S <= CONSUMERS, "a thread for each token and rank");
+  if (const int i = threadIdx.x; i < T * S) {
+    const int token = i / S, d = i % S;
+    float sum = 0;
+#pragma unroll
+    for (int tile = 0; tile < DX; ++tile)
+      if (tile < b.xn()) sum += part[tile * NT * 8 + token];
+    send(at_rank(b.base + M_SSQ + (b.rank * NT * 8 + token) * 4, d), __float_as_uint(sum), at_rank(b.bar(bar), d));
+  }
+}
+constexpr u32 SQUARES_EXPECT = FEW ? SQ * ((T + 1) / 2) * 8 : SQ * T * 4;
+// 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a spare warp makes them.
+__device__ __forceinline__ float2 inverse_rms(const Block& b, int token) {
+  mbar_wait(b.bar(BAR_RMS), b.x_parity ^ 1);
+  return *(const float2*)(b.smem + M_RMS + token * 4);
+}
+__device__ __forceinline__ void make_inverse_rms(const Block& b) {
+  const int uses = b.a.steps * L * (b.attends() ? 2 : 1);
+#pragma unroll 1
+  for (int use = 0; use < uses; ++use) {
+    mbar_wait(b.bar(BAR_X), use & 1);
+#pragma unroll 1
+    for (int token = b.lane; token < NT * 8; token += 32) {
+      float sum = 0;
+#pragma unroll 8
+      for (int s = 0; s < SQ; ++s) sum += *(const float*)(b.smem + M_SSQ + (s * NT * 8 + token) * 4);
+      *(float*)(b.smem + M_RMS + token * 4) = rsqrtf(sum * (1.0f / D) + b.a.eps);
+    }
+    __syncwarp();
+    if (b.lane == 0) mbar_arrive(b.bar(BAR_RMS));
+  }
+}
+constexpr u32 X_EXPECT = D16 * T * 32 + SQUARES_EXPECT;
+
+// A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
+__device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X], const float* row) {
+#pragma unroll
+  for (int j = 0; j < ITEMS_X; ++j)
+    v[j] = __ldg((const float2*)(row + (b.x0() + stream_item(b, j).tile) * 16 + 2 * b.g()));
+}
+
+// Partial sums of an item of the stream from all clusters, two in a word.
+constexpr int FETCH = most(NH, 2) < 4 ? most(NH, 2) : 4;  // words at a time: no more than there ever are
+__device__ __forceinline__ const uint4* partials(const Block& b, const uint4* buffer, Item item) {
+  return buffer + ((b.x0() + item.tile) * NT + item.n) * PAIRS * 32 + b.lane;
+}
+// Asks until what `parts` clusters send is there, in words `first` and on; adds it up, without what comes before
+// `from`.
+__device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int from, int parts, u32 bit) {
+  uint4 v[FETCH];
+#pragma unroll
+  for (int i = 0; i < FETCH; ++i) v[i] = peek(p + i * 32);
+#pragma unroll 1
+  for (;;) {
+    bool again = false;
+#pragma unroll
+    for (int i = 0; i < FETCH; ++i) {
+      const bool both = (NC % 2 == 0 && NH % 2 == 0) || 2 * (first + i) + 1 < parts;
+      if (((v[i].x ^ bit) | (v[i].y ^ bit) | (both ? (v[i].z ^ bit) | (v[i].w ^ bit) : 0)) & 1)
+        v[i] = peek(p + i * 32), again = true;
+    }
+    if (!again) break;
+  }
+#pragma unroll
+  for (int i = 0; i < FETCH; ++i) {
+    const bool both = (NC % 2 == 0 && NH % 2 == 0) || 2 * (first + i) + 1 < parts;
+    if (PAIRS == FETCH || first + i >= from) {
+      const float2 a = unpack_half(v[i].x), c = unpack_half(v[i].y);
+      sum.x += a.x, sum.y += a.y, sum.z += c.x, sum.w += c.y;
+      if (both) {
+        const float2 a1 = unpack_half(v[i].z), c1 = unpack_half(v[i].w);
+        sum.x += a1.x, sum.y += a1.y, sum.z += c1.x, sum.w += c1.y;
+      }
+    }
+  }
+}
+
+// Fetch `parts` clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
+// slice times the next norm's scale to all ranks. buffer: [D16][NT][PAIRS][32] 16-byte words.
+__device__ __forceinline__ void gather(const Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
+                                       const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
+                                       int half) {
+  for (const u32 since = u32(clock64()); u32(clock64()) - since < PATIENCE;);
+#pragma unroll
+  for (int j = 0; j < ITEMS_X; ++j) {
+    const Item item = stream_item(b, j);
+    const uint4* p = partials(b, buffer, item);
+    if (item.real) {
+      float4 sum = make_float4(0, 0, 0, 0);
+#pragma unroll 1
+      for (int from = 0, words = most(parts, 2); from < words; from += FETCH) {
+        const int first = min(from, max(words - FETCH, 0));  // the last round may ask for what the one before had
+        take(sum, p + first * 32, first, from, parts, bit);
+      }
+      const float2 gate = make_float2(gates[j].x / PARTIAL_SCALE, gates[j].y / PARTIAL_SCALE);
+      x[j].x += gate.x * sum.x, x[j].y += gate.x * sum.y, x[j].z += gate.y * sum.z, x[j].w += gate.y * sum.w;
+    }
+    __syncwarp();
+    if (j == 0) {
+      MARK(21 + half)
+    }
+    if (send_on) {
+      const float4 y =
+          make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
+      send_columns(b, M_X, b.x0() + item.tile, item.n, y, BAR_X, item.real);
+    }
+  }
+  if (send_on) send_squares(b, x, BAR_X);
+}
+
+// A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
+// sums lie over its own operand, region H. Nothing for region H can arrive before it is read: a peer sends queries or
+// hidden units only when it has this rank's whole slice of the stream, which follows what is published here.
+__device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, uint4* buffer, u32 bit) {
+  float sums[plan_groups(DX)][NT * 4];
+  constexpr int EVEN = F16 % NC == 0 && HC % 16 == 0 && QT % 16 == 0 ? 16
+                       : F16 % NC == 0 && HC % 8 == 0 && QT % 8 == 0 ? 8
+                                                                     : 1;
+  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums);
+  Own<DX> own(b, b.xn());
+  own.add_up(b, M_H, b.xn(), sums);
+#pragma unroll
+  for (int i = 0; i < plan_groups(DX); ++i)
+#pragma unroll
+    for (int k = 0; k < OWN<DX>; ++k) {
+      const int n = own.n[i][k];
+      if (own.mine[i][k] && n * 8 + 2 * b.t() < T) {
+        const float4 c = own.sums[i][k];
+        const uint4* const words = buffer + ((b.x0() + own.tile[i]) * NT + n) * PAIRS * 32 + b.lane;
+        publish((uint2*)(words + b.cluster / 2 * 32) + (b.cluster & 1),
+                pack_half(c.x * PARTIAL_SCALE, c.y * PARTIAL_SCALE),
+                pack_half(c.z * PARTIAL_SCALE, c.w * PARTIAL_SCALE), bit);
+      }
+    }
+}
+
+// x (1 + tanh u) / 2 = x / (1 + exp(-2 u))
+__device__ __forceinline__ float gelu(float x) {
+  return __fdividef(x, 1.0f + exp2_approx(-2.302208198f * (x + 0.044715f * x * x * x)));  // 2 sqrt(2 / pi) log2 e
+}
+
+// Awaits the stream. gate|up and GeGLU: a tile has 8 units' gate rows, then their up rows. The next slice of the stream
+// arrives in region X only when a peer has all of this rank's hidden units.
+__device__ __forceinline__ void gate_up(Block& b, const float* shifted, const float* row_scales) {
+  constexpr int GROUPS_ = plan_groups(GTL);
+  const int gn = b.gn();
+  Own<GTL> own(b, gn);
+  float2 shift[GROUPS_], scale[GROUPS_];
+#pragma unroll
+  for (int i = 0; i < GROUPS_; ++i) {
+    const int row = (QTL + KVL + min(own.tile[i], GTL - 1)) * 16 + b.g();
+    shift[i] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
+    if (FP8) scale[i] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
+  }
+  receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
+  b.x_parity ^= 1;
+  MARK(13)
+  float sums[GROUPS_][NT * 4];
+  multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums);
+  MARK(15)
+  own.add_up(b, M_X, gn, sums);
+#pragma unroll
+  for (int i = 0; i < GROUPS_; ++i)
+#pragma unroll
+    for (int k = 0; k < OWN<GTL>; ++k)
+      if (own.mine[i][k]) {
+        const int n = own.n[i][k], at = b.g0() + own.tile[i], token = 2 * b.t() + (b.g() & 1);
+        float4 c = own.sums[i][k];
+        if (FP8) c = make_float4(c.x * scale[i].x, c.y * scale[i].x, c.z * scale[i].y, c.w * scale[i].y);
+        const float2 r = inverse_rms(b, n * 8 + 2 * b.t());
+        const float h0 = gelu(c.x * r.x + shift[i].x) * (c.z * r.x + shift[i].y),
+                    h1 = gelu(c.y * r.y + shift[i].x) * (c.w * r.y + shift[i].y);
+        // first two, then four, then all 8 units of a token in a lane: four lanes have the same, they share the ranks
+        const float got = exchange(b.g() & 1 ? h0 : h1, 4);
+        const u32 two = b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got), next = exchange(two, 8);
+        const u32 lo = b.g() & 2 ? next : two, hi = b.g() & 2 ? two : next;
+        const u32 far_lo = exchange(lo, 16), far_hi = exchange(hi, 16);
+        const uint4 units =
+            b.g() & 4 ? make_uint4(far_lo, far_hi, lo, hi) : make_uint4(lo, hi, far_lo, far_hi);
+        const u32 to = b.base + M_H + ((at >> 1) * NT + n) * 256 + (at & 1) * 128 + token * 16;
+        if (n * 8 + token < T) {
+          constexpr int QUARTER = most(S, 4);
+          u32 data[QUARTER], bars[QUARTER];
+#pragma unroll
+          for (int d = 0; d < QUARTER; ++d) {
+            const int rank = (b.g() >> 1) * QUARTER + d;
+            data[d] = at_rank(to, rank), bars[d] = at_rank(b.bar(BAR_HID), rank);
+          }
+          static_assert(S % 4 == 0, "four lanes share the ranks");
+#pragma unroll
+          for (int d = 0; d < QUARTER; ++d) send(data[d], units, bars[d]);
+        }
+      }
+  if (IDLE && threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_HID), threadIdx.x));
+}
