@@ -161,11 +161,11 @@ def test_time_in_which_the_device_waits_for_the_host_is_the_prefixs() -> None:
     runner: Any = backend("fused", "pi05", "bf16")
     observation, noise = made_up("pi05", 2, 5)
     row = HostRow.of(observation, 0)
-    for wait in (0, 0.05):
+    for wait in (0, 0.5):  # the first captures; other processes may use the GPU, too
         begun = runner.begin(row.images)
         time.sleep(wait)
         stage_ms = begun.finish(row.tokens, row.state, noise[0].numpy(), 3).stage_ms
-    assert stage_ms["prefix"] > 40 > stage_ms["vision"]
+    assert stage_ms["prefix"] > 400 > stage_ms["vision"]
 
 
 def test_tf32_stays_out_of_the_oracle() -> None:

@@ -101,6 +101,7 @@ def matmul(
     folded, weight = (weight, weight.data) if isinstance(weight, Folded) else (None, weight)
     assert (folded is None) == (sums is None) and (folded is None or (bias is None and epilogue in ("bias", "gelu")))
     assert residual is None or (epilogue == "bias" and residual.is_contiguous() and sums_out is not None)
+    assert not tile.gather or (epilogue != "geglu" and folded is None), "sums are gathered after that"
     m, k = a.shape
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
     assert a.dtype == weight.dtype == torch.bfloat16 and a.is_contiguous() and weight.is_contiguous()

@@ -74,6 +74,7 @@ def matmul_fp8(
     assert tile.columns % (8 * pieces) == 0 and tile.rows % (8 * tile.cluster_n) == 0, "a share is whole groups of 8"
     partial = epilogue == "partial"
     assert (tile.splits == 1 or partial) != tile.gather, "only partial sums stay split"
+    assert not tile.gather or epilogue != "geglu", "sums are gathered after that"
     assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu"))
     if out is None:
         shape = (tile.splits, m, n) if partial else (m, n)

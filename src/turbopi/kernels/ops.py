@@ -74,8 +74,8 @@ def fused_ops(device: torch.device) -> Ops:
             if hopper
             else "Triton",
             "suffix attention": "cuBLAS and Triton's softmax",
-            "LayerNorm": f"in the products around it for {_rows_folded()} rows in bfloat16, else Triton"
-            if hopper
+            "LayerNorm": f"most in the bfloat16 products around them for {_rows_folded()} rows, else Triton"
+            if hopper and _num_sms(device) >= GATHERING_SMS
             else "Triton",
             "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding": "Triton",
         },
