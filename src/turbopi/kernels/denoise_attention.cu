@@ -102,9 +102,10 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       if (b.warp < tiles) {
         const byte* from = b.ring(mine) + b.warp % SLOT_TILES * KEY_TILE;
         float rest[NT][4];
-        score<HELD_KEYS, HELD_KEYS>(b, [&](int k) { return keys[k]; }, 0, QT, c[0]);
+        const u32 held = score<HELD_KEYS, HELD_KEYS>(b, [&](int k) { return keys[k]; }, 0, QT, c[0]);
         auto fetch = [&](int k) { return load_fragment(from + (HELD_KEYS + k) * FRAGMENT, b.lane); };
-        const u32 seen = score<QT - HELD_KEYS, 4>(b, fetch, HELD_KEYS, QT, rest);
+        u32 seen = score<QT - HELD_KEYS, 4>(b, fetch, HELD_KEYS, QT, rest);
+        if (QT == HELD_KEYS) seen = held;
 #pragma unroll
         for (int n = 0; n < NT; ++n)
 #pragma unroll

@@ -96,14 +96,15 @@ constexpr bool IDLE = 2 * (F16 / NC) < S, IDLE_Q = QT < S;  // the same of queri
 // A message lands without asking, so its place must be free at every receiver before any sender can have it. What makes
 // it so: a rank goes on only with what it got from all ranks of its cluster, and each sends its part of an exchange
 // when all its warps that have work in what goes before are done with it: they each send a part, or follow a barrier of
-// the CTA's warps.
+// the warps that have. (Warps without a tile multiply too, whatever they read; nobody reads their sums.)
 //
 // Region X holds the stream (operand of qkv and gate|up). When those have read it, their partial sums lie there, then
 // attention's weights, suffix keys and values, and the partial outputs that other ranks send.
 //   sums of qkv over the stream: nothing is sent to X before a peer has this rank's queries, sent when they are read
 //   attention's outputs over them: so they land later still; the next slice follows the attention of all ranks, and
 //   that the outputs of all ranks, which their warps send when they have weighed
-//   sums of gate|up over the stream: the next slice lands when a peer has this rank's hidden units, made of those sums
+//   sums of gate|up over the stream, or in M_SUMS: the next slice lands when a peer has this rank's hidden units, made
+//   of those sums
 constexpr int X_BYTES = D16 * NT * 256;
 constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * 512;
 constexpr int X_SUFFIX_SUMS = X_P + (KT + 1) * NT * 256, X_KEEP = X_SUFFIX_SUMS + 3 * NT * 256,

@@ -167,20 +167,6 @@ __device__ __forceinline__ void publish(uint2* p, u32 v, u32 w, u32 bit) {
   asm volatile("st.relaxed.gpu.global.v2.u32 [%0], {%1, %2};" ::"l"(p), "r"((v & ~1u) | bit), "r"((w & ~1u) | bit)
                : "memory");
 }
-// v[i] = p[i * stride], asked for until it is there.
-template <int N>
-__device__ __forceinline__ void poll(uint4 (&v)[N], const uint4* p, size_t stride, u32 bit) {
-#pragma unroll
-  for (int i = 0; i < N; ++i) v[i] = peek(p + i * stride);
-#pragma unroll 1
-  for (;;) {
-    bool again = false;
-#pragma unroll
-    for (int i = 0; i < N; ++i)
-      if (missing(v[i], bit)) v[i] = peek(p + i * stride), again = true;
-    if (!again) return;
-  }
-}
 
 // ---- arithmetic
 

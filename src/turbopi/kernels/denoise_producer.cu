@@ -65,7 +65,7 @@ struct Producer {
       }
     };
 #pragma unroll 1
-    for (int i = 0; i < AHEAD; ++i) prefetch_next();
+    for (int i = 0; i < AHEAD && slots > 0; ++i) prefetch_next();
     u32 slot = 0, free = 1;
 #pragma unroll 1
     for (int step = 0; step < b.a.steps; ++step) {

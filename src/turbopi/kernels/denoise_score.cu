@@ -1,7 +1,7 @@
 // Part 8 of 10: attention's steps, of which denoise_attention.cu makes the whole.
 
-// Who does what: the first SCORERS warps score a tile of prefix keys each, or two if there are more; the last four
-// score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries. If
+// Who does what: the first SCORERS warps score a tile of prefix keys each, and the next if there are more; the last
+// four score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries. If
 // tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries and
 // weights; else all warps weigh, and the third warpgroup fetches the suffix's values.
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
