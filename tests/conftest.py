@@ -1,5 +1,6 @@
 """What several test files share: the golden folder and models built from it."""
 
+import json
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: spinning threads slow a busy machine
@@ -8,6 +9,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -26,6 +28,14 @@ def on_hopper(test: Callable[..., None]) -> Callable[..., None]:
     """A GPU test of kernels that are written for compute capability 9.0."""
     other = torch.cuda.is_available() and torch.cuda.get_device_capability() != (9, 0)
     return pytest.mark.gpu(pytest.mark.skipif(other, reason="needs compute capability 9.0")(test))
+
+
+def packed_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a packed archive by name: one run of bytes, in which equal arrays lie once, and where each is."""
+    with np.load(path) as file:
+        index, data = json.loads(file["index"].tobytes()), file["data"].tobytes()
+    places = ((name, np.dtype(kind), shape, at) for name, (kind, shape, at) in index.items())
+    return {name: np.frombuffer(data, kind, int(np.prod(shape)), at).reshape(shape) for name, kind, shape, at in places}
 
 
 @lru_cache

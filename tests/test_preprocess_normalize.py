@@ -7,6 +7,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+from conftest import packed_arrays
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -17,11 +18,11 @@ from turbopi.errors import ConfigError, ObservationError
 from turbopi.normalize import Normalizer, absolute_actions, action_mask, delta_actions, pad_last
 
 FOLDER = Path(__file__).parent / "golden" / "preprocess"
-NORMALIZED = np.load(FOLDER / "normalize.npz")
-DELTA = np.load(FOLDER / "delta_absolute.npz")
+NORMALIZED = packed_arrays(FOLDER / "normalize.npz")
+DELTA = packed_arrays(FOLDER / "delta_absolute.npz")
 PAD = np.load(FOLDER / "pad.npz")
 REFUSED: list[str] = json.loads((FOLDER / "normalize_refused.json").read_text())
-CASES = [name for name in NORMALIZED.files if name.split("/")[-2] != "in"]
+CASES = [name for name in NORMALIZED if name.split("/")[-2] != "in"]
 LEROBOT: list[NormMode] = ["lerobot_quantile", "lerobot_zscore", "lerobot_min_max"]
 
 
@@ -144,7 +145,7 @@ def test_identity_needs_no_statistics() -> None:
     assert scale.normalize(x).dtype == np.float64
 
 
-@pytest.mark.parametrize("name", [name for name in DELTA.files if name.endswith("/actions") and "/in/" not in name])
+@pytest.mark.parametrize("name", [name for name in DELTA if name.endswith("/actions") and "/in/" not in name])
 def test_relative_and_absolute_actions_are_openpis_exactly(name: str) -> None:
     robot, dtype, direction, _ = name.split("/")
     mask = action_mask(DELTA[f"{robot}/mask_dims"].tolist())

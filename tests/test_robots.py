@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import packed_arrays
 
 from turbopi.config import CAMERAS, PRESETS
 from turbopi.errors import ConfigError, ObservationError
@@ -29,10 +30,9 @@ CREATED = {
 def golden(robot: str) -> dict[str, dict[str, dict[str, np.ndarray]]]:
     """case -> in | out -> key -> value"""
     cases: dict[str, dict[str, dict[str, np.ndarray]]] = {}
-    with np.load(FOLDER / f"{robot}.npz") as file:
-        for name in file.files:
-            case, side, key = name.split("/", 2)
-            cases.setdefault(case, {}).setdefault(side, {})[key] = file[name]
+    for name, value in packed_arrays(FOLDER / f"{robot}.npz").items():
+        case, side, key = name.split("/", 2)
+        cases.setdefault(case, {}).setdefault(side, {})[key] = value
     return cases
 
 
