@@ -188,8 +188,12 @@ def test_products(m: int, n: int, k: int, epilogue: Epilogue, tile: Tile, out_fp
     inverse = 30.0 if out_fp8 else None
     out = torch.full((m, n), torch.nan, device=DEVICE, dtype=E4M3 if out_fp8 else DTYPE)
     ours = gemm_fp8.matmul_fp8(x, matrix, tile, epilogue, bias, out, inverse)
-    relative = (ours.float() / (inverse or 1) - exact).norm() / exact.norm()
-    assert float(relative) < (0.04 if out_fp8 else 0.006)
+
+    def error(result: Tensor) -> float:
+        return float((result.float() / (inverse or 1) - exact).norm() / exact.norm())
+
+    # E4M3 can't say it better than the exact result, rounded; of few numbers that error varies much
+    assert error(ours) < 0.006 + (error(to_e4m3(exact, inverse)) if inverse else 0)
 
 
 @on_hopper

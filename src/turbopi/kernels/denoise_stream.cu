@@ -168,9 +168,9 @@ __device__ __forceinline__ void gather(const Block& b, float4 (&x)[ITEMS_X], con
 }
 
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
-// sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive before
-// it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which follows
-// what is published here.
+// sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive
+// before it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which
+// follows what is published here.
 __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, uint4* buffer, u32 bit) {
   float sums[plan_groups(DX)][NT * 4];
   constexpr int EVEN = F16 % NC == 0 && HC % 16 == 0 && QT % 16 == 0 ? 16
