@@ -138,7 +138,7 @@ def source(tile: Tile) -> str:
     """attention.cu with the instructions for a tile."""
     logits = hopper.wgmma("mma_logits", tile.keys)
     values = hopper.wgmma("mma_values", tile.dim, from_registers=True, across=True)
-    return hopper.source("attention.cu", f"{logits}\n{values}")
+    return hopper.source("attention.cu", instructions=f"{logits}\n{values}")
 
 
 @cache

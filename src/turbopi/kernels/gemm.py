@@ -187,8 +187,8 @@ def _kernel(tile: Tile, epilogue: Epilogue, residual: bool, normed: int, device:
 
 
 def source(columns: int, fp8: bool = False) -> str:
-    """gemm.cu with the instruction for tiles of that many columns."""
-    return hopper.source("gemm.cu", hopper.wgmma("mma", columns, fp8=fp8))
+    """gemm_base.cu and gemm.cu with the instruction for tiles of that many columns."""
+    return hopper.source("gemm_base.cu", "gemm.cu", instructions=hopper.wgmma("mma", columns, fp8=fp8))
 
 
 def matrix_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> Any:

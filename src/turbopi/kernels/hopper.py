@@ -49,11 +49,10 @@ class DependentKernel(Kernel):
         return config
 
 
-def source(name: str, instructions: str) -> str:
-    """A kernel's source, with the instructions that its line TP_MMA stands for."""
-    folder = files("turbopi.kernels")
-    text = re.sub(r"^TP_MMA.*$", lambda _: instructions, (folder / name).read_text(), flags=re.MULTILINE)
-    return (folder / "hopper.cu").read_text() + "\n" + text
+def source(*names: str, instructions: str) -> str:
+    """A kernel's source, of those files, with the instructions that its line TP_MMA stands for."""
+    text = "\n".join((files("turbopi.kernels") / name).read_text() for name in ("hopper.cu", *names))
+    return re.sub(r"^TP_MMA.*$", lambda _: instructions, text, flags=re.MULTILINE)
 
 
 def wgmma(name: str, columns: int, *, fp8: bool = False, from_registers: bool = False, across: bool = False) -> str:

@@ -1,0 +1,153 @@
+// out[M, N] = epilogue(a[M, K] @ w[N, K]^T) in bfloat16 with float32 sums: TMA feeds shared memory, wgmma multiplies.
+// For compute capability 9.0. gemm.py sets the TP_ constants and writes `mma` for the tile's width.
+//
+// TP_FP8: a and w are E4M3; `scale` (of each output channel, times the input's) multiplies the sums before bias and
+// nonlinearity. The tensor cores keep only some 14 bits of sums of E4M3 products: after every TP_PROMOTE blocks of K
+// (0: never) they are added up in float32 registers. TP_OUT_FP8: the result leaves as E4M3, times `inverse`.
+//
+// A CTA has one producer warp and TP_WGS consumer warpgroups of 64 rows each, and walks over its tiles
+// (grid = SMs, not tiles), so the next tile's loads run during an epilogue. TP_CM x TP_CN CTAs form a cluster of
+// neighbouring tiles: those of a row share their part of `a` and those of a column theirs of `w`; each loads its share
+// of it into all of them, as reading operands from L2 would be the bottleneck.
+// Weights don't depend on the kernel before this one: their first loads are issued before waiting for its end.
+//
+// Epilogues: 0 plain, 1 + bias, 2 gelu(+ bias), 3 GeGLU (w has N gate rows, then N up rows), 4 float32 sums of a part
+// of K each (+ bias in the first) as out[split, M, N].
+//
+// TP_GATHER: the CTAs that share a tile, each with a part of K, are in one cluster. In the end each gets the others'
+// sums of a share of the tile's columns through distributed shared memory. For one tile a CTA: they go where operands
+// were.
+//
+// LayerNorm between two products without a pass of its own: TP_RESIDUAL adds `residual` [M, N] to the result, and the
+// sum of each row's results and of their squares goes, by tile, to `sums_out`. TP_NORMED (parts of a row's sums, or 0)
+// takes a's LayerNorm for a, whose scale is in w and whose shift in `offset`: as the product is linear, the norm is
+// only made of the sums in the end. `sums_of_w` are of the rounded w, so a mean in a's rows cancels, however large.
+//
+// `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
+
+constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
+constexpr bool GATHER = TP_GATHER;
+constexpr int EPILOGUE = TP_EPILOGUE, PARTS = EPILOGUE == 3 ? 2 : 1;
+constexpr int SHARING = CM * CN, CLUSTER = SHARING * (GATHER ? SPLITS : 1);
+constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
+#if TP_OUT_FP8
+typedef unsigned char Element;
+#else
+typedef u16 Element;
+#endif
+constexpr int ROW_BYTES = 128;  // of a block of an operand: as much as a swizzle spans
+constexpr int BM = 64 * WGS, BK = FP8 ? ROW_BYTES : ROW_BYTES / 2, TILE_N = BN / PARTS;
+constexpr int A_BYTES = BM * ROW_BYTES, B_BYTES = BN * ROW_BYTES, STAGE_BYTES = A_BYTES + B_BYTES;
+constexpr bool BIASED = !FP8 && !TP_NORMED && (EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4);  // E4M3: see Factors
+constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
+constexpr int PRODUCER_REGISTERS = WGS == 1 ? 40 : WGS == 2 ? 40 : 24;
+
+// into the CTAs of `mask`, at the same place in each
+template <bool MULTICAST>
+__device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int row, u32 bar, u32 mask) {
+    if (MULTICAST)
+        asm volatile(
+            "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster"
+            " [%0], [%1, {%2, %3}], [%4], %5;"
+            ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar), "h"((u16)mask) : "memory");
+    else
+        asm volatile(
+            "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3}], [%4];"
+            ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar) : "memory");
+}
+TP_MMA  // mma(float (&sums)[BN / 2], u64 a, u64 b, int keep)
+
+__device__ __forceinline__ float gelu(float x) {  // tanh's, as x * sigmoid
+    return __fdividef(x, 1.0f + exp2f(x * (-2.302208198f - 0.1029432397f * x * x)));
+}
+// A tile's scales and biases by column of `w`. Each thread of a warpgroup fetches some of them long before they are
+// needed; once the sums are there they go through shared memory to whom they belong.
+struct Factors {
+    static constexpr int OWN = (BN + 127) / 128;
+    float scale[OWN], bias[OWN];
+
+    __device__ __forceinline__ void fetch(const float* scales, const u16* biases, int n, int N, bool with_bias) {
+#pragma unroll
+        for (int i = 0; i < OWN; ++i) {
+            const int c = threadIdx.x % 128 + 128 * i, part = c / TILE_N, col = n + c % TILE_N;
+            const bool inside = c < BN && col < N;
+            scale[i] = inside ? scales[part * N + col] : 0.0f;
+            bias[i] = inside && with_bias ? __uint_as_float((u32)biases[col] << 16) : 0.0f;
+        }
+    }
+    __device__ __forceinline__ void fetch(const float* scales, const float* biases, int n, int N) {
+#pragma unroll
+        for (int i = 0; i < OWN; ++i) {
+            const int c = threadIdx.x % 128 + 128 * i;
+            const bool inside = c < BN && n + c < N;
+            scale[i] = inside ? scales[n + c] : 0.0f;
+            bias[i] = inside ? biases[n + c] : 0.0f;
+        }
+    }
+    __device__ __forceinline__ void share(float* shared, int warpgroup) const {
+        const auto sync = [&] { asm volatile("bar.sync %0, 128;" ::"r"(warpgroup + 1) : "memory"); };
+        sync();  // the last tile's have been read
+#pragma unroll
+        for (int i = 0; i < OWN; ++i) {
+            const int c = threadIdx.x % 128 + 128 * i;
+            if (c < BN) shared[c] = scale[i], shared[BN + c] = bias[i];
+        }
+        sync();
+    }
+};
+
+// which of a tile's parts ends up with a block of 8 columns; blocks go in fours, as that many leave together
+__device__ constexpr int owner(int block) { return block / 4 * SPLITS / ((TILE_N / 8 + 3) / 4); }
+
+// Adds up, for the blocks of 8 columns that are this part's, the sums of all parts of a tile.
+__device__ __forceinline__ void gather(float (&sums)[BN / 2], int split, char* raw, u32 base, int rank) {
+    constexpr int BLOCKS = TILE_N / 8, FOURS = (BLOCKS + 3) / 4, THREADS = 128 * WGS;
+    constexpr int FROM_ONE = (FOURS + SPLITS - 1) / SPLITS * 4 * THREADS * 16;  // by block, then by thread
+    static_assert(!GATHER || (SPLITS - 1) * FROM_ONE <= STAGES * STAGE_BYTES, "no room for the others' sums");
+    cluster_sync();  // nobody reads operands any more
+#pragma unroll
+    for (int to = 0; to < SPLITS; ++to) {
+        if (to == split) continue;
+        u32 there = base + (split < to ? split : split - 1) * FROM_ONE + threadIdx.x * 16;
+        asm volatile("mapa.shared::cluster.u32 %0, %0, %1;" : "+r"(there) : "r"(to * SHARING + rank % SHARING));
+        int count = 0;
+#pragma unroll
+        for (int j = 0; j < BLOCKS; ++j)
+            if (owner(j) == to)
+                asm volatile("st.shared::cluster.v4.f32 [%0], {%1, %2, %3, %4};" ::"r"(there + count++ * THREADS * 16),
+                             "f"(sums[4 * j]), "f"(sums[4 * j + 1]), "f"(sums[4 * j + 2]), "f"(sums[4 * j + 3])
+                             : "memory");
+    }
+    cluster_exchange();
+    const float4* const received = (const float4*)(raw + (base - shared_address(raw))) + threadIdx.x;
+#pragma unroll
+    for (int mine = 0; mine < SPLITS; ++mine) {
+        if (mine != split) continue;
+        int count = 0;
+#pragma unroll
+        for (int j = 0; j < BLOCKS; ++j) {
+            if (owner(j) != mine) continue;
+#pragma unroll
+            for (int i = 0; i < SPLITS - 1; ++i) {
+                const float4 x = received[i * (FROM_ONE / 16) + count * THREADS];
+                sums[4 * j] += x.x, sums[4 * j + 1] += x.y, sums[4 * j + 2] += x.z, sums[4 * j + 3] += x.w;
+            }
+            ++count;
+        }
+    }
+}
+
+struct Tile {
+    int m, n, k, k_end, split;
+};
+
+__device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, int k_blocks, int rank) {
+    Tile t;
+    const int place = rank % SHARING, rest = unit / m_groups;
+    t.m = (unit % m_groups * CM + place / CN) * BM;
+    t.n = (rest % n_groups * CN + place % CN) * TILE_N;
+    t.split = GATHER ? rank / SHARING : rest / n_groups;
+    t.k = k_blocks * t.split / SPLITS;
+    t.k_end = k_blocks * (t.split + 1) / SPLITS;
+    return t;
+}
