@@ -175,6 +175,10 @@ def test_kernels_that_wait_for_each_other_are_counted_once() -> None:
     assert {one.name: one.busy_us for one in ran} == {"inside": 5.0, "a": 1.0, "b": 5.0, "c": 1.0}
 
 
+def test_stages_are_counted_back_from_the_end_of_a_call() -> None:
+    assert profile.stage_edges([1.0, 2.0, 0.5], 10_000.0) == [6500.0, 7500.0, 9500.0, 10_000.0]
+
+
 def test_kernels_belong_to_the_stage_in_which_they_ran() -> None:
     ran = [profile.Ran(name, start, 1.0) for name, start in (("v", 0.0), ("p", 10.0), ("d", 20.0), ("after", 99.0))]
     parts = profile.split(ran, [0.0, 9.0, 19.0, 30.0])

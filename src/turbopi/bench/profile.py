@@ -74,16 +74,19 @@ def _one_call(policy: UnifiedPolicy, observation: dict[str, Any], job: Job) -> t
         cuda = torch.autograd.DeviceType.CUDA
         kernels = [e for e in events if e.device_type == cuda and not e.is_user_annotation]
         ran = in_turn([(e.name, e.time_range.start, e.time_range.end) for e in kernels])
-        begin = min((e.time_range.start for e in kernels), default=0.0)
+        end = max((e.time_range.end for e in kernels), default=0.0)
     else:
         call = next(e for e in events if e.name == _CALL)
         begin = call.time_range.start + timing["preprocess_ms"] * 1e3
         ran = [Ran(e.name, e.time_range.start, e.self_cpu_time_total) for e in events if e.name != _CALL]
         ran = [one for one in ran if one.start_us >= begin]
-    edges = [begin]
-    for stage in STAGES:
-        edges.append(edges[-1] + timing.get(f"{stage}_ms", 0.0) * 1e3)
-    return ran, edges
+        end = begin + sum(timing.get(f"{stage}_ms", 0.0) for stage in STAGES) * 1e3
+    return ran, stage_edges([timing.get(f"{stage}_ms", 0.0) for stage in STAGES], end)
+
+
+def stage_edges(stage_ms: Sequence[float], end_us: float) -> list[float]:
+    """When each stage began, and the end [us]. From the end, as under a profiler a graph's first kernel is late."""
+    return [end_us - 1e3 * sum(stage_ms[i:]) for i in range(len(stage_ms) + 1)]
 
 
 def split(ran: Sequence[Ran], edges: Sequence[float]) -> list[list[Ran]]:
