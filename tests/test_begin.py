@@ -1,5 +1,6 @@
 """Vision starts while the host still tokenises: the order, the same actions, and no harm from what goes wrong then."""
 
+import dataclasses
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -162,6 +163,17 @@ def test_every_bucket_and_number_of_cameras_in_turn_equals_a_call_of_its_own(kin
         ours = backend.begin(row.images).finish(row.tokens, row.state, noise[0].numpy(), 2)
         assert torch.equal(ours.actions[0], expected), (cameras, tokens)
         assert torch.equal(backend.sample(observation, noise, 2).actions[0], expected), (cameras, tokens)
+
+
+def test_float_pictures_and_whole_numbers_in_turn() -> None:
+    backend = on_cpu()
+    observation, noise = made_up("pi05", 2, 5)
+    floats = dataclasses.replace(observation, images=observation.images.float() / 255 * 2 - 1.003)
+    for one in (observation, floats, observation, floats):
+        row = HostRow.of(one, 0)
+        ours = backend.begin(row.images).finish(row.tokens, row.state, noise[0].numpy(), 2)
+        expected = answer(static_call("pi05", shape_of(one, noise, 2)), one, noise)
+        assert torch.equal(ours.actions[0], expected)
 
 
 def test_calls_share_the_pictures_of_as_many_cameras() -> None:
