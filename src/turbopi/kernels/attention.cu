@@ -59,9 +59,6 @@ __device__ __forceinline__ float largest_of_quad(float x) {
     x = fmaxf(x, __shfl_xor_sync(~0u, x, 1));
     return fmaxf(x, __shfl_xor_sync(~0u, x, 2));
 }
-__device__ __forceinline__ void commit_products() { asm volatile("wgmma.commit_group.sync.aligned;" ::: "memory"); }
-__device__ __forceinline__ void begin_products() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }
-__device__ __forceinline__ void await_products() { asm volatile("wgmma.wait_group.sync.aligned 0;" ::: "memory"); }
 
 __device__ __forceinline__ void sync_consumers(int barrier, int threads) {
     asm volatile("bar.sync %0, %1;" ::"r"(barrier), "r"(threads) : "memory");
@@ -200,7 +197,7 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
             const u32 first = await_tile(place);
             begin_products();
             multiply_keys(first);
-            await_products();
+            await_products<0>();
             release(place);
         }
         if (tile < last) {
@@ -211,7 +208,7 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
                 begin_products();
                 multiply_values(values);
                 multiply_keys(next);
-                await_products();
+                await_products<0>();
                 release(place + WGS);
                 release(place + 2 * WGS);
             }
@@ -219,7 +216,7 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
             weigh(tile, values);
             begin_products();
             multiply_values(values);
-            await_products();
+            await_products<0>();
         }
 #pragma unroll
         for (int half = 0; half < 2; ++half) total[half] = sum_of_quad(total[half]);

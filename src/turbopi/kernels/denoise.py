@@ -9,7 +9,6 @@ Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns,
 """
 
 import ctypes
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.engine.weights import State
 from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.kernels import hopper
 from turbopi.kernels.denoise_packing import (
     BLOCK,
     DIVISOR,
@@ -101,14 +101,19 @@ def kernel_sizes(
     }
 
 
-def source() -> str:
-    return "".join((files("turbopi.kernels") / part).read_text() for part in PARTS)
+def source(suffix: int) -> str:
+    columns = most(suffix, 8) * 8
+    products = (
+        hopper.wgmma("add_product", columns),
+        hopper.wgmma("add_product", columns, numbers="f16", from_registers=True),
+    )
+    return hopper.source(*PARTS, instructions="\n".join(products))
 
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
     """The kernel's machine code. Raises BackendUnavailable if a block has too little shared memory for these sizes."""
     try:
-        return compile_cubin(source(), arch, sizes, folder=folder)
+        return compile_cubin(source(sizes["TP_T"]), arch, sizes, folder=folder)
     except BackendError as e:
         if "too little shared memory" not in str(e):
             raise

@@ -19,8 +19,6 @@
 // that meet weights lie as [block][8 tokens][8 columns][token][16 bytes], queries and attention's weights as
 // [block][8 columns][8 tokens][token][16 bytes].
 
-typedef unsigned int u32;
-typedef unsigned long long u64;
 typedef unsigned char byte;
 
 constexpr int D = TP_D, F = TP_F, L = TP_L, NH = TP_NH, HD = TP_HD, T = TP_T, A = TP_A;

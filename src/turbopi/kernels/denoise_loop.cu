@@ -117,7 +117,7 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
           "mbarrier.arrive.release.cluster.shared::cluster.b64 _, [%0];" ::"r"(at_rank(b.bar(BAR_GO), threadIdx.x))
           : "memory");
     note(b, WAIT_GO);
-    mbar_wait(b.bar(BAR_GO), step & 1);
+    barrier_wait(b.bar(BAR_GO), step & 1);
   }
 }
 
@@ -204,20 +204,20 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
   Block b(args, smem);
   if (threadIdx.x == 0) {
     note(b, WAIT_NONE);
-    for (u32 i = 0; i < STAGES; ++i) mbar_init(b.full(i), 1), mbar_init(b.empty(i), W);
-    for (int i = BAR_X; i <= BAR_V; ++i) mbar_init(b.bar(i), 1);
-    mbar_init(b.bar(BAR_GO), S), mbar_init(b.bar(BAR_RMS), 1);
+    for (u32 i = 0; i < STAGES; ++i) barrier_init(b.full(i), 1), barrier_init(b.empty(i), W);
+    for (int i = BAR_X; i <= BAR_V; ++i) barrier_init(b.bar(i), 1);
+    barrier_init(b.bar(BAR_GO), S), barrier_init(b.bar(BAR_RMS), 1);
     asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
-    mbar_expect(b.bar(BAR_X), X_EXPECT);
-    mbar_expect(b.bar(BAR_Q), Q_EXPECT);
-    mbar_expect(b.bar(BAR_TOPS), TOPS_EXPECT);
-    mbar_expect(b.bar(BAR_COMB), outputs_expect(b));
-    mbar_expect(b.bar(BAR_ATT), HD * T * 2);
-    mbar_expect(b.bar(BAR_HID), hidden_bytes(b));
-    mbar_expect(b.bar(BAR_V), V_EXPECT);
+    barrier_expect(b.bar(BAR_X), X_EXPECT);
+    barrier_expect(b.bar(BAR_Q), Q_EXPECT);
+    barrier_expect(b.bar(BAR_TOPS), TOPS_EXPECT);
+    barrier_expect(b.bar(BAR_COMB), outputs_expect(b));
+    barrier_expect(b.bar(BAR_ATT), HD * T * 2);
+    barrier_expect(b.bar(BAR_HID), hidden_bytes(b));
+    barrier_expect(b.bar(BAR_V), V_EXPECT);
   }
   __syncthreads();
-  cluster_sync();
+  cluster_exchange();
   if (b.warp < W) {  // 4 x 112 + 32 registers on each quarter of the multiprocessor are what 5 x 96 were at launch
     asm volatile("setmaxnreg.inc.sync.aligned.u32 112;");
     consume(b);
@@ -235,5 +235,5 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     }
   }
   __syncwarp();
-  cluster_sync();  // nobody leaves while a peer may still write to it
+  cluster_exchange();  // nobody leaves while a peer may still write to it
 }

@@ -57,19 +57,6 @@ __device__ __forceinline__ void watch(const Block& b) {
   }
 }
 
-__device__ __forceinline__ void mbar_wait(u32 bar, u32 parity) {
-  asm volatile(
-      "{\n"
-      ".reg .pred p;\n"
-      "AGAIN:\n"
-      "mbarrier.try_wait.parity.shared::cta.b64 p, [%0], %1;\n"
-      "@p bra DONE;\n"
-      "bra AGAIN;\n"
-      "DONE:\n"
-      "}" ::"r"(bar),
-      "r"(parity)
-      : "memory");
-}
 __device__ __forceinline__ bool test_wait(u32 bar, u32 parity) {
   u32 done;
   asm volatile(
@@ -79,30 +66,17 @@ __device__ __forceinline__ bool test_wait(u32 bar, u32 parity) {
       : "memory");
   return done;
 }
-__device__ __forceinline__ void mbar_init(u32 bar, u32 count) {
-  asm volatile("mbarrier.init.shared::cta.b64 [%0], %1;" ::"r"(bar), "r"(count) : "memory");
-}
-__device__ __forceinline__ void mbar_arrive(u32 bar) {
-  asm volatile("mbarrier.arrive.shared::cta.b64 _, [%0];" ::"r"(bar) : "memory");
-}
-__device__ __forceinline__ void mbar_expect(u32 bar, u32 bytes) {
-  asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(bar), "r"(bytes) : "memory");
-}
 // All threads wait for use n of an exchange in the cluster; one of them arms the barrier for the next.
 __device__ __forceinline__ void receive(const Block& b, int bar, int n, u32 bytes, int what) {
   note(b, what);
-  mbar_wait(b.bar(bar), n & 1);
+  barrier_wait(b.bar(bar), n & 1);
   __syncwarp();
-  if (threadIdx.x == 0) mbar_expect(b.bar(bar), bytes);
+  if (threadIdx.x == 0) barrier_expect(b.bar(bar), bytes);
 }
 __device__ __forceinline__ void consumers_sync() {
   __syncwarp();  // lanes leave a wait one by one, and this barrier counts warps
   asm volatile("bar.sync 1, %0;" ::"n"(CONSUMERS) : "memory");
 }
-__device__ __forceinline__ void cluster_sync() {
-  asm volatile("barrier.cluster.arrive.release.aligned;\nbarrier.cluster.wait.acquire.aligned;" ::: "memory");
-}
-
 // ---- moving data
 
 __device__ __forceinline__ u32 at_rank(u32 address, int rank) {
@@ -181,11 +155,6 @@ __device__ __forceinline__ float2 unpack_half(u32 v) {
       : "=f"(f.x), "=f"(f.y)
       : "r"(v));
   return f;
-}
-__device__ __forceinline__ u32 pack(float lo, float hi) {
-  u32 v;
-  asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(v) : "f"(hi), "f"(lo));
-  return v;
 }
 // Two numbers that meet weights.
 __device__ __forceinline__ u32 pack_operand(float lo, float hi) {

@@ -84,8 +84,8 @@ struct Producer {
 #pragma unroll 1
             for (int k = gate_up + STAGES; k < gate_up_end; ++k) prefetch(weights, list[k]);
           }
-          mbar_wait(full + 8, free);  // until its last contents have been read
-          mbar_expect(full, bytes);
+          barrier_wait(full + 8, free);  // until its last contents have been read
+          barrier_expect(full, bytes);
           bulk_load(b.base + M_RING + slot * SLOT, (key ? keys : weights) + what.x, bytes, full, key ? keep : once);
           if (++slot == STAGES) slot = 0, free ^= 1;
         }

@@ -2,7 +2,7 @@
 
 __device__ __forceinline__ u32 take_slot(Block& b, bool full = false) {
   const u32 slot = b.slot;
-  if (!full) mbar_wait(b.full(slot), b.phase);
+  if (!full) barrier_wait(b.full(slot), b.phase);
   __syncwarp();
   if (++b.slot == STAGES) b.slot = 0, b.phase ^= 1;
   return slot;
@@ -11,7 +11,7 @@ __device__ __forceinline__ u32 take_slot(Block& b, bool full = false) {
 // still on their way (seen as wrong sums). Hence an address that needs what they brought.
 __device__ __forceinline__ void give_slot(const Block& b, u32 slot, u32 seen = 0) {
   __syncwarp();
-  if (b.lane == 0) mbar_arrive(b.empty(slot) + (seen & b.a.zero));
+  if (b.lane == 0) barrier_arrive(b.empty(slot) + (seen & b.a.zero));
 }
 
 // The same without a branch, which would make products wait for each other, for what products alone have read.
@@ -37,7 +37,7 @@ struct Share {
 // of EVEN. A product is issued when the one before has begun, so what else there is to do stands between two.
 template <int TILES_, int EVEN>
 __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int tiles, float (&sums)[NT * 4]) {
-  constexpr int PARTS = group_parts(TILES_), COLUMNS = NT * 8;
+  constexpr int PARTS = group_parts(TILES_);
   constexpr bool EXACT = EVEN % (KB * PARTS * 4) == 0;
   const Share my(b, PARTS);
   const int rounds = plan_rounds(PARTS, blocks), rounds_of_slot = slot_rounds(PARTS, tiles);
@@ -66,8 +66,8 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
         const uint4 even = from_e4m3(w.x, w.y), odd = from_e4m3(w.z, w.w);
         if (i + 1 < RPS) w = load_fragment(p + (i + 1) * PARTS * tiles * FRAGMENT, b.lane);
         begin_products();
-        add_product<COLUMNS>(sums, even, activations(unit + i * PARTS, 0), r | i);
-        add_product<COLUMNS>(sums, odd, activations(unit + i * PARTS, 1), 1);
+        add_product(sums, even.x, even.y, even.z, even.w, activations(unit + i * PARTS, 0), r | i);
+        add_product(sums, odd.x, odd.y, odd.z, odd.w, activations(unit + i * PARTS, 1), 1);
         commit_products();
         await_products<0>();  // it reads these registers; other warpgroups multiply meanwhile
       }
@@ -76,8 +76,8 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
       begin_products();
 #pragma unroll
       for (int i = 0; i < RPS; ++i) {
-        add_product<COLUMNS>(sums, behind(weights, from + i * PARTS * tiles * FRAGMENT),
-                             activations(unit + i * PARTS, 0), r | i);
+        add_product(sums, behind(weights, from + i * PARTS * tiles * FRAGMENT), activations(unit + i * PARTS, 0),
+                    r | i);
         if (i == 0) {
           commit_products();
           await_products<1>();  // the round before is done

@@ -70,14 +70,14 @@ __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[I
 constexpr u32 SQUARES_EXPECT = FEW ? SQ * ((T + 1) / 2) * 8 : SQ * T * 4;
 // 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a spare warp makes them.
 __device__ __forceinline__ float2 inverse_rms(const Block& b, int token) {
-  mbar_wait(b.bar(BAR_RMS), b.x_parity ^ 1);
+  barrier_wait(b.bar(BAR_RMS), b.x_parity ^ 1);
   return *(const float2*)(b.smem + M_RMS + token * 4);
 }
 __device__ __forceinline__ void make_inverse_rms(const Block& b) {
   const int uses = b.a.steps * L * (b.attends() ? 2 : 1);
 #pragma unroll 1
   for (int use = 0; use < uses; ++use) {
-    mbar_wait(b.bar(BAR_X), use & 1);
+    barrier_wait(b.bar(BAR_X), use & 1);
 #pragma unroll 1
     for (int token = b.lane; token < NT * 8; token += 32) {
       float sum = 0;
@@ -86,7 +86,7 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
       *(float*)(b.smem + M_RMS + token * 4) = rsqrtf(sum * (1.0f / D) + b.a.eps);
     }
     __syncwarp();
-    if (b.lane == 0) mbar_arrive(b.bar(BAR_RMS));
+    if (b.lane == 0) barrier_arrive(b.bar(BAR_RMS));
   }
 }
 constexpr u32 X_EXPECT = D16 * T * 32 + SQUARES_EXPECT;

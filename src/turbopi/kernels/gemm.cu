@@ -151,14 +151,14 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     const int s = step % STAGES;
                     barrier_wait(full + 8 * s, (step / STAGES) & 1);
                     const u32 a = base + s * STAGE_BYTES + group * 8192, b = base + s * STAGE_BYTES + A_BYTES;
-                    asm volatile("wgmma.fence.sync.aligned;" ::: "memory");
+                    begin_products();
 #pragma unroll
                     for (int j = 0; j < 4; ++j)
                         mma(parts, operand(a + j * 32), operand(b + j * 32), k > start || j > 0);
-                    asm volatile("wgmma.commit_group.sync.aligned;\nwgmma.wait_group.sync.aligned 1;" ::: "memory");
+                    commit_products(), await_products<1>();
                     if (k > start) release(step - 1);
                 }
-                asm volatile("wgmma.wait_group.sync.aligned 0;" ::: "memory");
+                await_products<0>();
                 release(step - 1);
 #pragma unroll
                 for (int i = 0; i < BN / 2; ++i) sums[i] += parts[i];
@@ -168,14 +168,14 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                 const int s = step % STAGES;
                 barrier_wait(full + 8 * s, (step / STAGES) & 1);
                 const u32 a = base + s * STAGE_BYTES + group * 8192, b = base + s * STAGE_BYTES + A_BYTES;
-                asm volatile("wgmma.fence.sync.aligned;" ::: "memory");
+                begin_products();
 #pragma unroll
                 for (int j = 0; j < 4; ++j)
                     mma(sums, operand(a + j * 32), operand(b + j * 32), k > t.k || j > 0);
-                asm volatile("wgmma.commit_group.sync.aligned;\nwgmma.wait_group.sync.aligned 1;" ::: "memory");
+                commit_products(), await_products<1>();
                 if (k > t.k) release(step - 1);
             }
-            asm volatile("wgmma.wait_group.sync.aligned 0;" ::: "memory");
+            await_products<0>();
             release(step - 1);
 #endif
 #if TP_FP8

@@ -188,7 +188,9 @@ def _kernel(tile: Tile, epilogue: Epilogue, residual: bool, normed: int, device:
 
 def source(columns: int, fp8: bool = False) -> str:
     """gemm_base.cu and gemm.cu with the instruction for tiles of that many columns."""
-    return hopper.source("gemm_base.cu", "gemm.cu", instructions=hopper.wgmma("mma", columns, fp8=fp8))
+    return hopper.source(
+        "gemm_base.cu", "gemm.cu", instructions=hopper.wgmma("mma", columns, numbers="e4m3" if fp8 else "bf16")
+    )
 
 
 def matrix_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> Any:

@@ -24,9 +24,11 @@ __device__ __forceinline__ void barrier_arrive(u32 bar) {
 }
 __device__ __forceinline__ void barrier_wait(u32 bar, u32 parity) {
     asm volatile(
-        "{ .reg .pred done;\n"
-        "again: mbarrier.try_wait.parity.shared::cta.b64 done, [%0], %1;\n"
-        "@!done bra again; }" ::"r"(bar), "r"(parity) : "memory");
+        "{ .reg .pred over;\n"
+        "again: mbarrier.try_wait.parity.shared::cta.b64 over, [%0], %1;\n"
+        "@over bra done;\n"
+        "bra again;\n"
+        "done: }" ::"r"(bar), "r"(parity) : "memory");
 }
 __device__ __forceinline__ void cluster_sync() {
     asm volatile("barrier.cluster.arrive.relaxed;\nbarrier.cluster.wait;" ::: "memory");
@@ -37,6 +39,15 @@ __device__ __forceinline__ void cluster_exchange() {  // what was stored before 
 // K-major operand in shared memory, rows of 128 bytes, swizzled; groups of 8 rows lie 1024 bytes apart
 __device__ __forceinline__ u64 operand(u32 address) {
     return ((u64)(address & 0x3ffff) >> 4) | (1ull << 16) | (64ull << 32) | (1ull << 62);
+}
+
+// A warpgroup's products: before the first, or the first after their registers were touched; to make a group of those
+// issued since the last; until all groups but the last LEFT are done.
+__device__ __forceinline__ void begin_products() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }
+__device__ __forceinline__ void commit_products() { asm volatile("wgmma.commit_group.sync.aligned;" ::: "memory"); }
+template <int LEFT>
+__device__ __forceinline__ void await_products() {
+    asm volatile("wgmma.wait_group.sync.aligned %0;" ::"n"(LEFT) : "memory");
 }
 
 __device__ __forceinline__ u32 pack(float low, float high) {

@@ -7,7 +7,7 @@ import ctypes
 import re
 from functools import lru_cache
 from importlib.resources import files
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -55,11 +55,16 @@ def source(*names: str, instructions: str) -> str:
     return re.sub(r"^TP_MMA.*$", lambda _: instructions, text, flags=re.MULTILINE)
 
 
-def wgmma(name: str, columns: int, *, fp8: bool = False, from_registers: bool = False, across: bool = False) -> str:
+Numbers = Literal["bf16", "f16", "e4m3"]
+
+
+def wgmma(
+    name: str, columns: int, *, numbers: Numbers = "bf16", from_registers: bool = False, across: bool = False
+) -> str:
     """A function `name(float (&sums)[columns / 2], a, u64 b, int keep)`: sums (kept or not) += a @ b, asynchronously.
 
     a is 64 rows of 32 bytes, a descriptor or, `from_registers`, four u32; b `columns` rows of as much, or `across` 16
-    rows of so many bfloat16. Its operands can't be written generically.
+    rows of so many numbers of 16 bits. Its operands can't be written generically.
     """
     assert columns % 8 == 0 and columns <= 256
     count = columns // 2
@@ -72,8 +77,8 @@ def wgmma(name: str, columns: int, *, fp8: bool = False, from_registers: bool = 
     else:
         parameters, inputs, a = "u64 a", '"l"(a)', f"%{count}"
     b = count + (4 if from_registers else 1)
-    form = "k32.f32.e4m3.e4m3" if fp8 else "k16.f32.bf16.bf16"
-    transposed = "" if fp8 else ("" if from_registers else ", 0") + f", {int(across)}"
+    form = f"k{32 if numbers == 'e4m3' else 16}.f32.{numbers}.{numbers}"
+    transposed = "" if numbers == "e4m3" else ("" if from_registers else ", 0") + f", {int(across)}"
     return (
         f"__device__ __forceinline__ void {name}(float (&sums)[{count}], {parameters}, u64 b, int keep) {{\n"
         f'asm volatile("{{ .reg .pred p; setp.ne.b32 p, %{b + 1}, 0;\\n"\n'
