@@ -18,6 +18,7 @@ from turbopi.engine import ops as plain  # noqa: E402
 from turbopi.engine.fp8 import E4M3, E4M3_MAX, Fp8Matrix, input_of, to_e4m3  # noqa: E402
 from turbopi.kernels import attention, attention_hopper, gemm_fp8, norms  # noqa: E402
 from turbopi.kernels.gemm import Epilogue, Tile  # noqa: E402
+from turbopi.kernels.hopper import SHARED_BYTES  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32
@@ -247,11 +248,11 @@ def test_repetition_is_bit_identical() -> None:
 )
 def test_the_chosen_tile_is_one_that_the_kernel_takes(rows: int, n: int, k: int, epilogue: Epilogue) -> None:
     tile = gemm_fp8.best_tile(rows, n, k, epilogue, 132)
-    assert gemm_fp8.stages(tile) >= 3
+    assert tile.stages(factors=True) >= 3
     assert tile.columns % (16 if epilogue == "geglu" else 8) == 0 and tile.columns <= 256
     assert tile.splits == 1 or epilogue == "partial"
     steps = -(-k // gemm_fp8.DEPTH)
     assert tile.splits <= steps
     assert gemm_fp8.promotion(tile, k) or steps <= gemm_fp8.UNPROMOTED_STEPS * tile.splits
-    used = gemm_fp8.stages(tile) * (tile.rows + tile.columns) * 128 + 16 * 16 + 8 * tile.warpgroups * tile.columns
-    assert used + 1024 <= gemm_fp8.SHARED_BYTES
+    used = tile.stages(factors=True) * (tile.rows + tile.columns) * 128 + 16 * 16 + 8 * tile.warpgroups * tile.columns
+    assert used + 1024 <= SHARED_BYTES

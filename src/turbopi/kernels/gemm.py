@@ -19,6 +19,7 @@ from turbopi.kernels.nvrtc import compile_cubin
 Epilogue = Literal["plain", "bias", "gelu", "geglu", "partial"]
 EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, "partial": 4}
 DEPTH = 64  # of a step along the inner axis
+STEP_BYTES = 128  # the same, in either precision
 BF16 = {"TP_FP8": 0, "TP_OUT_FP8": 0, "TP_PROMOTE": 0}  # gemm_fp8.py has the others
 
 
@@ -41,10 +42,10 @@ class Tile:
     def cluster(self) -> int:
         return self.cluster_m * self.cluster_n * (self.splits if self.gather else 1)
 
-    @property
-    def stages(self) -> int:
-        """As many as fit, beside 1 KB of alignment and the barriers."""
-        return min(16, (SHARED_BYTES - 2048) // ((self.rows + self.columns) * DEPTH * 2))
+    def stages(self, *, factors: bool) -> int:
+        """As many as fit beside 1 KB of alignment and the barriers, and two `factors` a column for each warpgroup."""
+        room = SHARED_BYTES - 2048 - (8 * self.warpgroups * self.columns if factors else 0)
+        return min(16, room // ((self.rows + self.columns) * STEP_BYTES))
 
 
 @dataclass(frozen=True)
@@ -100,22 +101,17 @@ def matmul(
     """
     folded, weight = (weight, weight.data) if isinstance(weight, Folded) else (None, weight)
     assert (folded is None) == (sums is None) and (folded is None or (bias is None and epilogue in ("bias", "gelu")))
-    assert residual is None or (epilogue == "bias" and residual.is_contiguous() and sums_out is not None)
-    assert not tile.gather or (epilogue != "geglu" and folded is None), "sums are gathered after that"
+    assert not tile.gather or folded is None, "sums are gathered after that"
     m, k = a.shape
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
     assert a.dtype == weight.dtype == torch.bfloat16 and a.is_contiguous() and weight.is_contiguous()
     assert k % 8 == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
-    parts = tile.cluster_m * (2 if epilogue == "geglu" else 1)
-    assert tile.columns % (8 * parts) == 0 and tile.rows % (8 * tile.cluster_n) == 0, "a share is whole groups of 8"
-    assert (tile.splits == 1 or epilogue == "partial") != tile.gather, "only partial sums stay split"
+    columns, groups = layout(tile, epilogue, m, n, residual, sums_out)
     if out is None:
         partial = epilogue == "partial"
         shape, dtype = ((tile.splits, m, n), torch.float32) if partial else ((m, n), torch.bfloat16)
         out = torch.empty(shape, dtype=dtype, device=a.device)
     assert out.is_contiguous()
-    columns = tile.columns // 2 if epilogue == "geglu" else tile.columns
-    m_groups, n_groups = -(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n))
     kernel = _kernel(tile, epilogue, residual is not None, 0 if sums is None else sums.parts.shape[0], a.device)
     arguments = (
         matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
@@ -124,23 +120,39 @@ def matmul(
         ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
         *residual_arguments(residual, sums_out),
         *_norm_arguments(folded, sums, k, eps),
-        *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), m_groups, n_groups)),
+        *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), *groups)),
     )
-    blocks = clusters(tile, m_groups * n_groups, kernel.max_clusters) * tile.cluster
-    kernel.launch_dependent(blocks, arguments + ahead_arguments(ahead, blocks))
+    launch(kernel, tile, groups, arguments, ahead)
     return out
+
+
+def layout(
+    tile: Tile, epilogue: Epilogue, m: int, n: int, residual: Tensor | None, sums_out: Sums | None
+) -> tuple[int, tuple[int, int]]:
+    """(columns of the result in a tile, how many clusters' tiles it takes along M and along N)"""
+    assert residual is None or (epilogue == "bias" and residual.is_contiguous() and sums_out is not None)
+    assert not tile.gather or epilogue != "geglu", "sums are gathered after that"
+    parts = tile.cluster_m * (2 if epilogue == "geglu" else 1)
+    assert tile.columns % (8 * parts) == 0 and tile.rows % (8 * tile.cluster_n) == 0, "a share is whole groups of 8"
+    assert (tile.splits == 1 or epilogue == "partial") != tile.gather, "only partial sums stay split"
+    columns = tile.columns // 2 if epilogue == "geglu" else tile.columns
+    return columns, (-(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n)))
+
+
+def launch(
+    kernel: DependentKernel, tile: Tile, groups: tuple[int, int], arguments: tuple[Any, ...], ahead: Tensor | None
+) -> None:
+    """`ahead` is the matrix that is to be in L2 for the next product; each block fetches a share of it."""
+    blocks = clusters(tile, groups[0] * groups[1], kernel.max_clusters) * tile.cluster
+    share = 0 if ahead is None else ahead.numel() * ahead.element_size() // blocks // 16 * 16
+    place = ctypes.c_void_p(ahead.data_ptr() if ahead is not None and share else None)
+    kernel.launch_dependent(blocks, (*arguments, place, ctypes.c_uint(share)))
 
 
 def residual_arguments(residual: Tensor | None, sums_out: Sums | None) -> tuple[Any, ...]:
     if residual is None or sums_out is None:
         return ()
     return ctypes.c_void_p(residual.data_ptr()), ctypes.c_void_p(sums_out.parts.data_ptr())
-
-
-def ahead_arguments(ahead: Tensor | None, blocks: int) -> tuple[Any, ...]:
-    """The matrix that is to be in L2 for the next product, and each block's share of it in bytes."""
-    share = 0 if ahead is None else ahead.numel() * ahead.element_size() // blocks // 16 * 16
-    return ctypes.c_void_p(ahead.data_ptr() if ahead is not None and share else None), ctypes.c_uint(share)
 
 
 def _norm_arguments(folded: Folded | None, sums: Sums | None, width: int, eps: float) -> tuple[Any, ...]:
@@ -163,34 +175,39 @@ def clusters(tile: Tile, groups: int, at_once: int) -> int:
 
 def constants(tile: Tile, epilogue: Epilogue, residual: bool = False, normed: int = 0) -> dict[str, int]:
     """What gemm.cu is compiled with."""
-    room = SHARED_BYTES - 2048 - (8 * tile.warpgroups * tile.columns if normed else 0)
+    return tile_constants(tile, epilogue, residual, factors=normed > 0) | {"TP_NORMED": normed, **BF16}
+
+
+def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: bool) -> dict[str, int]:
+    """Of these, what doesn't depend on the precision; for `factors` see `Tile.stages`."""
     return {
         "TP_WGS": tile.warpgroups,
         "TP_BN": tile.columns,
-        "TP_STAGES": min(16, room // ((tile.rows + tile.columns) * DEPTH * 2)),
+        "TP_STAGES": tile.stages(factors=factors),
         "TP_CM": tile.cluster_m,
         "TP_CN": tile.cluster_n,
         "TP_SPLITS": tile.splits,
         "TP_GATHER": int(tile.gather),
         "TP_EPILOGUE": EPILOGUES[epilogue],
         "TP_RESIDUAL": int(residual),
-        "TP_NORMED": normed,
-        **BF16,
     }
 
 
 @cache
 def _kernel(tile: Tile, epilogue: Epilogue, residual: bool, normed: int, device: torch.device) -> DependentKernel:
+    return build(source(tile.columns), constants(tile, epilogue, residual, normed), tile, device)
+
+
+def build(source: str, sizes: dict[str, int], tile: Tile, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
-        cubin = compile_cubin(source(tile.columns), "sm_90a", constants(tile, epilogue, residual, normed))
+        cubin = compile_cubin(source, "sm_90a", sizes)
         return DependentKernel(cubin, "gemm", SHARED_BYTES, 128 * (tile.warpgroups + 1), tile.cluster)
 
 
 def source(columns: int, fp8: bool = False) -> str:
     """gemm_base.cu and gemm.cu with the instruction for tiles of that many columns."""
-    return hopper.source(
-        "gemm_base.cu", "gemm.cu", instructions=hopper.wgmma("mma", columns, numbers="e4m3" if fp8 else "bf16")
-    )
+    mma = hopper.wgmma("mma", columns, numbers="e4m3" if fp8 else "bf16")
+    return hopper.source("gemm_base.cu", "gemm.cu", instructions=mma)
 
 
 def matrix_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> Any:

@@ -13,18 +13,18 @@ from torch import Tensor
 
 from turbopi.engine.fp8 import ALIGNMENT, E4M3, Fp8Matrix
 from turbopi.kernels.gemm import (
-    EPILOGUES,
     Epilogue,
     Sums,
     Tile,
-    ahead_arguments,
-    clusters,
+    build,
+    launch,
+    layout,
     matrix_map,
     residual_arguments,
     source,
+    tile_constants,
 )
-from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
-from turbopi.kernels.nvrtc import compile_cubin
+from turbopi.kernels.hopper import DependentKernel
 
 DEPTH = 128  # of a step along the inner axis
 PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are added up in float32
@@ -32,12 +32,6 @@ PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are ad
 # rounding to E4M3 costs 4e-2; products of one sign lose more, so longer sums are promoted.
 UNPROMOTED_STEPS = 17
 PROMOTED_COLUMNS = {1: 184, 2: 184, 3: 112}  # by warpgroups: of wider tiles the sums don't fit registers twice
-
-
-def stages(tile: Tile) -> int:
-    """As many as fit beside alignment, barriers, and scales and biases for each warpgroup."""
-    room = SHARED_BYTES - 2048 - 8 * tile.warpgroups * tile.columns
-    return min(16, room // ((tile.rows + tile.columns) * 128))
 
 
 def promotion(tile: Tile, k: int) -> int:
@@ -70,19 +64,13 @@ def matmul_fp8(
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
     assert a.dtype == weight.data.dtype == E4M3 and a.is_contiguous() and weight.data.is_contiguous()
     assert k % ALIGNMENT == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
-    pieces = tile.cluster_m * (2 if epilogue == "geglu" else 1)
-    assert tile.columns % (8 * pieces) == 0 and tile.rows % (8 * tile.cluster_n) == 0, "a share is whole groups of 8"
+    columns, groups = layout(tile, epilogue, m, n, residual, sums_out)
     partial = epilogue == "partial"
-    assert (tile.splits == 1 or partial) != tile.gather, "only partial sums stay split"
-    assert not tile.gather or epilogue != "geglu", "sums are gathered after that"
     assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu"))
     if out is None:
         shape = (tile.splits, m, n) if partial else (m, n)
         out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)
     assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
-    columns = tile.columns // 2 if epilogue == "geglu" else tile.columns
-    m_groups, n_groups = -(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n))
-    assert residual is None or (epilogue == "bias" and residual.is_contiguous() and sums_out is not None)
     promote = promotion(tile, k) if promote is None else promote
     kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, a.device)
     arguments = (
@@ -93,10 +81,9 @@ def matmul_fp8(
         ctypes.c_void_p(weight.scale.data_ptr()),
         ctypes.c_float(1.0 if inverse is None else inverse),
         *residual_arguments(residual, sums_out),
-        *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), m_groups, n_groups)),
+        *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), *groups)),
     )
-    blocks = clusters(tile, m_groups * n_groups, kernel.max_clusters) * tile.cluster
-    kernel.launch_dependent(blocks, arguments + ahead_arguments(ahead, blocks))
+    launch(kernel, tile, groups, arguments, ahead)
     return out
 
 
@@ -106,31 +93,15 @@ def _result_dtype(partial: bool, inverse: float | None) -> torch.dtype:
 
 def constants(tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool = False) -> dict[str, int]:
     """What gemm.cu is compiled with."""
-    return {
-        "TP_WGS": tile.warpgroups,
-        "TP_BN": tile.columns,
-        "TP_STAGES": stages(tile),
-        "TP_CM": tile.cluster_m,
-        "TP_CN": tile.cluster_n,
-        "TP_SPLITS": tile.splits,
-        "TP_GATHER": int(tile.gather),
-        "TP_EPILOGUE": EPILOGUES[epilogue],
-        "TP_FP8": 1,
-        "TP_OUT_FP8": int(out_fp8),
-        "TP_PROMOTE": promote,
-        "TP_RESIDUAL": int(residual),
-        "TP_NORMED": 0,
-    }
+    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": 0}
+    return tile_constants(tile, epilogue, residual, factors=True) | own
 
 
 @cache
 def _kernel(
     tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool, device: torch.device
 ) -> DependentKernel:
-    with torch.cuda.device(device):
-        sizes = constants(tile, epilogue, out_fp8, promote, residual)
-        cubin = compile_cubin(source(tile.columns, fp8=True), "sm_90a", sizes)
-        return DependentKernel(cubin, "gemm", SHARED_BYTES, 128 * (tile.warpgroups + 1), tile.cluster)
+    return build(source(tile.columns, fp8=True), constants(tile, epilogue, out_fp8, promote, residual), tile, device)
 
 
 # -- which tile --------------------------------------------------------------------------------------------------------
@@ -167,7 +138,7 @@ def candidates(epilogue: Epilogue) -> list[Tile]:
         if 64 * warpgroups * columns <= 192 * 192
         for splits in ((1, 2, 3, 4) if epilogue == "partial" else (1,))
     ]
-    return [tile for tile in found if stages(tile) >= 3]
+    return [tile for tile in found if tile.stages(factors=True) >= 3]
 
 
 def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> float:
