@@ -15,7 +15,15 @@ ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine import ops as plain  # noqa: E402
-from turbopi.kernels import activations, attention, attention_hopper, embedding, norms, rope  # noqa: E402
+from turbopi.kernels import (  # noqa: E402
+    activations,
+    attention,
+    attention_hopper,
+    embedding,
+    norms,
+    products,
+    rope,
+)
 from turbopi.kernels import ops as fused  # noqa: E402
 from turbopi.kernels.gemm import Epilogue, Tile, matmul  # noqa: E402
 from turbopi.model.layers import rope_tables  # noqa: E402
@@ -312,16 +320,16 @@ def test_matmul(m: int, n: int, k: int, epilogue: Epilogue, tile: Tile) -> None:
 
 
 @on_hopper
-@pytest.mark.parametrize("shape", fused.VISION_TILES)
+@pytest.mark.parametrize("shape", products.VISION_TILES)
 def test_tuned_products_of_the_vision_tower(shape: tuple[int, int, int]) -> None:
     m, n, k = shape
     x, weight, bias = random(m, k, outliers=True), random(n, k), random(n)
     poison_allocator()
-    ours = fused.tuned_residual_linear(x, weight, bias)
+    ours = products.tuned_residual_linear(x, weight, bias)
     twin, exact = plain.linear(x, weight, bias), plain.linear(x.float(), weight.float(), bias.float())
     assert_as_good((ours.sum(0) if ours.dim() == 3 else ours).to(DTYPE), twin, exact)
-    if fused.VISION_TILES[shape].splits == 1:
-        assert_as_good(fused.tuned_linear_gelu(x, weight, bias), plain.gelu(twin), plain.gelu(exact))
+    if products.VISION_TILES[shape].splits == 1:
+        assert_as_good(products.tuned_linear_gelu(x, weight, bias), plain.gelu(twin), plain.gelu(exact))
 
 
 @on_hopper
@@ -330,7 +338,7 @@ def test_tuned_geglu(rows: int) -> None:
     x, weight = random(rows, 2048, outliers=True), random(2 * 16384, 2048) / 45
     poison_allocator()
     twin = plain.geglu(plain.linear(x, weight))
-    assert_as_good(fused.tuned_linear_geglu(x, weight), twin, plain.geglu(plain.linear(x.float(), weight.float())))
+    assert_as_good(products.tuned_linear_geglu(x, weight), twin, plain.geglu(plain.linear(x.float(), weight.float())))
 
 
 @on_hopper
@@ -382,4 +390,4 @@ def test_matmul_waits_for_the_kernel_before_it() -> None:
 def test_linear_gelu_is_tanhs(m: int, n: int, k: int) -> None:
     x, weight, bias = random(m, k, outliers=True), random(n, k), random(n)
     exact = plain.gelu(plain.linear(x.float(), weight.float(), bias.float()))
-    assert_as_good(fused.linear_gelu(x, weight, bias), plain.gelu(plain.linear(x, weight, bias)), exact)
+    assert_as_good(products.linear_gelu(x, weight, bias), plain.gelu(plain.linear(x, weight, bias)), exact)

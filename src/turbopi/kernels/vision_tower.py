@@ -1,0 +1,129 @@
+"""The vision tower's products with the LayerNorms and the residual stream between them, for compute capability 9.0."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from turbopi.engine.fp8 import Fp8Matrix, Matrix
+from turbopi.kernels import norms
+from turbopi.kernels.gemm import Epilogue, Folded, Sums, Tile, matmul
+from turbopi.kernels.gemm_fp8 import GATHERING_SMS, matmul_fp8
+from turbopi.kernels.products import (
+    as_input,
+    num_sms,
+    tuned_linear,
+    tuned_linear_gelu,
+    tuned_residual_linear,
+    vision_tile,
+)
+
+# As `products.VISION_TILES`, for products that add their result to the residual stream, in either precision. Where sums
+# are gathered, all clusters must be on the GPU at once: an H200 takes 15 of eight blocks and 30 of four.
+RESIDUAL_TILES = {
+    (256, 1152, 1152): Tile(1, 40),
+    (256, 1152, 4304): Tile(1, 96, cluster_m=2, splits=2, gather=True),
+    (512, 1152, 1152): Tile(1, 72),
+    (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
+    (768, 1152, 1152): Tile(2, 64),
+    (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2, gather=True),
+}
+
+
+@dataclass(frozen=True)
+class Product:
+    """A product that isn't made before the norm brings the residual stream to add it to."""
+
+    x: Tensor
+    weight: Matrix
+    bias: Tensor
+    tile: Tile
+
+
+@dataclass(frozen=True)
+class Normed:
+    """LayerNorm of x, made only where the product behind it can't do it."""
+
+    x: Tensor
+    sums: Sums
+    scale: Tensor
+    shift: Tensor
+    eps: float
+
+    def made(self) -> Tensor:
+        return norms.residual_layer_norm(self.x, None, self.scale, self.shift, self.eps)[1]
+
+
+class VisionTower:
+    """Its products. Those in front of a LayerNorm add the residual stream themselves, those behind do the norm."""
+
+    def __init__(self) -> None:
+        # by the weight's address; the weight stays with it, so that no other one can come to lie there
+        self._folded: dict[int, tuple[Tensor, Folded]] = {}
+        self._behind: dict[int, Tensor] = {}  # which matrix came behind the one at this address last time: a hint
+        self._last: Tensor | None = None
+
+    def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
+        tile = RESIDUAL_TILES.get((x.shape[0], weight.shape[0], weight.shape[1]))
+        if tile is None or bias is None or num_sms(x.device) < GATHERING_SMS:
+            return tuned_residual_linear(x, weight, bias)
+        return Product(x, weight, bias, tile)
+
+    def residual_layer_norm(
+        self,
+        x: Tensor,
+        y: Tensor | Product | None,
+        weight: Tensor,
+        bias: Tensor,
+        eps: float,
+        inverse: float | None = None,
+    ) -> tuple[Tensor, Tensor | Normed]:
+        if not isinstance(y, Product):
+            return norms.residual_layer_norm(x, y, weight, bias, eps, inverse)
+        ahead = self._next(y.weight)
+        if inverse is not None:  # a product can't round its input to E4M3
+            made = tuned_residual_linear(y.x, y.weight, y.bias, ahead)
+            return norms.residual_layer_norm(x, made, weight, bias, eps, inverse)
+        sums = Sums.allocate(y.tile, x.shape[0], x.shape[1], x.device)
+        if isinstance(y.weight, Fp8Matrix):
+            x = matmul_fp8(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, ahead=ahead)
+        else:
+            x = matmul(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, ahead=ahead)
+        return x, Normed(x, sums, weight, bias, eps)
+
+    def linear(
+        self, x: Tensor | Normed, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None
+    ) -> Tensor:
+        if isinstance(x, Normed):
+            if out is None and (made := self._normed(x, weight, bias, "bias")) is not None:
+                return made
+            x = x.made()
+        return tuned_linear(x, weight, bias, out)
+
+    def linear_gelu(self, x: Tensor | Normed, weight: Matrix, bias: Tensor, inverse: float | None = None) -> Tensor:
+        if isinstance(x, Normed):
+            if (made := self._normed(x, weight, bias, "gelu")) is not None:
+                return as_input(made, inverse)
+            x = x.made()
+        return tuned_linear_gelu(x, weight, bias, inverse, self._next(weight))
+
+    def _normed(self, x: Normed, weight: Matrix, bias: Tensor | None, epilogue: Epilogue) -> Tensor | None:
+        if (
+            isinstance(weight, Fp8Matrix)
+            or bias is None
+            or (tile := vision_tile(x.x, weight)) is None
+            or tile.splits > 1
+        ):
+            return None
+        key = weight.data_ptr()
+        if key not in self._folded:
+            self._folded[key] = weight, Folded.fold(weight, bias, x.scale, x.shift)
+        folded = self._folded[key][1]
+        return matmul(x.x, folded, tile, epilogue, sums=x.sums, eps=x.eps, ahead=self._next(folded.data))
+
+    def _next(self, matrix: Matrix) -> Tensor | None:
+        """What may be fetched into L2 during a product: the matrix that came behind this one last time."""
+        data = matrix.data if isinstance(matrix, Fp8Matrix) else matrix
+        if self._last is not None:
+            self._behind[self._last.data_ptr()] = data
+        self._last = data
+        return self._behind.get(data.data_ptr())
