@@ -10,7 +10,7 @@ import pytest
 import torch
 from serve_fakes import PipelinedFakePolicy, observation
 from tensorrt_fakes import on_twins
-from test_serve_server import client, eventually, infer, metric, refused
+from test_serve_server import client, eventually, infer, metric, refused, stop_while_the_client_has_left
 from websockets.exceptions import ConnectionClosed
 
 from turbopi import UnifiedPolicy
@@ -90,21 +90,9 @@ def test_a_failure_in_flight_sends_its_traceback_and_costs_only_its_client() -> 
 
 
 def test_stopping_waits_for_what_is_in_flight_though_its_client_left() -> None:
-    async def main() -> None:
-        policy = PipelinedFakePolicy()
-        server = PolicyServer(policy, port=0)
-        await server.start()
-        async with client(server) as leaving:
-            await leaving.send(pack(observation("hold")))
-            await eventually(policy.started.is_set)
-        stop = asyncio.create_task(server.stop())
-        await asyncio.sleep(0.2)
-        assert not stop.done()
-        policy.release.set()
-        await asyncio.wait_for(stop, 10)
-        assert policy.in_flight == 0
-
-    asyncio.run(main())
+    policy = PipelinedFakePolicy()
+    asyncio.run(stop_while_the_client_has_left(policy))
+    assert policy.in_flight == 0
 
 
 def test_stopping_answers_what_is_in_flight() -> None:

@@ -539,21 +539,22 @@ def test_stopping_finishes_the_running_inference_and_says_goodbye() -> None:
     asyncio.run(main())
 
 
-def test_stopping_waits_for_an_inference_whose_client_left() -> None:
-    async def main() -> None:
-        policy = FakePolicy()
-        server = PolicyServer(policy, port=0)
-        await server.start()
-        async with client(server) as connection:
-            await connection.send(pack(observation("hold")))
-            await eventually(policy.started.is_set)
-        stop = asyncio.create_task(server.stop())
-        await asyncio.sleep(0.1)
-        assert not stop.done()
-        policy.release.set()
-        await asyncio.wait_for(stop, 10)
+async def stop_while_the_client_has_left(policy: FakePolicy) -> None:
+    """Asserts that stopping a server waits for what the policy is at, and then ends."""
+    server = PolicyServer(policy, port=0)
+    await server.start()
+    async with client(server) as leaving:
+        await leaving.send(pack(observation("hold")))
+        await eventually(policy.started.is_set)
+    stop = asyncio.create_task(server.stop())
+    await asyncio.sleep(0.2)
+    assert not stop.done()
+    policy.release.set()
+    await asyncio.wait_for(stop, 10)
 
-    asyncio.run(main())
+
+def test_stopping_waits_for_an_inference_whose_client_left() -> None:
+    asyncio.run(stop_while_the_client_has_left(FakePolicy()))
 
 
 PROGRAM = """

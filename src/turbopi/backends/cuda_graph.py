@@ -62,7 +62,7 @@ class Graph:
 
     def replay(self) -> None:
         """`launch`, and wait for whatever the current stream has to do."""
-        self._graph.replay()
+        self.launch()
         torch.cuda.current_stream(self._device).synchronize()
 
     def stage_ms(self) -> dict[str, float]:
