@@ -47,7 +47,8 @@ constexpr int QTL = most(QT, S);           // query tiles of a CTA: 8 RoPE pairs
 constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
-constexpr u32 PATIENCE = FEW ? 400 : 0;    // clock cycles before sums are asked for: polls slow down what they wait for
+// Clock cycles before sums are asked for: polls slow down what they wait for.
+constexpr u32 PATIENCE = FEW ? 400 : 0;
 constexpr int ITEMS_X = most(DX * NT, W);  // (tile, 8 tokens) of the slice that one warp looks after
 static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NC >= NH && A <= CONSUMERS,
               "sizes");
@@ -81,6 +82,12 @@ __host__ __device__ constexpr int slot_rounds(int parts, int tiles) {  // W / (p
   for (int i = 1; i < 8; i *= 2) n = i < tiles ? n / 2 : n;
   return n;
 }
+// With few tokens q|k|v are multiplied by mma: see `QkvProduct`. Its parts are the warps', or of two warps each if all
+// would need more memory than the stream that they lie over.
+constexpr int QKV = QTL + KVL, QKV_ROUNDS = plan_rounds(group_parts(imin(QKV, 8)), D16);
+constexpr bool MMA_QKV = FEW && QKV <= 3 && RPS * group_parts(imin(QKV, 8)) == W && QKV_ROUNDS * KB <= 4;
+constexpr bool QKV_PAIRS = QKV * W * PARTIAL > D16 * NT * 256;
+constexpr int QKV_PARTS = QKV_PAIRS ? W / 2 : W;
 constexpr int KEY_TILE = QT * FRAGMENT;     // bytes of 16 keys, or values
 constexpr int SLOT_TILES = RPS;             // of them in a slot
 constexpr int KT = most(KEY_TILES, S);      // tiles of a rank's prefix keys
@@ -110,7 +117,7 @@ constexpr int X_SUFFIX_SUMS = X_P + (KT + 1) * NT * 256, X_KEEP = X_SUFFIX_SUMS 
 constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);  // between steps
 constexpr int X_SIZE =
     up128(imax(imax(X_BYTES, X_SUFFIX + 2 * SUFFIX * RS),
-               imax(imax(plan_partials(QTL + KVL), plan_partials(GTL)) * PARTIAL,
+               imax(imax(MMA_QKV ? QKV * QKV_PARTS : plan_partials(QTL + KVL), plan_partials(GTL)) * PARTIAL,
                     X_XS + DX * 16 * T * 4)));
 // Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down; between
 // steps x_t. Hidden units, or queries, land when a peer has this rank's slice, which follows out's, or down's, sums.

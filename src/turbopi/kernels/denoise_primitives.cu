@@ -166,6 +166,28 @@ __device__ __forceinline__ void mma(float (&c)[4], uint4 a, uint2 b) {
       : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
       : "r"(a.x), "r"(a.y), "r"(a.z), "r"(a.w), "r"(b.x), "r"(b.y));
 }
+__device__ __forceinline__ void mma_half(float* c, uint4 a, uint2 b) {
+  asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+      : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
+      : "r"(a.x), "r"(a.y), "r"(a.z), "r"(a.w), "r"(b.x), "r"(b.y));
+}
+// Weights times activations: float16 if the weights were E4M3.
+__device__ __forceinline__ void mma_weights(float (&c)[4], uint4 a, uint2 b) {
+  if (FP8)
+    mma_half(c, a, b);
+  else
+    mma(c, a, b);
+}
+__device__ __forceinline__ void ldmatrix(uint4& v, u32 address) {
+  asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0,%1,%2,%3}, [%4];"
+               : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w)
+               : "r"(address));
+}
+__device__ __forceinline__ void ldmatrix_transposed(uint4& v, u32 address) {
+  asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0,%1,%2,%3}, [%4];"
+               : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w)
+               : "r"(address));
+}
 // Operand A of a tile x one block: of E4M3 weights a lane has columns 2t, 2t + 1, 2t + 8, 2t + 9 of row g, and of
 // g + 8.
 __device__ __forceinline__ uint4 from_e4m3(u32 row, u32 row_8) {

@@ -58,7 +58,25 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
   for (int r = 0; r < rounds; ++r) {
     if (left == 0) slot = take_slot(b, full), left = rounds_of_slot, from = slot * SLOT, full = false;
     const int unit = r * RPS * PARTS + my.part;
-    if constexpr (FP8) {
+    if constexpr (FP8 && FEW) {  // by mma, a tile a warp: of E4M3 weights it takes both blocks of a fragment at once
+      const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
+      uint4 w[RPS];
+      u32 seen = 0;
+#pragma unroll
+      for (int i = 0; i < RPS; ++i) w[i] = load_fragment(p + i * PARTS * tiles * FRAGMENT, b.lane), seen ^= fold(w[i]);
+#pragma unroll
+      for (int i = 0; i < RPS; ++i)
+#pragma unroll
+        for (int half = 0; half < 2; ++half) {
+          const uint4 a = half ? from_e4m3(w[i].z, w[i].w) : from_e4m3(w[i].x, w[i].y);
+          const int block = (unit + i * PARTS) * KB + half;
+          uint4 v;  // of the first 8 tokens 8 columns, the other 8, then of the next 8 tokens
+          ldmatrix(v, x + (EXACT ? block : min(block, blocks - 1)) * NT * 256 + b.lane * 16);
+          mma_half(sums, a, make_uint2(v.x, v.y));
+          if (NT > 1) mma_half(sums + (NT - 1) * 4, a, make_uint2(v.z, v.w));
+        }
+      if (--left == 0 || r + 1 == rounds) give_slot(b, slot, seen);
+    } else if constexpr (FP8) {
       const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
       uint4 w = load_fragment(p, b.lane);
 #pragma unroll 1  // with room for two fragments, others' registers would spill
@@ -111,7 +129,20 @@ __device__ __forceinline__ void multiply(Block& b, u32 x, int blocks, int tiles,
 __device__ __forceinline__ int partial_place(const Block& b, int n) {
   return n * 512 + (TAIL == 4 || n + 1 < NT ? b.lane : b.g() * TAIL + min(b.t(), TAIL - 1)) * 16;
 }
-// The warps' partial sums to shared memory, and a tile's total back, always in the same order.
+// So many parts of a tile, always in the same order.
+template <int PARTS>
+__device__ __forceinline__ float4 add_up(const byte* p) {
+  float4 v[PARTS];
+#pragma unroll
+  for (int i = 0; i < PARTS; ++i) v[i] = *(const float4*)(p + i * PARTIAL);
+#pragma unroll
+  for (int d = 1; d < PARTS; d *= 2)
+#pragma unroll
+    for (int i = 0; i + d < PARTS; i += 2 * d)
+      v[i].x += v[i + d].x, v[i].y += v[i + d].y, v[i].z += v[i + d].z, v[i].w += v[i + d].w;
+  return v[0];
+}
+// The warps' partial sums to shared memory, and a tile's total back.
 template <int MT, int FIRST = 0>
 __device__ __forceinline__ void store_partials(const Block& b, byte* to, int tiles, float (*sums)[NT * 4]) {
   if constexpr (FIRST < MT) {
@@ -133,16 +164,7 @@ __device__ __forceinline__ float4 total(const Block& b, const byte* from, int ti
   constexpr int N = group_tiles(MT - FIRST), PARTS = group_parts(N);
   if constexpr (FIRST + N < MT)
     if (tile >= FIRST + N) return total<MT, FIRST + N>(b, from, tile, n);
-  const byte* p = from + (plan_partials(FIRST) + (tile - FIRST) * PARTS) * PARTIAL + partial_place(b, n);
-  float4 v[PARTS];
-#pragma unroll
-  for (int i = 0; i < PARTS; ++i) v[i] = *(const float4*)(p + i * PARTIAL);
-#pragma unroll
-  for (int d = 1; d < PARTS; d *= 2)
-#pragma unroll
-    for (int i = 0; i + d < PARTS; i += 2 * d)
-      v[i].x += v[i + d].x, v[i].y += v[i + d].y, v[i].z += v[i + d].z, v[i].w += v[i + d].w;
-  return v[0];
+  return add_up<PARTS>(from + (plan_partials(FIRST) + (tile - FIRST) * PARTS) * PARTIAL + partial_place(b, n));
 }
 
 // Or else: the warps that share a tile divide its tokens, part p has 8 tokens n = p, p + parts, ... An item is (tile, 8

@@ -1,16 +1,5 @@
 // Part 7 of 10: queries, keys and values of the suffix.
 
-__device__ __forceinline__ void ldmatrix(uint4& v, u32 address) {
-  asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0,%1,%2,%3}, [%4];"
-               : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w)
-               : "r"(address));
-}
-__device__ __forceinline__ void ldmatrix_transposed(uint4& v, u32 address) {
-  asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0,%1,%2,%3}, [%4];"
-               : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w)
-               : "r"(address));
-}
-
 constexpr int ITEMS_Q =
     most((QTL + KVL) * NT, W);  // (tile, 8 tokens) of queries, keys and values that one warp finishes
 
@@ -45,6 +34,101 @@ constexpr float LOWEST = -3e38f;
 __device__ __forceinline__ int ordered(int v) { return v ^ ((v >> 31) & 0x7fffffff); }
 __device__ __forceinline__ int ordered(float v) { return ordered(__float_as_int(v)); }
 
+// q|k|v by mma, for few tokens: of wgmma's 64 rows a third or half would be empty. A warp has all tiles of every 16th
+// fragment, so each block's activations are read once; its weights wait in registers for the stream, and their slots
+// are free early.
+struct QkvProduct {
+  uint4 weights[QKV_ROUNDS * KB][QKV];
+  float sums[QKV][NT][4];
+  int tiles;
+
+  __device__ __forceinline__ explicit QkvProduct(int n) : tiles(n) {}
+  __device__ __forceinline__ bool some() const { return QT % S == 0 || tiles > 0; }
+  // Missing tiles are loaded, too: whatever lies there.
+  __device__ __forceinline__ void load(Block& b) {
+    if (!some()) return;
+    const int rounds_of_slot = slot_rounds(group_parts(QKV), tiles);
+    u32 slot = 0, at = 0, seen = 0;
+    int left = 0;
+#pragma unroll
+    for (int r = 0; r < QKV_ROUNDS; ++r) {
+      if (left == 0) {
+        slot = take_slot(b), left = rounds_of_slot, seen = 0;
+        // ldmatrix's second quarter of lanes fetches rows g + 8, which lie behind the other columns of rows g
+        const int place = FP8 ? b.lane * 16 : (b.lane & 7) * 16 + (b.lane >> 3 & 1) * 256 + (b.lane >> 4) * 128;
+        at = M_RING + slot * SLOT + b.warp * tiles * FRAGMENT + place;
+      }
+#pragma unroll
+      for (int i = 0; i < QKV; ++i) {
+        uint4 v;
+        if (FP8) {
+          v = *(const uint4*)(b.smem + at + i * FRAGMENT);
+          weights[r * KB][i] = from_e4m3(v.x, v.y), weights[r * KB + KB - 1][i] = from_e4m3(v.z, v.w);
+        } else {
+          ldmatrix(v, b.base + at + i * FRAGMENT);
+          weights[r][i] = v;
+        }
+        seen ^= fold(v);
+      }
+      at += W * tiles * FRAGMENT;
+      if (--left == 0 || r + 1 == QKV_ROUNDS) give_slot(b, slot, seen);
+    }
+  }
+  __device__ __forceinline__ void multiply(const Block& b) {
+    constexpr bool EXACT = D16 % (KB * W) == 0;
+#pragma unroll
+    for (int i = 0; i < QKV; ++i) clear(sums[i]);
+    if (!some()) return;
+#pragma unroll
+    for (int k = 0; k < QKV_ROUNDS * KB; ++k) {
+      const int block = (k / KB * W + b.warp) * KB + k % KB;
+      uint4 v;  // of the first 8 tokens 8 columns, the other 8, then of the next 8 tokens
+      ldmatrix(v, b.base + M_X + (EXACT ? block : min(block, D16 - 1)) * NT * 256 + b.lane * 16);
+#pragma unroll
+      for (int i = 0; i < QKV; ++i)
+#pragma unroll
+        for (int n = 0; n < NT; ++n)
+          mma_weights(sums[i][n], weights[k][i], n ? make_uint2(v.z, v.w) : make_uint2(v.x, v.y));
+    }
+  }
+  // With QKV_PAIRS warps i and i + 8 add up their sums, each of them half.
+  __device__ __forceinline__ void store(const Block& b, byte* to) {
+    const int upper = b.warp / QKV_PARTS, part = b.warp % QKV_PARTS;
+    auto exists = [&](int i, int n) { return i < tiles && (n + 1 < NT || b.t() < TAIL); };
+    auto place = [&](int i, int n) {
+      return (float4*)(to + (i * QKV_PARTS + part) * PARTIAL + partial_place(b, n));
+    };
+#pragma unroll
+    for (int i = 0; i < QKV; ++i)
+#pragma unroll
+      for (int n = 0; n < NT; ++n)
+        if ((!QKV_PAIRS || (i * NT + n) % 2 != upper) && exists(i, n))
+          *place(i, n) = make_float4(sums[i][n][0], sums[i][n][1], sums[i][n][2], sums[i][n][3]);
+    if (!QKV_PAIRS) return;
+    __syncwarp();
+    asm volatile("bar.sync %0, 64;" ::"r"(8 + part) : "memory");
+#pragma unroll
+    for (int i = 0; i < QKV; ++i)
+#pragma unroll
+      for (int n = 0; n < NT; ++n)
+        if ((i * NT + n) % 2 == upper && exists(i, n)) {
+          const float4 v = *place(i, n);
+          *place(i, n) =
+              make_float4(sums[i][n][0] + v.x, sums[i][n][1] + v.y, sums[i][n][2] + v.z, sums[i][n][3] + v.w);
+        }
+  }
+  static __device__ __forceinline__ float4 total(const Block& b, const byte* from, int tile, int n) {
+    const byte* p = from + tile * QKV_PARTS * PARTIAL + partial_place(b, n);
+    float4 sum = make_float4(0, 0, 0, 0);
+#pragma unroll
+    for (int first = 0; first < QKV_PARTS; first += 8) {
+      const float4 v = add_up<8>(p + first * PARTIAL);
+      sum.x += v.x, sum.y += v.y, sum.z += v.z, sum.w += v.w;
+    }
+    return sum;
+  }
+};
+
 // Awaits the stream. q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream; queries are sent when all of those have been read, so what a peer sends after it has them may lie there too.
 __device__ __forceinline__ void project(Block& b, const float* shifted, const float* row_scales, float* kv, u32 bit,
@@ -58,14 +142,27 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     shift[j] = make_float2(__ldg(shifted + tile * 16 + b.g()), __ldg(shifted + tile * 16 + b.g() + 8));
     if (FP8) scale[j] = make_float2(__ldg(row_scales + tile * 16 + b.g()), __ldg(row_scales + tile * 16 + b.g() + 8));
   }
-  receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
-  b.x_parity ^= 1;
-  MARK(0)
-  float sums[plan_groups(QTL + KVL)][NT * 4];
-  multiply<QTL + KVL, D16>(b, b.base + M_X, D16, qn + kvn, sums);
-  MARK(1)
-  consumers_sync();
-  store_partials<QTL + KVL>(b, b.smem + M_X, qn + kvn, sums);
+  auto await_stream = [&] {
+    receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
+    b.x_parity ^= 1;
+    MARK(0)
+  };
+  if constexpr (MMA_QKV) {
+    QkvProduct product(qn + kvn);
+    product.load(b);
+    await_stream();
+    product.multiply(b);
+    MARK(1)
+    consumers_sync();
+    product.store(b, b.smem + M_X);
+  } else {
+    await_stream();
+    float sums[plan_groups(QKV)][NT * 4];
+    multiply<QKV, D16>(b, b.base + M_X, D16, qn + kvn, sums);
+    MARK(1)
+    consumers_sync();
+    store_partials<QKV>(b, b.smem + M_X, qn + kvn, sums);
+  }
   consumers_sync();
   if (threadIdx.x < NT * 8) ((int*)(b.smem + M_PART))[threadIdx.x] = ordered(LOWEST);  // for `weigh_prefix`
   byte* const staged = b.smem + M_H + H_ATT;  // free until all have what attention sends: [item][half][8 tokens][8]
@@ -77,7 +174,8 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
                     : KVL == 1 ? k
                                : k / kvn,
                 kv_tile = KVL == 1 ? 0 : k % kvn, token = n * 8 + 2 * b.t();
-      float4 c = total<QTL + KVL>(b, b.smem + M_X, k < 0 ? i % qn : qn + kv_tile, n);
+      const int at = k < 0 ? i % qn : qn + kv_tile;
+      float4 c = MMA_QKV ? QkvProduct::total(b, b.smem + M_X, at, n) : total<QKV>(b, b.smem + M_X, at, n);
       if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
       const float2 r = inverse_rms(b, token);
       float4 turn = make_float4(rope[j][0].x, rope[j][0].y, rope[j][1].x, rope[j][1].y);
