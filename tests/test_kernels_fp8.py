@@ -248,11 +248,11 @@ def test_repetition_is_bit_identical() -> None:
 )
 def test_the_chosen_tile_is_one_that_the_kernel_takes(rows: int, n: int, k: int, epilogue: Epilogue) -> None:
     tile = gemm_fp8.best_tile(rows, n, k, epilogue, 132)
-    assert tile.stages(factors=True) >= 3
+    assert tile.stages(factors=1) >= 3
     assert tile.columns % (16 if epilogue == "geglu" else 8) == 0 and tile.columns <= 256
     assert tile.splits == 1 or epilogue == "partial"
     steps = -(-k // gemm_fp8.DEPTH)
     assert tile.splits <= steps
     assert gemm_fp8.promotion(tile, k) or steps <= gemm_fp8.UNPROMOTED_STEPS * tile.splits
-    used = tile.stages(factors=True) * (tile.rows + tile.columns) * 128 + 16 * 16 + 8 * tile.warpgroups * tile.columns
+    used = tile.stages(factors=1) * (tile.rows + tile.columns) * 128 + 16 * 16 + 8 * tile.warpgroups * tile.columns
     assert used + 1024 <= SHARED_BYTES

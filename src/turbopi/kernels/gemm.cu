@@ -8,8 +8,14 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #if TP_RESIDUAL
      const u32* residual, float2* sums_out,
 #endif
+#if TP_ROW_PARTS
+     const float2* sums_in, float inverse_width, float eps,
+#endif
 #if TP_NORMED
-     const float2* sums_in, float inverse_width, float eps, const float* sums_of_w, const float* offset,
+     const float* sums_of_w, const float* offset,
+#endif
+#if TP_COPY
+     const u32* norm_scale, const u32* norm_shift, float copy_inverse, unsigned char* copy,
 #endif
      int M, int N, int k_blocks, int m_groups, int n_groups, const char* ahead, u32 ahead_bytes) {
     extern __shared__ char raw[];
@@ -100,7 +106,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
             float sums[BN / 2];
 #if TP_FP8
-            Factors factors;
+            Factors factors;  // where the input is normed, `bias` goes with the offset
             factors.fetch(scale, (const u16*)bias, t.n, N, bias && t.split == 0);
             float* const shared = (float*)(raw + (empty + 8 * STAGES - shared_address(raw))) + group * 2 * BN;
 #if TP_PROMOTE
@@ -109,20 +115,29 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #endif
 #endif
 #if TP_NORMED
-            Factors factors;
-            factors.fetch(sums_of_w, offset, t.n, N);
-            float* const shared = (float*)(raw + (empty + 8 * STAGES - shared_address(raw))) + group * 2 * BN;
+            Factors of_norm;
+            of_norm.fetch(sums_of_w, offset, t.n, N);
+            float* const shared_norm =
+                (float*)(raw + (empty + 8 * STAGES - shared_address(raw))) + (FP8 * WGS + group) * 2 * BN;
+#endif
+#if TP_COPY
+            u32 scales[BN / 8], shifts[BN / 8];  // of the next norm
+#pragma unroll
+            for (int j = 0; j < BN / 8; ++j) {
+                const int col = t.n + j * 8 + lane % 4 * 2;
+                scales[j] = col < N ? norm_scale[col / 2] : 0, shifts[j] = col < N ? norm_shift[col / 2] : 0;
+            }
 #endif
 #if TP_RESIDUAL || TP_NORMED
             asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
-#if TP_NORMED
-            constexpr int OWN_SUMS = (TP_NORMED + 3) / 4;  // of a row's parts: fetched now, needed in the end
+#if TP_ROW_PARTS
+            constexpr int OWN_SUMS = (TP_ROW_PARTS + 3) / 4;  // of a row's parts: fetched now, needed in the end
             float2 row_sums[2][OWN_SUMS];
 #pragma unroll
             for (int i = 0; i < 2 * OWN_SUMS; ++i) {
                 const int row = t.m + group * 64 + warp * 16 + lane / 4 + i % 2 * 8, part = i / 2 * 4 + lane % 4;
-                const bool there = row < M && part < TP_NORMED;
+                const bool there = row < M && part < TP_ROW_PARTS;
                 row_sums[i % 2][i / 2] = there ? sums_in[(size_t)part * M + row] : make_float2(0.0f, 0.0f);
             }
 #endif
@@ -180,6 +195,8 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #endif
 #if TP_FP8
             factors.share(shared, group);
+#endif
+#if TP_FP8 && !TP_NORMED
 #pragma unroll
             for (int j = 0; j < BN / 8; ++j) {  // sums of whole numbers become what they stand for
                 const float2 by = *(const float2*)(shared + j * 8 + lane % 4 * 2);
@@ -193,7 +210,9 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #endif
 
 #if TP_NORMED
-            factors.share(shared, group);
+            of_norm.share(shared_norm, group);
+#endif
+#if TP_ROW_PARTS
             float mean[2], factor[2];
 #pragma unroll
             for (int half = 0; half < 2; ++half) {
@@ -204,15 +223,26 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                 const float variance = sum_of_quad(squares) * inverse_width - mean[half] * mean[half];
                 factor[half] = rsqrtf(fmaxf(variance, 0.0f) + eps);
             }
+#endif
+#if TP_NORMED
 #pragma unroll
             for (int j = 0; j < BN / 8; ++j) {
-                const float2 of_w = *(const float2*)(shared + j * 8 + lane % 4 * 2);
-                const float2 plus = *(const float2*)(shared + BN + j * 8 + lane % 4 * 2);
+                const float2 of_w = *(const float2*)(shared_norm + j * 8 + lane % 4 * 2);
+                const float2 plus = *(const float2*)(shared_norm + BN + j * 8 + lane % 4 * 2);
+#if TP_FP8
+                const float2 by = *(const float2*)(shared + j * 8 + lane % 4 * 2);
+                const float2 biases = *(const float2*)(shared + BN + j * 8 + lane % 4 * 2);
+#endif
 #pragma unroll
                 for (int half = 0; half < 2; ++half) {
                     float &x = sums[4 * j + 2 * half], &y = sums[4 * j + 2 * half + 1];
+#if TP_FP8  // the shift is in x already, once: (x by - mean of_w - plus) factor + plus + bias
+                    x = fmaf(fmaf(x, by.x, -fmaf(mean[half], of_w.x, plus.x)), factor[half], plus.x + biases.x);
+                    y = fmaf(fmaf(y, by.y, -fmaf(mean[half], of_w.y, plus.y)), factor[half], plus.y + biases.y);
+#else
                     x = fmaf(x - mean[half] * of_w.x, factor[half], plus.x);
                     y = fmaf(y - mean[half] * of_w.y, factor[half], plus.y);
+#endif
                 }
             }
 #endif
@@ -236,9 +266,11 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                         if (inside && col < N) *(float2*)(to + col) = make_float2(x, y);
                     }
                 } else {
-                    Element* to = (Element*)out + (size_t)row * N;
 #if TP_RESIDUAL
                     float sum = 0.0f, squares = 0.0f;  // of the row's results
+#endif
+#if TP_COPY
+                    u32 copies[BLOCKS];
 #endif
                     auto value = [&](int j) -> u32 {
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
@@ -251,6 +283,13 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #if TP_RESIDUAL
                         const u32 both = pack(x + bf16_low(before[half][j]), y + bf16_high(before[half][j]));
                         x = bf16_low(both), y = bf16_high(both);
+#if TP_COPY
+                        const bool there = t.n + j * 8 < N;
+                        x = there ? (x - mean[half]) * factor[half] : 0.0f;
+                        y = there ? (y - mean[half]) * factor[half] : 0.0f;
+                        copies[j] = pack_e4m3(fmaf(x, bf16_low(scales[j]), bf16_low(shifts[j])) * copy_inverse,
+                                              fmaf(y, bf16_high(scales[j]), bf16_high(shifts[j])) * copy_inverse);
+#endif
                         sum += x + y, squares += x * x + y * y;
                         return both;
 #endif
@@ -259,26 +298,12 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #endif
                         return pack(x, y);
                     };
-#pragma unroll
-                    for (int j = 0; j + 3 < BLOCKS; j += 4) {
-                        if (GATHER && owner(j) != t.split) continue;
-                        const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
-                        const int col = t.n + (j + lane % 4) * 8;
-                        if (inside && col < N) {
-                            if (OUT_FP8) *(uint2*)(to + col) = make_uint2(v.x | v.y << 16, v.z | v.w << 16);
-                            else *(uint4*)(to + col) = v;
-                        }
-                    }
-#pragma unroll
-                    for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
-                        if (GATHER && owner(j) != t.split) continue;
-                        const int col = t.n + j * 8 + lane % 4 * 2;
-                        const u32 v = value(j);
-                        if (inside && col < N) {
-                            if (OUT_FP8) *(u16*)(to + col) = (u16)v;
-                            else *(u32*)(to + col) = v;
-                        }
-                    }
+                    store_row((Element*)out + (size_t)row * N, t, N, inside, lane, value);
+#if TP_COPY
+                    store_row(copy + (size_t)row * N, t, N, inside, lane, [&](int j) { return copies[j]; });
+                    if (t.n == 0 && (!GATHER || t.split == 0) && lane % 4 == 0)  // so that no eps is needed any more
+                        squares += eps * factor[half] * factor[half] / inverse_width;
+#endif
 #if TP_RESIDUAL
                     sum = sum_of_quad(sum), squares = sum_of_quad(squares);
                     const int part = GATHER ? t.n / TILE_N * SPLITS + t.split : t.n / TILE_N;

@@ -23,10 +23,16 @@
 // takes a's LayerNorm for a, whose scale is in w and whose shift in `offset`: as the product is linear, the norm is
 // only made of the sums in the end. `sums_of_w` are of the rounded w, so a mean in a's rows cancels, however large.
 //
+// The same where the product behind is of E4M3 numbers: TP_COPY (parts of the residual's row sums, or 0) also rounds the
+// result to E4M3 as if the residual's mean and variance were its own, and `sums_out` are of the result in these units.
+// They are close, so it is as good an E4M3 copy as the norm's would be; TP_NORMED then makes up for the difference, in
+// which w times the shift is in `offset`, as it is in the copy already, and the bias goes apart.
+//
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
 
 constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
 constexpr bool GATHER = TP_GATHER;
+#define TP_ROW_PARTS (TP_NORMED + TP_COPY)
 constexpr int EPILOGUE = TP_EPILOGUE, PARTS = EPILOGUE == 3 ? 2 : 1;
 constexpr int SHARING = CM * CN, CLUSTER = SHARING * (GATHER ? SPLITS : 1);
 constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
@@ -150,4 +156,31 @@ __device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, in
     t.k = k_blocks * t.split / SPLITS;
     t.k_end = k_blocks * (t.split + 1) / SPLITS;
     return t;
+}
+
+// A lane's part of one row of a tile's results, `value(block)` for each block of 8 columns.
+template <typename Number, typename Value>
+__device__ __forceinline__ void store_row(Number* to, const Tile& t, int N, bool inside, int lane, Value value) {
+    constexpr int BLOCKS = TILE_N / 8;
+    constexpr bool BYTES = sizeof(Number) == 1;
+#pragma unroll
+    for (int j = 0; j + 3 < BLOCKS; j += 4) {
+        if (GATHER && owner(j) != t.split) continue;
+        const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
+        const int col = t.n + (j + lane % 4) * 8;
+        if (inside && col < N) {
+            if (BYTES) *(uint2*)(to + col) = make_uint2(v.x | v.y << 16, v.z | v.w << 16);
+            else *(uint4*)(to + col) = v;
+        }
+    }
+#pragma unroll
+    for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
+        if (GATHER && owner(j) != t.split) continue;
+        const int col = t.n + j * 8 + lane % 4 * 2;
+        const u32 v = value(j);
+        if (inside && col < N) {
+            if (BYTES) *(u16*)(to + col) = (u16)v;
+            else *(u32*)(to + col) = v;
+        }
+    }
 }
