@@ -66,7 +66,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class Copy:
-    """An E4M3 copy of the result x: round(((x - mean) / deviation * scale + shift) * inverse).
+    """An E4M3 copy of the result x: round((x - mean) / deviation * scale + shift).
 
     Mean and deviation are those of the *residual*'s rows. `sums_out` are then of (x - mean) / deviation, and what the
     norm adds to the variance of x is in the squares.
@@ -74,10 +74,9 @@ class Copy:
 
     out: Tensor  # e4m3[M, N]
     sums: Sums  # of the residual
-    scale: Tensor  # bfloat16[N]  of the LayerNorm behind
-    shift: Tensor  # bfloat16[N]
+    scale: Tensor  # float32[N]  of the LayerNorm behind, over the scale of the copy
+    shift: Tensor  # float32[N]  the same
     eps: float
-    inverse: float
 
 
 @dataclass(frozen=True)
@@ -135,6 +134,7 @@ def matmul(
         out = torch.empty(shape, dtype=dtype, device=a.device)
     assert out.is_contiguous()
     assert copy is None or (residual is not None and copy.out.is_contiguous() and copy.out.shape == (m, n))
+    assert copy is None or (sums is None and not tile.gather and copy.scale.dtype == copy.shift.dtype == torch.float32)
     copied = 0 if copy is None else copy.sums.count
     kernel = _kernel(tile, epilogue, residual is not None, 0 if sums is None else sums.count, copied, a.device)
     arguments = (
@@ -192,7 +192,6 @@ def _copy_arguments(copy: Copy | None, width: int) -> tuple[Any, ...]:
         *_row_arguments(copy.sums, width, copy.eps),
         ctypes.c_void_p(copy.scale.data_ptr()),
         ctypes.c_void_p(copy.shift.data_ptr()),
-        ctypes.c_float(copy.inverse),
         ctypes.c_void_p(copy.out.data_ptr()),
     )
 

@@ -23,10 +23,10 @@
 // takes a's LayerNorm for a, whose scale is in w and whose shift in `offset`: as the product is linear, the norm is
 // only made of the sums in the end. `sums_of_w` are of the rounded w, so a mean in a's rows cancels, however large.
 //
-// The same where the product behind is of E4M3 numbers: TP_COPY (parts of the residual's row sums, or 0) also rounds the
-// result to E4M3 as if the residual's mean and variance were its own, and `sums_out` are of the result in these units.
-// They are close, so it is as good an E4M3 copy as the norm's would be; TP_NORMED then makes up for the difference, in
-// which w times the shift is in `offset`, as it is in the copy already, and the bias goes apart.
+// The same where the product behind is of E4M3 numbers: TP_COPY (parts of the residual's row sums, or 0) also rounds
+// the result to E4M3 as if the residual's mean and variance were its own, and `sums_out` are of the result in these
+// units. They are close, so it is as good an E4M3 copy as the norm's would be; TP_NORMED then makes up for the
+// difference, in which w times the shift is in `offset`, as it is in the copy already, and the bias goes apart.
 //
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
 
@@ -36,6 +36,7 @@ constexpr bool GATHER = TP_GATHER;
 constexpr int EPILOGUE = TP_EPILOGUE, PARTS = EPILOGUE == 3 ? 2 : 1;
 constexpr int SHARING = CM * CN, CLUSTER = SHARING * (GATHER ? SPLITS : 1);
 constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
+static_assert(!(TP_COPY && (GATHER || FP8)) && !(TP_COPY && TP_NORMED), "copies leave whole bfloat16 products");
 #if TP_OUT_FP8
 typedef unsigned char Element;
 #else
@@ -63,11 +64,29 @@ __device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int ro
 }
 TP_MMA  // mma(float (&sums)[BN / 2], u64 a, u64 b, int keep)
 
-__device__ __forceinline__ float gelu(float x) {  // tanh's, as x * sigmoid
-    return __fdividef(x, 1.0f + exp2f(x * (-2.302208198f - 0.1029432397f * x * x)));
+__device__ __forceinline__ float gelu(float x) {  // tanh's, which is off by 2^-11 at most: less than rounding is
+    float t;
+    asm("tanh.approx.f32 %0, %1;" : "=f"(t) : "f"(x * fmaf(0.0356774081f, x * x, 0.7978845608f)));
+    return fmaf(0.5f * x, t, 0.5f * x);
 }
+// The descriptor of hopper.cu's `operand`, of its lower half, which counts in 16 bytes.
+__device__ __forceinline__ u32 lower_half(u32 address) { return (u32)operand(address); }
+__device__ __forceinline__ u64 operand_of(u32 lower) { return lower | (operand(0) & 0xffffffff00000000ull); }
+
+// Values that the compiler is to make here, and once: else it makes addresses anew for each load, after a wait.
+template <typename T>
+__device__ __forceinline__ T* settled(T* pointer) {
+    asm volatile("" : "+l"(pointer));
+    return pointer;
+}
+__device__ __forceinline__ float settled(float x) {
+    asm volatile("" : "+f"(x));
+    return x;
+}
+
 // A tile's scales and biases by column of `w`. Each thread of a warpgroup fetches some of them long before they are
-// needed; once the sums are there they go through shared memory to whom they belong.
+// needed; they go through shared memory to whom they belong: before the sums are made where a CTA has one tile, as it
+// waits for the kernel before it then, else after that.
 struct Factors {
     static constexpr int OWN = (BN + 127) / 128;
     float scale[OWN], bias[OWN];
@@ -90,13 +109,13 @@ struct Factors {
             bias[i] = inside ? biases[n + c] : 0.0f;
         }
     }
-    __device__ __forceinline__ void share(float* shared, int warpgroup) const {
+    __device__ __forceinline__ void share(float2* shared, int warpgroup) const {
         const auto sync = [&] { asm volatile("bar.sync %0, 128;" ::"r"(warpgroup + 1) : "memory"); };
         sync();  // the last tile's have been read
 #pragma unroll
         for (int i = 0; i < OWN; ++i) {
             const int c = threadIdx.x % 128 + 128 * i;
-            if (c < BN) shared[c] = scale[i], shared[BN + c] = bias[i];
+            if (c < BN) shared[c] = make_float2(scale[i], bias[i]);
         }
         sync();
     }
@@ -158,29 +177,49 @@ __device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, in
     return t;
 }
 
-// A lane's part of one row of a tile's results, `value(block)` for each block of 8 columns.
-template <typename Number, typename Value>
-__device__ __forceinline__ void store_row(Number* to, const Tile& t, int N, bool inside, int lane, Value value) {
+// A quad's E4M3 numbers of 4 blocks, 2 columns of each a lane, in p (blocks 0 and 1) and q; lane i gets block i.
+__device__ __forceinline__ uint2 transpose_bytes(u32 p, u32 q, int lane) {
+    const bool odd = lane & 1, high = lane & 2;
+    const u32 low_halves = high ? 0x1054 : 0x5410, high_halves = high ? 0x3276 : 0x7632;
+    const u32 kept = high ? q : p, of_pair = __shfl_xor_sync(~0u, high ? p : q, 2);
+    const u32 mine = __byte_perm(kept, of_pair, odd ? high_halves : low_halves);
+    const u32 other = __shfl_xor_sync(~0u, __byte_perm(kept, of_pair, odd ? low_halves : high_halves), 1);
+    return make_uint2(__byte_perm(mine, other, odd ? 0x1054 : 0x5410), __byte_perm(mine, other, odd ? 0x3276 : 0x7632));
+}
+
+// A lane's part of a row of a tile's results, `value(block)` for each of `count` blocks of 8 columns; `to` is where the
+// tile begins in that row.
+template <typename Value>
+__device__ __forceinline__ void store_row(u16* to, int count, int split, int lane, Value value) {
     constexpr int BLOCKS = TILE_N / 8;
-    constexpr bool BYTES = sizeof(Number) == 1;
+    const bool odd = lane & 1;
+    u16* const place = to + (odd ? 8 : 0) + lane % 4 / 2 * 4;
+#pragma unroll
+    for (int j = 0; j + 1 < BLOCKS; j += 2) {  // lanes of a pair exchange halves of two blocks
+        if (GATHER && owner(j) != split) continue;
+        const u32 x = value(j), y = value(j + 1), other = __shfl_xor_sync(~0u, odd ? x : y, 1);
+        if (j + odd < count) *(uint2*)(place + j * 8) = odd ? make_uint2(other, y) : make_uint2(x, other);
+    }
+    if (BLOCKS % 2 && (!GATHER || owner(BLOCKS - 1) == split)) {
+        const u32 x = value(BLOCKS - 1);
+        if (BLOCKS - 1 < count) *(u32*)(to + (BLOCKS - 1) * 8 + lane % 4 * 2) = x;
+    }
+}
+template <typename Value>
+__device__ __forceinline__ void store_row(unsigned char* to, int count, int split, int lane, Value value) {
+    constexpr int BLOCKS = TILE_N / 8;
+    unsigned char* const place = to + lane % 4 * 8;
 #pragma unroll
     for (int j = 0; j + 3 < BLOCKS; j += 4) {
-        if (GATHER && owner(j) != t.split) continue;
-        const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
-        const int col = t.n + (j + lane % 4) * 8;
-        if (inside && col < N) {
-            if (BYTES) *(uint2*)(to + col) = make_uint2(v.x | v.y << 16, v.z | v.w << 16);
-            else *(uint4*)(to + col) = v;
-        }
+        if (GATHER && owner(j) != split) continue;
+        const u32 p = value(j) | value(j + 1) << 16, q = value(j + 2) | value(j + 3) << 16;
+        const uint2 v = transpose_bytes(p, q, lane);
+        if (j + lane % 4 < count) *(uint2*)(place + j * 8) = v;
     }
 #pragma unroll
     for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
-        if (GATHER && owner(j) != t.split) continue;
-        const int col = t.n + j * 8 + lane % 4 * 2;
-        const u32 v = value(j);
-        if (inside && col < N) {
-            if (BYTES) *(u16*)(to + col) = (u16)v;
-            else *(u32*)(to + col) = v;
-        }
+        if (GATHER && owner(j) != split) continue;
+        const u32 x = value(j);
+        if (j < count) *(u16*)(to + j * 8 + lane % 4 * 2) = (u16)x;
     }
 }

@@ -71,6 +71,7 @@ class VisionTower:
         # by the weight's address; the weight stays with it, so that no other one can come to lie there
         self._folded: dict[int, tuple[Tensor, Folded]] = {}
         self._folded_fp8: dict[int, FoldedFp8] = {}
+        self._scaled: dict[int, tuple[Tensor, tuple[Tensor, Tensor]]] = {}  # by the norm's address, as above
         self._stream: Normed | None = None  # the residual stream and its sums, as the last product left it
         self._behind: dict[int, Tensor] = {}  # which matrix came behind the one at this address last time: a hint
         self._last: Tensor | None = None
@@ -96,11 +97,11 @@ class VisionTower:
         ahead = self._next(y.weight)
         sums = Sums.allocate(y.tile, x.shape[0], x.shape[1], x.device)
         if inverse is not None:
-            if before is None or before.x is not x or isinstance(y.weight, Fp8Matrix):
+            if before is None or before.x is not x or isinstance(y.weight, Fp8Matrix) or y.tile.gather:
                 made = tuned_residual_linear(y.x, y.weight, y.bias, ahead)
                 return norms.residual_layer_norm(x, made, weight, bias, eps, inverse)
             copied = torch.empty_like(x, dtype=E4M3)
-            copy = Copy(copied, before.sums, weight, bias, eps, inverse / HEADROOM)
+            copy = Copy(copied, before.sums, *self._for_copies(weight, bias, inverse), eps)
             x = matmul(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, copy=copy, ahead=ahead)
             return x, NormedCopy(copied, sums, weight, bias)
         if isinstance(y.weight, Fp8Matrix):
@@ -150,6 +151,14 @@ class VisionTower:
         if out is not None:  # the tower's result: what comes behind it is the next call's
             ahead = None
         return matmul(x.x, folded, tile, epilogue, out=out, sums=x.sums, eps=x.eps, ahead=ahead)
+
+    def _for_copies(self, scale: Tensor, shift: Tensor, inverse: float) -> tuple[Tensor, Tensor]:
+        """A LayerNorm's weights as `Copy` wants them."""
+        key = scale.data_ptr()
+        if key not in self._scaled:
+            by = inverse / HEADROOM
+            self._scaled[key] = scale, (scale.float() * by, shift.float() * by)
+        return self._scaled[key][1]
 
     def _from_copy(
         self,
