@@ -28,11 +28,9 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
     if (threadIdx.x == 128 * WGS) {
         asm volatile("prefetch.tensormap [%0];\nprefetch.tensormap [%1];" ::"l"(&map_a), "l"(&map_w));
     }
-    if (threadIdx.x == 0) {
-        for (int s = 0; s < STAGES; ++s) {
-            barrier_init(full + 8 * s, 1);
-            barrier_init(empty + 8 * s, WGS * (CM + CN - 1));
-        }
+    if (threadIdx.x < STAGES) {
+        barrier_init(full + 8 * threadIdx.x, 1);
+        barrier_init(empty + 8 * threadIdx.x, WGS * (CM + CN - 1));
         asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     }
     if (CLUSTER > 1) cluster_sync();
@@ -41,7 +39,8 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 
     if (warpgroup == WGS) {
         asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
-        if (threadIdx.x == 128 * WGS) {
+        const int producer = threadIdx.x / 32 - 4 * WGS;  // 0 loads w, 1 loads a
+        if (threadIdx.x % 32 == 0 && producer < 2) {
             const int cm = rank % SHARING / CN, cn = rank % CN, others = rank / SHARING * SHARING;  // those before
             const u32 same_row = ((1u << CN) - 1) << (others + cm * CN);
             u32 same_column = 0;
@@ -59,24 +58,19 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                 const u32 to = base + s * STAGE_BYTES + cn * (A_BYTES / CN);
                 load<(CN > 1)>(to, &map_a, k * BK, m + cn * (BM / CN), full + 8 * s, same_row);
             };
-            int step = 0;
+            if (producer == 1) asm volatile("griddepcontrol.wait;" ::: "memory");
+            int slot = 0;
+            u32 round = 0;
             for (int unit = first; unit < units; unit += stride) {
                 const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
-                int k = t.k;
-                if (unit == first) {
-                    const int early = min(STAGES, t.k_end - t.k);
-                    for (; step < early; ++step) load_w(step, k + step, t.n);
-                    asm volatile("griddepcontrol.wait;" ::: "memory");
-                    for (step = 0; step < early; ++step, ++k) load_a(step, k, t.m);
-                }
-                for (; k < t.k_end; ++k, ++step) {
-                    const int s = step % STAGES;
-                    if (step >= STAGES) barrier_wait(empty + 8 * s, (step / STAGES + 1) & 1);
-                    load_w(s, k, t.n);
-                    load_a(s, k, t.m);
+                for (int k = t.k; k < t.k_end; ++k) {
+                    if (round) barrier_wait(empty + 8 * slot, round & 1 ^ 1);
+                    if (producer == 0) load_w(slot, k, t.n);
+                    else load_a(slot, k, t.m);
+                    if (++slot == STAGES) slot = 0, ++round;
                 }
             }
-            if (ahead)
+            if (ahead && producer == 0)
                 asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;"
                              ::"l"(ahead + (size_t)blockIdx.x * ahead_bytes), "r"(ahead_bytes) : "memory");
         }
@@ -314,7 +308,8 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     };
                     store_row(settled((Element*)out + begin + t.n), in_row[half], t.split, lane, value);
 #if TP_COPY
-                    store_row(settled(copy + begin + t.n), in_row[half], t.split, lane, [&](int j) { return copies[j]; });
+                    auto copied = [&](int j) { return copies[j]; };
+                    store_row(settled(copy + begin + t.n), in_row[half], t.split, lane, copied);
                     if (t.n == 0 && lane % 4 == 0)  // so that no eps is needed any more
                         squares += eps * factor[half] * factor[half] / inverse_width;
 #endif
