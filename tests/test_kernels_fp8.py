@@ -155,8 +155,9 @@ def test_attention_leaves_in_e4m3(heads: int, head_dim: int) -> None:
 
 @on_hopper
 @pytest.mark.parametrize(("heads", "head_dim"), [(2, 24), (16, 72), (8, 256)])
-def test_attention_of_hopper_leaves_in_e4m3(heads: int, head_dim: int) -> None:
-    qkv = random(2 * 50, 3 * heads * head_dim)
+@pytest.mark.parametrize("tokens", [50, 128, 256])
+def test_attention_of_hopper_leaves_in_e4m3(tokens: int, heads: int, head_dim: int) -> None:
+    qkv = random(2 * tokens, 3 * heads * head_dim)
     exact = plain.vision_attention(qkv.float(), 2, heads)
     ours = attention_hopper.vision_attention(qkv, 2, heads, 55.0)
     assert ours.dtype == E4M3 and float((ours.float() / 55 - exact).norm() / exact.norm()) < 0.035

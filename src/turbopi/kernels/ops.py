@@ -24,7 +24,7 @@ def fused_ops(device: torch.device) -> Ops:
     hopper = capability(device) == (9, 0)
     tower = VisionTower()
     return Ops(
-        embed_patches=EmbedPatches(hopper),
+        embed_patches=EmbedPatches(),
         embed_prompt=embedding.embed_prompt,
         residual_rms_norm=norms.residual_rms_norm,
         residual_layer_norm=tower.residual_layer_norm if hopper else norms.residual_layer_norm,
@@ -58,8 +58,7 @@ def _rows(tiles: dict[tuple[int, int, int], Tile]) -> str:
 class EmbedPatches:
     """Pixels are whole numbers, so tensor cores can multiply them exactly: see `embedding.odd_rows`."""
 
-    def __init__(self, hopper: bool) -> None:
-        self._sums = products.tuned_sums if hopper else products.sums
+    def __init__(self) -> None:
         self._split: dict[int, Tensor] = {}  # by the weight's address
 
     def __call__(self, images: Tensor, weight: Tensor, position: Tensor, dtype: torch.dtype) -> Tensor:
@@ -68,7 +67,9 @@ class EmbedPatches:
             return embedding.add_position(F.linear(embedding.patch_rows(images, patch), weight), position, dtype)
         if weight.data_ptr() not in self._split:
             self._split[weight.data_ptr()] = embedding.split_in_two(weight)
-        product = self._sums(embedding.odd_rows(images, patch), self._split[weight.data_ptr()])
+        product = torch.mm(
+            embedding.odd_rows(images, patch), self._split[weight.data_ptr()].t(), out_dtype=torch.float32
+        )
         return embedding.add_position(product, position, dtype)
 
 

@@ -19,19 +19,16 @@ GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choic
 
 # SigLIP So400m's products that beat cuBLAS on an H200, by [rows, out, in]: the tiles fill its SMs just once.
 VISION_TILES = {
-    (256, 1152, 1176): Tile(1, 40),
     (256, 3456, 1152): Tile(1, 112),
     (256, 1152, 1152): Tile(2, 40, splits=2),
     (256, 4304, 1152): Tile(2, 72),
     (256, 1152, 4304): Tile(2, 72, cluster_n=2, splits=4),
     (256, 2048, 1152): Tile(1, 64),
-    (512, 1152, 1176): Tile(1, 72),
     (512, 3456, 1152): Tile(2, 112),
     (512, 1152, 1152): Tile(2, 40),
     (512, 4304, 1152): Tile(2, 136),
     (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2),
     (512, 2048, 1152): Tile(2, 64),
-    (768, 1152, 1176): Tile(2, 64),
     (768, 3456, 1152): Tile(2, 160),
     (768, 1152, 1152): Tile(2, 64, cluster_m=2),
     (768, 4304, 1152): Tile(3, 136),
@@ -44,11 +41,6 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None, out: Tensor | 
     if out is None:
         return F.linear(x, weight, bias)
     return torch.mm(x, weight.t(), out=out) if bias is None else torch.addmm(bias, x, weight.t(), out=out)
-
-
-def sums(x: Tensor, weight: Tensor) -> Tensor:
-    """x @ weightᵀ in float32, which it is summed in."""
-    return torch.mm(x, weight.t(), out_dtype=torch.float32)
 
 
 def linear_gelu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -70,11 +62,6 @@ def tuned_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Ten
     if tile is None or bias is None:
         return linear(x, weight, bias, out)
     return matmul(x, weight, tile, "bias", bias, out)
-
-
-def tuned_sums(x: Tensor, weight: Tensor) -> Tensor:
-    tile = vision_tile(x, weight)
-    return sums(x, weight) if tile is None else matmul(x, weight, tile, "partial")[0]
 
 
 def tuned_residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, ahead: Tensor | None = None) -> Tensor:
