@@ -124,7 +124,7 @@ def _launch(
 
 
 def constants(tile: Tile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
-    """What attention.cu is compiled with; `whole`: for as many keys as the warpgroups take at once, all of them seen."""
+    """What attention.cu is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
     return {
         "TP_DIM": tile.dim,
         "TP_WGS": tile.warpgroups,
