@@ -20,7 +20,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
      int M, int N, int k_blocks, int m_groups, int n_groups, const char* ahead, u32 ahead_bytes) {
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
-    const u32 full = base + STAGES * STAGE_BYTES, empty = full + 8 * STAGES;
+    const u32 full = base + STAGES * STAGE_BYTES + RECEIVED_BYTES, empty = full + 8 * STAGES;
     const int warpgroup = threadIdx.x / 128, rank = CLUSTER > 1 ? blockIdx.x % CLUSTER : 0;
     const int units = m_groups * n_groups * (GATHER ? 1 : SPLITS);
     const int stride = gridDim.x / CLUSTER, first = blockIdx.x / CLUSTER;
@@ -76,7 +76,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
         }
         if (GATHER) {  // with the consumers
             __syncwarp();
-            cluster_sync();
+            if (!APART) cluster_sync();
             cluster_exchange();
         }
     } else {
@@ -323,5 +323,5 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             }
         }
     }
-    if (CLUSTER > 1) cluster_sync();  // the other CTA may still signal barriers here
+    if (CLUSTER > 1 && !GATHER) cluster_sync();  // the other CTA may still signal barriers here
 }

@@ -43,9 +43,23 @@ class Tile:
         return self.cluster_m * self.cluster_n * (self.splits if self.gather else 1)
 
     def stages(self, *, factors: int) -> int:
-        """As many as fit beside 1 KB of alignment and the barriers, and pairs of `factors` a column and warpgroup."""
-        room = SHARED_BYTES - 2048 - 8 * self.warpgroups * self.columns * factors
-        return min(16, room // ((self.rows + self.columns) * STEP_BYTES))
+        """As many as fit beside 1 KB of alignment, the barriers, pairs of `factors` a column and warpgroup, and sums."""
+        return min(16, (self._room(factors) - self.apart(factors=factors) * self._received) // self._stage_bytes)
+
+    def apart(self, *, factors: int) -> bool:
+        """Whether there is room beside the stages for what a part of the inner axis gets of the others' sums."""
+        return self.gather and self._room(factors) - self._received >= 6 * self._stage_bytes
+
+    @property
+    def _stage_bytes(self) -> int:
+        return (self.rows + self.columns) * STEP_BYTES
+
+    @property
+    def _received(self) -> int:  # see gemm_base.cu
+        return (self.splits - 1) * -(-self.columns // 16 // self.splits) * 32 * 128 * self.warpgroups
+
+    def _room(self, factors: int) -> int:
+        return SHARED_BYTES - 2048 - 8 * self.warpgroups * self.columns * factors
 
 
 @dataclass(frozen=True)
@@ -227,6 +241,7 @@ def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: i
         "TP_CN": tile.cluster_n,
         "TP_SPLITS": tile.splits,
         "TP_GATHER": int(tile.gather),
+        "TP_APART": int(tile.apart(factors=factors)),
         "TP_EPILOGUE": EPILOGUES[epilogue],
         "TP_RESIDUAL": int(residual),
     }

@@ -16,8 +16,8 @@
 // of K each (+ bias in the first) as out[split, M, N].
 //
 // TP_GATHER: the CTAs that share a tile, each with a part of K, are in one cluster. In the end each gets the others'
-// sums of a share of the tile's columns through distributed shared memory. For one tile a CTA: they go where operands
-// were.
+// sums of a share of the tile's columns through distributed shared memory. For one tile a CTA: without TP_APART they go
+// where operands were.
 //
 // LayerNorm between two products without a pass of its own: TP_RESIDUAL adds `residual` [M, N] to the result, and the
 // sum of each row's results and of their squares goes, by tile, to `sums_out`. TP_NORMED (parts of a row's sums, or 0)
@@ -122,15 +122,20 @@ struct Factors {
     }
 };
 
-// which of a tile's parts ends up with a block of 8 columns; blocks go in fours, as that many leave together
-__device__ constexpr int owner(int block) { return block / 4 * SPLITS / ((TILE_N / 8 + 3) / 4); }
+// which of a tile's parts ends up with a block of 8 columns; blocks go in twos or fours, as that many leave together
+constexpr int BLOCKS = TILE_N / 8, TOGETHER = OUT_FP8 ? 4 : 2, GROUPS = (BLOCKS + TOGETHER - 1) / TOGETHER;
+__device__ constexpr int owner(int block) { return block / TOGETHER * SPLITS / GROUPS; }
+// What one part gets of another's sums, by block, then by thread. TP_APART: where all this lies is no slot of operands.
+constexpr int FROM_ONE = (GROUPS + SPLITS - 1) / SPLITS * TOGETHER * 128 * WGS * 16;
+constexpr bool APART = TP_APART;
+constexpr int RECEIVED_BYTES = APART ? (SPLITS - 1) * FROM_ONE : 0;
+static_assert(!GATHER || APART || (SPLITS - 1) * FROM_ONE <= STAGES * STAGE_BYTES, "no room for the others' sums");
 
 // Adds up, for the blocks of 8 columns that are this part's, the sums of all parts of a tile.
 __device__ __forceinline__ void gather(float (&sums)[BN / 2], int split, char* raw, u32 base, int rank) {
-    constexpr int BLOCKS = TILE_N / 8, FOURS = (BLOCKS + 3) / 4, THREADS = 128 * WGS;
-    constexpr int FROM_ONE = (FOURS + SPLITS - 1) / SPLITS * 4 * THREADS * 16;  // by block, then by thread
-    static_assert(!GATHER || (SPLITS - 1) * FROM_ONE <= STAGES * STAGE_BYTES, "no room for the others' sums");
-    cluster_sync();  // nobody reads operands any more
+    constexpr int THREADS = 128 * WGS;
+    if (APART) base += STAGES * STAGE_BYTES;
+    else cluster_sync();  // nobody reads operands any more
 #pragma unroll
     for (int to = 0; to < SPLITS; ++to) {
         if (to == split) continue;
@@ -192,7 +197,6 @@ __device__ __forceinline__ uint2 transpose_bytes(u32 p, u32 q, int lane) {
 // tile begins in that row.
 template <typename Value>
 __device__ __forceinline__ void store_row(u16* to, int count, int split, int lane, Value value) {
-    constexpr int BLOCKS = TILE_N / 8;
     const bool odd = lane & 1;
     u16* const place = to + (odd ? 8 : 0) + lane % 4 / 2 * 4;
 #pragma unroll
@@ -208,7 +212,6 @@ __device__ __forceinline__ void store_row(u16* to, int count, int split, int lan
 }
 template <typename Value>
 __device__ __forceinline__ void store_row(unsigned char* to, int count, int split, int lane, Value value) {
-    constexpr int BLOCKS = TILE_N / 8;
     unsigned char* const place = to + lane % 4 * 8;
 #pragma unroll
     for (int j = 0; j + 3 < BLOCKS; j += 4) {

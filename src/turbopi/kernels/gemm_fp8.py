@@ -125,6 +125,8 @@ def constants(
 ) -> dict[str, int]:
     """What gemm.cu is compiled with."""
     own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": 0}
+    if out_fp8:
+        own["TP_APART"] = 0
     return tile_constants(tile, epilogue, residual, factors=2 if normed else 1) | own
 
 
