@@ -43,7 +43,7 @@ class Tile:
         return self.cluster_m * self.cluster_n * (self.splits if self.gather else 1)
 
     def stages(self, *, factors: int) -> int:
-        """As many as fit beside 1 KB of alignment, the barriers, pairs of `factors` a column and warpgroup, and sums."""
+        """As many as fit beside 1 KB of alignment, barriers, pairs of `factors` a column and warpgroup, and sums."""
         return min(16, (self._room(factors) - self.apart(factors=factors) * self._received) // self._stage_bytes)
 
     def apart(self, *, factors: int) -> bool:
