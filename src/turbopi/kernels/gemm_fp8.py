@@ -150,6 +150,7 @@ GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that g
 # The fastest of some 25 tiles each, by [rows, out, in]. Rows count in whole 64, the least that a tile has: so fewer
 # kernels are compiled for all the prompt lengths.
 MEASURED = {
+    (256, 4304, 1152): Tile(2, 72),
     (512, 3456, 1152): Tile(2, 112, cluster_m=2),
     (512, 1152, 1152): Tile(1, 96),
     (512, 4304, 1152): Tile(2, 136),
