@@ -9,6 +9,8 @@
 // TP_SHARING CTAs of one group form a cluster: each loads a share of every tile of keys and values into all of them.
 // All tiles must have room then, as nobody waits for the others to free a slot.
 //
+// TP_WHOLE: there are KEYS keys for each warpgroup and no length, so that nothing is decided while it runs.
+//
 // A CTA has 64 rows of q, a producer warp and TP_WGS consumer warpgroups, which take tiles of TP_KEYS keys in turn: one
 // multiplies while another weighs. In the end each gets the others' sums of a share of the columns.
 //
@@ -16,7 +18,7 @@
 // lane / 4 and lane / 4 + 8 of its warp's 16.
 
 constexpr int WGS = TP_WGS, KEYS = TP_KEYS, STAGES = TP_STAGES, DIM = TP_DIM, SHARING = TP_SHARING;
-constexpr bool OUT_FP8 = TP_OUT_FP8;
+constexpr bool OUT_FP8 = TP_OUT_FP8, WHOLE = TP_WHOLE;
 #if TP_OUT_FP8
 typedef unsigned char Element;
 #else
@@ -71,7 +73,8 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024, ring = base + Q_BYTES;
     const u32 q_full = ring + STAGES * STAGE_BYTES, full = q_full + 8, empty = full + 8 * STAGES;
-    const int warpgroup = threadIdx.x / 128, head = blockIdx.x / tiles % heads, group = blockIdx.x / tiles / heads;
+    const int warpgroup = __shfl_sync(~0u, threadIdx.x / 128, 0);  // the same for all, as the compiler now sees
+    const int head = blockIdx.x / tiles % heads, group = blockIdx.x / tiles / heads;
     const int row = blockIdx.x % tiles * 64;  // in its group
 
     if (threadIdx.x == THREADS) {
@@ -89,7 +92,7 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
 
     // Tiles pass through the ring in rounds: one of keys for each warpgroup, then their values. Each warpgroup's first
     // keys, up to `early`, are loaded and multiplied before the length is known.
-    const int early = min((keys + KEYS - 1) / KEYS, WGS);
+    const int early = WHOLE ? WGS : min((keys + KEYS - 1) / KEYS, WGS);
     auto place_of_keys = [](int tile) { return tile / WGS * 2 * WGS + tile % WGS; };
 
     if (warpgroup == WGS) {
@@ -110,7 +113,7 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
             for (int p = 0; p < PANELS; ++p)
                 load(base + p * Q_PANEL, &map_q, 64 * p, head, group * rows + row, q_full);
             for (int tile = 0; tile < early; ++tile) load_tile(&map_k, k_first, tile, place_of_keys(tile));
-            const int valid = length ? (int)*length : keys, last = (valid + KEYS - 1) / KEYS;
+            const int valid = WHOLE ? WGS * KEYS : length ? (int)*length : keys, last = (valid + KEYS - 1) / KEYS;
 #pragma unroll 1
             for (int round = 0; round < last; round += WGS) {
                 const int end = min(round + WGS, last);
@@ -123,12 +126,13 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
     } else {
         asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
         const int lane = threadIdx.x % 32, own = threadIdx.x % 128, warp = own / 32;
-        const int valid = length ? (int)*length : keys, last = (valid + KEYS - 1) / KEYS;
+        const int valid = WHOLE ? WGS * KEYS : length ? (int)*length : keys, last = (valid + KEYS - 1) / KEYS;
         const float none = __uint_as_float(0xff800000);  // -inf
         float logits[KEYS / 2], sums[DIM / 2] = {};      // of the values, by weight
         float top[2] = {none, none}, total[2] = {};
         u32 weights[KEYS / 4];  // as wgmma's operand in registers wants them
         auto await_tile = [&](int place) {
+            if (WHOLE) __builtin_assume(place < STAGES);
             barrier_wait(full + 8 * (place % STAGES), (place / STAGES) & 1);
             return ring + place % STAGES * STAGE_BYTES;
         };
@@ -152,7 +156,7 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
         // the tile's logits become weights, the sums follow the new top; values beyond the length become 0
         auto weigh = [&](int tile, u32 values) {
             const int left = valid - tile * KEYS;
-            if (left < KEYS) {
+            if (!WHOLE && left < KEYS) {
 #pragma unroll
                 for (int i = 0; i < KEYS / 2; ++i)
                     if (i / 4 * 8 + lane % 4 * 2 + i % 2 >= left) logits[i] = none;
@@ -178,9 +182,11 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
                 total[half] += x + y;
                 weights[i / 2] = pack(x, y);
             }
+            if (!WHOLE) {
 #pragma unroll
-            for (int i = 0; i < DIM / 2; ++i) sums[i] *= shrink[i / 2 % 2];
-            if (left < KEYS) {  // 0 * NaN would be NaN
+                for (int i = 0; i < DIM / 2; ++i) sums[i] *= shrink[i / 2 % 2];
+            }
+            if (!WHOLE && left < KEYS) {  // 0 * NaN would be NaN
                 const int first = left * (ROW_BYTES / 16), count = KEY_PANEL / 16 - first;
                 for (int i = own; i < PANELS * count; i += 128) {
                     const u32 at = values + i / count * KEY_PANEL + (first + i % count) * 16;
@@ -193,15 +199,15 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
 
         barrier_wait(q_full, 0);
         int tile = warpgroup, place = place_of_keys(tile);
-        if (tile < early) {  // also where the length ends before it: its place is used again in the end
+        if (WHOLE || tile < early) {  // also where the length ends before it: its place is used again in the end
             const u32 first = await_tile(place);
             begin_products();
             multiply_keys(first);
             await_products<0>();
             release(place);
         }
-        if (tile < last) {
-            for (; tile + WGS < last; tile += WGS, place += 2 * WGS) {
+        if (WHOLE || tile < last) {
+            for (; !WHOLE && tile + WGS < last; tile += WGS, place += 2 * WGS) {
                 const u32 values = await_tile(place + WGS);
                 weigh(tile, values);
                 const u32 next = await_tile(place + 2 * WGS);

@@ -110,7 +110,8 @@ def _launch(
     ]
     tiles = -(-rows // 64)
     assert tile.sharing == 1 or (tiles % tile.sharing == 0 and tile.holds(keys)), "who shares never waits for a slot"
-    kernel = _kernel(tile, inverse is not None, out.device)
+    whole = length is None and keys == tile.keys * tile.warpgroups
+    kernel = _kernel(tile, inverse is not None, whole, out.device)
     arguments = (
         *maps,
         ctypes.c_void_p(out.data_ptr()),
@@ -122,8 +123,8 @@ def _launch(
     kernel.launch_dependent(tiles * groups, arguments)
 
 
-def constants(tile: Tile, out_fp8: bool) -> dict[str, int]:
-    """What attention.cu is compiled with."""
+def constants(tile: Tile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
+    """What attention.cu is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
     return {
         "TP_DIM": tile.dim,
         "TP_WGS": tile.warpgroups,
@@ -131,6 +132,7 @@ def constants(tile: Tile, out_fp8: bool) -> dict[str, int]:
         "TP_STAGES": tile.stages,
         "TP_OUT_FP8": int(out_fp8),
         "TP_SHARING": tile.sharing,
+        "TP_WHOLE": int(whole),
     }
 
 
@@ -142,7 +144,7 @@ def source(tile: Tile) -> str:
 
 
 @cache
-def _kernel(tile: Tile, out_fp8: bool, device: torch.device) -> DependentKernel:
+def _kernel(tile: Tile, out_fp8: bool, whole: bool, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
-        cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8))
+        cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8, whole))
         return DependentKernel(cubin, "attention", SHARED_BYTES, 128 * (tile.warpgroups + 1), tile.sharing)

@@ -8,13 +8,19 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #if TP_RESIDUAL
      const u32* residual, float2* sums_out,
 #endif
+#if TP_ROW_PARTS
+     const float2* sums_in, float inverse_width, float eps,
+#endif
 #if TP_NORMED
-     const float2* sums_in, float inverse_width, float eps, const float* sums_of_w, const float* offset,
+     const float* sums_of_w, const float* offset,
+#endif
+#if TP_COPY
+     const float2* norm_scale, const float2* norm_shift, unsigned char* copy,
 #endif
      int M, int N, int k_blocks, int m_groups, int n_groups, const char* ahead, u32 ahead_bytes) {
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
-    const u32 full = base + STAGES * STAGE_BYTES, empty = full + 8 * STAGES;
+    const u32 full = base + STAGES * STAGE_BYTES + RECEIVED_BYTES, empty = full + 8 * STAGES;
     const int warpgroup = threadIdx.x / 128, rank = CLUSTER > 1 ? blockIdx.x % CLUSTER : 0;
     const int units = m_groups * n_groups * (GATHER ? 1 : SPLITS);
     const int stride = gridDim.x / CLUSTER, first = blockIdx.x / CLUSTER;
@@ -22,11 +28,9 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
     if (threadIdx.x == 128 * WGS) {
         asm volatile("prefetch.tensormap [%0];\nprefetch.tensormap [%1];" ::"l"(&map_a), "l"(&map_w));
     }
-    if (threadIdx.x == 0) {
-        for (int s = 0; s < STAGES; ++s) {
-            barrier_init(full + 8 * s, 1);
-            barrier_init(empty + 8 * s, WGS * (CM + CN - 1));
-        }
+    if (threadIdx.x < STAGES) {
+        barrier_init(full + 8 * threadIdx.x, 1);
+        barrier_init(empty + 8 * threadIdx.x, WGS * (CM + CN - 1));
         asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     }
     if (CLUSTER > 1) cluster_sync();
@@ -35,7 +39,8 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 
     if (warpgroup == WGS) {
         asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
-        if (threadIdx.x == 128 * WGS) {
+        const int producer = threadIdx.x / 32 - 4 * WGS;  // 0 loads w, 1 loads a
+        if (threadIdx.x % 32 == 0 && producer < 2) {
             const int cm = rank % SHARING / CN, cn = rank % CN, others = rank / SHARING * SHARING;  // those before
             const u32 same_row = ((1u << CN) - 1) << (others + cm * CN);
             u32 same_column = 0;
@@ -53,37 +58,33 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                 const u32 to = base + s * STAGE_BYTES + cn * (A_BYTES / CN);
                 load<(CN > 1)>(to, &map_a, k * BK, m + cn * (BM / CN), full + 8 * s, same_row);
             };
-            int step = 0;
+            if (producer == 1) asm volatile("griddepcontrol.wait;" ::: "memory");
+            int slot = 0;
+            u32 round = 0;
             for (int unit = first; unit < units; unit += stride) {
                 const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
-                int k = t.k;
-                if (unit == first) {
-                    const int early = min(STAGES, t.k_end - t.k);
-                    for (; step < early; ++step) load_w(step, k + step, t.n);
-                    asm volatile("griddepcontrol.wait;" ::: "memory");
-                    for (step = 0; step < early; ++step, ++k) load_a(step, k, t.m);
-                }
-                for (; k < t.k_end; ++k, ++step) {
-                    const int s = step % STAGES;
-                    if (step >= STAGES) barrier_wait(empty + 8 * s, (step / STAGES + 1) & 1);
-                    load_w(s, k, t.n);
-                    load_a(s, k, t.m);
+                for (int k = t.k; k < t.k_end; ++k) {
+                    if (round) barrier_wait(empty + 8 * slot, round & 1 ^ 1);
+                    if (producer == 0) load_w(slot, k, t.n);
+                    else load_a(slot, k, t.m);
+                    if (++slot == STAGES) slot = 0, ++round;
                 }
             }
-            if (ahead)
+            if (ahead && producer == 0)
                 asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;"
                              ::"l"(ahead + (size_t)blockIdx.x * ahead_bytes), "r"(ahead_bytes) : "memory");
         }
         if (GATHER) {  // with the consumers
             __syncwarp();
-            cluster_sync();
+            if (!APART) cluster_sync();
             cluster_exchange();
         }
     } else {
         asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
-        const int group = warpgroup, lane = threadIdx.x % 32, warp = threadIdx.x / 32 % 4;
-        auto release = [&](int step) {
-            const u32 bar = empty + 8 * (step % STAGES);
+        const int lane = threadIdx.x % 32, warp = threadIdx.x / 32 % 4;
+        const int group = __shfl_sync(~0u, warpgroup, 0);  // the same for all, as the compiler now sees
+        auto release = [&](int slot) {
+            const u32 bar = empty + 8 * slot;
             if (SHARING == 1) {
                 if (threadIdx.x % 128 == 0) barrier_arrive(bar);
             } else {  // all that load into this CTA
@@ -92,127 +93,167 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     barrier_arrive(bar, rank - own + place);
             }
         };
-        int step = 0;
+        const u32 a_lower = lower_half(base + group * 8192), b_lower = lower_half(base + A_BYTES);
+        int slot = 0, last = 0;
+        u32 parity = 0;
+        auto multiply = [&](float(&to)[BN / 2], bool keep) {  // one step, and no more than it is still going on then
+            barrier_wait(full + 8 * slot, parity);
+            const u32 a = a_lower + slot * (STAGE_BYTES / 16), b = b_lower + slot * (STAGE_BYTES / 16);
+            begin_products();
+#pragma unroll
+            for (int j = 0; j < 4; ++j) mma(to, operand_of(a + 2 * j), operand_of(b + 2 * j), keep || j > 0);
+            commit_products(), await_products<1>();
+        };
+        auto advance = [&] {
+            last = slot++;
+            if (slot == STAGES) slot = 0, parity ^= 1;
+        };
 #if TP_PROMOTE
         float parts[BN / 2] = {};  // of the sums: what the tensor cores have not handed over yet
 #endif
         for (int unit = first; unit < units; unit += stride) {
             const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
+            const int row = t.m + group * 64 + warp * 16 + lane / 4, col = t.n + lane % 4 * 2;  // and 8 rows on
+            const int blocks = max(0, min((N - t.n) / 8, TILE_N / 8));  // of 8 columns, within the matrix
+            const int in_row[2] = {row < M ? blocks : 0, row + 8 < M ? blocks : 0};
             float sums[BN / 2];
 #if TP_FP8
-            Factors factors;
+            Factors factors;  // where the input is normed, `bias` goes with the offset
             factors.fetch(scale, (const u16*)bias, t.n, N, bias && t.split == 0);
-            float* const shared = (float*)(raw + (empty + 8 * STAGES - shared_address(raw))) + group * 2 * BN;
-#if TP_PROMOTE
-#pragma unroll
-            for (int i = 0; i < BN / 2; ++i) sums[i] = 0.0f;
-#endif
+            float2* const shared = (float2*)(raw + (empty + 8 * STAGES - shared_address(raw))) + group * BN;
 #endif
 #if TP_NORMED
-            Factors factors;
-            factors.fetch(sums_of_w, offset, t.n, N);
-            float* const shared = (float*)(raw + (empty + 8 * STAGES - shared_address(raw))) + group * 2 * BN;
+            Factors of_norm;
+            of_norm.fetch(sums_of_w, offset, t.n, N);
+            float2* const shared_norm =
+                (float2*)(raw + (empty + 8 * STAGES - shared_address(raw))) + (FP8 * WGS + group) * BN;
+            of_norm.share(shared_norm, group);
+#endif
+#if TP_FP8
+            constexpr bool SHARED_EARLY = GATHER || TP_NORMED;
+            if (SHARED_EARLY) factors.share(shared, group);
+#endif
+            u32 offsets[BIASED ? BN / 8 : 1];  // the bias of this lane's columns, read long before it is needed
+            if (BIASED) {
+#pragma unroll
+                for (int j = 0; j < BN / 8; ++j) {
+                    const bool needed = GATHER ? owner(j) == t.split : t.split == 0;
+                    offsets[j] = bias && j < blocks && needed ? bias[col / 2 + 4 * j] : 0;
+                }
+            }
+#if TP_COPY
+            float2 scales[BN / 8], shifts[BN / 8];  // of the next norm
+#pragma unroll
+            for (int j = 0; j < BN / 8; ++j) {
+                scales[j] = j < blocks ? norm_scale[col / 2 + 4 * j] : make_float2(0.0f, 0.0f);
+                shifts[j] = j < blocks ? norm_shift[col / 2 + 4 * j] : make_float2(0.0f, 0.0f);
+            }
+#endif
+#if TP_ROW_PARTS
+            const float2* const own_sums = settled(sums_in + (size_t)(lane % 4) * M + row);
+#endif
+#if TP_RESIDUAL
+            const u32* const own_residual[2] = {settled(residual + ((size_t)row * N + col) / 2),
+                                                settled(residual + ((size_t)(row + 8) * N + col) / 2)};
 #endif
 #if TP_RESIDUAL || TP_NORMED
             asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
-#if TP_NORMED
-            constexpr int OWN_SUMS = (TP_NORMED + 3) / 4;  // of a row's parts: fetched now, needed in the end
+#if TP_ROW_PARTS
+            constexpr int OWN_SUMS = (TP_ROW_PARTS + 3) / 4;
             float2 row_sums[2][OWN_SUMS];
 #pragma unroll
             for (int i = 0; i < 2 * OWN_SUMS; ++i) {
-                const int row = t.m + group * 64 + warp * 16 + lane / 4 + i % 2 * 8, part = i / 2 * 4 + lane % 4;
-                const bool there = row < M && part < TP_NORMED;
-                row_sums[i % 2][i / 2] = there ? sums_in[(size_t)part * M + row] : make_float2(0.0f, 0.0f);
+                const bool there = row + i % 2 * 8 < M && i / 2 * 4 + lane % 4 < TP_ROW_PARTS;
+                row_sums[i % 2][i / 2] =
+                    there ? own_sums[(size_t)(i / 2 * 4) * M + i % 2 * 8] : make_float2(0.0f, 0.0f);
             }
 #endif
 #if TP_RESIDUAL
             u32 before[2][BN / 8];
 #pragma unroll
             for (int i = 0; i < BN / 4; ++i) {
-                const int half = i % 2, j = i / 2, row = t.m + group * 64 + warp * 16 + lane / 4 + half * 8;
-                const int col = t.n + j * 8 + lane % 4 * 2;
-                const bool needed = row < M && col < N && (!GATHER || owner(j) == t.split);
-                before[half][j] = needed ? residual[((size_t)row * N + col) / 2] : 0;
+                const int half = i % 2, j = i / 2;
+                const bool needed = j < in_row[half] && (!GATHER || owner(j) == t.split);
+                before[half][j] = needed ? own_residual[half][4 * j] : 0;
             }
 #endif
-            u32 offsets[BIASED ? BN / 8 : 1];  // the bias of this lane's columns, read long before it is needed
-            if (BIASED) {
-#pragma unroll
-                for (int j = 0; j < BN / 8; ++j) {
-                    const int col = t.n + j * 8 + lane % 4 * 2;
-                    offsets[j] = bias && col < N && (GATHER || t.split == 0) ? bias[col / 2] : 0;
-                }
-            }
-#if TP_PROMOTE
-            for (int k = t.k; k < t.k_end;) {
-                const int start = k, stop = min(k + TP_PROMOTE, t.k_end);
-                for (; k < stop; ++k, ++step) {
-                    const int s = step % STAGES;
-                    barrier_wait(full + 8 * s, (step / STAGES) & 1);
-                    const u32 a = base + s * STAGE_BYTES + group * 8192, b = base + s * STAGE_BYTES + A_BYTES;
-                    begin_products();
-#pragma unroll
-                    for (int j = 0; j < 4; ++j)
-                        mma(parts, operand(a + j * 32), operand(b + j * 32), k > start || j > 0);
-                    commit_products(), await_products<1>();
-                    if (k > start) release(step - 1);
-                }
-                await_products<0>();
-                release(step - 1);
-#pragma unroll
-                for (int i = 0; i < BN / 2; ++i) sums[i] += parts[i];
-            }
-#else
-            for (int k = t.k; k < t.k_end; ++k, ++step) {
-                const int s = step % STAGES;
-                barrier_wait(full + 8 * s, (step / STAGES) & 1);
-                const u32 a = base + s * STAGE_BYTES + group * 8192, b = base + s * STAGE_BYTES + A_BYTES;
-                begin_products();
-#pragma unroll
-                for (int j = 0; j < 4; ++j)
-                    mma(sums, operand(a + j * 32), operand(b + j * 32), k > t.k || j > 0);
-                commit_products(), await_products<1>();
-                if (k > t.k) release(step - 1);
-            }
-            await_products<0>();
-            release(step - 1);
-#endif
-#if TP_FP8
-            factors.share(shared, group);
-#pragma unroll
-            for (int j = 0; j < BN / 8; ++j) {  // sums of whole numbers become what they stand for
-                const float2 by = *(const float2*)(shared + j * 8 + lane % 4 * 2);
-                const float2 plus = *(const float2*)(shared + BN + j * 8 + lane % 4 * 2);
-#pragma unroll
-                for (int half = 0; half < 2; ++half) {
-                    float &x = sums[4 * j + 2 * half], &y = sums[4 * j + 2 * half + 1];
-                    x = fmaf(x, by.x, plus.x), y = fmaf(y, by.y, plus.y);
-                }
-            }
-#endif
-
-#if TP_NORMED
-            factors.share(shared, group);
-            float mean[2], factor[2];
+#if TP_ROW_PARTS
+            float mean[2], factor[2];  // while the first blocks of `a` are on their way
 #pragma unroll
             for (int half = 0; half < 2; ++half) {
                 float sum = 0.0f, squares = 0.0f;
 #pragma unroll
                 for (int i = 0; i < OWN_SUMS; ++i) sum += row_sums[half][i].x, squares += row_sums[half][i].y;
-                mean[half] = sum_of_quad(sum) * inverse_width;
+                mean[half] = settled(sum_of_quad(sum) * inverse_width);
                 const float variance = sum_of_quad(squares) * inverse_width - mean[half] * mean[half];
-                factor[half] = rsqrtf(fmaxf(variance, 0.0f) + eps);
+                factor[half] = settled(rsqrtf(fmaxf(variance, 0.0f) + eps));
             }
+#endif
+            constexpr bool PRESET = TP_RESIDUAL && !FP8;  // the sums begin with the bias and the residual
+#if TP_RESIDUAL && !TP_FP8
 #pragma unroll
-            for (int j = 0; j < BN / 8; ++j) {
-                const float2 of_w = *(const float2*)(shared + j * 8 + lane % 4 * 2);
-                const float2 plus = *(const float2*)(shared + BN + j * 8 + lane % 4 * 2);
+            for (int i = 0; i < BN / 4; ++i) {
+                const int half = i % 2, j = i / 2;
+                sums[4 * j + 2 * half] = bf16_low(before[half][j]) + (BIASED ? bf16_low(offsets[j]) : 0.0f);
+                sums[4 * j + 2 * half + 1] = bf16_high(before[half][j]) + (BIASED ? bf16_high(offsets[j]) : 0.0f);
+            }
+#endif
+#if TP_PROMOTE
+#pragma unroll
+            for (int i = 0; i < BN / 2; ++i) sums[i] = 0.0f;
+            for (int k = t.k; k < t.k_end;) {
+                const int start = k, stop = min(k + TP_PROMOTE, t.k_end);
+                for (; k < stop; ++k) {
+                    multiply(parts, k > start);
+                    if (k > start) release(last);
+                    advance();
+                }
+                await_products<0>();
+                release(last);
+#pragma unroll
+                for (int i = 0; i < BN / 2; ++i) sums[i] += parts[i];
+            }
+#else
+            for (int k = t.k; k < t.k_end; ++k) {
+                multiply(sums, PRESET || k > t.k);
+                if (k > t.k) release(last);
+                advance();
+            }
+            await_products<0>();
+            release(last);
+#endif
+#if TP_FP8
+            if (!SHARED_EARLY) factors.share(shared, group);
+#endif
+#if TP_FP8 && !TP_NORMED
+#pragma unroll
+            for (int j = 0; j < BN / 8; ++j) {  // sums of whole numbers become what they stand for
+                const float4 of = *(const float4*)(shared + j * 8 + lane % 4 * 2);
 #pragma unroll
                 for (int half = 0; half < 2; ++half) {
                     float &x = sums[4 * j + 2 * half], &y = sums[4 * j + 2 * half + 1];
-                    x = fmaf(x - mean[half] * of_w.x, factor[half], plus.x);
-                    y = fmaf(y - mean[half] * of_w.y, factor[half], plus.y);
+                    x = fmaf(x, of.x, of.y), y = fmaf(y, of.z, of.w);
+                }
+            }
+#endif
+#if TP_NORMED
+#pragma unroll
+            for (int j = 0; j < BN / 8; ++j) {
+                const float4 of_w = *(const float4*)(shared_norm + j * 8 + lane % 4 * 2);
+#if TP_FP8
+                const float4 of = *(const float4*)(shared + j * 8 + lane % 4 * 2);
+#endif
+#pragma unroll
+                for (int half = 0; half < 2; ++half) {
+                    float &x = sums[4 * j + 2 * half], &y = sums[4 * j + 2 * half + 1];
+#if TP_FP8  // the shift is in x already, once: (x by - mean of_w - plus) factor + plus + bias
+                    x = fmaf(fmaf(x, of.x, -fmaf(mean[half], of_w.x, of_w.y)), factor[half], of_w.y + of.y);
+                    y = fmaf(fmaf(y, of.z, -fmaf(mean[half], of_w.z, of_w.w)), factor[half], of_w.w + of.w);
+#else
+                    x = fmaf(x - mean[half] * of_w.x, factor[half], of_w.y);
+                    y = fmaf(y - mean[half] * of_w.z, factor[half], of_w.w);
+#endif
                 }
             }
 #endif
@@ -223,35 +264,41 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 
 #pragma unroll
             for (int half = 0; half < 2; ++half) {
-                const int row = t.m + group * 64 + warp * 16 + lane / 4 + half * 8;
-                const bool inside = row < M;
-                constexpr int BLOCKS = TILE_N / 8;
+                const size_t begin = (size_t)(row + half * 8) * N;  // of the row
                 if (EPILOGUE == 4) {
-                    float* to = (float*)out + ((size_t)t.split * M + row) * N;
+                    float* const to = (float*)out + (size_t)t.split * M * N + begin + col;
 #pragma unroll
-                    for (int j = 0; j < BLOCKS; ++j) {
-                        const int col = t.n + j * 8 + lane % 4 * 2;
+                    for (int j = 0; j < TILE_N / 8; ++j) {
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
                         if (BIASED) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
-                        if (inside && col < N) *(float2*)(to + col) = make_float2(x, y);
+                        if (j < in_row[half]) *(float2*)(to + 8 * j) = make_float2(x, y);
                     }
                 } else {
-                    Element* to = (Element*)out + (size_t)row * N;
-#if TP_RESIDUAL
+#if TP_COPY
+                    const float shift = -mean[half] * factor[half];
+                    const float beyond = shift * 2 * (TILE_N / 8 - blocks);  // zeros beyond the matrix, in these units
+                    float sum = -beyond, squares = -beyond * shift;
+                    u32 copies[TILE_N / 8];
+#elif TP_RESIDUAL
                     float sum = 0.0f, squares = 0.0f;  // of the row's results
 #endif
                     auto value = [&](int j) -> u32 {
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
-                        if (BIASED) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
+                        if (BIASED && !PRESET) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
                         if (EPILOGUE == 2) x = gelu(x), y = gelu(y);
                         if (EPILOGUE == 3) {
                             x = gelu(x) * sums[BN / 4 + 4 * j + 2 * half];
                             y = gelu(y) * sums[BN / 4 + 4 * j + 2 * half + 1];
                         }
 #if TP_RESIDUAL
-                        const u32 both = pack(x + bf16_low(before[half][j]), y + bf16_high(before[half][j]));
+                        if (!PRESET) x += bf16_low(before[half][j]), y += bf16_high(before[half][j]);
+                        const u32 both = pack(x, y);
                         x = bf16_low(both), y = bf16_high(both);
-                        sum += x + y, squares += x * x + y * y;
+#if TP_COPY
+                        x = fmaf(x, factor[half], shift), y = fmaf(y, factor[half], shift);
+                        copies[j] = pack_e4m3(fmaf(x, scales[j].x, shifts[j].x), fmaf(y, scales[j].y, shifts[j].y));
+#endif
+                        sum += x + y, squares = fmaf(x, x, fmaf(y, y, squares));
                         return both;
 #endif
 #if TP_FP8
@@ -259,35 +306,22 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #endif
                         return pack(x, y);
                     };
-#pragma unroll
-                    for (int j = 0; j + 3 < BLOCKS; j += 4) {
-                        if (GATHER && owner(j) != t.split) continue;
-                        const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
-                        const int col = t.n + (j + lane % 4) * 8;
-                        if (inside && col < N) {
-                            if (OUT_FP8) *(uint2*)(to + col) = make_uint2(v.x | v.y << 16, v.z | v.w << 16);
-                            else *(uint4*)(to + col) = v;
-                        }
-                    }
-#pragma unroll
-                    for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
-                        if (GATHER && owner(j) != t.split) continue;
-                        const int col = t.n + j * 8 + lane % 4 * 2;
-                        const u32 v = value(j);
-                        if (inside && col < N) {
-                            if (OUT_FP8) *(u16*)(to + col) = (u16)v;
-                            else *(u32*)(to + col) = v;
-                        }
-                    }
+                    store_row(settled((Element*)out + begin + t.n), in_row[half], t.split, lane, value);
+#if TP_COPY
+                    auto copied = [&](int j) { return copies[j]; };
+                    store_row(settled(copy + begin + t.n), in_row[half], t.split, lane, copied);
+                    if (t.n == 0 && lane % 4 == 0)  // so that no eps is needed any more
+                        squares += eps * factor[half] * factor[half] / inverse_width;
+#endif
 #if TP_RESIDUAL
                     sum = sum_of_quad(sum), squares = sum_of_quad(squares);
                     const int part = GATHER ? t.n / TILE_N * SPLITS + t.split : t.n / TILE_N;
-                    if (inside && t.n < N && lane % 4 == 0)
-                        sums_out[(size_t)part * M + row] = make_float2(sum, squares);
+                    if (in_row[half] && lane % 4 == 0)
+                        sums_out[(size_t)part * M + row + half * 8] = make_float2(sum, squares);
 #endif
                 }
             }
         }
     }
-    if (CLUSTER > 1) cluster_sync();  // the other CTA may still signal barriers here
+    if (CLUSTER > 1 && !GATHER) cluster_sync();  // the other CTA may still signal barriers here
 }

@@ -42,10 +42,24 @@ class Tile:
     def cluster(self) -> int:
         return self.cluster_m * self.cluster_n * (self.splits if self.gather else 1)
 
-    def stages(self, *, factors: bool) -> int:
-        """As many as fit beside 1 KB of alignment and the barriers, and two `factors` a column for each warpgroup."""
-        room = SHARED_BYTES - 2048 - (8 * self.warpgroups * self.columns if factors else 0)
-        return min(16, room // ((self.rows + self.columns) * STEP_BYTES))
+    def stages(self, *, factors: int) -> int:
+        """As many as fit beside 1 KB of alignment, barriers, pairs of `factors` a column and warpgroup, and sums."""
+        return min(16, (self._room(factors) - self.apart(factors=factors) * self._received) // self._stage_bytes)
+
+    def apart(self, *, factors: int) -> bool:
+        """Whether there is room beside the stages for what a part of the inner axis gets of the others' sums."""
+        return self.gather and self._room(factors) - self._received >= 6 * self._stage_bytes
+
+    @property
+    def _stage_bytes(self) -> int:
+        return (self.rows + self.columns) * STEP_BYTES
+
+    @property
+    def _received(self) -> int:  # see gemm_base.cu
+        return (self.splits - 1) * -(-self.columns // 16 // self.splits) * 32 * 128 * self.warpgroups
+
+    def _room(self, factors: int) -> int:
+        return SHARED_BYTES - 2048 - 8 * self.warpgroups * self.columns * factors
 
 
 @dataclass(frozen=True)
@@ -58,6 +72,25 @@ class Sums:
     def allocate(cls, tile: Tile, m: int, n: int, device: torch.device) -> "Sums":
         count = -(-n // tile.columns) * (tile.splits if tile.gather else 1)
         return cls(torch.empty(count, m, 2, device=device))
+
+    @property
+    def count(self) -> int:
+        return self.parts.shape[0]
+
+
+@dataclass(frozen=True)
+class Copy:
+    """An E4M3 copy of the result x: round((x - mean) / deviation * scale + shift).
+
+    Mean and deviation are those of the *residual*'s rows. `sums_out` are then of (x - mean) / deviation, and what the
+    norm adds to the variance of x is in the squares.
+    """
+
+    out: Tensor  # e4m3[M, N]
+    sums: Sums  # of the residual
+    scale: Tensor  # float32[N]  of the LayerNorm behind, over the scale of the copy
+    shift: Tensor  # float32[N]  the same
+    eps: float
 
 
 @dataclass(frozen=True)
@@ -91,13 +124,15 @@ def matmul(
     sums_out: Sums | None = None,
     sums: Sums | None = None,
     eps: float = 0.0,
+    copy: Copy | None = None,
     ahead: Tensor | None = None,
 ) -> Tensor:
     """a [M, K] @ weightᵀ with the epilogue -> bfloat16[M, N]; "partial" -> float32[splits, M, N].
 
     weight [N, K], for "geglu" [2N, K]. All bfloat16 and contiguous, K and N multiples of 8. With "bias" alone,
-    `residual` [M, N] is added and the sums of the result's rows go into `sums_out`. With a `Folded` weight, whose bias
-    is in it, a's LayerNorm is multiplied, made of the `sums` of a's rows. `ahead` is fetched into L2 in the end.
+    `residual` [M, N] is added, the sums of the result's rows go into `sums_out`, and a `copy` may leave, too. With a
+    `Folded` weight, whose bias is in it, a's LayerNorm is multiplied, made of the `sums` of a's rows. `ahead` is
+    fetched into L2 in the end.
     """
     folded, weight = (weight, weight.data) if isinstance(weight, Folded) else (None, weight)
     assert (folded is None) == (sums is None) and (folded is None or (bias is None and epilogue in ("bias", "gelu")))
@@ -112,14 +147,18 @@ def matmul(
         shape, dtype = ((tile.splits, m, n), torch.float32) if partial else ((m, n), torch.bfloat16)
         out = torch.empty(shape, dtype=dtype, device=a.device)
     assert out.is_contiguous()
-    kernel = _kernel(tile, epilogue, residual is not None, 0 if sums is None else sums.parts.shape[0], a.device)
+    assert copy is None or (residual is not None and copy.out.is_contiguous() and copy.out.shape == (m, n))
+    assert copy is None or (sums is None and not tile.gather and copy.scale.dtype == copy.shift.dtype == torch.float32)
+    copied = 0 if copy is None else copy.sums.count
+    kernel = _kernel(tile, epilogue, residual is not None, 0 if sums is None else sums.count, copied, a.device)
     arguments = (
         matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
         matrix_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
         ctypes.c_void_p(out.data_ptr()),
         ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
         *residual_arguments(residual, sums_out),
-        *_norm_arguments(folded, sums, k, eps),
+        *(() if folded is None else norm_arguments(sums, k, eps, folded.sums, folded.offset)),
+        *_copy_arguments(copy, n),
         *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), *groups)),
     )
     launch(kernel, tile, groups, arguments, ahead)
@@ -155,16 +194,24 @@ def residual_arguments(residual: Tensor | None, sums_out: Sums | None) -> tuple[
     return ctypes.c_void_p(residual.data_ptr()), ctypes.c_void_p(sums_out.parts.data_ptr())
 
 
-def _norm_arguments(folded: Folded | None, sums: Sums | None, width: int, eps: float) -> tuple[Any, ...]:
-    if folded is None or sums is None:
+def norm_arguments(sums: Sums | None, width: int, eps: float, of_weight: Tensor, offset: Tensor) -> tuple[Any, ...]:
+    assert sums is not None
+    return (*_row_arguments(sums, width, eps), *(ctypes.c_void_p(t.data_ptr()) for t in (of_weight, offset)))
+
+
+def _copy_arguments(copy: Copy | None, width: int) -> tuple[Any, ...]:
+    if copy is None:
         return ()
     return (
-        ctypes.c_void_p(sums.parts.data_ptr()),
-        ctypes.c_float(1 / width),
-        ctypes.c_float(eps),
-        ctypes.c_void_p(folded.sums.data_ptr()),
-        ctypes.c_void_p(folded.offset.data_ptr()),
+        *_row_arguments(copy.sums, width, copy.eps),
+        ctypes.c_void_p(copy.scale.data_ptr()),
+        ctypes.c_void_p(copy.shift.data_ptr()),
+        ctypes.c_void_p(copy.out.data_ptr()),
     )
+
+
+def _row_arguments(sums: Sums, width: int, eps: float) -> tuple[Any, ...]:
+    return ctypes.c_void_p(sums.parts.data_ptr()), ctypes.c_float(1 / width), ctypes.c_float(eps)
 
 
 def clusters(tile: Tile, groups: int, at_once: int) -> int:
@@ -173,12 +220,18 @@ def clusters(tile: Tile, groups: int, at_once: int) -> int:
     return min(groups * (1 if tile.gather else tile.splits), at_once)
 
 
-def constants(tile: Tile, epilogue: Epilogue, residual: bool = False, normed: int = 0) -> dict[str, int]:
+def constants(
+    tile: Tile, epilogue: Epilogue, residual: bool = False, normed: int = 0, copied: int = 0
+) -> dict[str, int]:
     """What gemm.cu is compiled with."""
-    return tile_constants(tile, epilogue, residual, factors=normed > 0) | {"TP_NORMED": normed, **BF16}
+    return tile_constants(tile, epilogue, residual, factors=normed > 0) | {
+        "TP_NORMED": normed,
+        "TP_COPY": copied,
+        **BF16,
+    }
 
 
-def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: bool) -> dict[str, int]:
+def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: int) -> dict[str, int]:
     """Of these, what doesn't depend on the precision; for `factors` see `Tile.stages`."""
     return {
         "TP_WGS": tile.warpgroups,
@@ -188,14 +241,17 @@ def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: b
         "TP_CN": tile.cluster_n,
         "TP_SPLITS": tile.splits,
         "TP_GATHER": int(tile.gather),
+        "TP_APART": int(tile.apart(factors=factors)),
         "TP_EPILOGUE": EPILOGUES[epilogue],
         "TP_RESIDUAL": int(residual),
     }
 
 
 @cache
-def _kernel(tile: Tile, epilogue: Epilogue, residual: bool, normed: int, device: torch.device) -> DependentKernel:
-    return build(source(tile.columns), constants(tile, epilogue, residual, normed), tile, device)
+def _kernel(
+    tile: Tile, epilogue: Epilogue, residual: bool, normed: int, copied: int, device: torch.device
+) -> DependentKernel:
+    return build(source(tile.columns), constants(tile, epilogue, residual, normed, copied), tile, device)
 
 
 def build(source: str, sizes: dict[str, int], tile: Tile, device: torch.device) -> DependentKernel:

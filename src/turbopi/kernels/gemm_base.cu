@@ -5,31 +5,39 @@
 // nonlinearity. The tensor cores keep only some 14 bits of sums of E4M3 products: after every TP_PROMOTE blocks of K
 // (0: never) they are added up in float32 registers. TP_OUT_FP8: the result leaves as E4M3, times `inverse`.
 //
-// A CTA has one producer warp and TP_WGS consumer warpgroups of 64 rows each, and walks over its tiles
+// A CTA has two producer warps and TP_WGS consumer warpgroups of 64 rows each, and walks over its tiles
 // (grid = SMs, not tiles), so the next tile's loads run during an epilogue. TP_CM x TP_CN CTAs form a cluster of
 // neighbouring tiles: those of a row share their part of `a` and those of a column theirs of `w`; each loads its share
 // of it into all of them, as reading operands from L2 would be the bottleneck.
-// Weights don't depend on the kernel before this one: their first loads are issued before waiting for its end.
+// Weights don't depend on the kernel before this one: one thread loads them, as far ahead as there is room, while
+// another waits for that kernel's end to load `a`.
 //
 // Epilogues: 0 plain, 1 + bias, 2 gelu(+ bias), 3 GeGLU (w has N gate rows, then N up rows), 4 float32 sums of a part
 // of K each (+ bias in the first) as out[split, M, N].
 //
 // TP_GATHER: the CTAs that share a tile, each with a part of K, are in one cluster. In the end each gets the others'
-// sums of a share of the tile's columns through distributed shared memory. For one tile a CTA: they go where operands
-// were.
+// sums of a share of the tile's columns through distributed shared memory. For one tile a CTA: without TP_APART they go
+// where operands were.
 //
 // LayerNorm between two products without a pass of its own: TP_RESIDUAL adds `residual` [M, N] to the result, and the
 // sum of each row's results and of their squares goes, by tile, to `sums_out`. TP_NORMED (parts of a row's sums, or 0)
 // takes a's LayerNorm for a, whose scale is in w and whose shift in `offset`: as the product is linear, the norm is
 // only made of the sums in the end. `sums_of_w` are of the rounded w, so a mean in a's rows cancels, however large.
 //
+// The same where the product behind is of E4M3 numbers: TP_COPY (parts of the residual's row sums, or 0) also rounds
+// the result to E4M3 as if the residual's mean and variance were its own, and `sums_out` are of the result in these
+// units. They are close, so it is as good an E4M3 copy as the norm's would be; TP_NORMED then makes up for the
+// difference, in which w times the shift is in `offset`, as it is in the copy already, and the bias goes apart.
+//
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
 
 constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
 constexpr bool GATHER = TP_GATHER;
+#define TP_ROW_PARTS (TP_NORMED + TP_COPY)
 constexpr int EPILOGUE = TP_EPILOGUE, PARTS = EPILOGUE == 3 ? 2 : 1;
 constexpr int SHARING = CM * CN, CLUSTER = SHARING * (GATHER ? SPLITS : 1);
 constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
+static_assert(!(TP_COPY && (GATHER || FP8)) && !(TP_COPY && TP_NORMED), "copies leave whole bfloat16 products");
 #if TP_OUT_FP8
 typedef unsigned char Element;
 #else
@@ -57,11 +65,29 @@ __device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int ro
 }
 TP_MMA  // mma(float (&sums)[BN / 2], u64 a, u64 b, int keep)
 
-__device__ __forceinline__ float gelu(float x) {  // tanh's, as x * sigmoid
-    return __fdividef(x, 1.0f + exp2f(x * (-2.302208198f - 0.1029432397f * x * x)));
+__device__ __forceinline__ float gelu(float x) {  // tanh's, which is off by 2^-11 at most: less than rounding is
+    float t;
+    asm("tanh.approx.f32 %0, %1;" : "=f"(t) : "f"(x * fmaf(0.0356774081f, x * x, 0.7978845608f)));
+    return fmaf(0.5f * x, t, 0.5f * x);
 }
+// The descriptor of hopper.cu's `operand`, of its lower half, which counts in 16 bytes.
+__device__ __forceinline__ u32 lower_half(u32 address) { return (u32)operand(address); }
+__device__ __forceinline__ u64 operand_of(u32 lower) { return lower | (operand(0) & 0xffffffff00000000ull); }
+
+// Values that the compiler is to make here, and once: else it makes addresses anew for each load, after a wait.
+template <typename T>
+__device__ __forceinline__ T* settled(T* pointer) {
+    asm volatile("" : "+l"(pointer));
+    return pointer;
+}
+__device__ __forceinline__ float settled(float x) {
+    asm volatile("" : "+f"(x));
+    return x;
+}
+
 // A tile's scales and biases by column of `w`. Each thread of a warpgroup fetches some of them long before they are
-// needed; once the sums are there they go through shared memory to whom they belong.
+// needed; they go through shared memory to whom they belong: before the sums are made where a CTA has one tile, as it
+// waits for the kernel before it then, else after that.
 struct Factors {
     static constexpr int OWN = (BN + 127) / 128;
     float scale[OWN], bias[OWN];
@@ -84,27 +110,32 @@ struct Factors {
             bias[i] = inside ? biases[n + c] : 0.0f;
         }
     }
-    __device__ __forceinline__ void share(float* shared, int warpgroup) const {
+    __device__ __forceinline__ void share(float2* shared, int warpgroup) const {
         const auto sync = [&] { asm volatile("bar.sync %0, 128;" ::"r"(warpgroup + 1) : "memory"); };
         sync();  // the last tile's have been read
 #pragma unroll
         for (int i = 0; i < OWN; ++i) {
             const int c = threadIdx.x % 128 + 128 * i;
-            if (c < BN) shared[c] = scale[i], shared[BN + c] = bias[i];
+            if (c < BN) shared[c] = make_float2(scale[i], bias[i]);
         }
         sync();
     }
 };
 
-// which of a tile's parts ends up with a block of 8 columns; blocks go in fours, as that many leave together
-__device__ constexpr int owner(int block) { return block / 4 * SPLITS / ((TILE_N / 8 + 3) / 4); }
+// which of a tile's parts ends up with a block of 8 columns; blocks go in twos or fours, as that many leave together
+constexpr int BLOCKS = TILE_N / 8, TOGETHER = OUT_FP8 ? 4 : 2, GROUPS = (BLOCKS + TOGETHER - 1) / TOGETHER;
+__device__ constexpr int owner(int block) { return block / TOGETHER * SPLITS / GROUPS; }
+// What one part gets of another's sums, by block, then by thread. TP_APART: where all this lies is no slot of operands.
+constexpr int FROM_ONE = (GROUPS + SPLITS - 1) / SPLITS * TOGETHER * 128 * WGS * 16;
+constexpr bool APART = TP_APART;
+constexpr int RECEIVED_BYTES = APART ? (SPLITS - 1) * FROM_ONE : 0;
+static_assert(!GATHER || APART || (SPLITS - 1) * FROM_ONE <= STAGES * STAGE_BYTES, "no room for the others' sums");
 
 // Adds up, for the blocks of 8 columns that are this part's, the sums of all parts of a tile.
 __device__ __forceinline__ void gather(float (&sums)[BN / 2], int split, char* raw, u32 base, int rank) {
-    constexpr int BLOCKS = TILE_N / 8, FOURS = (BLOCKS + 3) / 4, THREADS = 128 * WGS;
-    constexpr int FROM_ONE = (FOURS + SPLITS - 1) / SPLITS * 4 * THREADS * 16;  // by block, then by thread
-    static_assert(!GATHER || (SPLITS - 1) * FROM_ONE <= STAGES * STAGE_BYTES, "no room for the others' sums");
-    cluster_sync();  // nobody reads operands any more
+    constexpr int THREADS = 128 * WGS;
+    if (APART) base += STAGES * STAGE_BYTES;
+    else cluster_sync();  // nobody reads operands any more
 #pragma unroll
     for (int to = 0; to < SPLITS; ++to) {
         if (to == split) continue;
@@ -150,4 +181,49 @@ __device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, in
     t.k = k_blocks * t.split / SPLITS;
     t.k_end = k_blocks * (t.split + 1) / SPLITS;
     return t;
+}
+
+// A quad's E4M3 numbers of 4 blocks, 2 columns of each a lane, in p (blocks 0 and 1) and q; lane i gets block i.
+__device__ __forceinline__ uint2 transpose_bytes(u32 p, u32 q, int lane) {
+    const bool odd = lane & 1, high = lane & 2;
+    const u32 low_halves = high ? 0x1054 : 0x5410, high_halves = high ? 0x3276 : 0x7632;
+    const u32 kept = high ? q : p, of_pair = __shfl_xor_sync(~0u, high ? p : q, 2);
+    const u32 mine = __byte_perm(kept, of_pair, odd ? high_halves : low_halves);
+    const u32 other = __shfl_xor_sync(~0u, __byte_perm(kept, of_pair, odd ? low_halves : high_halves), 1);
+    return make_uint2(__byte_perm(mine, other, odd ? 0x1054 : 0x5410), __byte_perm(mine, other, odd ? 0x3276 : 0x7632));
+}
+
+// A lane's part of a row of a tile's results, `value(block)` for each of `count` blocks of 8 columns; `to` is where the
+// tile begins in that row.
+template <typename Value>
+__device__ __forceinline__ void store_row(u16* to, int count, int split, int lane, Value value) {
+    const bool odd = lane & 1;
+    u16* const place = to + (odd ? 8 : 0) + lane % 4 / 2 * 4;
+#pragma unroll
+    for (int j = 0; j + 1 < BLOCKS; j += 2) {  // lanes of a pair exchange halves of two blocks
+        if (GATHER && owner(j) != split) continue;
+        const u32 x = value(j), y = value(j + 1), other = __shfl_xor_sync(~0u, odd ? x : y, 1);
+        if (j + odd < count) *(uint2*)(place + j * 8) = odd ? make_uint2(other, y) : make_uint2(x, other);
+    }
+    if (BLOCKS % 2 && (!GATHER || owner(BLOCKS - 1) == split)) {
+        const u32 x = value(BLOCKS - 1);
+        if (BLOCKS - 1 < count) *(u32*)(to + (BLOCKS - 1) * 8 + lane % 4 * 2) = x;
+    }
+}
+template <typename Value>
+__device__ __forceinline__ void store_row(unsigned char* to, int count, int split, int lane, Value value) {
+    unsigned char* const place = to + lane % 4 * 8;
+#pragma unroll
+    for (int j = 0; j + 3 < BLOCKS; j += 4) {
+        if (GATHER && owner(j) != split) continue;
+        const u32 p = value(j) | value(j + 1) << 16, q = value(j + 2) | value(j + 3) << 16;
+        const uint2 v = transpose_bytes(p, q, lane);
+        if (j + lane % 4 < count) *(uint2*)(place + j * 8) = v;
+    }
+#pragma unroll
+    for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
+        if (GATHER && owner(j) != split) continue;
+        const u32 x = value(j);
+        if (j < count) *(u16*)(to + j * 8 + lane % 4 * 2) = (u16)x;
+    }
 }

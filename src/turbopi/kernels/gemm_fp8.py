@@ -5,7 +5,7 @@ Twins: `engine.ops`' products with an `Fp8Matrix`. The results are bfloat16, E4M
 """
 
 import ctypes
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
@@ -20,6 +20,7 @@ from turbopi.kernels.gemm import (
     launch,
     layout,
     matrix_map,
+    norm_arguments,
     residual_arguments,
     source,
     tile_constants,
@@ -34,6 +35,27 @@ UNPROMOTED_STEPS = 17
 PROMOTED_COLUMNS = {1: 184, 2: 184, 3: 112}  # by warpgroups: of wider tiles the sums don't fit registers twice
 
 
+# A `Copy` of a stream may be so many times larger than calibration saw in its norm before it saturates, as the stream
+# grows between two norms. Costs nothing: the numbers below 2^-6, which lose precision, are far below any deviation.
+HEADROOM = 16.0
+NO_EPS = 1e-12  # the sums of a copy have it; what is left keeps a variance that rounding made 0 from dividing
+
+
+@dataclass(frozen=True)
+class FoldedFp8:
+    """An E4M3 matrix behind a LayerNorm whose input comes as a `Copy`, HEADROOM times smaller than calibrated."""
+
+    matrix: Fp8Matrix
+    scale: Tensor  # float32[N]: the matrix's, for such a copy
+    of_scale: Tensor  # float32[N]: the matrix times the norm's scale
+    of_shift: Tensor  # float32[N]: the matrix times its shift
+
+    @classmethod
+    def fold(cls, matrix: Fp8Matrix, scale: Tensor, shift: Tensor) -> "FoldedFp8":
+        wide = matrix.dequantized()
+        return cls(matrix, matrix.scale * HEADROOM, wide @ scale.float(), wide @ shift.float())
+
+
 def promotion(tile: Tile, k: int) -> int:
     """Steps between two promotions of sums over k values; 0: none is needed, or the tile is too wide."""
     return 0 if _short(tile, k) or tile.columns > PROMOTED_COLUMNS[tile.warpgroups] else PROMOTE
@@ -41,7 +63,7 @@ def promotion(tile: Tile, k: int) -> int:
 
 def matmul_fp8(
     a: Tensor,
-    weight: Fp8Matrix,
+    weight: Fp8Matrix | FoldedFp8,
     tile: Tile,
     epilogue: Epilogue,
     bias: Tensor | None = None,
@@ -51,15 +73,20 @@ def matmul_fp8(
     *,
     residual: Tensor | None = None,
     sums_out: Sums | None = None,
+    sums: Sums | None = None,
     ahead: Tensor | None = None,
 ) -> Tensor:
     """a e4m3[M, K] @ weightᵀ with the epilogue -> bfloat16[M, N], or with `inverse` e4m3[M, N] = round(… * inverse);
     "partial" -> float32[splits, M, N].
 
-    With "bias" alone, `residual` bfloat16[M, N] is added and the sums of the result's rows go into `sums_out`.
+    With "bias" alone, `residual` bfloat16[M, N] is added and the sums of the result's rows go into `sums_out`. With a
+    `FoldedFp8` ("bias" or "gelu"), a is a `Copy` and `sums` its `sums_out`: its LayerNorm is multiplied.
     weight [N, K], for "geglu" [2N, K]; bias bfloat16[N] of any epilogue but "geglu". All contiguous, K a multiple of
     16, N of 8.
     """
+    folded, weight = (weight, weight.matrix) if isinstance(weight, FoldedFp8) else (None, weight)
+    assert (folded is None) == (sums is None) and (folded is None or epilogue in ("bias", "gelu"))
+    assert not tile.gather or folded is None, "sums are gathered after that"
     m, k = a.shape
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
     assert a.dtype == weight.data.dtype == E4M3 and a.is_contiguous() and weight.data.is_contiguous()
@@ -72,15 +99,17 @@ def matmul_fp8(
         out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)
     assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
     promote = promotion(tile, k) if promote is None else promote
-    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, a.device)
+    normed = 0 if sums is None else sums.count
+    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, a.device)
     arguments = (
         matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
         matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
         ctypes.c_void_p(out.data_ptr()),
         ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
-        ctypes.c_void_p(weight.scale.data_ptr()),
+        ctypes.c_void_p((weight if folded is None else folded).scale.data_ptr()),
         ctypes.c_float(1.0 if inverse is None else inverse),
         *residual_arguments(residual, sums_out),
+        *(() if folded is None else norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),
         *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), *groups)),
     )
     launch(kernel, tile, groups, arguments, ahead)
@@ -91,17 +120,22 @@ def _result_dtype(partial: bool, inverse: float | None) -> torch.dtype:
     return torch.float32 if partial else torch.bfloat16 if inverse is None else E4M3
 
 
-def constants(tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool = False) -> dict[str, int]:
+def constants(
+    tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool = False, normed: int = 0
+) -> dict[str, int]:
     """What gemm.cu is compiled with."""
-    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": 0}
-    return tile_constants(tile, epilogue, residual, factors=True) | own
+    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": 0}
+    if out_fp8:
+        own["TP_APART"] = 0
+    return tile_constants(tile, epilogue, residual, factors=2 if normed else 1) | own
 
 
 @cache
 def _kernel(
-    tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool, device: torch.device
+    tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool, normed: int, device: torch.device
 ) -> DependentKernel:
-    return build(source(tile.columns, fp8=True), constants(tile, epilogue, out_fp8, promote, residual), tile, device)
+    sizes = constants(tile, epilogue, out_fp8, promote, residual, normed)
+    return build(source(tile.columns, fp8=True), sizes, tile, device)
 
 
 # -- which tile --------------------------------------------------------------------------------------------------------
@@ -116,6 +150,7 @@ GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that g
 # The fastest of some 25 tiles each, by [rows, out, in]. Rows count in whole 64, the least that a tile has: so fewer
 # kernels are compiled for all the prompt lengths.
 MEASURED = {
+    (256, 4304, 1152): Tile(2, 72),
     (512, 3456, 1152): Tile(2, 112, cluster_m=2),
     (512, 1152, 1152): Tile(1, 96),
     (512, 4304, 1152): Tile(2, 136),
@@ -138,7 +173,7 @@ def candidates(epilogue: Epilogue) -> list[Tile]:
         if 64 * warpgroups * columns <= 192 * 192
         for splits in ((1, 2, 3, 4) if epilogue == "partial" else (1,))
     ]
-    return [tile for tile in found if tile.stages(factors=True) >= 3]
+    return [tile for tile in found if tile.stages(factors=1) >= 3]
 
 
 def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> float:

@@ -43,7 +43,7 @@ def fused_ops(device: torch.device) -> Ops:
             if hopper
             else "Triton",
             "suffix attention": "cuBLAS and Triton's softmax",
-            "LayerNorm": f"most in the bfloat16 products around them for {_rows(RESIDUAL_TILES)} rows, else Triton"
+            "LayerNorm": f"most in the products around them for {_rows(RESIDUAL_TILES)} rows, else Triton"
             if hopper and products.num_sms(device) >= GATHERING_SMS
             else "Triton",
             "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding": "Triton",

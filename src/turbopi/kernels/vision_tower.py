@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
-from turbopi.engine.fp8 import Fp8Matrix, Matrix
+from turbopi.engine.fp8 import E4M3, Fp8Matrix, Matrix
 from turbopi.kernels import norms
-from turbopi.kernels.gemm import Epilogue, Folded, Sums, Tile, matmul
-from turbopi.kernels.gemm_fp8 import GATHERING_SMS, matmul_fp8
+from turbopi.kernels.gemm import Copy, Epilogue, Folded, Sums, Tile, matmul
+from turbopi.kernels.gemm_fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
 from turbopi.kernels.products import (
     as_input,
     num_sms,
@@ -20,9 +21,9 @@ from turbopi.kernels.products import (
 # As `products.VISION_TILES`, for products that add their result to the residual stream, in either precision. Where sums
 # are gathered, all clusters must be on the GPU at once: an H200 takes 15 of eight blocks and 30 of four.
 RESIDUAL_TILES = {
-    (256, 1152, 1152): Tile(1, 40),
-    (256, 1152, 4304): Tile(1, 96, cluster_m=2, splits=2, gather=True),
-    (512, 1152, 1152): Tile(1, 72),
+    (256, 1152, 1152): Tile(1, 72),
+    (256, 1152, 4304): Tile(1, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
+    (512, 1152, 1152): Tile(1, 96, cluster_n=4),
     (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
     (768, 1152, 1152): Tile(2, 64),
     (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2, gather=True),
@@ -53,12 +54,25 @@ class Normed:
         return norms.residual_layer_norm(self.x, None, self.scale, self.shift, self.eps)[1]
 
 
+@dataclass(frozen=True)
+class NormedCopy:
+    """LayerNorm of the residual stream for a product of E4M3 numbers, of which there is a copy nearly normed."""
+
+    copy: Tensor  # e4m3: see `gemm.Copy`
+    sums: Sums  # of the stream, in the copy's units
+    scale: Tensor
+    shift: Tensor
+
+
 class VisionTower:
     """Its products. Those in front of a LayerNorm add the residual stream themselves, those behind do the norm."""
 
     def __init__(self) -> None:
         # by the weight's address; the weight stays with it, so that no other one can come to lie there
         self._folded: dict[int, tuple[Tensor, Folded]] = {}
+        self._folded_fp8: dict[int, FoldedFp8] = {}
+        self._scaled: dict[int, tuple[Tensor, tuple[Tensor, Tensor]]] = {}  # by the norm's address, as above
+        self._stream: Normed | None = None  # the residual stream and its sums, as the last product left it
         self._behind: dict[int, Tensor] = {}  # which matrix came behind the one at this address last time: a hint
         self._last: Tensor | None = None
 
@@ -76,37 +90,52 @@ class VisionTower:
         bias: Tensor,
         eps: float,
         inverse: float | None = None,
-    ) -> tuple[Tensor, Tensor | Normed]:
+    ) -> tuple[Tensor, Tensor | Normed | NormedCopy]:
+        before, self._stream = self._stream, None
         if not isinstance(y, Product):
             return norms.residual_layer_norm(x, y, weight, bias, eps, inverse)
         ahead = self._next(y.weight)
-        if inverse is not None:  # a product can't round its input to E4M3
-            made = tuned_residual_linear(y.x, y.weight, y.bias, ahead)
-            return norms.residual_layer_norm(x, made, weight, bias, eps, inverse)
         sums = Sums.allocate(y.tile, x.shape[0], x.shape[1], x.device)
+        if inverse is not None:
+            if before is None or before.x is not x or isinstance(y.weight, Fp8Matrix) or y.tile.gather:
+                made = tuned_residual_linear(y.x, y.weight, y.bias, ahead)
+                return norms.residual_layer_norm(x, made, weight, bias, eps, inverse)
+            copied = torch.empty_like(x, dtype=E4M3)
+            copy = Copy(copied, before.sums, *self._for_copies(weight, bias, inverse), eps)
+            x = matmul(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, copy=copy, ahead=ahead)
+            return x, NormedCopy(copied, sums, weight, bias)
         if isinstance(y.weight, Fp8Matrix):
             x = matmul_fp8(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, ahead=ahead)
         else:
             x = matmul(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, ahead=ahead)
-        return x, Normed(x, sums, weight, bias, eps)
+        self._stream = Normed(x, sums, weight, bias, eps)
+        return x, self._stream
 
     def linear(
-        self, x: Tensor | Normed, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None
+        self, x: Tensor | Normed | NormedCopy, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None
     ) -> Tensor:
+        if isinstance(x, NormedCopy):
+            return self._from_copy(x, weight, bias, "bias", out)
         if isinstance(x, Normed):
-            if out is None and (made := self._normed(x, weight, bias, "bias")) is not None:
+            if (made := self._normed(x, weight, bias, "bias", out)) is not None:
                 return made
             x = x.made()
         return tuned_linear(x, weight, bias, out)
 
-    def linear_gelu(self, x: Tensor | Normed, weight: Matrix, bias: Tensor, inverse: float | None = None) -> Tensor:
+    def linear_gelu(
+        self, x: Tensor | Normed | NormedCopy, weight: Matrix, bias: Tensor, inverse: float | None = None
+    ) -> Tensor:
+        if isinstance(x, NormedCopy):
+            return self._from_copy(x, weight, bias, "gelu", inverse=inverse)
         if isinstance(x, Normed):
             if (made := self._normed(x, weight, bias, "gelu")) is not None:
                 return as_input(made, inverse)
             x = x.made()
         return tuned_linear_gelu(x, weight, bias, inverse, self._next(weight))
 
-    def _normed(self, x: Normed, weight: Matrix, bias: Tensor | None, epilogue: Epilogue) -> Tensor | None:
+    def _normed(
+        self, x: Normed, weight: Matrix, bias: Tensor | None, epilogue: Epilogue, out: Tensor | None = None
+    ) -> Tensor | None:
         if (
             isinstance(weight, Fp8Matrix)
             or bias is None
@@ -118,7 +147,36 @@ class VisionTower:
         if key not in self._folded:
             self._folded[key] = weight, Folded.fold(weight, bias, x.scale, x.shift)
         folded = self._folded[key][1]
-        return matmul(x.x, folded, tile, epilogue, sums=x.sums, eps=x.eps, ahead=self._next(folded.data))
+        ahead = self._next(folded.data)
+        if out is not None:  # the tower's result: what comes behind it is the next call's
+            ahead = None
+        return matmul(x.x, folded, tile, epilogue, out=out, sums=x.sums, eps=x.eps, ahead=ahead)
+
+    def _for_copies(self, scale: Tensor, shift: Tensor, inverse: float) -> tuple[Tensor, Tensor]:
+        """A LayerNorm's weights as `Copy` wants them."""
+        key = scale.data_ptr()
+        if key not in self._scaled:
+            by = inverse / HEADROOM
+            self._scaled[key] = scale, (scale.float() * by, shift.float() * by)
+        return self._scaled[key][1]
+
+    def _from_copy(
+        self,
+        x: NormedCopy,
+        weight: Matrix,
+        bias: Tensor | None,
+        epilogue: Epilogue,
+        out: Tensor | None = None,
+        inverse: float | None = None,
+    ) -> Tensor:
+        assert isinstance(weight, Fp8Matrix), "only such a matrix's input is asked for in E4M3"
+        key = weight.data.data_ptr()
+        if key not in self._folded_fp8:
+            self._folded_fp8[key] = FoldedFp8.fold(weight, x.scale, x.shift)
+        rows, (columns, inner) = x.copy.shape[0], weight.shape
+        tile = best_tile(rows, columns, inner, epilogue, num_sms(x.copy.device))
+        ahead = self._next(weight)
+        return matmul_fp8(x.copy, self._folded_fp8[key], tile, epilogue, bias, out, inverse, sums=x.sums, ahead=ahead)
 
     def _next(self, matrix: Matrix) -> Tensor | None:
         """What may be fetched into L2 during a product: the matrix that came behind this one last time."""
