@@ -37,7 +37,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     if (b.warp == SUFFIX_WARP)
       weigh_suffix(b, c, suffix);
     else
-      sync<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
+      sync<WEIGHTS_FOR_SUFFIX, SUFFIX_WARPS>();
   };
   auto clear_out = [&](float (&out)[CT][NT][4]) {
 #pragma unroll
@@ -55,10 +55,10 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         ldmatrix_transposed(last[j], b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (tile * 16 + (b.lane & 8)) * 2);
       constexpr bool ONE_OWNER = QT % S == 0 && QTL % CT == 0;
       if (ONE_OWNER && j > 0) {
-        to[j] = to[0] + j * NT * 512, to_bar[j] = to_bar[0];
+        to[j] = to[0] + j * NT * OUTPUT, to_bar[j] = to_bar[0];
         continue;
       }
-      to[j] = at_rank(b.base + M_X + X_COMB + (b.rank * QTL + in) * NT * 512 + b.lane * 16, owner);
+      to[j] = at_rank(b.base + M_X + X_COMB + (b.rank * QTL + in) * NT * OUTPUT + b.lane * (OUTPUT / 32), owner);
       to_bar[j] = at_rank(b.bar(BAR_COMB), owner);
     }
   };
@@ -71,8 +71,13 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         if (suffix > 0) mma_tokens(out[j], last[j], token_address(b, M_X + X_P) + KT * NT * 256);
 #pragma unroll
         for (int n = 0; n < NT; ++n)
-          if (n * 8 + 2 * b.t() < T)
-            send(to[j] + n * 512, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
+          if (n * 8 + 2 * b.t() < T) {
+            if constexpr (SPREAD)
+              send(to[j] + n * OUTPUT, pack_half(out[j][n][0] * OUTPUT_SCALE, out[j][n][1] * OUTPUT_SCALE),
+                   pack_half(out[j][n][2] * OUTPUT_SCALE, out[j][n][3] * OUTPUT_SCALE), to_bar[j]);
+            else
+              send(to[j] + n * 512, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
+          }
       }
   };
   if constexpr (HOLD) {
@@ -185,7 +190,8 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   } else {
     receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
     MARK(3)
-    float c[ROUNDS][NT][4];
+    const int first_tile = b.warp / HALVES, n0 = b.warp % HALVES * HALF_NT;
+    float c[ROUNDS][HALF_NT][4];
 #pragma unroll
     for (int r = 0; r < ROUNDS; ++r) clear(c[r]);
 #pragma unroll
@@ -195,22 +201,41 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         u32 seen = 0;
 #pragma unroll
         for (int r = 0; r < ROUNDS; ++r) {
-          const int tile = b.warp + r * SCORERS;
-          if (scorer && tile / SLOT_TILES == i && tile < tiles) {
+          const int tile = first_tile + r * SCORERS;
+          if ((SPREAD || scorer) && tile / SLOT_TILES == i && tile < tiles) {
             const byte* from = b.ring(slot) + tile % SLOT_TILES * KEY_TILE;
-            seen ^= score<QT, 4>(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); }, 0, QT, c[r]);
+            auto fetch = [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); };
+            seen ^= score<QT, 4>(b, fetch, 0, QT, c[r], n0);
           }
         }
         give_slot(b, slot, seen);
       }
     MARK(4)
-    if (scorer) {
-      weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
-      arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
+    if constexpr (SPREAD) {
+      const int rows = prefix - first_tile * 16;
+      raise_tops(b, c, rows, n0);
+      if (for_suffix) {
+        arrive<TOPS, TOPS_WARPS>();
+        if (some_keys) suffix_keys.ask();
+        of_suffix();
+      } else {
+        arrive<WEIGHTS_FOR_SUFFIX, SUFFIX_WARPS>();
+        sync<TOPS, TOPS_WARPS>();
+      }
+      store_prefix(b, c, first_tile, rows, n0);
+      if (some_values) {
+        suffix_values.ask();
+        suffix_values.keep(b);
+      }
+    } else {
+      if (scorer) {
+        weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
+        arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
+      }
+      ask_suffix();
+      if (some_values) suffix_values.keep(b);
+      if (for_suffix) of_suffix();
     }
-    ask_suffix();
-    if (some_values) suffix_values.keep(b);
-    if (for_suffix) of_suffix();
     consumers_sync();
   }
   MARK(5)
@@ -262,13 +287,21 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     float2 sum = make_float2(0, 0);
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      const float4 v = *(const float4*)(b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * 512 + b.lane * 16);
+      const byte* p = b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * OUTPUT + b.lane * (OUTPUT / 32);
+      float4 v;
+      if constexpr (SPREAD) {
+        const uint2 both = *(const uint2*)p;
+        const float2 first = unpack_half(both.x), second = unpack_half(both.y);
+        v = make_float4(first.x, first.y, second.x, second.y);
+      } else {
+        v = *(const float4*)p;
+      }
       const float2 l = *(const float2*)(b.smem + M_X + X_SUMS + (s * NT * 8 + token) * 4);
       sum.x += w[s].x * l.x, sum.y += w[s].y * l.y;
       o.x += w[s].x * v.x, o.y += w[s].y * v.y, o.z += w[s].x * v.z, o.w += w[s].y * v.w;
     }
-    const float x = __fdividef(1.0f, sum.x), y = __fdividef(1.0f, sum.y);
-    send_columns(b, M_H + H_ATT, b.q0() + tile, n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y), BAR_ATT, true);
+    const float x = __fdividef(1 / OUTPUT_SCALE, sum.x), y = __fdividef(1 / OUTPUT_SCALE, sum.y);
+    send_columns(b, M_ATT, b.q0() + tile, n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y), BAR_ATT, true);
   }
   MARK(9)
   receive(b, BAR_ATT, b.n, HD * T * 2, WAIT_ATT);

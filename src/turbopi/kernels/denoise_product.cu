@@ -166,14 +166,15 @@ struct Own {
         n[i][k] = k * parts + my.part, mine[i][k] = my.tile < size && tile[i] < tiles && n[i][k] < NT;
     }
   }
-  // To `sums` come all parts' sums of what is mine. They lie over the operand of the product, or APART.
+  // To `sums` come all parts' sums of what is mine. They lie APART, or in `region`: over the operand of the
+  // product unless SPREAD.
   __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
     byte* const place = b.smem + (APART ? M_SUMS : region);
     auto other = [&](int i, int parts, int part, int n) {
       return (float4*)(place + (plan_others(i * 8) + (tile[i] & 7) * (parts - 1) + part) * PARTIAL +
                        partial_place(b, n));
     };
-    if (!APART) consumers_sync();
+    if (!APART && !SPREAD) consumers_sync();
 #pragma unroll
     for (int i = 0; i < plan_groups(MT); ++i) {
       const int size = group_tiles(MT - i * 8), parts = group_parts(size);
@@ -188,7 +189,7 @@ struct Own {
           *other(i, parts, my.part - (my.part > owner), n) = sum;
       }
     }
-    if (APART && plan_groups(MT) == 1) {  // for the warps of my tile
+    if ((APART || SPREAD) && plan_groups(MT) == 1) {  // for the warps of my tile
       __syncwarp();
       asm volatile("bar.sync %0, %1;" ::"r"(8 + (tile[0] & 7)), "n"(group_parts(group_tiles(MT)) * 32) : "memory");
     } else {
