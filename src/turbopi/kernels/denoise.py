@@ -111,6 +111,7 @@ def source(suffix: int) -> str:
     products = (
         hopper.wgmma("add_product", columns),
         hopper.wgmma("add_product", columns, numbers="f16", from_registers=True),
+        hopper.wgmma("add_rows", columns, from_registers=True),
     )
     return hopper.source(*PARTS, instructions="\n".join(products))
 

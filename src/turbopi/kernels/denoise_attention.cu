@@ -1,4 +1,4 @@
-// Part 9 of 10: attention. The keys are split over the ranks of the head's cluster.
+// Part 10 of 11: attention. The keys are split over the ranks of the head's cluster.
 
 // Attention of this cluster's head, to region H of all ranks. Everything local lies in region X.
 __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix_all) {
@@ -31,13 +31,13 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   auto of_suffix = [&] {
     float c[1][NT][4];
     clear(c[0]);
-    if (some_keys) suffix_keys.keep(b);
+    if (!ASYNC && some_keys) suffix_keys.keep(b);
     __syncwarp();
     if (suffix > 0) score_suffix(b, suffix, c[0]);
     if (b.warp == SUFFIX_WARP)
       weigh_suffix(b, c, suffix);
     else
-      sync<WEIGHTS_FOR_SUFFIX, SUFFIX_WARPS>();
+      sync<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
   };
   auto clear_out = [&](float (&out)[CT][NT][4]) {
 #pragma unroll
@@ -187,11 +187,42 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       }
       send_outputs(out);
     }
+  } else if constexpr (ASYNC) {
+    if (some_keys) suffix_keys.ask(), suffix_keys.keep(b);  // while queries come
+    if (some_values) suffix_values.ask(), suffix_values.keep(b);
+    receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
+    MARK(3)
+    u32 taken[MOST_SLOTS];
+#pragma unroll
+    for (int i = 0; i < MOST_SLOTS; ++i)
+      if (i < slots) taken[i] = take_slot(b);
+    float c[1][NT][4];
+    clear(c[0]);
+    if (scorer && b.warp / 4 * 4 < tiles) {
+      show_to_products();
+      const int tile = min(b.warp, tiles - 1);
+      u32 slot = taken[0];
+#pragma unroll
+      for (int i = 1; i < MOST_SLOTS; ++i)
+        if (tile / SLOT_TILES == i) slot = taken[i];
+      const byte* from = b.ring(slot) + tile % SLOT_TILES * KEY_TILE;
+      score_together(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); }, c[0]);
+    }
+#pragma unroll
+    for (int i = 0; i < MOST_SLOTS; ++i)
+      if (i < slots) give_slot(b, taken[i]);
+    MARK(4)
+    if (scorer) {
+      weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
+      arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
+    }
+    if (for_suffix) of_suffix();
+    show_to_products();
+    consumers_sync();
   } else {
     receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
     MARK(3)
-    const int first_tile = b.warp / HALVES, n0 = b.warp % HALVES * HALF_NT;
-    float c[ROUNDS][HALF_NT][4];
+    float c[ROUNDS][NT][4];
 #pragma unroll
     for (int r = 0; r < ROUNDS; ++r) clear(c[r]);
 #pragma unroll
@@ -201,45 +232,56 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         u32 seen = 0;
 #pragma unroll
         for (int r = 0; r < ROUNDS; ++r) {
-          const int tile = first_tile + r * SCORERS;
-          if ((SPREAD || scorer) && tile / SLOT_TILES == i && tile < tiles) {
+          const int tile = b.warp + r * SCORERS;
+          if (scorer && tile / SLOT_TILES == i && tile < tiles) {
             const byte* from = b.ring(slot) + tile % SLOT_TILES * KEY_TILE;
-            auto fetch = [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); };
-            seen ^= score<QT, 4>(b, fetch, 0, QT, c[r], n0);
+            seen ^= score<QT, 4>(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); }, 0, QT, c[r]);
           }
         }
         give_slot(b, slot, seen);
       }
     MARK(4)
-    if constexpr (SPREAD) {
-      const int rows = prefix - first_tile * 16;
-      raise_tops(b, c, rows, n0);
-      if (for_suffix) {
-        arrive<TOPS, TOPS_WARPS>();
-        if (some_keys) suffix_keys.ask();
-        of_suffix();
-      } else {
-        arrive<WEIGHTS_FOR_SUFFIX, SUFFIX_WARPS>();
-        sync<TOPS, TOPS_WARPS>();
-      }
-      store_prefix(b, c, first_tile, rows, n0);
-      if (some_values) {
-        suffix_values.ask();
-        suffix_values.keep(b);
-      }
-    } else {
-      if (scorer) {
-        weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
-        arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
-      }
-      ask_suffix();
-      if (some_values) suffix_values.keep(b);
-      if (for_suffix) of_suffix();
+    if (scorer) {
+      weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
+      arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
     }
+    ask_suffix();
+    if (some_values) suffix_values.keep(b);
+    if (for_suffix) of_suffix();
     consumers_sync();
   }
   MARK(5)
-  if constexpr (!HOLD) {
+  if constexpr (ASYNC) {
+    static_assert(!ASYNC || CT == 1, "a tile of columns for a warp");
+    const u64 weights = operand(b.base + M_X + X_P, 128, NT * 128);
+    float sums[NT * 4], out[CT][NT][4];
+#pragma unroll
+    for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
+#pragma unroll 1
+    for (int i = 0; i < slots; ++i) {
+      const u32 slot = take_slot(b);
+      const byte* from = b.ring(slot) + min(b.warp, QT - 1) * FRAGMENT;
+      uint4 v[SLOT_TILES];
+#pragma unroll
+      for (int sub = 0; sub < SLOT_TILES; ++sub) {  // missing tiles are zeros
+        v[sub] = make_uint4(0, 0, 0, 0);
+        if (i * SLOT_TILES + sub < tiles) v[sub] = load_fragment(from + sub * KEY_TILE, b.lane);
+      }
+      begin_products();
+#pragma unroll
+      for (int sub = 0; sub < SLOT_TILES; ++sub)
+        add_rows(sums, v[sub].x, v[sub].y, v[sub].z, v[sub].w,
+                 behind(weights, min(i * SLOT_TILES + sub, tiles - 1) * NT * 256), 1);
+      commit_products();
+      await_products<0>();
+      give_slot(b, slot);
+    }
+#pragma unroll
+    for (int i = 0; i < NT * 4; ++i) out[0][i / 4][i % 4] = sums[i];
+    prepare_outputs();
+    send_outputs(out);
+    if (b.warp == LEADER) send_sums(b, tiles, suffix);
+  } else if constexpr (!HOLD) {
     float out[CT][NT][4];
     clear_out(out);
 #pragma unroll 1

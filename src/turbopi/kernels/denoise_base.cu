@@ -1,5 +1,5 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
-// Part 1 of 10, which denoise.py puts together: sizes, shared memory, a CTA's view.
+// Part 1 of 11, which denoise.py puts together: sizes, shared memory, a CTA's view.
 //
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
@@ -150,9 +150,9 @@ constexpr int SPREAD_STAGES = imin((TP_SMEM - X_SIZE - BEHIND) / SLOT, 7);
 constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + (SPREAD ? SPREAD_STAGES * SLOT : H_SIZE);
 constexpr int M_Q = SPREAD ? M_X + X_Q : M_H + H_Q, M_ATT = SPREAD ? M_X + X_ATT : M_H + H_ATT,
               M_HID = SPREAD ? M_X : M_H;  // queries, attention, hidden units or x_t
-constexpr int M_PART = M_SSQ + SIZE_SSQ;     // of this slice, by tile; in attention largest logits
-constexpr int M_RMS = M_PART + SIZE_PART;    // 1 / rms of each token
-constexpr int M_ROPE = M_RMS + up128(NT * 32);       // if tokens are few: see `make_rope`
+constexpr int M_PART = M_SSQ + SIZE_SSQ;        // of this slice, by tile; in attention largest logits
+constexpr int M_RMS = M_PART + SIZE_PART;       // 1 / rms of each token
+constexpr int M_ROPE = M_RMS + up128(NT * 32);  // if tokens are few: see `make_rope`
 constexpr int M_BAR = M_ROPE + (FEW ? (QTL + KVL) * NT * 512 : 0), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
               M_LIST = M_BAR + SIZE_BAR, M_SUMS = M_LIST + SIZE_LIST;
 __host__ __device__ constexpr int plan_stages(int ring) { return imin((TP_SMEM - ring - BEYOND) / SLOT, 11); }
@@ -162,10 +162,6 @@ constexpr bool APART = !SPREAD && plan_stages(M_SUMS) == plan_stages(M_SUMS + SU
 constexpr int M_RING = SPREAD ? M_H : M_SUMS + (APART ? SUMS_SIZE : 0);
 constexpr int STAGES = SPREAD ? SPREAD_STAGES : plan_stages(M_RING);
 static_assert(STAGES >= 2, "too little shared memory");
-
-// Slots of weights that are asked into L2 before they are loaded. With few tokens: only those of gate|up that find no
-// slot before it begins, while attention leaves memory idle; at other times they slow down what crosses clusters.
-constexpr int AHEAD = 0;
 
 // ring: full and empty, by slot
 enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };

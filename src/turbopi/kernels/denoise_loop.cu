@@ -1,4 +1,4 @@
-// Part 10 of 10: between steps, the loop, the kernel.
+// Part 11 of 11: between steps, the loop, the kernel.
 
 constexpr int GROUPS = CONSUMERS / A, HELD = most(T, GROUPS);  // threads per action number, tokens each of them keeps
 
@@ -83,7 +83,7 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   const u32 mine = (b.rank * T + actions.group) * A + actions.out;
   if (active) {
     const float* w = b.a.out_w + size_t(b.x0()) * 16 * A + actions.out;
-#pragma unroll(HELD == 1 ? 32 : 8)
+#pragma unroll(HELD == 1 ? 32 : SPREAD ? 16 : 8)
     for (int c = 0; c < b.xn() * 16; ++c) {
       const float v = __ldg(w + c * A);
 #pragma unroll

@@ -1,4 +1,4 @@
-// Part 7 of 10: queries, keys and values of the suffix.
+// Part 8 of 11: queries, keys and values of the suffix.
 
 __device__ __forceinline__ void ldmatrix(uint4& v, u32 address) {
   asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0,%1,%2,%3}, [%4];"

@@ -1,15 +1,14 @@
-// Part 8 of 10: attention's steps, of which denoise_attention.cu makes the whole.
+// Part 9 of 11: attention's steps, of which denoise_attention.cu makes the whole.
 
 // Who does what: the first SCORERS warps score a tile of prefix keys each, and the next if there are more; the last
 // four score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries.
 // If tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries
-// and weights; else all warps weigh, and the third warpgroup fetches the suffix's values. If tokens are many (SPREAD)
-// two warps share a tile of prefix keys, each with half of the tokens, and the last warps score such a tile only if
-// there are more than six.
+// and weights; else all warps weigh, and the third warpgroup fetches the suffix's values. Queries of many tokens are
+// more than shared memory can bring to each warp by itself (ASYNC): a warpgroup's products share them, with keys or
+// values in registers.
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
-constexpr int HALVES = SPREAD ? 2 : 1, HALF_NT = most(NT, HALVES);
-constexpr int TOPS_WARPS = SPREAD ? W : SCORERS, SUFFIX_WARPS = SPREAD ? W : SCORERS + 4;  // of barriers
+constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES;  // scored and weighed by wgmma
 // Blocks of its keys that a scoring warp holds, tiles of values that a weighing warp does: more would spill.
 constexpr int HELD_KEYS = QT < 12 ? QT : 12, HELD_TILES = KT < 4 ? KT : 4;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
@@ -31,28 +30,27 @@ __device__ __forceinline__ void sync() {
 __device__ __forceinline__ u32 token_address(const Block& b, u32 region) {
   return b.base + region + ((b.lane >> 3 & 1) * NT + (b.lane >> 4)) * 128 + (b.lane & 7) * 16;
 }
-// One block: a tile's rows times 8 N tokens. What is read beyond the last tokens isn't used.
-template <int N>
-__device__ __forceinline__ void mma_tokens(float (&c)[N][4], uint4 a, u32 from) {
+// One block: a tile's rows times all tokens. What is read beyond the last tokens isn't used.
+__device__ __forceinline__ void mma_tokens(float (&c)[NT][4], uint4 a, u32 from) {
 #pragma unroll
-  for (int n = 0; n < N; n += 2) {
+  for (int n = 0; n < NT; n += 2) {
     uint4 v;
     ldmatrix(v, from + n * 128);
     mma(c[n], a, make_uint2(v.x, v.y));
-    if (n + 1 < N) mma(c[n + 1], a, make_uint2(v.z, v.w));
+    if (n + 1 < NT) mma(c[n + 1], a, make_uint2(v.z, v.w));
   }
 }
 
 // Logits of 16 keys over STEPS blocks of columns from block `first` on, `steps` of which exist. fetch(k) is the k-th
-// fragment of the keys. Of 8 N tokens from 8 n0 on. Returns a word that needs all it read, for give_slot.
-template <int STEPS, int UNROLL, typename Fetch, int N>
-__device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int steps, float (&c)[N][4], int n0 = 0) {
-  constexpr int CHAINS = (FEW || N <= 4) && STEPS > 4 ? 2 : 1;
-  float sums[CHAINS][N][4];
+// fragment of the keys. Returns a word that needs all it read, for give_slot.
+template <int STEPS, int UNROLL, typename Fetch>
+__device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int steps, float (&c)[NT][4]) {
+  constexpr int CHAINS = FEW && STEPS > 4 ? 2 : 1;
+  float sums[CHAINS][NT][4];
 #pragma unroll
   for (int i = 0; i < CHAINS; ++i) clear(sums[i]);
   u32 seen = 0;
-  const u32 q = token_address(b, M_Q) + first * NT * 256 + n0 * 128;
+  const u32 q = token_address(b, M_Q) + first * NT * 256;
 #pragma unroll(UNROLL)
   for (int k = 0; k < STEPS; ++k)
     if (QT % 4 == 0 || k < steps) {
@@ -61,10 +59,39 @@ __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int
       mma_tokens(sums[k % CHAINS], a, q + k * NT * 256);
     }
 #pragma unroll
-  for (int n = 0; n < N; ++n)
+  for (int n = 0; n < NT; ++n)
 #pragma unroll
     for (int i = 0; i < 4; ++i) c[n][i] = CHAINS == 2 ? sums[0][n][i] + sums[CHAINS - 1][n][i] : sums[0][n][i];
   return seen;
+}
+
+// The same for a warpgroup, each warp with 16 keys of its own.
+template <typename Fetch>
+__device__ __forceinline__ void score_together(const Block& b, Fetch fetch, float (&c)[NT][4]) {
+  constexpr int CHUNK = QT % 4 == 0 ? 4 : 1;
+  const u64 queries = operand(b.base + M_Q, 128, NT * 128);
+  float sums[NT * 4];
+#pragma unroll
+  for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
+  uint4 now[CHUNK], next[CHUNK];
+#pragma unroll
+  for (int i = 0; i < CHUNK; ++i) now[i] = fetch(i);
+#pragma unroll
+  for (int k = 0; k < QT; k += CHUNK) {
+    begin_products();
+#pragma unroll
+    for (int i = 0; i < CHUNK; ++i)
+      add_rows(sums, now[i].x, now[i].y, now[i].z, now[i].w, behind(queries, (k + i) * NT * 256), 1);
+    commit_products();
+    if (k + CHUNK < QT)
+#pragma unroll
+      for (int i = 0; i < CHUNK; ++i) next[i] = fetch(k + CHUNK + i);
+    await_products<0>();
+#pragma unroll
+    for (int i = 0; i < CHUNK; ++i) now[i] = next[i];
+  }
+#pragma unroll
+  for (int i = 0; i < NT * 4; ++i) c[i / 4][i % 4] = sums[i];
 }
 
 // Suffix keys (kind 0) or values (1) from all clusters to shared memory, asked for first and kept later: of `rows` of
@@ -129,11 +156,11 @@ __device__ __forceinline__ void score_suffix(const Block& b, int count, float (&
 }
 
 // Logits times the scale and log2 e, or -inf in rows that don't exist; the largest of each token.
-template <int R, int N>
-__device__ __forceinline__ void scale_logits(const Block& b, float (&c)[R][N][4], int rows, float2 (&top)[N]) {
+template <int R>
+__device__ __forceinline__ void scale_logits(const Block& b, float (&c)[R][NT][4], int rows, float2 (&top)[NT]) {
   const float scale = rsqrtf(float(HD)) * 1.4426950408889634f, none = __int_as_float(0xff800000);
 #pragma unroll
-  for (int n = 0; n < N; ++n) {
+  for (int n = 0; n < NT; ++n) {
     top[n] = make_float2(none, none);
 #pragma unroll
     for (int r = 0; r < R; ++r) {
@@ -150,53 +177,41 @@ __device__ __forceinline__ void scale_logits(const Block& b, float (&c)[R][N][4]
 }
 // Unnormalised weights of 16 keys to shared memory: operand B of the next product, in which column 2i is row i, column
 // 2i + 1 row i + 8.
-template <int N>
-__device__ __forceinline__ void store_weights(const Block& b, const float (&c)[N][4], int tile, const float2 (&top)[N],
-                                              int n0 = 0) {
+__device__ __forceinline__ void store_weights(const Block& b, const float (&c)[NT][4], int tile,
+                                              const float2 (&top)[NT]) {
   byte* p = b.smem + M_X + X_P + (tile * 2 + (b.g() >> 2)) * NT * 128 + b.t() * 32 + (b.g() & 3) * 4;
 #pragma unroll
-  for (int n = 0; n < N; ++n)
+  for (int n = 0; n < NT; ++n)
 #pragma unroll
     for (int i = 0; i < 2; ++i) {
       const float at = i ? top[n].y : top[n].x;
-      if (N == NT || n0 + n < NT)
-        *(u32*)(p + (n0 + n) * 128 + i * 16) = pack(exp2_approx(c[n][i] - at), exp2_approx(c[n][i + 2] - at));
+      *(u32*)(p + n * 128 + i * 16) = pack(exp2_approx(c[n][i] - at), exp2_approx(c[n][i + 2] - at));
     }
 }
 // The largest logits of the rank's prefix.
-template <int N>
-__device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[N], int n0 = 0) {
+__device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT]) {
 #pragma unroll
-  for (int n = 0; n < N; ++n) {
-    const int2 v = *(const int2*)(b.smem + M_PART + (min(n0 + n, NT - 1) * 8 + 2 * b.t()) * 4);
+  for (int n = 0; n < NT; ++n) {
+    const int2 v = *(const int2*)(b.smem + M_PART + (n * 8 + 2 * b.t()) * 4);
     top[n] = make_float2(__int_as_float(ordered(v.x)), __int_as_float(ordered(v.y)));
   }
 }
 // Scoring warps: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist.
-template <int R, int N>
-__device__ __forceinline__ void raise_tops(const Block& b, float (&c)[R][N][4], int rows, int n0 = 0) {
-  float2 top[N];
+template <int R>
+__device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4], int tile, int rows) {
+  float2 top[NT];
   if (rows > 0) {
     scale_logits(b, c, rows, top);
 #pragma unroll
-    for (int n = 0; n < N; ++n)
-      if (b.g() < 2 && (N == NT || n0 + n < NT))
-        atomicMax((int*)(b.smem + M_PART) + (n0 + n) * 8 + 2 * b.t() + b.g(), ordered(b.g() ? top[n].y : top[n].x));
+    for (int n = 0; n < NT; ++n)
+      if (b.g() < 2)
+        atomicMax((int*)(b.smem + M_PART) + n * 8 + 2 * b.t() + b.g(), ordered(b.g() ? top[n].y : top[n].x));
   }
-}
-template <int R, int N>
-__device__ __forceinline__ void store_prefix(const Block& b, float (&c)[R][N][4], int tile, int rows, int n0 = 0) {
-  float2 top[N];
-  load_tops(b, top, n0);
+  sync<TOPS, SCORERS>();
+  load_tops(b, top);
 #pragma unroll
   for (int r = 0; r < R; ++r)
-    if (rows > r * SCORERS * 16) store_weights(b, c[r], tile + r * SCORERS, top, n0);
-}
-template <int R, int N>
-__device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][N][4], int tile, int rows, int n0 = 0) {
-  raise_tops(b, c, rows, n0);
-  sync<TOPS, TOPS_WARPS>();
-  store_prefix(b, c, tile, rows, n0);
+    if (rows > r * SCORERS * 16) store_weights(b, c[r], tile + r * SCORERS, top);
 }
 // Of each token something of this rank, to all ranks.
 __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[NT], int region, int bar) {
@@ -215,7 +230,7 @@ __device__ __forceinline__ u32 outputs_expect(const Block& b) {
 __device__ __forceinline__ void weigh_suffix(const Block& b, float (&c)[1][NT][4], int rows) {
   float2 own[NT], top[NT];
   scale_logits(b, c, rows, own);
-  sync<WEIGHTS_FOR_SUFFIX, SUFFIX_WARPS>();
+  sync<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
   load_tops(b, top);
 #pragma unroll
   for (int n = 0; n < NT; ++n) {

@@ -1,10 +1,11 @@
-// Part 6 of 11: who keeps which part of the residual stream, and how its parts come together if tokens are many (SPREAD).
+// Part 6 of 11: who keeps which part of the residual stream, and how the parts come together if tokens are many
+// (SPREAD).
 //
-// If tokens are few, every cluster keeps the whole stream: each CTA adds up its slice for all tokens, and the ranks send
-// their slices to each other. With more tokens the bytes of both cost more than the delay of another hop through L2. Then
-// CTA (cluster, rank) keeps its rank's slice of tokens 8 cluster.. (and 8 (cluster + NC)..), adds up for those alone,
-// and puts what the next products take into L2, behind it a flag. Of each cluster a spare warp of rank r fetches slice r
-// as soon as all its flags are there, and the copy engine writes it to all ranks at once.
+// If tokens are few, every cluster keeps the whole stream: each CTA adds up its slice for all tokens, and the ranks
+// send their slices to each other. With more tokens the bytes of both cost more than another hop through L2. Then CTA
+// (cluster, rank) keeps its rank's slice of tokens 8 cluster.. (and 8 (cluster + NC)..) alone, adds up for those, and
+// puts what the next products take into L2, behind it a flag. Of each cluster a spare warp of rank r fetches slice r as
+// soon as all its flags are there, and the copy engine writes it to all ranks at once.
 
 // An item is (tile, 8 tokens); lane (g, t) has columns 2g, 2g + 1 of tokens 2t, 2t + 1 of it, as x y (first column) and
 // z w (second). A warp keeps its items in registers for good.
@@ -24,9 +25,9 @@ __device__ __forceinline__ Item stream_item(const Block& b, int j) {
   return {tile, n, n * 8 + 2 * b.t(), i < xn * NT && n * 8 + 2 * b.t() < T};
 }
 
-// Region X is used for everything, one thing after the other. Where a place changes hands from what all ranks read to
-// what any rank writes, all ranks agree: before the stream comes, spare warps do (DONE, FREE), before queries and hidden
-// units come, which lie over the stream, the consumers do (ROOM).
+// Region X is used for everything, one thing after the other. Before any rank may write where all ranks read, all
+// agree: before the stream comes, spare warps do (DONE, FREE); before queries and hidden units come, which lie over the
+// stream, the consumers do (ROOM).
 
 // This warp has read what it needs of region X, up to the next exchange of the stream.
 __device__ __forceinline__ void done_with_x(const Block& b) {
@@ -97,15 +98,15 @@ __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS
 // `bytes` from L2 to the same place of all ranks, counted in by `bar` of each.
 __device__ __forceinline__ void load_for_all(u32 to, const void* from, u32 bytes, u32 bar) {
   asm volatile(
-      "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster [%0], [%1], %2, [%3], %4;" ::
-          "r"(to),
+      "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster "
+      "[%0], [%1], %2, [%3], %4;" ::"r"(to),
       "l"(from), "r"(bytes), "r"(bar), "h"((unsigned short)((1 << S) - 1))
       : "memory");
 }
 __device__ __forceinline__ u32 xs_expect(const Block& b) { return imax(b.xn() * NT * 512, 16); }  // if none: any 16
 
-// A spare warp. Buffers are free when their turn comes again: who writes them has sums of all clusters that read them,
-// made of what came after.
+// A spare warp. Buffers in L2 are free when their turn comes again: who writes them has sums, made of what came after,
+// of all clusters that read them. The flags need no acquire: the copy engine reads L2, and only when they are seen.
 __device__ __forceinline__ void fetch_stream(const Block& b) {
   const u32* const flags = (const u32*)(b.a.scratch + B_FLAGS) + b.rank * 32;
   const u32 place = b.x0() * NT, items = b.xn() * NT;

@@ -1,4 +1,4 @@
-// Part 6 of 10: the residual stream, and what goes into it: sums across clusters, GeGLU.
+// Part 7 of 11: the residual stream, and what goes into it: sums across clusters, GeGLU.
 
 // 8 bytes with the lane pair's four columns 2g.. of one token (even g: 2t, odd g: 2t + 1) to all ranks.
 __device__ __forceinline__ void send_columns(const Block& b, int region, int block, int n, float4 v, int bar,
