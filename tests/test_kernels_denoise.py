@@ -196,7 +196,11 @@ def test_a_machine_without_gpu_is_refused() -> None:
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize(
     ("name", "clusters", "suffix", "fp8"),
-    [("golden", 8, 10, False), ("odd", 9, 33, True), ("full", 8, 10, False), ("full", 8, 10, True)],
+    [
+        ("golden", 8, 10, False),
+        ("odd", 9, 33, True),
+        *(("full", 8, suffix, fp8) for suffix in (10, 50) for fp8 in (False, True)),
+    ],
 )
 def test_the_source_compiles_for_hopper(tmp_path: Path, name: str, clusters: int, suffix: int, fp8: bool) -> None:
     arrangement = packing.Arrangement(CONFIGS[name], clusters)
@@ -208,8 +212,8 @@ def test_the_source_compiles_for_hopper(tmp_path: Path, name: str, clusters: int
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 def test_too_many_keys_for_shared_memory_are_refused_by_name(tmp_path: Path) -> None:
     arrangement = packing.Arrangement(CONFIGS["full"], 8)
-    sizes = denoise.kernel_sizes(arrangement, cache_rows=6000, suffix=56, shared_bytes=232448)
-    with pytest.raises(BackendUnavailable, match=r"56 suffix tokens and 6000 cache rows leave .* 232448 bytes"):
+    sizes = denoise.kernel_sizes(arrangement, cache_rows=20000, suffix=56, shared_bytes=232448)
+    with pytest.raises(BackendUnavailable, match=r"56 suffix tokens and 20000 cache rows leave .* 232448 bytes"):
         denoise.compiled("sm_90a", sizes, folder=tmp_path)
 
 
@@ -260,9 +264,12 @@ SHAPES = pytest.mark.parametrize(
         ("golden", 3, 10, 37, None),
         ("golden", 1, 1, 5, None),
         ("golden", 10, 50, 77, None),
+        ("golden", 2, 50, 1100, None),
         ("tiny", 3, 10, 300, None),
         ("odd", 3, 16, 101, None),
         ("odd", 2, 33, 256, 9),
+        ("odd", 2, 50, 1100, None),
+        ("tiny", 2, 50, 100, 15),
         ("shallow", 1, 1, 304, None),
         ("shallow", 3, 10, 571, None),
         ("shallow", 3, 10, 571, 15),
@@ -322,8 +329,9 @@ def test_it_repeats_itself_bit_by_bit(suffix: int, weights: packing.Precision) -
 
 
 @on_hopper
-def test_one_kernel_serves_many_lengths() -> None:
-    p = problem("shallow", 3, 10, 600, 5, GPU)
+@pytest.mark.parametrize("suffix", [10, 50])
+def test_one_kernel_serves_many_lengths(suffix: int) -> None:
+    p = problem("shallow", 3, suffix, 600, 5, GPU)
     kernel = kernel_of(p)
     for p.length in (600, 1, 7, 8, 15, 16, 17, 128, 304, 512, 513, 599):
         p.noise = torch.randn_like(p.noise)

@@ -36,7 +36,7 @@ from turbopi.kernels.nvrtc import Kernel, compile_cubin
 PARTS = tuple(
     f"denoise_{part}.cu"
     for part in (
-        *("base", "primitives", "wgmma", "producer", "product", "stream"),
+        *("base", "primitives", "wgmma", "producer", "product", "spread", "stream"),
         *("project", "score", "attention", "loop"),
     )
 )
@@ -46,6 +46,7 @@ WAITS = (
     *("nothing", "the stream", "queries", "largest logits", "outputs", "attention", "attention's sums", "hidden units"),
     *("feed-forward sums", "v_t", "the next step", "its end"),
 )
+FEW = 16  # tokens: `FEW` of denoise_base.cu
 MAX_SUFFIX = 56  # beyond it too little shared memory is left for weights on their way
 
 
@@ -81,7 +82,11 @@ def kernel_sizes(
 ) -> dict[str, int]:
     """The kernel's compile-time constants."""
     config, g = arrangement.config, arrangement.config.expert
-    stream = most(arrangement.clusters, 2) * (g.width // BLOCK) * most(suffix, 8) * 32
+    groups = most(suffix, 8)
+    stream = most(arrangement.clusters, 2) * (g.width // BLOCK) * groups * 32
+    scratch = 4 * stream + suffix * g.head_dim
+    if suffix > FEW:
+        scratch += g.width // BLOCK * groups * 64 + RANKS * (groups * 6 + 8)
     return {
         "TP_D": g.width,
         "TP_F": g.mlp_dim,
@@ -97,7 +102,7 @@ def kernel_sizes(
         "TP_DIVISOR": DIVISOR,
         "TP_RPS": 4 if suffix <= 24 else 2,  # larger slots of weights are faster, if enough of them fit
         "TP_SMEM": shared_bytes,
-        "TP_SCRATCH": 4 * stream + suffix * g.head_dim,
+        "TP_SCRATCH": scratch,
     }
 
 
@@ -106,6 +111,7 @@ def source(suffix: int) -> str:
     products = (
         hopper.wgmma("add_product", columns),
         hopper.wgmma("add_product", columns, numbers="f16", from_registers=True),
+        hopper.wgmma("add_rows", columns, from_registers=True),
     )
     return hopper.source(*PARTS, instructions="\n".join(products))
 

@@ -1,4 +1,4 @@
-// Part 9 of 10: attention. The keys are split over the ranks of the head's cluster.
+// Part 10 of 11: attention. The keys are split over the ranks of the head's cluster.
 
 // Attention of this cluster's head, to region H of all ranks. Everything local lies in region X.
 __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix_all) {
@@ -31,7 +31,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   auto of_suffix = [&] {
     float c[1][NT][4];
     clear(c[0]);
-    if (some_keys) suffix_keys.keep(b);
+    if (!ASYNC && some_keys) suffix_keys.keep(b);
     __syncwarp();
     if (suffix > 0) score_suffix(b, suffix, c[0]);
     if (b.warp == SUFFIX_WARP)
@@ -55,10 +55,10 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         ldmatrix_transposed(last[j], b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (tile * 16 + (b.lane & 8)) * 2);
       constexpr bool ONE_OWNER = QT % S == 0 && QTL % CT == 0;
       if (ONE_OWNER && j > 0) {
-        to[j] = to[0] + j * NT * 512, to_bar[j] = to_bar[0];
+        to[j] = to[0] + j * NT * OUTPUT, to_bar[j] = to_bar[0];
         continue;
       }
-      to[j] = at_rank(b.base + M_X + X_COMB + (b.rank * QTL + in) * NT * 512 + b.lane * 16, owner);
+      to[j] = at_rank(b.base + M_X + X_COMB + (b.rank * QTL + in) * NT * OUTPUT + b.lane * (OUTPUT / 32), owner);
       to_bar[j] = at_rank(b.bar(BAR_COMB), owner);
     }
   };
@@ -71,8 +71,13 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         if (suffix > 0) mma_tokens(out[j], last[j], token_address(b, M_X + X_P) + KT * NT * 256);
 #pragma unroll
         for (int n = 0; n < NT; ++n)
-          if (n * 8 + 2 * b.t() < T)
-            send(to[j] + n * 512, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
+          if (n * 8 + 2 * b.t() < T) {
+            if constexpr (SPREAD)
+              send(to[j] + n * OUTPUT, pack_half(out[j][n][0] * OUTPUT_SCALE, out[j][n][1] * OUTPUT_SCALE),
+                   pack_half(out[j][n][2] * OUTPUT_SCALE, out[j][n][3] * OUTPUT_SCALE), to_bar[j]);
+            else
+              send(to[j] + n * 512, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
+          }
       }
   };
   if constexpr (HOLD) {
@@ -182,6 +187,38 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       }
       send_outputs(out);
     }
+  } else if constexpr (ASYNC) {
+    if (some_keys) suffix_keys.ask(), suffix_keys.keep(b);  // while queries come
+    if (some_values) suffix_values.ask(), suffix_values.keep(b);
+    receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
+    MARK(3)
+    u32 taken[MOST_SLOTS];
+#pragma unroll
+    for (int i = 0; i < MOST_SLOTS; ++i)
+      if (i < slots) taken[i] = take_slot(b);
+    float c[1][NT][4];
+    clear(c[0]);
+    if (scorer && b.warp / 4 * 4 < tiles) {
+      show_to_products();
+      const int tile = min(b.warp, tiles - 1);
+      u32 slot = taken[0];
+#pragma unroll
+      for (int i = 1; i < MOST_SLOTS; ++i)
+        if (tile / SLOT_TILES == i) slot = taken[i];
+      const byte* from = b.ring(slot) + tile % SLOT_TILES * KEY_TILE;
+      score_together(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); }, c[0]);
+    }
+#pragma unroll
+    for (int i = 0; i < MOST_SLOTS; ++i)
+      if (i < slots) give_slot(b, taken[i]);
+    MARK(4)
+    if (scorer) {
+      weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
+      arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
+    }
+    if (for_suffix) of_suffix();
+    show_to_products();
+    consumers_sync();
   } else {
     receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
     MARK(3)
@@ -214,7 +251,37 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     consumers_sync();
   }
   MARK(5)
-  if constexpr (!HOLD) {
+  if constexpr (ASYNC) {
+    static_assert(!ASYNC || CT == 1, "a tile of columns for a warp");
+    const u64 weights = operand(b.base + M_X + X_P, 128, NT * 128);
+    float sums[NT * 4], out[CT][NT][4];
+#pragma unroll
+    for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
+#pragma unroll 1
+    for (int i = 0; i < slots; ++i) {
+      const u32 slot = take_slot(b);
+      const byte* from = b.ring(slot) + min(b.warp, QT - 1) * FRAGMENT;
+      uint4 v[SLOT_TILES];
+#pragma unroll
+      for (int sub = 0; sub < SLOT_TILES; ++sub) {  // missing tiles are zeros
+        v[sub] = make_uint4(0, 0, 0, 0);
+        if (i * SLOT_TILES + sub < tiles) v[sub] = load_fragment(from + sub * KEY_TILE, b.lane);
+      }
+      begin_products();
+#pragma unroll
+      for (int sub = 0; sub < SLOT_TILES; ++sub)
+        add_rows(sums, v[sub].x, v[sub].y, v[sub].z, v[sub].w,
+                 behind(weights, min(i * SLOT_TILES + sub, tiles - 1) * NT * 256), 1);
+      commit_products();
+      await_products<0>();
+      give_slot(b, slot);
+    }
+#pragma unroll
+    for (int i = 0; i < NT * 4; ++i) out[0][i / 4][i % 4] = sums[i];
+    prepare_outputs();
+    send_outputs(out);
+    if (b.warp == LEADER) send_sums(b, tiles, suffix);
+  } else if constexpr (!HOLD) {
     float out[CT][NT][4];
     clear_out(out);
 #pragma unroll 1
@@ -262,13 +329,21 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     float2 sum = make_float2(0, 0);
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      const float4 v = *(const float4*)(b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * 512 + b.lane * 16);
+      const byte* p = b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * OUTPUT + b.lane * (OUTPUT / 32);
+      float4 v;
+      if constexpr (SPREAD) {
+        const uint2 both = *(const uint2*)p;
+        const float2 first = unpack_half(both.x), second = unpack_half(both.y);
+        v = make_float4(first.x, first.y, second.x, second.y);
+      } else {
+        v = *(const float4*)p;
+      }
       const float2 l = *(const float2*)(b.smem + M_X + X_SUMS + (s * NT * 8 + token) * 4);
       sum.x += w[s].x * l.x, sum.y += w[s].y * l.y;
       o.x += w[s].x * v.x, o.y += w[s].y * v.y, o.z += w[s].x * v.z, o.w += w[s].y * v.w;
     }
-    const float x = __fdividef(1.0f, sum.x), y = __fdividef(1.0f, sum.y);
-    send_columns(b, M_H + H_ATT, b.q0() + tile, n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y), BAR_ATT, true);
+    const float x = __fdividef(1 / OUTPUT_SCALE, sum.x), y = __fdividef(1 / OUTPUT_SCALE, sum.y);
+    send_columns(b, M_ATT, b.q0() + tile, n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y), BAR_ATT, true);
   }
   MARK(9)
   receive(b, BAR_ATT, b.n, HD * T * 2, WAIT_ATT);

@@ -1,5 +1,5 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
-// Part 1 of 10, which denoise.py puts together: sizes, shared memory, a CTA's view.
+// Part 1 of 11, which denoise.py puts together: sizes, shared memory, a CTA's view.
 //
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
@@ -47,9 +47,10 @@ constexpr int QTL = most(QT, S);           // query tiles of a CTA: 8 RoPE pairs
 constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
-// Clock cycles before sums are asked for: polls slow down what they wait for.
-constexpr u32 PATIENCE = FEW ? 400 : 0;
-constexpr int ITEMS_X = most(DX * NT, W);  // (tile, 8 tokens) of the slice that one warp looks after
+constexpr u32 PATIENCE = FEW ? 400 : 0;    // clock cycles before sums are asked for: polls slow down what they wait for
+constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see denoise_spread.cu
+constexpr int OWN_N = most(NT, NC);        // if so: 8 tokens of the slice at a time, which a CTA looks after
+constexpr int ITEMS_X = most(SPREAD ? DX * OWN_N : DX * NT, W);  // (tile, 8 tokens) that one warp looks after
 static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NC >= NH && A <= CONSUMERS,
               "sizes");
 
@@ -111,18 +112,28 @@ constexpr bool IDLE = 2 * (F16 / NC) < S, IDLE_Q = QT < S;  // the same of queri
 //   sums of gate|up over the stream, or in M_SUMS: the next slice lands when a peer has this rank's hidden units, made
 //   of those sums
 constexpr int X_BYTES = D16 * NT * 256;
-constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * 512;
-constexpr int X_SUFFIX_SUMS = X_P + (KT + 1) * NT * 256, X_KEEP = X_SUFFIX_SUMS + 3 * NT * 256,
-              X_SUFFIX = X_KEEP + up128(NT * 32);
+constexpr int OUTPUT = SPREAD ? 256 : 512;  // bytes of a partial output's tile for 8 tokens: float16, or float32
+constexpr float OUTPUT_SCALE = SPREAD ? 1.0f / 64 : 1;  // keeps them within float16's range
+constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * OUTPUT;
+constexpr int X_SUFFIX_SUMS_FEW = X_P + (KT + 1) * NT * 256,
+              X_KEEP = X_SUFFIX_SUMS_FEW + (SPREAD ? 0 : 3 * NT * 256), X_SUFFIX = X_KEEP + up128(NT * 32);
 constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);  // between steps
+// If SPREAD, region X holds everything, as each exchange waits until all ranks are done with what lay there: attention
+// and queries behind qkv's sums, hidden units over the stream with the feed-forward's partial sums behind them.
+// Attention comes when the suffix's partial logits are no longer needed.
+constexpr int X_ATT = up128(imax(X_SUFFIX + 2 * SUFFIX * RS,
+                                 imax(plan_partials(QKV), plan_others(DX)) * PARTIAL)),
+              X_Q = X_ATT + imax(QT, 3) * NT * 256, X_FF_SUMS = HC * NT * 256;
+constexpr int X_SUFFIX_SUMS = SPREAD ? X_ATT : X_SUFFIX_SUMS_FEW;
+constexpr int X_SPREAD = imax(X_Q + QT * NT * 256, X_FF_SUMS + imax(plan_others(GTL), plan_others(DX)) * PARTIAL);
 constexpr int X_SIZE =
-    up128(imax(imax(X_BYTES, X_SUFFIX + 2 * SUFFIX * RS),
-               imax(imax(MMA_QKV ? QKV * QKV_PARTS : plan_partials(QTL + KVL), plan_partials(GTL)) * PARTIAL,
-                    X_XS + DX * 16 * T * 4)));
+    up128(imax(imax(X_BYTES, SPREAD ? X_SPREAD : X_SUFFIX + 2 * SUFFIX * RS),
+               imax(imax(MMA_QKV ? QKV * QKV_PARTS : plan_partials(QKV), SPREAD ? 0 : plan_partials(GTL)) * PARTIAL,
+                    X_XS + DX * 16 * (SPREAD ? NT * 8 : T) * 4)));
 // Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down; between
 // steps x_t. Hidden units, or queries, land when a peer has this rank's slice, which follows out's, or down's, sums.
 constexpr int H_Q = 0, H_ATT = QT * NT * 256, H_BYTES = imax(2 * QT, HC) * NT * 256;
-constexpr int H_SIZE = up128(imax(imax(H_BYTES, plan_partials(DX) * PARTIAL), T * A * 4));
+constexpr int H_SIZE = SPREAD ? 0 : up128(imax(imax(H_BYTES, plan_partials(DX) * PARTIAL), T * A * 4));
 
 // Sums of squares of the stream, float32[SQ][NT * 8]: by tile if tokens are few, else by slice.
 constexpr int SQ = FEW ? S * DX : S;
@@ -136,26 +147,32 @@ __host__ __device__ constexpr int plan_slots(int mt, int blocks) {
 }
 constexpr int MAX_SLOTS = plan_slots(QTL + KVL, D16) + 2 * most(KT, SLOT_TILES) + plan_slots(DX, QT) +
                           plan_slots(GTL, D16) + plan_slots(DX, HC);
-constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + H_SIZE;
-constexpr int M_PART = M_SSQ + up128(SQ * NT * 32);  // of this slice, by tile; in attention largest logits
-constexpr int M_RMS = M_PART + up128(DX * NT * 32);  // 1 / rms of each token
-constexpr int M_ROPE = M_RMS + up128(NT * 32);       // if tokens are few: see `make_rope`
-constexpr int M_BAR = M_ROPE + (FEW ? (QTL + KVL) * NT * 512 : 0), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
-              M_LIST = M_BAR + 512, M_SUMS = M_LIST + up128(MAX_SLOTS * 8);
+// If SPREAD the ring comes second, for what is read beyond its end lies behind it.
 constexpr int BEYOND = 3 * FRAGMENT;  // of a slot: where the missing ones of 4 tiles are read
+constexpr int SIZE_SSQ = up128(SQ * NT * 32), SIZE_PART = up128((SPREAD ? imax(DX * OWN_N, NT) : DX * NT) * 32),
+              SIZE_BAR = SPREAD ? 384 : 512, SIZE_LIST = up128(MAX_SLOTS * 8);
+constexpr int BEHIND = imax(SIZE_SSQ + SIZE_PART + up128(NT * 32) + SIZE_BAR + SIZE_LIST, BEYOND);
+constexpr int SPREAD_STAGES = imin((TP_SMEM - X_SIZE - BEHIND) / SLOT, 7);
+constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + (SPREAD ? SPREAD_STAGES * SLOT : H_SIZE);
+constexpr int M_Q = SPREAD ? M_X + X_Q : M_H + H_Q, M_ATT = SPREAD ? M_X + X_ATT : M_H + H_ATT,
+              M_HID = SPREAD ? M_X : M_H;  // queries, attention, hidden units or x_t
+constexpr int M_PART = M_SSQ + SIZE_SSQ;        // of this slice, by tile; in attention largest logits
+constexpr int M_RMS = M_PART + SIZE_PART;       // 1 / rms of each token
+constexpr int M_ROPE = M_RMS + up128(NT * 32);  // if tokens are few: see `make_rope`
+constexpr int M_BAR = M_ROPE + (FEW ? (QTL + KVL) * NT * 512 : 0), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
+              M_LIST = M_BAR + SIZE_BAR, M_SUMS = M_LIST + SIZE_LIST;
 __host__ __device__ constexpr int plan_stages(int ring) { return imin((TP_SMEM - ring - BEYOND) / SLOT, 11); }
 // Partial sums of gate|up, out and down lie in a place of their own unless that costs a slot.
 constexpr int SUMS_SIZE = up128(imax(plan_others(GTL), plan_others(DX)) * PARTIAL);
-constexpr bool APART = plan_stages(M_SUMS) == plan_stages(M_SUMS + SUMS_SIZE);
-constexpr int M_RING = M_SUMS + (APART ? SUMS_SIZE : 0), STAGES = plan_stages(M_RING);
+constexpr bool APART = !SPREAD && plan_stages(M_SUMS) == plan_stages(M_SUMS + SUMS_SIZE);
+constexpr int M_RING = SPREAD ? M_H : M_SUMS + (APART ? SUMS_SIZE : 0);
+constexpr int STAGES = SPREAD ? SPREAD_STAGES : plan_stages(M_RING);
 static_assert(STAGES >= 2, "too little shared memory");
-
-// Slots of weights that are asked into L2 before they are loaded. With few tokens: only those of gate|up that find no
-// slot before it begins, while attention leaves memory idle; at other times they slow down what crosses clusters.
-constexpr int AHEAD = NT > 3 ? 4 : 0;
 
 // ring: full and empty, by slot
 enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };
+// if SPREAD: region X read by all warps here, by all ranks; the stream multiplied by all ranks; the slice in float32
+enum SpreadBarrier { BAR_DONE = BAR_RING + 2 * 7, BAR_FREE, BAR_ROOM, BAR_XS };
 
 // ---- scratch in global memory, in 16-byte words
 
@@ -166,7 +183,13 @@ constexpr size_t N_STREAM = size_t(D16) * NT * PAIRS * 32;
 // Keeps them within float16's range; sums of E4M3 weights lack their scales yet.
 constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;
 constexpr size_t N_KV = size_t(T) * HD / 2;              // suffix keys and values, float32[T][2 HD]
-constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM, SCRATCH = B_KV + 2 * N_KV;
+constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM;
+// If SPREAD: the stream as products take it, twice, and at a step's end in float32 [D16][NT][32 lanes][4]; sums of
+// squares float32[3][S][NT * 8]; flags u32[S][32].
+constexpr size_t N_STAGE = size_t(D16) * NT * 16, N_SQUARES = size_t(S) * NT * 2;
+constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_FINAL = B_STAGE + 2 * N_STAGE, B_SQUARES = B_FINAL + 2 * N_STAGE,
+                 B_FLAGS = B_SQUARES + 3 * N_SQUARES;
+constexpr size_t SCRATCH = SPREAD ? B_FLAGS + S * 8 : B_STAGE;
 static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");
 
 struct Args {
@@ -205,7 +228,7 @@ struct Block {
   int cluster, rank, warp, lane;
   int n = 0;                // layers done
   u32 slot = 0, phase = 0;  // of the ring
-  u32 x_parity = 0;
+  u32 x_parity = 0, turn = 0, room = 0;  // turn: exchanges of the stream, room: uses of BAR_ROOM
 
   __device__ Block(const Args& args, byte* s) : a(args), smem(s), base(u32(__cvta_generic_to_shared(s))) {
     u32 r;

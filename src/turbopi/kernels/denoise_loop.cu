@@ -1,4 +1,4 @@
-// Part 10 of 10: between steps, the loop, the kernel.
+// Part 11 of 11: between steps, the loop, the kernel.
 
 constexpr int GROUPS = CONSUMERS / A, HELD = most(T, GROUPS);  // threads per action number, tokens each of them keeps
 
@@ -9,9 +9,9 @@ struct Actions {
 };
 
 // x_t to the stream: action_in_proj, this rank's slice, and x_t's copy in region H for it.
-__device__ __forceinline__ void embed(const Block& b, const Actions& actions, float4 (&x)[ITEMS_X],
+__device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (&x)[ITEMS_X],
                                       const float* scale) {
-  float* xt = (float*)(b.smem + M_H);
+  float* xt = (float*)(b.smem + M_HID);
 #pragma unroll
   for (int i = 0; i < HELD; ++i) {
     const int token = actions.group + i * GROUPS;
@@ -40,13 +40,20 @@ __device__ __forceinline__ void embed(const Block& b, const Actions& actions, fl
       x[j] = c;
     }
     __syncwarp();
-    if (b.attends()) {
+    if (!SPREAD && b.attends()) {
       const float2 s = __ldg((const float2*)(scale + col));
       send_columns(b, M_X, b.x0() + item.tile, item.n,
                    make_float4(x[j].x * s.x, x[j].y * s.x, x[j].z * s.y, x[j].w * s.y), BAR_X, item.real);
     }
   }
-  if (b.attends()) send_squares(b, x, BAR_X);
+  if constexpr (SPREAD) {
+    float2 scales[ITEMS_X];
+    load_columns(b, scales, scale);
+    if (b.attends()) done_with_x(b);
+    publish_stream(b, x, scales, false);
+  } else if (b.attends()) {
+    send_squares(b, x, BAR_X);
+  }
 }
 
 constexpr u32 V_EXPECT = S * T * A * 4 + SQUARES_EXPECT;
@@ -56,16 +63,19 @@ constexpr u32 V_EXPECT = S * T * A * 4 + SQUARES_EXPECT;
 __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4 (&x)[ITEMS_X], const float* scale,
                                         int step) {
   float* xs = (float*)(b.smem + M_X + X_XS);
+  if constexpr (SPREAD) receive(b, BAR_XS, step, xs_expect(b), WAIT_V);
 #pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j) {
+  for (int j = 0; j < (SPREAD ? 0 : ITEMS_X); ++j) {
     const Item item = stream_item(b, j);
     const float2 s = __ldg((const float2*)(scale + (b.x0() + item.tile) * 16 + 2 * b.g()));
     float* p = xs + (item.tile * 16 + 2 * b.g()) * T + item.token;
     if (item.real) p[0] = x[j].x * s.x, p[T] = x[j].z * s.y;
     if (item.real && item.token + 1 < T) p[1] = x[j].y * s.x, p[T + 1] = x[j].w * s.y;
   }
-  send_squares(b, x, BAR_V);
-  if (FEW) consumers_sync();
+  if constexpr (!SPREAD) {
+    send_squares(b, x, BAR_V);
+    consumers_sync();
+  }
   float sum[HELD];
 #pragma unroll
   for (int i = 0; i < HELD; ++i) sum[i] = 0;
@@ -73,11 +83,16 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   const u32 mine = (b.rank * T + actions.group) * A + actions.out;
   if (active) {
     const float* w = b.a.out_w + size_t(b.x0()) * 16 * A + actions.out;
-#pragma unroll(HELD == 1 ? 32 : 8)
+#pragma unroll(HELD == 1 ? 32 : SPREAD ? 16 : 8)
     for (int c = 0; c < b.xn() * 16; ++c) {
       const float v = __ldg(w + c * A);
 #pragma unroll
-      for (int i = 0; i < HELD; ++i) sum[i] += v * xs[c * T + min(actions.group + i * GROUPS, T - 1)];
+      for (int i = 0; i < HELD; ++i) {
+        const int token = min(actions.group + i * GROUPS, T - 1);
+        sum[i] += v * xs[SPREAD ? (c / 16 * NT + token / 8) * 128 + (c % 16 / 2 * 4 + token % 8 / 2) * 4 + c % 2 * 2 +
+                                      token % 2
+                                : c * T + token];
+      }
     }
 #pragma unroll
     for (int i = 0; i < HELD; ++i)
@@ -112,6 +127,7 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   }
   if (step + 1 < b.a.steps) {  // a peer's next slice lands where this rank has read the partial sums
     consumers_sync();
+    if constexpr (SPREAD) return;
     if (threadIdx.x < S)
       asm volatile(
           "mbarrier.arrive.release.cluster.shared::cluster.b64 _, [%0];" ::"r"(at_rank(b.bar(BAR_GO), threadIdx.x))
@@ -142,7 +158,7 @@ __device__ __forceinline__ void consume(Block& b) {
   float4 x[ITEMS_X];
   const u32 expect_hidden = hidden_bytes(b);
 #ifdef TP_TRACE
-  if (threadIdx.x < 64) ((u32*)(b.smem + M_BAR + 256))[threadIdx.x] = threadIdx.x ? 0 : u32(clock64());
+  if (threadIdx.x < 32) ((u32*)(b.smem + M_BAR + 256))[threadIdx.x] = threadIdx.x ? 0 : u32(clock64());
   consumers_sync();
 #endif
 #pragma unroll 1
@@ -180,11 +196,14 @@ __device__ __forceinline__ void consume(Block& b) {
         }
         if (!half) load_norm();
         if (half || b.attends())
-          residual_product(b, b.base + M_H + (half ? 0 : H_ATT), half ? b.hn() : QT, buffer, bit);
+          residual_product(b, b.base + (half ? M_HID : M_ATT), half ? b.hn() : QT,
+                           SPREAD ? M_X + (half ? X_FF_SUMS : 0) : M_H, buffer, bit);
+        if constexpr (SPREAD)
+          if (!half || b.attends() || l + 1 == L) done_with_x(b);
         MARK(half ? 18 : 11)
         note(b, half ? WAIT_X1 : WAIT_X2);
         gather(b, x, buffer, half ? NC : NH, bit, gates, scales,
-               !half || (l + 1 < L && b.attends()), half);
+               !half || (l + 1 < L && (SPREAD || b.attends())), half);
         MARK(half ? 14 : 12)
       }
     }
@@ -194,7 +213,7 @@ __device__ __forceinline__ void consume(Block& b) {
   note(b, FINISHED);
 #ifdef TP_TRACE
   consumers_sync();
-  if (threadIdx.x < 64) a.trace[blockIdx.x * 64 + threadIdx.x] = ((u32*)(b.smem + M_BAR + 256))[threadIdx.x];
+  if (threadIdx.x < 32) a.trace[blockIdx.x * 64 + threadIdx.x] = ((u32*)(b.smem + M_BAR + 256))[threadIdx.x];
 #endif
 }
 
@@ -207,6 +226,10 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     for (u32 i = 0; i < STAGES; ++i) barrier_init(b.full(i), 1), barrier_init(b.empty(i), W);
     for (int i = BAR_X; i <= BAR_V; ++i) barrier_init(b.bar(i), 1);
     barrier_init(b.bar(BAR_GO), S), barrier_init(b.bar(BAR_RMS), 1);
+    if constexpr (SPREAD) {
+      barrier_init(b.bar(BAR_DONE), W), barrier_init(b.bar(BAR_FREE), S);
+      barrier_init(b.bar(BAR_ROOM), S), barrier_init(b.bar(BAR_XS), 1);
+    }
     asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     barrier_expect(b.bar(BAR_X), X_EXPECT);
     barrier_expect(b.bar(BAR_Q), Q_EXPECT);
@@ -215,6 +238,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     barrier_expect(b.bar(BAR_ATT), HD * T * 2);
     barrier_expect(b.bar(BAR_HID), hidden_bytes(b));
     barrier_expect(b.bar(BAR_V), V_EXPECT);
+    if constexpr (SPREAD) barrier_expect(b.bar(BAR_XS), xs_expect(b));
   }
   __syncthreads();
   cluster_exchange();
@@ -232,6 +256,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
       watch(b);
     } else if (b.warp == W + 2) {
       make_inverse_rms(b);
+    } else if (SPREAD) {
+      fetch_stream(b);
     }
   }
   __syncwarp();

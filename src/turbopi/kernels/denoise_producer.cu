@@ -1,4 +1,4 @@
-// Part 4 of 10: what brings weights, keys and values.
+// Part 4 of 11: what brings weights, keys and values.
 
 // One thread of a CTA, which never waits for activations. What it loads is the same in every layer, so a list of it is
 // made first: 100 cycles more for a slot are a microsecond in a layer.
@@ -55,17 +55,6 @@ struct Producer {
                    "l"(once)
                    : "memory");
     };
-    const byte* ahead = first_weights;
-    int next = 0, layer = 0;
-    auto prefetch_next = [&] {
-      if (!(list[next].y & 1)) prefetch(ahead, list[next]);
-      if (++next == slots) {
-        next = 0, ahead += b.a.layer_bytes;
-        if (++layer == L) layer = 0, ahead = first_weights;
-      }
-    };
-#pragma unroll 1
-    for (int i = 0; i < AHEAD && slots > 0; ++i) prefetch_next();
     u32 slot = 0, free = 1;
 #pragma unroll 1
     for (int step = 0; step < b.a.steps; ++step) {
@@ -78,9 +67,7 @@ struct Producer {
           const uint2 what = list[i];
           const bool key = what.y & 1;
           const u32 bytes = what.y & ~1u, full = b.full(slot);
-          if (AHEAD > 0) {
-            prefetch_next();
-          } else if (i == gate_up) {
+          if (i == gate_up) {  // of gate|up, what finds no slot before it begins: attention leaves memory idle
 #pragma unroll 1
             for (int k = gate_up + STAGES; k < gate_up_end; ++k) prefetch(weights, list[k]);
           }

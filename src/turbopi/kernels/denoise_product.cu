@@ -1,4 +1,4 @@
-// Part 5 of 10: matrix products.
+// Part 5 of 11: matrix products.
 
 __device__ __forceinline__ u32 take_slot(Block& b, bool full = false) {
   const u32 slot = b.slot;
@@ -78,6 +78,27 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
       if (--left == 0 || r + 1 == rounds) give_slot(b, slot, seen);
     } else if constexpr (FP8) {
       const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
+      if constexpr (SPREAD) {  // two fragments at a time: each product takes longer here
+        static_assert(RPS % 2 == 0, "pairs of fragments");
+#pragma unroll 1
+        for (int i = 0; i < RPS; i += 2) {
+          const uint4 w0 = load_fragment(p + i * PARTS * tiles * FRAGMENT, b.lane),
+                      w1 = load_fragment(p + (i + 1) * PARTS * tiles * FRAGMENT, b.lane);
+          const uint4 a0 = from_e4m3(w0.x, w0.y), a1 = from_e4m3(w0.z, w0.w), a2 = from_e4m3(w1.x, w1.y),
+                      a3 = from_e4m3(w1.z, w1.w);
+          begin_products();
+          add_product(sums, a0.x, a0.y, a0.z, a0.w, activations(unit + i * PARTS, 0), r | i);
+          add_product(sums, a1.x, a1.y, a1.z, a1.w, activations(unit + i * PARTS, 1), 1);
+          add_product(sums, a2.x, a2.y, a2.z, a2.w, activations(unit + (i + 1) * PARTS, 0), 1);
+          add_product(sums, a3.x, a3.y, a3.z, a3.w, activations(unit + (i + 1) * PARTS, 1), 1);
+          commit_products();
+          if (i + 2 == RPS && (left == 1 || r + 1 == rounds)) give_slot(b, slot);  // what was loaded has been used
+          await_products<0>();
+        }
+        --left;
+        from += RPS * PARTS * tiles * FRAGMENT;
+        continue;
+      }
       uint4 w = load_fragment(p, b.lane);
 #pragma unroll 1  // with room for two fragments, others' registers would spill
       for (int i = 0; i < RPS; ++i) {
@@ -188,14 +209,15 @@ struct Own {
         n[i][k] = k * parts + my.part, mine[i][k] = my.tile < size && tile[i] < tiles && n[i][k] < NT;
     }
   }
-  // To `sums` come all parts' sums of what is mine. They lie over the operand of the product, or APART.
+  // To `sums` come all parts' sums of what is mine. They lie APART, or in `region`: over the operand of the
+  // product unless SPREAD.
   __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
     byte* const place = b.smem + (APART ? M_SUMS : region);
     auto other = [&](int i, int parts, int part, int n) {
       return (float4*)(place + (plan_others(i * 8) + (tile[i] & 7) * (parts - 1) + part) * PARTIAL +
                        partial_place(b, n));
     };
-    if (!APART) consumers_sync();
+    if (!APART && !SPREAD) consumers_sync();
 #pragma unroll
     for (int i = 0; i < plan_groups(MT); ++i) {
       const int size = group_tiles(MT - i * 8), parts = group_parts(size);
@@ -210,7 +232,7 @@ struct Own {
           *other(i, parts, my.part - (my.part > owner), n) = sum;
       }
     }
-    if (APART && plan_groups(MT) == 1) {  // for the warps of my tile
+    if ((APART || SPREAD) && plan_groups(MT) == 1) {  // for the warps of my tile
       __syncwarp();
       asm volatile("bar.sync %0, %1;" ::"r"(8 + (tile[0] & 7)), "n"(group_parts(group_tiles(MT)) * 32) : "memory");
     } else {

@@ -1,4 +1,4 @@
-// Part 7 of 10: queries, keys and values of the suffix.
+// Part 8 of 11: queries, keys and values of the suffix.
 
 constexpr int ITEMS_Q =
     most((QTL + KVL) * NT, W);  // (tile, 8 tokens) of queries, keys and values that one warp finishes
@@ -161,11 +161,12 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     multiply<QKV, D16>(b, b.base + M_X, D16, qn + kvn, sums);
     MARK(1)
     consumers_sync();
+    if constexpr (SPREAD) give_room(b);
     store_partials<QKV>(b, b.smem + M_X, qn + kvn, sums);
   }
   consumers_sync();
   if (threadIdx.x < NT * 8) ((int*)(b.smem + M_PART))[threadIdx.x] = ordered(LOWEST);  // for `weigh_prefix`
-  byte* const staged = b.smem + M_H + H_ATT;  // free until all have what attention sends: [item][half][8 tokens][8]
+  byte* const staged = b.smem + M_ATT;  // free until all have what attention sends: [item][half][8 tokens][8]
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
     const int i = b.warp + j * W, k = i - qn * NT;
@@ -200,6 +201,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     }
   }
   consumers_sync();
+  if constexpr (SPREAD) await_room(b), ++b.room;
   static_assert(S == 8, "half a warp serves half of the ranks");
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
@@ -207,7 +209,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     if (i < qn * NT) {
       const int n = i / qn, half = b.lane >> 3 & 1, token = b.lane & 7, d0 = b.lane >> 4 << 2;
       const float4 v = *(const float4*)(staged + i * 256 + (b.lane & 15) * 16);
-      const u32 to = b.base + M_H + H_Q + ((b.q0() + i % qn + half * QT) * NT + n) * 128 + token * 16;
+      const u32 to = b.base + M_Q + ((b.q0() + i % qn + half * QT) * NT + n) * 128 + token * 16;
       u32 data[4], bars[4];
 #pragma unroll
       for (int d = 0; d < 4; ++d) data[d] = at_rank(to, d0 + d), bars[d] = at_rank(b.bar(BAR_Q), d0 + d);

@@ -1,11 +1,14 @@
-// Part 8 of 10: attention's steps, of which denoise_attention.cu makes the whole.
+// Part 9 of 11: attention's steps, of which denoise_attention.cu makes the whole.
 
 // Who does what: the first SCORERS warps score a tile of prefix keys each, and the next if there are more; the last
 // four score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries.
 // If tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries
-// and weights; else all warps weigh, and the third warpgroup fetches the suffix's values.
+// and weights; else all warps weigh, and the third warpgroup fetches the suffix's values. Queries of many tokens are
+// more than shared memory can bring to each warp by itself (ASYNC): a warpgroup's products share them, with keys or
+// values in registers.
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
+constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES;  // scored and weighed by wgmma
 // Blocks of its keys that a scoring warp holds, tiles of values that a weighing warp does: more would spill.
 constexpr int HELD_KEYS = QT < 12 ? QT : 12, HELD_TILES = KT < 4 ? KT : 4;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
@@ -47,7 +50,7 @@ __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int
 #pragma unroll
   for (int i = 0; i < CHAINS; ++i) clear(sums[i]);
   u32 seen = 0;
-  const u32 q = token_address(b, M_H + H_Q) + first * NT * 256;
+  const u32 q = token_address(b, M_Q) + first * NT * 256;
 #pragma unroll(UNROLL)
   for (int k = 0; k < STEPS; ++k)
     if (QT % 4 == 0 || k < steps) {
@@ -60,6 +63,35 @@ __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int
 #pragma unroll
     for (int i = 0; i < 4; ++i) c[n][i] = CHAINS == 2 ? sums[0][n][i] + sums[CHAINS - 1][n][i] : sums[0][n][i];
   return seen;
+}
+
+// The same for a warpgroup, each warp with 16 keys of its own.
+template <typename Fetch>
+__device__ __forceinline__ void score_together(const Block& b, Fetch fetch, float (&c)[NT][4]) {
+  constexpr int CHUNK = QT % 4 == 0 ? 4 : 1;
+  const u64 queries = operand(b.base + M_Q, 128, NT * 128);
+  float sums[NT * 4];
+#pragma unroll
+  for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
+  uint4 now[CHUNK], next[CHUNK];
+#pragma unroll
+  for (int i = 0; i < CHUNK; ++i) now[i] = fetch(i);
+#pragma unroll
+  for (int k = 0; k < QT; k += CHUNK) {
+    begin_products();
+#pragma unroll
+    for (int i = 0; i < CHUNK; ++i)
+      add_rows(sums, now[i].x, now[i].y, now[i].z, now[i].w, behind(queries, (k + i) * NT * 256), 1);
+    commit_products();
+    if (k + CHUNK < QT)
+#pragma unroll
+      for (int i = 0; i < CHUNK; ++i) next[i] = fetch(k + CHUNK + i);
+    await_products<0>();
+#pragma unroll
+    for (int i = 0; i < CHUNK; ++i) now[i] = next[i];
+  }
+#pragma unroll
+  for (int i = 0; i < NT * 4; ++i) c[i / 4][i % 4] = sums[i];
 }
 
 // Suffix keys (kind 0) or values (1) from all clusters to shared memory, asked for first and kept later: of `rows` of
@@ -191,7 +223,7 @@ __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[
 }
 constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
 __device__ __forceinline__ u32 outputs_expect(const Block& b) {
-  return S * ((T + 1) / 2) * 8 + S * b.qn() * ((T + 1) / 2) * 128;
+  return S * ((T + 1) / 2) * 8 + S * b.qn() * ((T + 1) / 2) * (OUTPUT / 4);
 }
 // The suffix's keys come last. Their weights go by the prefix's largest logits, too, unless theirs are so much larger
 // (2^64) that the prefix's weights count for nothing: then those are dropped, which `X_KEEP` says.

@@ -1,17 +1,5 @@
-// Part 6 of 10: the residual stream, and what goes into it: sums across clusters, GeGLU.
+// Part 7 of 11: the residual stream, and what goes into it: sums across clusters, GeGLU.
 
-// An item is (tile, 8 tokens); lane (g, t) has columns 2g, 2g + 1 of tokens 2t, 2t + 1 of it, as x y (first column) and
-// z w (second). A warp keeps its items in registers for good.
-
-struct Item {
-  int tile, n, token;  // token: the lane's first
-  bool real;           // of this warp, and tokens that exist
-};
-__device__ __forceinline__ Item stream_item(const Block& b, int j) {
-  const int i = b.warp + j * W, xn = b.xn();
-  const int tile = i < xn * NT ? i % xn : 0, n = i < xn * NT ? i / xn : 0;
-  return {tile, n, n * 8 + 2 * b.t(), i < xn * NT && n * 8 + 2 * b.t() < T};
-}
 // 8 bytes with the lane pair's four columns 2g.. of one token (even g: 2t, odd g: 2t + 1) to all ranks.
 __device__ __forceinline__ void send_columns(const Block& b, int region, int block, int n, float4 v, int bar,
                                              bool real) {
@@ -26,7 +14,7 @@ __device__ __forceinline__ void send_columns(const Block& b, int region, int blo
   }
 }
 // Sums of squares to all ranks, which add them up. If tokens are few every warp sends those of its tiles, as soon as it
-// has them; else they are added up for the slice before.
+// has them; else see `publish_stream`.
 __device__ __forceinline__ void send_tile_squares(const Block& b, float4 x, int i, int bar) {
   const int xn = b.xn(), absent = i - xn * NT;  // tiles that a rank lacks are sent as zeros
   if (i >= DX * NT) return;
@@ -42,32 +30,10 @@ __device__ __forceinline__ void send_tile_squares(const Block& b, float4 x, int 
     send(at_rank(to, b.g()), __float_as_uint(q0), __float_as_uint(q1), at_rank(b.bar(bar), b.g()));
 }
 __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[ITEMS_X], int bar) {
-  if constexpr (FEW) {
 #pragma unroll
-    for (int j = 0; j < ITEMS_X; ++j) send_tile_squares(b, x[j], b.warp + j * W, bar);
-    return;
-  }
-  float* part = (float*)(b.smem + M_PART);
-#pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j) {
-    const Item item = stream_item(b, j);
-    float q0 = x[j].x * x[j].x + x[j].z * x[j].z, q1 = x[j].y * x[j].y + x[j].w * x[j].w;
-#pragma unroll
-    for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
-    if (item.real && b.g() == 0) *(float2*)(part + (item.tile * NT + item.n) * 8 + 2 * b.t()) = make_float2(q0, q1);
-  }
-  consumers_sync();
-  static_assert(T * S <= CONSUMERS, "a thread for each token and rank");
-  if (const int i = threadIdx.x; i < T * S) {
-    const int token = i / S, d = i % S;
-    float sum = 0;
-#pragma unroll
-    for (int tile = 0; tile < DX; ++tile)
-      if (tile < b.xn()) sum += part[tile * NT * 8 + token];
-    send(at_rank(b.base + M_SSQ + (b.rank * NT * 8 + token) * 4, d), __float_as_uint(sum), at_rank(b.bar(bar), d));
-  }
+  for (int j = 0; j < ITEMS_X; ++j) send_tile_squares(b, x[j], b.warp + j * W, bar);
 }
-constexpr u32 SQUARES_EXPECT = FEW ? SQ * ((T + 1) / 2) * 8 : SQ * T * 4;
+constexpr u32 SQUARES_EXPECT = SPREAD ? S * NT * 32 : SQ * ((T + 1) / 2) * 8;
 // 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a spare warp makes them.
 __device__ __forceinline__ float2 inverse_rms(const Block& b, int token) {
   barrier_wait(b.bar(BAR_RMS), b.x_parity ^ 1);
@@ -89,7 +55,7 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
     if (b.lane == 0) barrier_arrive(b.bar(BAR_RMS));
   }
 }
-constexpr u32 X_EXPECT = D16 * T * 32 + SQUARES_EXPECT;
+constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * 32 + SQUARES_EXPECT;
 
 // A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
 __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X], const float* row) {
@@ -136,7 +102,7 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
 
 // Fetch `parts` clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
 // slice times the next norm's scale to all ranks. buffer: [D16][NT][PAIRS][32] 16-byte words.
-__device__ __forceinline__ void gather(const Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
+__device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
                                        int half) {
   for (const u32 since = u32(clock64()); u32(clock64()) - since < PATIENCE;);
@@ -158,27 +124,30 @@ __device__ __forceinline__ void gather(const Block& b, float4 (&x)[ITEMS_X], con
     if (j == 0) {
       MARK(21 + half)
     }
-    if (send_on) {
+    if (!SPREAD && send_on) {
       const float4 y =
           make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
       send_columns(b, M_X, b.x0() + item.tile, item.n, y, BAR_X, item.real);
     }
   }
-  if (send_on) send_squares(b, x, BAR_X);
+  if constexpr (SPREAD)
+    publish_stream(b, x, scales, !send_on);
+  else if (send_on)
+    send_squares(b, x, BAR_X);
 }
 
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
 // sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive
 // before it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which
 // follows what is published here.
-__device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, uint4* buffer, u32 bit) {
+__device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, int region, uint4* buffer, u32 bit) {
   float sums[plan_groups(DX)][NT * 4];
   constexpr int EVEN = F16 % NC == 0 && HC % 16 == 0 && QT % 16 == 0 ? 16
                        : F16 % NC == 0 && HC % 8 == 0 && QT % 8 == 0 ? 8
                                                                      : 1;
   multiply<DX, EVEN>(b, x, blocks, b.xn(), sums);
   Own<DX> own(b, b.xn());
-  own.add_up(b, M_H, b.xn(), sums);
+  own.add_up(b, region, b.xn(), sums);
 #pragma unroll
   for (int i = 0; i < plan_groups(DX); ++i)
 #pragma unroll
@@ -218,7 +187,8 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
   float sums[GROUPS_][NT * 4];
   multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums);
   MARK(15)
-  own.add_up(b, M_X, gn, sums);
+  if constexpr (SPREAD) consumers_sync(), give_room(b);
+  own.add_up(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);
 #pragma unroll
   for (int i = 0; i < GROUPS_; ++i)
 #pragma unroll
@@ -237,7 +207,8 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
         const u32 far_lo = exchange(lo, 16), far_hi = exchange(hi, 16);
         const uint4 units =
             b.g() & 4 ? make_uint4(far_lo, far_hi, lo, hi) : make_uint4(lo, hi, far_lo, far_hi);
-        const u32 to = b.base + M_H + ((at >> 1) * NT + n) * 256 + (at & 1) * 128 + token * 16;
+        const u32 to = b.base + M_HID + ((at >> 1) * NT + n) * 256 + (at & 1) * 128 + token * 16;
+        if constexpr (SPREAD) await_room(b);
         if (n * 8 + token < T) {
           constexpr int QUARTER = most(S, 4);
           u32 data[QUARTER], bars[QUARTER];
@@ -251,6 +222,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
           for (int d = 0; d < QUARTER; ++d) send(data[d], units, bars[d]);
         }
       }
+  if constexpr (SPREAD) await_room(b), ++b.room;
   if (IDLE) {
     inverse_rms(b, 0), consumers_sync();  // no warp may be left behind by a whole use of a barrier
     if (threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_HID), threadIdx.x));

@@ -1,4 +1,4 @@
-// Part 3 of 10: asynchronous products of the tensor cores (wgmma). The four warps of a warpgroup together add 64 rows x
+// Part 3 of 11: asynchronous products of the tensor cores (wgmma). The four warps of a warpgroup together add 64 rows x
 // 16 columns of operand A, from shared memory or registers, times 16 columns x NT * 8 tokens of operand B, from shared
 // memory, to float32 sums: warp i has rows 16 i.., laid out as those of mma.m16n8k16, 8 tokens after 8.
 //
@@ -18,4 +18,6 @@ __device__ __forceinline__ u64 behind(u64 operand, u32 bytes) {
 }
 // What threads wrote to shared memory (or peers, whose barrier was waited for) before may now be read by products.
 __device__ __forceinline__ void show_to_products() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
-TP_MMA  // add_product(float (&sums)[NT * 4], u64 a or u32 * 4, u64 b, int keep): bfloat16, with registers float16
+// add_product(float (&sums)[NT * 4], u64 a or u32 * 4, u64 b, int keep): bfloat16, with registers float16; add_rows:
+// bfloat16 with registers. The compiler makes all of them wait for each other if one stands in a branch of its own.
+TP_MMA

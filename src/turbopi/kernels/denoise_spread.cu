@@ -1,0 +1,145 @@
+// Part 6 of 11: who keeps which part of the residual stream, and how the parts come together if tokens are many
+// (SPREAD).
+//
+// If tokens are few, every cluster keeps the whole stream: each CTA adds up its slice for all tokens, and the ranks
+// send their slices to each other. With more tokens the bytes of both cost more than another hop through L2. Then CTA
+// (cluster, rank) keeps its rank's slice of tokens 8 cluster.. (and 8 (cluster + NC)..) alone, adds up for those, and
+// puts what the next products take into L2, behind it a flag. Of each cluster a spare warp of rank r fetches slice r as
+// soon as all its flags are there, and the copy engine writes it to all ranks at once.
+
+// An item is (tile, 8 tokens); lane (g, t) has columns 2g, 2g + 1 of tokens 2t, 2t + 1 of it, as x y (first column) and
+// z w (second). A warp keeps its items in registers for good.
+
+struct Item {
+  int tile, n, token;  // token: the lane's first
+  bool real;           // of this warp, and tokens that exist
+};
+__device__ __forceinline__ Item stream_item(const Block& b, int j) {
+  const int i = b.warp + j * W, xn = b.xn();
+  if constexpr (SPREAD) {
+    const int tile = i % DX, n = b.cluster + i / DX * NC;
+    const bool real = i < DX * OWN_N && tile < xn && n < NT;
+    return {real ? tile : 0, real ? n : 0, (real ? n : 0) * 8 + 2 * b.t(), real && n * 8 + 2 * b.t() < T};
+  }
+  const int tile = i < xn * NT ? i % xn : 0, n = i < xn * NT ? i / xn : 0;
+  return {tile, n, n * 8 + 2 * b.t(), i < xn * NT && n * 8 + 2 * b.t() < T};
+}
+
+// Region X is used for everything, one thing after the other. Before any rank may write where all ranks read, all
+// agree: before the stream comes, spare warps do (DONE, FREE); before queries and hidden units come, which lie over the
+// stream, the consumers do (ROOM).
+
+// This warp has read what it needs of region X, up to the next exchange of the stream.
+__device__ __forceinline__ void done_with_x(const Block& b) {
+  show_to_products();  // the copy engine comes behind our reads and writes
+  __syncwarp();
+  if (b.lane == 0) barrier_arrive(b.bar(BAR_DONE));
+}
+// Nothing was written that a peer reads, so nothing is to be released: that would cost a microsecond.
+__device__ __forceinline__ void arrive_at(u32 bar) {
+  asm volatile("mbarrier.arrive.relaxed.cluster.shared::cluster.b64 _, [%0];" ::"r"(bar) : "memory");
+}
+// All warps here have multiplied the stream; all ranks have.
+__device__ __forceinline__ void give_room(const Block& b) {
+  if (threadIdx.x < S) arrive_at(at_rank(b.bar(BAR_ROOM), threadIdx.x));
+}
+__device__ __forceinline__ void await_room(const Block& b) {
+  barrier_wait(b.bar(BAR_ROOM), b.room & 1);
+  __syncwarp();
+}
+
+// What this CTA keeps of the stream, times the next norm's scale, to L2: as products take it or, for the end of a step,
+// in float32. Then the slice's sums of squares and the flags, which say how many times that has been done.
+__device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS_X], const float2 (&scales)[ITEMS_X],
+                                               bool last) {
+  byte* const to = (byte*)(b.a.scratch + (last ? B_FINAL : B_STAGE + (b.turn & 1) * N_STAGE));
+  float* const part = (float*)(b.smem + M_PART);  // [8 tokens at a time][DX][8]
+#pragma unroll
+  for (int j = 0; j < ITEMS_X; ++j) {
+    const Item item = stream_item(b, j);
+    const int place = (b.x0() + item.tile) * NT + item.n, token = 2 * b.t() + (b.g() & 1);
+    const float4 y =
+        make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
+    if (last) {
+      if (item.real) *(float4*)(to + place * 512 + b.lane * 16) = y;
+    } else {
+      const u32 w0 = pack_operand(y.x, y.z), w1 = pack_operand(y.y, y.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
+      if (item.real && item.n * 8 + token < T)
+        *(uint2*)(to + place * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8) =
+            make_uint2(b.g() & 1 ? got : w0, b.g() & 1 ? w1 : got);
+    }
+    float q0 = x[j].x * x[j].x + x[j].z * x[j].z, q1 = x[j].y * x[j].y + x[j].w * x[j].w;
+#pragma unroll
+    for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
+    if (const int i = b.warp + j * W; i < DX * OWN_N && b.g() == 0)
+      *(float2*)(part + i * 8 + 2 * b.t()) = item.real ? make_float2(q0, q1) : make_float2(0, 0);
+  }
+  consumers_sync();
+  if (b.warp == 0) {
+    float* const squares = (float*)(b.a.scratch + B_SQUARES + (last ? 2 : b.turn & 1) * N_SQUARES);
+    u32* const flags = (u32*)(b.a.scratch + B_FLAGS) + b.rank * 32;
+#pragma unroll
+    for (int k = 0; k < OWN_N; ++k)
+      if (const int n = b.cluster + k * NC; n < NT) {
+        if (b.lane < 8) {
+          float sum = 0;
+#pragma unroll
+          for (int tile = 0; tile < DX; ++tile) sum += part[(k * DX + tile) * 8 + b.lane];
+          squares[(b.rank * NT + n) * 8 + b.lane] = sum;
+        }
+        __syncwarp();
+        if (b.lane == 0)  // behind everything that the barrier above was behind of
+          asm volatile("st.release.gpu.global.u32 [%0], %1;" ::"l"(flags + n), "r"(b.turn + 1) : "memory");
+      }
+  }
+  ++b.turn;
+}
+
+// `bytes` from L2 to the same place of all ranks, counted in by `bar` of each.
+__device__ __forceinline__ void load_for_all(u32 to, const void* from, u32 bytes, u32 bar) {
+  asm volatile(
+      "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster "
+      "[%0], [%1], %2, [%3], %4;" ::"r"(to),
+      "l"(from), "r"(bytes), "r"(bar), "h"((unsigned short)((1 << S) - 1))
+      : "memory");
+}
+__device__ __forceinline__ u32 xs_expect(const Block& b) { return imax(b.xn() * NT * 512, 16); }  // if none: any 16
+
+// A spare warp. Buffers in L2 are free when their turn comes again: who writes them has sums, made of what came after,
+// of all clusters that read them. The flags need no acquire: the copy engine reads L2, and only when they are seen.
+__device__ __forceinline__ void fetch_stream(const Block& b) {
+  const u32* const flags = (const u32*)(b.a.scratch + B_FLAGS) + b.rank * 32;
+  const u32 place = b.x0() * NT, items = b.xn() * NT;
+  u32 uses = 0, turn = 0;
+#pragma unroll 1
+  for (int step = 0; step < b.a.steps; ++step)
+#pragma unroll 1
+    for (int i = 0; i <= 2 * L; ++i, ++turn) {  // embedded, then behind attention, behind the feed-forward, ...
+      const bool last = i == 2 * L;
+      if (!b.attends() && i % 2 == 0 && !last) continue;
+      barrier_wait(b.bar(BAR_DONE), uses & 1);
+      __syncwarp();
+      if (b.lane < S) arrive_at(at_rank(b.bar(BAR_FREE), b.lane));
+      barrier_wait(b.bar(BAR_FREE), uses++ & 1);
+      if (b.lane < NT) {
+        u32 flag;
+        do {
+          asm volatile("ld.acquire.gpu.global.u32 %0, [%1];" : "=r"(flag) : "l"(flags + b.lane) : "memory");
+        } while (int(flag - turn) <= 0);
+      }
+      asm volatile("fence.proxy.async.global;" ::: "memory");
+      __syncwarp();
+      if (b.lane == 0) {
+        const uint4* const squares = b.a.scratch + B_SQUARES + (last ? 2 : turn & 1) * N_SQUARES + b.rank * NT * 2;
+        const uint4* const from = b.a.scratch + (last ? B_FINAL : B_STAGE + (turn & 1) * N_STAGE);
+        if (last)
+          asm volatile("cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1], %2, [%3];" ::"r"(
+                           b.base + M_X + X_XS),
+                       "l"(from + (items > 0 ? place * 32 : 0)), "r"(xs_expect(b)), "r"(b.bar(BAR_XS))
+                       : "memory");
+        else if (items > 0)
+          load_for_all(b.base + M_X + place * 256, from + place * 16, items * 256, b.bar(BAR_X));
+        load_for_all(b.base + M_SSQ + b.rank * NT * 32, squares, NT * 32, b.bar(last ? BAR_V : BAR_X));
+      }
+    }
+}
