@@ -73,8 +73,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         for (int n = 0; n < NT; ++n)
           if (n * 8 + 2 * b.t() < T) {
             if constexpr (SPREAD)
-              send(to[j] + n * OUTPUT, pack_half(out[j][n][0] * OUTPUT_SCALE, out[j][n][1] * OUTPUT_SCALE),
-                   pack_half(out[j][n][2] * OUTPUT_SCALE, out[j][n][3] * OUTPUT_SCALE), to_bar[j]);
+              send(to[j] + n * OUTPUT, pack(out[j][n][0], out[j][n][1]), pack(out[j][n][2], out[j][n][3]), to_bar[j]);
             else
               send(to[j] + n * 512, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
           }
@@ -333,8 +332,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       float4 v;
       if constexpr (SPREAD) {
         const uint2 both = *(const uint2*)p;
-        const float2 first = unpack_half(both.x), second = unpack_half(both.y);
-        v = make_float4(first.x, first.y, second.x, second.y);
+        v = make_float4(bf16_low(both.x), bf16_high(both.x), bf16_low(both.y), bf16_high(both.y));
       } else {
         v = *(const float4*)p;
       }
@@ -342,10 +340,12 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       sum.x += w[s].x * l.x, sum.y += w[s].y * l.y;
       o.x += w[s].x * v.x, o.y += w[s].y * v.y, o.z += w[s].x * v.z, o.w += w[s].y * v.w;
     }
-    const float x = __fdividef(1 / OUTPUT_SCALE, sum.x), y = __fdividef(1 / OUTPUT_SCALE, sum.y);
+    const float x = __fdividef(1.0f, sum.x), y = __fdividef(1.0f, sum.y);
     send_columns(b, M_ATT, b.q0() + tile, n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y), BAR_ATT, true);
   }
   MARK(9)
-  receive(b, BAR_ATT, b.n, HD * T * 2, WAIT_ATT);
+  // A rank without queries has nothing to send now, but what has come may not land over the stream that comes next.
+  if (IDLE_Q && threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_ATT), threadIdx.x));
+  receive(b, BAR_ATT, b.n, ATT_EXPECT, WAIT_ATT);
   MARK(10)
 }

@@ -112,8 +112,8 @@ constexpr bool IDLE = 2 * (F16 / NC) < S, IDLE_Q = QT < S;  // the same of queri
 //   sums of gate|up over the stream, or in M_SUMS: the next slice lands when a peer has this rank's hidden units, made
 //   of those sums
 constexpr int X_BYTES = D16 * NT * 256;
-constexpr int OUTPUT = SPREAD ? 256 : 512;  // bytes of a partial output's tile for 8 tokens: float16, or float32
-constexpr float OUTPUT_SCALE = SPREAD ? 1.0f / 64 : 1;  // keeps them within float16's range
+// Bytes of a partial output's tile for 8 tokens: bfloat16, as weights of the suffix can be large, or float32.
+constexpr int OUTPUT = SPREAD ? 256 : 512;
 constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * OUTPUT;
 constexpr int X_SUFFIX_SUMS_FEW = X_P + (KT + 1) * NT * 256,
               X_KEEP = X_SUFFIX_SUMS_FEW + (SPREAD ? 0 : 3 * NT * 256), X_SUFFIX = X_KEEP + up128(NT * 32);

@@ -235,7 +235,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     barrier_expect(b.bar(BAR_Q), Q_EXPECT);
     barrier_expect(b.bar(BAR_TOPS), TOPS_EXPECT);
     barrier_expect(b.bar(BAR_COMB), outputs_expect(b));
-    barrier_expect(b.bar(BAR_ATT), HD * T * 2);
+    barrier_expect(b.bar(BAR_ATT), ATT_EXPECT);
     barrier_expect(b.bar(BAR_HID), hidden_bytes(b));
     barrier_expect(b.bar(BAR_V), V_EXPECT);
     if constexpr (SPREAD) barrier_expect(b.bar(BAR_XS), xs_expect(b));
