@@ -1,6 +1,7 @@
 """The benchmark: its floors are counted right, its calls are fresh, its document is complete."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -248,6 +249,23 @@ def test_the_command_writes_a_complete_document(tmp_path: Path) -> None:
     page = (tmp_path / "report.md").read_text()
     assert page == report(document)
     assert f"{document['results'][3]['milliseconds']['total']['p50']:.2f}" in page
+
+
+def test_a_run_that_is_ended_has_kept_what_it_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[Any] = []
+
+    def measure_twice(*args: Any, **options: Any) -> Any:
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        measured.append(measure_calls(*args, **options))
+        return measured[-1]
+
+    monkeypatch.setattr("turbopi.bench.run.measure_calls", measure_twice)
+    options = "--random-weights pi05_tiny --device cpu --cameras 1 --steps 1,2,3 --calls 3 --report"
+    CliRunner().invoke(app, ["bench", *options.split(), str(tmp_path)])
+    document = json.loads((tmp_path / "results.json").read_text())
+    assert document["unfinished"] is True and [one["job"]["steps"] for one in document["results"]] == [1, 2]
+    assert os.listdir(tmp_path) == ["results.json"]
 
 
 @pytest.mark.parametrize(

@@ -96,13 +96,15 @@ class Progress:
 
     doing: Callable[[str], None] = field(default=lambda text: None)
     advance: Callable[[], None] = field(default=lambda: None)
+    keep: Callable[[dict[str, Any]], None] = field(default=lambda document: None)  # what is measured so far
 
 
 def run(checkpoint: Checkpoint, plan: Plan, device: torch.device, progress: Progress | None = None) -> dict[str, Any]:
     """Measure everything in the plan.
 
     A backend that refuses or breaks on its jobs is named under `failed`, and the others go on; if none is left, its
-    error is raised. What can be refused beforehand is, before anything is measured (`Plan.check`).
+    error is raised. What can be refused beforehand is, before anything is measured (`Plan.check`). `progress.keep` gets
+    what there is after each job, marked as "unfinished".
     """
     progress = progress or Progress()
     plan.check(device)
@@ -113,11 +115,28 @@ def run(checkpoint: Checkpoint, plan: Plan, device: torch.device, progress: Prog
     results: list[dict[str, Any]] = []
     answered: list[Answered] = []
     failed: list[dict[str, str]] = []
+
+    def document(measured: list[dict[str, Any]]) -> dict[str, Any]:
+        return {
+            "provenance": before,
+            "model": checkpoint.config.name,
+            "weights": _weights_name(checkpoint),
+            "random_weights": checkpoint.format == "random",
+            "observations_seed": 0,
+            "main_job": asdict(plan.main),
+            "floors": {precision: asdict(floor) for precision, floor in floors.items()},
+            "results": measured,
+            "failed": failed,
+        }
+
+    def keep(measured: list[dict[str, Any]]) -> None:
+        progress.keep({**document(results + measured), "unfinished": True})
+
     for precision, backend, jobs in plan.policies():
         progress.doing(f"{backend} {precision}: loading")
         floor = floors[precision]
         try:
-            results += _measure(checkpoint, plan, device, backend, precision, jobs, floor, answered, progress)
+            results += _measure(checkpoint, plan, device, backend, precision, jobs, floor, answered, progress, keep)
         except TurboPiError as error:
             failed.append({"backend": backend, "precision": precision, "error": str(error)})
             last = error
@@ -127,26 +146,18 @@ def run(checkpoint: Checkpoint, plan: Plan, device: torch.device, progress: Prog
     if answered:
         progress.doing("the float32 reference's answers")
         _judge(checkpoint, plan, device, answered)
-    document = {
-        "provenance": {**before, "clocks_at_the_end": provenance(device).get("gpu", {})},
-        "model": checkpoint.config.name,
-        "weights": _weights_name(checkpoint),
-        "random_weights": checkpoint.format == "random",
-        "observations_seed": 0,
-        "main_job": asdict(plan.main),
-        "floors": {precision: asdict(floor) for precision, floor in floors.items()},
-        "results": results,
-        "failed": failed,
-        "linear": linear_models(results),
-    }
+        keep([])
+    complete = document(results)
+    complete["provenance"] = {**before, "clocks_at_the_end": provenance(device).get("gpu", {})}
+    complete["linear"] = linear_models(results)
     if plan.profile:
-        document["profile"] = [
+        complete["profile"] = [
             _profile(checkpoint, plan, device, backend, precision, progress)
             for precision, backend, _ in plan.policies()
             if backend in plan.backends
             and not any((one["backend"], one["precision"]) == (backend, precision) for one in failed)
         ]
-    return document
+    return complete
 
 
 def _measure(
@@ -159,6 +170,7 @@ def _measure(
     floors: Floors,
     answered: list[Answered],
     progress: Progress,
+    keep: Callable[[list[dict[str, Any]]], None],
 ) -> list[dict[str, Any]]:
     """One backend in one precision on its jobs. What it answers where errors are wanted goes to `answered`."""
     if device.type == "cuda":
@@ -190,6 +202,7 @@ def _measure(
         if plan.judges(job) and (policy.backend.name, precision) != ("pytorch", "f32"):
             answered.append((result, job, answers(shaped, job)))
         results.append(result)
+        keep(results)
     results[-1]["backend_details"] = policy.metadata["backend_details"]
     del policy, shaped
     _free(device)

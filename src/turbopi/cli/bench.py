@@ -121,7 +121,7 @@ def bench(
         )
         plan.check(resolved)
         starts = _starts(checkpoint, options, plan, str(resolved)) if ready else []
-        document = _run_with_bar(lambda progress: run(opened, plan, resolved, progress), plan, output)
+        document = _run_with_bar(lambda progress: run(opened, plan, resolved, progress), plan, report, output)
     document["provenance"]["command"] = ["turbopi", *sys.argv[1:]]
     if ready:
         document["ready"] = starts
@@ -148,14 +148,19 @@ def _starts(checkpoint: str | None, options: WeightOptions, plan: "Plan", device
     return starts
 
 
-def _run_with_bar(work: Any, plan: "Plan", output: Output) -> dict[str, Any]:
+def _run_with_bar(work: Any, plan: "Plan", folder: Path | None, output: Output) -> dict[str, Any]:
     from turbopi.bench.run import Progress as Told
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = new_console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not output.shows_progress) as bar:
         task = bar.add_task("", total=plan.total_calls)
-        told = Told(lambda text: bar.update(task, description=text), lambda: bar.advance(task))
+
+        def keep(document: dict[str, Any]) -> None:
+            if folder is not None:
+                _write_results(document, folder)
+
+        told = Told(lambda text: bar.update(task, description=text), lambda: bar.advance(task), keep)
         document: dict[str, Any] = work(told)
     return document
 
@@ -164,11 +169,17 @@ def _write(document: dict[str, Any], folder: Path) -> list[Path]:
     from turbopi.bench.plots import write_plots
     from turbopi.bench.report import report
 
-    folder.mkdir(parents=True, exist_ok=True)
-    results, page = folder / "results.json", folder / "report.md"
-    results.write_text(json.dumps(document, indent=1) + "\n")
+    results, page = _write_results(document, folder), folder / "report.md"
     page.write_text(report(document))
     return [results, page, *write_plots(document, folder)]
+
+
+def _write_results(document: dict[str, Any], folder: Path) -> Path:
+    """At once, so that what was measured before is whole whenever the run is ended."""
+    folder.mkdir(parents=True, exist_ok=True)
+    results, unfinished = folder / "results.json", folder / "results.json.unfinished"
+    unfinished.write_text(json.dumps(document, indent=1) + "\n")
+    return unfinished.replace(results)
 
 
 def _show(document: dict[str, Any], output: Output) -> None:
