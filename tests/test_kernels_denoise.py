@@ -319,6 +319,17 @@ def test_with_fp8_weights_it_is_as_exact_as_ordinary_bf16_with_what_they_stand_f
 
 
 @on_hopper
+@pytest.mark.parametrize("suffix", [10, 50])
+def test_weights_of_suffix_keys_far_above_the_prefixs_do_not_overflow(suffix: int) -> None:
+    p = problem("shallow", 1, suffix, 300, 3, GPU)
+    p.cache_k[:, :300] = 0
+    for layer in p.layers:  # logits of the suffix reach some 2^70 times the prefix's weights
+        layer.qkv[-2 * p.config.expert.head_dim : -p.config.expert.head_dim] *= 20
+    x_t, v_t = run(p, kernel_of(p))
+    assert x_t.isfinite().all() and v_t.isfinite().all()
+
+
+@on_hopper
 @WEIGHTS
 @pytest.mark.parametrize("suffix", [10, 33, 50])
 def test_it_repeats_itself_bit_by_bit(suffix: int, weights: packing.Precision) -> None:
