@@ -4,7 +4,8 @@
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
 // cluster owns the r-th slice of the residual stream's columns; all NC clusters keep the same stream, in float32
-// registers.
+// registers. (Of more than 16 tokens each cluster keeps some, and the stream comes together in another way: see
+// denoise_spread.cu. What follows holds for the rest.)
 //
 // What a cluster's CTAs tell each other goes through distributed shared memory (st.async, counted in by an mbarrier of
 // the receiver: no cluster barriers). What crosses clusters are sums over heads or over hidden units, two exchanges a

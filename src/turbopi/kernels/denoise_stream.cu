@@ -101,7 +101,7 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
 }
 
 // Fetch `parts` clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
-// slice times the next norm's scale to all ranks. buffer: [D16][NT][PAIRS][32] 16-byte words.
+// slice times the next norm's scale to all ranks (SPREAD: publish it). buffer: [D16][NT][PAIRS][32] 16-byte words.
 __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
                                        int half) {
