@@ -76,41 +76,25 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
           if (NT > 1) mma_half(sums + (NT - 1) * 4, a, make_uint2(v.z, v.w));
         }
       if (--left == 0 || r + 1 == rounds) give_slot(b, slot, seen);
-    } else if constexpr (FP8) {
+    } else if constexpr (FP8) {  // by wgmma, two fragments at a time
+      static_assert(RPS % 2 == 0, "pairs of fragments");
       const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
-      if constexpr (SPREAD) {  // two fragments at a time: each product takes longer here
-        static_assert(RPS % 2 == 0, "pairs of fragments");
 #pragma unroll 1
-        for (int i = 0; i < RPS; i += 2) {
-          const uint4 w0 = load_fragment(p + i * PARTS * tiles * FRAGMENT, b.lane),
-                      w1 = load_fragment(p + (i + 1) * PARTS * tiles * FRAGMENT, b.lane);
-          const uint4 a0 = from_e4m3(w0.x, w0.y), a1 = from_e4m3(w0.z, w0.w), a2 = from_e4m3(w1.x, w1.y),
-                      a3 = from_e4m3(w1.z, w1.w);
-          begin_products();
-          add_product(sums, a0.x, a0.y, a0.z, a0.w, activations(unit + i * PARTS, 0), r | i);
-          add_product(sums, a1.x, a1.y, a1.z, a1.w, activations(unit + i * PARTS, 1), 1);
-          add_product(sums, a2.x, a2.y, a2.z, a2.w, activations(unit + (i + 1) * PARTS, 0), 1);
-          add_product(sums, a3.x, a3.y, a3.z, a3.w, activations(unit + (i + 1) * PARTS, 1), 1);
-          commit_products();
-          if (i + 2 == RPS && (left == 1 || r + 1 == rounds)) give_slot(b, slot);  // what was loaded has been used
-          await_products<0>();
-        }
-        --left;
-        from += RPS * PARTS * tiles * FRAGMENT;
-        continue;
-      }
-      uint4 w = load_fragment(p, b.lane);
-#pragma unroll 1  // with room for two fragments, others' registers would spill
-      for (int i = 0; i < RPS; ++i) {
-        const uint4 even = from_e4m3(w.x, w.y), odd = from_e4m3(w.z, w.w);
-        if (i + 1 < RPS) w = load_fragment(p + (i + 1) * PARTS * tiles * FRAGMENT, b.lane);
+      for (int i = 0; i < RPS; i += 2) {
+        const uint4 w0 = load_fragment(p + i * PARTS * tiles * FRAGMENT, b.lane),
+                    w1 = load_fragment(p + (i + 1) * PARTS * tiles * FRAGMENT, b.lane);
+        const uint4 a0 = from_e4m3(w0.x, w0.y), a1 = from_e4m3(w0.z, w0.w), a2 = from_e4m3(w1.x, w1.y),
+                    a3 = from_e4m3(w1.z, w1.w);
         begin_products();
-        add_product(sums, even.x, even.y, even.z, even.w, activations(unit + i * PARTS, 0), r | i);
-        add_product(sums, odd.x, odd.y, odd.z, odd.w, activations(unit + i * PARTS, 1), 1);
+        add_product(sums, a0.x, a0.y, a0.z, a0.w, activations(unit + i * PARTS, 0), r | i);
+        add_product(sums, a1.x, a1.y, a1.z, a1.w, activations(unit + i * PARTS, 1), 1);
+        add_product(sums, a2.x, a2.y, a2.z, a2.w, activations(unit + (i + 1) * PARTS, 0), 1);
+        add_product(sums, a3.x, a3.y, a3.z, a3.w, activations(unit + (i + 1) * PARTS, 1), 1);
         commit_products();
+        if (i + 2 == RPS && (left == 1 || r + 1 == rounds)) give_slot(b, slot);  // what was loaded has been used
         await_products<0>();  // it reads these registers; other warpgroups multiply meanwhile
       }
-      if (--left == 0 || r + 1 == rounds) give_slot(b, slot);
+      --left;
     } else {
       begin_products();
 #pragma unroll
