@@ -150,7 +150,7 @@ def test_vision_apart_and_the_rest_equal_one_graph_of_the_whole_call(name: str) 
             noise = torch.randn(1, horizon, 32, generator=torch.Generator().manual_seed(seed))
             row = HostRow.of(observation, 0)
             ours = runner.begin(row.images).finish(row.tokens, row.state, noise[0].numpy(), 3).actions[0]
-            assert ours.isfinite().all()
+            assert ours.isfinite().all(), (turn, cameras, tokens)
             assert torch.equal(ours, in_one(row, noise)), (turn, cameras, tokens)
             runner.begin(row.images[:1])  # and given up
         if turn == 0:
