@@ -1,4 +1,4 @@
-"""Folders that appear whole or not at all, and the one for what can be made again."""
+"""Folders and files that appear whole or not at all, and the folder for what can be made again."""
 
 import os
 import shutil
@@ -11,6 +11,13 @@ from pathlib import Path
 def cache_folder() -> Path:
     """For compiled kernels, engines and fingerprints: $XDG_CACHE_HOME/turbopi or ~/.cache/turbopi."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "turbopi"
+
+
+def write_whole(file: Path, text: str) -> None:
+    """Write a file in UTF-8 so that a reader, or whoever ends the program, finds the old one or the new one."""
+    temporary = file.with_name(f".{file.name}.part")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(file)
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from turbopi.calibrate.sites import MLP_KINDS, PARTS, Part, Site, sites
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import ModelConfig
 from turbopi.errors import CalibrationError, ConfigError
+from turbopi.folders import write_whole
 
 logger = logging.getLogger(__name__)
 
@@ -130,9 +131,7 @@ class Quantization:
 
     def save(self, file: Path) -> None:
         """Write it, whole or not at all."""
-        temporary = file.with_name(f".{file.name}.part")
-        temporary.write_text(json.dumps(self.as_json(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        temporary.replace(file)
+        write_whole(file, json.dumps(self.as_json(), indent=1, ensure_ascii=False) + "\n")
 
     def as_json(self) -> dict[str, Any]:
         return {

@@ -13,6 +13,7 @@ from rich.table import Table
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, WeightOptions
 from turbopi.errors import ConfigError
+from turbopi.folders import write_whole
 
 if TYPE_CHECKING:
     from turbopi.bench.run import Plan
@@ -175,11 +176,10 @@ def _write(document: dict[str, Any], folder: Path) -> list[Path]:
 
 
 def _write_results(document: dict[str, Any], folder: Path) -> Path:
-    """At once, so that what was measured before is whole whenever the run is ended."""
     folder.mkdir(parents=True, exist_ok=True)
-    results, unfinished = folder / "results.json", folder / "results.json.unfinished"
-    unfinished.write_text(json.dumps(document, indent=1) + "\n")
-    return unfinished.replace(results)
+    results = folder / "results.json"
+    write_whole(results, json.dumps(document, indent=1) + "\n")
+    return results
 
 
 def _show(document: dict[str, Any], output: Output) -> None:

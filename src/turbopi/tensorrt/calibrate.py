@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from turbopi.calibrate.artifact import Quantization
 from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.folders import write_whole
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.tensorrt.networks import Fp8Scales
@@ -44,9 +45,7 @@ class Calibration:
         """Put it beside the engines of these weights."""
         folder.mkdir(parents=True, exist_ok=True)
         layers = [None if one is None else {name: float(getattr(one, name)) for name in _NAMES} for one in self.scales]
-        temporary = folder / f".{FILE}.new"
-        temporary.write_text(json.dumps({**self.about(), "scales": layers}, indent=1) + "\n")
-        temporary.replace(folder / FILE)
+        write_whole(folder / FILE, json.dumps({**self.about(), "scales": layers}, indent=1) + "\n")
 
     @classmethod
     def find(cls, folder: Path) -> "Calibration | None":
