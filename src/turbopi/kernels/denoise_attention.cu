@@ -1,6 +1,6 @@
 // Part 10 of 11: attention. The keys are split over the ranks of the head's cluster.
 
-// Attention of this cluster's head, to region H of all ranks. Everything local lies in region X.
+// Attention of this cluster's head, to all ranks. Everything local lies in region X.
 __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix_all) {
   b.forget();
   asm volatile("" : "+r"(prefix_all));
@@ -75,7 +75,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
             if constexpr (SPREAD)
               send(to[j] + n * OUTPUT, pack(out[j][n][0], out[j][n][1]), pack(out[j][n][2], out[j][n][3]), to_bar[j]);
             else
-              send(to[j] + n * 512, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
+              send(to[j] + n * OUTPUT, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
           }
       }
   };

@@ -86,8 +86,9 @@ __host__ __device__ constexpr int slot_rounds(int parts, int tiles) {  // W / (p
 }
 // With few tokens q|k|v are multiplied by mma: see `QkvProduct`. Its parts are the warps', or of two warps each if all
 // would need more memory than the stream that they lie over.
-constexpr int QKV = QTL + KVL, QKV_ROUNDS = plan_rounds(group_parts(imin(QKV, 8)), D16);
-constexpr bool MMA_QKV = FEW && QKV <= 3 && RPS * group_parts(imin(QKV, 8)) == W && QKV_ROUNDS * KB <= 4;
+constexpr int QKV = QTL + KVL, QKV_ROUNDS = plan_rounds(group_parts(group_tiles(QKV)), D16);
+constexpr bool MMA_QKV = FEW && QKV <= 3 && QKV_ROUNDS * KB <= 4;
+static_assert(!MMA_QKV || RPS * group_parts(QKV) == W, "a fragment of each round for a warp");
 constexpr bool QKV_PAIRS = QKV * W * PARTIAL > D16 * NT * 256;
 constexpr int QKV_PARTS = QKV_PAIRS ? W / 2 : W;
 constexpr int KEY_TILE = QT * FRAGMENT;     // bytes of 16 keys, or values

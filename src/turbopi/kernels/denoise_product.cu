@@ -45,10 +45,11 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
   const u64 weights = operand(b.base + M_RING + (my.part * tiles + first) * FRAGMENT, 256, 128);
   const u64 all = operand(x, 256, 128);
   // Of a block's activations; blocks that fill up a round have no weight, their activations are any.
-  auto activations = [&](int unit, int half) {
+  auto place = [&](int unit, int half) {
     const int block = unit * KB + half;
-    return behind(all, (EXACT ? block : min(block, blocks - 1)) * NT * 256);
+    return (EXACT ? block : min(block, blocks - 1)) * NT * 256;
   };
+  auto activations = [&](int unit, int half) { return behind(all, place(unit, half)); };
 #pragma unroll
   for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
   u32 slot = 0, from = 0, previous = ~0u;
@@ -69,9 +70,8 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
 #pragma unroll
         for (int half = 0; half < 2; ++half) {
           const uint4 a = half ? from_e4m3(w[i].z, w[i].w) : from_e4m3(w[i].x, w[i].y);
-          const int block = (unit + i * PARTS) * KB + half;
           uint4 v;  // of the first 8 tokens 8 columns, the other 8, then of the next 8 tokens
-          ldmatrix(v, x + (EXACT ? block : min(block, blocks - 1)) * NT * 256 + b.lane * 16);
+          ldmatrix(v, x + place(unit + i * PARTS, half) + b.lane * 16);
           mma_half(sums, a, make_uint2(v.x, v.y));
           if (NT > 1) mma_half(sums + (NT - 1) * 4, a, make_uint2(v.z, v.w));
         }
