@@ -52,9 +52,10 @@ GATHERED = [
 SHAPES = [(512, 1152, 4304), (203, 1152, 4304), (1, 264, 1152), (560, 576, 16384)]
 
 
-def at_once(tile: Tile, rows: int) -> int:
-    """As many of `rows` times the tower's width as the tile's clusters gather at once: 15 of eight blocks are."""
-    return min(rows, 256) if tile.gather and tile.warpgroups == 1 else rows
+def at_once(tile: Tile, rows: int, columns: int) -> int:
+    """As many of `rows` as the tile's clusters take at once: an H200 has room for 15 of eight blocks."""
+    across = -(-columns // (tile.columns * tile.cluster_n))
+    return min(rows, 15 // across * tile.rows * tile.cluster_m) if tile.cluster == 8 else rows
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -83,8 +84,8 @@ def test_smaller_gpus_gather_nothing() -> None:
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("tile", GATHERED)
 def test_sums_gathered_in_a_cluster(shape: tuple[int, int, int], tile: Tile) -> None:
-    m, n, k = shape
-    m = at_once(tile, m) if n == WIDTH else m
+    _, n, k = shape
+    m = at_once(tile, shape[0], n)
     x, weight, bias = random(m, k), random(n, k), random(n)
     x[:, ::300] *= 300
     exact = plain.linear(x.float(), weight.float(), bias.float())
@@ -97,8 +98,8 @@ def test_sums_gathered_in_a_cluster(shape: tuple[int, int, int], tile: Tile) -> 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("tile", [*GATHERED, Tile(3, 96, splits=2, gather=True)])
 def test_sums_of_e4m3_gathered_in_a_cluster(shape: tuple[int, int, int], tile: Tile) -> None:
-    m, n, k = shape
-    m = at_once(tile, m) if n == WIDTH else m
+    _, n, k = shape
+    m = at_once(tile, shape[0], n)
     matrix, bias = Fp8Matrix.quantize(random(n, k), 0.02), random(n)
     x = to_e4m3(random(m, k), matrix.inverse)
     out = torch.full((m, n), torch.nan, device=DEVICE, dtype=torch.bfloat16)
@@ -111,7 +112,7 @@ def test_sums_of_e4m3_gathered_in_a_cluster(shape: tuple[int, int, int], tile: T
 @pytest.mark.parametrize(("rows", "inner"), [(512, 4304), (203, 1152), (1, 1152)])
 @pytest.mark.parametrize("fp8", [False, True])
 def test_a_product_adds_the_stream_and_its_rows_sums(fp8: bool, rows: int, inner: int, tile: Tile) -> None:
-    rows = at_once(tile, rows)
+    rows = at_once(tile, rows, WIDTH)
     residual, bias, weight = stream("outliers", rows), random(WIDTH), random(WIDTH, inner) / inner**0.5
     sums, again = (Sums.allocate(tile, rows, WIDTH, DEVICE) for _ in range(2))
     sums.parts.fill_(torch.nan)

@@ -108,6 +108,8 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             last = slot++;
             if (slot == STAGES) slot = 0, parity ^= 1;
         };
+        [[maybe_unused]] float2* const behind_barriers =
+            (float2*)(raw + (empty + 8 * STAGES - shared_address(raw)));  // for `Factors`
 #if TP_PROMOTE
         float parts[BN / 2] = {};  // of the sums: what the tensor cores have not handed over yet
 #endif
@@ -120,13 +122,12 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #if TP_FP8
             Factors factors;  // where the input is normed, `bias` goes with the offset
             factors.fetch(scale, (const u16*)bias, t.n, N, bias && t.split == 0);
-            float2* const shared = (float2*)(raw + (empty + 8 * STAGES - shared_address(raw))) + group * BN;
+            float2* const shared = behind_barriers + group * BN;
 #endif
 #if TP_NORMED
             Factors of_norm;
             of_norm.fetch(sums_of_w, offset, t.n, N);
-            float2* const shared_norm =
-                (float2*)(raw + (empty + 8 * STAGES - shared_address(raw))) + (FP8 * WGS + group) * BN;
+            float2* const shared_norm = behind_barriers + (FP8 * WGS + group) * BN;
             of_norm.share(shared_norm, group);
 #endif
 #if TP_FP8

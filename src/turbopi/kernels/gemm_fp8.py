@@ -126,7 +126,7 @@ def constants(
     """What gemm.cu is compiled with."""
     own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": 0}
     if out_fp8:
-        own["TP_APART"] = 0
+        own["TP_APART"] = 0  # such blocks go in fours, which may need more room than `Tile.apart` counts
     return tile_constants(tile, epilogue, residual, factors=2 if normed else 1) | own
 
 
