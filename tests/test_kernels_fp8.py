@@ -210,6 +210,16 @@ def test_partial_sums_add_up(splits: int) -> None:
 
 
 @on_hopper
+@pytest.mark.parametrize("tile", [Tile(3, 96, splits=2), Tile(2, 144, splits=3), Tile(1, 256, splits=2)])
+@pytest.mark.parametrize(("m", "n", "k"), [(560, 2048, 16384), (203, 1160, 4304), (1, 16, 1152)])
+def test_parts_in_bfloat16_are_the_partial_sums_rounded(m: int, n: int, k: int, tile: Tile) -> None:
+    x, matrix = operands(m, n, k)
+    out = torch.full((tile.splits, m, n), torch.nan, device=DEVICE, dtype=DTYPE)
+    ours = gemm_fp8.matmul_fp8(x, matrix, tile, "parts", out=out)
+    assert torch.equal(ours, gemm_fp8.matmul_fp8(x, matrix, tile, "partial").to(DTYPE))
+
+
+@on_hopper
 def test_promoted_sums_lose_less_than_the_tensor_cores_own() -> None:
     x, matrix = operands(256, 512, 16384)
     x, matrix.data[:] = to_e4m3(x.float().abs(), 1.0), to_e4m3(matrix.data.float().abs(), 1.0)  # the worst: one sign
@@ -245,15 +255,18 @@ def test_repetition_is_bit_identical() -> None:
 
 @pytest.mark.parametrize("rows", [11, 256, 304, 512, 560, 768, 816, 976])
 @pytest.mark.parametrize(
-    ("n", "k", "epilogue"), [(3456, 1152, "bias"), (1152, 4304, "partial"), (16384, 2048, "geglu")]
+    ("n", "k", "epilogue"),
+    [(3456, 1152, "bias"), (1152, 4304, "partial"), (2048, 16384, "parts"), (16384, 2048, "geglu")],
 )
 def test_the_chosen_tile_is_one_that_the_kernel_takes(rows: int, n: int, k: int, epilogue: Epilogue) -> None:
     tile = gemm_fp8.best_tile(rows, n, k, epilogue, 132)
-    assert tile.stages(factors=1) >= 3
+    stages = tile.stages(factors=1, lines=epilogue == "parts")
+    assert stages >= 3
     assert tile.columns % (16 if epilogue == "geglu" else 8) == 0 and tile.columns <= 256
-    assert tile.splits == 1 or epilogue == "partial"
+    assert tile.splits == 1 or epilogue in ("partial", "parts")
     steps = -(-k // gemm_fp8.DEPTH)
     assert tile.splits <= steps
     assert gemm_fp8.promotion(tile, k) or steps <= gemm_fp8.UNPROMOTED_STEPS * tile.splits
-    used = tile.stages(factors=1) * (tile.rows + tile.columns) * 128 + 16 * 16 + 8 * tile.warpgroups * tile.columns
+    used = stages * (tile.rows + tile.columns) * 128 + 16 * 16 + 8 * tile.warpgroups * tile.columns
+    used += tile.warpgroups * 4 * 16 * 128 if epilogue == "parts" else 0
     assert used + 1024 <= SHARED_BYTES

@@ -78,7 +78,7 @@ def poison_allocator() -> None:
 
 @pytest.mark.parametrize("width", [32, 96, 1024, 1152, 2048])
 @pytest.mark.parametrize("rows", [1, 10, 51, 563])
-@pytest.mark.parametrize("form", ["first", "residual", "modulated", "split"])
+@pytest.mark.parametrize("form", ["first", "residual", "modulated", "split", "rounded parts"])
 def test_residual_rms_norm(width: int, rows: int, form: str) -> None:
     if not ON_GPU and rows > 51:
         rows = 5
@@ -90,11 +90,16 @@ def test_residual_rms_norm(width: int, rows: int, form: str) -> None:
         assert y is not None
         parts = random(2, rows, width, dtype=torch.float32)
         given = torch.cat((parts, (y.float() - parts.sum(0))[None]))
+    exact_y = None if y is None else y.float()
+    if form == "rounded parts":
+        given = random(4, rows, width)
+        exact_y = given.float().sum(0)
+        y = exact_y.to(DTYPE)
     poison_allocator()
     ours = norms.residual_rms_norm(x, given, gate, scale, shift, 1e-6)
     twin = plain.residual_rms_norm(x, y, gate, scale, shift, 1e-6)
     exact_gate = None if gate is None else gate.to(DTYPE).float()
-    exact = plain.residual_rms_norm(x.float(), None if y is None else y.float(), exact_gate, scale, shift, 1e-6)
+    exact = plain.residual_rms_norm(x.float(), exact_y, exact_gate, scale, shift, 1e-6)
     for a, b, c in zip(ours, twin, exact, strict=True):
         assert_as_good(a, b, c)
 
@@ -351,6 +356,37 @@ def test_partial_sums_add_up(splits: int, with_bias: bool) -> None:
     assert parts.shape == (splits, 531, 1152) and parts.dtype == torch.float32
     exact = plain.linear(x.float(), weight.float(), None if bias is None else bias.float())
     torch.testing.assert_close(parts.sum(0), exact, atol=2e-3, rtol=1e-4)
+
+
+@on_hopper
+@pytest.mark.parametrize("tile", [Tile(3, 192, splits=4), Tile(2, 256, splits=3), Tile(1, 80, splits=2), Tile(2, 136)])
+@pytest.mark.parametrize(("m", "n", "k"), [(560, 2048, 16384), (203, 1160, 4304), (1, 8, 1152)])
+def test_parts_in_bfloat16_are_the_partial_sums_rounded(m: int, n: int, k: int, tile: Tile) -> None:
+    x, weight = random(m, k, outliers=True), random(n, k)
+    out = torch.full((tile.splits, m, n), torch.nan, device=DEVICE, dtype=DTYPE)
+    ours = matmul(x, weight, tile, "parts", out=out)
+    assert torch.equal(ours, matmul(x, weight, tile, "partial").to(DTYPE))
+    assert torch.equal(matmul(x, weight, tile, "parts"), ours)
+
+
+@on_hopper
+@pytest.mark.parametrize("rows", [16, 304, 464, 560, 531, 720, 816, 976])
+def test_the_product_behind_geglu(rows: int) -> None:
+    x, weight = random(rows, 16384, outliers=True), random(2048, 16384) / 128
+    poison_allocator()
+    ours = products.tuned_residual_linear(x, weight)
+    twin, exact = plain.linear(x, weight), plain.linear(x.float(), weight.float())
+    assert_error_at_most_double(ours.float().sum(0) if ours.dim() == 3 else ours, twin, exact)
+    assert (ours.dim() == 3) == ((-(-rows // 64) * 64, 2048, 16384) in products.PARTS)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_parts_made_at_once_add_up(count: int) -> None:
+    x, weight = random(5, 64), random(24, 64)
+    parts = products.parts_at_once(x, weight, count)
+    assert parts.shape == (count, 5, 24) and parts.is_contiguous()
+    exact = plain.linear(x.float(), weight.float())
+    assert_error_at_most_double(parts.float().sum(0), exact.to(torch.bfloat16), exact)
 
 
 @on_hopper

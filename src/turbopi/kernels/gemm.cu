@@ -122,6 +122,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #if TP_FP8
             Factors factors;  // where the input is normed, `bias` goes with the offset
             factors.fetch(scale, (const u16*)bias, t.n, N, bias && t.split == 0);
+            if (EPILOGUE == 3) factors.scale_up(0.5f * inverse);
             float2* const shared = behind_barriers + group * BN;
 #endif
 #if TP_NORMED
@@ -263,6 +264,11 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             gather(sums, t.split, raw, base, rank);
 #endif
 
+#if TP_EPILOGUE == 5
+            store_part(sums, (u16*)out + ((size_t)t.split * M + t.m + group * 64 + warp * 16) * N + t.n,
+                       (char*)(behind_barriers + FP8 * WGS * BN) + threadIdx.x / 32 * ROWS_BYTES,
+                       M - (t.m + group * 64 + warp * 16), N, blocks, lane);
+#else
 #pragma unroll
             for (int half = 0; half < 2; ++half) {
                 const size_t begin = (size_t)(row + half * 8) * N;  // of the row
@@ -287,9 +293,9 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
                         if (BIASED && !PRESET) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
                         if (EPILOGUE == 2) x = gelu(x), y = gelu(y);
-                        if (EPILOGUE == 3) {
-                            x = gelu(x) * sums[BN / 4 + 4 * j + 2 * half];
-                            y = gelu(y) * sums[BN / 4 + 4 * j + 2 * half + 1];
+                        if (EPILOGUE == 3) {  // of E4M3, `up` has the half and what the result is multiplied by in it
+                            x = (FP8 ? twice_gelu(x) : gelu(x)) * sums[BN / 4 + 4 * j + 2 * half];
+                            y = (FP8 ? twice_gelu(y) : gelu(y)) * sums[BN / 4 + 4 * j + 2 * half + 1];
                         }
 #if TP_RESIDUAL
                         if (!PRESET) x += bf16_low(before[half][j]), y += bf16_high(before[half][j]);
@@ -303,6 +309,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                         return both;
 #endif
 #if TP_FP8
+                        if (OUT_FP8 && EPILOGUE == 3) return pack_e4m3(x, y);
                         if (OUT_FP8) return pack_e4m3(x * inverse, y * inverse);
 #endif
                         return pack(x, y);
@@ -322,6 +329,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #endif
                 }
             }
+#endif
         }
     }
     if (CLUSTER > 1 && !GATHER) cluster_sync();  // the other CTA may still signal barriers here

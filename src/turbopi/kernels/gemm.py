@@ -1,7 +1,7 @@
 """Matrix products in bfloat16 with float32 sums and a fused epilogue, for compute capability 9.0: see gemm.cu.
 
-Twins: `engine.ops.linear`, `linear_gelu`, `linear_geglu`; EPILOGUE "partial" is `linear` before its sums are added up,
-which the norms in `norms.py` do.
+Twins: `engine.ops.linear`, `linear_gelu`, `linear_geglu`; "partial" and "parts" are `linear` before its sums are added
+up, which the norms in `norms.py` do.
 """
 
 import ctypes
@@ -16,8 +16,9 @@ from turbopi.kernels import hopper
 from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
 from turbopi.kernels.nvrtc import compile_cubin
 
-Epilogue = Literal["plain", "bias", "gelu", "geglu", "partial"]
-EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, "partial": 4}
+Epilogue = Literal["plain", "bias", "gelu", "geglu", "partial", "parts"]
+EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, "partial": 4, "parts": 5}
+SPLIT = ("partial", "parts")
 DEPTH = 64  # of a step along the inner axis
 STEP_BYTES = 128  # the same, in either precision
 BF16 = {"TP_FP8": 0, "TP_OUT_FP8": 0, "TP_PROMOTE": 0}  # gemm_fp8.py has the others
@@ -32,7 +33,7 @@ class Tile:
     cluster_m: int = 1  # CTAs that share rows of the weight
     cluster_n: int = 1  # CTAs that share rows of a
     splits: int = 1
-    gather: bool = False  # the splits' sums are added up in a cluster; else the epilogue is "partial"
+    gather: bool = False  # the splits' sums are added up in a cluster; else the epilogue is "partial" or "parts"
 
     @property
     def rows(self) -> int:
@@ -42,9 +43,13 @@ class Tile:
     def cluster(self) -> int:
         return self.cluster_m * self.cluster_n * (self.splits if self.gather else 1)
 
-    def stages(self, *, factors: int) -> int:
-        """As many as fit beside 1 KB of alignment, barriers, pairs of `factors` a column and warpgroup, and sums."""
-        return min(16, (self._room(factors) - self.apart(factors=factors) * self._received) // self._stage_bytes)
+    def stages(self, *, factors: int, lines: bool = False) -> int:
+        """As many as fit beside 1 KB of alignment, barriers, pairs of `factors` a column and warpgroup, and sums.
+
+        With `lines` also beside the rows of 128 bytes in which "parts" leave.
+        """
+        taken = self.apart(factors=factors) * self._received + 64 * self.warpgroups * STEP_BYTES * lines
+        return min(16, (self._room(factors) - taken) // self._stage_bytes)
 
     def apart(self, *, factors: int) -> bool:
         """Whether there is room beside the stages for what a part of the inner axis gets of the others' sums."""
@@ -127,7 +132,7 @@ def matmul(
     copy: Copy | None = None,
     ahead: Tensor | None = None,
 ) -> Tensor:
-    """a [M, K] @ weightᵀ with the epilogue -> bfloat16[M, N]; "partial" -> float32[splits, M, N].
+    """a [M, K] @ weightᵀ with the epilogue -> bfloat16[M, N]; "partial" -> float32, "parts" -> bfloat16[splits, M, N].
 
     weight [N, K], for "geglu" [2N, K]. All bfloat16 and contiguous, K and N multiples of 8. With "bias" alone,
     `residual` [M, N] is added, the sums of the result's rows go into `sums_out`, and a `copy` may leave, too. With a
@@ -143,9 +148,8 @@ def matmul(
     assert k % 8 == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
     columns, groups = layout(tile, epilogue, m, n, residual, sums_out)
     if out is None:
-        partial = epilogue == "partial"
-        shape, dtype = ((tile.splits, m, n), torch.float32) if partial else ((m, n), torch.bfloat16)
-        out = torch.empty(shape, dtype=dtype, device=a.device)
+        shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
+        out = torch.empty(shape, dtype=torch.float32 if epilogue == "partial" else torch.bfloat16, device=a.device)
     assert out.is_contiguous()
     assert copy is None or (residual is not None and copy.out.is_contiguous() and copy.out.shape == (m, n))
     assert copy is None or (sums is None and not tile.gather and copy.scale.dtype == copy.shift.dtype == torch.float32)
@@ -173,7 +177,7 @@ def layout(
     assert not tile.gather or epilogue != "geglu", "sums are gathered after that"
     parts = tile.cluster_m * (2 if epilogue == "geglu" else 1)
     assert tile.columns % (8 * parts) == 0 and tile.rows % (8 * tile.cluster_n) == 0, "a share is whole groups of 8"
-    assert (tile.splits == 1 or epilogue == "partial") != tile.gather, "only partial sums stay split"
+    assert (tile.splits == 1 or epilogue in SPLIT) != tile.gather, "only partial sums stay split"
     columns = tile.columns // 2 if epilogue == "geglu" else tile.columns
     return columns, (-(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n)))
 
@@ -236,7 +240,7 @@ def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: i
     return {
         "TP_WGS": tile.warpgroups,
         "TP_BN": tile.columns,
-        "TP_STAGES": tile.stages(factors=factors),
+        "TP_STAGES": tile.stages(factors=factors, lines=epilogue == "parts"),
         "TP_CM": tile.cluster_m,
         "TP_CN": tile.cluster_n,
         "TP_SPLITS": tile.splits,

@@ -13,7 +13,7 @@
 // another waits for that kernel's end to load `a`.
 //
 // Epilogues: 0 plain, 1 + bias, 2 gelu(+ bias), 3 GeGLU (w has N gate rows, then N up rows), 4 float32 sums of a part
-// of K each (+ bias in the first) as out[split, M, N].
+// of K each (+ bias in the first) as out[split, M, N], 5 the same in bfloat16, without a bias.
 //
 // TP_GATHER: the CTAs that share a tile, each with a part of K, are in one cluster. In the end each gets the others'
 // sums of a share of the tile's columns through distributed shared memory. For one tile a CTA: without TP_APART they go
@@ -65,11 +65,13 @@ __device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int ro
 }
 TP_MMA  // mma(float (&sums)[BN / 2], u64 a, u64 b, int keep)
 
-__device__ __forceinline__ float gelu(float x) {  // tanh's, which is off by 2^-11 at most: less than rounding is
+__device__ __forceinline__ float tanh_of_gelu(float x) {  // off by 2^-11 at most: less than rounding is
     float t;
     asm("tanh.approx.f32 %0, %1;" : "=f"(t) : "f"(x * fmaf(0.0356774081f, x * x, 0.7978845608f)));
-    return fmaf(0.5f * x, t, 0.5f * x);
+    return t;
 }
+__device__ __forceinline__ float gelu(float x) { return fmaf(0.5f * x, tanh_of_gelu(x), 0.5f * x); }
+__device__ __forceinline__ float twice_gelu(float x) { return fmaf(x, tanh_of_gelu(x), x); }
 // The descriptor of hopper.cu's `operand`, of its lower half, which counts in 16 bytes.
 __device__ __forceinline__ u32 lower_half(u32 address) { return (u32)operand(address); }
 __device__ __forceinline__ u64 operand_of(u32 lower) { return lower | (operand(0) & 0xffffffff00000000ull); }
@@ -109,6 +111,11 @@ struct Factors {
             scale[i] = inside ? scales[n + c] : 0.0f;
             bias[i] = inside ? biases[n + c] : 0.0f;
         }
+    }
+    __device__ __forceinline__ void scale_up(float by) {  // GeGLU's up columns
+#pragma unroll
+        for (int i = 0; i < OWN; ++i)
+            if (threadIdx.x % 128 + 128 * i >= TILE_N) scale[i] *= by;
     }
     __device__ __forceinline__ void share(float2* shared, int warpgroup) const {
         const auto sync = [&] { asm volatile("bar.sync %0, 128;" ::"r"(warpgroup + 1) : "memory"); };
@@ -225,5 +232,29 @@ __device__ __forceinline__ void store_row(unsigned char* to, int count, int spli
         if (GATHER && owner(j) != split) continue;
         const u32 x = value(j);
         if (j < count) *(u16*)(to + j * 8 + lane % 4 * 2) = (u16)x;
+    }
+}
+
+// A warp's 16 rows of a part of the sums, in bfloat16, to where its first one begins. They take the way through shared
+// memory, as whole lines of 128 bytes leave several times as fast as what a lane has of 8 rows.
+constexpr int ROWS_BYTES = 16 * 128;
+__device__ __forceinline__ void store_part(const float (&sums)[BN / 2], u16* to, char* shared, int rows, int N,
+                                           int blocks, int lane) {
+    const int of_quad = lane / 4, chunk = lane % 8;
+#pragma unroll
+    for (int first = 0; first < BLOCKS; first += 8) {
+        __syncwarp();
+#pragma unroll
+        for (int j = first; j < min(first + 8, BLOCKS); ++j) {
+            char* const place = shared + of_quad * 128 + ((j - first) ^ of_quad) * 16 + lane % 4 * 4;
+            *(u32*)place = pack(sums[4 * j], sums[4 * j + 1]);
+            *(u32*)(place + 8 * 128) = pack(sums[4 * j + 2], sums[4 * j + 3]);
+        }
+        __syncwarp();
+#pragma unroll
+        for (int row = lane / 8; row < 16; row += 4) {
+            const uint4 line = *(const uint4*)(shared + row * 128 + (chunk ^ row % 8) * 16);
+            if (row < rows && first + chunk < blocks) *(uint4*)(to + (size_t)row * N + (first + chunk) * 8) = line;
+        }
     }
 }

@@ -1,7 +1,7 @@
 """Matrix products of E4M3 numbers, for compute capability 9.0: gemm.cu compiled for them.
 
 Twins: `engine.ops`' products with an `Fp8Matrix`. The results are bfloat16, E4M3 for a product that reads them next
-(`inverse`), or float32 parts of the sums ("partial") for the norms of `norms.py` to add up.
+(`inverse`), or parts of the sums ("partial", "parts") for the norms of `norms.py` to add up.
 """
 
 import ctypes
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from turbopi.engine.fp8 import ALIGNMENT, E4M3, Fp8Matrix
 from turbopi.kernels.gemm import (
+    SPLIT,
     Epilogue,
     Sums,
     Tile,
@@ -77,12 +78,12 @@ def matmul_fp8(
     ahead: Tensor | None = None,
 ) -> Tensor:
     """a e4m3[M, K] @ weightᵀ with the epilogue -> bfloat16[M, N], or with `inverse` e4m3[M, N] = round(… * inverse);
-    "partial" -> float32[splits, M, N].
+    "partial" -> float32, "parts" -> bfloat16[splits, M, N].
 
     With "bias" alone, `residual` bfloat16[M, N] is added and the sums of the result's rows go into `sums_out`. With a
     `FoldedFp8` ("bias" or "gelu"), a is a `Copy` and `sums` its `sums_out`: its LayerNorm is multiplied.
-    weight [N, K], for "geglu" [2N, K]; bias bfloat16[N] of any epilogue but "geglu". All contiguous, K a multiple of
-    16, N of 8.
+    weight [N, K], for "geglu" [2N, K]; bias bfloat16[N] of any epilogue but "geglu" and "parts". All contiguous, K a
+    multiple of 16, N of 8.
     """
     folded, weight = (weight, weight.matrix) if isinstance(weight, FoldedFp8) else (None, weight)
     assert (folded is None) == (sums is None) and (folded is None or epilogue in ("bias", "gelu"))
@@ -93,9 +94,9 @@ def matmul_fp8(
     assert k % ALIGNMENT == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
     columns, groups = layout(tile, epilogue, m, n, residual, sums_out)
     partial = epilogue == "partial"
-    assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu"))
+    assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu", "parts"))
     if out is None:
-        shape = (tile.splits, m, n) if partial else (m, n)
+        shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
         out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)
     assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
     promote = promotion(tile, k) if promote is None else promote
@@ -142,7 +143,8 @@ def _kernel(
 
 # Clock cycles, fitted to 200 measurements on an H200 (median error 5 %): of a product besides its tiles, of a tile for
 # each of its results (with GELU twice as many), of a step, and of its loads for each byte. A step's products take
-# rows * columns / 32. Partial sums cost as much again in the norm that adds them up.
+# rows * columns / 32. Partial sums cost as much again in the norm that adds them up,
+# those in bfloat16 half.
 FIXED, WRITING, STEP, LOADING, ADDING = 2300, 0.098, 205, 0.013, 0.00042
 
 GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that gather sums may not all fit at once
@@ -171,7 +173,7 @@ def candidates(epilogue: Epilogue) -> list[Tile]:
         for warpgroups in (1, 2, 3)
         for columns in range(2 * unit, 257, unit)
         if 64 * warpgroups * columns <= 192 * 192
-        for splits in ((1, 2, 3, 4) if epilogue == "partial" else (1,))
+        for splits in ((1, 2, 3, 4) if epilogue in SPLIT else (1,))
     ]
     return [tile for tile in found if tile.stages(factors=1) >= 3]
 
@@ -183,7 +185,7 @@ def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> fl
     steps = -(-k // DEPTH) / tile.splits
     step = max(tile.rows * tile.columns / 32, (tile.rows + tile.columns) * DEPTH * LOADING) + STEP
     writing = tile.rows * tile.columns * WRITING * (2 if epilogue in ("gelu", "geglu") else 1)
-    adding = 8 * m * n * tile.splits * ADDING if tile.splits > 1 else 0
+    adding = (4 if epilogue == "parts" else 8) * m * n * tile.splits * ADDING if tile.splits > 1 else 0
     return waves * (steps * step + writing) + FIXED + adding
 
 

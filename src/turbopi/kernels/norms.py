@@ -1,7 +1,7 @@
 """Residual addition and the norm behind it in one pass: one row a program.
 
-Twins: `engine.ops.residual_rms_norm`, `engine.ops.residual_layer_norm`. `y` may also be float32[splits, tokens, D]: the
-partial sums of a product split over its inner axis, added up here (rounded once less than the twin). With `inverse`
+Twins: `engine.ops.residual_rms_norm`, `engine.ops.residual_layer_norm`. `y` may also be [splits, tokens, D], float32
+or as x: the partial sums of a product split over its inner axis, added up here in float32. With `inverse`
 the norm leaves as E4M3, rounded once from float32: see `engine.fp8`.
 """
 
@@ -15,7 +15,7 @@ from turbopi.kernels.launch import dependent_launch, launch_dependents, result_d
 
 @triton.jit
 def _add_residual(x, y, gate, out, row, rows, cols, width, mask, SPLITS, HAS_GATE):
-    """x + y * gate, stored and rounded as stored; y is one matrix or SPLITS float32 partial sums of one."""
+    """x + y * gate, stored and rounded as stored; y is one matrix or SPLITS partial sums of one."""
     dtype = out.dtype.element_ty
     a = tl.load(x + row * width + cols, mask, 0.0).to(tl.float32)
     if SPLITS == 0:
@@ -23,7 +23,7 @@ def _add_residual(x, y, gate, out, row, rows, cols, width, mask, SPLITS, HAS_GAT
     else:
         b = tl.zeros_like(a)
         for split in tl.static_range(SPLITS):
-            b += tl.load(y + (split * rows + row) * width + cols, mask, 0.0)
+            b += tl.load(y + (split * rows + row) * width + cols, mask, 0.0).to(tl.float32)
     if HAS_GATE:
         b = (b * tl.load(gate + cols, mask, 0.0).to(dtype).to(tl.float32)).to(dtype).to(tl.float32)
     total = (a + b).to(dtype)
@@ -94,7 +94,7 @@ def residual_rms_norm(
     _rms_norm_kernel[(rows,)](
         x, _or(y, x), _or(gate, scale), scale, _or(shift, scale), out, normed, rows, width, eps, inverse or 1.0,
         HAS_Y=y is not None, SPLITS=_splits(y), HAS_GATE=gate is not None,
-        HAS_SHIFT=shift is not None, SCALED=inverse is not None, BLOCK=block, num_warps=_warps(block),
+        HAS_SHIFT=shift is not None, SCALED=inverse is not None, BLOCK=block, num_warps=_warps(2 * block),
         **dependent_launch(x),
     )  # fmt: skip
     return out, normed

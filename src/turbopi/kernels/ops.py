@@ -3,6 +3,7 @@
 Activations are bfloat16; with an `Fp8Matrix` (on Hopper only) they are E4M3 between it and the operation before it.
 """
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -39,6 +40,11 @@ def fused_ops(device: torch.device) -> Ops:
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
             "vision products": f"CUDA for {_rows(products.VISION_TILES)} rows, else cuBLAS" if hopper else "cuBLAS",
             "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS" if hopper else "Triton",
+            "product behind the prefix's GeGLU": "in parts that the norm behind it adds up: "
+            f"CUDA for {_rows(products.PARTS, Tile)} rows, cuBLAS for {_rows(products.PARTS, int)}, in whole 64; else "
+            "cuBLAS at once"
+            if hopper
+            else "cuBLAS",
             "vision and prefix attention": "CUDA; Triton where head_dim isn't a multiple of 8 from 16 to 256"
             if hopper
             else "Triton",
@@ -51,8 +57,8 @@ def fused_ops(device: torch.device) -> Ops:
     )
 
 
-def _rows(tiles: dict[tuple[int, int, int], Tile]) -> str:
-    return ", ".join(str(rows) for rows in sorted({rows for rows, _, _ in tiles}))
+def _rows(tiles: Mapping[tuple[int, int, int], Tile | int], kind: type = Tile) -> str:
+    return ", ".join(str(rows) for rows in sorted({rows for (rows, _, _), tile in tiles.items() if type(tile) is kind}))
 
 
 class EmbedPatches:

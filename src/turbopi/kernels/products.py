@@ -11,7 +11,7 @@ from torch import Tensor
 
 from turbopi.engine.fp8 import Fp8Matrix, Matrix, to_e4m3
 from turbopi.kernels import activations
-from turbopi.kernels.gemm import Epilogue, Tile, matmul
+from turbopi.kernels.gemm import SPLIT, Epilogue, Tile, matmul
 from turbopi.kernels.gemm_fp8 import best_tile, matmul_fp8
 
 GEGLU_TILES = (Tile(3, 192), Tile(2, 256))
@@ -34,6 +34,16 @@ VISION_TILES = {
     (768, 4304, 1152): Tile(3, 136),
     (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2),
     (768, 2048, 1152): Tile(2, 96),
+}
+
+# The prefix's products that leave as bfloat16 parts and so beat cuBLAS and its pass that adds parts up, by [rows in
+# whole 64, out, in]: in our tiles, or as so many products over parts of the inner axis that cuBLAS makes at once.
+PARTS: dict[tuple[int, int, int], Tile | int] = {
+    (320, 2048, 16384): 4,
+    (512, 2048, 16384): 2,
+    (576, 2048, 16384): Tile(3, 192, splits=4),
+    (768, 2048, 16384): Tile(3, 192, splits=3),
+    (832, 2048, 16384): 2,
 }
 
 
@@ -65,13 +75,25 @@ def tuned_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Ten
 
 
 def tuned_residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, ahead: Tensor | None = None) -> Tensor:
-    """The product, or float32 parts of it that the norms add up."""
+    """The product, or parts of it that the norms add up."""
     if isinstance(weight, Fp8Matrix):
-        return _fp8(x, weight, "partial", bias, ahead=ahead)
+        return _fp8(x, weight, "parts" if bias is None else "partial", bias, ahead=ahead)
+    if bias is None:
+        cut = PARTS.get((-(-x.shape[0] // 64) * 64, weight.shape[0], weight.shape[1]))
+        if isinstance(cut, Tile):
+            return matmul(x, weight, cut, "parts", ahead=ahead)
+        return linear(x, weight) if cut is None else parts_at_once(x, weight, cut)
     tile = vision_tile(x, weight)
-    if tile is None or bias is None:
+    if tile is None:
         return linear(x, weight, bias)
     return matmul(x, weight, tile, "partial" if tile.splits > 1 else "bias", bias, ahead=ahead)
+
+
+def parts_at_once(x: Tensor, weight: Tensor, count: int) -> Tensor:
+    """[count, tokens, out]: products over `count` parts of the inner axis, as one batch of the library's."""
+    rows, inner = x.shape[0], x.shape[1] // count
+    a = x.view(rows, count, inner).transpose(0, 1)
+    return torch.bmm(a, weight.view(-1, count, inner).permute(1, 2, 0))
 
 
 def tuned_linear_gelu(
@@ -107,7 +129,7 @@ def _fp8(
 ) -> Tensor:
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
     tile = best_tile(x.shape[0], n, weight.shape[1], epilogue, num_sms(x.device))
-    if epilogue == "partial" and (tile.splits == 1 or tile.gather):
+    if epilogue in SPLIT and (tile.splits == 1 or tile.gather):
         epilogue = "bias"
     return matmul_fp8(x, weight, tile, epilogue, bias, out, inverse, ahead=ahead)
 
