@@ -74,8 +74,6 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024, ring = base + Q_BYTES;
     const u32 q_full = ring + STAGES * STAGE_BYTES, full = q_full + 8, empty = full + 8 * STAGES;
     const int warpgroup = __shfl_sync(~0u, threadIdx.x / 128, 0);  // the same for all, as the compiler now sees
-    const int head = blockIdx.x / tiles % heads, group = blockIdx.x / tiles / heads;
-    const int row = blockIdx.x % tiles * 64;  // in its group
 
     if (threadIdx.x == THREADS) {
         asm volatile("prefetch.tensormap [%0];\nprefetch.tensormap [%1];\nprefetch.tensormap [%2];"
@@ -88,7 +86,12 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
     }
     if (SHARING > 1) cluster_sync();
     else __syncthreads();
-    asm volatile("griddepcontrol.launch_dependents;\ngriddepcontrol.wait;" ::: "memory");
+    asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
+    // who loads nothing and asks for no length begins when something is there, so what is behind the wait
+    if (!WHOLE) asm volatile("griddepcontrol.wait;" ::: "memory");
+
+    const int series = quotient(blockIdx.x, tiles), group = quotient(series, heads), head = series - group * heads;
+    const int row = (blockIdx.x - series * tiles) * 64;  // in its group
 
     // Tiles pass through the ring in rounds: one of keys for each warpgroup, then their values. Each warpgroup's first
     // keys, up to `early`, are loaded and multiplied before the length is known.
@@ -109,6 +112,7 @@ attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ Tenso
                     else load(to, map, 64 * p, first + head, from, full + 8 * s);
                 }
             };
+            if (WHOLE) asm volatile("griddepcontrol.wait;" ::: "memory");
             barrier_expect(q_full, Q_BYTES);
             for (int p = 0; p < PANELS; ++p)
                 load(base + p * Q_PANEL, &map_q, 64 * p, head, group * rows + row, q_full);

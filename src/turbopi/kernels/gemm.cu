@@ -21,16 +21,20 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
     const u32 full = base + STAGES * STAGE_BYTES + RECEIVED_BYTES, empty = full + 8 * STAGES;
+    const u32 gathered = empty + 8 * STAGES, behind = gathered + 16;
     const int warpgroup = threadIdx.x / 128, rank = CLUSTER > 1 ? blockIdx.x % CLUSTER : 0;
     const int units = m_groups * n_groups * (GATHER ? 1 : SPLITS);
     const int stride = gridDim.x / CLUSTER, first = blockIdx.x / CLUSTER;
 
     if (threadIdx.x == 128 * WGS) {
-        asm volatile("prefetch.tensormap [%0];\nprefetch.tensormap [%1];" ::"l"(&map_a), "l"(&map_w));
-    }
-    if (threadIdx.x < STAGES) {
-        barrier_init(full + 8 * threadIdx.x, 1);
-        barrier_init(empty + 8 * threadIdx.x, WGS * (CM + CN - 1));
+        asm volatile("prefetch.tensormap [%0];\nprefetch.tensormap [%1];" ::"l"(&map_w), "l"(&map_a));
+        // by one thread: several take turns, 50 cycles for each barrier
+#pragma unroll
+        for (int s = 0; s < STAGES; ++s) {
+            barrier_init(full + 8 * s, 1);
+            barrier_init(empty + 8 * s, WGS * (CM + CN - 1));
+        }
+        if (GATHER) barrier_init(gathered, 1);
         asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     }
     if (CLUSTER > 1) cluster_sync();
@@ -60,11 +64,17 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             };
             if (producer == 1) asm volatile("griddepcontrol.wait;" ::: "memory");
             int slot = 0;
-            u32 round = 0;
+            u32 round = 0, since = 0;  // the last load
             for (int unit = first; unit < units; unit += stride) {
                 const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
                 for (int k = t.k; k < t.k_end; ++k) {
-                    if (round) barrier_wait(empty + 8 * slot, round & 1 ^ 1);
+                    if (round) {
+                        barrier_wait(empty + 8 * slot, round & 1 ^ 1);
+                    } else if (PACED && slot >= LEAD) {
+                        const u32 before = full + 8 * (slot - LEAD);
+                        while (!barrier_over(before, 0) && (producer == 1 || clock() - since < PACE)) {}
+                    }
+                    since = clock();
                     if (producer == 0) load_w(slot, k, t.n);
                     else load_a(slot, k, t.m);
                     if (++slot == STAGES) slot = 0, ++round;
@@ -74,10 +84,9 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                 asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;"
                              ::"l"(ahead + (size_t)blockIdx.x * ahead_bytes), "r"(ahead_bytes) : "memory");
         }
-        if (GATHER) {  // with the consumers
+        if (GATHER && !APART) {  // with the consumers
             __syncwarp();
-            if (!APART) cluster_sync();
-            cluster_exchange();
+            cluster_sync();
         }
     } else {
         asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
@@ -109,7 +118,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             if (slot == STAGES) slot = 0, parity ^= 1;
         };
         [[maybe_unused]] float2* const behind_barriers =
-            (float2*)(raw + (empty + 8 * STAGES - shared_address(raw)));  // for `Factors`
+            (float2*)(raw + (behind - shared_address(raw)));  // for `Factors`
 #if TP_PROMOTE
         float parts[BN / 2] = {};  // of the sums: what the tensor cores have not handed over yet
 #endif
@@ -261,7 +270,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #endif
 
 #if TP_GATHER
-            gather(sums, t.split, raw, base, rank);
+            gather(sums, t.split, raw, base, rank, gathered);
 #endif
 
 #if TP_EPILOGUE == 5
@@ -332,5 +341,5 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #endif
         }
     }
-    if (CLUSTER > 1 && !GATHER) cluster_sync();  // the other CTA may still signal barriers here
+    if (CLUSTER > 1) cluster_sync();  // another CTA may still signal barriers here
 }

@@ -186,6 +186,7 @@ def launch(
     kernel: DependentKernel, tile: Tile, groups: tuple[int, int], arguments: tuple[Any, ...], ahead: Tensor | None
 ) -> None:
     """`ahead` is the matrix that is to be in L2 for the next product; each block fetches a share of it."""
+    assert groups[0] * groups[1] * tile.splits < 1 << 20, "gemm.cu divides no larger numbers"
     blocks = clusters(tile, groups[0] * groups[1], kernel.max_clusters) * tile.cluster
     share = 0 if ahead is None else ahead.numel() * ahead.element_size() // blocks // 16 * 16
     place = ctypes.c_void_p(ahead.data_ptr() if ahead is not None and share else None)

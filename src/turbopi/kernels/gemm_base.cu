@@ -46,6 +46,12 @@ typedef u16 Element;
 constexpr int ROW_BYTES = 128;  // of a block of an operand: as much as a swizzle spans
 constexpr int BM = 64 * WGS, BK = FP8 ? ROW_BYTES : ROW_BYTES / 2, TILE_N = BN / PARTS;
 constexpr int A_BYTES = BM * ROW_BYTES, B_BYTES = BN * ROW_BYTES, STAGE_BYTES = A_BYTES + B_BYTES;
+// Loads asked for together share a multiprocessor's bandwidth: the first would come as late as the last. So until the
+// ring has been full once, `a` is loaded LEAD steps ahead of what has come, and w, which may have nothing to wait for,
+// a step every PACE cycles at least. Smaller steps than these come too slowly so: 256 rows took 0.05 ms more.
+constexpr bool PACED = STAGE_BYTES >= 28 * 1024;
+constexpr int LEAD = 2;
+constexpr u32 PACE = 250;
 constexpr bool BIASED = !FP8 && !TP_NORMED && (EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4);  // E4M3: see Factors
 constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
 constexpr int PRODUCER_REGISTERS = WGS == 1 ? 40 : WGS == 2 ? 40 : 24;
@@ -84,6 +90,10 @@ __device__ __forceinline__ T* settled(T* pointer) {
 }
 __device__ __forceinline__ float settled(float x) {
     asm volatile("" : "+f"(x));
+    return x;
+}
+__device__ __forceinline__ int settled(int x) {
+    asm volatile("" : "+r"(x));
     return x;
 }
 
@@ -129,6 +139,17 @@ struct Factors {
     }
 };
 
+// Into the memory of a CTA of the cluster, which learns by its barrier there when so many bytes have come.
+__device__ __forceinline__ u32 place_in(u32 address, u32 cta) {
+    asm volatile("mapa.shared::cluster.u32 %0, %0, %1;" : "+r"(address) : "r"(cta));
+    return address;
+}
+__device__ __forceinline__ void send(u32 to, float x, float y, float z, float w, u32 bar) {
+    asm volatile(
+        "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.f32 [%0], {%1, %2, %3, %4}, [%5];"
+        ::"r"(to), "f"(x), "f"(y), "f"(z), "f"(w), "r"(bar) : "memory");
+}
+
 // which of a tile's parts ends up with a block of 8 columns; blocks go in twos or fours, as that many leave together
 constexpr int BLOCKS = TILE_N / 8, TOGETHER = OUT_FP8 ? 4 : 2, GROUPS = (BLOCKS + TOGETHER - 1) / TOGETHER;
 __device__ constexpr int owner(int block) { return block / TOGETHER * SPLITS / GROUPS; }
@@ -138,25 +159,30 @@ constexpr bool APART = TP_APART;
 constexpr int RECEIVED_BYTES = APART ? (SPLITS - 1) * FROM_ONE : 0;
 static_assert(!GATHER || APART || (SPLITS - 1) * FROM_ONE <= STAGES * STAGE_BYTES, "no room for the others' sums");
 
-// Adds up, for the blocks of 8 columns that are this part's, the sums of all parts of a tile.
-__device__ __forceinline__ void gather(float (&sums)[BN / 2], int split, char* raw, u32 base, int rank) {
+// Adds up, for the blocks of 8 columns that are this part's, the sums of all parts of a tile, which come with `bar`.
+__device__ __forceinline__ void gather(float (&sums)[BN / 2], int split, char* raw, u32 base, int rank, u32 bar) {
     constexpr int THREADS = 128 * WGS;
+    if (threadIdx.x == 0) {
+        int own = 0;
+#pragma unroll
+        for (int j = 0; j < BLOCKS; ++j) own += owner(j) == split;
+        barrier_expect(bar, own * (SPLITS - 1) * THREADS * 16);
+    }
     if (APART) base += STAGES * STAGE_BYTES;
     else cluster_sync();  // nobody reads operands any more
 #pragma unroll
     for (int to = 0; to < SPLITS; ++to) {
         if (to == split) continue;
-        u32 there = base + (split < to ? split : split - 1) * FROM_ONE + threadIdx.x * 16;
-        asm volatile("mapa.shared::cluster.u32 %0, %0, %1;" : "+r"(there) : "r"(to * SHARING + rank % SHARING));
+        const u32 cta = to * SHARING + rank % SHARING, its_bar = place_in(bar, cta);
+        const u32 there = place_in(base + (split < to ? split : split - 1) * FROM_ONE + threadIdx.x * 16, cta);
         int count = 0;
 #pragma unroll
         for (int j = 0; j < BLOCKS; ++j)
             if (owner(j) == to)
-                asm volatile("st.shared::cluster.v4.f32 [%0], {%1, %2, %3, %4};" ::"r"(there + count++ * THREADS * 16),
-                             "f"(sums[4 * j]), "f"(sums[4 * j + 1]), "f"(sums[4 * j + 2]), "f"(sums[4 * j + 3])
-                             : "memory");
+                send(there + count++ * THREADS * 16, sums[4 * j], sums[4 * j + 1], sums[4 * j + 2], sums[4 * j + 3],
+                     its_bar);
     }
-    cluster_exchange();
+    barrier_wait(bar, 0);
     const float4* const received = (const float4*)(raw + (base - shared_address(raw))) + threadIdx.x;
 #pragma unroll
     for (int mine = 0; mine < SPLITS; ++mine) {
@@ -181,11 +207,12 @@ struct Tile {
 
 __device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, int k_blocks, int rank) {
     Tile t;
-    const int place = rank % SHARING, rest = unit / m_groups;
-    t.m = (unit % m_groups * CM + place / CN) * BM;
-    t.n = (rest % n_groups * CN + place % CN) * TILE_N;
-    t.split = GATHER ? rank / SHARING : rest / n_groups;
-    t.k = k_blocks * t.split / SPLITS;
+    constexpr bool SEVERAL = !GATHER && SPLITS > 1;  // parts of K, in different clusters
+    const int place = rank % SHARING, rest = quotient(unit, m_groups), part = SEVERAL ? quotient(rest, n_groups) : 0;
+    t.m = ((unit - rest * m_groups) * CM + place / CN) * BM;
+    t.n = ((rest - part * n_groups) * CN + place % CN) * TILE_N;
+    t.split = GATHER ? rank / SHARING : part;
+    t.k = settled(k_blocks * t.split / SPLITS);  // of a loop that starts at 0 for sure, ptxas makes wgmma wait
     t.k_end = k_blocks * (t.split + 1) / SPLITS;
     return t;
 }
