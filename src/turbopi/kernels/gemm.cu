@@ -67,6 +67,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             u32 round = 0, since = 0;  // the last load
             for (int unit = first; unit < units; unit += stride) {
                 const Tile t = tile_of(unit, m_groups, n_groups, k_blocks, rank);
+#pragma unroll 1
                 for (int k = t.k; k < t.k_end; ++k) {
                     if (round) {
                         barrier_wait(empty + 8 * slot, round & 1 ^ 1);
