@@ -1,6 +1,6 @@
 // Part 10 of 11: attention. The keys are split over the ranks of the head's cluster.
 
-// Attention of this cluster's head, to all ranks. Everything local lies in region X.
+// Attention of this cluster's head, sent to all ranks. Everything local lies in region X.
 __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix_all) {
   b.forget();
   asm volatile("" : "+r"(prefix_all));
@@ -341,11 +341,10 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       o.x += w[s].x * v.x, o.y += w[s].y * v.y, o.z += w[s].x * v.z, o.w += w[s].y * v.w;
     }
     const float x = __fdividef(1.0f, sum.x), y = __fdividef(1.0f, sum.y);
-    send_columns(b, M_ATT, b.q0() + tile, n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y), BAR_ATT, true);
+    send_columns(b, columns_place(b, M_ATT, b.q0() + tile, n), n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y),
+                 BAR_ATT, true);
   }
   MARK(9)
   // A rank without queries has nothing to send now, but what has come may not land over the stream that comes next.
   if (IDLE_Q && threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_ATT), threadIdx.x));
-  receive(b, BAR_ATT, b.n, ATT_EXPECT, WAIT_ATT);
-  MARK(10)
 }

@@ -236,12 +236,14 @@ struct Block {
     u32 r;
     asm("mov.u32 %0, %%cluster_ctarank;" : "=r"(r));
     cluster = blockIdx.x / S, rank = int(r), warp = threadIdx.x >> 5, lane = threadIdx.x & 31;
-    forget();
   }
-  // Make the compiler forget what these are made of: what it derives from them it would keep in registers, or in local
-  // memory, over all layers, and a fetch from there costs more than to derive it again.
+  // For warps that multiply: make the compiler forget what these are made of. What it derives from them it would keep
+  // in registers, or in local memory, over all layers, and a fetch from there costs more than to derive it again.
   __device__ __forceinline__ void forget() {
     asm volatile("" : "+r"(base), "+r"(cluster), "+r"(rank), "+r"(warp), "+r"(lane));
+    if (FP8 && SPREAD) return;  // there it costs spills
+    __builtin_assume(cluster >= 0), __builtin_assume(rank >= 0 && rank < S);  // so divisions become shifts
+    __builtin_assume(warp >= 0 && warp < W), __builtin_assume(lane >= 0 && lane < 32);
   }
   __device__ __forceinline__ int g() const { return lane >> 2; }  // a lane's place in the tensor cores' operands
   __device__ __forceinline__ int t() const { return lane & 3; }

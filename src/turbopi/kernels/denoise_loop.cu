@@ -28,7 +28,7 @@ __device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (
       const float* x0 = xt + item.token * A;
       const float* x1 = xt + min(item.token + 1, T - 1) * A;
       float4 c = make_float4(b.a.in_b[col], b.a.in_b[col], b.a.in_b[col + 1], b.a.in_b[col + 1]);
-#pragma unroll 4
+#pragma unroll(FEW ? 8 : 4)
       for (int k = 0; k < A; k += 4) {
         const float4 w0 = __ldg((const float4*)(w + k)), w1 = __ldg((const float4*)(w + A + k));
         const float4 y0 = *(const float4*)(x0 + k), y1 = *(const float4*)(x1 + k);
@@ -42,7 +42,7 @@ __device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (
     __syncwarp();
     if (!SPREAD && b.attends()) {
       const float2 s = __ldg((const float2*)(scale + col));
-      send_columns(b, M_X, b.x0() + item.tile, item.n,
+      send_columns(b, columns_place(b, M_X, b.x0() + item.tile, item.n), item.n,
                    make_float4(x[j].x * s.x, x[j].y * s.x, x[j].z * s.y, x[j].w * s.y), BAR_X, item.real);
     }
   }
@@ -128,10 +128,7 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   if (step + 1 < b.a.steps) {  // a peer's next slice lands where this rank has read the partial sums
     consumers_sync();
     if constexpr (SPREAD) return;
-    if (threadIdx.x < S)
-      asm volatile(
-          "mbarrier.arrive.release.cluster.shared::cluster.b64 _, [%0];" ::"r"(at_rank(b.bar(BAR_GO), threadIdx.x))
-          : "memory");
+    if (threadIdx.x < S) arrive_at(at_rank(b.bar(BAR_GO), threadIdx.x));
     note(b, WAIT_GO);
     barrier_wait(b.bar(BAR_GO), step & 1);
   }
@@ -185,8 +182,6 @@ __device__ __forceinline__ void consume(Block& b) {
             gate_up(b, shifted, row_scales);
             MARK(16)
             load_norm();
-            receive(b, BAR_HID, b.n, expect_hidden, WAIT_HID);
-            MARK(17)
           } else {
             float* const kv = (float*)(a.scratch + B_KV + (b.n & 1) * N_KV);
             project(b, shifted, row_scales, kv, bit, rope);
@@ -194,10 +189,23 @@ __device__ __forceinline__ void consume(Block& b) {
             attend(b, kv, bit, prefix);
           }
         }
-        if (!half) load_norm();
+        auto await = [&] {
+          if (half) {
+            receive(b, BAR_HID, b.n, expect_hidden, WAIT_HID);
+            MARK(17)
+          } else {
+            receive(b, BAR_ATT, b.n, ATT_EXPECT, WAIT_ATT);
+            MARK(10)
+          }
+        };
+        auto then = [&] {
+          if (!half) load_norm();
+        };
         if (half || b.attends())
           residual_product(b, b.base + (half ? M_HID : M_ATT), half ? b.hn() : QT,
-                           SPREAD ? M_X + (half ? X_FF_SUMS : 0) : M_H, buffer, bit);
+                           SPREAD ? M_X + (half ? X_FF_SUMS : 0) : M_H, buffer, bit, await, then);
+        else
+          load_norm();
         if constexpr (SPREAD)
           if (!half || b.attends() || l + 1 == L) done_with_x(b);
         MARK(half ? 18 : 11)

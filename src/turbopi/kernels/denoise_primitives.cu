@@ -57,15 +57,6 @@ __device__ __forceinline__ void watch(const Block& b) {
   }
 }
 
-__device__ __forceinline__ bool test_wait(u32 bar, u32 parity) {
-  u32 done;
-  asm volatile(
-      "{.reg .pred p; mbarrier.test_wait.parity.shared::cta.b64 p, [%1], %2; selp.u32 %0, 1, 0, p;}"
-      : "=r"(done)
-      : "r"(bar), "r"(parity)
-      : "memory");
-  return done;
-}
 // All threads wait for use n of an exchange in the cluster; one of them arms the barrier for the next.
 __device__ __forceinline__ void receive(const Block& b, int bar, int n, u32 bytes, int what) {
   note(b, what);
@@ -131,8 +122,14 @@ __device__ __forceinline__ uint4 peek(const uint4* p) {
                : "memory");
   return v;
 }
+// The bits in which a word differs, and those of `others`: one instruction, where the compiler makes four of `missing`.
+__device__ __forceinline__ u32 differing(u32 word, u32 bit, u32 others) {
+  u32 v;
+  asm("lop3.b32 %0, %1, %2, %3, 0xbe;" : "=r"(v) : "r"(word), "r"(bit), "r"(others));  // (word ^ bit) | others
+  return v;
+}
 __device__ __forceinline__ bool missing(uint4 v, u32 bit) {
-  return ((v.x ^ bit) | (v.y ^ bit) | (v.z ^ bit) | (v.w ^ bit)) & 1;
+  return differing(v.x, bit, differing(v.y, bit, differing(v.z, bit, v.w ^ bit))) & 1;
 }
 __device__ __forceinline__ void publish(float* p, float v, u32 bit) {
   asm volatile("st.relaxed.gpu.global.u32 [%0], %1;" ::"l"(p), "r"(flagged(v, bit)) : "memory");

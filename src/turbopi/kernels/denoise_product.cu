@@ -105,7 +105,7 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
           commit_products();
           await_products<1>();  // the round before is done
           give_slot_if(b, previous, previous != ~0u);
-          full = left == 1 && r + 1 < rounds && test_wait(b.full(b.slot), b.phase);
+          full = left == 1 && r + 1 < rounds && barrier_over(b.full(b.slot), b.phase);
         }
       }
       commit_products();
@@ -117,10 +117,13 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
   if (!FP8 && rounds > 0) give_slot(b, slot);
 }
 
+// Before activations are multiplied. A fence that waits for whatever this thread has asked memory for; mma needs none.
+__device__ __forceinline__ void show_activations() {
+  if (!(FP8 && FEW)) show_to_products();
+}
 // Up to MT tiles (`tiles` of them) times the activations.
 template <int MT, int EVEN, int FIRST = 0>
 __device__ __forceinline__ void multiply(Block& b, u32 x, int blocks, int tiles, float (*sums)[NT * 4]) {
-  if constexpr (FIRST == 0) show_to_products();
   if constexpr (FIRST < MT) {
     constexpr int N = group_tiles(MT - FIRST);
     if (FIRST < tiles) {

@@ -15,10 +15,10 @@ struct Item {
   bool real;           // of this warp, and tokens that exist
 };
 __device__ __forceinline__ Item stream_item(const Block& b, int j) {
-  const int i = b.warp + j * W, xn = b.xn();
+  const u32 i = b.warp + j * W, xn = b.xn();  // unsigned: divisions become shifts
   if constexpr (SPREAD) {
     const int tile = i % DX, n = b.cluster + i / DX * NC;
-    const bool real = i < DX * OWN_N && tile < xn && n < NT;
+    const bool real = i < DX * OWN_N && u32(tile) < xn && n < NT;
     return {real ? tile : 0, real ? n : 0, (real ? n : 0) * 8 + 2 * b.t(), real && n * 8 + 2 * b.t() < T};
   }
   const int tile = i < xn * NT ? i % xn : 0, n = i < xn * NT ? i / xn : 0;

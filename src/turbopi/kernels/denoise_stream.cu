@@ -1,11 +1,14 @@
 // Part 7 of 11: the residual stream, and what goes into it: sums across clusters, GeGLU.
 
-// 8 bytes with the lane pair's four columns 2g.. of one token (even g: 2t, odd g: 2t + 1) to all ranks.
-__device__ __forceinline__ void send_columns(const Block& b, int region, int block, int n, float4 v, int bar,
-                                             bool real) {
+// 8 bytes with the lane pair's four columns 2g.. of one token (even g: 2t, odd g: 2t + 1) to all ranks, where
+// `columns_place` says.
+__device__ __forceinline__ u32 columns_place(const Block& b, int region, int block, int n) {
+  const int token = 2 * b.t() + (b.g() & 1);
+  return b.base + region + (block * NT + n) * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8;
+}
+__device__ __forceinline__ void send_columns(const Block& b, u32 to, int n, float4 v, int bar, bool real) {
   const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
   const int token = 2 * b.t() + (b.g() & 1);
-  const u32 to = b.base + region + (block * NT + n) * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8;
   if (real && n * 8 + token < T) {
     const u32 lo = b.g() & 1 ? got : w0, hi = b.g() & 1 ? w1 : got;
     const Everyone data(to), bars(b.bar(bar));
@@ -77,14 +80,17 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
   for (int i = 0; i < FETCH; ++i) v[i] = peek(p + i * 32);
 #pragma unroll 1
   for (;;) {
-    bool again = false;
+    u32 missing[FETCH], any = 0;
 #pragma unroll
     for (int i = 0; i < FETCH; ++i) {
       const bool both = (NC % 2 == 0 && NH % 2 == 0) || 2 * (first + i) + 1 < parts;
-      if (((v[i].x ^ bit) | (v[i].y ^ bit) | (both ? (v[i].z ^ bit) | (v[i].w ^ bit) : 0)) & 1)
-        v[i] = peek(p + i * 32), again = true;
+      const u32 second = both ? differing(v[i].z, bit, v[i].w ^ bit) : 0;
+      missing[i] = differing(v[i].x, bit, differing(v[i].y, bit, second)), any |= missing[i];
     }
-    if (!again) break;
+    if (!(any & 1)) break;
+#pragma unroll
+    for (int i = 0; i < FETCH; ++i)
+      if (missing[i] & 1) v[i] = peek(p + i * 32);
   }
 #pragma unroll
   for (int i = 0; i < FETCH; ++i) {
@@ -105,11 +111,21 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
 __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
                                        int half) {
-  for (const u32 since = u32(clock64()); u32(clock64()) - since < PATIENCE;);
+  const u32 since = u32(clock64());
+  const uint4* words[ITEMS_X];  // addresses are made while there is nothing else to do
+  u32 places[ITEMS_X];
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
-    const uint4* p = partials(b, buffer, item);
+    words[j] = partials(b, buffer, item), places[j] = columns_place(b, M_X, b.x0() + item.tile, item.n);
+    if (PATIENCE) asm volatile("" : "+l"(words[j]), "+r"(places[j]));
+  }
+  while (u32(clock64()) - since < PATIENCE) {
+  }
+#pragma unroll
+  for (int j = 0; j < ITEMS_X; ++j) {
+    const Item item = stream_item(b, j);
+    const uint4* p = words[j];
     if (item.real) {
       float4 sum = make_float4(0, 0, 0, 0);
 #pragma unroll 1
@@ -127,7 +143,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
     if (!SPREAD && send_on) {
       const float4 y =
           make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
-      send_columns(b, M_X, b.x0() + item.tile, item.n, y, BAR_X, item.real);
+      send_columns(b, places[j], item.n, y, BAR_X, item.real);
     }
   }
   if constexpr (SPREAD)
@@ -140,13 +156,27 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
 // sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive
 // before it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which
 // follows what is published here.
-__device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, int region, uint4* buffer, u32 bit) {
+template <typename Await, typename Then>
+__device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, int region, uint4* buffer, u32 bit,
+                                                 Await await, Then then) {
+  Own<DX> own(b, b.xn());
+  uint2* place[plan_groups(DX)][OWN<DX>];  // in the buffer
+#pragma unroll
+  for (int i = 0; i < plan_groups(DX); ++i)
+#pragma unroll
+    for (int k = 0; k < OWN<DX>; ++k) {
+      const uint4* const words = buffer + ((b.x0() + own.tile[i]) * NT + own.n[i][k]) * PAIRS * 32 + b.lane;
+      place[i][k] = (uint2*)(words + b.cluster / 2 * 32) + (b.cluster & 1);
+      if (FEW) asm volatile("" : "+l"(place[i][k]));  // made now
+    }
+  await();
+  show_activations();
   float sums[plan_groups(DX)][NT * 4];
   constexpr int EVEN = F16 % NC == 0 && HC % 16 == 0 && QT % 16 == 0 ? 16
                        : F16 % NC == 0 && HC % 8 == 0 && QT % 8 == 0 ? 8
                                                                      : 1;
   multiply<DX, EVEN>(b, x, blocks, b.xn(), sums);
-  Own<DX> own(b, b.xn());
+  then();
   own.add_up(b, region, b.xn(), sums);
 #pragma unroll
   for (int i = 0; i < plan_groups(DX); ++i)
@@ -155,9 +185,7 @@ __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, in
       const int n = own.n[i][k];
       if (own.mine[i][k] && n * 8 + 2 * b.t() < T) {
         const float4 c = own.sums[i][k];
-        const uint4* const words = buffer + ((b.x0() + own.tile[i]) * NT + n) * PAIRS * 32 + b.lane;
-        publish((uint2*)(words + b.cluster / 2 * 32) + (b.cluster & 1),
-                pack_half(c.x * PARTIAL_SCALE, c.y * PARTIAL_SCALE),
+        publish(place[i][k], pack_half(c.x * PARTIAL_SCALE, c.y * PARTIAL_SCALE),
                 pack_half(c.z * PARTIAL_SCALE, c.w * PARTIAL_SCALE), bit);
       }
     }
@@ -181,10 +209,21 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
     shift[i] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
     if (FP8) scale[i] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
   }
+  const int token = 2 * b.t() + (b.g() & 1);
+  u32 place[GROUPS_][OWN<GTL>];  // of the hidden units, at any rank
+#pragma unroll
+  for (int i = 0; i < GROUPS_; ++i)
+#pragma unroll
+    for (int k = 0; k < OWN<GTL>; ++k) {
+      const int at = b.g0() + own.tile[i];
+      place[i][k] = b.base + M_HID + ((at >> 1) * NT + own.n[i][k]) * 256 + (at & 1) * 128 + token * 16;
+      if (FEW) asm volatile("" : "+r"(place[i][k]));  // made now
+    }
   receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
   b.x_parity ^= 1;
   MARK(13)
   float sums[GROUPS_][NT * 4];
+  show_activations();
   multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums);
   MARK(15)
   if constexpr (SPREAD) consumers_sync(), give_room(b);
@@ -194,7 +233,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
 #pragma unroll
     for (int k = 0; k < OWN<GTL>; ++k)
       if (own.mine[i][k]) {
-        const int n = own.n[i][k], at = b.g0() + own.tile[i], token = 2 * b.t() + (b.g() & 1);
+        const int n = own.n[i][k];
         float4 c = own.sums[i][k];
         if (FP8) c = make_float4(c.x * scale[i].x, c.y * scale[i].x, c.z * scale[i].y, c.w * scale[i].y);
         const float2 r = inverse_rms(b, n * 8 + 2 * b.t());
@@ -207,7 +246,6 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
         const u32 far_lo = exchange(lo, 16), far_hi = exchange(hi, 16);
         const uint4 units =
             b.g() & 4 ? make_uint4(far_lo, far_hi, lo, hi) : make_uint4(lo, hi, far_lo, far_hi);
-        const u32 to = b.base + M_HID + ((at >> 1) * NT + n) * 256 + (at & 1) * 128 + token * 16;
         if constexpr (SPREAD) await_room(b);
         if (n * 8 + token < T) {
           constexpr int QUARTER = most(S, 4);
@@ -215,7 +253,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
 #pragma unroll
           for (int d = 0; d < QUARTER; ++d) {
             const int rank = (b.g() >> 1) * QUARTER + d;
-            data[d] = at_rank(to, rank), bars[d] = at_rank(b.bar(BAR_HID), rank);
+            data[d] = at_rank(place[i][k], rank), bars[d] = at_rank(b.bar(BAR_HID), rank);
           }
           static_assert(S % 4 == 0, "four lanes share the ranks");
 #pragma unroll
