@@ -155,7 +155,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
 // sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive
 // before it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which
-// follows what is published here.
+// follows what is published here. `await` until the operand is here; `then`, behind the product, whatever else there is.
 template <typename Await, typename Then>
 __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, int region, uint4* buffer, u32 bit,
                                                  Await await, Then then) {
