@@ -158,6 +158,14 @@ def test_compiled_operations_equal_the_reference_and_compile_little_for_other_bu
             torch.testing.assert_close(answer(call, observation, noise), expected, atol=5e-6, rtol=1e-5)
 
 
+def test_operations_are_not_called_compiled_where_compiling_is_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    with torch._dynamo.config.patch(disable=True):
+        assert compiled() is PLAIN
+    assert compiled() is not PLAIN
+    monkeypatch.setenv("TORCHDYNAMO_DISABLE", "1")
+    assert compiled() is PLAIN and "Inductor" not in PLAIN.origin.values()
+
+
 def test_a_row_on_the_host_has_valid_cameras_and_tokens_only() -> None:
     observation, _ = made_up("pi05", 2, 5)
     mask = torch.tensor([[True, False, True]])

@@ -11,6 +11,7 @@ Shapes: D, W widths, F hidden width of an MLP, K head_dim, n query heads over on
 """
 
 import inspect
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -237,7 +238,13 @@ _RECOMPILE_LIMIT = 64  # one compilation per width and per set of optional argum
 
 
 def compiled() -> Ops:
-    """The same operations with torch.compile between the matrix products, for any number of tokens and keys."""
+    """The same operations with torch.compile between the matrix products, for any number of tokens and keys.
+
+    Where it is switched off (TORCH_COMPILE_DISABLE or TORCHDYNAMO_DISABLE is 1, which PyTorch reads when it compiles)
+    `PLAIN`, as what suits a compiler is slower one by one.
+    """
+    if torch._dynamo.config.disable or os.environ.get("TORCHDYNAMO_DISABLE") == "1":
+        return PLAIN
     softmax = _compiled(masked_softmax)
     compiled_gelu, compiled_geglu = _compiled(gelu_by_sigmoid), _compiled(geglu_by_sigmoid)
 
