@@ -70,11 +70,6 @@ __device__ __forceinline__ void consumers_sync() {
 }
 // ---- moving data
 
-__device__ __forceinline__ u32 at_rank(u32 address, int rank) {
-  u32 x;
-  asm volatile("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(x) : "r"(address), "r"(rank));
-  return x;
-}
 // An address at all ranks. All of them first, as a send reads its registers late.
 struct Everyone {
   u32 at[S];
@@ -92,13 +87,6 @@ __device__ __forceinline__ void send(u32 to, u32 v, u32 w, u32 bar) {
   asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v2.b32 [%0], {%1, %2}, [%3];" ::"r"(to),
                "r"(v), "r"(w), "r"(bar)
                : "memory");
-}
-__device__ __forceinline__ void send(u32 to, float4 v, u32 bar) {
-  asm volatile(
-      "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.b32 [%0], {%1, %2, %3, %4}, [%5];" ::"r"(to),
-      "r"(__float_as_uint(v.x)), "r"(__float_as_uint(v.y)), "r"(__float_as_uint(v.z)), "r"(__float_as_uint(v.w)),
-      "r"(bar)
-      : "memory");
 }
 __device__ __forceinline__ void send(u32 to, uint4 v, u32 bar) {
   send(to, make_float4(__uint_as_float(v.x), __uint_as_float(v.y), __uint_as_float(v.z), __uint_as_float(v.w)), bar);

@@ -118,7 +118,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
     words[j] = partials(b, buffer, item), places[j] = columns_place(b, M_X, b.x0() + item.tile, item.n);
-    if (PATIENCE) asm volatile("" : "+l"(words[j]), "+r"(places[j]));
+    if (PATIENCE) words[j] = settled(words[j]), places[j] = settled(places[j]);
   }
   while (u32(clock64()) - since < PATIENCE) {
   }
@@ -155,7 +155,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
 // sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive
 // before it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which
-// follows what is published here. `await` until the operand is here; `then`, behind the product, whatever else there is.
+// follows what is published here. `await` until the operand is here; `then`, behind the product, what else there is.
 template <typename Await, typename Then>
 __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, int region, uint4* buffer, u32 bit,
                                                  Await await, Then then) {
@@ -167,7 +167,7 @@ __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, in
     for (int k = 0; k < OWN<DX>; ++k) {
       const uint4* const words = buffer + ((b.x0() + own.tile[i]) * NT + own.n[i][k]) * PAIRS * 32 + b.lane;
       place[i][k] = (uint2*)(words + b.cluster / 2 * 32) + (b.cluster & 1);
-      if (FEW) asm volatile("" : "+l"(place[i][k]));  // made now
+      if (FEW) place[i][k] = settled(place[i][k]);
     }
   await();
   show_activations();
@@ -217,7 +217,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
     for (int k = 0; k < OWN<GTL>; ++k) {
       const int at = b.g0() + own.tile[i];
       place[i][k] = b.base + M_HID + ((at >> 1) * NT + own.n[i][k]) * 256 + (at & 1) * 128 + token * 16;
-      if (FEW) asm volatile("" : "+r"(place[i][k]));  // made now
+      if (FEW) place[i][k] = settled(place[i][k]);
     }
   receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
   b.x_parity ^= 1;

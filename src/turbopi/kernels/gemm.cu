@@ -21,7 +21,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
     const u32 full = base + STAGES * STAGE_BYTES + RECEIVED_BYTES, empty = full + 8 * STAGES;
-    const u32 gathered = empty + 8 * STAGES, behind = gathered + 16;
+    const u32 gathered = empty + 8 * STAGES;
     const int warpgroup = threadIdx.x / 128, rank = CLUSTER > 1 ? blockIdx.x % CLUSTER : 0;
     const int units = m_groups * n_groups * (GATHER ? 1 : SPLITS);
     const int stride = gridDim.x / CLUSTER, first = blockIdx.x / CLUSTER;
@@ -119,7 +119,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             if (slot == STAGES) slot = 0, parity ^= 1;
         };
         [[maybe_unused]] float2* const behind_barriers =
-            (float2*)(raw + (behind - shared_address(raw)));  // for `Factors`
+            (float2*)(raw + (gathered + 16 - shared_address(raw)));  // for `Factors` and lines
 #if TP_PROMOTE
         float parts[BN / 2] = {};  // of the sums: what the tensor cores have not handed over yet
 #endif

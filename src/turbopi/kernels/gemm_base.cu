@@ -82,21 +82,6 @@ __device__ __forceinline__ float twice_gelu(float x) { return fmaf(x, tanh_of_ge
 __device__ __forceinline__ u32 lower_half(u32 address) { return (u32)operand(address); }
 __device__ __forceinline__ u64 operand_of(u32 lower) { return lower | (operand(0) & 0xffffffff00000000ull); }
 
-// Values that the compiler is to make here, and once: else it makes addresses anew for each load, after a wait.
-template <typename T>
-__device__ __forceinline__ T* settled(T* pointer) {
-    asm volatile("" : "+l"(pointer));
-    return pointer;
-}
-__device__ __forceinline__ float settled(float x) {
-    asm volatile("" : "+f"(x));
-    return x;
-}
-__device__ __forceinline__ int settled(int x) {
-    asm volatile("" : "+r"(x));
-    return x;
-}
-
 // A tile's scales and biases by column of `w`. Each thread of a warpgroup fetches some of them long before they are
 // needed; they go through shared memory to whom they belong: before the sums are made where a CTA has one tile, as it
 // waits for the kernel before it then, else after that.
@@ -139,17 +124,6 @@ struct Factors {
     }
 };
 
-// Into the memory of a CTA of the cluster, which learns by its barrier there when so many bytes have come.
-__device__ __forceinline__ u32 place_in(u32 address, u32 cta) {
-    asm volatile("mapa.shared::cluster.u32 %0, %0, %1;" : "+r"(address) : "r"(cta));
-    return address;
-}
-__device__ __forceinline__ void send(u32 to, float x, float y, float z, float w, u32 bar) {
-    asm volatile(
-        "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.f32 [%0], {%1, %2, %3, %4}, [%5];"
-        ::"r"(to), "f"(x), "f"(y), "f"(z), "f"(w), "r"(bar) : "memory");
-}
-
 // which of a tile's parts ends up with a block of 8 columns; blocks go in twos or fours, as that many leave together
 constexpr int BLOCKS = TILE_N / 8, TOGETHER = OUT_FP8 ? 4 : 2, GROUPS = (BLOCKS + TOGETHER - 1) / TOGETHER;
 __device__ constexpr int owner(int block) { return block / TOGETHER * SPLITS / GROUPS; }
@@ -173,14 +147,14 @@ __device__ __forceinline__ void gather(float (&sums)[BN / 2], int split, char* r
 #pragma unroll
     for (int to = 0; to < SPLITS; ++to) {
         if (to == split) continue;
-        const u32 cta = to * SHARING + rank % SHARING, its_bar = place_in(bar, cta);
-        const u32 there = place_in(base + (split < to ? split : split - 1) * FROM_ONE + threadIdx.x * 16, cta);
+        const u32 cta = to * SHARING + rank % SHARING, its_bar = at_rank(bar, cta);
+        const u32 there = at_rank(base + (split < to ? split : split - 1) * FROM_ONE + threadIdx.x * 16, cta);
         int count = 0;
 #pragma unroll
         for (int j = 0; j < BLOCKS; ++j)
             if (owner(j) == to)
-                send(there + count++ * THREADS * 16, sums[4 * j], sums[4 * j + 1], sums[4 * j + 2], sums[4 * j + 3],
-                     its_bar);
+                send(there + count++ * THREADS * 16,
+                     make_float4(sums[4 * j], sums[4 * j + 1], sums[4 * j + 2], sums[4 * j + 3]), its_bar);
     }
     barrier_wait(bar, 0);
     const float4* const received = (const float4*)(raw + (base - shared_address(raw))) + threadIdx.x;
@@ -212,7 +186,7 @@ __device__ __forceinline__ Tile tile_of(int unit, int m_groups, int n_groups, in
     t.m = ((unit - rest * m_groups) * CM + place / CN) * BM;
     t.n = ((rest - part * n_groups) * CN + place % CN) * TILE_N;
     t.split = GATHER ? rank / SHARING : part;
-    t.k = settled(k_blocks * t.split / SPLITS);  // of a loop that starts at 0 for sure, ptxas makes wgmma wait
+    t.k = settled(u32(k_blocks * t.split / SPLITS));  // of a loop that starts at 0 for sure, ptxas makes wgmma wait
     t.k_end = k_blocks * (t.split + 1) / SPLITS;
     return t;
 }

@@ -143,8 +143,7 @@ def _kernel(
 
 # Clock cycles, fitted to 200 measurements on an H200 (median error 5 %): of a product besides its tiles, of a tile for
 # each of its results (with GELU twice as many), of a step, and of its loads for each byte. A step's products take
-# rows * columns / 32. Partial sums cost as much again in the norm that adds them up,
-# those in bfloat16 half.
+# rows * columns / 32. Partial sums cost as much again in the norm that adds them up, those in bfloat16 half.
 FIXED, WRITING, STEP, LOADING, ADDING = 2300, 0.098, 205, 0.013, 0.00042
 
 GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that gather sums may not all fit at once
@@ -175,7 +174,7 @@ def candidates(epilogue: Epilogue) -> list[Tile]:
         if 64 * warpgroups * columns <= 192 * 192
         for splits in ((1, 2, 3, 4) if epilogue in SPLIT else (1,))
     ]
-    return [tile for tile in found if tile.stages(factors=1) >= 3]
+    return [tile for tile in found if tile.stages(factors=1, lines=epilogue == "parts") >= 3]
 
 
 def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> float:

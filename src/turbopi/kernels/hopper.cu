@@ -43,9 +43,36 @@ __device__ __forceinline__ void cluster_sync() {
 __device__ __forceinline__ void cluster_exchange() {  // what was stored before it in others' memory is there after it
     asm volatile("barrier.cluster.arrive.release;\nbarrier.cluster.wait.acquire;" ::: "memory");
 }
+// An address of this CTA's shared memory as that of another one of the cluster, and a store to such a place, which the
+// receiver's barrier counts in.
+__device__ __forceinline__ u32 at_rank(u32 address, int rank) {
+    u32 there;
+    asm volatile("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(there) : "r"(address), "r"(rank));
+    return there;
+}
+__device__ __forceinline__ void send(u32 to, float4 v, u32 bar) {
+    asm volatile(
+        "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.f32 [%0], {%1, %2, %3, %4}, [%5];"
+        ::"r"(to), "f"(v.x), "f"(v.y), "f"(v.z), "f"(v.w), "r"(bar) : "memory");
+}
 // K-major operand in shared memory, rows of 128 bytes, swizzled; groups of 8 rows lie 1024 bytes apart
 __device__ __forceinline__ u64 operand(u32 address) {
     return ((u64)(address & 0x3ffff) >> 4) | (1ull << 16) | (64ull << 32) | (1ull << 62);
+}
+
+// Values that the compiler is to make here, and once: else it makes addresses anew for each load, after a wait.
+template <typename T>
+__device__ __forceinline__ T* settled(T* pointer) {
+    asm volatile("" : "+l"(pointer));
+    return pointer;
+}
+__device__ __forceinline__ float settled(float x) {
+    asm volatile("" : "+f"(x));
+    return x;
+}
+__device__ __forceinline__ u32 settled(u32 x) {
+    asm volatile("" : "+r"(x));
+    return x;
 }
 
 // x / by for 0 <= x < 2^20 and by > 0, in a third of the time that a division takes.

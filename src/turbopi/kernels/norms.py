@@ -1,8 +1,8 @@
 """Residual addition and the norm behind it in one pass: one row a program.
 
 Twins: `engine.ops.residual_rms_norm`, `engine.ops.residual_layer_norm`. `y` may also be [splits, tokens, D], float32
-or as x: the partial sums of a product split over its inner axis, added up here in float32. With `inverse`
-the norm leaves as E4M3, rounded once from float32: see `engine.fp8`.
+or as x: the partial sums of a product split over its inner axis, added up here in float32. With `inverse` the norm
+leaves as E4M3, rounded once from float32: see `engine.fp8`.
 """
 
 import torch
@@ -91,10 +91,11 @@ def residual_rms_norm(
     rows, width = _checked(x, y)
     out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x, dtype=result_dtype(x, inverse))
     block = triton.next_power_of_2(width)
+    warps = _warps(2 * block)  # twice LayerNorm's, for parts to add up
     _rms_norm_kernel[(rows,)](
         x, _or(y, x), _or(gate, scale), scale, _or(shift, scale), out, normed, rows, width, eps, inverse or 1.0,
         HAS_Y=y is not None, SPLITS=_splits(y), HAS_GATE=gate is not None,
-        HAS_SHIFT=shift is not None, SCALED=inverse is not None, BLOCK=block, num_warps=_warps(2 * block),
+        HAS_SHIFT=shift is not None, SCALED=inverse is not None, BLOCK=block, num_warps=warps,
         **dependent_launch(x),
     )  # fmt: skip
     return out, normed
