@@ -1,6 +1,9 @@
 """The engine's static forward pass equals the reference on the CPU: every golden case, odd prompts, 0 to 3 cameras."""
 
 import dataclasses
+import importlib.util
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +12,10 @@ from conftest import golden_cases, golden_model
 from torch import Tensor
 
 from turbopi import backends
-from turbopi.backends.cuda_graph import HostRow
+from turbopi.backends.cuda_graph import CudaGraphBackend, HostRow
 from turbopi.config import Kind
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
+from turbopi.engine.one_by_one import OPS, Denoiser
 from turbopi.engine.ops import PLAIN, Ops, compiled, geglu, geglu_by_sigmoid, gelu, gelu_by_sigmoid
 from turbopi.engine.weights import modulation, pack
 from turbopi.model.reference import Precision
@@ -25,10 +29,17 @@ CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
 def static_call(kind: Kind, shape: CallShape, precision: Precision = "f32", ops: Ops = PLAIN) -> StaticCall:
     model = golden_model(kind, precision)
     weights = pack(model.config, dict(model.state_dict()))
-    cache = Cache.allocate(model.config, shape.prefix_slots(model.config) + 64, CPU, weights.embed_tokens.dtype)
+    cache = Cache.allocate(
+        model.config, shape.prefix_slots(model.config) + 64, CPU, weights.embed_tokens.dtype, ops is OPS
+    )
     pictures = Pictures(model.config, weights, ops, shape.cameras, shape.float_images, shape.prompt_slots)
     table = modulation(model.config, weights.conditioning, shape.num_steps)
-    return StaticCall(model.config, weights, ops, shape, pictures, cache, table)
+    call = StaticCall(model.config, weights, ops, shape, pictures, cache, table)
+    if ops is OPS and table is not None:
+        call.denoiser = dataclasses.replace(
+            Denoiser.prepare(model.config, weights, table), slots=shape.prefix_slots(model.config)
+        )
+    return call
 
 
 def answer(call: StaticCall, observation: Observation, noise: Tensor, row: int = 0) -> Tensor:
@@ -64,12 +75,13 @@ def made_up(kind: Kind, cameras: int, tokens: int, seed: int = 0) -> tuple[Obser
     return observation, torch.randn(1, 7, config.action_dim, generator=g)
 
 
+@pytest.mark.parametrize("ops", [PLAIN, OPS], ids=["plain", "one_by_one"])
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("steps", [1, 3, 10])
-def test_equals_the_reference_on_golden_cases(case: str, steps: int) -> None:
+def test_equals_the_reference_on_golden_cases(case: str, steps: int, ops: Ops) -> None:
     one = golden_cases()[case]
     for row in range(one.observation.batch_size):
-        call = static_call(one.kind, shape_of(one.observation, one.noise, steps, row))
+        call = static_call(one.kind, shape_of(one.observation, one.noise, steps, row), ops=ops)
         expected = golden_model(one.kind).sample(one.observation, one.noise, steps)[row]
         torch.testing.assert_close(answer(call, one.observation, one.noise, row), expected, atol=5e-6, rtol=1e-5)
 
@@ -94,11 +106,12 @@ def test_a_longer_prompt_leaves_nothing_behind_for_a_shorter_one() -> None:
     torch.testing.assert_close(answer(call, short, noise), expected, atol=5e-6, rtol=1e-5)
 
 
-def test_bfloat16_is_as_close_to_float32_as_the_reference_is() -> None:
+@pytest.mark.parametrize("ops", [PLAIN, OPS], ids=["plain", "one_by_one"])
+def test_bfloat16_is_as_close_to_float32_as_the_reference_is(ops: Ops) -> None:
     one = golden_cases()["b_third_masked"]
     exact = golden_model("pi05").sample(one.observation, one.noise, 10)[0]
     reference = golden_model("pi05", "bf16").sample(one.observation, one.noise, 10)[0]
-    call = static_call("pi05", shape_of(one.observation, one.noise, 10), "bf16")
+    call = static_call("pi05", shape_of(one.observation, one.noise, 10), "bf16", ops)
 
     def error(actions: Tensor) -> float:
         return float((actions - exact).square().mean().sqrt())
@@ -116,11 +129,12 @@ def test_the_host_buffer_holds_valid_pictures_and_tokens_only() -> None:
     assert call.host.length.item() == 2 * call.config.vision.num_tokens + 5
 
 
+@pytest.mark.parametrize("ops", [PLAIN, OPS], ids=["plain", "one_by_one"])
 @pytest.mark.parametrize("horizon", [6, 7, 16])
-def test_rows_between_prefix_and_suffix_are_seen_by_nobody(horizon: int) -> None:
+def test_rows_between_prefix_and_suffix_are_seen_by_nobody(horizon: int, ops: Ops) -> None:
     observation, _ = made_up("pi05", 1, 19)
     noise = torch.randn(1, horizon, 32, generator=torch.Generator().manual_seed(horizon))
-    call = static_call("pi05", shape_of(observation, noise, 2))
+    call = static_call("pi05", shape_of(observation, noise, 2), ops=ops)
     assert call.cache_k.shape[1] % 16 == 0
     for poison in (torch.nan, torch.inf):
         call.cache_k[:, -horizon - 3 :], call.cache_v[:, -horizon - 3 :] = poison, poison
@@ -158,12 +172,16 @@ def test_compiled_operations_equal_the_reference_and_compile_little_for_other_bu
             torch.testing.assert_close(answer(call, observation, noise), expected, atol=5e-6, rtol=1e-5)
 
 
-def test_operations_are_not_called_compiled_where_compiling_is_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_operations_are_not_called_compiled_where_nothing_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     with torch._dynamo.config.patch(disable=True):
-        assert compiled() is PLAIN
-    assert compiled() is not PLAIN
+        assert compiled() is OPS
+    assert compiled() is not OPS
+    on_gpu: Any = SimpleNamespace(device=torch.device("cuda"))
+    with monkeypatch.context() as without_triton:
+        without_triton.setattr(importlib.util, "find_spec", lambda name: None)
+        assert CudaGraphBackend._make_ops(on_gpu) is OPS
     monkeypatch.setenv("TORCHDYNAMO_DISABLE", "1")
-    assert compiled() is PLAIN and "Inductor" not in PLAIN.origin.values()
+    assert compiled() is OPS and "Inductor" not in OPS.origin.values()
 
 
 def test_a_row_on_the_host_has_valid_cameras_and_tokens_only() -> None:

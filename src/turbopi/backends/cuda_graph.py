@@ -6,6 +6,7 @@ captured anew when pictures, prompt, state or noise change. A bucket that warm-u
 needed, with a log line. Batches run one observation after the other.
 """
 
+import dataclasses
 import itertools
 import logging
 import time
@@ -18,7 +19,9 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Sample, Tier
+from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.config import ModelConfig
+from turbopi.engine import one_by_one
 from turbopi.engine.call import Cache, CallShape, Denoiser, Mark, Pictures, StaticCall
 from turbopi.engine.ops import Ops, compiled
 from turbopi.engine.weights import Weights, modulation, pack
@@ -107,7 +110,7 @@ class Begun:
 
 
 class CudaGraphBackend:
-    """The engine's forward pass with PyTorch's kernels, those between the matrix products fused by Inductor."""
+    """The engine's forward pass with PyTorch's kernels, those between products fused by Inductor if it is there."""
 
     name: ClassVar[str] = "cuda_graph"
     precisions: ClassVar[tuple[Tier, ...]] = ("bf16", "f32")
@@ -119,8 +122,10 @@ class CudaGraphBackend:
         self._weights = self._pack(load)
         self._ops = self._make_ops()
         rows = MAX_CAMERAS * config.vision.num_tokens + _bucket(config.max_prompt_tokens) + config.action_horizon + 64
-        self._cache = Cache.allocate(config, rows, device, self._weights.embed_tokens.dtype)
-        self._tables: dict[int, Tensor | None] = {}
+        dtype, joint = self._weights.embed_tokens.dtype, self._ops is one_by_one.OPS
+        self._cache = Cache.allocate(config, rows, device, dtype, joint)
+        self._tables: dict[int, Tensor | None] = {}  # by number of steps, as the next
+        self._loops: dict[int, one_by_one.Denoiser] = {}
         self._calls: dict[CallShape, StaticCall] = {}
         self._pictures: dict[tuple[int, bool], Pictures] = {}  # by cameras, and whether they are float
         self._graphs: dict[tuple[CallShape | Pictures, str], Graph] = {}
@@ -211,11 +216,15 @@ class CudaGraphBackend:
         return pack(self.config, load(self.device, "f32" if self.precision == "f32" else "bf16"))
 
     def _make_ops(self) -> Ops:
-        return compiled()
+        return compiled() if PyTorchCompileBackend.unavailable(self.device) is None else one_by_one.OPS
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """None: the engine's operations one by one."""
-        return None
+        if self._ops is not one_by_one.OPS or table is None:
+            return None
+        if shape.num_steps not in self._loops:
+            self._loops[shape.num_steps] = one_by_one.Denoiser.prepare(self.config, self._weights, table)
+        return dataclasses.replace(self._loops[shape.num_steps], slots=shape.prefix_slots(self.config))
 
     def _run(self, part: str, row: HostRow, noise: np.ndarray, num_steps: int) -> tuple[StaticCall, Graph]:
         """Replay the call up to a part's end on one row and noise float32[H, action_dim]."""

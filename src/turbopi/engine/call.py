@@ -95,9 +95,14 @@ class Cache:
     v: Tensor
 
     @classmethod
-    def allocate(cls, config: ModelConfig, rows: int, device: torch.device, dtype: torch.dtype) -> "Cache":
+    def allocate(
+        cls, config: ModelConfig, rows: int, device: torch.device, dtype: torch.dtype, joint: bool = False
+    ) -> "Cache":
+        """`joint`: as parts of one tensor."""
         size = (config.vlm.depth, rows, config.vlm.head_dim)
         # NaN: a row that is read before it is written shows
+        if joint:
+            return cls(*torch.full((2, *size), torch.nan, device=device, dtype=dtype))
         return cls(*(torch.full(size, torch.nan, device=device, dtype=dtype) for _ in range(2)))
 
 
@@ -200,7 +205,8 @@ class StaticCall:
         slots = self.shape.prefix_slots(config)
         ops.embed_prompt(inputs.tokens, weights.embed_tokens, self.embs[self.pictures.rows :])
         rope = (self.rope[0][:slots], self.rope[1][:slots])
-        forward.prefix_cache(config, weights, ops, self.embs, inputs.length, self.cache_k, self.cache_v, rope)
+        prefix_cache = ops.prefix_cache or forward.prefix_cache
+        prefix_cache(config, weights, ops, self.embs, inputs.length, self.cache_k, self.cache_v, rope)
         mark("prefix")
 
     def denoise(self, mark: Mark = lambda stage: None) -> None:

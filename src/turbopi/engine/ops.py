@@ -44,6 +44,7 @@ class Ops:
     rope_split: Callable[..., Tensor]
     vision_attention: Callable[..., Tensor]
     attention: Callable[..., Tensor]
+    prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
     origin: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -241,10 +242,12 @@ def compiled() -> Ops:
     """The same operations with torch.compile between the matrix products, for any number of tokens and keys.
 
     Where it is switched off (TORCH_COMPILE_DISABLE or TORCHDYNAMO_DISABLE is 1, which PyTorch reads when it compiles)
-    `PLAIN`, as what suits a compiler is slower one by one.
+    `one_by_one.OPS`, as what suits a compiler is slower one by one.
     """
     if torch._dynamo.config.disable or os.environ.get("TORCHDYNAMO_DISABLE") == "1":
-        return PLAIN
+        from turbopi.engine import one_by_one  # which is made of this module
+
+        return one_by_one.OPS
     softmax = _compiled(masked_softmax)
     compiled_gelu, compiled_geglu = _compiled(gelu_by_sigmoid), _compiled(geglu_by_sigmoid)
 
