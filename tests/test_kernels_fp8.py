@@ -5,6 +5,7 @@ GPU the bits are compared with PyTorch's.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 from turbopi.engine import ops as plain  # noqa: E402
 from turbopi.engine.fp8 import E4M3, E4M3_MAX, Fp8Matrix, input_of, to_e4m3  # noqa: E402
 from turbopi.kernels import attention, attention_hopper, gemm_fp8, norms  # noqa: E402
-from turbopi.kernels.gemm import Epilogue, Tile  # noqa: E402
+from turbopi.kernels.gemm import Epilogue, Tile, matmul  # noqa: E402
 from turbopi.kernels.hopper import SHARED_BYTES  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
@@ -199,6 +200,19 @@ def test_products(m: int, n: int, k: int, epilogue: Epilogue, tile: Tile, out_fp
 
 
 @on_hopper
+@pytest.mark.parametrize("tile", [Tile(3, 128), Tile(2, 176, cluster_n=2), Tile(1, 96)])
+@pytest.mark.parametrize(("m", "n", "k"), [(560, 16384, 2048), (203, 4304, 1152), (1, 16, 992)])
+def test_geglu_during_the_next_tiles_products_is_the_same(m: int, n: int, k: int, tile: Tile) -> None:
+    x, matrix = operands(m, 2 * n, k)
+    tiles = tile, replace(tile, overlap=True)
+    for inverse in (None, 30.0):
+        one, other = (gemm_fp8.matmul_fp8(x, matrix, t, "geglu", inverse=inverse).float() for t in tiles)
+        assert torch.equal(one, other)
+    one, other = (matmul(x.to(DTYPE), matrix.data.to(DTYPE), t, "geglu") for t in tiles)
+    assert torch.equal(one, other)
+
+
+@on_hopper
 @pytest.mark.parametrize("splits", [1, 2, 4])
 def test_partial_sums_add_up(splits: int) -> None:
     x, matrix = operands(531, 1152, 4304)
@@ -265,7 +279,7 @@ def test_the_chosen_tile_is_one_that_the_kernel_takes(rows: int, n: int, k: int,
     assert tile.columns % (16 if epilogue == "geglu" else 8) == 0 and tile.columns <= 256
     assert tile.splits == 1 or epilogue in ("partial", "parts")
     steps = -(-k // gemm_fp8.DEPTH)
-    assert tile.splits <= steps
+    assert tile.splits <= steps and tile.takes(epilogue, steps)
     assert gemm_fp8.promotion(tile, k) or steps <= gemm_fp8.UNPROMOTED_STEPS * tile.splits
     used = stages * (tile.rows + tile.columns) * 128 + 16 * 16 + 8 * tile.warpgroups * tile.columns
     used += tile.warpgroups * 4 * 16 * 128 if epilogue == "parts" else 0

@@ -120,6 +120,20 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
         };
         [[maybe_unused]] float2* const behind_barriers =
             (float2*)(raw + (gathered + 16 - shared_address(raw)));  // for `Factors` and lines
+#if TP_OVERLAP
+        auto step = [&](float(&sums)[BN / 2], bool first, bool keep) {
+            multiply(sums, keep);
+            if (!first) release(last);
+            advance();
+        };
+        auto tile_at = [&](int unit) { return tile_of(unit, m_groups, n_groups, k_blocks, rank); };
+        auto end = [&] { await_products<0>(), release(last); };
+        geglu_tiles(step, end, tile_at, first, units, stride, k_blocks, (Element*)out, M, N, group
+#if TP_FP8
+                    , scale, inverse, behind_barriers + group * BN
+#endif
+        );
+#else
 #if TP_PROMOTE
         float parts[BN / 2] = {};  // of the sums: what the tensor cores have not handed over yet
 #endif
@@ -130,20 +144,15 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             const int in_row[2] = {row < M ? blocks : 0, row + 8 < M ? blocks : 0};
             float sums[BN / 2];
 #if TP_FP8
-            Factors factors;  // where the input is normed, `bias` goes with the offset
+            Factors<u16> factors;  // where the input is normed, `bias` goes with the offset
             factors.fetch(scale, (const u16*)bias, t.n, N, bias && t.split == 0);
             if (EPILOGUE == 3) factors.scale_up(0.5f * inverse);
             float2* const shared = behind_barriers + group * BN;
 #endif
 #if TP_NORMED
-            Factors of_norm;
-            of_norm.fetch(sums_of_w, offset, t.n, N);
+            Factors<float> of_norm;
+            of_norm.fetch(sums_of_w, offset, t.n, N, true);
             float2* const shared_norm = behind_barriers + (FP8 * WGS + group) * BN;
-            of_norm.share(shared_norm, group);
-#endif
-#if TP_FP8
-            constexpr bool SHARED_EARLY = GATHER || TP_NORMED;
-            if (SHARED_EARLY) factors.share(shared, group);
 #endif
             u32 offsets[BIASED ? BN / 8 : 1];  // the bias of this lane's columns, read long before it is needed
             if (BIASED) {
@@ -191,31 +200,45 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             }
 #endif
 #if TP_ROW_PARTS
-            float mean[2], factor[2];  // while the first blocks of `a` are on their way
-#pragma unroll
-            for (int half = 0; half < 2; ++half) {
-                float sum = 0.0f, squares = 0.0f;
-#pragma unroll
-                for (int i = 0; i < OWN_SUMS; ++i) sum += row_sums[half][i].x, squares += row_sums[half][i].y;
-                mean[half] = settled(sum_of_quad(sum) * inverse_width);
-                const float variance = sum_of_quad(squares) * inverse_width - mean[half] * mean[half];
-                factor[half] = settled(rsqrtf(fmaxf(variance, 0.0f) + eps));
-            }
+            float mean[2], factor[2];
 #endif
-            constexpr bool PRESET = TP_RESIDUAL && !FP8;  // the sums begin with the bias and the residual
+#if TP_RESIDUAL && !TP_FP8
+            float plus[BN / 2];  // bias and residual
+#endif
+            auto prepare = [&] {  // what was loaded above, for the epilogue
 #if TP_RESIDUAL && !TP_FP8
 #pragma unroll
-            for (int i = 0; i < BN / 4; ++i) {
-                const int half = i % 2, j = i / 2;
-                sums[4 * j + 2 * half] = bf16_low(before[half][j]) + (BIASED ? bf16_low(offsets[j]) : 0.0f);
-                sums[4 * j + 2 * half + 1] = bf16_high(before[half][j]) + (BIASED ? bf16_high(offsets[j]) : 0.0f);
-            }
+                for (int i = 0; i < BN / 4; ++i) {
+                    const int half = i % 2, j = i / 2;
+                    plus[2 * i] = bf16_low(before[half][j]) + (BIASED ? bf16_low(offsets[j]) : 0.0f);
+                    plus[2 * i + 1] = bf16_high(before[half][j]) + (BIASED ? bf16_high(offsets[j]) : 0.0f);
+                }
 #endif
+#if TP_NORMED
+                of_norm.share(shared_norm, group);
+#endif
+#if TP_FP8
+                factors.share(shared, group);
+#endif
+#if TP_ROW_PARTS
+#pragma unroll
+                for (int half = 0; half < 2; ++half) {
+                    float sum = 0.0f, squares = 0.0f;
+#pragma unroll
+                    for (int i = 0; i < OWN_SUMS; ++i) sum += row_sums[half][i].x, squares += row_sums[half][i].y;
+                    mean[half] = settled(sum_of_quad(sum) * inverse_width);
+                    const float variance = sum_of_quad(squares) * inverse_width - mean[half] * mean[half];
+                    factor[half] = settled(rsqrtf(fmaxf(variance, 0.0f) + eps));
+                }
+#endif
+            };
 #if TP_PROMOTE
 #pragma unroll
             for (int i = 0; i < BN / 2; ++i) sums[i] = 0.0f;
-            for (int k = t.k; k < t.k_end;) {
-                const int start = k, stop = min(k + TP_PROMOTE, t.k_end);
+            // Three warpgroups do it at different times, as nothing is multiplied for one meanwhile; two lose by that.
+            int length = TP_PROMOTE - (WGS == 3 ? group : 0);
+            for (int k = t.k; k < t.k_end; length = TP_PROMOTE) {
+                const int start = k, stop = min(k + length, t.k_end);
                 for (; k < stop; ++k) {
                     multiply(parts, k > start);
                     if (k > start) release(last);
@@ -226,17 +249,15 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #pragma unroll
                 for (int i = 0; i < BN / 2; ++i) sums[i] += parts[i];
             }
+            prepare();
 #else
-            for (int k = t.k; k < t.k_end; ++k) {
-                multiply(sums, PRESET || k > t.k);
-                if (k > t.k) release(last);
-                advance();
-            }
+            // The first products don't wait for what only the epilogue needs.
+            multiply(sums, false), advance();
+            if (t.k + 1 < t.k_end) multiply(sums, true), release(last), advance();
+            prepare();
+            for (int k = t.k + 2; k < t.k_end; ++k) multiply(sums, true), release(last), advance();
             await_products<0>();
             release(last);
-#endif
-#if TP_FP8
-            if (!SHARED_EARLY) factors.share(shared, group);
 #endif
 #if TP_FP8 && !TP_NORMED
 #pragma unroll
@@ -301,14 +322,18 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #endif
                     auto value = [&](int j) -> u32 {
                         float x = sums[4 * j + 2 * half], y = sums[4 * j + 2 * half + 1];
-                        if (BIASED && !PRESET) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
+#if TP_RESIDUAL && !TP_FP8
+                        x += plus[4 * j + 2 * half], y += plus[4 * j + 2 * half + 1];
+#else
+                        if (BIASED) x += bf16_low(offsets[j]), y += bf16_high(offsets[j]);
+#endif
                         if (EPILOGUE == 2) x = gelu(x), y = gelu(y);
                         if (EPILOGUE == 3) {  // of E4M3, `up` has the half and what the result is multiplied by in it
                             x = (FP8 ? twice_gelu(x) : gelu(x)) * sums[BN / 4 + 4 * j + 2 * half];
                             y = (FP8 ? twice_gelu(y) : gelu(y)) * sums[BN / 4 + 4 * j + 2 * half + 1];
                         }
 #if TP_RESIDUAL
-                        if (!PRESET) x += bf16_low(before[half][j]), y += bf16_high(before[half][j]);
+                        if (FP8) x += bf16_low(before[half][j]), y += bf16_high(before[half][j]);
                         const u32 both = pack(x, y);
                         x = bf16_low(both), y = bf16_high(both);
 #if TP_COPY
@@ -341,6 +366,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             }
 #endif
         }
+#endif
     }
     if (CLUSTER > 1) cluster_sync();  // another CTA may still signal barriers here
 }

@@ -33,6 +33,8 @@ class Tile:
     cluster_m: int = 1  # CTAs that share rows of the weight
     cluster_n: int = 1  # CTAs that share rows of a
     splits: int = 1
+    overlap: bool = False  # GeGLU of a tile goes on during the next one's products
+    ring: int = 16  # most steps on their way: of more, the first come late
     gather: bool = False  # the splits' sums are added up in a cluster; else the epilogue is "partial" or "parts"
 
     @property
@@ -43,13 +45,17 @@ class Tile:
     def cluster(self) -> int:
         return self.cluster_m * self.cluster_n * (self.splits if self.gather else 1)
 
+    def takes(self, epilogue: Epilogue, steps: int) -> bool:
+        """Whether there are steps for the pieces in which GeGLU goes on between them."""
+        return not self.overlap or (epilogue == "geglu" and steps > -(-self.columns // 64) * 2)
+
     def stages(self, *, factors: int, lines: bool = False) -> int:
         """As many as fit beside 1 KB of alignment, barriers, pairs of `factors` a column and warpgroup, and sums.
 
         With `lines` also beside the rows of 128 bytes in which "parts" leave.
         """
         taken = self.apart(factors=factors) * self._received + 64 * self.warpgroups * STEP_BYTES * lines
-        return min(16, (self._room(factors) - taken) // self._stage_bytes)
+        return min(self.ring, (self._room(factors) - taken) // self._stage_bytes)
 
     def apart(self, *, factors: int) -> bool:
         """Whether there is room beside the stages for what a part of the inner axis gets of the others' sums."""
@@ -146,7 +152,7 @@ def matmul(
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
     assert a.dtype == weight.dtype == torch.bfloat16 and a.is_contiguous() and weight.is_contiguous()
     assert k % 8 == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
-    columns, groups = layout(tile, epilogue, m, n, residual, sums_out)
+    columns, groups = layout(tile, epilogue, m, n, -(-k // DEPTH), residual, sums_out)
     if out is None:
         shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
         out = torch.empty(shape, dtype=torch.float32 if epilogue == "partial" else torch.bfloat16, device=a.device)
@@ -170,10 +176,11 @@ def matmul(
 
 
 def layout(
-    tile: Tile, epilogue: Epilogue, m: int, n: int, residual: Tensor | None, sums_out: Sums | None
+    tile: Tile, epilogue: Epilogue, m: int, n: int, steps: int, residual: Tensor | None, sums_out: Sums | None
 ) -> tuple[int, tuple[int, int]]:
     """(columns of the result in a tile, how many clusters' tiles it takes along M and along N)"""
     assert residual is None or (epilogue == "bias" and residual.is_contiguous() and sums_out is not None)
+    assert tile.splits <= steps and tile.takes(epilogue, steps), f"{steps} steps are too few for {tile}"
     assert not tile.gather or epilogue != "geglu", "sums are gathered after that"
     parts = tile.cluster_m * (2 if epilogue == "geglu" else 1)
     assert tile.columns % (8 * parts) == 0 and tile.rows % (8 * tile.cluster_n) == 0, "a share is whole groups of 8"
@@ -246,6 +253,7 @@ def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: i
         "TP_CN": tile.cluster_n,
         "TP_SPLITS": tile.splits,
         "TP_GATHER": int(tile.gather),
+        "TP_OVERLAP": int(tile.overlap),
         "TP_APART": int(tile.apart(factors=factors)),
         "TP_EPILOGUE": EPILOGUES[epilogue],
         "TP_RESIDUAL": int(residual),
@@ -266,9 +274,9 @@ def build(source: str, sizes: dict[str, int], tile: Tile, device: torch.device) 
 
 
 def source(columns: int, fp8: bool = False) -> str:
-    """gemm_base.cu and gemm.cu with the instruction for tiles of that many columns."""
+    """gemm_base.cu, gemm_geglu.cu and gemm.cu with the instruction for tiles of that many columns."""
     mma = hopper.wgmma("mma", columns, numbers="e4m3" if fp8 else "bf16")
-    return hopper.source("gemm_base.cu", "gemm.cu", instructions=mma)
+    return hopper.source("gemm_base.cu", "gemm_geglu.cu", "gemm.cu", instructions=mma)
 
 
 def matrix_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> Any:

@@ -30,6 +30,7 @@
 // difference, in which w times the shift is in `offset`, as it is in the copy already, and the bias goes apart.
 //
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
+// TP_OVERLAP: see gemm_geglu.cu.
 
 constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
 constexpr bool GATHER = TP_GATHER;
@@ -82,29 +83,23 @@ __device__ __forceinline__ float twice_gelu(float x) { return fmaf(x, tanh_of_ge
 __device__ __forceinline__ u32 lower_half(u32 address) { return (u32)operand(address); }
 __device__ __forceinline__ u64 operand_of(u32 lower) { return lower | (operand(0) & 0xffffffff00000000ull); }
 
+__device__ __forceinline__ float wide(u16 x) { return __uint_as_float((u32)x << 16); }
+__device__ __forceinline__ float wide(float x) { return x; }
 // A tile's scales and biases by column of `w`. Each thread of a warpgroup fetches some of them long before they are
-// needed; they go through shared memory to whom they belong: before the sums are made where a CTA has one tile, as it
-// waits for the kernel before it then, else after that.
+// needed; they go through shared memory to whom they belong when the first products are under way.
+template <typename Bias>
 struct Factors {
     static constexpr int OWN = (BN + 127) / 128;
-    float scale[OWN], bias[OWN];
+    float scale[OWN];
+    Bias bias[OWN];  // as loaded: who made a float of it here would wait for it here
 
-    __device__ __forceinline__ void fetch(const float* scales, const u16* biases, int n, int N, bool with_bias) {
+    __device__ __forceinline__ void fetch(const float* scales, const Bias* biases, int n, int N, bool with_bias) {
 #pragma unroll
         for (int i = 0; i < OWN; ++i) {
             const int c = threadIdx.x % 128 + 128 * i, part = c / TILE_N, col = n + c % TILE_N;
             const bool inside = c < BN && col < N;
             scale[i] = inside ? scales[part * N + col] : 0.0f;
-            bias[i] = inside && with_bias ? __uint_as_float((u32)biases[col] << 16) : 0.0f;
-        }
-    }
-    __device__ __forceinline__ void fetch(const float* scales, const float* biases, int n, int N) {
-#pragma unroll
-        for (int i = 0; i < OWN; ++i) {
-            const int c = threadIdx.x % 128 + 128 * i;
-            const bool inside = c < BN && n + c < N;
-            scale[i] = inside ? scales[n + c] : 0.0f;
-            bias[i] = inside ? biases[n + c] : 0.0f;
+            bias[i] = inside && with_bias ? biases[col] : Bias();
         }
     }
     __device__ __forceinline__ void scale_up(float by) {  // GeGLU's up columns
@@ -118,7 +113,7 @@ struct Factors {
 #pragma unroll
         for (int i = 0; i < OWN; ++i) {
             const int c = threadIdx.x % 128 + 128 * i;
-            if (c < BN) shared[c] = make_float2(scale[i], bias[i]);
+            if (c < BN) shared[c] = make_float2(scale[i], wide(bias[i]));
         }
         sync();
     }
@@ -204,32 +199,34 @@ __device__ __forceinline__ uint2 transpose_bytes(u32 p, u32 q, int lane) {
 // A lane's part of a row of a tile's results, `value(block)` for each of `count` blocks of 8 columns; `to` is where the
 // tile begins in that row.
 template <typename Value>
-__device__ __forceinline__ void store_row(u16* to, int count, int split, int lane, Value value) {
+__device__ __forceinline__ void store_row(u16* to, int count, int split, int lane, Value value, int begin = 0,
+                                          int end = BLOCKS) {
     const bool odd = lane & 1;
     u16* const place = to + (odd ? 8 : 0) + lane % 4 / 2 * 4;
 #pragma unroll
-    for (int j = 0; j + 1 < BLOCKS; j += 2) {  // lanes of a pair exchange halves of two blocks
+    for (int j = begin; j + 1 < end; j += 2) {  // lanes of a pair exchange halves of two blocks
         if (GATHER && owner(j) != split) continue;
         const u32 x = value(j), y = value(j + 1), other = __shfl_xor_sync(~0u, odd ? x : y, 1);
         if (j + odd < count) *(uint2*)(place + j * 8) = odd ? make_uint2(other, y) : make_uint2(x, other);
     }
-    if (BLOCKS % 2 && (!GATHER || owner(BLOCKS - 1) == split)) {
-        const u32 x = value(BLOCKS - 1);
-        if (BLOCKS - 1 < count) *(u32*)(to + (BLOCKS - 1) * 8 + lane % 4 * 2) = x;
+    if (end % 2 && (!GATHER || owner(end - 1) == split)) {
+        const u32 x = value(end - 1);
+        if (end - 1 < count) *(u32*)(to + (end - 1) * 8 + lane % 4 * 2) = x;
     }
 }
 template <typename Value>
-__device__ __forceinline__ void store_row(unsigned char* to, int count, int split, int lane, Value value) {
+__device__ __forceinline__ void store_row(unsigned char* to, int count, int split, int lane, Value value, int begin = 0,
+                                          int end = BLOCKS) {
     unsigned char* const place = to + lane % 4 * 8;
 #pragma unroll
-    for (int j = 0; j + 3 < BLOCKS; j += 4) {
+    for (int j = begin; j + 3 < end; j += 4) {
         if (GATHER && owner(j) != split) continue;
         const u32 p = value(j) | value(j + 1) << 16, q = value(j + 2) | value(j + 3) << 16;
         const uint2 v = transpose_bytes(p, q, lane);
         if (j + lane % 4 < count) *(uint2*)(place + j * 8) = v;
     }
 #pragma unroll
-    for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
+    for (int j = end / 4 * 4; j < end; ++j) {
         if (GATHER && owner(j) != split) continue;
         const u32 x = value(j);
         if (j < count) *(u16*)(to + j * 8 + lane % 4 * 2) = (u16)x;

@@ -33,7 +33,7 @@ PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are ad
 # Of sums shorter than these steps the tensor cores lose too little to matter: 2e-3 of 8192 random products, where
 # rounding to E4M3 costs 4e-2; products of one sign lose more, so longer sums are promoted.
 UNPROMOTED_STEPS = 17
-PROMOTED_COLUMNS = {1: 184, 2: 184, 3: 112}  # by warpgroups: of wider tiles the sums don't fit registers twice
+PROMOTED_COLUMNS = {1: 184, 2: 192, 3: 112}  # by warpgroups: of wider tiles the sums don't fit registers twice
 
 
 # A `Copy` of a stream may be so many times larger than calibration saw in its norm before it saturates, as the stream
@@ -92,7 +92,7 @@ def matmul_fp8(
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
     assert a.dtype == weight.data.dtype == E4M3 and a.is_contiguous() and weight.data.is_contiguous()
     assert k % ALIGNMENT == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
-    columns, groups = layout(tile, epilogue, m, n, residual, sums_out)
+    columns, groups = layout(tile, epilogue, m, n, -(-k // DEPTH), residual, sums_out)
     partial = epilogue == "partial"
     assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu", "parts"))
     if out is None:
@@ -154,12 +154,15 @@ MEASURED = {
     (256, 4304, 1152): Tile(2, 72),
     (512, 3456, 1152): Tile(2, 112, cluster_m=2),
     (512, 1152, 1152): Tile(1, 96),
-    (512, 4304, 1152): Tile(2, 136),
+    (512, 4304, 1152): Tile(2, 136, ring=5),
+    (768, 4304, 1152): Tile(3, 136),
     (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
     (576, 2560, 2048): Tile(3, 64),
     (576, 2048, 2048): Tile(1, 160),
-    (576, 16384, 2048): Tile(3, 192, cluster_n=2),
+    **{(rows, 16384, 2048): Tile(3, 128, cluster_n=2, overlap=True) for rows in (320, 576, 704, 768, 960)},
+    (832, 16384, 2048): Tile(2, 176, cluster_n=2, overlap=True),
     (576, 2048, 16384): Tile(3, 96, splits=2),
+    (832, 2048, 16384): Tile(2, 120, cluster_n=2),
     (576, 512, 2048): Tile(1, 80),
 }
 

@@ -11,25 +11,25 @@ from torch import Tensor
 
 from turbopi.engine.fp8 import Fp8Matrix, Matrix, to_e4m3
 from turbopi.kernels import activations
-from turbopi.kernels.gemm import SPLIT, Epilogue, Tile, matmul
+from turbopi.kernels.gemm import DEPTH, SPLIT, Epilogue, Tile, matmul
 from turbopi.kernels.gemm_fp8 import best_tile, matmul_fp8
 
-GEGLU_TILES = (Tile(3, 192), Tile(2, 256))
+GEGLU_TILES = (Tile(3, 128, 1, 2, overlap=True), Tile(3, 192), Tile(2, 256), Tile(2, 160, 1, 2, overlap=True))
 GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
 
 # SigLIP So400m's products that beat cuBLAS on an H200, by [rows, out, in]: the tiles fill its SMs just once.
 VISION_TILES = {
-    (256, 3456, 1152): Tile(1, 112),
+    (256, 3456, 1152): Tile(1, 112, cluster_m=2),
     (256, 1152, 1152): Tile(2, 40, splits=2),
     (256, 4304, 1152): Tile(2, 72),
     (256, 1152, 4304): Tile(2, 72, cluster_n=2, splits=4),
     (256, 2048, 1152): Tile(1, 64),
-    (512, 3456, 1152): Tile(2, 112),
+    (512, 3456, 1152): Tile(2, 112, cluster_m=2, ring=5),
     (512, 1152, 1152): Tile(2, 40),
-    (512, 4304, 1152): Tile(2, 144, cluster_m=2),
+    (512, 4304, 1152): Tile(2, 144, cluster_m=2, ring=5),
     (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2),
     (512, 2048, 1152): Tile(2, 64),
-    (768, 3456, 1152): Tile(2, 160),
+    (768, 3456, 1152): Tile(2, 160, ring=5),
     (768, 1152, 1152): Tile(2, 64, cluster_m=2),
     (768, 4304, 1152): Tile(3, 136),
     (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2),
@@ -109,7 +109,7 @@ def tuned_linear_gelu(
 def tuned_linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None) -> Tensor:
     if isinstance(gate_up, Fp8Matrix):
         return _fp8(x, gate_up, "geglu", inverse=inverse)
-    tile = _geglu_tile(x.shape[0], gate_up.shape[0] // 2, x.device)
+    tile = _geglu_tile(x.shape[0], gate_up.shape[0] // 2, x.shape[1], x.device)
     return as_input(linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu"), inverse)
 
 
@@ -140,13 +140,13 @@ def num_sms(device: torch.device) -> int:
 
 
 @lru_cache
-def _geglu_tile(rows: int, hidden: int, device: torch.device) -> Tile | None:
-    """The tile that wastes least on the matrix's ragged edges and on the last wave of tiles, if that is little."""
+def _geglu_tile(rows: int, hidden: int, inner: int, device: torch.device) -> Tile | None:
+    """The first tile to waste least on the matrix's ragged edges and on the last wave of tiles, if that is little."""
     sms = num_sms(device)
 
     def fill(tile: Tile) -> float:
         tiles = -(-rows // tile.rows) * -(-2 * hidden // tile.columns)
         return rows * 2 * hidden / (-(-tiles // sms) * sms * tile.rows * tile.columns)
 
-    best = max(GEGLU_TILES, key=fill)
+    best = max((tile for tile in GEGLU_TILES if tile.takes("geglu", -(-inner // DEPTH))), key=fill)
     return best if fill(best) > GEGLU_FILL else None
