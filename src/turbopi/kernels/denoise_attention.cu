@@ -4,25 +4,25 @@
 __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix_all) {
   b.forget();
   asm volatile("" : "+r"(prefix_all));
-  const int all = most(prefix_all, 16), tile0 = share(all, S, b.rank), tiles = share(all, S, b.rank + 1) - tile0;
+  const int all = most(prefix_all, 16), tile0 = share(all, S, b.rank()), tiles = share(all, S, b.rank() + 1) - tile0;
   const int prefix = min(tiles * 16, prefix_all - tile0 * 16), slots = most(tiles, SLOT_TILES);
-  const int suffix0 = share(T, S, b.rank), suffix = share(T, S, b.rank + 1) - suffix0;
-  const bool scorer = b.warp < SCORERS, for_suffix = b.warp >= SUFFIX_WARP;
-  const int column = (b.warp - (W - WEIGHERS)) * CT;  // this warp's first tile of them
+  const int suffix0 = share(T, S, b.rank()), suffix = share(T, S, b.rank() + 1) - suffix0;
+  const bool scorer = b.warp() < SCORERS, for_suffix = b.warp() >= SUFFIX_WARP;
+  const int column = (b.warp() - (W - WEIGHERS)) * CT;  // this warp's first tile of them
   constexpr int MOST_SLOTS = most(KT, SLOT_TILES);
   auto pass = [&] {  // slots that a warp has no use for
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) give_slot(b, take_slot(b), 0);
   };
   // Keys: a warp those columns that it scores. Values: a warp those that it weighs, or the third warpgroup all.
-  const int k0 = share(QT, 4, b.warp - SUFFIX_WARP), key_steps = share(QT, 4, b.warp - SUFFIX_WARP + 1) - k0;
+  const int k0 = share(QT, 4, b.warp() - SUFFIX_WARP), key_steps = share(QT, 4, b.warp() - SUFFIX_WARP + 1) - k0;
   const bool some_keys = suffix > 0 && for_suffix && key_steps > 0;
-  const bool some_values = suffix > 0 && (HOLD ? column < QT : b.warp >= SCORERS && !for_suffix);
-  SuffixPart<most(SUFFIX * SUFFIX_STEPS * 4, 32)> suffix_keys{kv,      bit,    0,      b.lane,       32,
+  const bool some_values = suffix > 0 && (HOLD ? column < QT : b.warp() >= SCORERS && !for_suffix);
+  SuffixPart<most(SUFFIX * SUFFIX_STEPS * 4, 32)> suffix_keys{kv,      bit,    0,      b.lane(),       32,
                                                               suffix0, suffix, k0 * 4, key_steps * 4};
   constexpr int VALUE_THREADS = HOLD ? 32 : 128;
   SuffixPart<most(SUFFIX * (HOLD ? CT * 4 : HD / 4), VALUE_THREADS)> suffix_values{
-      kv,      bit,    1, int(threadIdx.x) & (VALUE_THREADS - 1), VALUE_THREADS,
+      kv,      bit,    1, int(b.thread) & (VALUE_THREADS - 1), VALUE_THREADS,
       suffix0, suffix, HOLD ? column * 4 : 0, HOLD ? min(CT, QT - column) * 4 : HD / 4};
   auto ask_suffix = [&] {
     if (some_keys) suffix_keys.ask();
@@ -34,7 +34,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     if (!ASYNC && some_keys) suffix_keys.keep(b);
     __syncwarp();
     if (suffix > 0) score_suffix(b, suffix, c[0]);
-    if (b.warp == SUFFIX_WARP)
+    if (b.warp() == SUFFIX_WARP)
       weigh_suffix(b, c, suffix);
     else
       sync<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
@@ -46,24 +46,24 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   uint4 last[CT];  // of the suffix's values
   u32 to[CT], to_bar[CT];
   auto prepare_outputs = [&] {
-    const int row = min(((b.lane & 7) + (b.lane >> 4 << 3)) >> 1, suffix - 1);  // the others' weights are 0
+    const int row = min(((b.lane() & 7) + (b.lane() >> 4 << 3)) >> 1, suffix - 1);  // the others' weights are 0
 #pragma unroll
     for (int j = 0; j < CT; ++j) {
       const int tile = min(column + j, QT - 1), owner = ((tile + 1) * S - 1) / QT, in = tile - share(QT, S, owner);
       last[j] = make_uint4(0, 0, 0, 0);
       if (suffix > 0)
-        ldmatrix_transposed(last[j], b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (tile * 16 + (b.lane & 8)) * 2);
+        ldmatrix_transposed(last[j], b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (tile * 16 + (b.lane() & 8)) * 2);
       constexpr bool ONE_OWNER = QT % S == 0 && QTL % CT == 0;
       if (ONE_OWNER && j > 0) {
         to[j] = to[0] + j * NT * OUTPUT, to_bar[j] = to_bar[0];
         continue;
       }
-      to[j] = at_rank(b.base + M_X + X_COMB + (b.rank * QTL + in) * NT * OUTPUT + b.lane * (OUTPUT / 32), owner);
+      to[j] = at_rank(b.base + M_X + X_COMB + (b.rank() * QTL + in) * NT * OUTPUT + b.lane() * (OUTPUT / 32), owner);
       to_bar[j] = at_rank(b.bar(BAR_COMB), owner);
     }
   };
   auto send_outputs = [&](float (&out)[CT][NT][4]) {  // after the suffix has had its part in them
-    if (HOLD && b.warp != SUFFIX_WARP) sync<SUFFIX_WEIGHTS, WEIGHERS + 1>();
+    if (HOLD && b.warp() != SUFFIX_WARP) sync<SUFFIX_WEIGHTS, WEIGHERS + 1>();
 #pragma unroll
     for (int j = 0; j < CT; ++j)
       if (column + j < QT) {
@@ -88,11 +88,11 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
 #pragma unroll 1
       for (int i = 0; i < slots; ++i) {
         const u32 slot = take_slot(b);
-        if (b.warp / SLOT_TILES == i && b.warp < tiles) {
+        if (b.warp() / SLOT_TILES == i && b.warp() < tiles) {
           mine = slot;
 #pragma unroll
           for (int k = 0; k < HELD_KEYS; ++k)
-            keys[k] = load_fragment(b.ring(slot) + b.warp % SLOT_TILES * KEY_TILE + k * FRAGMENT, b.lane);
+            keys[k] = load_fragment(b.ring(slot) + b.warp() % SLOT_TILES * KEY_TILE + k * FRAGMENT, b.lane());
         } else {
           give_slot(b, slot, 0);
         }
@@ -103,11 +103,11 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       MARK(3)
       float c[1][NT][4];
       clear(c[0]);
-      if (b.warp < tiles) {
-        const byte* from = b.ring(mine) + b.warp % SLOT_TILES * KEY_TILE;
+      if (b.warp() < tiles) {
+        const byte* from = b.ring(mine) + b.warp() % SLOT_TILES * KEY_TILE;
         float rest[NT][4];
         const u32 held = score<HELD_KEYS, HELD_KEYS>(b, [&](int k) { return keys[k]; }, 0, QT, c[0]);
-        auto fetch = [&](int k) { return load_fragment(from + (HELD_KEYS + k) * FRAGMENT, b.lane); };
+        auto fetch = [&](int k) { return load_fragment(from + (HELD_KEYS + k) * FRAGMENT, b.lane()); };
         u32 seen = score<QT - HELD_KEYS, 4>(b, fetch, HELD_KEYS, QT, rest);
         if (QT == HELD_KEYS) seen = held;
 #pragma unroll
@@ -117,9 +117,9 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         give_slot(b, mine, seen);
       }
       MARK(4)
-      weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
+      weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16);
       arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
-      if (b.warp == LEADER) {
+      if (b.warp() == LEADER) {
         sync<WEIGHTS, SCORERS + 4>();
         send_sums(b, tiles, suffix);
       } else {
@@ -129,7 +129,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       pass();
       uint4 values[HELD_TILES][CT];  // zeros at first, as the keys
       auto load = [&](u32 slot, int i, int j) {
-        return load_fragment(b.ring(slot) + i * KEY_TILE + (column + j) * FRAGMENT, b.lane);
+        return load_fragment(b.ring(slot) + i * KEY_TILE + (column + j) * FRAGMENT, b.lane());
       };
       auto exists = [&](int j) { return QT % WEIGHERS == 0 || column + j < QT; };
 #pragma unroll
@@ -191,28 +191,23 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     if (some_values) suffix_values.ask(), suffix_values.keep(b);
     receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
     MARK(3)
-    u32 taken[MOST_SLOTS];
-#pragma unroll
-    for (int i = 0; i < MOST_SLOTS; ++i)
-      if (i < slots) taken[i] = take_slot(b);
+    const u32 first_slot = b.slot;
+    auto slot_of = [&](u32 i) { return first_slot + i < STAGES ? first_slot + i : first_slot + i - STAGES; };
+#pragma unroll 1
+    for (int i = 0; i < slots; ++i) take_slot(b);
     float c[1][NT][4];
     clear(c[0]);
-    if (scorer && b.warp / 4 * 4 < tiles) {
+    if (scorer && b.warp() / 4 * 4 < tiles) {
       show_to_products();
-      const int tile = min(b.warp, tiles - 1);
-      u32 slot = taken[0];
-#pragma unroll
-      for (int i = 1; i < MOST_SLOTS; ++i)
-        if (tile / SLOT_TILES == i) slot = taken[i];
-      const byte* from = b.ring(slot) + tile % SLOT_TILES * KEY_TILE;
-      score_together(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); }, c[0]);
+      const int tile = min(b.warp(), tiles - 1);
+      const byte* from = b.ring(slot_of(tile / SLOT_TILES)) + tile % SLOT_TILES * KEY_TILE;
+      score_together(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane()); }, c[0]);
     }
-#pragma unroll
-    for (int i = 0; i < MOST_SLOTS; ++i)
-      if (i < slots) give_slot(b, taken[i]);
+#pragma unroll 1
+    for (int i = 0; i < slots; ++i) give_slot(b, slot_of(i));
     MARK(4)
     if (scorer) {
-      weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
+      weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16);
       arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
     }
     if (for_suffix) of_suffix();
@@ -231,17 +226,17 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         u32 seen = 0;
 #pragma unroll
         for (int r = 0; r < ROUNDS; ++r) {
-          const int tile = b.warp + r * SCORERS;
+          const int tile = b.warp() + r * SCORERS;
           if (scorer && tile / SLOT_TILES == i && tile < tiles) {
             const byte* from = b.ring(slot) + tile % SLOT_TILES * KEY_TILE;
-            seen ^= score<QT, 4>(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane); }, 0, QT, c[r]);
+            seen ^= score<QT, 4>(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane()); }, 0, QT, c[r]);
           }
         }
         give_slot(b, slot, seen);
       }
     MARK(4)
     if (scorer) {
-      weigh_prefix(b, c, b.warp, prefix - b.warp * 16);
+      weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16);
       arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
     }
     ask_suffix();
@@ -259,12 +254,12 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) {
       const u32 slot = take_slot(b);
-      const byte* from = b.ring(slot) + min(b.warp, QT - 1) * FRAGMENT;
+      const byte* from = b.ring(slot) + min(b.warp(), QT - 1) * FRAGMENT;
       uint4 v[SLOT_TILES];
 #pragma unroll
       for (int sub = 0; sub < SLOT_TILES; ++sub) {  // missing tiles are zeros
         v[sub] = make_uint4(0, 0, 0, 0);
-        if (i * SLOT_TILES + sub < tiles) v[sub] = load_fragment(from + sub * KEY_TILE, b.lane);
+        if (i * SLOT_TILES + sub < tiles) v[sub] = load_fragment(from + sub * KEY_TILE, b.lane());
       }
       begin_products();
 #pragma unroll
@@ -279,20 +274,20 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     for (int i = 0; i < NT * 4; ++i) out[0][i / 4][i % 4] = sums[i];
     prepare_outputs();
     send_outputs(out);
-    if (b.warp == LEADER) send_sums(b, tiles, suffix);
+    if (b.warp() == LEADER) send_sums(b, tiles, suffix);
   } else if constexpr (!HOLD) {
     float out[CT][NT][4];
     clear_out(out);
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) {
       const u32 slot = take_slot(b);
-      const byte* from = b.ring(slot) + b.warp * FRAGMENT;
+      const byte* from = b.ring(slot) + b.warp() * FRAGMENT;
       u32 seen = 0;
-      if (b.warp < QT) {
+      if (b.warp() < QT) {
 #pragma unroll
         for (int sub = 0; sub < SLOT_TILES; ++sub)
           if (i * SLOT_TILES + sub < tiles) {
-            const uint4 v = load_fragment(from + sub * KEY_TILE, b.lane);
+            const uint4 v = load_fragment(from + sub * KEY_TILE, b.lane());
             seen ^= fold(v);
             mma_tokens(out[0], v, token_address(b, M_X + X_P) + (i * SLOT_TILES + sub) * NT * 256);
           }
@@ -301,15 +296,16 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     }
     prepare_outputs();
     send_outputs(out);
-    if (b.warp == LEADER) send_sums(b, tiles, suffix);
+    if (b.warp() == LEADER) send_sums(b, tiles, suffix);
   }
   MARK(6)
   // Ranks' outputs, by their largest logits, which come first.
   b.forget();
   static_assert(QTL * NT <= W, "a warp for 8 tokens of a tile");
-  const int qn = b.qn(), tile = b.warp % imax(qn, 1), n = b.warp / imax(qn, 1), token = n * 8 + 2 * b.t();
-  const bool mine = b.warp < qn * NT;
+  const int qn = b.qn(), tile = b.warp() % imax(qn, 1), n = b.warp() / imax(qn, 1), token = n * 8 + 2 * b.t();
+  const bool mine = b.warp() < qn * NT;
   float2 w[S];
+  const Everyone places(columns_place(b, M_ATT, b.q0() + tile, n)), bars(b.bar(BAR_ATT));
   receive(b, BAR_TOPS, b.n, TOPS_EXPECT, WAIT_TOPS);
   float2 highest = make_float2(LOWEST, LOWEST);
 #pragma unroll
@@ -328,7 +324,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     float2 sum = make_float2(0, 0);
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      const byte* p = b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * OUTPUT + b.lane * (OUTPUT / 32);
+      const byte* p = b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * OUTPUT + b.lane() * (OUTPUT / 32);
       float4 v;
       if constexpr (SPREAD) {
         const uint2 both = *(const uint2*)p;
@@ -341,10 +337,9 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       o.x += w[s].x * v.x, o.y += w[s].y * v.y, o.z += w[s].x * v.z, o.w += w[s].y * v.w;
     }
     const float x = __fdividef(1.0f, sum.x), y = __fdividef(1.0f, sum.y);
-    send_columns(b, columns_place(b, M_ATT, b.q0() + tile, n), n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y),
-                 BAR_ATT, true);
+    send_columns(b, places, bars, n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y), true);
   }
   MARK(9)
   // A rank without queries has nothing to send now, but what has come may not land over the stream that comes next.
-  if (IDLE_Q && threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_ATT), threadIdx.x));
+  if (IDLE_Q && b.thread < S) send(at_rank(b.base + M_TOKEN, b.thread), 0, at_rank(b.bar(BAR_ATT), b.thread));
 }

@@ -87,8 +87,20 @@ __host__ __device__ constexpr int slot_rounds(int parts, int tiles) {  // W / (p
 // With few tokens q|k|v are multiplied by mma: see `QkvProduct`. Its parts are the warps', or of two warps each if all
 // would need more memory than the stream that they lie over.
 constexpr int QKV = QTL + KVL, QKV_ROUNDS = plan_rounds(group_parts(group_tiles(QKV)), D16);
-constexpr bool MMA_QKV = FEW && QKV <= 3 && QKV_ROUNDS * KB <= 4;
+constexpr bool MMA_QKV = FEW && QKV <= 3 && QKV_ROUNDS * KB <= 4 && (QKV_ROUNDS & (QKV_ROUNDS - 1)) == 0;
 static_assert(!MMA_QKV || RPS * group_parts(QKV) == W, "a fragment of each round for a warp");
+// Of other products' weights the first rounds wait in registers for activations, if tokens are few: that is room for as
+// many more behind them. A round is a slot then, and all CTAs have as many.
+__host__ __device__ constexpr int rounds_ahead(int tiles, bool all, int blocks, int rounds) {
+  const int parts = group_parts(group_tiles(tiles));
+  return FEW && RPS == 4 && all && tiles <= 8 && slot_rounds(parts, tiles) == 1 && blocks % (KB * parts * 4) == 0
+             ? imin(rounds, plan_rounds(parts, blocks))
+             : 0;
+}
+constexpr int GATE_UP_AHEAD = rounds_ahead(GTL, F16 % NC == 0 && 2 * HC % S == 0, D16, FP8 ? 1 : 4);
+constexpr int OUT_AHEAD = rounds_ahead(DX, D16 % S == 0, QT, 1),
+              DOWN_AHEAD = rounds_ahead(DX, D16 % S == 0 && F16 % NC == 0, HC, 1),
+              RESIDUAL_AHEAD = imin(OUT_AHEAD, DOWN_AHEAD);  // the same code
 constexpr bool QKV_PAIRS = QKV * W * PARTIAL > D16 * NT * 256;
 constexpr int QKV_PARTS = QKV_PAIRS ? W / 2 : W;
 constexpr int KEY_TILE = QT * FRAGMENT;     // bytes of 16 keys, or values
@@ -132,10 +144,10 @@ constexpr int X_SIZE =
     up128(imax(imax(X_BYTES, SPREAD ? X_SPREAD : X_SUFFIX + 2 * SUFFIX * RS),
                imax(imax(MMA_QKV ? QKV * QKV_PARTS : plan_partials(QKV), SPREAD ? 0 : plan_partials(GTL)) * PARTIAL,
                     X_XS + DX * 16 * (SPREAD ? NT * 8 : T) * 4)));
-// Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down; between
-// steps x_t. Hidden units, or queries, land when a peer has this rank's slice, which follows out's, or down's, sums.
+// Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down. Hidden
+// units, or queries, land when a peer has this rank's slice, which follows out's, or down's, sums.
 constexpr int H_Q = 0, H_ATT = QT * NT * 256, H_BYTES = imax(2 * QT, HC) * NT * 256;
-constexpr int H_SIZE = SPREAD ? 0 : up128(imax(imax(H_BYTES, plan_partials(DX) * PARTIAL), T * A * 4));
+constexpr int H_SIZE = SPREAD ? 0 : up128(imax(H_BYTES, plan_partials(DX) * PARTIAL));
 
 // Sums of squares of the stream, float32[SQ][NT * 8]: by tile if tokens are few, else by slice.
 constexpr int SQ = FEW ? S * DX : S;
@@ -157,11 +169,12 @@ constexpr int BEHIND = imax(SIZE_SSQ + SIZE_PART + up128(NT * 32) + SIZE_BAR + S
 constexpr int SPREAD_STAGES = imin((TP_SMEM - X_SIZE - BEHIND) / SLOT, 7);
 constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + (SPREAD ? SPREAD_STAGES * SLOT : H_SIZE);
 constexpr int M_Q = SPREAD ? M_X + X_Q : M_H + H_Q, M_ATT = SPREAD ? M_X + X_ATT : M_H + H_ATT,
-              M_HID = SPREAD ? M_X : M_H;  // queries, attention, hidden units or x_t
+              M_HID = SPREAD ? M_X : M_H;  // queries, attention, hidden units; if SPREAD between steps x_t
 constexpr int M_PART = M_SSQ + SIZE_SSQ;        // of this slice, by tile; in attention largest logits
 constexpr int M_RMS = M_PART + SIZE_PART;       // 1 / rms of each token
 constexpr int M_ROPE = M_RMS + up128(NT * 32);  // if tokens are few: see `make_rope`
-constexpr int M_BAR = M_ROPE + (FEW ? (QTL + KVL) * NT * 512 : 0), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
+constexpr int M_XT = M_ROPE + (FEW ? (QTL + KVL) * NT * 512 : 0);  // if tokens are few: x_t
+constexpr int M_BAR = M_XT + (FEW ? up128(T * A * 4) : 0), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
               M_LIST = M_BAR + SIZE_BAR, M_SUMS = M_LIST + SIZE_LIST;
 __host__ __device__ constexpr int plan_stages(int ring) { return imin((TP_SMEM - ring - BEYOND) / SLOT, 11); }
 // Partial sums of gate|up, out and down lie in a place of their own unless that costs a slot.
@@ -169,7 +182,7 @@ constexpr int SUMS_SIZE = up128(imax(plan_others(GTL), plan_others(DX)) * PARTIA
 constexpr bool APART = !SPREAD && plan_stages(M_SUMS) == plan_stages(M_SUMS + SUMS_SIZE);
 constexpr int M_RING = SPREAD ? M_H : M_SUMS + (APART ? SUMS_SIZE : 0);
 constexpr int STAGES = SPREAD ? SPREAD_STAGES : plan_stages(M_RING);
-static_assert(STAGES >= 2, "too little shared memory");
+static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little shared memory");
 
 // ring: full and empty, by slot
 enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };
@@ -226,46 +239,51 @@ struct Args {
 struct Block {
   const Args& a;
   byte* smem;
-  u32 base;  // of smem in the shared window
-  int cluster, rank, warp, lane;
-  int n = 0;                // layers done
+  u32 base;         // of smem in the shared window
+  u32 cta, thread;  // cluster and rank, warp and lane: two registers for four
+  u32 n = 0;                // layers done
   u32 slot = 0, phase = 0;  // of the ring
-  u32 x_parity = 0, turn = 0, room = 0;  // turn: exchanges of the stream, room: uses of BAR_ROOM
+  u32 turn = 0, room = 0;   // exchanges of the stream, uses of BAR_ROOM
 
-  __device__ Block(const Args& args, byte* s) : a(args), smem(s), base(u32(__cvta_generic_to_shared(s))) {
-    u32 r;
-    asm("mov.u32 %0, %%cluster_ctarank;" : "=r"(r));
-    cluster = blockIdx.x / S, rank = int(r), warp = threadIdx.x >> 5, lane = threadIdx.x & 31;
-  }
+  __device__ Block(const Args& args, byte* s)
+      : a(args), smem(s), base(u32(__cvta_generic_to_shared(s))), cta(blockIdx.x), thread(threadIdx.x) {}
   // For warps that multiply: make the compiler forget what these are made of. What it derives from them it would keep
   // in registers, or in local memory, over all layers, and a fetch from there costs more than to derive it again.
   __device__ __forceinline__ void forget() {
-    asm volatile("" : "+r"(base), "+r"(cluster), "+r"(rank), "+r"(warp), "+r"(lane));
+    asm volatile("" : "+r"(base));
+    asm volatile("mov.u32 %0, %%ctaid.x;" : "=r"(cta));
+    asm volatile("mov.u32 %0, %%tid.x;" : "=r"(thread));
     if (FP8 && SPREAD) return;  // there it costs spills
-    __builtin_assume(cluster >= 0), __builtin_assume(rank >= 0 && rank < S);  // so divisions become shifts
-    __builtin_assume(warp >= 0 && warp < W), __builtin_assume(lane >= 0 && lane < 32);
+    __builtin_assume(cta < NC * S), __builtin_assume(thread < CONSUMERS);
   }
-  __device__ __forceinline__ int g() const { return lane >> 2; }  // a lane's place in the tensor cores' operands
-  __device__ __forceinline__ int t() const { return lane & 3; }
+  __device__ __forceinline__ int cluster() const { return int(cta / S); }
+  __device__ __forceinline__ int rank() const { return int(cta % S); }
+  __device__ __forceinline__ int warp() const { return int(thread / 32); }
+  __device__ __forceinline__ int lane() const { return int(thread % 32); }
+  // Which of a barrier's two phases the stream has that comes before attention, or (half 1) the feed-forward.
+  __device__ __forceinline__ u32 x_parity(int half) const { return attends() ? u32(half) : n & 1; }
+  // A lane's place in the tensor cores' operands.
+  __device__ __forceinline__ int g() const { return int(thread / 4 % 8); }
+  __device__ __forceinline__ int t() const { return int(thread % 4); }
   __device__ __forceinline__ u32 bar(int i) const { return base + M_BAR + i * 8; }
   __device__ __forceinline__ u32 full(u32 s) const { return base + M_BAR + BAR_RING * 8 + s * 16; }
   __device__ __forceinline__ u32 empty(u32 s) const { return full(s) + 8; }
   __device__ __forceinline__ byte* ring(u32 s) const { return smem + M_RING + s * SLOT; }
-  __device__ __forceinline__ bool attends() const { return NC == NH || cluster < NH; }
+  __device__ __forceinline__ bool attends() const { return NC == NH || cluster() < NH; }
   // blocks of the stream's slice, hidden blocks of the cluster, tiles of the CTA
-  __device__ __forceinline__ int x0() const { return share(D16, S, rank); }
-  __device__ __forceinline__ int xn() const { return D16 % S == 0 ? DX : share(D16, S, rank + 1) - x0(); }
+  __device__ __forceinline__ int x0() const { return share(D16, S, rank()); }
+  __device__ __forceinline__ int xn() const { return D16 % S == 0 ? DX : share(D16, S, rank() + 1) - x0(); }
   __device__ __forceinline__ int hn() const {
-    return F16 % NC == 0 ? HC : share(F16, NC, cluster + 1) - share(F16, NC, cluster);
+    return F16 % NC == 0 ? HC : share(F16, NC, cluster() + 1) - share(F16, NC, cluster());
   }
-  __device__ __forceinline__ int g0() const { return share(2 * hn(), S, rank); }
+  __device__ __forceinline__ int g0() const { return share(2 * hn(), S, rank()); }
   __device__ __forceinline__ int gn() const {
-    return F16 % NC == 0 && 2 * HC % S == 0 ? GTL : share(2 * hn(), S, rank + 1) - g0();
+    return F16 % NC == 0 && 2 * HC % S == 0 ? GTL : share(2 * hn(), S, rank() + 1) - g0();
   }
-  __device__ __forceinline__ int q0() const { return share(QT, S, rank); }
-  __device__ __forceinline__ int qn() const { return QT % S == 0 ? QTL : share(QT, S, rank + 1) - q0(); }
-  __device__ __forceinline__ int kv0() const { return share(KVT, NH * S, cluster * S + rank); }
-  __device__ __forceinline__ int kvn() const { return share(KVT, NH * S, cluster * S + rank + 1) - kv0(); }
+  __device__ __forceinline__ int q0() const { return share(QT, S, rank()); }
+  __device__ __forceinline__ int qn() const { return QT % S == 0 ? QTL : share(QT, S, rank() + 1) - q0(); }
+  __device__ __forceinline__ int kv0() const { return share(KVT, NH * S, cluster() * S + rank()); }
+  __device__ __forceinline__ int kvn() const { return share(KVT, NH * S, cluster() * S + rank() + 1) - kv0(); }
 };
 
 // Cycles up to each mark, summed up: 0 stream here, 1 qkv multiplied, 2 sent, 3 queries here, 4 prefix scored, 5 its
@@ -274,7 +292,7 @@ struct Block {
 // 16 sent, 17 hidden here, 18 down, 14 sent, 19 embedded, 20 step done. Before 12 and 14: 21 and 22 partial sums here.
 #ifdef TP_TRACE
 #define MARK(i)                              \
-  if (threadIdx.x == 0) {                    \
+  if (b.thread == 0) {                       \
     const u32 now_ = u32(clock64());         \
     u32* m_ = (u32*)(b.smem + M_BAR + 256); \
     m_[1 + (i)] += now_ - m_[0];             \

@@ -2,21 +2,37 @@
 
 constexpr int GROUPS = CONSUMERS / A, HELD = most(T, GROUPS);  // threads per action number, tokens each of them keeps
 
-// Thread (action number `out`, token group) keeps x_t[group + i * GROUPS][out].
+// Thread (action number, token group) looks after x_t[group + i * GROUPS][number]. It keeps them in shared memory if
+// tokens are few, as registers are dear in the loop.
 struct Actions {
-  int out, group;
-  float x[HELD];
+  float kept[SPREAD ? HELD : 1];
+
+  static __device__ __forceinline__ int number(const Block& b) { return b.thread % A; }
+  static __device__ __forceinline__ int group(const Block& b) { return b.thread / A; }
+  static __device__ __forceinline__ bool exists(const Block& b, int i) {
+    return group(b) < GROUPS && group(b) + i * GROUPS < T;
+  }
+  static __device__ __forceinline__ int place(const Block& b, int i) {
+    return (group(b) + i * GROUPS) * A + number(b);
+  }
+  __device__ __forceinline__ float get(const Block& b, int i) const {
+    return SPREAD ? kept[SPREAD ? i : 0] : ((const float*)(b.smem + M_XT))[place(b, i)];
+  }
+  __device__ __forceinline__ void set(const Block& b, int i, float x) {
+    if (SPREAD)
+      kept[SPREAD ? i : 0] = x;
+    else
+      ((float*)(b.smem + M_XT))[place(b, i)] = x;
+  }
 };
 
-// x_t to the stream: action_in_proj, this rank's slice, and x_t's copy in region H for it.
-__device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (&x)[ITEMS_X],
-                                      const float* scale) {
-  float* xt = (float*)(b.smem + M_HID);
+// x_t to the stream: action_in_proj, this rank's slice.
+__device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (&x)[ITEMS_X], const float* scale) {
+  float* xt = (float*)(b.smem + (SPREAD ? M_HID : M_XT));
+  if (SPREAD)
 #pragma unroll
-  for (int i = 0; i < HELD; ++i) {
-    const int token = actions.group + i * GROUPS;
-    if (actions.group < GROUPS && token < T) xt[token * A + actions.out] = actions.x[i];
-  }
+    for (int i = 0; i < HELD; ++i)
+      if (Actions::exists(b, i)) xt[Actions::place(b, i)] = actions.get(b, i);
   consumers_sync();
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
@@ -42,8 +58,8 @@ __device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (
     __syncwarp();
     if (!SPREAD && b.attends()) {
       const float2 s = __ldg((const float2*)(scale + col));
-      send_columns(b, columns_place(b, M_X, b.x0() + item.tile, item.n), item.n,
-                   make_float4(x[j].x * s.x, x[j].y * s.x, x[j].z * s.y, x[j].w * s.y), BAR_X, item.real);
+      send_columns(b, Everyone(columns_place(b, M_X, b.x0() + item.tile, item.n)), Everyone(b.bar(BAR_X)), item.n,
+                   make_float4(x[j].x * s.x, x[j].y * s.x, x[j].z * s.y, x[j].w * s.y), item.real);
     }
   }
   if constexpr (SPREAD) {
@@ -79,16 +95,16 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   float sum[HELD];
 #pragma unroll
   for (int i = 0; i < HELD; ++i) sum[i] = 0;
-  const bool active = actions.group < GROUPS && actions.group < T;
-  const u32 mine = (b.rank * T + actions.group) * A + actions.out;
+  const bool active = Actions::exists(b, 0);
+  const u32 mine = b.rank() * T * A + Actions::place(b, 0);
   if (active) {
-    const float* w = b.a.out_w + size_t(b.x0()) * 16 * A + actions.out;
+    const float* w = b.a.out_w + size_t(b.x0()) * 16 * A + Actions::number(b);
 #pragma unroll(HELD == 1 ? 32 : SPREAD ? 16 : 8)
     for (int c = 0; c < b.xn() * 16; ++c) {
       const float v = __ldg(w + c * A);
 #pragma unroll
       for (int i = 0; i < HELD; ++i) {
-        const int token = min(actions.group + i * GROUPS, T - 1);
+        const int token = min(Actions::group(b) + i * GROUPS, T - 1);
         sum[i] += v * xs[SPREAD ? (c / 16 * NT + token / 8) * 128 + (c % 16 / 2 * 4 + token % 8 / 2) * 4 + c % 2 * 2 +
                                       token % 2
                                 : c * T + token];
@@ -96,7 +112,7 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
     }
 #pragma unroll
     for (int i = 0; i < HELD; ++i)
-      if (actions.group + i * GROUPS < T)
+      if (Actions::exists(b, i))
 #pragma unroll
         for (int d = 0; d < S; ++d)
           send(at_rank(b.base + M_X + X_VPART + (mine + i * GROUPS * A) * 4, d), __float_as_uint(sum[i]),
@@ -106,21 +122,22 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   if (active) {
     const float* parts = (const float*)(b.smem + M_X + X_VPART);
     const float* squares = (const float*)(b.smem + M_SSQ);
-    const float shift = __ldg(b.a.out_shift + step * A + actions.out);
+    const float shift = __ldg(b.a.out_shift + step * A + Actions::number(b));
 #pragma unroll
     for (int i = 0; i < HELD; ++i) {
-      const int token = actions.group + i * GROUPS, at = token * A + actions.out;
-      if (token < T) {
+      const int token = Actions::group(b) + i * GROUPS, at = Actions::place(b, i);
+      if (Actions::exists(b, i)) {
         float v = 0, q = 0;
 #pragma unroll
         for (int s = 0; s < S; ++s) v += parts[s * T * A + at];
 #pragma unroll
         for (int s = 0; s < SQ; ++s) q += squares[s * NT * 8 + token];
         v = v * rsqrtf(q * (1.0f / D) + b.a.eps) + shift;
-        actions.x[i] = __fadd_rn(actions.x[i], __fmul_rn(b.a.dt, v));
-        if (blockIdx.x == 0) {
+        const float next = __fadd_rn(actions.get(b, i), __fmul_rn(b.a.dt, v));
+        actions.set(b, i, next);
+        if (b.cta == 0) {
           b.a.v_t[size_t(step) * T * A + at] = v;
-          b.a.x_t[size_t(step + 1) * T * A + at] = actions.x[i];
+          b.a.x_t[size_t(step + 1) * T * A + at] = next;
         }
       }
     }
@@ -128,7 +145,7 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   if (step + 1 < b.a.steps) {  // a peer's next slice lands where this rank has read the partial sums
     consumers_sync();
     if constexpr (SPREAD) return;
-    if (threadIdx.x < S) arrive_at(at_rank(b.bar(BAR_GO), threadIdx.x));
+    if (b.thread < S) arrive_at(at_rank(b.bar(BAR_GO), b.thread));
     note(b, WAIT_GO);
     barrier_wait(b.bar(BAR_GO), step & 1);
   }
@@ -138,18 +155,15 @@ __device__ __forceinline__ u32 hidden_bytes(const Block& b) { return b.hn() * 16
 
 __device__ __forceinline__ void consume(Block& b) {
   const Args& a = b.a;
-  const int prefix = int(*a.length), cta = b.cluster * S + b.rank;
+  const int prefix = int(*a.length);
   Actions actions;
-  actions.out = threadIdx.x % A, actions.group = threadIdx.x / A;
 #pragma unroll
-  for (int i = 0; i < HELD; ++i) {
-    const int token = actions.group + i * GROUPS, at = token * A + actions.out;
-    actions.x[i] = 0;
-    if (actions.group < GROUPS && token < T) {
-      actions.x[i] = a.noise[at];
-      if (blockIdx.x == 0) a.x_t[at] = actions.x[i];
+  for (int i = 0; i < HELD; ++i)
+    if (Actions::exists(b, i)) {
+      const float noise = a.noise[Actions::place(b, i)];
+      actions.set(b, i, noise);
+      if (b.cta == 0) a.x_t[Actions::place(b, i)] = noise;
     }
-  }
   float2 rope[ITEMS_Q][2];
   make_rope(b, prefix, rope);
   float4 x[ITEMS_X];
@@ -160,35 +174,37 @@ __device__ __forceinline__ void consume(Block& b) {
 #endif
 #pragma unroll 1
   for (int step = 0; step < a.steps; ++step) {
-    const float* table = a.table + size_t(step) * (2 * L + 1) * 3 * D;
-    embed(b, actions, x, table);
+    embed(b, actions, x, a.table + size_t(step) * (2 * L + 1) * 3 * D);
     MARK(19)
 #pragma unroll 1
-    for (int l = 0; l < L; ++l, ++b.n, table += 6 * D) {
-      const float* shifted = a.shifted + ((size_t(step) * L + l) * (NC * S) + cta) * TILES * 16;
-      const float* row_scales = FP8 ? a.row_scales + (size_t(l) * (NC * S) + cta) * TILES * 16 : nullptr;
-      const u32 bit = flag(b.n);
+    for (; b.n < u32(step + 1) * L; ++b.n) {
+      const bool last = b.n + 1 == u32(step + 1) * L;
 #pragma unroll 1
       for (int half = 0; half < 2; ++half) {  // attention, feed-forward; what they share is one piece of code
         b.forget();
-        uint4* const buffer = a.scratch + (half ? B_X1 : B_X2) + (b.n & 1) * N_STREAM;
+        const u32 bit = flag(b.n);
+        auto of_tiles = [&](const float* all, u32 layer) {  // a CTA's rows of all tiles
+          return all + (settled(layer) * (NC * S) + b.cta) * (TILES * 16);
+        };
         float2 gates[ITEMS_X], scales[ITEMS_X];
         auto load_norm = [&] {
+          const float* const table = a.table + (2 * settled(b.n) + step) * (3 * D);
           load_columns(b, gates, table + (half ? 5 : 2) * D);
           load_columns(b, scales, table + (half ? 6 : 3) * D);  // of the next norm, the final one behind the last layer
         };
         if (half || b.attends()) {
           if (half) {
-            gate_up(b, shifted, row_scales);
+            gate_up(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L));
             MARK(16)
             load_norm();
           } else {
             float* const kv = (float*)(a.scratch + B_KV + (b.n & 1) * N_KV);
-            project(b, shifted, row_scales, kv, bit, rope);
+            project(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L), kv, bit, rope);
             MARK(2)
             attend(b, kv, bit, prefix);
           }
         }
+        uint4* const buffer = a.scratch + (half ? B_X1 : B_X2) + (settled(b.n) & 1) * N_STREAM;
         auto await = [&] {
           if (half) {
             receive(b, BAR_HID, b.n, expect_hidden, WAIT_HID);
@@ -207,15 +223,15 @@ __device__ __forceinline__ void consume(Block& b) {
         else
           load_norm();
         if constexpr (SPREAD)
-          if (!half || b.attends() || l + 1 == L) done_with_x(b);
+          if (!half || b.attends() || last) done_with_x(b);
         MARK(half ? 18 : 11)
         note(b, half ? WAIT_X1 : WAIT_X2);
         gather(b, x, buffer, half ? NC : NH, bit, gates, scales,
-               !half || (l + 1 < L && (SPREAD || b.attends())), half);
+               !half || (!last && (SPREAD || b.attends())), half);
         MARK(half ? 14 : 12)
       }
     }
-    advance(b, actions, x, table, step);
+    advance(b, actions, x, a.table + (size_t(step + 1) * (2 * L + 1) - 1) * 3 * D, step);
     MARK(20)
   }
   note(b, FINISHED);
@@ -250,19 +266,19 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
   }
   __syncthreads();
   cluster_exchange();
-  if (b.warp < W) {  // 4 x 112 + 32 registers on each quarter of the multiprocessor are what 5 x 96 were at launch
+  if (b.warp() < W) {  // 4 x 112 + 32 registers on each quarter of the multiprocessor are what 5 x 96 were at launch
     asm volatile("setmaxnreg.inc.sync.aligned.u32 112;");
     consume(b);
   } else {
     asm volatile("setmaxnreg.dec.sync.aligned.u32 32;");
-    if (b.warp == W) {
-      if (b.lane == 0) {
+    if (b.warp() == W) {
+      if (b.lane() == 0) {
         Producer producer(b);
         producer.run();
       }
-    } else if (b.warp == W + 1) {
+    } else if (b.warp() == W + 1) {
       watch(b);
-    } else if (b.warp == W + 2) {
+    } else if (b.warp() == W + 2) {
       make_inverse_rms(b);
     } else if (SPREAD) {
       fetch_stream(b);

@@ -20,7 +20,7 @@ enum What {
   FINISHED
 };
 __device__ __forceinline__ void note(const Block& b, int what) {
-  if (threadIdx.x == 0) *(volatile u32*)(b.smem + M_PROGRESS) = u32(what) << 20 | u32(b.n);
+  if (b.thread == 0) *(volatile u32*)(b.smem + M_PROGRESS) = u32(what) << 20 | u32(b.n);
 }
 // What the norms of layer n need, to L2: it is read once, by everybody at the same time, while memory is busy with
 // weights.
@@ -29,10 +29,10 @@ __device__ __forceinline__ void prefetch(const Block& b, int n) {
   if (step >= b.a.steps) return;
   auto lines = [&](const float* from, int floats) {
 #pragma unroll 1
-    for (int i = b.lane * 32; i < floats; i += 32 * 32) asm volatile("prefetch.global.L2 [%0];" ::"l"(from + i));
+    for (int i = b.lane() * 32; i < floats; i += 32 * 32) asm volatile("prefetch.global.L2 [%0];" ::"l"(from + i));
   };
   const float* table = b.a.table + (size_t(step) * (2 * L + 1) + 2 * l) * 3 * D + b.x0() * 16;
-  lines(b.a.shifted + (size_t(n) * (NC * S) + b.cluster * S + b.rank) * TILES * 16, TILES * 16);
+  lines(b.a.shifted + (size_t(n) * (NC * S) + b.cluster() * S + b.rank()) * TILES * 16, TILES * 16);
   lines(table + 2 * D, b.xn() * 16), lines(table + 3 * D, b.xn() * 16);
   lines(table + 5 * D, b.xn() * 16), lines(table + 6 * D, b.xn() * 16);
 }
@@ -62,7 +62,7 @@ __device__ __forceinline__ void receive(const Block& b, int bar, int n, u32 byte
   note(b, what);
   barrier_wait(b.bar(bar), n & 1);
   __syncwarp();
-  if (threadIdx.x == 0) barrier_expect(b.bar(bar), bytes);
+  if (b.thread == 0) barrier_expect(b.bar(bar), bytes);
 }
 __device__ __forceinline__ void consumers_sync() {
   __syncwarp();  // lanes leave a wait one by one, and this barrier counts warps
@@ -73,6 +73,7 @@ __device__ __forceinline__ void consumers_sync() {
 // An address at all ranks. All of them first, as a send reads its registers late.
 struct Everyone {
   u32 at[S];
+  Everyone() = default;
   __device__ __forceinline__ explicit Everyone(u32 address) {
 #pragma unroll
     for (int d = 0; d < S; ++d) at[d] = at_rank(address, d);

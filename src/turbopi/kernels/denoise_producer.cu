@@ -38,8 +38,8 @@ struct Producer {
     for (int k = 0; k < count; k += SLOT_TILES) add(from + k * KEY_TILE, min(SLOT_TILES, count - k) * KEY_TILE, true);
   }
   __device__ void run() {
-    const int tiles = most(int(*b.a.length), 16), first = share(tiles, S, b.rank);
-    const int count = share(tiles, S, b.rank + 1) - first;
+    const int tiles = most(int(*b.a.length), 16), first = share(tiles, S, b.rank());
+    const int count = share(tiles, S, b.rank() + 1) - first;
     int last_key = -STAGES;
     if (b.attends()) {
       product<QTL + KVL>(D16, b.qn() + b.kvn());
@@ -56,7 +56,7 @@ struct Producer {
     u64 once, keep;  // L2 policies: weights are read once a step; keys and values by every cluster, every step
     asm volatile("createpolicy.fractional.L2::evict_first.b64 %0, 1.0;" : "=l"(once));
     asm volatile("createpolicy.fractional.L2::evict_last.b64 %0, 1.0;" : "=l"(keep));
-    const byte* const first_weights = b.a.weights + b.a.starts[b.cluster * S + b.rank];
+    const byte* const first_weights = b.a.weights + b.a.starts[b.cluster() * S + b.rank()];
     auto prefetch = [&](const byte* weights, uint2 what) {
       asm volatile("cp.async.bulk.prefetch.L2.global.L2::cache_hint [%0], %1, %2;" ::"l"(weights + what.x), "r"(what.y),
                    "l"(once)
@@ -84,7 +84,7 @@ struct Producer {
           }
           barrier_wait(full + 8, free);  // until its last contents have been read
           barrier_expect(full, bytes);
-          if (PACE) {
+          if (PACE && i < gate_up + STAGES) {  // the others wait for room as it is
             while (u32(clock64()) - loaded < PACE) {
             }
             loaded = u32(clock64());

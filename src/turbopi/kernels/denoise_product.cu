@@ -9,15 +9,17 @@ __device__ __forceinline__ u32 take_slot(Block& b, bool full = false) {
 }
 // Give a slot back. Not before the loads from it have arrived: the copy engine isn't ordered behind loads that are
 // still on their way (seen as wrong sums). Hence an address that needs what they brought.
-__device__ __forceinline__ void give_slot(const Block& b, u32 slot, u32 seen = 0) {
+__device__ __forceinline__ void give_slot(const Block& b, u32 slot, u32 seen = 0, u32 warps = 1) {
   __syncwarp();
-  if (b.lane == 0) barrier_arrive(b.empty(slot) + (seen & b.a.zero));
+  if (b.lane() == 0)  // for so many warps
+    asm volatile("mbarrier.arrive.shared::cta.b64 _, [%0], %1;" ::"r"(b.empty(slot) + (seen & b.a.zero)), "r"(warps)
+                 : "memory");
 }
 
 // The same without a branch, which would make products wait for each other, for what products alone have read.
 __device__ __forceinline__ void give_slot_if(const Block& b, u32 slot, bool really) {
   asm volatile("{.reg .pred p; setp.ne.u32 p, %1, 0; @p mbarrier.arrive.shared::cta.b64 _, [%0];}" ::"r"(b.empty(slot)),
-               "r"(u32(really && b.lane == 0))
+               "r"(u32(really && b.lane() == 0))
                : "memory");
 }
 
@@ -28,79 +30,110 @@ __device__ __forceinline__ u32 fold(uint4 v) { return v.x; }
 struct Share {
   int part, first, tile;
   __device__ __forceinline__ Share(const Block& b, int parts) {
-    const int group = b.warp >> 2, rows = W / 4 / parts;
-    part = group / rows, first = group % rows * 4, tile = first + (b.warp & 3);
+    const int group = b.warp() >> 2, rows = W / 4 / parts;
+    part = group / rows, first = group % rows * 4, tile = first + (b.warp() & 3);
+  }
+};
+
+// A lane's share of a fragment of weights; of bfloat16 as operand A.
+__device__ __forceinline__ uint4 load_weights(const Block& b, u32 at) {
+  if (FP8) return *(const uint4*)(b.smem + at + b.lane() * 16);
+  uint4 v;  // ldmatrix's second quarter of lanes fetches rows g + 8, which lie behind the other columns of rows g
+  ldmatrix(v, b.base + at + b.lane() % 8 * 16 + b.lane() / 8 % 2 * 256 + b.lane() / 16 * 128);
+  return v;
+}
+// Operand A of block `half` of it.
+__device__ __forceinline__ uint4 operand_of(uint4 v, int half) {
+  if (!FP8) return v;
+  return half ? from_e4m3(v.z, v.w) : from_e4m3(v.x, v.y);
+}
+
+// This warp's share of the first rounds of a group of tiles, as operand A.
+template <int TILES_, int ROUNDS>
+struct Ahead {
+  uint4 weights[imax(ROUNDS * RPS * KB, 1)];
+
+  __device__ __forceinline__ explicit Ahead(Block& b) {
+    constexpr int PARTS = group_parts(TILES_);
+    const Share my(b, PARTS);
+#pragma unroll
+    for (int r = 0; r < ROUNDS; ++r) {
+      const u32 slot = take_slot(b), at = M_RING + slot * SLOT + (my.part * TILES_ + my.tile) * FRAGMENT;
+      u32 seen = 0;
+#pragma unroll
+      for (int i = 0; i < RPS; ++i) {
+        const uint4 v = load_weights(b, at + i * PARTS * TILES_ * FRAGMENT);
+        seen ^= fold(v);
+#pragma unroll
+        for (int half = 0; half < KB; ++half) weights[(r * RPS + i) * KB + half] = operand_of(v, half);
+      }
+      give_slot(b, slot, seen);
+    }
   }
 };
 
 // One group of tiles, this warp's share of it. x: activations in shared memory; `blocks` of the reduction, a multiple
-// of EVEN. A product is issued when the one before has begun, so what else there is to do stands between two.
-template <int TILES_, int EVEN>
-__device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int tiles, float (&sums)[NT * 4]) {
-  constexpr int PARTS = group_parts(TILES_);
-  constexpr bool EXACT = EVEN % (KB * PARTS * 4) == 0;
-  const Share my(b, PARTS);
-  const int rounds = plan_rounds(PARTS, blocks), rounds_of_slot = slot_rounds(PARTS, tiles);
-  const int first = my.first < tiles ? my.first : 0;
-  const u64 weights = operand(b.base + M_RING + (my.part * tiles + first) * FRAGMENT, 256, 128);
-  const u64 all = operand(x, 256, 128);
-  // Of a block's activations; blocks that fill up a round have no weight, their activations are any.
-  auto place = [&](int unit, int half) {
-    const int block = unit * KB + half;
+// of EVEN, of whose rounds AHEAD have been loaded.
+template <int TILES_, int EVEN, int AHEAD>
+struct GroupProduct {
+  static constexpr int PARTS = group_parts(TILES_);
+  static constexpr bool EXACT = EVEN % (KB * PARTS * 4) == 0;
+  Block& b;
+  const Share my;
+  const u32 x;
+  const int blocks, tiles, rounds, rounds_of_slot;
+  float (&sums)[NT * 4];
+
+  __device__ __forceinline__ GroupProduct(Block& block, u32 from, int n, int t, float (&to)[NT * 4])
+      : b(block), my(block, PARTS), x(from), blocks(n), tiles(t), rounds(plan_rounds(PARTS, n)),
+        rounds_of_slot(slot_rounds(PARTS, t)), sums(to) {
+#pragma unroll
+    for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
+  }
+  // Bytes before a block's activations, that of this warp's fragment i of round r. Blocks that fill up a round have no
+  // weight, their activations are any.
+  __device__ __forceinline__ int place(int r, int i, int half) const {
+    const int block = ((r * RPS + i) * PARTS + my.part) * KB + half;
     return (EXACT ? block : min(block, blocks - 1)) * NT * 256;
-  };
-  auto activations = [&](int unit, int half) { return behind(all, place(unit, half)); };
+  }
+  __device__ __forceinline__ u64 activations(int r, int i, int half) const {
+    return behind(operand(x, 256, 128), place(r, i, half));
+  }
+  // Weights in registers, by mma: a tile a warp.
+  __device__ __forceinline__ void multiply(uint4 w, int r, int i, int half) {
+    uint4 v;  // of the first 8 tokens 8 columns, the other 8, then of the next 8 tokens
+    ldmatrix(v, x + place(r, i, half) + b.lane() * 16);
+    mma_half(sums, w, make_uint2(v.x, v.y));
+    if (NT > 1) mma_half(sums + (NT - 1) * 4, w, make_uint2(v.z, v.w));
+  }
+  __device__ __forceinline__ void multiply(const Ahead<TILES_, AHEAD>& ahead) {
+    if (!FP8) begin_products();
 #pragma unroll
-  for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
-  u32 slot = 0, from = 0, previous = ~0u;
-  int left = 0;  // rounds of the slot
-  bool full = false;
+    for (int i = 0; i < AHEAD * RPS * KB; ++i) {
+      const uint4 w = ahead.weights[i];
+      if constexpr (FP8)
+        multiply(w, 0, i / KB, i % KB);
+      else
+        add_rows(sums, w.x, w.y, w.z, w.w, activations(0, i, 0), i);
+    }
+    if (!FP8) commit_products();
+  }
+
+  // bfloat16: weights from shared memory. A product is issued when the one before has begun, so what else there is to
+  // do stands between two.
+  __device__ __forceinline__ void from_slots() {
+    const int first = my.first < tiles ? my.first : 0;
+    const u64 weights = operand(b.base + M_RING + (my.part * tiles + first) * FRAGMENT, 256, 128);
+    u32 slot = 0, from = 0, previous = ~0u;
+    int left = 0;  // rounds of the slot
+    bool full = false;
 #pragma unroll 1
-  for (int r = 0; r < rounds; ++r) {
-    if (left == 0) slot = take_slot(b, full), left = rounds_of_slot, from = slot * SLOT, full = false;
-    const int unit = r * RPS * PARTS + my.part;
-    if constexpr (FP8 && FEW) {  // by mma, a tile a warp: of E4M3 weights it takes both blocks of a fragment at once
-      const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
-      uint4 w[RPS];
-      u32 seen = 0;
-#pragma unroll
-      for (int i = 0; i < RPS; ++i) w[i] = load_fragment(p + i * PARTS * tiles * FRAGMENT, b.lane), seen ^= fold(w[i]);
-#pragma unroll
-      for (int i = 0; i < RPS; ++i)
-#pragma unroll
-        for (int half = 0; half < 2; ++half) {
-          const uint4 a = half ? from_e4m3(w[i].z, w[i].w) : from_e4m3(w[i].x, w[i].y);
-          uint4 v;  // of the first 8 tokens 8 columns, the other 8, then of the next 8 tokens
-          ldmatrix(v, x + place(unit + i * PARTS, half) + b.lane * 16);
-          mma_half(sums, a, make_uint2(v.x, v.y));
-          if (NT > 1) mma_half(sums + (NT - 1) * 4, a, make_uint2(v.z, v.w));
-        }
-      if (--left == 0 || r + 1 == rounds) give_slot(b, slot, seen);
-    } else if constexpr (FP8) {  // by wgmma, two fragments at a time
-      static_assert(RPS % 2 == 0, "pairs of fragments");
-      const byte* p = b.smem + M_RING + from + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
-#pragma unroll 1
-      for (int i = 0; i < RPS; i += 2) {
-        const uint4 w0 = load_fragment(p + i * PARTS * tiles * FRAGMENT, b.lane),
-                    w1 = load_fragment(p + (i + 1) * PARTS * tiles * FRAGMENT, b.lane);
-        const uint4 a0 = from_e4m3(w0.x, w0.y), a1 = from_e4m3(w0.z, w0.w), a2 = from_e4m3(w1.x, w1.y),
-                    a3 = from_e4m3(w1.z, w1.w);
-        begin_products();
-        add_product(sums, a0.x, a0.y, a0.z, a0.w, activations(unit + i * PARTS, 0), r | i);
-        add_product(sums, a1.x, a1.y, a1.z, a1.w, activations(unit + i * PARTS, 1), 1);
-        add_product(sums, a2.x, a2.y, a2.z, a2.w, activations(unit + (i + 1) * PARTS, 0), 1);
-        add_product(sums, a3.x, a3.y, a3.z, a3.w, activations(unit + (i + 1) * PARTS, 1), 1);
-        commit_products();
-        if (i + 2 == RPS && (left == 1 || r + 1 == rounds)) give_slot(b, slot);  // what was loaded has been used
-        await_products<0>();  // it reads these registers; other warpgroups multiply meanwhile
-      }
-      --left;
-    } else {
+    for (int r = AHEAD; r < rounds; ++r) {
+      if (left == 0) slot = take_slot(b, full), left = rounds_of_slot, from = slot * SLOT, full = false;
       begin_products();
 #pragma unroll
       for (int i = 0; i < RPS; ++i) {
-        add_product(sums, behind(weights, from + i * PARTS * tiles * FRAGMENT), activations(unit + i * PARTS, 0),
-                    r | i);
+        add_product(sums, behind(weights, from + i * PARTS * tiles * FRAGMENT), activations(r, i, 0), r | i);
         if (i == 0) {
           commit_products();
           await_products<1>();  // the round before is done
@@ -110,12 +143,60 @@ __device__ __forceinline__ void multiply_group(Block& b, u32 x, int blocks, int 
       }
       commit_products();
       previous = --left == 0 ? slot : ~0u;
+      from += RPS * PARTS * tiles * FRAGMENT;
     }
-    from += RPS * PARTS * tiles * FRAGMENT;
+    await_products<0>();
+    if (rounds > AHEAD) give_slot(b, slot);
   }
-  await_products<0>();
-  if (!FP8 && rounds > 0) give_slot(b, slot);
-}
+  // E4M3: weights through registers, where they become float16; all of a round for mma, two fragments for wgmma.
+  __device__ __forceinline__ void through_registers() {
+    constexpr int STEP = FEW ? RPS : 2;
+    static_assert(RPS % STEP == 0, "whole steps");
+    u32 slot = 0, at = 0;
+    int left = 0;
+#pragma unroll 1
+    for (int r = AHEAD; r < rounds; ++r) {
+      if (left == 0)
+        slot = take_slot(b), left = rounds_of_slot,
+        at = M_RING + slot * SLOT + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
+      --left;
+#pragma unroll 1
+      for (int i0 = 0; i0 < RPS; i0 += STEP, at += STEP * PARTS * tiles * FRAGMENT) {
+        const bool last = i0 + STEP == RPS && (left == 0 || r + 1 == rounds);
+        uint4 w[STEP];
+        u32 seen = 0;
+#pragma unroll
+        for (int i = 0; i < STEP; ++i) w[i] = load_weights(b, at + i * PARTS * tiles * FRAGMENT), seen ^= fold(w[i]);
+        if (!FEW) begin_products();
+#pragma unroll
+        for (int i = 0; i < STEP * KB; ++i) {
+          const uint4 a = operand_of(w[i / KB], i % KB);
+          if constexpr (FEW)
+            multiply(a, r, i / KB, i % KB);
+          else
+            add_product(sums, a.x, a.y, a.z, a.w, activations(r, i0 + i / KB, i % KB), r | i0 | i);
+        }
+        if (!FEW) commit_products();
+        if (last) give_slot(b, slot, seen);
+        if (!FEW) await_products<0>();  // they read these registers; other warpgroups multiply meanwhile
+      }
+    }
+  }
+
+  __device__ __forceinline__ void operator()(const Ahead<TILES_, AHEAD>* ahead) {
+    if constexpr (AHEAD > 0) multiply(*ahead);
+    if constexpr (FP8)
+      through_registers();
+    else
+      from_slots();
+    if constexpr (AHEAD > 0 && !FP8)
+#pragma unroll
+      for (int i = 0; i < AHEAD * RPS; ++i) {  // until now products have read them
+        const uint4 w = ahead->weights[i];
+        asm volatile("" ::"r"(w.x), "r"(w.y), "r"(w.z), "r"(w.w));
+      }
+  }
+};
 
 // Before activations are multiplied. A fence that waits for whatever this thread has asked memory for; mma needs none.
 __device__ __forceinline__ void show_activations() {
@@ -127,15 +208,24 @@ __device__ __forceinline__ void multiply(Block& b, u32 x, int blocks, int tiles,
   if constexpr (FIRST < MT) {
     constexpr int N = group_tiles(MT - FIRST);
     if (FIRST < tiles) {
-      multiply_group<N, EVEN>(b, x, blocks, min(tiles - FIRST, N), sums[FIRST / 8]);
+      GroupProduct<N, EVEN, 0>(b, x, blocks, min(tiles - FIRST, N), sums[FIRST / 8])(nullptr);
       multiply<MT, EVEN, FIRST + N>(b, x, blocks, tiles, sums);
     }
   }
 }
+// The same with what has been loaded ahead.
+template <int MT, int EVEN, int AHEAD>
+__device__ __forceinline__ void multiply(Block& b, u32 x, int blocks, int tiles, float (*sums)[NT * 4],
+                                         const Ahead<group_tiles(MT), AHEAD>& ahead) {
+  if constexpr (AHEAD > 0)
+    GroupProduct<MT, EVEN, AHEAD>(b, x, blocks, tiles, sums[0])(&ahead);
+  else
+    multiply<MT, EVEN>(b, x, blocks, tiles, sums);
+}
 
 // Where a lane's partial sums of 8 tokens lie. Of the last 8 only pairs that exist are kept.
 __device__ __forceinline__ int partial_place(const Block& b, int n) {
-  return n * 512 + (TAIL == 4 || n + 1 < NT ? b.lane : b.g() * TAIL + min(b.t(), TAIL - 1)) * 16;
+  return n * 512 + (TAIL == 4 || n + 1 < NT ? b.lane() : b.g() * TAIL + min(b.t(), TAIL - 1)) * 16;
 }
 // So many parts of a tile, always in the same order.
 template <int PARTS>
@@ -184,6 +274,10 @@ struct Own {
   float4 sums[plan_groups(MT)][OWN<MT>];
   int tile[plan_groups(MT)], n[plan_groups(MT)][OWN<MT>];
   bool mine[plan_groups(MT)][OWN<MT>];
+  // Two parts of one group, 8 or 16 tokens: a warp keeps 8 of them and gives the other 8 to the tile's other warp.
+  static constexpr bool PAIR = FEW && plan_groups(MT) == 1 && group_parts(group_tiles(MT)) == 2;
+  u32 to, from;
+  bool gives;
 
   __device__ __forceinline__ Own(const Block& b, int tiles) {
 #pragma unroll
@@ -195,10 +289,35 @@ struct Own {
       for (int k = 0; k < OWN<MT>; ++k)
         n[i][k] = k * parts + my.part, mine[i][k] = my.tile < size && tile[i] < tiles && n[i][k] < NT;
     }
+    if constexpr (PAIR) {
+      const int mine = n[0][0], other = 1 - mine;
+      gives = tile[0] < imin(tiles, group_tiles(MT)) && other < NT && (other + 1 < NT || b.t() < TAIL);
+      from = (tile[0] & 7) * PARTIAL + partial_place(b, imin(mine, NT - 1));
+      to = (tile[0] & 7) * PARTIAL + partial_place(b, imin(other, NT - 1));
+      if (APART) from = settled(from + M_SUMS), to = settled(to + M_SUMS);
+    }
   }
   // To `sums` come all parts' sums of what is mine. They lie APART, or in `region`: over the operand of the
   // product unless SPREAD.
   __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
+    if constexpr (PAIR) {
+      const float* const s = mixed[0];
+      const bool second = n[0][0] == 1;
+      constexpr int LAST = (NT - 1) * 4;
+      float4 &own = sums[0][0], give;
+      own = second ? make_float4(s[LAST], s[LAST + 1], s[LAST + 2], s[LAST + 3]) : make_float4(s[0], s[1], s[2], s[3]);
+      give = second ? make_float4(s[0], s[1], s[2], s[3]) : make_float4(s[LAST], s[LAST + 1], s[LAST + 2], s[LAST + 3]);
+      byte* const place = b.smem + (APART ? 0 : region);
+      if (!APART) consumers_sync();
+      if (gives) *(float4*)(place + to) = give;
+      __syncwarp();
+      asm volatile("bar.sync %0, 64;" ::"r"(8 + (tile[0] & 7)) : "memory");
+      if (mine[0][0]) {
+        const float4 v = *(const float4*)(place + from);
+        own.x += v.x, own.y += v.y, own.z += v.z, own.w += v.w;
+      }
+      return;
+    }
     byte* const place = b.smem + (APART ? M_SUMS : region);
     auto other = [&](int i, int parts, int part, int n) {
       return (float4*)(place + (plan_others(i * 8) + (tile[i] & 7) * (parts - 1) + part) * PARTIAL +

@@ -7,7 +7,7 @@ constexpr int ITEMS_Q =
 __device__ __forceinline__ void make_rope(const Block& b, int prefix, float2 (&rope)[ITEMS_Q][2]) {
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
-    const int i = b.warp + j * W, qn = b.qn(), kvn = b.kvn(), k = i - qn * NT;
+    const int i = b.warp() + j * W, qn = b.qn(), kvn = b.kvn(), k = i - qn * NT;
     rope[j][0] = rope[j][1] = make_float2(1, 0);
     if (!b.attends() || i >= (qn + kvn) * NT) continue;
     const int tile = k < 0 ? b.q0() + i % qn : b.kv0() + (KVL == 1 ? 0 : k % kvn), n = k < 0      ? i / qn
@@ -24,8 +24,8 @@ __device__ __forceinline__ void make_rope(const Block& b, int prefix, float2 (&r
   if (FEW)
 #pragma unroll
     for (int j = 0; j < ITEMS_Q; ++j)
-      if (b.warp + j * W < (QTL + KVL) * NT)
-        *(float4*)(b.smem + M_ROPE + (b.warp + j * W) * 512 + b.lane * 16) =
+      if (b.warp() + j * W < (QTL + KVL) * NT)
+        *(float4*)(b.smem + M_ROPE + (b.warp() + j * W) * 512 + b.lane() * 16) =
             make_float4(rope[j][0].x, rope[j][0].y, rope[j][1].x, rope[j][1].y);
 }
 
@@ -34,9 +34,9 @@ constexpr float LOWEST = -3e38f;
 __device__ __forceinline__ int ordered(int v) { return v ^ ((v >> 31) & 0x7fffffff); }
 __device__ __forceinline__ int ordered(float v) { return ordered(__float_as_int(v)); }
 
-// q|k|v by mma, for few tokens: of wgmma's 64 rows a third or half would be empty. A warp has all tiles of every 16th
-// fragment, so each block's activations are read once; its weights wait in registers for the stream, and their slots
-// are free early.
+// q|k|v by mma, for few tokens: of wgmma's 64 rows a third or half would be empty. A warp has all tiles of a
+// 16th of the reduction, so each block's activations are read once; its weights, which all lie in one slot, wait in
+// registers for the stream, and their slots are free early.
 struct QkvProduct {
   uint4 weights[QKV_ROUNDS * KB][QKV];
   float sums[QKV][NT][4];
@@ -44,35 +44,40 @@ struct QkvProduct {
 
   __device__ __forceinline__ explicit QkvProduct(int n) : tiles(n) {}
   __device__ __forceinline__ bool some() const { return QT % S == 0 || tiles > 0; }
-  // Missing tiles are loaded, too: whatever lies there.
+  static __host__ __device__ constexpr int slot_log2(int tiles) {
+    int log = 0;
+    while ((2 << log) <= slot_rounds(group_parts(QKV), tiles) * W) ++log;
+    return log;
+  }
+  // Missing tiles are loaded, too: whatever lies there. A warp waits for its own slot alone; the others are full, too,
+  // before it waits for their next contents, as all warps meet behind the products.
   __device__ __forceinline__ void load(Block& b) {
     if (!some()) return;
-    const int rounds_of_slot = slot_rounds(group_parts(QKV), tiles);
-    u32 slot = 0, at = 0, seen = 0;
-    int left = 0;
+    // A slot has 2^in_slot fragments a tile, and a warp QKV_ROUNDS: both powers of two, so shifts are enough.
+    const int in_slot = tiles == QKV       ? slot_log2(QKV)
+                        : tiles == QKV - 1 ? slot_log2(imax(QKV - 1, 1))
+                                           : slot_log2(1);
+    const int first = b.warp() * QKV_ROUNDS;
+    const u32 slots = imax(QKV_ROUNDS * W >> in_slot, 1);
+    u32 slot = b.slot + (first >> in_slot), phase = b.phase;
+    if (slot >= STAGES) slot -= STAGES, phase ^= 1;
+    b.slot += slots;
+    if (b.slot >= STAGES) b.slot -= STAGES, b.phase ^= 1;
+    barrier_wait(b.full(slot), phase);
+    __syncwarp();
+    const u32 at = M_RING + slot * SLOT + (first & ((1 << in_slot) - 1)) * tiles * FRAGMENT;
+    u32 seen = 0;
 #pragma unroll
     for (int r = 0; r < QKV_ROUNDS; ++r) {
-      if (left == 0) {
-        slot = take_slot(b), left = rounds_of_slot, seen = 0;
-        // ldmatrix's second quarter of lanes fetches rows g + 8, which lie behind the other columns of rows g
-        const int place = FP8 ? b.lane * 16 : (b.lane & 7) * 16 + (b.lane >> 3 & 1) * 256 + (b.lane >> 4) * 128;
-        at = M_RING + slot * SLOT + b.warp * tiles * FRAGMENT + place;
-      }
 #pragma unroll
       for (int i = 0; i < QKV; ++i) {
-        uint4 v;
-        if (FP8) {
-          v = *(const uint4*)(b.smem + at + i * FRAGMENT);
-          weights[r * KB][i] = from_e4m3(v.x, v.y), weights[r * KB + KB - 1][i] = from_e4m3(v.z, v.w);
-        } else {
-          ldmatrix(v, b.base + at + i * FRAGMENT);
-          weights[r][i] = v;
-        }
+        const uint4 v = load_weights(b, at + (r * tiles + i) * FRAGMENT);
         seen ^= fold(v);
+#pragma unroll
+        for (int half = 0; half < KB; ++half) weights[r * KB + half][i] = operand_of(v, half);
       }
-      at += W * tiles * FRAGMENT;
-      if (--left == 0 || r + 1 == QKV_ROUNDS) give_slot(b, slot, seen);
     }
+    give_slot(b, slot, seen, slots);
   }
   __device__ __forceinline__ void multiply(const Block& b) {
     constexpr bool EXACT = D16 % (KB * W) == 0;
@@ -81,9 +86,9 @@ struct QkvProduct {
     if (!some()) return;
 #pragma unroll
     for (int k = 0; k < QKV_ROUNDS * KB; ++k) {
-      const int block = (k / KB * W + b.warp) * KB + k % KB;
+      const int block = b.warp() * QKV_ROUNDS * KB + k;
       uint4 v;  // of the first 8 tokens 8 columns, the other 8, then of the next 8 tokens
-      ldmatrix(v, b.base + M_X + (EXACT ? block : min(block, D16 - 1)) * NT * 256 + b.lane * 16);
+      ldmatrix(v, b.base + M_X + (EXACT ? block : min(block, D16 - 1)) * NT * 256 + b.lane() * 16);
 #pragma unroll
       for (int i = 0; i < QKV; ++i)
 #pragma unroll
@@ -93,7 +98,7 @@ struct QkvProduct {
   }
   // With QKV_PAIRS warps i and i + 8 add up their sums, each of them half.
   __device__ __forceinline__ void store(const Block& b, byte* to) {
-    const int upper = b.warp / QKV_PARTS, part = b.warp % QKV_PARTS;
+    const int upper = b.warp() / QKV_PARTS, part = b.warp() % QKV_PARTS;
     auto exists = [&](int i, int n) { return i < tiles && (n + 1 < NT || b.t() < TAIL); };
     auto place = [&](int i, int n) {
       return (float4*)(to + (i * QKV_PARTS + part) * PARTIAL + partial_place(b, n));
@@ -137,14 +142,13 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   float2 shift[ITEMS_Q], scale[ITEMS_Q];
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
-    const int i = b.warp + j * W, k = i - qn * NT;
+    const int i = b.warp() + j * W, k = i - qn * NT;
     const int tile = i >= (qn + kvn) * NT ? 0 : k < 0 ? i % qn : QTL + (KVL == 1 ? 0 : k % kvn);
     shift[j] = make_float2(__ldg(shifted + tile * 16 + b.g()), __ldg(shifted + tile * 16 + b.g() + 8));
     if (FP8) scale[j] = make_float2(__ldg(row_scales + tile * 16 + b.g()), __ldg(row_scales + tile * 16 + b.g() + 8));
   }
   auto await_stream = [&] {
-    receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
-    b.x_parity ^= 1;
+    receive(b, BAR_X, b.x_parity(0), X_EXPECT, WAIT_X);
     MARK(0)
   };
   if constexpr (MMA_QKV) {
@@ -166,11 +170,11 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     store_partials<QKV>(b, b.smem + M_X, qn + kvn, sums);
   }
   consumers_sync();
-  if (threadIdx.x < NT * 8) ((int*)(b.smem + M_PART))[threadIdx.x] = ordered(LOWEST);  // for `weigh_prefix`
+  if (b.thread < NT * 8) ((int*)(b.smem + M_PART))[b.thread] = ordered(LOWEST);  // for `weigh_prefix`
   byte* const staged = b.smem + M_ATT;  // free until all have what attention sends: [item][half][8 tokens][8]
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
-    const int i = b.warp + j * W, k = i - qn * NT;
+    const int i = b.warp() + j * W, k = i - qn * NT;
     if (i < (qn + kvn) * NT) {
       const int n = k < 0      ? i / qn
                     : KVL == 1 ? k
@@ -179,9 +183,9 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
       const int at = k < 0 ? i % qn : qn + kv_tile;
       float4 c = MMA_QKV ? QkvProduct::total(b, b.smem + M_X, at, n) : total<QKV>(b, b.smem + M_X, at, n);
       if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
-      const float2 r = inverse_rms(b, token);
+      const float2 r = inverse_rms(b, token, 0);
       float4 turn = make_float4(rope[j][0].x, rope[j][0].y, rope[j][1].x, rope[j][1].y);
-      if (FEW) turn = *(const float4*)(b.smem + M_ROPE + i * 512 + b.lane * 16);
+      if (FEW) turn = *(const float4*)(b.smem + M_ROPE + i * 512 + b.lane() * 16);
       const float2 u = make_float2(turn.x, turn.y), v = make_float2(turn.z, turn.w);
       const float a0 = c.x * r.x + shift[j].x, a1 = c.z * r.x + shift[j].y, c0 = c.y * r.y + shift[j].x,
                   c1 = c.w * r.y + shift[j].y;
@@ -206,10 +210,10 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   static_assert(S == 8, "half a warp serves half of the ranks");
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
-    const int i = b.warp + j * W;
+    const int i = b.warp() + j * W;
     if (i < qn * NT) {
-      const int n = i / qn, half = b.lane >> 3 & 1, token = b.lane & 7, d0 = b.lane >> 4 << 2;
-      const float4 v = *(const float4*)(staged + i * 256 + (b.lane & 15) * 16);
+      const int n = i / qn, half = b.lane() >> 3 & 1, token = b.lane() & 7, d0 = b.lane() >> 4 << 2;
+      const float4 v = *(const float4*)(staged + i * 256 + (b.lane() & 15) * 16);
       const u32 to = b.base + M_Q + ((b.q0() + i % qn + half * QT) * NT + n) * 128 + token * 16;
       u32 data[4], bars[4];
 #pragma unroll
@@ -219,6 +223,6 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
         for (int d = 0; d < 4; ++d) send(data[d], v, bars[d]);
     }
   }
-  if (IDLE_Q && threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_Q), threadIdx.x));
+  if (IDLE_Q && b.thread < S) send(at_rank(b.base + M_TOKEN, b.thread), 0, at_rank(b.bar(BAR_Q), b.thread));
 }
 constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);

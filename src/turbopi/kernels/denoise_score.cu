@@ -28,7 +28,7 @@ __device__ __forceinline__ void sync() {
 
 // A lane's address for `mma_tokens` in activations [block][half][NT][8 tokens][8 columns], standard order.
 __device__ __forceinline__ u32 token_address(const Block& b, u32 region) {
-  return b.base + region + ((b.lane >> 3 & 1) * NT + (b.lane >> 4)) * 128 + (b.lane & 7) * 16;
+  return b.base + region + ((b.lane() >> 3 & 1) * NT + (b.lane() >> 4)) * 128 + (b.lane() & 7) * 16;
 }
 // One block: a tile's rows times all tokens. What is read beyond the last tokens isn't used.
 __device__ __forceinline__ void mma_tokens(float (&c)[NT][4], uint4 a, u32 from) {
@@ -130,15 +130,15 @@ struct SuffixPart {
 
 // Logits of the rank's suffix keys, by the last four warps; SUFFIX_WARP gets them.
 __device__ __forceinline__ void score_suffix(const Block& b, int count, float (&c)[NT][4]) {
-  const int part = b.warp - SUFFIX_WARP, first = share(QT, 4, part), steps = share(QT, 4, part + 1) - first;
-  const u32 from = b.base + M_X + X_SUFFIX + min(b.lane & 7, count - 1) * RS + first * 32 + (b.lane >> 4) * 16;
+  const int part = b.warp() - SUFFIX_WARP, first = share(QT, 4, part), steps = share(QT, 4, part + 1) - first;
+  const u32 from = b.base + M_X + X_SUFFIX + min(b.lane() & 7, count - 1) * RS + first * 32 + (b.lane() >> 4) * 16;
   auto fetch = [&](int k) {  // rows beyond the last key hold anything
     uint4 v;
     ldmatrix(v, from + k * 32);
     return v;
   };
   score<SUFFIX_STEPS, SUFFIX_STEPS>(b, fetch, first, steps, c);
-  float2* sums = (float2*)(b.smem + M_X + X_SUFFIX_SUMS) + b.lane;
+  float2* sums = (float2*)(b.smem + M_X + X_SUFFIX_SUMS) + b.lane();
   if (part > 0) {
 #pragma unroll
     for (int n = 0; n < NT; ++n) sums[((part - 1) * NT + n) * 32] = make_float2(c[n][0], c[n][1]);
@@ -215,7 +215,7 @@ __device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4
 }
 // Of each token something of this rank, to all ranks.
 __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[NT], int region, int bar) {
-  const u32 to = at_rank(b.base + M_X + region + (b.rank * NT * 8 + 2 * b.t()) * 4, b.g());
+  const u32 to = at_rank(b.base + M_X + region + (b.rank() * NT * 8 + 2 * b.t()) * 4, b.g());
   const u32 at = at_rank(b.bar(bar), b.g());
 #pragma unroll
   for (int n = 0; n < NT; ++n)

@@ -15,9 +15,9 @@ struct Item {
   bool real;           // of this warp, and tokens that exist
 };
 __device__ __forceinline__ Item stream_item(const Block& b, int j) {
-  const u32 i = b.warp + j * W, xn = b.xn();  // unsigned: divisions become shifts
+  const u32 i = b.warp() + j * W, xn = b.xn();  // unsigned: divisions become shifts
   if constexpr (SPREAD) {
-    const int tile = i % DX, n = b.cluster + i / DX * NC;
+    const int tile = i % DX, n = b.cluster() + i / DX * NC;
     const bool real = i < DX * OWN_N && u32(tile) < xn && n < NT;
     return {real ? tile : 0, real ? n : 0, (real ? n : 0) * 8 + 2 * b.t(), real && n * 8 + 2 * b.t() < T};
   }
@@ -33,7 +33,7 @@ __device__ __forceinline__ Item stream_item(const Block& b, int j) {
 __device__ __forceinline__ void done_with_x(const Block& b) {
   show_to_products();  // the copy engine comes behind our reads and writes
   __syncwarp();
-  if (b.lane == 0) barrier_arrive(b.bar(BAR_DONE));
+  if (b.lane() == 0) barrier_arrive(b.bar(BAR_DONE));
 }
 // Nothing was written that a peer reads, so nothing is to be released: that would cost a microsecond.
 __device__ __forceinline__ void arrive_at(u32 bar) {
@@ -41,7 +41,7 @@ __device__ __forceinline__ void arrive_at(u32 bar) {
 }
 // All warps here have multiplied the stream; all ranks have.
 __device__ __forceinline__ void give_room(const Block& b) {
-  if (threadIdx.x < S) arrive_at(at_rank(b.bar(BAR_ROOM), threadIdx.x));
+  if (b.thread < S) arrive_at(at_rank(b.bar(BAR_ROOM), b.thread));
 }
 __device__ __forceinline__ void await_room(const Block& b) {
   barrier_wait(b.bar(BAR_ROOM), b.room & 1);
@@ -61,7 +61,7 @@ __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS
     const float4 y =
         make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
     if (last) {
-      if (item.real) *(float4*)(to + place * 512 + b.lane * 16) = y;
+      if (item.real) *(float4*)(to + place * 512 + b.lane() * 16) = y;
     } else {
       const u32 w0 = pack_operand(y.x, y.z), w1 = pack_operand(y.y, y.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
       if (item.real && item.n * 8 + token < T)
@@ -71,24 +71,24 @@ __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS
     float q0 = x[j].x * x[j].x + x[j].z * x[j].z, q1 = x[j].y * x[j].y + x[j].w * x[j].w;
 #pragma unroll
     for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
-    if (const int i = b.warp + j * W; i < DX * OWN_N && b.g() == 0)
+    if (const int i = b.warp() + j * W; i < DX * OWN_N && b.g() == 0)
       *(float2*)(part + i * 8 + 2 * b.t()) = item.real ? make_float2(q0, q1) : make_float2(0, 0);
   }
   consumers_sync();
-  if (b.warp == 0) {
+  if (b.warp() == 0) {
     float* const squares = (float*)(b.a.scratch + B_SQUARES + (last ? 2 : b.turn & 1) * N_SQUARES);
-    u32* const flags = (u32*)(b.a.scratch + B_FLAGS) + b.rank * 32;
+    u32* const flags = (u32*)(b.a.scratch + B_FLAGS) + b.rank() * 32;
 #pragma unroll
     for (int k = 0; k < OWN_N; ++k)
-      if (const int n = b.cluster + k * NC; n < NT) {
-        if (b.lane < 8) {
+      if (const int n = b.cluster() + k * NC; n < NT) {
+        if (b.lane() < 8) {
           float sum = 0;
 #pragma unroll
-          for (int tile = 0; tile < DX; ++tile) sum += part[(k * DX + tile) * 8 + b.lane];
-          squares[(b.rank * NT + n) * 8 + b.lane] = sum;
+          for (int tile = 0; tile < DX; ++tile) sum += part[(k * DX + tile) * 8 + b.lane()];
+          squares[(b.rank() * NT + n) * 8 + b.lane()] = sum;
         }
         __syncwarp();
-        if (b.lane == 0)  // behind everything that the barrier above was behind of
+        if (b.lane() == 0)  // behind everything that the barrier above was behind of
           asm volatile("st.release.gpu.global.u32 [%0], %1;" ::"l"(flags + n), "r"(b.turn + 1) : "memory");
       }
   }
@@ -108,7 +108,7 @@ __device__ __forceinline__ u32 xs_expect(const Block& b) { return imax(b.xn() * 
 // A spare warp. Buffers in L2 are free when their turn comes again: who writes them has sums, made of what came after,
 // of all clusters that read them. The flags need no acquire: the copy engine reads L2, and only when they are seen.
 __device__ __forceinline__ void fetch_stream(const Block& b) {
-  const u32* const flags = (const u32*)(b.a.scratch + B_FLAGS) + b.rank * 32;
+  const u32* const flags = (const u32*)(b.a.scratch + B_FLAGS) + b.rank() * 32;
   const u32 place = b.x0() * NT, items = b.xn() * NT;
   u32 uses = 0, turn = 0;
 #pragma unroll 1
@@ -119,18 +119,18 @@ __device__ __forceinline__ void fetch_stream(const Block& b) {
       if (!b.attends() && i % 2 == 0 && !last) continue;
       barrier_wait(b.bar(BAR_DONE), uses & 1);
       __syncwarp();
-      if (b.lane < S) arrive_at(at_rank(b.bar(BAR_FREE), b.lane));
+      if (b.lane() < S) arrive_at(at_rank(b.bar(BAR_FREE), b.lane()));
       barrier_wait(b.bar(BAR_FREE), uses++ & 1);
-      if (b.lane < NT) {
+      if (b.lane() < NT) {
         u32 flag;
         do {
-          asm volatile("ld.acquire.gpu.global.u32 %0, [%1];" : "=r"(flag) : "l"(flags + b.lane) : "memory");
+          asm volatile("ld.acquire.gpu.global.u32 %0, [%1];" : "=r"(flag) : "l"(flags + b.lane()) : "memory");
         } while (int(flag - turn) <= 0);
       }
       asm volatile("fence.proxy.async.global;" ::: "memory");
       __syncwarp();
-      if (b.lane == 0) {
-        const uint4* const squares = b.a.scratch + B_SQUARES + (last ? 2 : turn & 1) * N_SQUARES + b.rank * NT * 2;
+      if (b.lane() == 0) {
+        const uint4* const squares = b.a.scratch + B_SQUARES + (last ? 2 : turn & 1) * N_SQUARES + b.rank() * NT * 2;
         const uint4* const from = b.a.scratch + (last ? B_FINAL : B_STAGE + (turn & 1) * N_STAGE);
         if (last)
           asm volatile("cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1], %2, [%3];" ::"r"(
@@ -139,7 +139,7 @@ __device__ __forceinline__ void fetch_stream(const Block& b) {
                        : "memory");
         else if (items > 0)
           load_for_all(b.base + M_X + place * 256, from + place * 16, items * 256, b.bar(BAR_X));
-        load_for_all(b.base + M_SSQ + b.rank * NT * 32, squares, NT * 32, b.bar(last ? BAR_V : BAR_X));
+        load_for_all(b.base + M_SSQ + b.rank() * NT * 32, squares, NT * 32, b.bar(last ? BAR_V : BAR_X));
       }
     }
 }

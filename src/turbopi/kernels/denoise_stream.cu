@@ -6,12 +6,12 @@ __device__ __forceinline__ u32 columns_place(const Block& b, int region, int blo
   const int token = 2 * b.t() + (b.g() & 1);
   return b.base + region + (block * NT + n) * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8;
 }
-__device__ __forceinline__ void send_columns(const Block& b, u32 to, int n, float4 v, int bar, bool real) {
+__device__ __forceinline__ void send_columns(const Block& b, const Everyone& data, const Everyone& bars, int n,
+                                             float4 v, bool real) {
   const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
   const int token = 2 * b.t() + (b.g() & 1);
   if (real && n * 8 + token < T) {
     const u32 lo = b.g() & 1 ? got : w0, hi = b.g() & 1 ? w1 : got;
-    const Everyone data(to), bars(b.bar(bar));
 #pragma unroll
     for (int d = 0; d < S; ++d) send(data.at[d], lo, hi, bars.at[d]);
   }
@@ -28,18 +28,18 @@ __device__ __forceinline__ void send_tile_squares(const Block& b, float4 x, int 
   for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
   if (absent >= 0) q0 = q1 = 0;
   static_assert(S == 8, "lane g serves rank g");
-  const u32 to = b.base + M_SSQ + ((b.rank * DX + tile) * NT * 8 + n * 8 + 2 * b.t()) * 4;
+  const u32 to = b.base + M_SSQ + ((b.rank() * DX + tile) * NT * 8 + n * 8 + 2 * b.t()) * 4;
   if (n * 8 + 2 * b.t() < T)
     send(at_rank(to, b.g()), __float_as_uint(q0), __float_as_uint(q1), at_rank(b.bar(bar), b.g()));
 }
 __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[ITEMS_X], int bar) {
 #pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j) send_tile_squares(b, x[j], b.warp + j * W, bar);
+  for (int j = 0; j < ITEMS_X; ++j) send_tile_squares(b, x[j], b.warp() + j * W, bar);
 }
 constexpr u32 SQUARES_EXPECT = SPREAD ? S * NT * 32 : SQ * ((T + 1) / 2) * 8;
 // 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a spare warp makes them.
-__device__ __forceinline__ float2 inverse_rms(const Block& b, int token) {
-  barrier_wait(b.bar(BAR_RMS), b.x_parity ^ 1);
+__device__ __forceinline__ float2 inverse_rms(const Block& b, int token, int half) {
+  barrier_wait(b.bar(BAR_RMS), b.x_parity(half));
   return *(const float2*)(b.smem + M_RMS + token * 4);
 }
 __device__ __forceinline__ void make_inverse_rms(const Block& b) {
@@ -48,14 +48,14 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
   for (int use = 0; use < uses; ++use) {
     barrier_wait(b.bar(BAR_X), use & 1);
 #pragma unroll 1
-    for (int token = b.lane; token < NT * 8; token += 32) {
+    for (int token = b.lane(); token < NT * 8; token += 32) {
       float sum = 0;
 #pragma unroll 8
       for (int s = 0; s < SQ; ++s) sum += *(const float*)(b.smem + M_SSQ + (s * NT * 8 + token) * 4);
       *(float*)(b.smem + M_RMS + token * 4) = rsqrtf(sum * (1.0f / D) + b.a.eps);
     }
     __syncwarp();
-    if (b.lane == 0) barrier_arrive(b.bar(BAR_RMS));
+    if (b.lane() == 0) barrier_arrive(b.bar(BAR_RMS));
   }
 }
 constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * 32 + SQUARES_EXPECT;
@@ -70,7 +70,7 @@ __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X
 // Partial sums of an item of the stream from all clusters, two in a word.
 constexpr int FETCH = most(NH, 2) < 4 ? most(NH, 2) : 4;  // words at a time: no more than there ever are
 __device__ __forceinline__ const uint4* partials(const Block& b, const uint4* buffer, Item item) {
-  return buffer + ((b.x0() + item.tile) * NT + item.n) * PAIRS * 32 + b.lane;
+  return buffer + ((b.x0() + item.tile) * NT + item.n) * PAIRS * 32 + b.lane();
 }
 // Asks until what `parts` clusters send is there, in words `first` and on; adds it up, without what comes before
 // `from`.
@@ -113,12 +113,14 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
                                        int half) {
   const u32 since = u32(clock64());
   const uint4* words[ITEMS_X];  // addresses are made while there is nothing else to do
-  u32 places[ITEMS_X];
+  Everyone places[ITEMS_X], bars;
+  if (!SPREAD) bars = Everyone(b.bar(BAR_X));
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
-    words[j] = partials(b, buffer, item), places[j] = columns_place(b, M_X, b.x0() + item.tile, item.n);
-    if (PATIENCE) words[j] = settled(words[j]), places[j] = settled(places[j]);
+    words[j] = partials(b, buffer, item);
+    if (PATIENCE) words[j] = settled(words[j]);
+    if (!SPREAD) places[j] = Everyone(columns_place(b, M_X, b.x0() + item.tile, item.n));
   }
   while (u32(clock64()) - since < PATIENCE) {
   }
@@ -143,7 +145,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
     if (!SPREAD && send_on) {
       const float4 y =
           make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
-      send_columns(b, places[j], item.n, y, BAR_X, item.real);
+      send_columns(b, places[j], bars, item.n, y, item.real);
     }
   }
   if constexpr (SPREAD)
@@ -165,17 +167,18 @@ __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, in
   for (int i = 0; i < plan_groups(DX); ++i)
 #pragma unroll
     for (int k = 0; k < OWN<DX>; ++k) {
-      const uint4* const words = buffer + ((b.x0() + own.tile[i]) * NT + own.n[i][k]) * PAIRS * 32 + b.lane;
-      place[i][k] = (uint2*)(words + b.cluster / 2 * 32) + (b.cluster & 1);
+      const uint4* const words = buffer + ((b.x0() + own.tile[i]) * NT + own.n[i][k]) * PAIRS * 32 + b.lane();
+      place[i][k] = (uint2*)(words + b.cluster() / 2 * 32) + (b.cluster() & 1);
       if (FEW) place[i][k] = settled(place[i][k]);
     }
+  const Ahead<group_tiles(DX), RESIDUAL_AHEAD> ahead(b);
   await();
   show_activations();
   float sums[plan_groups(DX)][NT * 4];
   constexpr int EVEN = F16 % NC == 0 && HC % 16 == 0 && QT % 16 == 0 ? 16
                        : F16 % NC == 0 && HC % 8 == 0 && QT % 8 == 0 ? 8
                                                                      : 1;
-  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums);
+  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, ahead);
   then();
   own.add_up(b, region, b.xn(), sums);
 #pragma unroll
@@ -203,28 +206,26 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
   const int gn = b.gn();
   Own<GTL> own(b, gn);
   float2 shift[GROUPS_], scale[GROUPS_];
+  const int token = 2 * b.t() + (b.g() & 1);
+  u32 place[GROUPS_][OWN<GTL>];  // of the hidden units, at any rank
 #pragma unroll
   for (int i = 0; i < GROUPS_; ++i) {
     const int row = (QTL + KVL + min(own.tile[i], GTL - 1)) * 16 + b.g();
     shift[i] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
     if (FP8) scale[i] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
-  }
-  const int token = 2 * b.t() + (b.g() & 1);
-  u32 place[GROUPS_][OWN<GTL>];  // of the hidden units, at any rank
-#pragma unroll
-  for (int i = 0; i < GROUPS_; ++i)
 #pragma unroll
     for (int k = 0; k < OWN<GTL>; ++k) {
       const int at = b.g0() + own.tile[i];
       place[i][k] = b.base + M_HID + ((at >> 1) * NT + own.n[i][k]) * 256 + (at & 1) * 128 + token * 16;
       if (FEW) place[i][k] = settled(place[i][k]);
     }
-  receive(b, BAR_X, b.x_parity, X_EXPECT, WAIT_X);
-  b.x_parity ^= 1;
+  }
+  const Ahead<group_tiles(GTL), GATE_UP_AHEAD> ahead(b);
+  receive(b, BAR_X, b.x_parity(1), X_EXPECT, WAIT_X);
   MARK(13)
   float sums[GROUPS_][NT * 4];
   show_activations();
-  multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums);
+  multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums, ahead);
   MARK(15)
   if constexpr (SPREAD) consumers_sync(), give_room(b);
   own.add_up(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);
@@ -236,7 +237,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
         const int n = own.n[i][k];
         float4 c = own.sums[i][k];
         if (FP8) c = make_float4(c.x * scale[i].x, c.y * scale[i].x, c.z * scale[i].y, c.w * scale[i].y);
-        const float2 r = inverse_rms(b, n * 8 + 2 * b.t());
+        const float2 r = inverse_rms(b, n * 8 + 2 * b.t(), 1);
         const float h0 = gelu(c.x * r.x + shift[i].x) * (c.z * r.x + shift[i].y),
                     h1 = gelu(c.y * r.y + shift[i].x) * (c.w * r.y + shift[i].y);
         // first two, then four, then all 8 units of a token in a lane: four lanes have the same, they share the ranks
@@ -262,7 +263,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
       }
   if constexpr (SPREAD) await_room(b), ++b.room;
   if (IDLE) {
-    inverse_rms(b, 0), consumers_sync();  // no warp may be left behind by a whole use of a barrier
-    if (threadIdx.x < S) send(at_rank(b.base + M_TOKEN, threadIdx.x), 0, at_rank(b.bar(BAR_HID), threadIdx.x));
+    inverse_rms(b, 0, 1), consumers_sync();  // no warp may be left behind by a whole use of a barrier
+    if (b.thread < S) send(at_rank(b.base + M_TOKEN, b.thread), 0, at_rank(b.bar(BAR_HID), b.thread));
   }
 }
