@@ -109,7 +109,8 @@ def write_frames(out: Path, episodes: list[Episode]) -> None:
                 row[name] = file
             rows.append(row | {"expert": chunk(episodes[task], frame.step)})
             table.append(f"| {stem} | {task} | {frame.step} | {frame.phase} |")
-    (out / "frames.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    lines = ",\n".join(json.dumps(row) for row in rows)
+    (out / "frames.json").write_text(f"[\n{lines}\n]\n", encoding="utf-8")
     readme = README.format(
         suite=SUITE,
         state=INITIAL_STATE,

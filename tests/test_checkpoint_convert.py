@@ -40,7 +40,7 @@ def assert_openpis_own(file: Path, kind: str) -> None:
     for name, tensor in written.items():
         theirs = expected["tensors"][name]
         assert (list(tensor.shape), dtypes[tensor.dtype]) == (theirs["shape"], theirs["dtype"])
-        assert name == UNUSED or sha256(tensor) == theirs["sha256"], name
+        assert name == UNUSED or sha256(tensor)[:16] == theirs["sha256"], name
     assert not written[UNUSED].any()
 
 
