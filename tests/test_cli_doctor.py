@@ -32,6 +32,7 @@ def cpu_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(checkups, "nvidia_smi", lambda: (None, []))
     monkeypatch.setattr("psutil.getloadavg", lambda: (0.5, 0.5, 0.5))
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: types.SimpleNamespace(free=100e9))
     monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
 
 
@@ -46,6 +47,14 @@ def test_a_machine_without_a_gpu_is_warned_about_and_passes() -> None:
         assert row["found"]
         assert bool(row["fix"]) == (row["level"] != "OK"), row
         assert "\n" not in row["fix"]
+
+
+@pytest.mark.usefixtures("cpu_only")
+def test_a_disk_without_room_for_a_checkpoint_is_warned_about(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: types.SimpleNamespace(free=3e9))
+    code, rows = doctor()
+    assert code == 0 and rows["disk"]["level"] == "WARN"
+    assert "3 GB free" in rows["disk"]["found"] and "free some" in rows["disk"]["fix"]
 
 
 @pytest.mark.usefixtures("cpu_only")
