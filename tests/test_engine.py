@@ -15,9 +15,9 @@ from turbopi import backends
 from turbopi.backends.cuda_graph import CudaGraphBackend, HostRow
 from turbopi.config import Kind
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
-from turbopi.engine.one_by_one import OPS, Denoiser
 from turbopi.engine.ops import PLAIN, Ops, compiled, geglu, geglu_by_sigmoid, gelu, gelu_by_sigmoid
 from turbopi.engine.weights import modulation, pack
+from turbopi.engine.without_compiler import OPS, Denoiser
 from turbopi.model.reference import Precision
 from turbopi.observation import Observation
 
@@ -75,7 +75,7 @@ def made_up(kind: Kind, cameras: int, tokens: int, seed: int = 0) -> tuple[Obser
     return observation, torch.randn(1, 7, config.action_dim, generator=g)
 
 
-@pytest.mark.parametrize("ops", [PLAIN, OPS], ids=["plain", "one_by_one"])
+@pytest.mark.parametrize("ops", [PLAIN, OPS], ids=["plain", "without_compiler"])
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("steps", [1, 3, 10])
 def test_equals_the_reference_on_golden_cases(case: str, steps: int, ops: Ops) -> None:
@@ -106,7 +106,7 @@ def test_a_longer_prompt_leaves_nothing_behind_for_a_shorter_one() -> None:
     torch.testing.assert_close(answer(call, short, noise), expected, atol=5e-6, rtol=1e-5)
 
 
-@pytest.mark.parametrize("ops", [PLAIN, OPS], ids=["plain", "one_by_one"])
+@pytest.mark.parametrize("ops", [PLAIN, OPS], ids=["plain", "without_compiler"])
 def test_bfloat16_is_as_close_to_float32_as_the_reference_is(ops: Ops) -> None:
     one = golden_cases()["b_third_masked"]
     exact = golden_model("pi05").sample(one.observation, one.noise, 10)[0]
@@ -129,7 +129,7 @@ def test_the_host_buffer_holds_valid_pictures_and_tokens_only() -> None:
     assert call.host.length.item() == 2 * call.config.vision.num_tokens + 5
 
 
-@pytest.mark.parametrize("ops", [PLAIN, OPS], ids=["plain", "one_by_one"])
+@pytest.mark.parametrize("ops", [PLAIN, OPS], ids=["plain", "without_compiler"])
 @pytest.mark.parametrize("horizon", [6, 7, 16])
 def test_rows_between_prefix_and_suffix_are_seen_by_nobody(horizon: int, ops: Ops) -> None:
     observation, _ = made_up("pi05", 1, 19)

@@ -21,7 +21,7 @@ from torch import Tensor
 from turbopi.backends.base import LoadState, Sample, Tier
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.config import ModelConfig
-from turbopi.engine import one_by_one
+from turbopi.engine import without_compiler
 from turbopi.engine.call import Cache, CallShape, Denoiser, Mark, Pictures, StaticCall
 from turbopi.engine.ops import Ops, compiled
 from turbopi.engine.weights import Weights, modulation, pack
@@ -122,10 +122,10 @@ class CudaGraphBackend:
         self._weights = self._pack(load)
         self._ops = self._make_ops()
         rows = MAX_CAMERAS * config.vision.num_tokens + _bucket(config.max_prompt_tokens) + config.action_horizon + 64
-        dtype, joint = self._weights.embed_tokens.dtype, self._ops is one_by_one.OPS
+        dtype, joint = self._weights.embed_tokens.dtype, self._ops is without_compiler.OPS
         self._cache = Cache.allocate(config, rows, device, dtype, joint)
         self._tables: dict[int, Tensor | None] = {}  # by number of steps, as the next
-        self._loops: dict[int, one_by_one.Denoiser] = {}
+        self._loops: dict[int, without_compiler.Denoiser] = {}
         self._calls: dict[CallShape, StaticCall] = {}
         self._pictures: dict[tuple[int, bool], Pictures] = {}  # by cameras, and whether they are float
         self._graphs: dict[tuple[CallShape | Pictures, str], Graph] = {}
@@ -216,14 +216,14 @@ class CudaGraphBackend:
         return pack(self.config, load(self.device, "f32" if self.precision == "f32" else "bf16"))
 
     def _make_ops(self) -> Ops:
-        return compiled() if PyTorchCompileBackend.unavailable(self.device) is None else one_by_one.OPS
+        return compiled() if PyTorchCompileBackend.unavailable(self.device) is None else without_compiler.OPS
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """None: the engine's operations one by one."""
-        if self._ops is not one_by_one.OPS or table is None:
+        if self._ops is not without_compiler.OPS or table is None:
             return None
         if shape.num_steps not in self._loops:
-            self._loops[shape.num_steps] = one_by_one.Denoiser.prepare(self.config, self._weights, table)
+            self._loops[shape.num_steps] = without_compiler.Denoiser.prepare(self.config, self._weights, table)
         return dataclasses.replace(self._loops[shape.num_steps], slots=shape.prefix_slots(self.config))
 
     def _run(self, part: str, row: HostRow, noise: np.ndarray, num_steps: int) -> tuple[StaticCall, Graph]:

@@ -197,12 +197,12 @@ def attention(
     and the suffix's keys begin. With `state_token` the first query token doesn't see keys beyond `slots` (Pi0).
     All query heads read the same keys, so they are rows of one product.
     """
-    logits = _matmul_f32(q, k.t())
+    logits = matmul_f32(q, k.t())
     probabilities = softmax(logits, length, slots, heads, state_token, q.shape[1] ** -0.5, v.dtype)
     return _as_input((probabilities @ v).view(-1, heads * q.shape[1]), q.dtype, inverse)
 
 
-def _matmul_f32(a: Tensor, b: Tensor) -> Tensor:
+def matmul_f32(a: Tensor, b: Tensor) -> Tensor:
     """a @ b with the float32 accumulators kept, which CUDA's library does for bfloat16 inputs."""
     if a.dtype == torch.float32:
         return a @ b
@@ -242,12 +242,12 @@ def compiled() -> Ops:
     """The same operations with torch.compile between the matrix products, for any number of tokens and keys.
 
     Where it is switched off (TORCH_COMPILE_DISABLE or TORCHDYNAMO_DISABLE is 1, which PyTorch reads when it compiles)
-    `one_by_one.OPS`, as what suits a compiler is slower one by one.
+    `without_compiler.OPS`, as what suits a compiler is slower one by one.
     """
     if torch._dynamo.config.disable or os.environ.get("TORCHDYNAMO_DISABLE") == "1":
-        from turbopi.engine import one_by_one  # which is made of this module
+        from turbopi.engine import without_compiler  # which is made of this module
 
-        return one_by_one.OPS
+        return without_compiler.OPS
     softmax = _compiled(masked_softmax)
     compiled_gelu, compiled_geglu = _compiled(gelu_by_sigmoid), _compiled(geglu_by_sigmoid)
 

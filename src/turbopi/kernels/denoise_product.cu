@@ -37,7 +37,7 @@ struct Share {
 
 // A lane's share of a fragment of weights; of bfloat16 as operand A.
 __device__ __forceinline__ uint4 load_weights(const Block& b, u32 at) {
-  if (FP8) return *(const uint4*)(b.smem + at + b.lane() * 16);
+  if (FP8) return load_fragment(b.smem + at, b.lane());
   uint4 v;  // ldmatrix's second quarter of lanes fetches rows g + 8, which lie behind the other columns of rows g
   ldmatrix(v, b.base + at + b.lane() % 8 * 16 + b.lane() / 8 % 2 * 256 + b.lane() / 16 * 128);
   return v;
@@ -297,6 +297,10 @@ struct Own {
       if (APART) from = settled(from + M_SUMS), to = settled(to + M_SUMS);
     }
   }
+  __device__ __forceinline__ void meet() const {  // the warps of my tile, in the one group
+    __syncwarp();
+    asm volatile("bar.sync %0, %1;" ::"r"(8 + (tile[0] & 7)), "n"(group_parts(group_tiles(MT)) * 32) : "memory");
+  }
   // To `sums` come all parts' sums of what is mine. They lie APART, or in `region`: over the operand of the
   // product unless SPREAD.
   __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
@@ -310,8 +314,7 @@ struct Own {
       byte* const place = b.smem + (APART ? 0 : region);
       if (!APART) consumers_sync();
       if (gives) *(float4*)(place + to) = give;
-      __syncwarp();
-      asm volatile("bar.sync %0, 64;" ::"r"(8 + (tile[0] & 7)) : "memory");
+      meet();
       if (mine[0][0]) {
         const float4 v = *(const float4*)(place + from);
         own.x += v.x, own.y += v.y, own.z += v.z, own.w += v.w;
@@ -338,12 +341,10 @@ struct Own {
           *other(i, parts, my.part - (my.part > owner), n) = sum;
       }
     }
-    if ((APART || SPREAD) && plan_groups(MT) == 1) {  // for the warps of my tile
-      __syncwarp();
-      asm volatile("bar.sync %0, %1;" ::"r"(8 + (tile[0] & 7)), "n"(group_parts(group_tiles(MT)) * 32) : "memory");
-    } else {
+    if ((APART || SPREAD) && plan_groups(MT) == 1)
+      meet();
+    else
       consumers_sync();
-    }
 #pragma unroll
     for (int i = 0; i < plan_groups(MT); ++i) {
       const int parts = group_parts(group_tiles(MT - i * 8));

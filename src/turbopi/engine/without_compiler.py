@@ -26,7 +26,7 @@ FEW = 64  # rows whose GeGLU is launches, not bytes
 def product(a: Tensor, weight: Tensor, onto: Tensor | None = None, alpha: float = 1.0) -> Tensor:
     """a @ weightᵀ in float32, or `onto` with that times alpha added in place."""
     if onto is None:
-        return plain._matmul_f32(a, weight.t())
+        return plain.matmul_f32(a, weight.t())
     if a.dtype == onto.dtype:
         return onto.addmm_(a, weight.t(), alpha=alpha)
     if a.is_cuda:
