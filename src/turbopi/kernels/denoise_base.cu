@@ -48,7 +48,7 @@ constexpr int QTL = most(QT, S);           // query tiles of a CTA: 8 RoPE pairs
 constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
-constexpr u32 PATIENCE = FEW ? 400 : 0;    // clock cycles before sums are asked for: polls slow down what they wait for
+constexpr u32 PATIENCE = FEW ? 500 : 0;    // clock cycles before sums are asked for: polls slow down what they wait for
 constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see denoise_spread.cu
 constexpr int OWN_N = most(NT, NC);        // if so: 8 tokens of the slice at a time, which a CTA looks after
 constexpr int ITEMS_X = most(SPREAD ? DX * OWN_N : DX * NT, W);  // (tile, 8 tokens) that one warp looks after
@@ -131,7 +131,9 @@ constexpr int OUTPUT = SPREAD ? 256 : 512;
 constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * OUTPUT;
 constexpr int X_SUFFIX_SUMS_FEW = X_P + (KT + 1) * NT * 256,
               X_KEEP = X_SUFFIX_SUMS_FEW + (SPREAD ? 0 : 3 * NT * 256), X_SUFFIX = X_KEEP + up128(NT * 32);
-constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);  // between steps
+// Between steps: what ranks add to v_t, then the slice in float32; if tokens are few by item, and what it adds to v_t.
+constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);
+constexpr int XS_PART = A > 32 ? 512 : 0, XS_ITEM = imax(XS_PART + A * 32, 512);  // over the item, if read at once
 // If SPREAD, region X holds everything, as each exchange waits until all ranks are done with what lay there: attention
 // and queries behind qkv's sums, hidden units over the stream with the feed-forward's partial sums behind them.
 // Attention comes when the suffix's partial logits are no longer needed.
@@ -143,7 +145,7 @@ constexpr int X_SPREAD = imax(X_Q + QT * NT * 256, X_FF_SUMS + imax(plan_others(
 constexpr int X_SIZE =
     up128(imax(imax(X_BYTES, SPREAD ? X_SPREAD : X_SUFFIX + 2 * SUFFIX * RS),
                imax(imax(MMA_QKV ? QKV * QKV_PARTS : plan_partials(QKV), SPREAD ? 0 : plan_partials(GTL)) * PARTIAL,
-                    X_XS + DX * 16 * (SPREAD ? NT * 8 : T) * 4)));
+                    X_XS + (SPREAD ? DX * 16 * NT * 8 * 4 : DX * NT * XS_ITEM))));
 // Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down. Hidden
 // units, or queries, land when a peer has this rank's slice, which follows out's, or down's, sums.
 constexpr int H_Q = 0, H_ATT = QT * NT * 256, H_BYTES = imax(2 * QT, HC) * NT * 256;

@@ -151,6 +151,154 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   }
 }
 
+// ---- the same of few tokens: x_t lies in shared memory, token w is warp w's
+
+// action_in_proj of a warp's items. What it needs besides x_t is asked for before x_t is there.
+struct Embedding {
+  static constexpr bool EARLY = ITEMS_X == 1 && A <= 32;
+  float4 weights[EARLY ? A / 4 : 1][2];
+  float2 bias[ITEMS_X], scale[ITEMS_X];
+
+  static __device__ __forceinline__ int column(const Block& b, int j) {
+    return (b.x0() + stream_item(b, j).tile) * 16 + 2 * b.g();
+  }
+  static __device__ __forceinline__ float4 weight(const Block& b, int column, int k, int odd) {
+    return __ldg((const float4*)(b.a.in_w + size_t(column + odd) * A) + k);
+  }
+  __device__ __forceinline__ Embedding(const Block& b, const float* scales) {
+#pragma unroll
+    for (int j = 0; j < ITEMS_X; ++j) {
+      bias[j] = __ldg((const float2*)(b.a.in_b + column(b, j)));
+      scale[j] = __ldg((const float2*)(scales + column(b, j)));
+    }
+    if (EARLY)
+#pragma unroll
+      for (int i = 0; i < A / 2; ++i) weights[i / 2][i % 2] = weight(b, column(b, 0), i / 2, i % 2);
+  }
+  __device__ __forceinline__ void multiply(const Block& b, float4 (&x)[ITEMS_X]) const {
+#pragma unroll
+    for (int j = 0; j < ITEMS_X; ++j) {
+      const Item item = stream_item(b, j);
+      const float4* const x0 = (const float4*)(b.smem + M_XT) + min(item.token, T - 1) * (A / 4);
+      const float4* const x1 = (const float4*)(b.smem + M_XT) + min(item.token + 1, T - 1) * (A / 4);
+      float4 c = make_float4(bias[j].x, bias[j].x, bias[j].y, bias[j].y);
+#pragma unroll(EARLY ? A / 4 : 4)
+      for (int k = 0; k < A / 4; ++k) {
+        const float4 w0 = EARLY ? weights[EARLY ? k : 0][0] : weight(b, column(b, j), k, 0),
+                     w1 = EARLY ? weights[EARLY ? k : 0][1] : weight(b, column(b, j), k, 1);
+        const float4 y0 = x0[k], y1 = x1[k];
+        c.x += w0.x * y0.x + w0.y * y0.y + w0.z * y0.z + w0.w * y0.w,
+            c.y += w0.x * y1.x + w0.y * y1.y + w0.z * y1.z + w0.w * y1.w;
+        c.z += w1.x * y0.x + w1.y * y0.y + w1.z * y0.z + w1.w * y0.w,
+            c.w += w1.x * y1.x + w1.y * y1.y + w1.z * y1.z + w1.w * y1.w;
+      }
+      x[j] = item.real ? c : make_float4(0, 0, 0, 0);
+    }
+  }
+  __device__ __forceinline__ void send(const Block& b, const float4 (&x)[ITEMS_X]) const {
+    if (!b.attends()) return;
+    __syncwarp();
+#pragma unroll
+    for (int j = 0; j < ITEMS_X; ++j) {
+      const Item item = stream_item(b, j);
+      const float2 s = scale[j];
+      send_columns(b, Everyone(columns_place(b, M_X, b.x0() + item.tile, item.n)), Everyone(b.bar(BAR_X)), item.n,
+                   make_float4(x[j].x * s.x, x[j].y * s.x, x[j].z * s.y, x[j].w * s.y), item.real);
+    }
+    send_squares(b, x, BAR_X);
+  }
+};
+
+// From what `gather` kept to the next step's stream, whose norm has these scales.
+__device__ __forceinline__ void advance_few(Block& b, float4 (&x)[ITEMS_X], const float* scales, int step) {
+  send_squares(b, x, BAR_V);
+  __syncwarp();
+#pragma unroll
+  for (int j = 0; j < ITEMS_X; ++j) {
+    const int i = b.warp() + j * W, xn = b.xn();
+    if (i >= xn * NT) continue;
+    const float* const w = b.a.out_w + size_t((b.x0() + i % xn) * 16) * A;
+    const float4* const y = (const float4*)kept_item(b, i);
+    const bool more = i / xn + 1 < NT || TAIL > 2;  // than four tokens
+#pragma unroll 1
+    for (int first = 0; first < A; first += 32) {
+      const int number = min(first + b.lane(), A - 1);
+      float4 low = make_float4(0, 0, 0, 0), high = low;
+#pragma unroll
+      for (int c = 0; c < 16; ++c) {
+        const float v = __ldg(w + c * A + number);
+        const float4 y0 = y[c * 2];
+        low.x += v * y0.x, low.y += v * y0.y, low.z += v * y0.z, low.w += v * y0.w;
+        if (more) {
+          const float4 y1 = y[c * 2 + 1];
+          high.x += v * y1.x, high.y += v * y1.y, high.z += v * y1.z, high.w += v * y1.w;
+        }
+      }
+      __syncwarp();
+      float* const to = kept_item(b, i) + XS_PART / 4 + number;
+      to[0] = low.x, to[A] = low.y, to[2 * A] = low.z, to[3 * A] = low.w;
+      if (more) to[4 * A] = high.x, to[5 * A] = high.y, to[6 * A] = high.z, to[7 * A] = high.w;
+    }
+  }
+  consumers_sync();
+  const int token = b.warp();
+  if (token < T) {
+    static_assert(S % 4 == 0, "a lane serves every fourth rank");
+    const float4* const parts = (const float4*)(kept_item(b, token / 8 * b.xn()) + XS_PART / 4 + token % 8 * A);
+#pragma unroll 1
+    for (int q = b.lane() % 8; q < A / 4; q += 8) {
+      float4 sum = make_float4(0, 0, 0, 0);
+#pragma unroll
+      for (int tile = 0; tile < DX; ++tile)
+        if (D16 % S == 0 || tile < b.xn()) {
+          const float4 v = parts[tile * (XS_ITEM / 16) + q];
+          sum.x += v.x, sum.y += v.y, sum.z += v.z, sum.w += v.w;
+        }
+      const u32 to = b.base + M_X + X_VPART + ((b.rank() * T + token) * A + q * 4) * 4;
+#pragma unroll
+      for (int d = b.lane() / 8; d < S; d += 4) send(at_rank(to, d), sum, at_rank(b.bar(BAR_V), d));
+    }
+  }
+  const Embedding embedding(b, scales);
+  const float* const shifts = b.a.out_shift + step * A;
+  const float shift = __ldg(shifts + min(b.lane(), A - 1));
+  receive(b, BAR_V, step, V_EXPECT, WAIT_V);
+  if (token < T) {
+    const float* const parts = (const float*)(b.smem + M_X + X_VPART) + token * A;
+    float q = 0;
+#pragma unroll
+    for (int s = 0; s < most(SQ, 32); ++s)
+      if (SQ % 32 == 0 || s * 32 + b.lane() < SQ)
+        q += ((const float*)(b.smem + M_SSQ))[(s * 32 + b.lane()) * NT * 8 + token];
+#pragma unroll
+    for (int o = 1; o < 32; o *= 2) q += exchange(q, o);
+    const float inverse = rsqrtf(q * (1.0f / D) + b.a.eps);
+#pragma unroll 1
+    for (int number = b.lane(); number < A; number += 32) {
+      float v = 0;
+#pragma unroll
+      for (int s = 0; s < S; ++s) v += parts[s * T * A + number];
+      v = v * inverse + (number < 32 ? shift : __ldg(shifts + number));
+      const int at = token * A + number;
+      float* const xt = (float*)(b.smem + M_XT) + at;
+      const float next = __fadd_rn(*xt, __fmul_rn(b.a.dt, v));
+      *xt = next;
+      if (b.cta == 0) {
+        b.a.v_t[size_t(step) * T * A + at] = v;
+        b.a.x_t[size_t(step + 1) * T * A + at] = next;
+      }
+    }
+  }
+  MARK(20)
+  if (step + 1 == b.a.steps) return;
+  consumers_sync();
+  if (b.thread < S) arrive_at(at_rank(b.bar(BAR_GO), b.thread));
+  embedding.multiply(b, x);
+  note(b, WAIT_GO);
+  barrier_wait(b.bar(BAR_GO), step & 1);  // a peer's slice lands where this rank has read the partial sums
+  embedding.send(b, x);
+}
+
 __device__ __forceinline__ u32 hidden_bytes(const Block& b) { return b.hn() * 16 * T * 2 + (IDLE ? S * 4 : 0); }
 
 __device__ __forceinline__ void consume(Block& b) {
@@ -172,9 +320,15 @@ __device__ __forceinline__ void consume(Block& b) {
   if (threadIdx.x < 32) ((u32*)(b.smem + M_BAR + 256))[threadIdx.x] = threadIdx.x ? 0 : u32(clock64());
   consumers_sync();
 #endif
+  if constexpr (!SPREAD) {
+    const Embedding first(b, a.table);
+    consumers_sync();
+    first.multiply(b, x), first.send(b, x);
+  }
 #pragma unroll 1
   for (int step = 0; step < a.steps; ++step) {
-    embed(b, actions, x, a.table + size_t(step) * (2 * L + 1) * 3 * D);
+    const float* const scales = a.table + size_t(step) * (2 * L + 1) * 3 * D;
+    if constexpr (SPREAD) embed(b, actions, x, scales);
     MARK(19)
 #pragma unroll 1
     for (; b.n < u32(step + 1) * L; ++b.n) {
@@ -227,12 +381,16 @@ __device__ __forceinline__ void consume(Block& b) {
         MARK(half ? 18 : 11)
         note(b, half ? WAIT_X1 : WAIT_X2);
         gather(b, x, buffer, half ? NC : NH, bit, gates, scales,
-               !half || (!last && (SPREAD || b.attends())), half);
+               !half || (!last && (SPREAD || b.attends())), half, half && last);
         MARK(half ? 14 : 12)
       }
     }
-    advance(b, actions, x, a.table + (size_t(step + 1) * (2 * L + 1) - 1) * 3 * D, step);
-    MARK(20)
+    if constexpr (SPREAD) {
+      advance(b, actions, x, scales + 2 * L * 3 * D, step);
+      MARK(20)
+    } else {
+      advance_few(b, x, step + 1 < a.steps ? scales + (2 * L + 1) * 3 * D : scales, step);
+    }
   }
   note(b, FINISHED);
 #ifdef TP_TRACE
@@ -282,6 +440,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
       make_inverse_rms(b);
     } else if (SPREAD) {
       fetch_stream(b);
+    } else {
+      keep_awake(b);
     }
   }
   __syncwarp();

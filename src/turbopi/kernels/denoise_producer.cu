@@ -5,7 +5,7 @@
 struct Producer {
   // Few tokens' bfloat16 weights take half of the loop's time to load. At full speed they come in bursts, and what the
   // CTAs tell each other is late: so loads are some cycles apart, and those of gate|up wait for the keys' scores.
-  static constexpr u32 PACE = FEW && !FP8 ? 600 : 0;
+  static constexpr u32 PACE = FEW && !FP8 ? 750 : 0;
   static constexpr bool AHEAD = plan_slots(GTL, D16) > STAGES;  // some of gate|up finds no slot before it begins
   Block& b;
   uint2* list;  // of slots: where from, bytes; an odd number of bytes: of keys or values, else of weights

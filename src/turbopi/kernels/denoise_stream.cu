@@ -47,16 +47,32 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
 #pragma unroll 1
   for (int use = 0; use < uses; ++use) {
     barrier_wait(b.bar(BAR_X), use & 1);
+    constexpr int LANES = FEW ? 32 / (NT * 8) : 1;  // of a token
 #pragma unroll 1
-    for (int token = b.lane(); token < NT * 8; token += 32) {
+    for (int token = FEW ? b.lane() % (NT * 8) : b.lane(); token < NT * 8; token += 32) {
       float sum = 0;
 #pragma unroll 8
-      for (int s = 0; s < SQ; ++s) sum += *(const float*)(b.smem + M_SSQ + (s * NT * 8 + token) * 4);
+      for (int s = FEW ? b.lane() / (NT * 8) : 0; s < SQ; s += LANES)
+        sum += *(const float*)(b.smem + M_SSQ + (s * NT * 8 + token) * 4);
+#pragma unroll
+      for (int o = NT * 8; FEW && o < 32; o *= 2) sum += exchange(sum, o);
       *(float*)(b.smem + M_RMS + token * 4) = rsqrtf(sum * (1.0f / D) + b.a.eps);
     }
     __syncwarp();
     if (b.lane() == 0) barrier_arrive(b.bar(BAR_RMS));
   }
+}
+// Tensor cores that have rested for most of a microsecond slow the clock down when they begin again (measured: 1.73 GHz,
+// where it is 1.80 if they never rest so long). A spare warp multiplies zeros now and then.
+__device__ __forceinline__ void keep_awake(const Block& b) {
+  float c[4] = {0, 0, 0, 0};
+  const u32 zero = b.a.zero;
+#pragma unroll 1
+  while (*(volatile u32*)(b.smem + M_PROGRESS) >> 20 != FINISHED) {
+    mma_half(c, make_uint4(zero, zero, zero, zero), make_uint2(zero, zero));
+    __nanosleep(100);
+  }
+  if (c[0] != 0) *(volatile u32*)(b.smem + M_TOKEN) = 0;  // never, but the compiler can't know
 }
 constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * 32 + SQUARES_EXPECT;
 
@@ -106,11 +122,24 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
   }
 }
 
+// For `advance`, of few tokens: a warp's item as [16 columns][8 tokens]. Region X is free: every rank's hidden units have
+// come, so no sums of gate|up are still being read there.
+__device__ __forceinline__ float* kept_item(const Block& b, int i) {
+  return (float*)(b.smem + M_X + X_XS + i * XS_ITEM);
+}
+__device__ __forceinline__ void keep_item(const Block& b, int j, float4 y) {
+  const int i = b.warp() + j * W;
+  if (i >= b.xn() * NT) return;
+  float* const to = kept_item(b, i) + b.g() * 16 + b.t() * 2;
+  *(float2*)to = make_float2(y.x, y.y), *(float2*)(to + 8) = make_float2(y.z, y.w);
+}
+
 // Fetch `parts` clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
-// slice times the next norm's scale to all ranks (SPREAD: publish it). buffer: [D16][NT][PAIRS][32] 16-byte words.
+// slice times the next norm's scale to all ranks (SPREAD: publish it), if `last` keep it. buffer:
+// [D16][NT][PAIRS][32] 16-byte words.
 __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
-                                       int half) {
+                                       int half, bool last) {
   const u32 since = u32(clock64());
   const uint4* words[ITEMS_X];  // addresses are made while there is nothing else to do
   Everyone places[ITEMS_X], bars;
@@ -142,10 +171,13 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
     if (j == 0) {
       MARK(21 + half)
     }
-    if (!SPREAD && send_on) {
+    if (!SPREAD && (send_on || last)) {
       const float4 y =
           make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
-      send_columns(b, places[j], bars, item.n, y, item.real);
+      if (send_on)
+        send_columns(b, places[j], bars, item.n, y, item.real);
+      else
+        keep_item(b, j, y);
     }
   }
   if constexpr (SPREAD)
