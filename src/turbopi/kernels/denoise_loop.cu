@@ -1,6 +1,8 @@
 // Part 11 of 11: between steps, the loop, the kernel.
 
-constexpr int GROUPS = CONSUMERS / A, HELD = most(T, GROUPS);  // threads per action number, tokens each of them keeps
+constexpr int GROUPS = CONSUMERS / A;  // threads per action number
+// Tokens that a thread keeps. If SPREAD they are the CTA's own, which OWNERS of the groups divide among them.
+constexpr int OWNERS = imin(GROUPS, OWN_T), HELD = SPREAD ? most(OWN_T, OWNERS) : most(T, GROUPS);
 
 // Thread (action number, token group) looks after x_t[group + i * GROUPS][number]. It keeps them in shared memory if
 // tokens are few, as registers are dear in the loop.
@@ -9,12 +11,17 @@ struct Actions {
 
   static __device__ __forceinline__ int number(const Block& b) { return b.thread % A; }
   static __device__ __forceinline__ int group(const Block& b) { return b.thread / A; }
+  static __device__ __forceinline__ int own(const Block& b, int i) {  // which of the CTA's tokens
+    return imin(group(b) % OWNERS + i * OWNERS, OWN_T - 1);
+  }
+  static __device__ __forceinline__ int token(const Block& b, int i) {
+    return SPREAD ? (b.cluster() + own(b, i) / 8 * NC) * 8 + own(b, i) % 8 : group(b) + i * GROUPS;
+  }
   static __device__ __forceinline__ bool exists(const Block& b, int i) {
-    return group(b) < GROUPS && group(b) + i * GROUPS < T;
+    return group(b) < (SPREAD ? OWNERS : GROUPS) && token(b, i) < T;
   }
-  static __device__ __forceinline__ int place(const Block& b, int i) {
-    return (group(b) + i * GROUPS) * A + number(b);
-  }
+  static __device__ __forceinline__ int place(const Block& b, int i) { return token(b, i) * A + number(b); }
+  static __device__ __forceinline__ bool writes(const Block& b) { return SPREAD ? b.rank() == 0 : b.cta == 0; }
   __device__ __forceinline__ float get(const Block& b, int i) const {
     return SPREAD ? kept[SPREAD ? i : 0] : ((const float*)(b.smem + M_XT))[place(b, i)];
   }
@@ -28,11 +35,11 @@ struct Actions {
 
 // x_t to the stream: action_in_proj, this rank's slice.
 __device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (&x)[ITEMS_X], const float* scale) {
-  float* xt = (float*)(b.smem + (SPREAD ? M_HID : M_XT));
+  float* xt = (float*)(b.smem + (SPREAD ? M_X + X_V_XT : M_XT));
   if (SPREAD)
 #pragma unroll
-    for (int i = 0; i < HELD; ++i)
-      if (Actions::exists(b, i)) xt[Actions::place(b, i)] = actions.get(b, i);
+    for (int i = 0; i < HELD; ++i)  // of tokens that don't exist zeros
+      if (Actions::group(b) < OWNERS) xt[Actions::own(b, i) * A + Actions::number(b)] = actions.get(b, i);
   consumers_sync();
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
@@ -41,8 +48,8 @@ __device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (
     const int col = (b.x0() + item.tile) * 16 + 2 * b.g();
     if (item.real) {
       const float* w = b.a.in_w + size_t(col) * A;
-      const float* x0 = xt + item.token * A;
-      const float* x1 = xt + min(item.token + 1, T - 1) * A;
+      const float* x0 = xt + (SPREAD ? item.n / NC * 8 + 2 * b.t() : item.token) * A;
+      const float* x1 = SPREAD ? x0 + A : xt + min(item.token + 1, T - 1) * A;
       float4 c = make_float4(b.a.in_b[col], b.a.in_b[col], b.a.in_b[col + 1], b.a.in_b[col + 1]);
 #pragma unroll(FEW ? 8 : 4)
       for (int k = 0; k < A; k += 4) {
@@ -66,32 +73,85 @@ __device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (
     float2 scales[ITEMS_X];
     load_columns(b, scales, scale);
     if (b.attends()) done_with_x(b);
-    publish_stream(b, x, scales, false);
+    publish_stream(b, x, scales);
   } else if (b.attends()) {
     send_squares(b, x, BAR_X);
   }
 }
 
-constexpr u32 V_EXPECT = S * T * A * 4 + SQUARES_EXPECT;
+constexpr u32 V_EXPECT = SPREAD ? S * (V_PARTS * A + 1) * OWN_T * 4 : S * T * A * 4 + SQUARES_EXPECT;
+
+// The same if SPREAD, where each cluster does it for its own tokens, with what `keep_slice` left. Peers that have this
+// rank's hidden units may write where it has multiplied the stream.
+__device__ __forceinline__ void advance_own(Block& b, Actions& actions, int step) {
+  consumers_sync();
+  auto to_all = [&](u32 at, float v) {
+#pragma unroll
+    for (int d = 0; d < S; ++d) send(at_rank(b.base + M_X + at, d), __float_as_uint(v), at_rank(b.bar(BAR_V), d));
+  };
+  const int number = Actions::number(b), part = Actions::group(b) / OWNERS;
+  if (part < V_PARTS) {
+    const int first = share(b.xn() * 4, V_PARTS, part), end = share(b.xn() * 4, V_PARTS, part + 1);
+    const float* const w = b.a.out_w + size_t(b.x0()) * 16 * A + number;
+    const float* const slice = (const float*)(b.smem + M_X + X_V_SLICE);
+    float sum[HELD];
+#pragma unroll
+    for (int i = 0; i < HELD; ++i) sum[i] = 0;
+#pragma unroll 8
+    for (int c = first * 4; c < end * 4; c += 4) {
+      float v[4];
+#pragma unroll
+      for (int k = 0; k < 4; ++k) v[k] = __ldg(w + (c + k) * A);
+#pragma unroll
+      for (int i = 0; i < HELD; ++i) {
+        const float4 y = *(const float4*)(slice + Actions::own(b, i) * XS_ROW + c);
+        sum[i] += v[0] * y.x, sum[i] += v[1] * y.y, sum[i] += v[2] * y.z, sum[i] += v[3] * y.w;
+      }
+    }
+#pragma unroll
+    for (int i = 0; i < HELD; ++i)
+      if (i + 1 < HELD || OWN_T % OWNERS == 0 || Actions::group(b) % OWNERS < OWN_T % OWNERS)
+        to_all(X_V + (((b.rank() * V_PARTS + part) * OWN_T + Actions::own(b, i)) * A + number) * 4, sum[i]);
+  }
+  if (b.thread < OWN_T) to_all(X_V_SQUARES + (b.rank() * OWN_T + b.thread) * 4, slice_squares(b, b.thread));
+  receive(b, BAR_V, step, V_EXPECT, WAIT_V);
+  const float* const parts = (const float*)(b.smem + M_X + X_V);
+  const float* const squares = (const float*)(b.smem + M_X + X_V_SQUARES);
+  const float shift = __ldg(b.a.out_shift + step * A + number);
+#pragma unroll
+  for (int i = 0; i < HELD; ++i)
+    if (Actions::exists(b, i)) {
+      const int own = Actions::own(b, i), at = Actions::place(b, i);
+      float v = 0, q = 0;
+#pragma unroll
+      for (int s = 0; s < S * V_PARTS; ++s) v += parts[(s * OWN_T + own) * A + number];
+#pragma unroll
+      for (int s = 0; s < S; ++s) q += squares[s * OWN_T + own];
+      v = v * rsqrtf(q * (1.0f / D) + b.a.eps) + shift;
+      const float next = __fadd_rn(actions.get(b, i), __fmul_rn(b.a.dt, v));
+      actions.set(b, i, next);
+      if (Actions::writes(b)) {
+        b.a.v_t[size_t(step) * T * A + at] = v;
+        b.a.x_t[size_t(step + 1) * T * A + at] = next;
+      }
+    }
+}
 
 // Final norm, action_out_proj and the Euler step. Each rank's slice gives partial sums of v_t, which go to all ranks.
 // Region X is free for them: every rank's hidden units have come, so no gate|up sums are still being read there.
 __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4 (&x)[ITEMS_X], const float* scale,
                                         int step) {
   float* xs = (float*)(b.smem + M_X + X_XS);
-  if constexpr (SPREAD) receive(b, BAR_XS, step, xs_expect(b), WAIT_V);
 #pragma unroll
-  for (int j = 0; j < (SPREAD ? 0 : ITEMS_X); ++j) {
+  for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
     const float2 s = __ldg((const float2*)(scale + (b.x0() + item.tile) * 16 + 2 * b.g()));
     float* p = xs + (item.tile * 16 + 2 * b.g()) * T + item.token;
     if (item.real) p[0] = x[j].x * s.x, p[T] = x[j].z * s.y;
     if (item.real && item.token + 1 < T) p[1] = x[j].y * s.x, p[T + 1] = x[j].w * s.y;
   }
-  if constexpr (!SPREAD) {
-    send_squares(b, x, BAR_V);
-    consumers_sync();
-  }
+  send_squares(b, x, BAR_V);
+  consumers_sync();
   float sum[HELD];
 #pragma unroll
   for (int i = 0; i < HELD; ++i) sum[i] = 0;
@@ -99,15 +159,13 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   const u32 mine = b.rank() * T * A + Actions::place(b, 0);
   if (active) {
     const float* w = b.a.out_w + size_t(b.x0()) * 16 * A + Actions::number(b);
-#pragma unroll(HELD == 1 ? 32 : SPREAD ? 16 : 8)
+#pragma unroll(HELD == 1 ? 32 : 8)
     for (int c = 0; c < b.xn() * 16; ++c) {
       const float v = __ldg(w + c * A);
 #pragma unroll
       for (int i = 0; i < HELD; ++i) {
         const int token = min(Actions::group(b) + i * GROUPS, T - 1);
-        sum[i] += v * xs[SPREAD ? (c / 16 * NT + token / 8) * 128 + (c % 16 / 2 * 4 + token % 8 / 2) * 4 + c % 2 * 2 +
-                                      token % 2
-                                : c * T + token];
+        sum[i] += v * xs[c * T + token];
       }
     }
 #pragma unroll
@@ -144,7 +202,6 @@ __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4
   }
   if (step + 1 < b.a.steps) {  // a peer's next slice lands where this rank has read the partial sums
     consumers_sync();
-    if constexpr (SPREAD) return;
     if (b.thread < S) arrive_at(at_rank(b.bar(BAR_GO), b.thread));
     note(b, WAIT_GO);
     barrier_wait(b.bar(BAR_GO), step & 1);
@@ -162,7 +219,9 @@ __device__ __forceinline__ void consume(Block& b) {
     if (Actions::exists(b, i)) {
       const float noise = a.noise[Actions::place(b, i)];
       actions.set(b, i, noise);
-      if (b.cta == 0) a.x_t[Actions::place(b, i)] = noise;
+      if (Actions::writes(b)) a.x_t[Actions::place(b, i)] = noise;
+    } else if (SPREAD) {
+      actions.set(b, i, 0);
     }
   float2 rope[ITEMS_Q][2];
   make_rope(b, prefix, rope);
@@ -222,8 +281,8 @@ __device__ __forceinline__ void consume(Block& b) {
                            SPREAD ? M_X + (half ? X_FF_SUMS : 0) : M_H, buffer, bit, await, then);
         else
           load_norm();
-        if constexpr (SPREAD)
-          if (!half || b.attends() || last) done_with_x(b);
+        if constexpr (SPREAD)  // behind the last layer `embed` says it
+          if (!half || (b.attends() && !last)) done_with_x(b);
         MARK(half ? 18 : 11)
         note(b, half ? WAIT_X1 : WAIT_X2);
         gather(b, x, buffer, half ? NC : NH, bit, gates, scales,
@@ -231,7 +290,10 @@ __device__ __forceinline__ void consume(Block& b) {
         MARK(half ? 14 : 12)
       }
     }
-    advance(b, actions, x, a.table + (size_t(step + 1) * (2 * L + 1) - 1) * 3 * D, step);
+    if constexpr (SPREAD)
+      advance_own(b, actions, step);
+    else
+      advance(b, actions, x, a.table + (size_t(step + 1) * (2 * L + 1) - 1) * 3 * D, step);
     MARK(20)
   }
   note(b, FINISHED);
@@ -252,7 +314,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     barrier_init(b.bar(BAR_GO), S), barrier_init(b.bar(BAR_RMS), 1);
     if constexpr (SPREAD) {
       barrier_init(b.bar(BAR_DONE), W), barrier_init(b.bar(BAR_FREE), S);
-      barrier_init(b.bar(BAR_ROOM), S), barrier_init(b.bar(BAR_XS), 1);
+      barrier_init(b.bar(BAR_ROOM), S);
     }
     asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     barrier_expect(b.bar(BAR_X), X_EXPECT);
@@ -262,7 +324,6 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     barrier_expect(b.bar(BAR_ATT), ATT_EXPECT);
     barrier_expect(b.bar(BAR_HID), hidden_bytes(b));
     barrier_expect(b.bar(BAR_V), V_EXPECT);
-    if constexpr (SPREAD) barrier_expect(b.bar(BAR_XS), xs_expect(b));
   }
   __syncthreads();
   cluster_exchange();

@@ -162,7 +162,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   } else {
     await_stream();
     float sums[plan_groups(QKV)][NT * 4];
-    show_activations();
+    if (!SPREAD) show_activations();
     multiply<QKV, D16>(b, b.base + M_X, D16, qn + kvn, sums);
     MARK(1)
     consumers_sync();
