@@ -139,13 +139,12 @@ constexpr int X_ATT = up128(imax(X_SUFFIX + 2 * SUFFIX * RS,
                                  imax(plan_partials(QKV), plan_others(DX)) * PARTIAL)),
               X_Q = X_ATT + imax(QT, 3) * NT * 256, X_FF_SUMS = HC * NT * 256;
 constexpr int X_SUFFIX_SUMS = SPREAD ? X_ATT : X_SUFFIX_SUMS_FEW;
-// Behind them, when hidden units are here: what ends a step, float32. Partial sums of v_t [S][V_PARTS][OWN_T][A], sums of
-// squares [S][OWN_T], the slice [OWN_T][XS_ROW], x_t [OWN_T][A].
-constexpr int OWN_T = OWN_N * 8, V_PARTS = imax(CONSUMERS / A / OWN_T, 1), XS_ROW = DX * 16 + 4;
-constexpr int X_V = up128(X_FF_SUMS + imax(plan_others(GTL), plan_others(DX)) * PARTIAL),
-              X_V_SQUARES = X_V + S * V_PARTS * OWN_T * A * 4, X_V_SLICE = X_V_SQUARES + S * OWN_T * 4,
-              X_V_XT = X_V_SLICE + OWN_T * XS_ROW * 4;
-constexpr int X_SPREAD = imax(X_Q + QT * NT * 256, X_V_XT + OWN_T * A * 4);
+// Behind them float32 at a step's end: partial sums of v_t [S][V_PARTS][OWN_T][A], the slice [DX * 16][OWN_T], x_t.
+constexpr int OWN_T = SPREAD ? OWN_N * 8 : T;  // tokens whose x_t a CTA knows
+constexpr int V_PARTS = SPREAD ? imax(CONSUMERS / A / OWN_T, 1) : 1;
+constexpr int X_OWN_V = up128(X_FF_SUMS + imax(plan_others(GTL), plan_others(DX)) * PARTIAL),
+              X_OWN_XS = X_OWN_V + S * V_PARTS * OWN_T * A * 4, X_OWN_XT = X_OWN_XS + DX * 16 * OWN_T * 4;
+constexpr int X_SPREAD = imax(X_Q + QT * NT * 256, X_OWN_XT + OWN_T * A * 4);
 constexpr int X_SIZE =
     up128(imax(imax(X_BYTES, SPREAD ? X_SPREAD : X_SUFFIX + 2 * SUFFIX * RS),
                imax(imax(MMA_QKV ? QKV * QKV_PARTS : plan_partials(QKV), SPREAD ? 0 : plan_partials(GTL)) * PARTIAL,

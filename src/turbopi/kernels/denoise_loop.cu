@@ -1,24 +1,23 @@
 // Part 11 of 11: between steps, the loop, the kernel.
 
-constexpr int GROUPS = CONSUMERS / A;  // threads per action number
-// Tokens that a thread keeps. If SPREAD they are the CTA's own, which OWNERS of the groups divide among them.
-constexpr int OWNERS = imin(GROUPS, OWN_T), HELD = SPREAD ? most(OWN_T, OWNERS) : most(T, GROUPS);
+// Threads per action number; those that keep x_t (if SPREAD the others help to add up), tokens that each of them keeps.
+constexpr int GROUPS = CONSUMERS / A, OWNERS = SPREAD ? imin(GROUPS, OWN_T) : GROUPS, HELD = most(OWN_T, OWNERS);
 
-// Thread (action number, token group) looks after x_t[group + i * GROUPS][number]. It keeps them in shared memory if
-// tokens are few, as registers are dear in the loop.
+// Thread (action number, token group) looks after x_t[group + i * OWNERS][number], or if SPREAD that of the CTA's own
+// tokens. It keeps them in shared memory if tokens are few, as registers are dear in the loop.
 struct Actions {
   float kept[SPREAD ? HELD : 1];
 
   static __device__ __forceinline__ int number(const Block& b) { return b.thread % A; }
   static __device__ __forceinline__ int group(const Block& b) { return b.thread / A; }
-  static __device__ __forceinline__ int own(const Block& b, int i) {  // which of the CTA's tokens
-    return imin(group(b) % OWNERS + i * OWNERS, OWN_T - 1);
+  static __device__ __forceinline__ int index(const Block& b, int i) {  // among the OWN_T
+    return (SPREAD ? group(b) % OWNERS : group(b)) + i * OWNERS;
   }
   static __device__ __forceinline__ int token(const Block& b, int i) {
-    return SPREAD ? (b.cluster() + own(b, i) / 8 * NC) * 8 + own(b, i) % 8 : group(b) + i * GROUPS;
+    return SPREAD ? (b.cluster() + index(b, i) / 8 * NC) * 8 + index(b, i) % 8 : index(b, i);
   }
   static __device__ __forceinline__ bool exists(const Block& b, int i) {
-    return group(b) < (SPREAD ? OWNERS : GROUPS) && token(b, i) < T;
+    return group(b) < OWNERS && index(b, i) < OWN_T && token(b, i) < T;
   }
   static __device__ __forceinline__ int place(const Block& b, int i) { return token(b, i) * A + number(b); }
   static __device__ __forceinline__ bool writes(const Block& b) { return SPREAD ? b.rank() == 0 : b.cta == 0; }
@@ -35,11 +34,12 @@ struct Actions {
 
 // x_t to the stream: action_in_proj, this rank's slice.
 __device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (&x)[ITEMS_X], const float* scale) {
-  float* xt = (float*)(b.smem + (SPREAD ? M_X + X_V_XT : M_XT));
+  float* xt = (float*)(b.smem + (SPREAD ? M_X + X_OWN_XT : M_XT));
   if (SPREAD)
 #pragma unroll
     for (int i = 0; i < HELD; ++i)  // of tokens that don't exist zeros
-      if (Actions::group(b) < OWNERS) xt[Actions::own(b, i) * A + Actions::number(b)] = actions.get(b, i);
+      if (Actions::group(b) < OWNERS && Actions::index(b, i) < OWN_T)
+        xt[Actions::index(b, i) * A + Actions::number(b)] = actions.get(b, i);
   consumers_sync();
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
@@ -81,126 +81,74 @@ __device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (
 
 constexpr u32 V_EXPECT = SPREAD ? S * (V_PARTS * A + 1) * OWN_T * 4 : S * T * A * 4 + SQUARES_EXPECT;
 
-// The same if SPREAD, where each cluster does it for its own tokens, with what `keep_slice` left. Peers that have this
-// rank's hidden units may write where it has multiplied the stream.
-__device__ __forceinline__ void advance_own(Block& b, Actions& actions, int step) {
-  consumers_sync();
-  auto to_all = [&](u32 at, float v) {
-#pragma unroll
-    for (int d = 0; d < S; ++d) send(at_rank(b.base + M_X + at, d), __float_as_uint(v), at_rank(b.bar(BAR_V), d));
-  };
-  const int number = Actions::number(b), part = Actions::group(b) / OWNERS;
-  if (part < V_PARTS) {
-    const int first = share(b.xn() * 4, V_PARTS, part), end = share(b.xn() * 4, V_PARTS, part + 1);
-    const float* const w = b.a.out_w + size_t(b.x0()) * 16 * A + number;
-    const float* const slice = (const float*)(b.smem + M_X + X_V_SLICE);
-    float sum[HELD];
-#pragma unroll
-    for (int i = 0; i < HELD; ++i) sum[i] = 0;
-#pragma unroll 8
-    for (int c = first * 4; c < end * 4; c += 4) {
-      float v[4];
-#pragma unroll
-      for (int k = 0; k < 4; ++k) v[k] = __ldg(w + (c + k) * A);
-#pragma unroll
-      for (int i = 0; i < HELD; ++i) {
-        const float4 y = *(const float4*)(slice + Actions::own(b, i) * XS_ROW + c);
-        sum[i] += v[0] * y.x, sum[i] += v[1] * y.y, sum[i] += v[2] * y.z, sum[i] += v[3] * y.w;
-      }
-    }
-#pragma unroll
-    for (int i = 0; i < HELD; ++i)
-      if (i + 1 < HELD || OWN_T % OWNERS == 0 || Actions::group(b) % OWNERS < OWN_T % OWNERS)
-        to_all(X_V + (((b.rank() * V_PARTS + part) * OWN_T + Actions::own(b, i)) * A + number) * 4, sum[i]);
-  }
-  if (b.thread < OWN_T) to_all(X_V_SQUARES + (b.rank() * OWN_T + b.thread) * 4, slice_squares(b, b.thread));
-  receive(b, BAR_V, step, V_EXPECT, WAIT_V);
-  const float* const parts = (const float*)(b.smem + M_X + X_V);
-  const float* const squares = (const float*)(b.smem + M_X + X_V_SQUARES);
-  const float shift = __ldg(b.a.out_shift + step * A + number);
-#pragma unroll
-  for (int i = 0; i < HELD; ++i)
-    if (Actions::exists(b, i)) {
-      const int own = Actions::own(b, i), at = Actions::place(b, i);
-      float v = 0, q = 0;
-#pragma unroll
-      for (int s = 0; s < S * V_PARTS; ++s) v += parts[(s * OWN_T + own) * A + number];
-#pragma unroll
-      for (int s = 0; s < S; ++s) q += squares[s * OWN_T + own];
-      v = v * rsqrtf(q * (1.0f / D) + b.a.eps) + shift;
-      const float next = __fadd_rn(actions.get(b, i), __fmul_rn(b.a.dt, v));
-      actions.set(b, i, next);
-      if (Actions::writes(b)) {
-        b.a.v_t[size_t(step) * T * A + at] = v;
-        b.a.x_t[size_t(step + 1) * T * A + at] = next;
-      }
-    }
-}
-
 // Final norm, action_out_proj and the Euler step. Each rank's slice gives partial sums of v_t, which go to all ranks.
-// Region X is free for them: every rank's hidden units have come, so no gate|up sums are still being read there.
+// Region X is free for them: every rank's hidden units have come, so no gate|up sums are still being read there. If
+// SPREAD each cluster does so for its own tokens, and more threads than there are sums share the columns.
 __device__ __forceinline__ void advance(Block& b, Actions& actions, const float4 (&x)[ITEMS_X], const float* scale,
                                         int step) {
-  float* xs = (float*)(b.smem + M_X + X_XS);
+  float* xs = (float*)(b.smem + M_X + (SPREAD ? X_OWN_XS : X_XS));
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
     const float2 s = __ldg((const float2*)(scale + (b.x0() + item.tile) * 16 + 2 * b.g()));
-    float* p = xs + (item.tile * 16 + 2 * b.g()) * T + item.token;
-    if (item.real) p[0] = x[j].x * s.x, p[T] = x[j].z * s.y;
-    if (item.real && item.token + 1 < T) p[1] = x[j].y * s.x, p[T + 1] = x[j].w * s.y;
+    float* p = xs + (item.tile * 16 + 2 * b.g()) * OWN_T + (SPREAD ? item.n / NC * 8 + 2 * b.t() : item.token);
+    if (item.real) p[0] = x[j].x * s.x, p[OWN_T] = x[j].z * s.y;
+    if (item.real && item.token + 1 < T) p[1] = x[j].y * s.x, p[OWN_T + 1] = x[j].w * s.y;
+    if constexpr (SPREAD) keep_squares(b, x[j], j, item.real);
   }
-  send_squares(b, x, BAR_V);
+  if constexpr (!SPREAD) send_squares(b, x, BAR_V);
   consumers_sync();
+  auto to_all = [&](u32 at, float v) {
+#pragma unroll
+    for (int d = 0; d < S; ++d) send(at_rank(b.base + at, d), __float_as_uint(v), at_rank(b.bar(BAR_V), d));
+  };
   float sum[HELD];
 #pragma unroll
   for (int i = 0; i < HELD; ++i) sum[i] = 0;
-  const bool active = Actions::exists(b, 0);
-  const u32 mine = b.rank() * T * A + Actions::place(b, 0);
+  const int part = SPREAD ? Actions::group(b) / OWNERS : 0;
+  const bool active = SPREAD ? part < V_PARTS : Actions::exists(b, 0);
+  const u32 mine = (b.rank() * V_PARTS + part) * OWN_T * A + (Actions::index(b, 0) * A + Actions::number(b));
   if (active) {
     const float* w = b.a.out_w + size_t(b.x0()) * 16 * A + Actions::number(b);
+    const int end = share(b.xn() * 16, V_PARTS, part + 1);
 #pragma unroll(HELD == 1 ? 32 : 8)
-    for (int c = 0; c < b.xn() * 16; ++c) {
+    for (int c = share(b.xn() * 16, V_PARTS, part); c < end; ++c) {
       const float v = __ldg(w + c * A);
 #pragma unroll
-      for (int i = 0; i < HELD; ++i) {
-        const int token = min(Actions::group(b) + i * GROUPS, T - 1);
-        sum[i] += v * xs[c * T + token];
-      }
+      for (int i = 0; i < HELD; ++i) sum[i] += v * xs[c * OWN_T + min(Actions::index(b, i), OWN_T - 1)];
     }
 #pragma unroll
     for (int i = 0; i < HELD; ++i)
-      if (Actions::exists(b, i))
-#pragma unroll
-        for (int d = 0; d < S; ++d)
-          send(at_rank(b.base + M_X + X_VPART + (mine + i * GROUPS * A) * 4, d), __float_as_uint(sum[i]),
-               at_rank(b.bar(BAR_V), d));
+      if (SPREAD ? Actions::index(b, i) < OWN_T : Actions::exists(b, i))
+        to_all(M_X + (SPREAD ? X_OWN_V : X_VPART) + (mine + i * OWNERS * A) * 4, sum[i]);
   }
+  if constexpr (SPREAD)
+    if (b.thread < OWN_T) to_all(M_SSQ + (b.rank() * OWN_T + b.thread) * 4, slice_squares(b, b.thread));
   receive(b, BAR_V, step, V_EXPECT, WAIT_V);
   if (active) {
-    const float* parts = (const float*)(b.smem + M_X + X_VPART);
+    const float* parts = (const float*)(b.smem + M_X + (SPREAD ? X_OWN_V : X_VPART));
     const float* squares = (const float*)(b.smem + M_SSQ);
     const float shift = __ldg(b.a.out_shift + step * A + Actions::number(b));
 #pragma unroll
     for (int i = 0; i < HELD; ++i) {
-      const int token = Actions::group(b) + i * GROUPS, at = Actions::place(b, i);
+      const int own = Actions::index(b, i), at = own * A + Actions::number(b), place = Actions::place(b, i);
       if (Actions::exists(b, i)) {
         float v = 0, q = 0;
 #pragma unroll
-        for (int s = 0; s < S; ++s) v += parts[s * T * A + at];
+        for (int s = 0; s < S * V_PARTS; ++s) v += parts[s * OWN_T * A + at];
 #pragma unroll
-        for (int s = 0; s < SQ; ++s) q += squares[s * NT * 8 + token];
+        for (int s = 0; s < SQ; ++s) q += squares[s * (SPREAD ? OWN_T : NT * 8) + own];
         v = v * rsqrtf(q * (1.0f / D) + b.a.eps) + shift;
         const float next = __fadd_rn(actions.get(b, i), __fmul_rn(b.a.dt, v));
         actions.set(b, i, next);
-        if (b.cta == 0) {
-          b.a.v_t[size_t(step) * T * A + at] = v;
-          b.a.x_t[size_t(step + 1) * T * A + at] = next;
+        if (Actions::writes(b)) {
+          b.a.v_t[size_t(step) * T * A + place] = v;
+          b.a.x_t[size_t(step + 1) * T * A + place] = next;
         }
       }
     }
   }
-  if (step + 1 < b.a.steps) {  // a peer's next slice lands where this rank has read the partial sums
+  if (!SPREAD && step + 1 < b.a.steps) {  // a peer's next slice lands where this rank has read the partial sums
     consumers_sync();
     if (b.thread < S) arrive_at(at_rank(b.bar(BAR_GO), b.thread));
     note(b, WAIT_GO);
@@ -290,10 +238,7 @@ __device__ __forceinline__ void consume(Block& b) {
         MARK(half ? 14 : 12)
       }
     }
-    if constexpr (SPREAD)
-      advance_own(b, actions, step);
-    else
-      advance(b, actions, x, a.table + (size_t(step + 1) * (2 * L + 1) - 1) * 3 * D, step);
+    advance(b, actions, x, a.table + (size_t(step + 1) * (2 * L + 1) - 1) * 3 * D, step);
     MARK(20)
   }
   note(b, FINISHED);

@@ -101,21 +101,6 @@ __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS
   ++b.turn;
 }
 
-// The same at a step's end: it stays here, in float32, for `advance`.
-__device__ __forceinline__ void keep_slice(const Block& b, const float4 (&x)[ITEMS_X],
-                                           const float2 (&scales)[ITEMS_X]) {
-#pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j) {
-    const int i = b.warp() + j * W;
-    if (i < DX * OWN_N) {  // zeros of what doesn't exist
-      float* const to = (float*)(b.smem + M_X + X_V_SLICE) + (i / DX * 8 + 2 * b.t()) * XS_ROW + i % DX * 16 + 2 * b.g();
-      *(float2*)to = make_float2(x[j].x * scales[j].x, x[j].z * scales[j].y);
-      *(float2*)(to + XS_ROW) = make_float2(x[j].y * scales[j].x, x[j].w * scales[j].y);
-    }
-    keep_squares(b, x[j], j, stream_item(b, j).real);
-  }
-}
-
 // `bytes` from L2 to the same place of all ranks, counted in by `bar` of each.
 __device__ __forceinline__ void load_for_all(u32 to, const void* from, u32 bytes, u32 bar) {
   asm volatile(

@@ -107,7 +107,7 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
 }
 
 // Fetch `parts` clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
-// slice times the next norm's scale to all ranks (SPREAD: publish it, else keep it for `advance`). buffer: [D16][NT][PAIRS][32] 16-byte words.
+// slice times the next norm's scale to all ranks (SPREAD: publish it). buffer: [D16][NT][PAIRS][32] 16-byte words.
 __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
                                        int half) {
@@ -148,13 +148,11 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
       send_columns(b, places[j], bars, item.n, y, item.real);
     }
   }
-  if constexpr (SPREAD) {
-    if (send_on)
+  if (send_on) {
+    if constexpr (SPREAD)
       publish_stream(b, x, scales);
     else
-      keep_slice(b, x, scales);
-  } else if (send_on) {
-    send_squares(b, x, BAR_X);
+      send_squares(b, x, BAR_X);
   }
 }
 
@@ -263,17 +261,14 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
         const u32 far_lo = exchange(lo, 16), far_hi = exchange(hi, 16);
         const uint4 units =
             b.g() & 4 ? make_uint4(far_lo, far_hi, lo, hi) : make_uint4(lo, hi, far_lo, far_hi);
-        if constexpr (SPREAD) {
-          if (i + k == 0) await_room(b);
-          if (n * 8 + token < T)
-#pragma unroll
-            for (int d = 0; d < QUARTER; ++d) send(window[d] + (place[i][k] - b.base), units, hidden_bars[d]);
-        } else if (n * 8 + token < T) {
+        if (SPREAD && i + k == 0) await_room(b);
+        if (n * 8 + token < T) {
           u32 data[QUARTER], bars[QUARTER];
 #pragma unroll
           for (int d = 0; d < QUARTER; ++d) {
             const int rank = (b.g() >> 1) * QUARTER + d;
-            data[d] = at_rank(place[i][k], rank), bars[d] = at_rank(b.bar(BAR_HID), rank);
+            data[d] = SPREAD ? window[d] + (place[i][k] - b.base) : at_rank(place[i][k], rank);
+            bars[d] = SPREAD ? hidden_bars[d] : at_rank(b.bar(BAR_HID), rank);
           }
 #pragma unroll
           for (int d = 0; d < QUARTER; ++d) send(data[d], units, bars[d]);
