@@ -276,6 +276,7 @@ SHAPES = pytest.mark.parametrize(
         ("shallow", 2, 16, 968, None),
         ("shallow", 2, 17, 77, None),
         ("shallow", 2, 24, 968, None),
+        ("shallow", 1, 48, 1000, None),
         ("shallow", 3, 50, 968, None),
         ("shallow", 1, 56, 1000, None),
         ("shallow", 3, 10, 1, None),

@@ -37,7 +37,7 @@ PARTS = tuple(
     f"denoise_{part}.cu"
     for part in (
         *("base", "primitives", "wgmma", "producer", "product", "spread", "stream"),
-        *("project", "score", "attention", "loop"),
+        *("project", "score", "attention", "step", "loop"),
     )
 )
 THREADS = (WARPS + 4) * 32
@@ -86,7 +86,7 @@ def kernel_sizes(
     stream = most(arrangement.clusters, 2) * (g.width // BLOCK) * groups * 32
     scratch = 4 * stream + suffix * g.head_dim
     if suffix > FEW:
-        scratch += g.width // BLOCK * groups * 64 + RANKS * (groups * 6 + 8)
+        scratch += g.width // BLOCK * groups * 32 + RANKS * (groups * 4 + 8)
     return {
         "TP_D": g.width,
         "TP_F": g.mlp_dim,
@@ -100,7 +100,8 @@ def kernel_sizes(
         "TP_KEY_TILES": most(cache_rows, BLOCK),
         "TP_FP8": int(fp8),
         "TP_DIVISOR": DIVISOR,
-        "TP_RPS": 4 if suffix <= 24 else 2,  # larger slots of weights are faster, if enough of them fit
+        # Larger slots of weights are faster, if enough of them fit.
+        "TP_RPS": 4 if suffix <= (48 if cache_rows <= 1024 else 24) else 2,
         "TP_SMEM": shared_bytes,
         "TP_SCRATCH": scratch,
     }

@@ -1,4 +1,4 @@
-// Part 10 of 11: attention. The keys are split over the ranks of the head's cluster.
+// Part 10 of 12: attention. The keys are split over the ranks of the head's cluster.
 
 // Attention of this cluster's head, sent to all ranks. Everything local lies in region X.
 __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix_all) {

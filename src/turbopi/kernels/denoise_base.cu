@@ -1,5 +1,5 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
-// Part 1 of 11, which denoise.py puts together: sizes, shared memory, a CTA's view.
+// Part 1 of 12, which denoise.py puts together: sizes, shared memory, a CTA's view.
 //
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
@@ -48,7 +48,7 @@ constexpr int QTL = most(QT, S);           // query tiles of a CTA: 8 RoPE pairs
 constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
-constexpr u32 PATIENCE = FEW ? 500 : 0;    // clock cycles before sums are asked for: polls slow down what they wait for
+constexpr u32 PATIENCE = FEW ? 500 : 600;  // clock cycles before sums are asked for: polls slow down what they wait for
 constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see denoise_spread.cu
 constexpr int OWN_N = most(NT, NC);        // if so: 8 tokens of the slice at a time, which a CTA looks after
 constexpr int ITEMS_X = most(SPREAD ? DX * OWN_N : DX * NT, W);  // (tile, 8 tokens) that one warp looks after
@@ -141,11 +141,15 @@ constexpr int X_ATT = up128(imax(X_SUFFIX + 2 * SUFFIX * RS,
                                  imax(plan_partials(QKV), plan_others(DX)) * PARTIAL)),
               X_Q = X_ATT + imax(QT, 3) * NT * 256, X_FF_SUMS = HC * NT * 256;
 constexpr int X_SUFFIX_SUMS = SPREAD ? X_ATT : X_SUFFIX_SUMS_FEW;
-constexpr int X_SPREAD = imax(X_Q + QT * NT * 256, X_FF_SUMS + imax(plan_others(GTL), plan_others(DX)) * PARTIAL);
+// Behind them float32 at a step's end: partial sums of v_t [S][V_PARTS][OWN_T][A], the slice [DX * 16][OWN_T], x_t.
+constexpr int OWN_T = OWN_N * 8, V_PARTS = imax(CONSUMERS / A / OWN_T, 1);  // tokens whose x_t a CTA knows
+constexpr int X_OWN_V = up128(X_FF_SUMS + imax(plan_others(GTL), plan_others(DX)) * PARTIAL),
+              X_OWN_XS = X_OWN_V + S * V_PARTS * OWN_T * A * 4, X_OWN_XT = X_OWN_XS + DX * 16 * OWN_T * 4;
+constexpr int X_SPREAD = imax(X_Q + QT * NT * 256, X_OWN_XT + OWN_T * A * 4);
 constexpr int X_SIZE =
     up128(imax(imax(X_BYTES, SPREAD ? X_SPREAD : X_SUFFIX + 2 * SUFFIX * RS),
                imax(imax(MMA_QKV ? QKV * QKV_PARTS : plan_partials(QKV), SPREAD ? 0 : plan_partials(GTL)) * PARTIAL,
-                    X_XS + (SPREAD ? DX * 16 * NT * 8 * 4 : DX * NT * XS_ITEM))));
+                    SPREAD ? 0 : X_XS + DX * NT * XS_ITEM)));
 // Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down. Hidden
 // units, or queries, land when a peer has this rank's slice, which follows out's, or down's, sums.
 constexpr int H_Q = 0, H_ATT = QT * NT * 256, H_BYTES = imax(2 * QT, HC) * NT * 256;
@@ -171,7 +175,7 @@ constexpr int BEHIND = imax(SIZE_SSQ + SIZE_PART + up128(NT * 32) + SIZE_BAR + S
 constexpr int SPREAD_STAGES = imin((TP_SMEM - X_SIZE - BEHIND) / SLOT, 7);
 constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + (SPREAD ? SPREAD_STAGES * SLOT : H_SIZE);
 constexpr int M_Q = SPREAD ? M_X + X_Q : M_H + H_Q, M_ATT = SPREAD ? M_X + X_ATT : M_H + H_ATT,
-              M_HID = SPREAD ? M_X : M_H;  // queries, attention, hidden units; if SPREAD between steps x_t
+              M_HID = SPREAD ? M_X : M_H;  // queries, attention, hidden units
 constexpr int M_PART = M_SSQ + SIZE_SSQ;        // of this slice, by tile; in attention largest logits
 constexpr int M_RMS = M_PART + SIZE_PART;       // 1 / rms of each token
 constexpr int M_ROPE = M_RMS + up128(NT * 32);  // if tokens are few: see `make_rope`
@@ -188,8 +192,8 @@ static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little sha
 
 // ring: full and empty, by slot
 enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };
-// if SPREAD: region X read by all warps here, by all ranks; the stream multiplied by all ranks; the slice in float32
-enum SpreadBarrier { BAR_DONE = BAR_RING + 2 * 7, BAR_FREE, BAR_ROOM, BAR_XS };
+// if SPREAD: region X read by all warps here, by all ranks; the stream multiplied by all ranks
+enum SpreadBarrier { BAR_DONE = BAR_RING + 2 * 7, BAR_FREE, BAR_ROOM };
 
 // ---- scratch in global memory, in 16-byte words
 
@@ -201,11 +205,9 @@ constexpr size_t N_STREAM = size_t(D16) * NT * PAIRS * 32;
 constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;
 constexpr size_t N_KV = size_t(T) * HD / 2;              // suffix keys and values, float32[T][2 HD]
 constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM;
-// If SPREAD: the stream as products take it, twice, and at a step's end in float32 [D16][NT][32 lanes][4]; sums of
-// squares float32[3][S][NT * 8]; flags u32[S][32].
+// If SPREAD: the stream as products take it, sums of squares float32[S][NT * 8], both twice; flags u32[S][32].
 constexpr size_t N_STAGE = size_t(D16) * NT * 16, N_SQUARES = size_t(S) * NT * 2;
-constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_FINAL = B_STAGE + 2 * N_STAGE, B_SQUARES = B_FINAL + 2 * N_STAGE,
-                 B_FLAGS = B_SQUARES + 3 * N_SQUARES;
+constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_SQUARES = B_STAGE + 2 * N_STAGE, B_FLAGS = B_SQUARES + 2 * N_SQUARES;
 constexpr size_t SCRATCH = SPREAD ? B_FLAGS + S * 8 : B_STAGE;
 static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");
 

@@ -1,316 +1,15 @@
-// Part 11 of 11: between steps, the loop, the kernel.
-
-constexpr int GROUPS = CONSUMERS / A, HELD = most(T, GROUPS);  // threads per action number, tokens each of them keeps
-
-// Thread (action number, token group) looks after x_t[group + i * GROUPS][number]. It keeps them in shared memory if
-// tokens are few, as registers are dear in the loop.
-struct Actions {
-  float kept[SPREAD ? HELD : 1];
-
-  static __device__ __forceinline__ int number(const Block& b) { return b.thread % A; }
-  static __device__ __forceinline__ int group(const Block& b) { return b.thread / A; }
-  static __device__ __forceinline__ bool exists(const Block& b, int i) {
-    return group(b) < GROUPS && group(b) + i * GROUPS < T;
-  }
-  static __device__ __forceinline__ int place(const Block& b, int i) {
-    return (group(b) + i * GROUPS) * A + number(b);
-  }
-  __device__ __forceinline__ float get(const Block& b, int i) const {
-    return SPREAD ? kept[SPREAD ? i : 0] : ((const float*)(b.smem + M_XT))[place(b, i)];
-  }
-  __device__ __forceinline__ void set(const Block& b, int i, float x) {
-    if (SPREAD)
-      kept[SPREAD ? i : 0] = x;
-    else
-      ((float*)(b.smem + M_XT))[place(b, i)] = x;
-  }
-};
-
-// x_t to the stream: action_in_proj, this rank's slice.
-__device__ __forceinline__ void embed(Block& b, const Actions& actions, float4 (&x)[ITEMS_X], const float* scale) {
-  float* xt = (float*)(b.smem + (SPREAD ? M_HID : M_XT));
-  if (SPREAD)
-#pragma unroll
-    for (int i = 0; i < HELD; ++i)
-      if (Actions::exists(b, i)) xt[Actions::place(b, i)] = actions.get(b, i);
-  consumers_sync();
-#pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j) {
-    const Item item = stream_item(b, j);
-    x[j] = make_float4(0, 0, 0, 0);
-    const int col = (b.x0() + item.tile) * 16 + 2 * b.g();
-    if (item.real) {
-      const float* w = b.a.in_w + size_t(col) * A;
-      const float* x0 = xt + item.token * A;
-      const float* x1 = xt + min(item.token + 1, T - 1) * A;
-      float4 c = make_float4(b.a.in_b[col], b.a.in_b[col], b.a.in_b[col + 1], b.a.in_b[col + 1]);
-#pragma unroll(FEW ? 8 : 4)
-      for (int k = 0; k < A; k += 4) {
-        const float4 w0 = __ldg((const float4*)(w + k)), w1 = __ldg((const float4*)(w + A + k));
-        const float4 y0 = *(const float4*)(x0 + k), y1 = *(const float4*)(x1 + k);
-        c.x += w0.x * y0.x + w0.y * y0.y + w0.z * y0.z + w0.w * y0.w,
-            c.y += w0.x * y1.x + w0.y * y1.y + w0.z * y1.z + w0.w * y1.w;
-        c.z += w1.x * y0.x + w1.y * y0.y + w1.z * y0.z + w1.w * y0.w,
-            c.w += w1.x * y1.x + w1.y * y1.y + w1.z * y1.z + w1.w * y1.w;
-      }
-      x[j] = c;
-    }
-    __syncwarp();
-    if (!SPREAD && b.attends()) {
-      const float2 s = __ldg((const float2*)(scale + col));
-      send_columns(b, Everyone(columns_place(b, M_X, b.x0() + item.tile, item.n)), Everyone(b.bar(BAR_X)), item.n,
-                   make_float4(x[j].x * s.x, x[j].y * s.x, x[j].z * s.y, x[j].w * s.y), item.real);
-    }
-  }
-  if constexpr (SPREAD) {
-    float2 scales[ITEMS_X];
-    load_columns(b, scales, scale);
-    if (b.attends()) done_with_x(b);
-    publish_stream(b, x, scales, false);
-  } else if (b.attends()) {
-    send_squares(b, x, BAR_X);
-  }
-}
-
-constexpr u32 V_EXPECT = S * T * A * 4 + SQUARES_EXPECT;
-
-// Final norm, action_out_proj and the Euler step. Each rank's slice gives partial sums of v_t, which go to all ranks.
-// Region X is free for them: every rank's hidden units have come, so no gate|up sums are still being read there.
-__device__ __forceinline__ void advance(Block& b, Actions& actions, const float4 (&x)[ITEMS_X], const float* scale,
-                                        int step) {
-  float* xs = (float*)(b.smem + M_X + X_XS);
-  if constexpr (SPREAD) receive(b, BAR_XS, step, xs_expect(b), WAIT_V);
-#pragma unroll
-  for (int j = 0; j < (SPREAD ? 0 : ITEMS_X); ++j) {
-    const Item item = stream_item(b, j);
-    const float2 s = __ldg((const float2*)(scale + (b.x0() + item.tile) * 16 + 2 * b.g()));
-    float* p = xs + (item.tile * 16 + 2 * b.g()) * T + item.token;
-    if (item.real) p[0] = x[j].x * s.x, p[T] = x[j].z * s.y;
-    if (item.real && item.token + 1 < T) p[1] = x[j].y * s.x, p[T + 1] = x[j].w * s.y;
-  }
-  if constexpr (!SPREAD) {
-    send_squares(b, x, BAR_V);
-    consumers_sync();
-  }
-  float sum[HELD];
-#pragma unroll
-  for (int i = 0; i < HELD; ++i) sum[i] = 0;
-  const bool active = Actions::exists(b, 0);
-  const u32 mine = b.rank() * T * A + Actions::place(b, 0);
-  if (active) {
-    const float* w = b.a.out_w + size_t(b.x0()) * 16 * A + Actions::number(b);
-#pragma unroll(HELD == 1 ? 32 : SPREAD ? 16 : 8)
-    for (int c = 0; c < b.xn() * 16; ++c) {
-      const float v = __ldg(w + c * A);
-#pragma unroll
-      for (int i = 0; i < HELD; ++i) {
-        const int token = min(Actions::group(b) + i * GROUPS, T - 1);
-        sum[i] += v * xs[SPREAD ? (c / 16 * NT + token / 8) * 128 + (c % 16 / 2 * 4 + token % 8 / 2) * 4 + c % 2 * 2 +
-                                      token % 2
-                                : c * T + token];
-      }
-    }
-#pragma unroll
-    for (int i = 0; i < HELD; ++i)
-      if (Actions::exists(b, i))
-#pragma unroll
-        for (int d = 0; d < S; ++d)
-          send(at_rank(b.base + M_X + X_VPART + (mine + i * GROUPS * A) * 4, d), __float_as_uint(sum[i]),
-               at_rank(b.bar(BAR_V), d));
-  }
-  receive(b, BAR_V, step, V_EXPECT, WAIT_V);
-  if (active) {
-    const float* parts = (const float*)(b.smem + M_X + X_VPART);
-    const float* squares = (const float*)(b.smem + M_SSQ);
-    const float shift = __ldg(b.a.out_shift + step * A + Actions::number(b));
-#pragma unroll
-    for (int i = 0; i < HELD; ++i) {
-      const int token = Actions::group(b) + i * GROUPS, at = Actions::place(b, i);
-      if (Actions::exists(b, i)) {
-        float v = 0, q = 0;
-#pragma unroll
-        for (int s = 0; s < S; ++s) v += parts[s * T * A + at];
-#pragma unroll
-        for (int s = 0; s < SQ; ++s) q += squares[s * NT * 8 + token];
-        v = v * rsqrtf(q * (1.0f / D) + b.a.eps) + shift;
-        const float next = __fadd_rn(actions.get(b, i), __fmul_rn(b.a.dt, v));
-        actions.set(b, i, next);
-        if (b.cta == 0) {
-          b.a.v_t[size_t(step) * T * A + at] = v;
-          b.a.x_t[size_t(step + 1) * T * A + at] = next;
-        }
-      }
-    }
-  }
-  if (step + 1 < b.a.steps) {  // a peer's next slice lands where this rank has read the partial sums
-    consumers_sync();
-    if constexpr (SPREAD) return;
-    if (b.thread < S) arrive_at(at_rank(b.bar(BAR_GO), b.thread));
-    note(b, WAIT_GO);
-    barrier_wait(b.bar(BAR_GO), step & 1);
-  }
-}
-
-// ---- the same of few tokens: x_t lies in shared memory, token w is warp w's
-
-// action_in_proj of a warp's items. What it needs besides x_t is asked for before x_t is there.
-struct Embedding {
-  static constexpr bool EARLY = ITEMS_X == 1 && A <= 32;
-  float4 weights[EARLY ? A / 4 : 1][2];
-  float2 bias[ITEMS_X], scale[ITEMS_X];
-
-  static __device__ __forceinline__ int column(const Block& b, int j) {
-    return (b.x0() + stream_item(b, j).tile) * 16 + 2 * b.g();
-  }
-  static __device__ __forceinline__ float4 weight(const Block& b, int column, int k, int odd) {
-    return __ldg((const float4*)(b.a.in_w + size_t(column + odd) * A) + k);
-  }
-  __device__ __forceinline__ Embedding(const Block& b, const float* scales) {
-#pragma unroll
-    for (int j = 0; j < ITEMS_X; ++j) {
-      bias[j] = __ldg((const float2*)(b.a.in_b + column(b, j)));
-      scale[j] = __ldg((const float2*)(scales + column(b, j)));
-    }
-    if (EARLY)
-#pragma unroll
-      for (int i = 0; i < A / 2; ++i) weights[i / 2][i % 2] = weight(b, column(b, 0), i / 2, i % 2);
-  }
-  __device__ __forceinline__ void multiply(const Block& b, float4 (&x)[ITEMS_X]) const {
-#pragma unroll
-    for (int j = 0; j < ITEMS_X; ++j) {
-      const Item item = stream_item(b, j);
-      const float4* const x0 = (const float4*)(b.smem + M_XT) + min(item.token, T - 1) * (A / 4);
-      const float4* const x1 = (const float4*)(b.smem + M_XT) + min(item.token + 1, T - 1) * (A / 4);
-      float4 c = make_float4(bias[j].x, bias[j].x, bias[j].y, bias[j].y);
-#pragma unroll(EARLY ? A / 4 : 4)
-      for (int k = 0; k < A / 4; ++k) {
-        const float4 w0 = EARLY ? weights[EARLY ? k : 0][0] : weight(b, column(b, j), k, 0),
-                     w1 = EARLY ? weights[EARLY ? k : 0][1] : weight(b, column(b, j), k, 1);
-        const float4 y0 = x0[k], y1 = x1[k];
-        c.x += w0.x * y0.x + w0.y * y0.y + w0.z * y0.z + w0.w * y0.w,
-            c.y += w0.x * y1.x + w0.y * y1.y + w0.z * y1.z + w0.w * y1.w;
-        c.z += w1.x * y0.x + w1.y * y0.y + w1.z * y0.z + w1.w * y0.w,
-            c.w += w1.x * y1.x + w1.y * y1.y + w1.z * y1.z + w1.w * y1.w;
-      }
-      x[j] = item.real ? c : make_float4(0, 0, 0, 0);
-    }
-  }
-  __device__ __forceinline__ void send(const Block& b, const float4 (&x)[ITEMS_X]) const {
-    if (!b.attends()) return;
-    __syncwarp();
-#pragma unroll
-    for (int j = 0; j < ITEMS_X; ++j) {
-      const Item item = stream_item(b, j);
-      const float2 s = scale[j];
-      send_columns(b, Everyone(columns_place(b, M_X, b.x0() + item.tile, item.n)), Everyone(b.bar(BAR_X)), item.n,
-                   make_float4(x[j].x * s.x, x[j].y * s.x, x[j].z * s.y, x[j].w * s.y), item.real);
-    }
-    send_squares(b, x, BAR_X);
-  }
-};
-
-// From what `gather` kept to the next step's stream, whose norm has these scales.
-__device__ __forceinline__ void advance_few(Block& b, float4 (&x)[ITEMS_X], const float* scales, int step) {
-  send_squares(b, x, BAR_V);
-  __syncwarp();
-#pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j) {
-    const int i = b.warp() + j * W, xn = b.xn();
-    if (i >= xn * NT) continue;
-    const float* const w = b.a.out_w + size_t((b.x0() + i % xn) * 16) * A;
-    const float4* const y = (const float4*)kept_item(b, i);
-    const bool more = i / xn + 1 < NT || TAIL > 2;  // than four tokens
-#pragma unroll 1
-    for (int first = 0; first < A; first += 32) {
-      const int number = min(first + b.lane(), A - 1);
-      float4 low = make_float4(0, 0, 0, 0), high = low;
-#pragma unroll
-      for (int c = 0; c < 16; ++c) {
-        const float v = __ldg(w + c * A + number);
-        const float4 y0 = y[c * 2];
-        low.x += v * y0.x, low.y += v * y0.y, low.z += v * y0.z, low.w += v * y0.w;
-        if (more) {
-          const float4 y1 = y[c * 2 + 1];
-          high.x += v * y1.x, high.y += v * y1.y, high.z += v * y1.z, high.w += v * y1.w;
-        }
-      }
-      __syncwarp();
-      float* const to = kept_item(b, i) + XS_PART / 4 + number;
-      to[0] = low.x, to[A] = low.y, to[2 * A] = low.z, to[3 * A] = low.w;
-      if (more) to[4 * A] = high.x, to[5 * A] = high.y, to[6 * A] = high.z, to[7 * A] = high.w;
-    }
-  }
-  consumers_sync();
-  const int token = b.warp();
-  if (token < T) {
-    static_assert(S % 4 == 0, "a lane serves every fourth rank");
-    const float4* const parts = (const float4*)(kept_item(b, token / 8 * b.xn()) + XS_PART / 4 + token % 8 * A);
-#pragma unroll 1
-    for (int q = b.lane() % 8; q < A / 4; q += 8) {
-      float4 sum = make_float4(0, 0, 0, 0);
-#pragma unroll
-      for (int tile = 0; tile < DX; ++tile)
-        if (D16 % S == 0 || tile < b.xn()) {
-          const float4 v = parts[tile * (XS_ITEM / 16) + q];
-          sum.x += v.x, sum.y += v.y, sum.z += v.z, sum.w += v.w;
-        }
-      const u32 to = b.base + M_X + X_VPART + ((b.rank() * T + token) * A + q * 4) * 4;
-#pragma unroll
-      for (int d = b.lane() / 8; d < S; d += 4) send(at_rank(to, d), sum, at_rank(b.bar(BAR_V), d));
-    }
-  }
-  const Embedding embedding(b, scales);
-  const float* const shifts = b.a.out_shift + step * A;
-  const float shift = __ldg(shifts + min(b.lane(), A - 1));
-  receive(b, BAR_V, step, V_EXPECT, WAIT_V);
-  if (token < T) {
-    const float* const parts = (const float*)(b.smem + M_X + X_VPART) + token * A;
-    float q = 0;
-#pragma unroll
-    for (int s = 0; s < most(SQ, 32); ++s)
-      if (SQ % 32 == 0 || s * 32 + b.lane() < SQ)
-        q += ((const float*)(b.smem + M_SSQ))[(s * 32 + b.lane()) * NT * 8 + token];
-#pragma unroll
-    for (int o = 1; o < 32; o *= 2) q += exchange(q, o);
-    const float inverse = rsqrtf(q * (1.0f / D) + b.a.eps);
-#pragma unroll 1
-    for (int number = b.lane(); number < A; number += 32) {
-      float v = 0;
-#pragma unroll
-      for (int s = 0; s < S; ++s) v += parts[s * T * A + number];
-      v = v * inverse + (number < 32 ? shift : __ldg(shifts + number));
-      const int at = token * A + number;
-      float* const xt = (float*)(b.smem + M_XT) + at;
-      const float next = __fadd_rn(*xt, __fmul_rn(b.a.dt, v));
-      *xt = next;
-      if (b.cta == 0) {
-        b.a.v_t[size_t(step) * T * A + at] = v;
-        b.a.x_t[size_t(step + 1) * T * A + at] = next;
-      }
-    }
-  }
-  MARK(20)
-  if (step + 1 == b.a.steps) return;
-  consumers_sync();
-  if (b.thread < S) arrive_at(at_rank(b.bar(BAR_GO), b.thread));
-  embedding.multiply(b, x);
-  note(b, WAIT_GO);
-  barrier_wait(b.bar(BAR_GO), step & 1);  // a peer's slice lands where this rank has read the partial sums
-  embedding.send(b, x);
-}
+// Part 12 of 12: the loop, the kernel.
 
 __device__ __forceinline__ u32 hidden_bytes(const Block& b) { return b.hn() * 16 * T * 2 + (IDLE ? S * 4 : 0); }
 
 __device__ __forceinline__ void consume(Block& b) {
   const Args& a = b.a;
   const int prefix = int(*a.length);
-  Actions actions;
-#pragma unroll
-  for (int i = 0; i < HELD; ++i)
-    if (Actions::exists(b, i)) {
-      const float noise = a.noise[Actions::place(b, i)];
-      actions.set(b, i, noise);
-      if (b.cta == 0) a.x_t[Actions::place(b, i)] = noise;
+  Actions actions(b);  // of many tokens
+  if (!SPREAD)
+    for (int i = b.thread; i < T * A; i += CONSUMERS) {
+      ((float*)(b.smem + M_XT))[i] = a.noise[i];
+      if (b.cta == 0) a.x_t[i] = a.noise[i];
     }
   float2 rope[ITEMS_Q][2];
   make_rope(b, prefix, rope);
@@ -327,8 +26,8 @@ __device__ __forceinline__ void consume(Block& b) {
   }
 #pragma unroll 1
   for (int step = 0; step < a.steps; ++step) {
-    const float* const scales = a.table + size_t(step) * (2 * L + 1) * 3 * D;
-    if constexpr (SPREAD) embed(b, actions, x, scales);
+    const float* const table = a.table + size_t(step) * (2 * L + 1) * 3 * D;
+    if constexpr (SPREAD) embed_own(b, actions, x, table);
     MARK(19)
 #pragma unroll 1
     for (; b.n < u32(step + 1) * L; ++b.n) {
@@ -376,8 +75,8 @@ __device__ __forceinline__ void consume(Block& b) {
                            SPREAD ? M_X + (half ? X_FF_SUMS : 0) : M_H, buffer, bit, await, then);
         else
           load_norm();
-        if constexpr (SPREAD)
-          if (!half || b.attends() || last) done_with_x(b);
+        if constexpr (SPREAD)  // behind the last layer `embed` says it
+          if (!half || (b.attends() && !last)) done_with_x(b);
         MARK(half ? 18 : 11)
         note(b, half ? WAIT_X1 : WAIT_X2);
         gather(b, x, buffer, half ? NC : NH, bit, gates, scales,
@@ -385,12 +84,10 @@ __device__ __forceinline__ void consume(Block& b) {
         MARK(half ? 14 : 12)
       }
     }
-    if constexpr (SPREAD) {
-      advance(b, actions, x, scales + 2 * L * 3 * D, step);
-      MARK(20)
-    } else {
-      advance_few(b, x, step + 1 < a.steps ? scales + (2 * L + 1) * 3 * D : scales, step);
-    }
+    if constexpr (SPREAD)
+      advance_own(b, actions, x, table + 2 * L * 3 * D, step);
+    else
+      advance(b, x, step + 1 < a.steps ? table + (2 * L + 1) * 3 * D : table, step);
   }
   note(b, FINISHED);
 #ifdef TP_TRACE
@@ -410,7 +107,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     barrier_init(b.bar(BAR_GO), S), barrier_init(b.bar(BAR_RMS), 1);
     if constexpr (SPREAD) {
       barrier_init(b.bar(BAR_DONE), W), barrier_init(b.bar(BAR_FREE), S);
-      barrier_init(b.bar(BAR_ROOM), S), barrier_init(b.bar(BAR_XS), 1);
+      barrier_init(b.bar(BAR_ROOM), S);
     }
     asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     barrier_expect(b.bar(BAR_X), X_EXPECT);
@@ -420,7 +117,6 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     barrier_expect(b.bar(BAR_ATT), ATT_EXPECT);
     barrier_expect(b.bar(BAR_HID), hidden_bytes(b));
     barrier_expect(b.bar(BAR_V), V_EXPECT);
-    if constexpr (SPREAD) barrier_expect(b.bar(BAR_XS), xs_expect(b));
   }
   __syncthreads();
   cluster_exchange();

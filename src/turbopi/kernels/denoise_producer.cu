@@ -1,4 +1,4 @@
-// Part 4 of 11: what brings weights, keys and values.
+// Part 4 of 12: what brings weights, keys and values.
 
 // One thread of a CTA, which never waits for activations. What it loads is the same in every layer, so a list of it is
 // made first: 100 cycles more for a slot are a microsecond in a layer.

@@ -1,4 +1,4 @@
-// Part 8 of 11: queries, keys and values of the suffix.
+// Part 8 of 12: queries, keys and values of the suffix.
 
 constexpr int ITEMS_Q =
     most((QTL + KVL) * NT, W);  // (tile, 8 tokens) of queries, keys and values that one warp finishes
@@ -162,7 +162,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   } else {
     await_stream();
     float sums[plan_groups(QKV)][NT * 4];
-    show_activations();
+    if (!SPREAD) show_activations();
     multiply<QKV, D16>(b, b.base + M_X, D16, qn + kvn, sums);
     MARK(1)
     consumers_sync();

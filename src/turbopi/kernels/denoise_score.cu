@@ -1,4 +1,4 @@
-// Part 9 of 11: attention's steps, of which denoise_attention.cu makes the whole.
+// Part 9 of 12: attention's steps, of which denoise_attention.cu makes the whole.
 
 // Who does what: the first SCORERS warps score a tile of prefix keys each, and the next if there are more; the last
 // four score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries.

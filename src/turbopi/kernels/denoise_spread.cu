@@ -1,4 +1,4 @@
-// Part 6 of 11: who keeps which part of the residual stream, and how the parts come together if tokens are many
+// Part 6 of 12: who keeps which part of the residual stream, and how the parts come together if tokens are many
 // (SPREAD).
 //
 // If tokens are few, every cluster keeps the whole stream: each CTA adds up its slice for all tokens, and the ranks
@@ -48,49 +48,55 @@ __device__ __forceinline__ void await_room(const Block& b) {
   __syncwarp();
 }
 
-// What this CTA keeps of the stream, times the next norm's scale, to L2: as products take it or, for the end of a step,
-// in float32. Then the slice's sums of squares and the flags, which say how many times that has been done.
-__device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS_X], const float2 (&scales)[ITEMS_X],
-                                               bool last) {
-  byte* const to = (byte*)(b.a.scratch + (last ? B_FINAL : B_STAGE + (b.turn & 1) * N_STAGE));
-  float* const part = (float*)(b.smem + M_PART);  // [8 tokens at a time][DX][8]
+// An item's sums of squares, to float[8 tokens at a time][DX][8].
+__device__ __forceinline__ void keep_squares(const Block& b, float4 x, int j, bool real) {
+  float q0 = x.x * x.x + x.z * x.z, q1 = x.y * x.y + x.w * x.w;
+#pragma unroll
+  for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
+  if (const int i = b.warp() + j * W; i < DX * OWN_N && b.g() == 0)
+    *(float2*)(b.smem + M_PART + (i * 8 + 2 * b.t()) * 4) = real ? make_float2(q0, q1) : make_float2(0, 0);
+}
+// Those of the slice of one of this CTA's tokens.
+__device__ __forceinline__ float slice_squares(const Block& b, int token) {
+  float sum = 0;
+#pragma unroll
+  for (int tile = 0; tile < DX; ++tile)
+    sum += *(const float*)(b.smem + M_PART + ((token / 8 * DX + tile) * 8 + token % 8) * 4);
+  return sum;
+}
+// What this CTA keeps of the stream, times the next norm's scale, to L2 as products take it, and flags, which say how
+// many times that has been done; the slice's sums of squares meanwhile, with flags of their own in their lowest bits.
+__device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS_X], const float2 (&scales)[ITEMS_X]) {
+  byte* const to = (byte*)(b.a.scratch + B_STAGE + (b.turn & 1) * N_STAGE);
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
     const int place = (b.x0() + item.tile) * NT + item.n, token = 2 * b.t() + (b.g() & 1);
     const float4 y =
         make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
-    if (last) {
-      if (item.real) *(float4*)(to + place * 512 + b.lane() * 16) = y;
-    } else {
-      const u32 w0 = pack_operand(y.x, y.z), w1 = pack_operand(y.y, y.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
-      if (item.real && item.n * 8 + token < T)
-        *(uint2*)(to + place * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8) =
-            make_uint2(b.g() & 1 ? got : w0, b.g() & 1 ? w1 : got);
-    }
-    float q0 = x[j].x * x[j].x + x[j].z * x[j].z, q1 = x[j].y * x[j].y + x[j].w * x[j].w;
-#pragma unroll
-    for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
-    if (const int i = b.warp() + j * W; i < DX * OWN_N && b.g() == 0)
-      *(float2*)(part + i * 8 + 2 * b.t()) = item.real ? make_float2(q0, q1) : make_float2(0, 0);
+    const u32 w0 = pack_operand(y.x, y.z), w1 = pack_operand(y.y, y.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
+    if (item.real && item.n * 8 + token < T)
+      *(uint2*)(to + place * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8) =
+          make_uint2(b.g() & 1 ? got : w0, b.g() & 1 ? w1 : got);
   }
   consumers_sync();
-  if (b.warp() == 0) {
-    float* const squares = (float*)(b.a.scratch + B_SQUARES + (last ? 2 : b.turn & 1) * N_SQUARES);
+  if (b.warp() == W - 1) {  // which mostly has no item: the fence waits for all stores
     u32* const flags = (u32*)(b.a.scratch + B_FLAGS) + b.rank() * 32;
 #pragma unroll
     for (int k = 0; k < OWN_N; ++k)
-      if (const int n = b.cluster() + k * NC; n < NT) {
-        if (b.lane() < 8) {
-          float sum = 0;
+      if (const int n = b.cluster() + k * NC; n < NT && b.lane() == 0)  // behind what the barrier above was behind of
+        asm volatile("st.release.gpu.global.u32 [%0], %1;" ::"l"(flags + n), "r"(b.turn + 1) : "memory");
+  }
+  constexpr int KEEPERS = imin(DX * OWN_N, W);
+  if (b.warp() < KEEPERS) {
 #pragma unroll
-          for (int tile = 0; tile < DX; ++tile) sum += part[(k * DX + tile) * 8 + b.lane()];
-          squares[(b.rank() * NT + n) * 8 + b.lane()] = sum;
-        }
-        __syncwarp();
-        if (b.lane() == 0)  // behind everything that the barrier above was behind of
-          asm volatile("st.release.gpu.global.u32 [%0], %1;" ::"l"(flags + n), "r"(b.turn + 1) : "memory");
-      }
+    for (int j = 0; j < ITEMS_X; ++j) keep_squares(b, x[j], j, stream_item(b, j).real);
+    __syncwarp();
+    asm volatile("bar.sync 7, %0;" ::"n"(KEEPERS * 32) : "memory");
+    if (b.thread < OWN_T)
+      if (const int n = b.cluster() + int(b.thread) / 8 * NC; n < NT)
+        publish((float*)(b.a.scratch + B_SQUARES + (b.turn & 1) * N_SQUARES) + (b.rank() * NT + n) * 8 + b.thread % 8,
+                slice_squares(b, b.thread), flag(b.turn));
   }
   ++b.turn;
 }
@@ -103,43 +109,66 @@ __device__ __forceinline__ void load_for_all(u32 to, const void* from, u32 bytes
       "l"(from), "r"(bytes), "r"(bar), "h"((unsigned short)((1 << S) - 1))
       : "memory");
 }
-__device__ __forceinline__ u32 xs_expect(const Block& b) { return imax(b.xn() * NT * 512, 16); }  // if none: any 16
 
+// All lanes: until all clusters have published slice and squares, use `turn`. Answers take long, so three questions are
+// on their way at any time.
+__device__ __forceinline__ void await_slice(const Block& b, u32 turn) {
+  const u32* const flags = (const u32*)(b.a.scratch + B_FLAGS) + b.rank() * 32 + imin(b.lane(), NT - 1);
+  const uint2* const squares = (const uint2*)(b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES) + b.rank() * NT * 4 +
+                               imin(b.lane(), NT * 4 - 1);
+  u32 turns[3];
+  uint2 q[3];
+  auto ask = [&](int i) {
+    asm volatile("ld.relaxed.gpu.global.u32 %0, [%1];" : "=r"(turns[i]) : "l"(flags) : "memory");
+    asm volatile("ld.relaxed.gpu.global.v2.u32 {%0, %1}, [%2];" : "=r"(q[i].x), "=r"(q[i].y) : "l"(squares) : "memory");
+  };
+#pragma unroll
+  for (int i = 0; i < 3; ++i) {
+    ask(i);
+    const u32 since = u32(clock64());
+    while (i < 2 && u32(clock64()) - since < 150) {
+    }
+  }
+#pragma unroll 1
+  for (bool here = false; !here;)
+#pragma unroll
+    for (int i = 0; i < 3; ++i)
+      if (!here) {
+        const u32 bit = flag(turn), missing = differing(q[i].x, bit, q[i].y ^ bit) & 1;
+        here = __all_sync(~0u, int(turns[i] - turn) > 0 && !missing);
+        if (!here) ask(i);
+      }
+}
 // A spare warp. Buffers in L2 are free when their turn comes again: who writes them has sums, made of what came after,
 // of all clusters that read them. The flags need no acquire: the copy engine reads L2, and only when they are seen.
 __device__ __forceinline__ void fetch_stream(const Block& b) {
-  const u32* const flags = (const u32*)(b.a.scratch + B_FLAGS) + b.rank() * 32;
   const u32 place = b.x0() * NT, items = b.xn() * NT;
   u32 uses = 0, turn = 0;
 #pragma unroll 1
   for (int step = 0; step < b.a.steps; ++step)
 #pragma unroll 1
-    for (int i = 0; i <= 2 * L; ++i, ++turn) {  // embedded, then behind attention, behind the feed-forward, ...
-      const bool last = i == 2 * L;
-      if (!b.attends() && i % 2 == 0 && !last) continue;
+    for (int i = 0; i < 2 * L; ++i, ++turn) {  // embedded, then behind attention, behind the feed-forward, ...
+      if (!b.attends() && i % 2 == 0) continue;
       barrier_wait(b.bar(BAR_DONE), uses & 1);
       __syncwarp();
       if (b.lane() < S) arrive_at(at_rank(b.bar(BAR_FREE), b.lane()));
       barrier_wait(b.bar(BAR_FREE), uses++ & 1);
-      if (b.lane() < NT) {
-        u32 flag;
-        do {
-          asm volatile("ld.acquire.gpu.global.u32 %0, [%1];" : "=r"(flag) : "l"(flags + b.lane()) : "memory");
-        } while (int(flag - turn) <= 0);
-      }
+      __syncwarp();
+      await_slice(b, turn);
       asm volatile("fence.proxy.async.global;" ::: "memory");
       __syncwarp();
       if (b.lane() == 0) {
-        const uint4* const squares = b.a.scratch + B_SQUARES + (last ? 2 : turn & 1) * N_SQUARES + b.rank() * NT * 2;
-        const uint4* const from = b.a.scratch + (last ? B_FINAL : B_STAGE + (turn & 1) * N_STAGE);
-        if (last)
-          asm volatile("cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1], %2, [%3];" ::"r"(
-                           b.base + M_X + X_XS),
-                       "l"(from + (items > 0 ? place * 32 : 0)), "r"(xs_expect(b)), "r"(b.bar(BAR_XS))
-                       : "memory");
-        else if (items > 0)
-          load_for_all(b.base + M_X + place * 256, from + place * 16, items * 256, b.bar(BAR_X));
-        load_for_all(b.base + M_SSQ + b.rank() * NT * 32, squares, NT * 32, b.bar(last ? BAR_V : BAR_X));
+        const uint4* const squares = b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES + b.rank() * NT * 2;
+        const uint4* const from = b.a.scratch + B_STAGE + (turn & 1) * N_STAGE;
+        if (items > 0) load_for_all(b.base + M_X + place * 256, from + place * 16, items * 256, b.bar(BAR_X));
+        load_for_all(b.base + M_SSQ + b.rank() * NT * 32, squares, NT * 32, b.bar(BAR_X));
+      }
+      if (i == 2 * L - 1) {  // what the end of the step needs, to L2
+#pragma unroll 1
+        for (int at = b.lane() * 32; at < b.xn() * 16 * A; at += 32 * 32) {
+          asm volatile("prefetch.global.L2 [%0];" ::"l"(b.a.out_w + size_t(b.x0()) * 16 * A + at));
+          asm volatile("prefetch.global.L2 [%0];" ::"l"(b.a.in_w + size_t(b.x0()) * 16 * A + at));
+        }
       }
     }
 }

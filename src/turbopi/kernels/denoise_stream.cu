@@ -1,4 +1,4 @@
-// Part 7 of 11: the residual stream, and what goes into it: sums across clusters, GeGLU.
+// Part 7 of 12: the residual stream, and what goes into it: sums across clusters, GeGLU.
 
 // 8 bytes with the lane pair's four columns 2g.. of one token (even g: 2t, odd g: 2t + 1) to all ranks, where
 // `columns_place` says.
@@ -180,10 +180,12 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
         keep_item(b, j, y);
     }
   }
-  if constexpr (SPREAD)
-    publish_stream(b, x, scales, !send_on);
-  else if (send_on)
-    send_squares(b, x, BAR_X);
+  if (send_on) {
+    if constexpr (SPREAD)
+      publish_stream(b, x, scales);
+    else
+      send_squares(b, x, BAR_X);
+  }
 }
 
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
@@ -256,11 +258,22 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
   receive(b, BAR_X, b.x_parity(1), X_EXPECT, WAIT_X);
   MARK(13)
   float sums[GROUPS_][NT * 4];
-  show_activations();
+  if (!SPREAD) show_activations();  // what the copy engine wrote needs none
   multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums, ahead);
   MARK(15)
   if constexpr (SPREAD) consumers_sync(), give_room(b);
   own.add_up(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);
+  constexpr int QUARTER = most(S, 4);
+  static_assert(S % 4 == 0, "four lanes share the ranks");
+  u32 window[QUARTER], hidden_bars[QUARTER];  // if SPREAD: this CTA's shared memory as theirs
+  if constexpr (SPREAD) {
+#pragma unroll
+    for (int d = 0; d < QUARTER; ++d) {
+      const int rank = (b.g() >> 1) * QUARTER + d;
+      window[d] = at_rank(b.base, rank), hidden_bars[d] = at_rank(b.bar(BAR_HID), rank);
+    }
+    inverse_rms(b, 0, 1);
+  }
 #pragma unroll
   for (int i = 0; i < GROUPS_; ++i)
 #pragma unroll
@@ -269,7 +282,8 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
         const int n = own.n[i][k];
         float4 c = own.sums[i][k];
         if (FP8) c = make_float4(c.x * scale[i].x, c.y * scale[i].x, c.z * scale[i].y, c.w * scale[i].y);
-        const float2 r = inverse_rms(b, n * 8 + 2 * b.t(), 1);
+        const float2 r = SPREAD ? *(const float2*)(b.smem + M_RMS + (n * 8 + 2 * b.t()) * 4)
+                                 : inverse_rms(b, n * 8 + 2 * b.t(), 1);
         const float h0 = gelu(c.x * r.x + shift[i].x) * (c.z * r.x + shift[i].y),
                     h1 = gelu(c.y * r.y + shift[i].x) * (c.w * r.y + shift[i].y);
         // first two, then four, then all 8 units of a token in a lane: four lanes have the same, they share the ranks
@@ -279,16 +293,15 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
         const u32 far_lo = exchange(lo, 16), far_hi = exchange(hi, 16);
         const uint4 units =
             b.g() & 4 ? make_uint4(far_lo, far_hi, lo, hi) : make_uint4(lo, hi, far_lo, far_hi);
-        if constexpr (SPREAD) await_room(b);
+        if (SPREAD && i + k == 0) await_room(b);
         if (n * 8 + token < T) {
-          constexpr int QUARTER = most(S, 4);
           u32 data[QUARTER], bars[QUARTER];
 #pragma unroll
           for (int d = 0; d < QUARTER; ++d) {
             const int rank = (b.g() >> 1) * QUARTER + d;
-            data[d] = at_rank(place[i][k], rank), bars[d] = at_rank(b.bar(BAR_HID), rank);
+            data[d] = SPREAD ? window[d] + (place[i][k] - b.base) : at_rank(place[i][k], rank);
+            bars[d] = SPREAD ? hidden_bars[d] : at_rank(b.bar(BAR_HID), rank);
           }
-          static_assert(S % 4 == 0, "four lanes share the ranks");
 #pragma unroll
           for (int d = 0; d < QUARTER; ++d) send(data[d], units, bars[d]);
         }
