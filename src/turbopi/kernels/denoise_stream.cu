@@ -62,18 +62,6 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
     if (b.lane() == 0) barrier_arrive(b.bar(BAR_RMS));
   }
 }
-// Tensor cores that have rested for most of a microsecond slow the clock down when they begin again (measured: 1.73 GHz,
-// where it is 1.80 if they never rest so long). A spare warp multiplies zeros now and then.
-__device__ __forceinline__ void keep_awake(const Block& b) {
-  float c[4] = {0, 0, 0, 0};
-  const u32 zero = b.a.zero;
-#pragma unroll 1
-  while (*(volatile u32*)(b.smem + M_PROGRESS) >> 20 != FINISHED) {
-    mma_half(c, make_uint4(zero, zero, zero, zero), make_uint2(zero, zero));
-    __nanosleep(100);
-  }
-  if (c[0] != 0) *(volatile u32*)(b.smem + M_TOKEN) = 0;  // never, but the compiler can't know
-}
 constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * 32 + SQUARES_EXPECT;
 
 // A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
