@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -207,6 +209,20 @@ def test_the_source_compiles_for_hopper(tmp_path: Path, name: str, clusters: int
     sizes = denoise.kernel_sizes(arrangement, cache_rows=968, suffix=suffix, shared_bytes=232448, fp8=fp8)
     code = denoise.compiled("sm_90a", sizes, folder=tmp_path)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [code]  # kept for the next start
+
+
+@pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
+def test_the_product_that_keeps_tensor_cores_awake_is_in_the_machine_code(tmp_path: Path) -> None:
+    # ptxas leaves out products whose sums nobody reads
+    sizes = denoise.kernel_sizes(
+        packing.Arrangement(CONFIGS["golden"], 8), cache_rows=48, suffix=10, shared_bytes=232448
+    )
+    file = tmp_path / "kernel.cubin"
+    file.write_bytes(denoise.compiled("sm_90a", sizes, folder=tmp_path / "kept"))
+    triton = pytest.importorskip("triton")
+    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "nvdisasm"
+    code = subprocess.run([tool, "-c", file], capture_output=True, text=True, check=True).stdout
+    assert re.search(r"HMMA[^\n]*\n[^\n]*NANOSLEEP 0x64", code), "100 ns without a product before them"
 
 
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
