@@ -131,7 +131,7 @@ constexpr int OUTPUT = SPREAD ? 256 : 512;
 constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * OUTPUT;
 constexpr int X_SUFFIX_SUMS_FEW = X_P + (KT + 1) * NT * 256,
               X_KEEP = X_SUFFIX_SUMS_FEW + (SPREAD ? 0 : 3 * NT * 256), X_SUFFIX = X_KEEP + up128(NT * 32);
-// Between steps: what ranks add to v_t, then the slice in float32; if tokens are few by item, and what it adds to v_t.
+// Between steps, if tokens are few: what ranks add to v_t, then by item the slice in float32 and what it adds to v_t.
 constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);
 constexpr int XS_PART = A > 32 ? 512 : 0, XS_ITEM = imax(XS_PART + A * 32, 512);  // over the item, if read at once
 // If SPREAD, region X holds everything, as each exchange waits until all ranks are done with what lay there: attention

@@ -22,6 +22,11 @@ enum What {
 __device__ __forceinline__ void note(const Block& b, int what) {
   if (b.thread == 0) *(volatile u32*)(b.smem + M_PROGRESS) = u32(what) << 20 | u32(b.n);
 }
+__device__ __forceinline__ void pause(u32 since, u32 cycles) {
+  while (u32(clock64()) - since < cycles) {
+  }
+}
+__device__ __forceinline__ void prefetch_line(const float* at) { asm volatile("prefetch.global.L2 [%0];" ::"l"(at)); }
 // What the norms of layer n need, to L2: it is read once, by everybody at the same time, while memory is busy with
 // weights.
 __device__ __forceinline__ void prefetch(const Block& b, int n) {
@@ -29,7 +34,7 @@ __device__ __forceinline__ void prefetch(const Block& b, int n) {
   if (step >= b.a.steps) return;
   auto lines = [&](const float* from, int floats) {
 #pragma unroll 1
-    for (int i = b.lane() * 32; i < floats; i += 32 * 32) asm volatile("prefetch.global.L2 [%0];" ::"l"(from + i));
+    for (int i = b.lane() * 32; i < floats; i += 32 * 32) prefetch_line(from + i);
   };
   const float* table = b.a.table + (size_t(step) * (2 * L + 1) + 2 * l) * 3 * D + b.x0() * 16;
   lines(b.a.shifted + (size_t(n) * (NC * S) + b.cluster() * S + b.rank()) * TILES * 16, TILES * 16);
@@ -188,6 +193,10 @@ template <int N>
 __device__ __forceinline__ void clear(float (&c)[N][4]) {
 #pragma unroll
   for (int i = 0; i < N; ++i) c[i][0] = c[i][1] = c[i][2] = c[i][3] = 0;
+}
+// An item of the stream, or of a product, each of its two columns (rows) times a factor.
+__device__ __forceinline__ float4 scaled(float4 v, float2 by) {
+  return make_float4(v.x * by.x, v.y * by.x, v.z * by.y, v.w * by.y);
 }
 __device__ __forceinline__ float exp2_approx(float x) {
   float y;

@@ -85,8 +85,7 @@ struct Producer {
           barrier_wait(full + 8, free);  // until its last contents have been read
           barrier_expect(full, bytes);
           if (PACE && i < gate_up + STAGES) {  // the others wait for room as it is
-            while (u32(clock64()) - loaded < PACE) {
-            }
+            pause(loaded, PACE);
             loaded = u32(clock64());
           }
           bulk_load(b.base + M_RING + slot * SLOT, (key ? keys : weights) + what.x, bytes, full, key ? keep : once);

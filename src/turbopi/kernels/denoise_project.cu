@@ -182,7 +182,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
                 kv_tile = KVL == 1 ? 0 : k % kvn, token = n * 8 + 2 * b.t();
       const int at = k < 0 ? i % qn : qn + kv_tile;
       float4 c = MMA_QKV ? QkvProduct::total(b, b.smem + M_X, at, n) : total<QKV>(b, b.smem + M_X, at, n);
-      if (FP8) c = make_float4(c.x * scale[j].x, c.y * scale[j].x, c.z * scale[j].y, c.w * scale[j].y);
+      if (FP8) c = scaled(c, scale[j]);
       const float2 r = inverse_rms(b, token, 0);
       float4 turn = make_float4(rope[j][0].x, rope[j][0].y, rope[j][1].x, rope[j][1].y);
       if (FEW) turn = *(const float4*)(b.smem + M_ROPE + i * 512 + b.lane() * 16);

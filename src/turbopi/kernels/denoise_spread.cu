@@ -48,11 +48,16 @@ __device__ __forceinline__ void await_room(const Block& b) {
   __syncwarp();
 }
 
-// An item's sums of squares, to float[8 tokens at a time][DX][8].
-__device__ __forceinline__ void keep_squares(const Block& b, float4 x, int j, bool real) {
-  float q0 = x.x * x.x + x.z * x.z, q1 = x.y * x.y + x.w * x.w;
+// An item's sums of squares, of the lane's two tokens.
+__device__ __forceinline__ void squares_of(float4 x, float& q0, float& q1) {
+  q0 = x.x * x.x + x.z * x.z, q1 = x.y * x.y + x.w * x.w;
 #pragma unroll
   for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
+}
+// The same to float[8 tokens at a time][DX][8].
+__device__ __forceinline__ void keep_squares(const Block& b, float4 x, int j, bool real) {
+  float q0, q1;
+  squares_of(x, q0, q1);
   if (const int i = b.warp() + j * W; i < DX * OWN_N && b.g() == 0)
     *(float2*)(b.smem + M_PART + (i * 8 + 2 * b.t()) * 4) = real ? make_float2(q0, q1) : make_float2(0, 0);
 }
@@ -72,8 +77,7 @@ __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
     const int place = (b.x0() + item.tile) * NT + item.n, token = 2 * b.t() + (b.g() & 1);
-    const float4 y =
-        make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
+    const float4 y = scaled(x[j], scales[j]);
     const u32 w0 = pack_operand(y.x, y.z), w1 = pack_operand(y.y, y.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
     if (item.real && item.n * 8 + token < T)
       *(uint2*)(to + place * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8) =
@@ -125,9 +129,7 @@ __device__ __forceinline__ void await_slice(const Block& b, u32 turn) {
 #pragma unroll
   for (int i = 0; i < 3; ++i) {
     ask(i);
-    const u32 since = u32(clock64());
-    while (i < 2 && u32(clock64()) - since < 150) {
-    }
+    if (i < 2) pause(u32(clock64()), 150);
   }
 #pragma unroll 1
   for (bool here = false; !here;)
@@ -166,8 +168,8 @@ __device__ __forceinline__ void fetch_stream(const Block& b) {
       if (i == 2 * L - 1) {  // what the end of the step needs, to L2
 #pragma unroll 1
         for (int at = b.lane() * 32; at < b.xn() * 16 * A; at += 32 * 32) {
-          asm volatile("prefetch.global.L2 [%0];" ::"l"(b.a.out_w + size_t(b.x0()) * 16 * A + at));
-          asm volatile("prefetch.global.L2 [%0];" ::"l"(b.a.in_w + size_t(b.x0()) * 16 * A + at));
+          prefetch_line(b.a.out_w + size_t(b.x0()) * 16 * A + at);
+          prefetch_line(b.a.in_w + size_t(b.x0()) * 16 * A + at);
         }
       }
     }

@@ -10,6 +10,15 @@ __device__ __forceinline__ void add_actions(float4& c, float4 w0, float4 w1, flo
       c.w += w1.x * y1.x + w1.y * y1.y + w1.z * y1.z + w1.w * y1.w;
 }
 
+__device__ __forceinline__ float euler_step(const Block& b, float x, float v) {
+  return __fadd_rn(x, __fmul_rn(b.a.dt, v));
+}
+// What the caller gets to see of a step.
+__device__ __forceinline__ void put_out(const Block& b, int step, int at, float v, float next) {
+  b.a.v_t[size_t(step) * T * A + at] = v;
+  b.a.x_t[size_t(step + 1) * T * A + at] = next;
+}
+
 // ---- few tokens: x_t lies in shared memory, token w is warp w's
 
 // action_in_proj of a warp's items. What it needs besides x_t is asked for before x_t is there.
@@ -56,20 +65,16 @@ struct Embedding {
 #pragma unroll
     for (int j = 0; j < ITEMS_X; ++j) {
       const Item item = stream_item(b, j);
-      const float2 s = scale[j];
       send_columns(b, Everyone(columns_place(b, M_X, b.x0() + item.tile, item.n)), Everyone(b.bar(BAR_X)), item.n,
-                   make_float4(x[j].x * s.x, x[j].y * s.x, x[j].z * s.y, x[j].w * s.y), item.real);
+                   scaled(x[j], scale[j]), item.real);
     }
     send_squares(b, x, BAR_X);
   }
 };
 
-// From what `gather` kept, behind the final norm's scale, to the next step's stream, whose norm has these scales:
-// action_out_proj, the Euler step, action_in_proj. A warp multiplies its items, then a warp has a token: each rank's
-// slice gives partial sums of v_t, which go to all ranks. Region X is free for them, see `kept_item`.
-__device__ __forceinline__ void advance(Block& b, float4 (&x)[ITEMS_X], const float* scales, int step) {
-  send_squares(b, x, BAR_V);
-  __syncwarp();
+// action_out_proj of what `gather` kept, behind the final norm's scale: this rank's partial sums of v_t to all ranks. A
+// warp multiplies its items, then a warp has a token. Region X is free for the sums, see `kept_item`.
+__device__ __forceinline__ void send_v(const Block& b) {
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const int i = b.warp() + j * W, xn = b.xn();
@@ -116,6 +121,14 @@ __device__ __forceinline__ void advance(Block& b, float4 (&x)[ITEMS_X], const fl
       for (int d = b.lane() / 8; d < S; d += 4) send(at_rank(to, d), sum, at_rank(b.bar(BAR_V), d));
     }
   }
+}
+
+// From the step's end to the next one's stream, whose norm has these scales: v_t, the Euler step, action_in_proj.
+__device__ __forceinline__ void advance(Block& b, float4 (&x)[ITEMS_X], const float* scales, int step) {
+  send_squares(b, x, BAR_V);
+  __syncwarp();
+  send_v(b);
+  const int token = b.warp();
   const Embedding embedding(b, scales);
   const float* const shifts = b.a.out_shift + step * A;
   const float shift = __ldg(shifts + min(b.lane(), A - 1));
@@ -129,7 +142,7 @@ __device__ __forceinline__ void advance(Block& b, float4 (&x)[ITEMS_X], const fl
         q += ((const float*)(b.smem + M_SSQ))[(s * 32 + b.lane()) * NT * 8 + token];
 #pragma unroll
     for (int o = 1; o < 32; o *= 2) q += exchange(q, o);
-    const float inverse = rsqrtf(q * (1.0f / D) + b.a.eps);
+    const float inverse = rms_from(b, q);
 #pragma unroll 1
     for (int number = b.lane(); number < A; number += 32) {
       float v = 0;
@@ -138,12 +151,9 @@ __device__ __forceinline__ void advance(Block& b, float4 (&x)[ITEMS_X], const fl
       v = v * inverse + (number < 32 ? shift : __ldg(shifts + number));
       const int at = token * A + number;
       float* const xt = (float*)(b.smem + M_XT) + at;
-      const float next = __fadd_rn(*xt, __fmul_rn(b.a.dt, v));
+      const float next = euler_step(b, *xt, v);
       *xt = next;
-      if (b.cta == 0) {
-        b.a.v_t[size_t(step) * T * A + at] = v;
-        b.a.x_t[size_t(step + 1) * T * A + at] = next;
-      }
+      if (b.cta == 0) put_out(b, step, at, v, next);
     }
   }
   MARK(20)
@@ -269,12 +279,9 @@ __device__ __forceinline__ void advance_own(Block& b, Actions& actions, const fl
       for (int s = 0; s < S * V_PARTS; ++s) v += parts[(s * OWN_T + own) * A + Actions::number(b)];
 #pragma unroll
       for (int s = 0; s < S; ++s) q += squares[s * OWN_T + own];
-      v = v * rsqrtf(q * (1.0f / D) + b.a.eps) + shift;
-      actions.kept[i] = __fadd_rn(actions.kept[i], __fmul_rn(b.a.dt, v));
-      if (b.rank() == 0) {
-        b.a.v_t[size_t(step) * T * A + at] = v;
-        b.a.x_t[size_t(step + 1) * T * A + at] = actions.kept[i];
-      }
+      v = v * rms_from(b, q) + shift;
+      actions.kept[i] = euler_step(b, actions.kept[i], v);
+      if (b.rank() == 0) put_out(b, step, at, v, actions.kept[i]);
     }
   MARK(20)
 }

@@ -23,9 +23,8 @@ __device__ __forceinline__ void send_tile_squares(const Block& b, float4 x, int 
   if (i >= DX * NT) return;
   const int lacks = imax(DX - xn, 1);
   const int tile = absent < 0 ? i % xn : xn + absent % lacks, n = absent < 0 ? i / xn : absent / lacks;
-  float q0 = x.x * x.x + x.z * x.z, q1 = x.y * x.y + x.w * x.w;
-#pragma unroll
-  for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
+  float q0, q1;
+  squares_of(x, q0, q1);
   if (absent >= 0) q0 = q1 = 0;
   static_assert(S == 8, "lane g serves rank g");
   const u32 to = b.base + M_SSQ + ((b.rank() * DX + tile) * NT * 8 + n * 8 + 2 * b.t()) * 4;
@@ -38,25 +37,31 @@ __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[I
 }
 constexpr u32 SQUARES_EXPECT = SPREAD ? S * NT * 32 : SQ * ((T + 1) / 2) * 8;
 // 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a spare warp makes them.
+__device__ __forceinline__ float2 known_rms(const Block& b, int token) {
+  return *(const float2*)(b.smem + M_RMS + token * 4);
+}
 __device__ __forceinline__ float2 inverse_rms(const Block& b, int token, int half) {
   barrier_wait(b.bar(BAR_RMS), b.x_parity(half));
-  return *(const float2*)(b.smem + M_RMS + token * 4);
+  return known_rms(b, token);
+}
+__device__ __forceinline__ float rms_from(const Block& b, float squares) {  // 1 / rms
+  return rsqrtf(squares * (1.0f / D) + b.a.eps);
 }
 __device__ __forceinline__ void make_inverse_rms(const Block& b) {
   const int uses = b.a.steps * L * (b.attends() ? 2 : 1);
 #pragma unroll 1
   for (int use = 0; use < uses; ++use) {
     barrier_wait(b.bar(BAR_X), use & 1);
-    constexpr int LANES = FEW ? 32 / (NT * 8) : 1;  // of a token
+    constexpr int LANES = imax(32 / (NT * 8), 1), TOKENS = 32 / LANES;  // lanes of a token, tokens at once
 #pragma unroll 1
-    for (int token = FEW ? b.lane() % (NT * 8) : b.lane(); token < NT * 8; token += 32) {
+    for (int token = b.lane() % TOKENS; token < NT * 8; token += 32) {
       float sum = 0;
 #pragma unroll 8
-      for (int s = FEW ? b.lane() / (NT * 8) : 0; s < SQ; s += LANES)
+      for (int s = b.lane() / TOKENS; s < SQ; s += LANES)
         sum += *(const float*)(b.smem + M_SSQ + (s * NT * 8 + token) * 4);
 #pragma unroll
-      for (int o = NT * 8; FEW && o < 32; o *= 2) sum += exchange(sum, o);
-      *(float*)(b.smem + M_RMS + token * 4) = rsqrtf(sum * (1.0f / D) + b.a.eps);
+      for (int o = TOKENS; o < 32; o *= 2) sum += exchange(sum, o);
+      *(float*)(b.smem + M_RMS + token * 4) = rms_from(b, sum);
     }
     __syncwarp();
     if (b.lane() == 0) barrier_arrive(b.bar(BAR_RMS));
@@ -139,8 +144,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
     if (PATIENCE) words[j] = settled(words[j]);
     if (!SPREAD) places[j] = Everyone(columns_place(b, M_X, b.x0() + item.tile, item.n));
   }
-  while (u32(clock64()) - since < PATIENCE) {
-  }
+  pause(since, PATIENCE);
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
@@ -160,8 +164,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
       MARK(21 + half)
     }
     if (!SPREAD && (send_on || last)) {
-      const float4 y =
-          make_float4(x[j].x * scales[j].x, x[j].y * scales[j].x, x[j].z * scales[j].y, x[j].w * scales[j].y);
+      const float4 y = scaled(x[j], scales[j]);
       if (send_on)
         send_columns(b, places[j], bars, item.n, y, item.real);
       else
@@ -269,9 +272,8 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
       if (own.mine[i][k]) {
         const int n = own.n[i][k];
         float4 c = own.sums[i][k];
-        if (FP8) c = make_float4(c.x * scale[i].x, c.y * scale[i].x, c.z * scale[i].y, c.w * scale[i].y);
-        const float2 r = SPREAD ? *(const float2*)(b.smem + M_RMS + (n * 8 + 2 * b.t()) * 4)
-                                 : inverse_rms(b, n * 8 + 2 * b.t(), 1);
+        if (FP8) c = scaled(c, scale[i]);
+        const float2 r = SPREAD ? known_rms(b, n * 8 + 2 * b.t()) : inverse_rms(b, n * 8 + 2 * b.t(), 1);
         const float h0 = gelu(c.x * r.x + shift[i].x) * (c.z * r.x + shift[i].y),
                     h1 = gelu(c.y * r.y + shift[i].x) * (c.w * r.y + shift[i].y);
         // first two, then four, then all 8 units of a token in a lane: four lanes have the same, they share the ranks
