@@ -249,6 +249,8 @@ def test_the_command_writes_a_complete_document(tmp_path: Path) -> None:
     page = (tmp_path / "report.md").read_text()
     assert page == report(document)
     assert f"{document['results'][3]['milliseconds']['total']['p50']:.2f}" in page
+    document["results"][-1]["backend_details"]["denoising_clock_mhz"] = {"H=10, 2 steps": 1795}
+    assert "1795 (H=10, 2 steps). nvidia-smi said nothing." in report(document)
 
 
 def test_a_run_that_is_ended_has_kept_what_it_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

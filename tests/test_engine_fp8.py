@@ -1,6 +1,7 @@
 """The engine with FP8 matrices equals the emulated reference, and a calibration decides which matrices those are."""
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 
 import pytest
@@ -128,7 +129,11 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     plan = told["fp8"]["plan"]
     assert plan["prefix.down"] == "fp8"
     assert plan["expert.qkv"] == plan["expert"] == "bf16, as operations denoise"
-    backend._denoisers = {(10, 10, 968): cast(Any, None)}
+    clock: list[float | None] = [None]
+    backend._denoisers = {(10, 10, 968): cast(Any, SimpleNamespace(clock_mhz=lambda: clock[0]))}
+    assert "denoising_clock_mhz" not in backend.describe()  # it hasn't run
+    clock[0] = 1795.4
+    assert backend.describe()["denoising_clock_mhz"] == {"H=10, 10 steps": 1795}
     plan = backend.describe()["fp8"]["plan"]
     assert plan["expert.qkv"] == "fp8"
     assert plan["expert"] == "fp8 weights in the denoising kernel; bf16 where operations denoise"

@@ -211,18 +211,30 @@ def test_the_source_compiles_for_hopper(tmp_path: Path, name: str, clusters: int
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [code]  # kept for the next start
 
 
+def machine_code(name: str, folder: Path, *, suffix: int, fp8: bool = False) -> str:
+    """The kernel's, as text."""
+    arrangement = packing.Arrangement(CONFIGS[name], 8)
+    sizes = denoise.kernel_sizes(arrangement, cache_rows=48, suffix=suffix, shared_bytes=232448, fp8=fp8)
+    file = folder / "kernel.cubin"
+    file.write_bytes(denoise.compiled("sm_90a", sizes, folder=folder / "kept"))
+    triton = pytest.importorskip("triton")
+    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "nvdisasm"
+    return subprocess.run([tool, "-c", file], capture_output=True, text=True, check=True).stdout
+
+
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 def test_the_product_that_keeps_tensor_cores_awake_is_in_the_machine_code(tmp_path: Path) -> None:
     # ptxas leaves out products whose sums nobody reads
-    sizes = denoise.kernel_sizes(
-        packing.Arrangement(CONFIGS["golden"], 8), cache_rows=48, suffix=10, shared_bytes=232448
-    )
-    file = tmp_path / "kernel.cubin"
-    file.write_bytes(denoise.compiled("sm_90a", sizes, folder=tmp_path / "kept"))
-    triton = pytest.importorskip("triton")
-    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "nvdisasm"
-    code = subprocess.run([tool, "-c", file], capture_output=True, text=True, check=True).stdout
+    code = machine_code("golden", tmp_path, suffix=10)
     assert re.search(r"HMMA[^\n]*\n[^\n]*NANOSLEEP 0x64", code), "100 ns without a product before them"
+
+
+@pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
+@pytest.mark.parametrize(("suffix", "fp8"), [(10, False), (24, True), (50, False), (50, True)])
+def test_products_do_not_wait_for_each_other(tmp_path: Path, suffix: int, fp8: bool) -> None:
+    # where ptxas can't tell who touches their registers it puts a fence and a wait around every single one
+    code = machine_code("full", tmp_path, suffix=suffix, fp8=fp8)
+    assert len(re.findall("HGMMA", code)) >= 3 * len(re.findall("WARPGROUP.ARRIVE", code)) > 0
 
 
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
@@ -243,6 +255,11 @@ def test_a_source_that_does_not_compile_shows_the_compilers_log(tmp_path: Path) 
 def test_other_gpus_are_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (12, 0))
     assert denoise.unavailable(GPU) == "the denoising kernel is written for compute capability 9.0, this GPU has 12.0"
+
+
+def test_the_clock_is_cycles_by_time() -> None:
+    assert denoise.megahertz(0, 0) is None
+    assert denoise.megahertz(4_500_000, 2_500_000) == 1800
 
 
 def test_blocks_that_gave_up_say_where() -> None:
@@ -300,6 +317,16 @@ SHAPES = pytest.mark.parametrize(
         ("full", 3, 50, 560, None),
     ],
 )
+
+
+@on_hopper
+def test_it_tells_its_clock() -> None:
+    p = problem("shallow", 2, 10, 100, 1, GPU)
+    kernel = kernel_of(p)
+    assert kernel.clock_mhz() is None
+    run(p, kernel)
+    clock = kernel.clock_mhz()
+    assert clock is not None and 300 < clock < 3000  # between idle and more than any has
 
 
 @on_hopper

@@ -94,6 +94,13 @@ class FusedBackend(CudaGraphBackend):
             if (call := f"H={horizon}, {steps} steps") not in calls:
                 calls.append(call)
         described["denoising"] = ({"one CUDA kernel": by_kernel} if by_kernel else {}) | by_operations
+        clocks = {
+            f"H={horizon}, {steps} steps": round(clock)
+            for (steps, horizon, _), kernel in self._denoisers.items()
+            if (clock := kernel.clock_mhz()) is not None
+        }
+        if clocks:
+            described["denoising_clock_mhz"] = clocks
         return described
 
     def _pack(self, load: LoadState) -> Weights:

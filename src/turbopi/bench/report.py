@@ -74,7 +74,18 @@ def _main(document: dict[str, Any]) -> list[str]:
         )
     floor = main_results(document)[0]["floor_ms"]
     rows.insert(0, ["floor", *(f"{floor[name]:.2f}" for name in (*_STAGES, "total")), *["-"] * 8])
-    return [f"## {job_label(document['main_job'])}", "", *_table(head, rows)]
+    return [f"## {job_label(document['main_job'])}", "", *_table(head, rows), *_clocks(document)]
+
+
+def _clocks(document: dict[str, Any]) -> list[str]:
+    """What the multiprocessors' clock was inside the last denoising kernel of each shape, if they told."""
+    told = [
+        f"{label(result)} {', '.join(f'{clock} ({shape})' for shape, clock in clocks.items())}"
+        for result in document["results"]
+        if (clocks := result.get("backend_details", {}).get("denoising_clock_mhz"))
+    ]
+    said = document["provenance"].get("gpu", {}).get("clocks.sm", "nothing")
+    return [f"Clock while denoising, MHz: {'; '.join(told)}. nvidia-smi said {said}.", ""] if told else []
 
 
 def _all(document: dict[str, Any]) -> list[str]:

@@ -66,7 +66,7 @@ class _Args(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_void_p) for name in ("weights", "starts", "table", "shifted", "out_w", "out_shift", "in_w")),
         *((name, ctypes.c_void_p) for name in ("in_b", "inv_freq", "cache_k", "cache_v", "keys", "length", "noise")),
-        *((name, ctypes.c_void_p) for name in ("x_t", "v_t", "scratch", "hang", "trace")),
+        *((name, ctypes.c_void_p) for name in ("x_t", "v_t", "scratch", "hang", "clock", "trace")),
         ("layer_stride", ctypes.c_longlong),
         ("layer_bytes", ctypes.c_longlong),
         ("steps", ctypes.c_int),
@@ -129,6 +129,10 @@ def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) ->
             f"{tokens} suffix tokens and {keys} cache rows leave the denoising kernel too little of a "
             f"block's {sizes['TP_SMEM']} bytes of shared memory"
         ) from e
+
+
+def megahertz(cycles: int, nanoseconds: int) -> float | None:
+    return cycles / nanoseconds * 1e3 if nanoseconds else None
 
 
 def stuck(words: list[int]) -> str | None:
@@ -207,6 +211,7 @@ class DenoiseKernel:
             ),
             "scratch": torch.empty(4 * sizes["TP_SCRATCH"], dtype=torch.int32, device=device),
             "hang": torch.zeros(self._blocks, dtype=torch.int32, pin_memory=True),  # see `why_it_trapped`
+            "clock": torch.zeros(2, dtype=torch.int64, pin_memory=True),  # see `clock_mhz`
             "trace": torch.zeros(self._blocks, 64, dtype=torch.int32, device=device),  # cycles by phase, with TP_TRACE
         }
 
@@ -234,6 +239,12 @@ class DenoiseKernel:
         )
         self._prepare.launch(self._tiles, 256, args)
         self._kernel.launch(self._blocks, THREADS, args)
+
+    def clock_mhz(self) -> float | None:
+        """The multiprocessors' clock during the last launch that has ended, in MHz, which may be lower than what
+        nvidia-smi says; None before the first.
+        """
+        return megahertz(*self._tensors["clock"].tolist())
 
     def why_it_trapped(self) -> str | None:
         """After a launch that failed: where blocks waited for seconds before they gave up, or None."""

@@ -189,19 +189,24 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   } else if constexpr (ASYNC) {
     if (some_keys) suffix_keys.ask(), suffix_keys.keep(b);  // while queries come
     if (some_values) suffix_values.ask(), suffix_values.keep(b);
-    receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
-    MARK(3)
     const u32 first_slot = b.slot;
     auto slot_of = [&](u32 i) { return first_slot + i < STAGES ? first_slot + i : first_slot + i - STAGES; };
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) take_slot(b);
+    const bool scores = scorer && b.warp() / 4 * 4 < tiles;
+    const int tile = scores ? min(b.warp(), tiles - 1) : 0;
+    const byte* const from = b.ring(slot_of(tile / SLOT_TILES)) + tile % SLOT_TILES * KEY_TILE;
+    auto fetch = [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane()); };
+    uint4 first[SCORE_CHUNK];
+#pragma unroll
+    for (int k = 0; k < SCORE_CHUNK; ++k) first[k] = fetch(k);
+    receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
+    MARK(3)
     float c[1][NT][4];
     clear(c[0]);
-    if (scorer && b.warp() / 4 * 4 < tiles) {
+    if (scores) {
       show_to_products();
-      const int tile = min(b.warp(), tiles - 1);
-      const byte* from = b.ring(slot_of(tile / SLOT_TILES)) + tile % SLOT_TILES * KEY_TILE;
-      score_together(b, [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane()); }, c[0]);
+      score_together(b, first, fetch, c[0]);
     }
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) give_slot(b, slot_of(i));

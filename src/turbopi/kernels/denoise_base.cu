@@ -230,6 +230,7 @@ struct Args {
   float* v_t;               // [N][T][A]
   uint4* scratch;           // zero at the start
   u32* hang;                // [NC * S] host memory: see `watch`
+  long long* clock;         // [2] host memory: cycles and nanoseconds of a launch, of CTA 0
   u32* trace;
   long long layer_stride, layer_bytes;
   int steps;
@@ -257,7 +258,6 @@ struct Block {
     asm volatile("" : "+r"(base));
     asm volatile("mov.u32 %0, %%ctaid.x;" : "=r"(cta));
     asm volatile("mov.u32 %0, %%tid.x;" : "=r"(thread));
-    if (FP8 && SPREAD) return;  // there it costs spills
     __builtin_assume(cta < NC * S), __builtin_assume(thread < CONSUMERS);
   }
   __device__ __forceinline__ int cluster() const { return int(cta / S); }

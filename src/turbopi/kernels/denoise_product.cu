@@ -72,6 +72,39 @@ struct Ahead {
   }
 };
 
+// E4M3 and many tokens: this warp's share of a group's fragments as they lie in the slots, two at a time.
+template <int TILES_>
+struct Reader {
+  static constexpr int STEP = 2, PARTS = group_parts(TILES_);
+  static_assert(FEW || RPS % STEP == 0, "whole steps");
+  uint4 weights[STEP];
+  u32 slot = 0, at = 0;
+  int left = 0, tiles;
+
+  __device__ __forceinline__ explicit Reader(int n) : tiles(n) {}
+  __device__ __forceinline__ void ask(Block& b) {
+    if (left == 0) {
+      const Share my(b, PARTS);
+      slot = take_slot(b), left = slot_rounds(PARTS, tiles) * (RPS / STEP),
+      at = M_RING + slot * SLOT + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
+    }
+#pragma unroll
+    for (int i = 0; i < STEP; ++i, at += PARTS * tiles * FRAGMENT) weights[i] = load_weights(b, at);
+    --left;
+  }
+};
+
+// What a product of `tiles` tiles reads of its first group before its activations are there.
+template <int TILES_, int ROUNDS>
+struct Early {
+  Ahead<TILES_, ROUNDS> ahead;
+  Reader<TILES_> reader;
+
+  __device__ __forceinline__ Early(Block& b, int tiles) : ahead(b), reader(min(tiles, TILES_)) {
+    if (FP8 && SPREAD && tiles > 0) reader.ask(b);
+  }
+};
+
 // One group of tiles, this warp's share of it. x: activations in shared memory; `blocks` of the reduction, a multiple
 // of EVEN, of whose rounds AHEAD have been loaded.
 template <int TILES_, int EVEN, int AHEAD>
@@ -148,10 +181,8 @@ struct GroupProduct {
     await_products<0>();
     if (rounds > AHEAD) give_slot(b, slot);
   }
-  // E4M3: weights through registers, where they become float16; all of a round for mma, two fragments for wgmma.
+  // E4M3 and few tokens: weights through registers, where they become float16, all of a round for mma.
   __device__ __forceinline__ void through_registers() {
-    constexpr int STEP = FEW ? RPS : 2;
-    static_assert(RPS % STEP == 0, "whole steps");
     u32 slot = 0, at = 0;
     int left = 0;
 #pragma unroll 1
@@ -160,41 +191,52 @@ struct GroupProduct {
         slot = take_slot(b), left = rounds_of_slot,
         at = M_RING + slot * SLOT + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
       --left;
+      uint4 w[RPS];
+      u32 seen = 0;
+#pragma unroll
+      for (int i = 0; i < RPS; ++i) w[i] = load_weights(b, at + i * PARTS * tiles * FRAGMENT), seen ^= fold(w[i]);
+#pragma unroll
+      for (int i = 0; i < RPS * KB; ++i) multiply(operand_of(w[i / KB], i % KB), r, i / KB, i % KB);
+      if (left == 0 || r + 1 == rounds) give_slot(b, slot, seen);
+      at += RPS * PARTS * tiles * FRAGMENT;
+    }
+  }
+  // E4M3 and many tokens: the same for wgmma. All of a step's weights become float16 before its first product, else the
+  // compiler makes products wait for each other; the next are asked for while products read these.
+  __device__ __forceinline__ void through_registers(Reader<TILES_>& reader) {
+    constexpr int STEP = Reader<TILES_>::STEP;
+    const int steps = rounds * (RPS / STEP);
 #pragma unroll 1
-      for (int i0 = 0; i0 < RPS; i0 += STEP, at += STEP * PARTS * tiles * FRAGMENT) {
-        const bool last = i0 + STEP == RPS && (left == 0 || r + 1 == rounds);
-        uint4 w[STEP];
-        u32 seen = 0;
+    for (int s = 0; s < steps; ++s) {
+      uint4 a[STEP * KB];
+      u32 seen = 0;
 #pragma unroll
-        for (int i = 0; i < STEP; ++i) w[i] = load_weights(b, at + i * PARTS * tiles * FRAGMENT), seen ^= fold(w[i]);
-        if (!FEW) begin_products();
+      for (int i = 0; i < STEP * KB; ++i)
+        a[i] = operand_of(reader.weights[i / KB], i % KB), seen ^= fold(reader.weights[i / KB]);
+      if (reader.left == 0 || s + 1 == steps) give_slot(b, reader.slot, seen);
+      begin_products();
 #pragma unroll
-        for (int i = 0; i < STEP * KB; ++i) {
-          const uint4 a = operand_of(w[i / KB], i % KB);
-          if constexpr (FEW)
-            multiply(a, r, i / KB, i % KB);
-          else
-            add_product(sums, a.x, a.y, a.z, a.w, activations(r, i0 + i / KB, i % KB), r | i0 | i);
-        }
-        if (!FEW) commit_products();
-        if (last) give_slot(b, slot, seen);
-        if (!FEW) await_products<0>();  // they read these registers; other warpgroups multiply meanwhile
-      }
+      for (int i = 0; i < STEP * KB; ++i)
+        add_product(sums, a[i].x, a[i].y, a[i].z, a[i].w, activations(0, s * STEP + i / KB, i % KB), s | i);
+      commit_products();
+      if (s + 1 < steps) reader.ask(b);
+      await_products<0>();  // other warpgroups multiply meanwhile
+#pragma unroll
+      for (int i = 0; i < STEP * KB; ++i) keep_until_here(a[i]);
     }
   }
 
-  __device__ __forceinline__ void operator()(const Ahead<TILES_, AHEAD>* ahead) {
-    if constexpr (AHEAD > 0) multiply(*ahead);
-    if constexpr (FP8)
+  __device__ __forceinline__ void operator()(Early<TILES_, AHEAD>& early) {
+    if constexpr (AHEAD > 0) multiply(early.ahead);
+    if constexpr (FP8 && SPREAD)
+      through_registers(early.reader);
+    else if constexpr (FP8)
       through_registers();
     else
       from_slots();
     if constexpr (AHEAD > 0 && !FP8)
 #pragma unroll
-      for (int i = 0; i < AHEAD * RPS; ++i) {  // until now products have read them
-        const uint4 w = ahead->weights[i];
-        asm volatile("" ::"r"(w.x), "r"(w.y), "r"(w.z), "r"(w.w));
-      }
+      for (int i = 0; i < AHEAD * RPS; ++i) keep_until_here(early.ahead.weights[i]);
   }
 };
 
@@ -203,24 +245,19 @@ __device__ __forceinline__ void show_activations() {
   if (!(FP8 && FEW)) show_to_products();
 }
 // Up to MT tiles (`tiles` of them) times the activations.
-template <int MT, int EVEN, int FIRST = 0>
-__device__ __forceinline__ void multiply(Block& b, u32 x, int blocks, int tiles, float (*sums)[NT * 4]) {
-  if constexpr (FIRST < MT) {
-    constexpr int N = group_tiles(MT - FIRST);
-    if (FIRST < tiles) {
-      GroupProduct<N, EVEN, 0>(b, x, blocks, min(tiles - FIRST, N), sums[FIRST / 8])(nullptr);
-      multiply<MT, EVEN, FIRST + N>(b, x, blocks, tiles, sums);
-    }
-  }
-}
-// The same with what has been loaded ahead.
 template <int MT, int EVEN, int AHEAD>
 __device__ __forceinline__ void multiply(Block& b, u32 x, int blocks, int tiles, float (*sums)[NT * 4],
-                                         const Ahead<group_tiles(MT), AHEAD>& ahead) {
-  if constexpr (AHEAD > 0)
-    GroupProduct<MT, EVEN, AHEAD>(b, x, blocks, tiles, sums[0])(&ahead);
-  else
-    multiply<MT, EVEN>(b, x, blocks, tiles, sums);
+                                         Early<group_tiles(MT), AHEAD>& early) {
+  constexpr int N = group_tiles(MT);
+  if constexpr (AHEAD > 0) {
+    GroupProduct<MT, EVEN, AHEAD>(b, x, blocks, tiles, sums[0])(early);
+  } else if (tiles > 0) {
+    GroupProduct<N, EVEN, 0>(b, x, blocks, min(tiles, N), sums[0])(early);
+    if constexpr (N < MT) {
+      Early<group_tiles(MT - N), 0> next(b, tiles - N);
+      multiply<MT - N, EVEN>(b, x, blocks, tiles - N, sums + 1, next);
+    }
+  }
 }
 
 // Where a lane's partial sums of 8 tokens lie. Of the last 8 only pairs that exist are kept.
@@ -301,6 +338,18 @@ struct Own {
     __syncwarp();
     asm volatile("bar.sync %0, %1;" ::"r"(8 + (tile[0] & 7)), "n"(group_parts(group_tiles(MT)) * 32) : "memory");
   }
+  // Of two parts: the other's to `to`, the rest to `sums`.
+  template <int PART>
+  __device__ __forceinline__ void share_out(const Block& b, byte* to, bool real, const float (&mixed)[NT * 4]) {
+#pragma unroll
+    for (int n = 0; n < NT; ++n) {
+      const float4 sum = make_float4(mixed[n * 4], mixed[n * 4 + 1], mixed[n * 4 + 2], mixed[n * 4 + 3]);
+      if (n % 2 == PART)
+        sums[0][n / 2] = sum;
+      else if (real && (n + 1 < NT || b.t() < TAIL))
+        *(float4*)(to + partial_place(b, n)) = sum;
+    }
+  }
   // To `sums` come all parts' sums of what is mine. They lie APART, or in `region`: over the operand of the
   // product unless SPREAD.
   __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
@@ -327,18 +376,28 @@ struct Own {
                        partial_place(b, n));
     };
     if (!APART && !SPREAD) consumers_sync();
+    if constexpr (plan_groups(MT) == 1 && group_parts(group_tiles(MT)) == 2) {  // branches, where else are selections
+      const bool real = tile[0] < imin(tiles, group_tiles(MT));
+      byte* const to = place + (tile[0] & 7) * PARTIAL;
+      if (n[0][0] == 1)
+        share_out<1>(b, to, real, mixed[0]);
+      else
+        share_out<0>(b, to, real, mixed[0]);
+    } else {
 #pragma unroll
-    for (int i = 0; i < plan_groups(MT); ++i) {
-      const int size = group_tiles(MT - i * 8), parts = group_parts(size);
-      const Share my(b, parts);
+      for (int i = 0; i < plan_groups(MT); ++i) {
+        const int size = group_tiles(MT - i * 8), parts = group_parts(size);
+        const Share my(b, parts);
 #pragma unroll
-      for (int n = 0; n < NT; ++n) {
-        const float4 sum = make_float4(mixed[i][n * 4], mixed[i][n * 4 + 1], mixed[i][n * 4 + 2], mixed[i][n * 4 + 3]);
-        const int owner = n % parts;
-        if (my.part == owner)
-          sums[i][n / parts] = sum;
-        else if (my.tile < size && tile[i] < tiles && (n + 1 < NT || b.t() < TAIL))
-          *other(i, parts, my.part - (my.part > owner), n) = sum;
+        for (int n = 0; n < NT; ++n) {
+          const float4 sum =
+              make_float4(mixed[i][n * 4], mixed[i][n * 4 + 1], mixed[i][n * 4 + 2], mixed[i][n * 4 + 3]);
+          const int owner = n % parts;
+          if (my.part == owner)
+            sums[i][n / parts] = sum;
+          else if (my.tile < size && tile[i] < tiles && (n + 1 < NT || b.t() < TAIL))
+            *other(i, parts, my.part - (my.part > owner), n) = sum;
+        }
       }
     }
     if ((APART || SPREAD) && plan_groups(MT) == 1)

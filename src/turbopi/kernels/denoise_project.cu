@@ -160,10 +160,11 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     consumers_sync();
     product.store(b, b.smem + M_X);
   } else {
+    Early<group_tiles(QKV), 0> early(b, qn + kvn);
     await_stream();
     float sums[plan_groups(QKV)][NT * 4];
     if (!SPREAD) show_activations();
-    multiply<QKV, D16>(b, b.base + M_X, D16, qn + kvn, sums);
+    multiply<QKV, D16>(b, b.base + M_X, D16, qn + kvn, sums, early);
     MARK(1)
     consumers_sync();
     if constexpr (SPREAD) give_room(b);

@@ -65,17 +65,17 @@ __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int
   return seen;
 }
 
-// The same for a warpgroup, each warp with 16 keys of its own.
+// The same for a warpgroup, each warp with 16 keys of its own, whose first blocks it has.
+constexpr int SCORE_CHUNK = QT % 4 == 0 ? 4 : 1;
 template <typename Fetch>
-__device__ __forceinline__ void score_together(const Block& b, Fetch fetch, float (&c)[NT][4]) {
-  constexpr int CHUNK = QT % 4 == 0 ? 4 : 1;
+__device__ __forceinline__ void score_together(const Block& b, uint4 (&now)[SCORE_CHUNK], Fetch fetch,
+                                               float (&c)[NT][4]) {
+  constexpr int CHUNK = SCORE_CHUNK;
   const u64 queries = operand(b.base + M_Q, 128, NT * 128);
   float sums[NT * 4];
 #pragma unroll
   for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
-  uint4 now[CHUNK], next[CHUNK];
-#pragma unroll
-  for (int i = 0; i < CHUNK; ++i) now[i] = fetch(i);
+  uint4 next[CHUNK];
 #pragma unroll
   for (int k = 0; k < QT; k += CHUNK) {
     begin_products();
@@ -88,7 +88,7 @@ __device__ __forceinline__ void score_together(const Block& b, Fetch fetch, floa
       for (int i = 0; i < CHUNK; ++i) next[i] = fetch(k + CHUNK + i);
     await_products<0>();
 #pragma unroll
-    for (int i = 0; i < CHUNK; ++i) now[i] = next[i];
+    for (int i = 0; i < CHUNK; ++i) keep_until_here(now[i]), now[i] = next[i];
   }
 #pragma unroll
   for (int i = 0; i < NT * 4; ++i) c[i / 4][i % 4] = sums[i];

@@ -196,14 +196,14 @@ __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, in
       place[i][k] = (uint2*)(words + b.cluster() / 2 * 32) + (b.cluster() & 1);
       if (FEW) place[i][k] = settled(place[i][k]);
     }
-  const Ahead<group_tiles(DX), RESIDUAL_AHEAD> ahead(b);
+  Early<group_tiles(DX), RESIDUAL_AHEAD> early(b, b.xn());
   await();
   show_activations();
   float sums[plan_groups(DX)][NT * 4];
   constexpr int EVEN = F16 % NC == 0 && HC % 16 == 0 && QT % 16 == 0 ? 16
                        : F16 % NC == 0 && HC % 8 == 0 && QT % 8 == 0 ? 8
                                                                      : 1;
-  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, ahead);
+  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, early);
   then();
   own.add_up(b, region, b.xn(), sums);
 #pragma unroll
@@ -245,12 +245,12 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
       if (FEW) place[i][k] = settled(place[i][k]);
     }
   }
-  const Ahead<group_tiles(GTL), GATE_UP_AHEAD> ahead(b);
+  Early<group_tiles(GTL), GATE_UP_AHEAD> early(b, gn);
   receive(b, BAR_X, b.x_parity(1), X_EXPECT, WAIT_X);
   MARK(13)
   float sums[GROUPS_][NT * 4];
   if (!SPREAD) show_activations();  // what the copy engine wrote needs none
-  multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums, ahead);
+  multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums, early);
   MARK(15)
   if constexpr (SPREAD) consumers_sync(), give_room(b);
   own.add_up(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);

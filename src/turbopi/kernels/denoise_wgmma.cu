@@ -16,6 +16,8 @@ __device__ __forceinline__ u64 behind(u64 operand, u32 bytes) {
       : "l"(operand), "r"(bytes >> 4));
   return v;
 }
+// Until here products have read these registers.
+__device__ __forceinline__ void keep_until_here(uint4 v) { asm volatile("" ::"r"(v.x), "r"(v.y), "r"(v.z), "r"(v.w)); }
 // What threads wrote to shared memory (or peers, whose barrier was waited for) before may now be read by products.
 __device__ __forceinline__ void show_to_products() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
 // add_product(float (&sums)[NT * 4], u64 a or u32 * 4, u64 b, int keep): bfloat16, with registers float16; add_rows:
