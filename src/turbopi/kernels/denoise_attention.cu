@@ -15,7 +15,8 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     for (int i = 0; i < slots; ++i) give_slot(b, take_slot(b), 0);
   };
   // Keys: a warp those columns that it scores. Values: a warp those that it weighs, or the third warpgroup all.
-  const int k0 = share(QT, 4, b.warp() - SUFFIX_WARP), key_steps = share(QT, 4, b.warp() - SUFFIX_WARP + 1) - k0;
+  const int k0 = share(QT, 4, b.warp() - SUFFIX_WARP);
+  const int key_steps = QT % 4 == 0 ? QT / 4 : share(QT, 4, b.warp() - SUFFIX_WARP + 1) - k0;
   const bool some_keys = suffix > 0 && for_suffix && key_steps > 0;
   const bool some_values = suffix > 0 && (HOLD ? column < QT : b.warp() >= SCORERS && !for_suffix);
   SuffixPart<most(SUFFIX * SUFFIX_STEPS * 4, 32)> suffix_keys{kv,      bit,    0,      b.lane(),       32,
@@ -23,7 +24,8 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   constexpr int VALUE_THREADS = HOLD ? 32 : 128;
   SuffixPart<most(SUFFIX * (HOLD ? CT * 4 : HD / 4), VALUE_THREADS)> suffix_values{
       kv,      bit,    1, int(b.thread) & (VALUE_THREADS - 1), VALUE_THREADS,
-      suffix0, suffix, HOLD ? column * 4 : 0, HOLD ? min(CT, QT - column) * 4 : HD / 4};
+      suffix0, suffix, HOLD ? column * 4 : 0,
+      !HOLD ? HD / 4 : QT % WEIGHERS == 0 ? CT * 4 : min(CT, QT - column) * 4};
   auto ask_suffix = [&] {
     if (some_keys) suffix_keys.ask();
     if (some_values) suffix_values.ask();
@@ -151,11 +153,10 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
           if (i == 0 || tiles <= HELD_TILES) give_slot(b, slot, seen);
         }
       b.forget();
+      barrier_wait(b.bar(BAR_Q), b.n & 1);  // and so all sums have been read that lay where the suffix will
+      pause(u32(clock64()), 150);           // asked for too early it comes later
       ask_suffix();
-      if (for_suffix) {
-        receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
-        of_suffix();
-      }
+      if (for_suffix) of_suffix();
       if (some_values) suffix_values.keep(b);
       __syncwarp();
       prepare_outputs();

@@ -77,10 +77,18 @@ __device__ __forceinline__ void receive(const Block& b, int bar, int n, u32 byte
   __syncwarp();
   if (b.thread == 0) barrier_expect(b.bar(bar), bytes);
 }
-__device__ __forceinline__ void consumers_sync() {
-  __syncwarp();  // lanes leave a wait one by one, and this barrier counts warps
-  asm volatile("bar.sync 1, %0;" ::"n"(CONSUMERS) : "memory");
+// Barriers of some warps. Lanes leave a wait one by one, and these barriers count warps.
+template <int BARRIER, int WARPS>
+__device__ __forceinline__ void arrive() {
+  __syncwarp();
+  asm volatile("bar.arrive %0, %1;" ::"n"(BARRIER), "n"(WARPS * 32) : "memory");
 }
+template <int BARRIER, int WARPS>
+__device__ __forceinline__ void sync() {
+  __syncwarp();
+  asm volatile("bar.sync %0, %1;" ::"n"(BARRIER), "n"(WARPS * 32) : "memory");
+}
+__device__ __forceinline__ void consumers_sync() { sync<1, W>(); }
 // ---- moving data
 
 // An address at all ranks. All of them first, as a send reads its registers late.

@@ -206,7 +206,12 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
       }
     }
   }
-  consumers_sync();
+  // All sums have been read. Warps without items, which weigh values, needn't wait for that.
+  constexpr bool GO_ON = FEW && !IDLE_Q && (QTL + KVL) * NT <= W / 2;
+  if (GO_ON && b.warp() >= W / 2)
+    arrive<1, W>();
+  else
+    consumers_sync();
   if constexpr (SPREAD) await_room(b), ++b.room;
   static_assert(S == 8, "half a warp serves half of the ranks");
 #pragma unroll

@@ -13,18 +13,8 @@ constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES; 
 constexpr int HELD_KEYS = QT < 12 ? QT : 12, HELD_TILES = KT < 4 ? KT : 4;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
 constexpr int SUFFIX_STEPS = most(QT, 4);                                   // blocks of columns of a suffix warp
-// Barriers of some warps; 1 is consumers_sync's.
+// Barriers of some warps.
 constexpr int TOPS = 2, SUFFIX_SUMS = 3, WEIGHTS = 4, WEIGHTS_FOR_SUFFIX = 5, SUFFIX_WEIGHTS = 6;
-template <int BARRIER, int WARPS>
-__device__ __forceinline__ void arrive() {
-  __syncwarp();
-  asm volatile("bar.arrive %0, %1;" ::"n"(BARRIER), "n"(WARPS * 32) : "memory");
-}
-template <int BARRIER, int WARPS>
-__device__ __forceinline__ void sync() {
-  __syncwarp();
-  asm volatile("bar.sync %0, %1;" ::"n"(BARRIER), "n"(WARPS * 32) : "memory");
-}
 
 // A lane's address for `mma_tokens` in activations [block][half][NT][8 tokens][8 columns], standard order.
 __device__ __forceinline__ u32 token_address(const Block& b, u32 region) {
