@@ -100,8 +100,8 @@ struct Early {
   Ahead<TILES_, ROUNDS> ahead;
   Reader<TILES_> reader;
 
-  __device__ __forceinline__ Early(Block& b, int tiles) : ahead(b), reader(min(tiles, TILES_)) {
-    if (FP8 && SPREAD && tiles > 0) reader.ask(b);
+  __device__ __forceinline__ Early(Block& b, int tiles, int blocks) : ahead(b), reader(min(tiles, TILES_)) {
+    if (FP8 && SPREAD && tiles > 0 && blocks > 0) reader.ask(b);
   }
 };
 
@@ -254,7 +254,7 @@ __device__ __forceinline__ void multiply(Block& b, u32 x, int blocks, int tiles,
   } else if (tiles > 0) {
     GroupProduct<N, EVEN, 0>(b, x, blocks, min(tiles, N), sums[0])(early);
     if constexpr (N < MT) {
-      Early<group_tiles(MT - N), 0> next(b, tiles - N);
+      Early<group_tiles(MT - N), 0> next(b, tiles - N, blocks);
       multiply<MT - N, EVEN>(b, x, blocks, tiles - N, sums + 1, next);
     }
   }

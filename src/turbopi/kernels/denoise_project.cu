@@ -160,7 +160,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     consumers_sync();
     product.store(b, b.smem + M_X);
   } else {
-    Early<group_tiles(QKV), 0> early(b, qn + kvn);
+    Early<group_tiles(QKV), 0> early(b, qn + kvn, D16);
     await_stream();
     float sums[plan_groups(QKV)][NT * 4];
     if (!SPREAD) show_activations();

@@ -196,7 +196,7 @@ __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, in
       place[i][k] = (uint2*)(words + b.cluster() / 2 * 32) + (b.cluster() & 1);
       if (FEW) place[i][k] = settled(place[i][k]);
     }
-  Early<group_tiles(DX), RESIDUAL_AHEAD> early(b, b.xn());
+  Early<group_tiles(DX), RESIDUAL_AHEAD> early(b, b.xn(), blocks);
   await();
   show_activations();
   float sums[plan_groups(DX)][NT * 4];
@@ -245,7 +245,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
       if (FEW) place[i][k] = settled(place[i][k]);
     }
   }
-  Early<group_tiles(GTL), GATE_UP_AHEAD> early(b, gn);
+  Early<group_tiles(GTL), GATE_UP_AHEAD> early(b, gn, D16);
   receive(b, BAR_X, b.x_parity(1), X_EXPECT, WAIT_X);
   MARK(13)
   float sums[GROUPS_][NT * 4];
