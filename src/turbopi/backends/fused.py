@@ -87,16 +87,20 @@ class FusedBackend(CudaGraphBackend):
                 if name.startswith("expert.") and what == "fp8" and not expert.startswith("fp8"):
                     plan[name] = expert  # its kernel takes one precision
             plan["expert"] = expert
-        by_kernel = sorted({f"H={horizon}, {steps} steps" for steps, horizon, _ in self._denoisers})
+
+        def call_of(steps: int, horizon: int, _: int) -> str:
+            return f"H={horizon}, {steps} steps"
+
+        by_kernel = sorted({call_of(*key) for key in self._denoisers})
         by_operations: dict[str, list[str]] = {}
-        for (steps, horizon, _), why in self._refused.items():
+        for key, why in self._refused.items():
             calls = by_operations.setdefault(f"operations, as {why}", [])
-            if (call := f"H={horizon}, {steps} steps") not in calls:
+            if (call := call_of(*key)) not in calls:
                 calls.append(call)
         described["denoising"] = ({"one CUDA kernel": by_kernel} if by_kernel else {}) | by_operations
         clocks = {
-            f"H={horizon}, {steps} steps": round(clock)
-            for (steps, horizon, _), kernel in self._denoisers.items()
+            call_of(*key): round(clock)
+            for key, kernel in self._denoisers.items()
             if (clock := kernel.clock_mhz()) is not None
         }
         if clocks:

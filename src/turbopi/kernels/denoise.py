@@ -132,6 +132,7 @@ def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) ->
 
 
 def megahertz(cycles: int, nanoseconds: int) -> float | None:
+    """A clock in MHz, or None if no time was measured."""
     return cycles / nanoseconds * 1e3 if nanoseconds else None
 
 

@@ -89,6 +89,7 @@ __device__ __forceinline__ void sync() {
   asm volatile("bar.sync %0, %1;" ::"n"(BARRIER), "n"(WARPS * 32) : "memory");
 }
 __device__ __forceinline__ void consumers_sync() { sync<1, W>(); }
+__device__ __forceinline__ void consumers_arrive() { arrive<1, W>(); }  // of a warp that goes on at once
 // ---- moving data
 
 // An address at all ranks. All of them first, as a send reads its registers late.

@@ -209,7 +209,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   // All sums have been read. Warps without items, which weigh values, needn't wait for that.
   constexpr bool GO_ON = FEW && !IDLE_Q && (QTL + KVL) * NT <= W / 2;
   if (GO_ON && b.warp() >= W / 2)
-    arrive<1, W>();
+    consumers_arrive();
   else
     consumers_sync();
   if constexpr (SPREAD) await_room(b), ++b.room;

@@ -13,7 +13,7 @@ constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES; 
 constexpr int HELD_KEYS = QT < 12 ? QT : 12, HELD_TILES = KT < 4 ? KT : 4;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
 constexpr int SUFFIX_STEPS = most(QT, 4);                                   // blocks of columns of a suffix warp
-// Barriers of some warps.
+// Barriers of some warps; 1 is consumers_sync's.
 constexpr int TOPS = 2, SUFFIX_SUMS = 3, WEIGHTS = 4, WEIGHTS_FOR_SUFFIX = 5, SUFFIX_WEIGHTS = 6;
 
 // A lane's address for `mma_tokens` in activations [block][half][NT][8 tokens][8 columns], standard order.
@@ -60,25 +60,24 @@ constexpr int SCORE_CHUNK = QT % 4 == 0 ? 4 : 1;
 template <typename Fetch>
 __device__ __forceinline__ void score_together(const Block& b, uint4 (&now)[SCORE_CHUNK], Fetch fetch,
                                                float (&c)[NT][4]) {
-  constexpr int CHUNK = SCORE_CHUNK;
   const u64 queries = operand(b.base + M_Q, 128, NT * 128);
   float sums[NT * 4];
 #pragma unroll
   for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
-  uint4 next[CHUNK];
+  uint4 next[SCORE_CHUNK];
 #pragma unroll
-  for (int k = 0; k < QT; k += CHUNK) {
+  for (int k = 0; k < QT; k += SCORE_CHUNK) {
     begin_products();
 #pragma unroll
-    for (int i = 0; i < CHUNK; ++i)
+    for (int i = 0; i < SCORE_CHUNK; ++i)
       add_rows(sums, now[i].x, now[i].y, now[i].z, now[i].w, behind(queries, (k + i) * NT * 256), 1);
     commit_products();
-    if (k + CHUNK < QT)
+    if (k + SCORE_CHUNK < QT)
 #pragma unroll
-      for (int i = 0; i < CHUNK; ++i) next[i] = fetch(k + CHUNK + i);
+      for (int i = 0; i < SCORE_CHUNK; ++i) next[i] = fetch(k + SCORE_CHUNK + i);
     await_products<0>();
 #pragma unroll
-    for (int i = 0; i < CHUNK; ++i) keep_until_here(now[i]), now[i] = next[i];
+    for (int i = 0; i < SCORE_CHUNK; ++i) keep_until_here(now[i]), now[i] = next[i];
   }
 #pragma unroll
   for (int i = 0; i < NT * 4; ++i) c[i / 4][i % 4] = sums[i];
