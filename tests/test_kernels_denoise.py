@@ -230,11 +230,20 @@ def test_the_product_that_keeps_tensor_cores_awake_is_in_the_machine_code(tmp_pa
 
 
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
-@pytest.mark.parametrize(("suffix", "fp8"), [(10, False), (24, True), (50, False), (50, True)])
+@pytest.mark.parametrize(("suffix", "fp8"), [(10, False), (10, True), (24, True), (50, False), (50, True)])
 def test_products_do_not_wait_for_each_other(tmp_path: Path, suffix: int, fp8: bool) -> None:
     # where ptxas can't tell who touches their registers it puts a fence and a wait around every single one
     code = machine_code("full", tmp_path, suffix=suffix, fp8=fp8)
-    assert len(re.findall("HGMMA", code)) >= 3 * len(re.findall("WARPGROUP.ARRIVE", code)) > 0
+    assert len(re.findall("HGMMA", code)) >= 2 * len(re.findall("WARPGROUP.ARRIVE", code)) > 0
+
+
+@pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
+@pytest.mark.parametrize(("suffix", "fp8"), [(10, False), (10, True), (24, False), (50, True)])
+def test_ptxas_knows_that_the_lanes_of_a_warp_stay_together(tmp_path: Path, suffix: int, fp8: bool) -> None:
+    # else products find their operands' places lane by lane: see `of_warp`. With few tokens those of a spare warp may
+    # part, and the others' at the very end
+    code = machine_code("full", tmp_path, suffix=suffix, fp8=fp8)
+    assert len(re.findall(r"BRA\.DIV", code)) <= (2 if suffix <= denoise.FEW else 0)
 
 
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")

@@ -101,7 +101,7 @@ def kernel_sizes(
         "TP_FP8": int(fp8),
         "TP_DIVISOR": DIVISOR,
         # Larger slots of weights are faster, if enough of them fit.
-        "TP_RPS": 4 if suffix <= (48 if cache_rows <= 1024 else 24) else 2,
+        "TP_RPS": 4 if suffix <= ((56 if fp8 else 48) if cache_rows <= 1024 else 24) else 2,
         "TP_SMEM": shared_bytes,
         "TP_SCRATCH": scratch,
     }

@@ -253,7 +253,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   MARK(5)
   if constexpr (ASYNC) {
     static_assert(!ASYNC || CT == 1, "a tile of columns for a warp");
-    const u64 weights = operand(b.base + M_X + X_P, 128, NT * 128);
+    const u32 weights = operand_place(b.start() + M_X + X_P, NT * 128);
     float sums[NT * 4], out[CT][NT][4];
 #pragma unroll
     for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
@@ -271,7 +271,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
 #pragma unroll
       for (int sub = 0; sub < SLOT_TILES; ++sub)
         add_rows(sums, v[sub].x, v[sub].y, v[sub].z, v[sub].w,
-                 behind(weights, min(i * SLOT_TILES + sub, tiles - 1) * NT * 256), 1);
+                 operand_at<128>(behind(weights, min(i * SLOT_TILES + sub, tiles - 1) * NT * 256)), 1);
       commit_products();
       await_products<0>();
       give_slot(b, slot);

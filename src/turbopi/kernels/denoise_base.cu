@@ -48,7 +48,7 @@ constexpr int QTL = most(QT, S);           // query tiles of a CTA: 8 RoPE pairs
 constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
-constexpr u32 PATIENCE = FEW ? 500 : 600;  // clock cycles before sums are asked for: polls slow down what they wait for
+constexpr u32 PATIENCE = FEW ? 500 : FP8 ? 450 : 600;  // clock cycles before sums are asked for: polls slow down what they wait for
 constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see denoise_spread.cu
 constexpr int OWN_N = most(NT, NC);        // if so: 8 tokens of the slice at a time, which a CTA looks after
 constexpr int ITEMS_X = most(SPREAD ? DX * OWN_N : DX * NT, W);  // (tile, 8 tokens) that one warp looks after
@@ -241,28 +241,40 @@ struct Args {
 
 // ---- a CTA's view
 
+// What is the same in all lanes of a warp, so that the compiler knows it. wgmma takes its operands' places from registers
+// that a warp has once. There the compiler reckons with such places, if it knows that all lanes agree on them and on every
+// branch and loop around: else each costs six instructions more, and many tokens' products took twice their time. So
+// nothing that holds for some lanes alone may decide where a warp goes on.
+__device__ __forceinline__ u32 of_warp(u32 v) { return __shfl_sync(~0u, v, 0); }
+
 struct Block {
   const Args& a;
   byte* smem;
-  u32 base;         // of smem in the shared window
-  u32 cta, thread;  // cluster and rank, warp and lane: two registers for four
+  u32 base;                 // of smem in the shared window
+  u32 cta, thread, warp_;   // cluster and rank; lane; the warp, for all lanes
   u32 n = 0;                // layers done
   u32 slot = 0, phase = 0;  // of the ring
   u32 turn = 0, room = 0;   // exchanges of the stream, uses of BAR_ROOM
 
   __device__ Block(const Args& args, byte* s)
-      : a(args), smem(s), base(u32(__cvta_generic_to_shared(s))), cta(blockIdx.x), thread(threadIdx.x) {}
+      : a(args), smem(s), base(u32(__cvta_generic_to_shared(s))), cta(blockIdx.x), thread(threadIdx.x),
+        warp_(of_warp(threadIdx.x / 32)) {}
+  // The same as `base`, known to be so in all lanes.
+  static __device__ __forceinline__ u32 start() {
+    extern __shared__ __align__(128) byte dynamic[];
+    return u32(__cvta_generic_to_shared(dynamic));
+  }
   // For warps that multiply: make the compiler forget what these are made of. What it derives from them it would keep
   // in registers, or in local memory, over all layers, and a fetch from there costs more than to derive it again.
   __device__ __forceinline__ void forget() {
-    asm volatile("" : "+r"(base));
+    asm volatile("" : "+r"(base), "+r"(warp_));
     asm volatile("mov.u32 %0, %%ctaid.x;" : "=r"(cta));
     asm volatile("mov.u32 %0, %%tid.x;" : "=r"(thread));
-    __builtin_assume(cta < NC * S), __builtin_assume(thread < CONSUMERS);
+    __builtin_assume(cta < NC * S), __builtin_assume(thread < CONSUMERS), __builtin_assume(warp_ < W);
   }
   __device__ __forceinline__ int cluster() const { return int(cta / S); }
   __device__ __forceinline__ int rank() const { return int(cta % S); }
-  __device__ __forceinline__ int warp() const { return int(thread / 32); }
+  __device__ __forceinline__ int warp() const { return int(warp_); }
   __device__ __forceinline__ int lane() const { return int(thread % 32); }
   // Which of a barrier's two phases the stream has that comes before attention, or (half 1) the feed-forward.
   __device__ __forceinline__ u32 x_parity(int half) const { return attends() ? u32(half) : n & 1; }

@@ -33,13 +33,14 @@ __device__ __forceinline__ void consume(Block& b) {
     for (; b.n < u32(step + 1) * L; ++b.n) {
       const bool last = b.n + 1 == u32(step + 1) * L;
 #pragma unroll 1
-      for (int half = 0; half < 2; ++half) {  // attention, feed-forward; what they share is one piece of code
+      for (int half = 0; half < 2; ++half) {  // attention, feed-forward
         b.forget();
         const u32 bit = flag(b.n);
         auto of_tiles = [&](const float* all, u32 layer) {  // a CTA's rows of all tiles
           return all + (settled(layer) * (NC * S) + b.cta) * (TILES * 16);
         };
         float2 gates[ITEMS_X], scales[ITEMS_X];
+        Sent sent = {};
         auto load_norm = [&] {
           const float* const table = a.table + (2 * settled(b.n) + step) * (3 * D);
           load_columns(b, gates, table + (half ? 5 : 2) * D);
@@ -47,7 +48,7 @@ __device__ __forceinline__ void consume(Block& b) {
         };
         if (half || b.attends()) {
           if (half) {
-            gate_up(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L));
+            gate_up(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L), sent);
             MARK(16)
             load_norm();
           } else {
@@ -70,11 +71,20 @@ __device__ __forceinline__ void consume(Block& b) {
         auto then = [&] {
           if (!half) load_norm();
         };
-        if (half || b.attends())
-          residual_product(b, b.base + (half ? M_HID : M_ATT), half ? b.hn() : QT,
-                           SPREAD ? M_X + (half ? X_FF_SUMS : 0) : M_H, buffer, bit, await, then);
-        else
+        constexpr int HIDDEN = F16 % NC == 0 ? HC : 1;
+        if constexpr (SPREAD) {
+          if (half)
+            residual_product<HIDDEN>(b, M_HID, b.hn(), M_X + X_FF_SUMS, buffer, bit, await, then, sent);
+          else if (b.attends())
+            residual_product<QT>(b, M_ATT, QT, M_X, buffer, bit, await, then, sent);
+          else
+            load_norm();
+        } else if (half || b.attends()) {  // one piece of code
+          constexpr int EVEN = HIDDEN % 16 == 0 && QT % 16 == 0 ? 16 : HIDDEN % 8 == 0 && QT % 8 == 0 ? 8 : 1;
+          residual_product<EVEN>(b, half ? M_HID : M_ATT, half ? b.hn() : QT, M_H, buffer, bit, await, then, sent);
+        } else {
           load_norm();
+        }
         if constexpr (SPREAD)  // behind the last layer `embed_own` says it
           if (!half || (b.attends() && !last)) done_with_x(b);
         MARK(half ? 18 : 11)

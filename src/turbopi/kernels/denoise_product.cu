@@ -1,8 +1,8 @@
 // Part 5 of 12: matrix products.
 
-__device__ __forceinline__ u32 take_slot(Block& b, bool full = false) {
+__device__ __forceinline__ u32 take_slot(Block& b) {
   const u32 slot = b.slot;
-  if (!full) barrier_wait(b.full(slot), b.phase);
+  barrier_wait(b.full(slot), b.phase);
   __syncwarp();
   if (++b.slot == STAGES) b.slot = 0, b.phase ^= 1;
   return slot;
@@ -76,7 +76,7 @@ struct Ahead {
 template <int TILES_>
 struct Reader {
   static constexpr int STEP = 2, PARTS = group_parts(TILES_);
-  static_assert(FEW || RPS % STEP == 0, "whole steps");
+  static_assert(RPS % STEP == 0, "whole steps");
   uint4 weights[STEP];
   u32 slot = 0, at = 0;
   int left = 0, tiles;
@@ -105,21 +105,23 @@ struct Early {
   }
 };
 
-// One group of tiles, this warp's share of it. x: activations in shared memory; `blocks` of the reduction, a multiple
-// of EVEN, of whose rounds AHEAD have been loaded.
+// One group of tiles, this warp's share of it. x: where activations lie in shared memory; `blocks` of the reduction, a
+// multiple of EVEN, of whose rounds AHEAD have been loaded.
 template <int TILES_, int EVEN, int AHEAD>
 struct GroupProduct {
   static constexpr int PARTS = group_parts(TILES_);
   static constexpr bool EXACT = EVEN % (KB * PARTS * 4) == 0;
+  static constexpr int UNROLL = EXACT && SPREAD ? 16 : 1;  // where the number of rounds is known
   Block& b;
   const Share my;
-  const u32 x;
-  const int blocks, tiles, rounds, rounds_of_slot;
+  const int x, blocks, tiles, rounds, rounds_of_slot;
+  const u32 first;  // this part's first activations, as an operand's place
   float (&sums)[NT * 4];
 
-  __device__ __forceinline__ GroupProduct(Block& block, u32 from, int n, int t, float (&to)[NT * 4])
-      : b(block), my(block, PARTS), x(from), blocks(n), tiles(t), rounds(plan_rounds(PARTS, n)),
-        rounds_of_slot(slot_rounds(PARTS, t)), sums(to) {
+  __device__ __forceinline__ GroupProduct(Block& block, int from, int n, int t, float (&to)[NT * 4])
+      : b(block), my(block, PARTS), x(from), blocks(n), tiles(t), rounds(plan_rounds(PARTS, blocks)),
+        rounds_of_slot(slot_rounds(PARTS, t)),
+        first(behind(operand_place(b.start() + from, 128), EXACT ? my.part * KB * NT * 256 : 0)), sums(to) {
 #pragma unroll
     for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
   }
@@ -130,83 +132,61 @@ struct GroupProduct {
     return (EXACT ? block : min(block, blocks - 1)) * NT * 256;
   }
   __device__ __forceinline__ u64 activations(int r, int i, int half) const {
-    return behind(operand(x, 256, 128), place(r, i, half));
-  }
-  // Weights in registers, by mma: a tile a warp.
-  __device__ __forceinline__ void multiply(uint4 w, int r, int i, int half) {
-    uint4 v;  // of the first 8 tokens 8 columns, the other 8, then of the next 8 tokens
-    ldmatrix(v, x + place(r, i, half) + b.lane() * 16);
-    mma_half(sums, w, make_uint2(v.x, v.y));
-    if (NT > 1) mma_half(sums + (NT - 1) * 4, w, make_uint2(v.z, v.w));
+    return operand_at<256>(behind(first, EXACT ? ((r * RPS + i) * PARTS * KB + half) * NT * 256 : place(r, i, half)));
   }
   __device__ __forceinline__ void multiply(const Ahead<TILES_, AHEAD>& ahead) {
-    if (!FP8) begin_products();
+    begin_products();
 #pragma unroll
     for (int i = 0; i < AHEAD * RPS * KB; ++i) {
       const uint4 w = ahead.weights[i];
       if constexpr (FP8)
-        multiply(w, 0, i / KB, i % KB);
+        add_product(sums, w.x, w.y, w.z, w.w, activations(0, i / KB, i % KB), i);
       else
         add_rows(sums, w.x, w.y, w.z, w.w, activations(0, i, 0), i);
     }
-    if (!FP8) commit_products();
+    commit_products();
   }
 
-  // bfloat16: weights from shared memory. A product is issued when the one before has begun, so what else there is to
-  // do stands between two.
+  // bfloat16: weights from shared memory. A slot is given back when the round behind it has begun.
   __device__ __forceinline__ void from_slots() {
-    const int first = my.first < tiles ? my.first : 0;
-    const u64 weights = operand(b.base + M_RING + (my.part * tiles + first) * FRAGMENT, 256, 128);
-    u32 slot = 0, from = 0, previous = ~0u;
+    const int tile = my.first < tiles ? my.first : 0;
+    const u32 start = b.start(), weights = operand_place(start + M_RING + (my.part * tiles + tile) * FRAGMENT, 128);
+    u32 next = of_warp(b.slot), phase = of_warp(b.phase), slot = 0, previous = 0, from = weights;
     int left = 0;  // rounds of the slot
-    bool full = false;
-#pragma unroll 1
+#pragma unroll(UNROLL)
     for (int r = AHEAD; r < rounds; ++r) {
-      if (left == 0) slot = take_slot(b, full), left = rounds_of_slot, from = slot * SLOT, full = false;
+      const bool another = left == 0;
+      if (another) {
+        barrier_wait(start + M_BAR + (BAR_RING + next * 2) * 8, phase);
+        __syncwarp();
+        previous = slot, slot = next, left = rounds_of_slot, from = behind(weights, slot * SLOT);
+        if (++next == STAGES) next = 0, phase ^= 1;
+      }
       begin_products();
 #pragma unroll
       for (int i = 0; i < RPS; ++i) {
-        add_product(sums, behind(weights, from + i * PARTS * tiles * FRAGMENT), activations(r, i, 0), r | i);
+        const u32 at = behind(from, i * PARTS * tiles * FRAGMENT);
+        add_product(sums, operand_at<256>(at), activations(r, i, 0), 1);
         if (i == 0) {
           commit_products();
           await_products<1>();  // the round before is done
-          give_slot_if(b, previous, previous != ~0u);
-          full = left == 1 && r + 1 < rounds && barrier_over(b.full(b.slot), b.phase);
+          give_slot_if(b, previous, another && r > AHEAD);
         }
       }
       commit_products();
-      previous = --left == 0 ? slot : ~0u;
-      from += RPS * PARTS * tiles * FRAGMENT;
+      --left, from = behind(from, RPS * PARTS * tiles * FRAGMENT);
     }
+    b.slot = next, b.phase = phase;
     await_products<0>();
     if (rounds > AHEAD) give_slot(b, slot);
   }
-  // E4M3 and few tokens: weights through registers, where they become float16, all of a round for mma.
-  __device__ __forceinline__ void through_registers() {
-    u32 slot = 0, at = 0;
-    int left = 0;
-#pragma unroll 1
-    for (int r = AHEAD; r < rounds; ++r) {
-      if (left == 0)
-        slot = take_slot(b), left = rounds_of_slot,
-        at = M_RING + slot * SLOT + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
-      --left;
-      uint4 w[RPS];
-      u32 seen = 0;
-#pragma unroll
-      for (int i = 0; i < RPS; ++i) w[i] = load_weights(b, at + i * PARTS * tiles * FRAGMENT), seen ^= fold(w[i]);
-#pragma unroll
-      for (int i = 0; i < RPS * KB; ++i) multiply(operand_of(w[i / KB], i % KB), r, i / KB, i % KB);
-      if (left == 0 || r + 1 == rounds) give_slot(b, slot, seen);
-      at += RPS * PARTS * tiles * FRAGMENT;
-    }
-  }
-  // E4M3 and many tokens: the same for wgmma. All of a step's weights become float16 before its first product, else the
+  // E4M3: weights through registers, where they become float16. All of a step's do before its first product, else the
   // compiler makes products wait for each other; the next are asked for while products read these.
   __device__ __forceinline__ void through_registers(Reader<TILES_>& reader) {
     constexpr int STEP = Reader<TILES_>::STEP;
-    const int steps = rounds * (RPS / STEP);
-#pragma unroll 1
+    const int steps = (rounds - AHEAD) * (RPS / STEP);
+    if (FEW && steps > 0) reader.ask(b);
+#pragma unroll(UNROLL)
     for (int s = 0; s < steps; ++s) {
       uint4 a[STEP * KB];
       u32 seen = 0;
@@ -217,7 +197,7 @@ struct GroupProduct {
       begin_products();
 #pragma unroll
       for (int i = 0; i < STEP * KB; ++i)
-        add_product(sums, a[i].x, a[i].y, a[i].z, a[i].w, activations(0, s * STEP + i / KB, i % KB), s | i);
+        add_product(sums, a[i].x, a[i].y, a[i].z, a[i].w, activations(AHEAD, s * STEP + i / KB, i % KB), 1);
       commit_products();
       if (s + 1 < steps) reader.ask(b);
       await_products<0>();  // other warpgroups multiply meanwhile
@@ -228,25 +208,21 @@ struct GroupProduct {
 
   __device__ __forceinline__ void operator()(Early<TILES_, AHEAD>& early) {
     if constexpr (AHEAD > 0) multiply(early.ahead);
-    if constexpr (FP8 && SPREAD)
+    if constexpr (FP8)
       through_registers(early.reader);
-    else if constexpr (FP8)
-      through_registers();
     else
       from_slots();
-    if constexpr (AHEAD > 0 && !FP8)
+    if constexpr (AHEAD > 0) {
+      if (FP8 && rounds == AHEAD) await_products<0>();
 #pragma unroll
-      for (int i = 0; i < AHEAD * RPS; ++i) keep_until_here(early.ahead.weights[i]);
+      for (int i = 0; i < AHEAD * RPS * KB; ++i) keep_until_here(early.ahead.weights[i]);
+    }
   }
 };
 
-// Before activations are multiplied. A fence that waits for whatever this thread has asked memory for; mma needs none.
-__device__ __forceinline__ void show_activations() {
-  if (!(FP8 && FEW)) show_to_products();
-}
-// Up to MT tiles (`tiles` of them) times the activations.
+// Up to MT tiles (`tiles` of them) times the activations at x.
 template <int MT, int EVEN, int AHEAD>
-__device__ __forceinline__ void multiply(Block& b, u32 x, int blocks, int tiles, float (*sums)[NT * 4],
+__device__ __forceinline__ void multiply(Block& b, int x, int blocks, int tiles, float (*sums)[NT * 4],
                                          Early<group_tiles(MT), AHEAD>& early) {
   constexpr int N = group_tiles(MT);
   if constexpr (AHEAD > 0) {

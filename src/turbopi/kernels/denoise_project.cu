@@ -163,8 +163,8 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     Early<group_tiles(QKV), 0> early(b, qn + kvn, D16);
     await_stream();
     float sums[plan_groups(QKV)][NT * 4];
-    if (!SPREAD) show_activations();
-    multiply<QKV, D16>(b, b.base + M_X, D16, qn + kvn, sums, early);
+    if (!SPREAD) show_to_products();
+    multiply<QKV, D16>(b, M_X, D16, qn + kvn, sums, early);
     MARK(1)
     consumers_sync();
     if constexpr (SPREAD) give_room(b);

@@ -60,7 +60,7 @@ constexpr int SCORE_CHUNK = QT % 4 == 0 ? 4 : 1;
 template <typename Fetch>
 __device__ __forceinline__ void score_together(const Block& b, uint4 (&now)[SCORE_CHUNK], Fetch fetch,
                                                float (&c)[NT][4]) {
-  const u64 queries = operand(b.base + M_Q, 128, NT * 128);
+  const u32 queries = operand_place(b.start() + M_Q, NT * 128);
   float sums[NT * 4];
 #pragma unroll
   for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
@@ -70,7 +70,8 @@ __device__ __forceinline__ void score_together(const Block& b, uint4 (&now)[SCOR
     begin_products();
 #pragma unroll
     for (int i = 0; i < SCORE_CHUNK; ++i)
-      add_rows(sums, now[i].x, now[i].y, now[i].z, now[i].w, behind(queries, (k + i) * NT * 256), 1);
+      add_rows(sums, now[i].x, now[i].y, now[i].z, now[i].w,
+               operand_at<128>(behind(queries, (k + i) * NT * 256)), 1);
     commit_products();
     if (k + SCORE_CHUNK < QT)
 #pragma unroll
@@ -108,6 +109,7 @@ struct SuffixPart {
 #pragma unroll
       for (int i = 0; i < MOST; ++i)
         if (missing(v[i], bit)) v[i] = peek(place(i)), again = true;
+      again = __any_sync(~0u, again);
     }
 #pragma unroll
     for (int i = 0; i < MOST; ++i)

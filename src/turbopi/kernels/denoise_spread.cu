@@ -12,17 +12,17 @@
 
 struct Item {
   int tile, n, token;  // token: the lane's first
-  bool real;           // of this warp, and tokens that exist
+  bool mine, real;     // of this warp; of tokens that exist, too
 };
 __device__ __forceinline__ Item stream_item(const Block& b, int j) {
   const u32 i = b.warp() + j * W, xn = b.xn();  // unsigned: divisions become shifts
   if constexpr (SPREAD) {
     const int tile = i % DX, n = b.cluster() + i / DX * NC;
     const bool real = i < DX * OWN_N && u32(tile) < xn && n < NT;
-    return {real ? tile : 0, real ? n : 0, (real ? n : 0) * 8 + 2 * b.t(), real && n * 8 + 2 * b.t() < T};
+    return {real ? tile : 0, real ? n : 0, (real ? n : 0) * 8 + 2 * b.t(), real, real && n * 8 + 2 * b.t() < T};
   }
   const int tile = i < xn * NT ? i % xn : 0, n = i < xn * NT ? i / xn : 0;
-  return {tile, n, n * 8 + 2 * b.t(), i < xn * NT && n * 8 + 2 * b.t() < T};
+  return {tile, n, n * 8 + 2 * b.t(), i < xn * NT, i < xn * NT && n * 8 + 2 * b.t() < T};
 }
 
 // Region X is used for everything, one thing after the other. Before any rank may write where all ranks read, all

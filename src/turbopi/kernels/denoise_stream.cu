@@ -83,7 +83,7 @@ __device__ __forceinline__ const uint4* partials(const Block& b, const uint4* bu
 }
 // Asks until what `parts` clusters send is there, in words `first` and on; adds it up, without what comes before
 // `from`.
-__device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int from, int parts, u32 bit) {
+__device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int from, int parts, u32 bit, bool real) {
   uint4 v[FETCH];
 #pragma unroll
   for (int i = 0; i < FETCH; ++i) v[i] = peek(p + i * 32);
@@ -96,7 +96,7 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
       const u32 second = both ? differing(v[i].z, bit, v[i].w ^ bit) : 0;
       missing[i] = differing(v[i].x, bit, differing(v[i].y, bit, second)), any |= missing[i];
     }
-    if (!(any & 1)) break;
+    if (!__any_sync(~0u, real && any & 1)) break;
 #pragma unroll
     for (int i = 0; i < FETCH; ++i)
       if (missing[i] & 1) v[i] = peek(p + i * 32);
@@ -149,15 +149,16 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
     const uint4* p = words[j];
-    if (item.real) {
+    if (item.mine) {
       float4 sum = make_float4(0, 0, 0, 0);
 #pragma unroll 1
       for (int from = 0, words = most(parts, 2); from < words; from += FETCH) {
         const int first = min(from, max(words - FETCH, 0));  // the last round may ask for what the one before had
-        take(sum, p + first * 32, first, from, parts, bit);
+        take(sum, p + first * 32, first, from, parts, bit, item.real);
       }
       const float2 gate = make_float2(gates[j].x / PARTIAL_SCALE, gates[j].y / PARTIAL_SCALE);
-      x[j].x += gate.x * sum.x, x[j].y += gate.x * sum.y, x[j].z += gate.y * sum.z, x[j].w += gate.y * sum.w;
+      if (item.real)
+        x[j].x += gate.x * sum.x, x[j].y += gate.x * sum.y, x[j].z += gate.y * sum.z, x[j].w += gate.y * sum.w;
     }
     __syncwarp();
     if (j == 0) {
@@ -179,13 +180,19 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
   }
 }
 
+struct Sent {
+  u32 v[8];
+};
+__device__ __forceinline__ void keep_until_here(const Sent& s) {
+  asm volatile("" ::"r"(s.v[0]), "r"(s.v[1]), "r"(s.v[2]), "r"(s.v[3]), "r"(s.v[4]), "r"(s.v[5]), "r"(s.v[6]), "r"(s.v[7]));
+}
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
 // sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive
 // before it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which
 // follows what is published here. `await` until the operand is here; `then`, behind the product, what else there is.
-template <typename Await, typename Then>
-__device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, int region, uint4* buffer, u32 bit,
-                                                 Await await, Then then) {
+template <int EVEN, typename Await, typename Then>
+__device__ __forceinline__ void residual_product(Block& b, int x, int blocks, int region, uint4* buffer, u32 bit,
+                                                 Await await, Then then, const Sent& sent) {
   Own<DX> own(b, b.xn());
   uint2* place[plan_groups(DX)][OWN<DX>];  // in the buffer
 #pragma unroll
@@ -197,12 +204,10 @@ __device__ __forceinline__ void residual_product(Block& b, u32 x, int blocks, in
       if (FEW) place[i][k] = settled(place[i][k]);
     }
   Early<group_tiles(DX), RESIDUAL_AHEAD> early(b, b.xn(), blocks);
+  if (FEW) keep_until_here(sent);
   await();
-  show_activations();
+  show_to_products();
   float sums[plan_groups(DX)][NT * 4];
-  constexpr int EVEN = F16 % NC == 0 && HC % 16 == 0 && QT % 16 == 0 ? 16
-                       : F16 % NC == 0 && HC % 8 == 0 && QT % 8 == 0 ? 8
-                                                                     : 1;
   multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, early);
   then();
   own.add_up(b, region, b.xn(), sums);
@@ -226,7 +231,7 @@ __device__ __forceinline__ float gelu(float x) {
 
 // Awaits the stream. gate|up and GeGLU: a tile has 8 units' gate rows, then their up rows. The next slice of the stream
 // arrives in region X only when a peer has all of this rank's hidden units.
-__device__ __forceinline__ void gate_up(Block& b, const float* shifted, const float* row_scales) {
+__device__ __forceinline__ void gate_up(Block& b, const float* shifted, const float* row_scales, Sent& sent) {
   constexpr int GROUPS_ = plan_groups(GTL);
   const int gn = b.gn();
   Own<GTL> own(b, gn);
@@ -249,8 +254,8 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
   receive(b, BAR_X, b.x_parity(1), X_EXPECT, WAIT_X);
   MARK(13)
   float sums[GROUPS_][NT * 4];
-  if (!SPREAD) show_activations();  // what the copy engine wrote needs none
-  multiply<GTL, D16>(b, b.base + M_X, D16, gn, sums, early);
+  if (!SPREAD) show_to_products();  // what the copy engine wrote needs none
+  multiply<GTL, D16>(b, M_X, D16, gn, sums, early);
   MARK(15)
   if constexpr (SPREAD) consumers_sync(), give_room(b);
   own.add_up(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);
@@ -294,6 +299,11 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
           }
 #pragma unroll
           for (int d = 0; d < QUARTER; ++d) send(data[d], units, bars[d]);
+          if (FEW) {
+            sent.v[0] = units.x, sent.v[1] = units.y, sent.v[2] = units.z, sent.v[3] = units.w;
+#pragma unroll
+            for (int d = 0; d < 2; ++d) sent.v[4 + d] = data[d], sent.v[6 + d] = bars[d];
+          }
         }
       }
   if constexpr (SPREAD) await_room(b), ++b.room;

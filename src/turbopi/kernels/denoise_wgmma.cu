@@ -4,18 +4,17 @@
 //
 // In shared memory an operand consists of core matrices: 8 rows (or tokens) of 16 bytes, one after the other.
 
-// next_rows: bytes from a core matrix to that of the next 8 rows, next_columns: to that of the next 8 columns.
-__device__ __forceinline__ u64 operand(u32 address, u32 next_rows, u32 next_columns) {
-  return u64((address & 0x3ffff) >> 4) | u64(next_columns >> 4) << 16 | u64(next_rows >> 4) << 32;
+// An operand is told by two words. The first says where it lies, and next_columns: the bytes from a core matrix to that of
+// the next 8 columns. The second says NEXT_ROWS: the bytes to that of the next 8 rows.
+__device__ __forceinline__ u32 operand_place(u32 address, u32 next_columns) {
+  return (address & 0x3ffff) >> 4 | (next_columns >> 4) << 16;
 }
-// The operand that lies `bytes` behind.
-__device__ __forceinline__ u64 behind(u64 operand, u32 bytes) {
-  u64 v;
-  asm("{.reg .b32 low, high; mov.b64 {low, high}, %1; add.u32 low, low, %2; mov.b64 %0, {low, high};}"
-      : "=l"(v)
-      : "l"(operand), "r"(bytes >> 4));
-  return v;
+template <int NEXT_ROWS>
+__device__ __forceinline__ u64 operand_at(u32 place) {
+  return u64(place) | u64(NEXT_ROWS >> 4) << 32;
 }
+// The place that lies `bytes` behind.
+__device__ __forceinline__ u32 behind(u32 place, u32 bytes) { return place + (bytes >> 4); }
 // Until here products have read these registers.
 __device__ __forceinline__ void keep_until_here(uint4 v) { asm volatile("" ::"r"(v.x), "r"(v.y), "r"(v.z), "r"(v.w)); }
 // What threads wrote to shared memory (or peers, whose barrier was waited for) before may now be read by products.
