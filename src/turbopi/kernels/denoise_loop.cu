@@ -79,7 +79,7 @@ __device__ __forceinline__ void consume(Block& b) {
             residual_product<QT>(b, M_ATT, QT, M_X, buffer, bit, await, then, sent);
           else
             load_norm();
-        } else if (half || b.attends()) {  // one piece of code
+        } else if (half || b.attends()) {  // one piece of code for both
           constexpr int EVEN = HIDDEN % 16 == 0 && QT % 16 == 0 ? 16 : HIDDEN % 8 == 0 && QT % 8 == 0 ? 8 : 1;
           residual_product<EVEN>(b, half ? M_HID : M_ATT, half ? b.hn() : QT, M_H, buffer, bit, await, then, sent);
         } else {
@@ -113,8 +113,11 @@ __device__ __forceinline__ void keep_awake(const Block& b) {
   const u32 zero = b.a.zero;
 #pragma unroll 1
   while (*(volatile u32*)(b.smem + M_PROGRESS) >> 20 != FINISHED) {
-    mma_half(c, make_uint4(zero, zero, zero, zero), make_uint2(zero, zero));
-    __nanosleep(100);
+#pragma unroll
+    for (int i = 0; i < 8; ++i) {
+      mma_half(c, make_uint4(zero, zero, zero, zero), make_uint2(zero, zero));
+      __nanosleep(100);
+    }
   }
   if (c[0] != 0) *(volatile u32*)(b.smem + M_TOKEN) = 0;  // never, but the compiler can't know
 }

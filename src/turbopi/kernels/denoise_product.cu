@@ -72,7 +72,7 @@ struct Ahead {
   }
 };
 
-// E4M3 and many tokens: this warp's share of a group's fragments as they lie in the slots, two at a time.
+// E4M3: this warp's share of a group's fragments as they lie in the slots, two at a time.
 template <int TILES_>
 struct Reader {
   static constexpr int STEP = 2, PARTS = group_parts(TILES_);
@@ -287,11 +287,6 @@ struct Own {
   float4 sums[plan_groups(MT)][OWN<MT>];
   int tile[plan_groups(MT)], n[plan_groups(MT)][OWN<MT>];
   bool mine[plan_groups(MT)][OWN<MT>];
-  // Two parts of one group, 8 or 16 tokens: a warp keeps 8 of them and gives the other 8 to the tile's other warp.
-  static constexpr bool PAIR = FEW && plan_groups(MT) == 1 && group_parts(group_tiles(MT)) == 2;
-  u32 to, from;
-  bool gives;
-
   __device__ __forceinline__ Own(const Block& b, int tiles) {
 #pragma unroll
     for (int i = 0; i < plan_groups(MT); ++i) {
@@ -301,13 +296,6 @@ struct Own {
 #pragma unroll
       for (int k = 0; k < OWN<MT>; ++k)
         n[i][k] = k * parts + my.part, mine[i][k] = my.tile < size && tile[i] < tiles && n[i][k] < NT;
-    }
-    if constexpr (PAIR) {
-      const int mine = n[0][0], other = 1 - mine;
-      gives = tile[0] < imin(tiles, group_tiles(MT)) && other < NT && (other + 1 < NT || b.t() < TAIL);
-      from = (tile[0] & 7) * PARTIAL + partial_place(b, imin(mine, NT - 1));
-      to = (tile[0] & 7) * PARTIAL + partial_place(b, imin(other, NT - 1));
-      if (APART) from = settled(from + M_SUMS), to = settled(to + M_SUMS);
     }
   }
   __device__ __forceinline__ void meet() const {  // the warps of my tile, in the one group
@@ -329,23 +317,6 @@ struct Own {
   // To `sums` come all parts' sums of what is mine. They lie APART, or in `region`: over the operand of the
   // product unless SPREAD.
   __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
-    if constexpr (PAIR) {
-      const float* const s = mixed[0];
-      const bool second = n[0][0] == 1;
-      constexpr int LAST = (NT - 1) * 4;
-      float4 &own = sums[0][0], give;
-      own = second ? make_float4(s[LAST], s[LAST + 1], s[LAST + 2], s[LAST + 3]) : make_float4(s[0], s[1], s[2], s[3]);
-      give = second ? make_float4(s[0], s[1], s[2], s[3]) : make_float4(s[LAST], s[LAST + 1], s[LAST + 2], s[LAST + 3]);
-      byte* const place = b.smem + (APART ? 0 : region);
-      if (!APART) consumers_sync();
-      if (gives) *(float4*)(place + to) = give;
-      meet();
-      if (mine[0][0]) {
-        const float4 v = *(const float4*)(place + from);
-        own.x += v.x, own.y += v.y, own.z += v.z, own.w += v.w;
-      }
-      return;
-    }
     byte* const place = b.smem + (APART ? M_SUMS : region);
     auto other = [&](int i, int parts, int part, int n) {
       return (float4*)(place + (plan_others(i * 8) + (tile[i] & 7) * (parts - 1) + part) * PARTIAL +
@@ -376,7 +347,7 @@ struct Own {
         }
       }
     }
-    if ((APART || SPREAD) && plan_groups(MT) == 1)
+    if (plan_groups(MT) == 1)
       meet();
     else
       consumers_sync();

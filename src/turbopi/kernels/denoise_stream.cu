@@ -81,8 +81,8 @@ constexpr int FETCH = most(NH, 2) < 4 ? most(NH, 2) : 4;  // words at a time: no
 __device__ __forceinline__ const uint4* partials(const Block& b, const uint4* buffer, Item item) {
   return buffer + ((b.x0() + item.tile) * NT + item.n) * PAIRS * 32 + b.lane();
 }
-// Asks until what `parts` clusters send is there, in words `first` and on; adds it up, without what comes before
-// `from`.
+// Asks until what `parts` clusters send is there, in words `first` and on (of `real` tokens: others never come); adds it
+// up, without what comes before `from`.
 __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int from, int parts, u32 bit, bool real) {
   uint4 v[FETCH];
 #pragma unroll
@@ -180,19 +180,21 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
   }
 }
 
+// Registers of sends, which are read when their turn comes: whatever else is written there waits some 500 cycles. So
+// nothing is until the next product's weights have been read. (Few tokens: with more there are no registers to spare.)
 struct Sent {
-  u32 v[8];
+  uint4 units, places;
 };
-__device__ __forceinline__ void keep_until_here(const Sent& s) {
-  asm volatile("" ::"r"(s.v[0]), "r"(s.v[1]), "r"(s.v[2]), "r"(s.v[3]), "r"(s.v[4]), "r"(s.v[5]), "r"(s.v[6]), "r"(s.v[7]));
-}
+
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
 // sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive
 // before it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which
-// follows what is published here. `await` until the operand is here; `then`, behind the product, what else there is.
+// follows what is published here. `sent` is kept until weights have been read; `await` until the operand is here; `then`,
+// behind the product, what else there is.
 template <int EVEN, typename Await, typename Then>
 __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, int region, uint4* buffer, u32 bit,
                                                  Await await, Then then, const Sent& sent) {
+  Early<group_tiles(DX), RESIDUAL_AHEAD> early(b, b.xn(), blocks);
   Own<DX> own(b, b.xn());
   uint2* place[plan_groups(DX)][OWN<DX>];  // in the buffer
 #pragma unroll
@@ -203,8 +205,7 @@ __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, in
       place[i][k] = (uint2*)(words + b.cluster() / 2 * 32) + (b.cluster() & 1);
       if (FEW) place[i][k] = settled(place[i][k]);
     }
-  Early<group_tiles(DX), RESIDUAL_AHEAD> early(b, b.xn(), blocks);
-  if (FEW) keep_until_here(sent);
+  if (FEW) keep_until_here(sent.units), keep_until_here(sent.places);
   await();
   show_to_products();
   float sums[plan_groups(DX)][NT * 4];
@@ -299,11 +300,8 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
           }
 #pragma unroll
           for (int d = 0; d < QUARTER; ++d) send(data[d], units, bars[d]);
-          if (FEW) {
-            sent.v[0] = units.x, sent.v[1] = units.y, sent.v[2] = units.z, sent.v[3] = units.w;
-#pragma unroll
-            for (int d = 0; d < 2; ++d) sent.v[4 + d] = data[d], sent.v[6 + d] = bars[d];
-          }
+          static_assert(QUARTER == 2, "what `sent` has room for");
+          if (FEW) sent = {units, make_uint4(data[0], data[1], bars[0], bars[1])};
         }
       }
   if constexpr (SPREAD) await_room(b), ++b.room;
