@@ -18,22 +18,24 @@ __device__ __forceinline__ void send_columns(const Block& b, const Everyone& dat
 }
 // Sums of squares to all ranks, which add them up. If tokens are few every warp sends those of its tiles, as soon as it
 // has them; else see `publish_stream`.
-__device__ __forceinline__ void send_tile_squares(const Block& b, float4 x, int i, int bar) {
+__device__ __forceinline__ void send_tile_squares(const Block& b, float2 q, int i, int bar) {
   const int xn = b.xn(), absent = i - xn * NT;  // tiles that a rank lacks are sent as zeros
   if (i >= DX * NT) return;
   const int lacks = imax(DX - xn, 1);
   const int tile = absent < 0 ? i % xn : xn + absent % lacks, n = absent < 0 ? i / xn : absent / lacks;
-  float q0, q1;
-  squares_of(x, q0, q1);
-  if (absent >= 0) q0 = q1 = 0;
+  if (absent >= 0) q = make_float2(0, 0);
   static_assert(S == 8, "lane g serves rank g");
   const u32 to = b.base + M_SSQ + ((b.rank() * DX + tile) * NT * 8 + n * 8 + 2 * b.t()) * 4;
   if (n * 8 + 2 * b.t() < T)
-    send(at_rank(to, b.g()), __float_as_uint(q0), __float_as_uint(q1), at_rank(b.bar(bar), b.g()));
+    send(at_rank(to, b.g()), __float_as_uint(q.x), __float_as_uint(q.y), at_rank(b.bar(bar), b.g()));
 }
 __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[ITEMS_X], int bar) {
 #pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j) send_tile_squares(b, x[j], b.warp() + j * W, bar);
+  for (int j = 0; j < ITEMS_X; ++j) {
+    float2 q;
+    squares_of(x[j], q.x, q.y);
+    send_tile_squares(b, q, b.warp() + j * W, bar);
+  }
 }
 constexpr u32 SQUARES_EXPECT = SPREAD ? S * NT * 32 : SQ * ((T + 1) / 2) * 8;
 // 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a spare warp makes them.
@@ -166,17 +168,19 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
     }
     if (!SPREAD && (send_on || last)) {
       const float4 y = scaled(x[j], scales[j]);
-      if (send_on)
+      if (send_on) {
+        float2 q;  // what lanes exchange waits behind sends: bfloat16 gains if it comes first, E4M3 if the columns do
+        if (!FP8) squares_of(x[j], q.x, q.y);
         send_columns(b, places[j], bars, item.n, y, item.real);
-      else
+        if (FP8) squares_of(x[j], q.x, q.y);
+        send_tile_squares(b, q, b.warp() + j * W, BAR_X);
+      } else {
         keep_item(b, j, y);
+      }
     }
   }
   if (send_on) {
-    if constexpr (SPREAD)
-      publish_stream(b, x, scales);
-    else
-      send_squares(b, x, BAR_X);
+    if constexpr (SPREAD) publish_stream(b, x, scales);
   }
 }
 
