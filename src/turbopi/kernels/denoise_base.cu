@@ -48,7 +48,8 @@ constexpr int QTL = most(QT, S);           // query tiles of a CTA: 8 RoPE pairs
 constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
-constexpr u32 PATIENCE = FEW ? 500 : FP8 ? 450 : 600;  // clock cycles before sums are asked for: polls slow down what they wait for
+// Clock cycles before sums are asked for: polls slow down what they wait for.
+constexpr u32 PATIENCE = FEW ? 500 : FP8 ? 450 : 600;
 constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see denoise_spread.cu
 constexpr int OWN_N = most(NT, NC);        // if so: 8 tokens of the slice at a time, which a CTA looks after
 constexpr int ITEMS_X = most(SPREAD ? DX * OWN_N : DX * NT, W);  // (tile, 8 tokens) that one warp looks after
@@ -241,17 +242,17 @@ struct Args {
 
 // ---- a CTA's view
 
-// What is the same in all lanes of a warp, so that the compiler knows it. wgmma takes its operands' places from registers
-// that a warp has once. There the compiler reckons with such places, if it knows that all lanes agree on them and on every
-// branch and loop around: else each costs six instructions more, and many tokens' products took twice their time. So
-// nothing that holds for some lanes alone may decide where a warp goes on.
+// What is the same in all lanes of a warp, so that the compiler knows it. wgmma takes its operands' places from
+// registers that a warp has once. There the compiler reckons with such places, if it knows that all lanes agree on them
+// and on every branch and loop around: else each costs six instructions more, and products of many tokens took twice
+// their time. So nothing that holds for some lanes alone may decide where a warp goes on.
 __device__ __forceinline__ u32 of_warp(u32 v) { return __shfl_sync(~0u, v, 0); }
 
 struct Block {
   const Args& a;
   byte* smem;
   u32 base;                 // of smem in the shared window
-  u32 cta, thread, warp_;   // cluster and rank; lane; the warp, for all lanes
+  u32 cta, thread, warp_;   // cluster and rank; lane; warp
   u32 n = 0;                // layers done
   u32 slot = 0, phase = 0;  // of the ring
   u32 turn = 0, room = 0;   // exchanges of the stream, uses of BAR_ROOM

@@ -114,7 +114,7 @@ __device__ __forceinline__ void keep_awake(const Block& b) {
 #pragma unroll 1
   while (*(volatile u32*)(b.smem + M_PROGRESS) >> 20 != FINISHED) {
 #pragma unroll
-    for (int i = 0; i < 8; ++i) {
+    for (int i = 0; i < 8; ++i) {  // to look seldom: who looks takes time from others
       mma_half(c, make_uint4(zero, zero, zero, zero), make_uint2(zero, zero));
       __nanosleep(100);
     }

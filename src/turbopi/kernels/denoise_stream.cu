@@ -83,8 +83,8 @@ constexpr int FETCH = most(NH, 2) < 4 ? most(NH, 2) : 4;  // words at a time: no
 __device__ __forceinline__ const uint4* partials(const Block& b, const uint4* buffer, Item item) {
   return buffer + ((b.x0() + item.tile) * NT + item.n) * PAIRS * 32 + b.lane();
 }
-// Asks until what `parts` clusters send is there, in words `first` and on (of `real` tokens: others never come); adds it
-// up, without what comes before `from`.
+// Asks until what `parts` clusters send is there, in words `first` and on (of `real` tokens: others never come); adds
+// it up, without what comes before `from`.
 __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int from, int parts, u32 bit, bool real) {
   uint4 v[FETCH];
 #pragma unroll
@@ -193,8 +193,8 @@ struct Sent {
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
 // sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive
 // before it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which
-// follows what is published here. `sent` is kept until weights have been read; `await` until the operand is here; `then`,
-// behind the product, what else there is.
+// follows what is published here. `sent` is kept until weights have been read; `await` until the operand is here;
+// `then`, behind the product, what else there is.
 template <int EVEN, typename Await, typename Then>
 __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, int region, uint4* buffer, u32 bit,
                                                  Await await, Then then, const Sent& sent) {

@@ -4,8 +4,8 @@
 //
 // In shared memory an operand consists of core matrices: 8 rows (or tokens) of 16 bytes, one after the other.
 
-// An operand is told by two words. The first says where it lies, and next_columns: the bytes from a core matrix to that of
-// the next 8 columns. The second says NEXT_ROWS: the bytes to that of the next 8 rows.
+// An operand is told by two words. The first says where it lies, and next_columns: the bytes from a core matrix to that
+// of the next 8 columns. The second says NEXT_ROWS: the bytes to that of the next 8 rows.
 __device__ __forceinline__ u32 operand_place(u32 address, u32 next_columns) {
   return (address & 0x3ffff) >> 4 | (next_columns >> 4) << 16;
 }
