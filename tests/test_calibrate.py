@@ -16,7 +16,7 @@ from turbopi import backends
 from turbopi.calibrate import formats
 from turbopi.calibrate.artifact import BESIDE, VERSION, Quantization, SiteScale, for_policy, shapes_of
 from turbopi.calibrate.observations import calls, read_samples, split
-from turbopi.calibrate.run import Settings, calibrate_model
+from turbopi.calibrate.run import Settings, by_harm, calibrate_model
 from turbopi.calibrate.sites import sites
 from turbopi.calibrate.statistics import Histogram, collect
 from turbopi.calibrate.studied import WEIGHTS, studied_checkpoint
@@ -133,6 +133,14 @@ def test_sites_stay_in_bf16_until_the_target_is_met() -> None:
     assert held["worst"]["observation"] == "b_third_masked 0"
     assert all(0.02 < site.error < 0.06 for site in loose.sites.values())
     assert set(loose.report["groups_alone"]) == {site.group for site in sites(model.config)}
+
+
+def test_the_expert_is_weighed_as_the_whole_that_it_goes_as() -> None:
+    # its out alone hurts more for its work than vision's fc2; all of it less
+    rms = {"vision.out": 0.04, "vision.fc2": 0.024, "expert.out": 0.018, "expert.gate_up": 0.013, "prefix.down": 0.008}
+    work = {"vision.out": 36, "vision.fc2": 134, "expert.out": 38, "expert.gate_up": 273, "prefix.down": 570}
+    expert = ("expert.out", "expert.gate_up")
+    assert by_harm(rms, work) == [("vision.out",), ("vision.fc2",), expert, ("prefix.down",)]
 
 
 def test_saturation_is_told_and_stays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ Everything is measured with the emulated reference (emulate.py) against the floa
 """
 
 import gc
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -264,6 +265,21 @@ def _groups(
     return measured
 
 
+def by_harm(rms: Mapping[str, float], work: Mapping[str, int]) -> list[tuple[str, ...]]:
+    """Groups of sites in the order in which they go back to bfloat16: those first that hurt most for the work they do.
+
+    The expert's go as one, since its kernel takes all matrices in one precision. Errors add up in squares.
+    """
+    together: dict[str, list[str]] = {}
+    for name in rms:
+        together.setdefault("expert" if name.startswith("expert.") else name, []).append(name)
+
+    def harm(names: tuple[str, ...]) -> float:
+        return sum(rms[name] ** 2 for name in names) / sum(work[name] for name in names)
+
+    return sorted((tuple(names) for names in together.values()), key=harm, reverse=True)
+
+
 def _keep_groups(
     eligible: Sequence[Site],
     scales: Mapping[Site, float],
@@ -273,19 +289,20 @@ def _keep_groups(
     target: float,
     progress: Progress,
 ) -> dict[str, str]:
-    """Take groups back to bfloat16, those first that hurt most for the work they do, until the target is met."""
+    """Take groups back to bfloat16, see `by_harm`, until the target is met."""
     work = {name: sum(site.width * site.outputs for site in eligible if site.group == name) for name in groups}
-    hurting = sorted(groups, key=lambda name: -(groups[name]["relative_rms"] ** 2) / work[name])
+    rms = {name: measured["relative_rms"] for name, measured in groups.items()}
+    hurting = by_harm(rms, work)
     progress.begin("which sites to keep in bfloat16", len(hurting))
     more: dict[str, str] = {}
     wanted = 1 - ROOM * (1 - target)
-    for name in hurting:
+    for names in hurting:
         used = {site: scales[site] for site in eligible if str(site) not in kept and str(site) not in more}
         if not used or trials.error(trials.actions(used))["delta_cosine"] >= wanted:
             break
-        reason = f"the actions' cosine is below {wanted:.5g} with it; alone it costs {groups[name]['relative_rms']:.2%}"
-        whole = name.startswith("expert.")  # its kernel takes all matrices in one precision
-        more |= {str(site): reason for site in used if site.group == name or (whole and site.part == "expert")}
+        alone = math.hypot(*(rms[name] for name in names))
+        reason = f"the actions' cosine is below {wanted:.5g} with it; alone it costs {alone:.2%}"
+        more |= {str(site): reason for site in used if site.group in names}
         progress.advance()
     return more
 
