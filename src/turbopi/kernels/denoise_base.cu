@@ -244,8 +244,8 @@ struct Args {
 
 // What is the same in all lanes of a warp, so that the compiler knows it. wgmma takes its operands' places from
 // registers that a warp has once. There the compiler reckons with such places, if it knows that all lanes agree on them
-// and on every branch and loop around: else each costs six instructions more, and products of many tokens took twice
-// their time. So nothing that holds for some lanes alone may decide where a warp goes on.
+// and on every branch and loop around: else each costs some six instructions more. So nothing that holds for some
+// lanes alone may decide where a warp goes on.
 __device__ __forceinline__ u32 of_warp(u32 v) { return __shfl_sync(~0u, v, 0); }
 
 struct Block {

@@ -114,25 +114,21 @@ struct GroupProduct {
   static constexpr int UNROLL = EXACT && SPREAD ? 16 : 1;  // where the number of rounds is known
   Block& b;
   const Share my;
-  const int x, blocks, tiles, rounds, rounds_of_slot;
+  const int blocks, tiles, rounds, rounds_of_slot;
   const u32 first;  // this part's first activations, as an operand's place
   float (&sums)[NT * 4];
 
-  __device__ __forceinline__ GroupProduct(Block& block, int from, int n, int t, float (&to)[NT * 4])
-      : b(block), my(block, PARTS), x(from), blocks(n), tiles(t), rounds(plan_rounds(PARTS, blocks)),
+  __device__ __forceinline__ GroupProduct(Block& block, int x, int n, int t, float (&to)[NT * 4])
+      : b(block), my(block, PARTS), blocks(n), tiles(t), rounds(plan_rounds(PARTS, blocks)),
         rounds_of_slot(slot_rounds(PARTS, t)),
-        first(behind(operand_place(b.start() + from, 128), EXACT ? my.part * KB * NT * 256 : 0)), sums(to) {
+        first(behind(operand_place(b.start() + x, 128), EXACT ? my.part * KB * NT * 256 : 0)), sums(to) {
 #pragma unroll
     for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
   }
-  // Bytes before a block's activations, that of this warp's fragment i of round r. Blocks that fill up a round have no
-  // weight, their activations are any.
-  __device__ __forceinline__ int place(int r, int i, int half) const {
-    const int block = ((r * RPS + i) * PARTS + my.part) * KB + half;
-    return (EXACT ? block : min(block, blocks - 1)) * NT * 256;
-  }
+  // What this warp's fragment i of round r meets. Blocks that fill up a round have no weight, their activations are any.
   __device__ __forceinline__ u64 activations(int r, int i, int half) const {
-    return operand_at<256>(behind(first, EXACT ? ((r * RPS + i) * PARTS * KB + half) * NT * 256 : place(r, i, half)));
+    const int block = (r * RPS + i) * PARTS * KB + half;
+    return operand_at<256>(behind(first, (EXACT ? block : min(block + my.part * KB, blocks - 1)) * NT * 256));
   }
   __device__ __forceinline__ void multiply(const Ahead<TILES_, AHEAD>& ahead) {
     begin_products();

@@ -49,17 +49,17 @@ __device__ __forceinline__ void await_room(const Block& b) {
 }
 
 // An item's sums of squares, of the lane's two tokens.
-__device__ __forceinline__ void squares_of(float4 x, float& q0, float& q1) {
-  q0 = x.x * x.x + x.z * x.z, q1 = x.y * x.y + x.w * x.w;
+__device__ __forceinline__ float2 squares_of(float4 x) {
+  float q0 = x.x * x.x + x.z * x.z, q1 = x.y * x.y + x.w * x.w;
 #pragma unroll
   for (int o = 4; o < 32; o *= 2) q0 += exchange(q0, o), q1 += exchange(q1, o);
+  return make_float2(q0, q1);
 }
 // The same to float[8 tokens at a time][DX][8].
 __device__ __forceinline__ void keep_squares(const Block& b, float4 x, int j, bool real) {
-  float q0, q1;
-  squares_of(x, q0, q1);
+  const float2 q = squares_of(x);
   if (const int i = b.warp() + j * W; i < DX * OWN_N && b.g() == 0)
-    *(float2*)(b.smem + M_PART + (i * 8 + 2 * b.t()) * 4) = real ? make_float2(q0, q1) : make_float2(0, 0);
+    *(float2*)(b.smem + M_PART + (i * 8 + 2 * b.t()) * 4) = real ? make_float2(q.x, q.y) : make_float2(0, 0);
 }
 // Those of the slice of one of this CTA's tokens.
 __device__ __forceinline__ float slice_squares(const Block& b, int token) {

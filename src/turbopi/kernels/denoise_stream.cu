@@ -31,11 +31,7 @@ __device__ __forceinline__ void send_tile_squares(const Block& b, float2 q, int 
 }
 __device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[ITEMS_X], int bar) {
 #pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j) {
-    float2 q;
-    squares_of(x[j], q.x, q.y);
-    send_tile_squares(b, q, b.warp() + j * W, bar);
-  }
+  for (int j = 0; j < ITEMS_X; ++j) send_tile_squares(b, squares_of(x[j]), b.warp() + j * W, bar);
 }
 constexpr u32 SQUARES_EXPECT = SPREAD ? S * NT * 32 : SQ * ((T + 1) / 2) * 8;
 // 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a spare warp makes them.
@@ -170,9 +166,9 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
       const float4 y = scaled(x[j], scales[j]);
       if (send_on) {
         float2 q;  // what lanes exchange waits behind sends: bfloat16 gains if it comes first, E4M3 if the columns do
-        if (!FP8) squares_of(x[j], q.x, q.y);
+        if (!FP8) q = squares_of(x[j]);
         send_columns(b, places[j], bars, item.n, y, item.real);
-        if (FP8) squares_of(x[j], q.x, q.y);
+        if (FP8) q = squares_of(x[j]);
         send_tile_squares(b, q, b.warp() + j * W, BAR_X);
       } else {
         keep_item(b, j, y);
