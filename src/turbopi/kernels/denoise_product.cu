@@ -127,8 +127,8 @@ struct GroupProduct {
   }
   // What this warp's fragment i of round r meets. Blocks that fill up a round have no weight, their activations are any.
   __device__ __forceinline__ u64 activations(int r, int i, int half) const {
-    const int block = (r * RPS + i) * PARTS * KB + half;
-    return operand_at<256>(behind(first, (EXACT ? block : min(block + my.part * KB, blocks - 1)) * NT * 256));
+    const int block = ((r * RPS + i) * PARTS + (EXACT ? 0 : my.part)) * KB + half;
+    return operand_at<256>(behind(first, (EXACT ? block : min(block, blocks - 1)) * NT * 256));
   }
   __device__ __forceinline__ void multiply(const Ahead<TILES_, AHEAD>& ahead) {
     begin_products();
