@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from turbopi import backends
 from turbopi.calibrate.artifact import TIERS, Quantization, Tier
-from turbopi.calibrate.emulate import rounded
+from turbopi.calibrate.emulate import RoundedWeights, rounded
 from turbopi.calibrate.sites import sites
 from turbopi.cli import app
 from turbopi.errors import ConfigError
@@ -52,7 +52,8 @@ def test_it_rounds_what_the_plan_says_and_nothing_else(calibration: Quantization
     plan = calibration.plan(model.config, tier)
     scales = {site: plan.scales[str(site)] for site in sites(model.config) if str(site) in plan.scales}
     assert 0 < len(scales) < len(sites(model.config)) or tier == "fp8"
-    with rounded(model, scales):
+    weights = RoundedWeights({site: plan.directions[str(site)] for site in scales})
+    with rounded(model, scales, weights):
         expected = model.sample(case.observation, case.noise, STEPS)[0]
     ours = actions(emulated(calibration, tier))
     assert torch.equal(ours[0], expected)

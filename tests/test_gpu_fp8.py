@@ -12,7 +12,7 @@ from turbopi import backends
 from turbopi.backends import Tier
 from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.artifact import Quantization
-from turbopi.calibrate.emulate import delta_cosine, relative_rms, rounded
+from turbopi.calibrate.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.calibrate.sites import sites
 from turbopi.config import Kind
 from turbopi.judge.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
@@ -59,16 +59,17 @@ def backend(kind: Kind, precision: Tier, target: float = 0.0) -> backends.Backen
 def emulated(case: Case, precision: Tier, target: float) -> tuple[Tensor, Tensor]:
     """(float32, float32 with the plan's sites rounded), on the host."""
     model, chosen = on_gpu(case.kind), quantization(case.kind, target)
-    plan = chosen.plan(model.config, precision).scales
-    in_kernel = refusal(model.config) is None and chosen.plan(model.config, precision).expert_weights == "fp8"
+    plan = chosen.plan(model.config, precision)
+    in_kernel = refusal(model.config) is None and plan.expert_weights == "fp8"
     used = {
-        site: plan[str(site)]
+        site: plan.scales[str(site)]
         for site in sites(model.config)
-        if str(site) in plan and (in_kernel or not site.weights_only)
+        if str(site) in plan.scales and (in_kernel or not site.weights_only)
     }
+    weights = RoundedWeights({site: plan.directions[str(site)] for site in used})
     observation, noise = case.observation.to("cuda"), case.noise.to("cuda")
     exact = model.sample(observation, noise, STEPS)
-    with rounded(model, used):
+    with rounded(model, used, weights):
         return exact.cpu(), model.sample(observation, noise, STEPS).cpu()
 
 

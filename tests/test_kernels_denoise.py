@@ -12,6 +12,7 @@ from conftest import on_hopper
 from denoise_helpers import CONFIGS, FULL, GPU, Problem, has_nvrtc, ordinary_bf16, plain, problem, relative
 from torch import Tensor
 
+from turbopi.calibrate.directions import directions
 from turbopi.engine.fp8 import Fp8Matrix
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import denoise, nvrtc
@@ -50,6 +51,22 @@ def test_packing_in_fp8_keeps_every_weight_as_e4m3_rounds_it(name: str, clusters
             # 4 bits of mantissa: within 2^-4 of each, or of the smallest normal number, 2^-6 / 448 of the largest
             bound = torch.maximum(matrix.abs().float(), matrix.abs().amax(dim=1, keepdim=True).float() / (64 * 448))
             assert ((found - matrix.float()).abs() <= bound / 16 * 1.001).all()
+
+
+def test_packing_in_fp8_rounds_for_a_sites_directions() -> None:
+    p = problem("golden", 1, 1, 3, 0, CPU)
+    known = {}
+    for kind, width in (("out", 128), ("down", 64)):
+        common = directions(torch.rand(50, width))
+        assert common is not None
+        known[f"expert.1.{kind}"] = common
+    packed = packing.PackedExpert.pack(p.config, p.layers, 8, "fp8", known)
+    for i, layer in enumerate(p.layers):
+        for found, kind in zip(packed.matrices(i), packing.KINDS, strict=True):
+            matrix, place = getattr(layer, kind), f"expert.{i}.{kind}"
+            expected = Fp8Matrix.quantize(matrix, 1.0, known.get(place)).dequantized()
+            torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+            assert (place in known) != torch.equal(expected, Fp8Matrix.quantize(matrix, 1.0).dequantized())
 
 
 @pytest.mark.parametrize(("name", "clusters"), ARRANGEMENTS)

@@ -43,7 +43,7 @@ class EmulatedFp8Backend(PyTorchBackend):
             if scale is None:
                 continue
             for linear in linears(self.model, site):
-                linear.weight.data = round_weight(linear.weight.data)
+                linear.weight.data = round_weight(linear.weight.data, self._plan.directions.get(str(site)))
                 if not site.weights_only:
                     linear.register_forward_pre_hook(partial(_round_input, scale=scale))
 

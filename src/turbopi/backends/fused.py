@@ -7,6 +7,7 @@ takes the engine's operations one by one, and `describe()` says so.
 
 import importlib.util
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -18,7 +19,7 @@ from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, _bucket
 from turbopi.calibrate.artifact import TIERS, Quantization, check_given
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape, Denoiser
-from turbopi.engine.fp8 import Fp8Matrix, Matrix
+from turbopi.engine.fp8 import Directions, Fp8Matrix, Matrix
 from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendError, BackendUnavailable
@@ -111,9 +112,15 @@ class FusedBackend(CudaGraphBackend):
         scales = {} if self._plan is None else self._plan.scales
 
         def make(place: str, matrix: Tensor) -> Matrix:
-            return Fp8Matrix.quantize(matrix, scales[place]) if place in scales else matrix
+            if place not in scales:
+                return matrix
+            return Fp8Matrix.quantize(matrix, scales[place], self._directions.get(place))
 
         return pack(self.config, load(self.device, "bf16"), make)
+
+    @property
+    def _directions(self) -> Mapping[str, Directions]:
+        return {} if self._plan is None else self._plan.directions
 
     def _expert_weights(self) -> Literal["bf16", "fp8"]:
         """What the denoising kernel is to have the expert's weights in."""
@@ -166,7 +173,10 @@ class FusedBackend(CudaGraphBackend):
             raise BackendUnavailable(reason or "there is no modulation")
         if self._packed_expert is None:
             self._keep_expert_on(self.device)
-            self._packed_expert = PackedExpert.pack(self.config, self._weights.expert, weights=self._expert_weights())
+            weights, expert = self._expert_weights(), self._weights.expert
+            self._packed_expert = PackedExpert.pack(
+                self.config, expert, weights=weights, directions=self._directions if weights == "fp8" else {}
+            )
         packed, small = self._packed_expert, self._weights.small
         kernel = DenoiseKernel(self.config, packed, small, table, cache_rows=rows, suffix=horizon, device=self.device)
         self._put_expert_away()

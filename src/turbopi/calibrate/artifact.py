@@ -4,23 +4,27 @@ It holds for one set of weights (by the hash of all of them), one model and one 
 is refused. What was measured to get there is kept in it and goes with it into every policy's metadata.
 """
 
+import base64
 import hashlib
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
+
+import torch
 
 from turbopi.calibrate.sites import MLP_KINDS, PARTS, Part, Site, sites
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import ModelConfig
+from turbopi.engine.fp8 import E4M3, Directions
 from turbopi.errors import CalibrationError, ConfigError
 from turbopi.folders import write_whole
 
 logger = logging.getLogger(__name__)
 
-FORMAT, VERSION = "turbopi-quantization", 1
+FORMAT, VERSION = "turbopi-quantization", 2  # 1 has no directions
 RANDOM_NOISE = "random-noise"  # instead of observations: has to be asked for by this name
 Tier = Literal["fp8", "fp8-mlp"]
 TIERS: tuple[Tier, ...] = get_args(Tier)
@@ -35,6 +39,7 @@ class SiteScale:
     saturated   part of the held-out values beyond the largest number
     error       relative rms of its products on held-out observations, rounded against not
     kept        why it stays in bfloat16; None: it doesn't
+    directions  what its activations have in common, for the rounding of its weights; None: rounded to nearest
     """
 
     scale: float | None
@@ -42,6 +47,38 @@ class SiteScale:
     saturated: float
     error: float
     kept: str | None = None
+    directions: Directions | None = None
+
+    @property
+    def digest(self) -> tuple[str, ...]:
+        """What tells its directions from others, if it has any."""
+        d = self.directions
+        return (
+            () if d is None else (hashlib.sha256(_bytes(d.codes)).hexdigest(), *map(str, d.scale.tolist()), str(d.rest))
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        content = {one.name: getattr(self, one.name) for one in fields(self)}
+        if self.directions is not None:
+            content["directions"] = {
+                "e4m3": base64.b64encode(_bytes(self.directions.codes)).decode(),  # [width, as many as scales]
+                "scale": self.directions.scale.tolist(),
+                "rest": self.directions.rest,
+            }
+        return content
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "SiteScale":
+        """Raises ValueError, KeyError or TypeError for what `as_json` didn't make."""
+        given = content.get("directions")
+        if given is None:
+            return cls(**content)
+        codes = torch.frombuffer(bytearray(base64.b64decode(given["e4m3"], validate=True)), dtype=torch.uint8)
+        scale = torch.tensor(given["scale"], dtype=torch.float32)
+        found = Directions(codes.view(E4M3).view(-1, len(scale)), scale, float(given["rest"]))
+        if not (found.main.isfinite().all() and 0 < found.rest < float("inf")):
+            raise ValueError("directions that aren't finite")
+        return cls(**{**content, "directions": found})
 
 
 @dataclass(frozen=True)
@@ -67,8 +104,8 @@ class Quantization:
 
     @property
     def identity(self) -> str:
-        """SHA-256 of all that decides a policy's numbers: weights, scales, what stays in bfloat16, parts."""
-        sites = {name: (site.scale, site.kept is None) for name, site in self.sites.items()}
+        """SHA-256 of all that decides a policy's numbers: weights, scales, directions, what stays in bf16, parts."""
+        sites = {name: (site.scale, site.kept is None, *site.digest) for name, site in self.sites.items()}
         decisive = {"weights": self.fingerprint, "sites": sites, "parts": list(self.parts)}
         return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
 
@@ -96,6 +133,13 @@ class Quantization:
         missing = [str(site) for site in sites(config) if str(site) not in self.sites]
         if missing:
             raise CalibrationError(f"{where} has no scale for {', '.join(missing[:5])}: it is damaged")
+        for site in sites(config):
+            common = self.sites[str(site)].directions
+            if common is not None and len(common.codes) != site.width:
+                raise CalibrationError(
+                    f"{where} has directions of {len(common.codes)} numbers for {site}, which is {site.width} wide: "
+                    "it is damaged"
+                )
         if fingerprint != self.fingerprint:
             raise CalibrationError(
                 f"{where} was made for other weights: their hash is {self.fingerprint[:16]}…, that of these weights "
@@ -108,14 +152,17 @@ class Quantization:
             raise ConfigError(f"{tier!r} is no FP8 tier; choose one of {', '.join(TIERS)}")
         chosen: dict[str, float] = {}
         kept: dict[str, str] = {}
+        common: dict[str, Directions] = {}
         for site in sites(config):
             entry = self.sites[str(site)]
             reason = _reason(site, entry, tier, self.parts)
             if reason is None:
                 chosen[str(site)] = 1.0 if entry.scale is None else entry.scale
+                if entry.directions is not None:
+                    common[str(site)] = entry.directions
             else:
                 kept[str(site)] = reason
-        return Plan(tier, chosen, kept)
+        return Plan(tier, chosen, kept, common)
 
     def describe(self, plan: "Plan") -> dict[str, Any]:
         """What goes into the metadata of a policy that runs with it."""
@@ -133,13 +180,15 @@ class Quantization:
         """Write it, whole or not at all."""
         write_whole(file, json.dumps(self.as_json(), indent=1, ensure_ascii=False) + "\n")
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self, *, directions: bool = True) -> dict[str, Any]:
+        """All of it; without `directions`, which are megabytes, what a reader wants."""
+        found = {name: site if directions else replace(site, directions=None) for name, site in self.sites.items()}
         return {
             "format": FORMAT,
             "version": VERSION,
             "weights_sha256": self.fingerprint,
             "shapes": dict(self.shapes),
-            "sites": {name: asdict(site) for name, site in self.sites.items()},
+            "sites": {name: site.as_json() for name, site in found.items()},
             "report": dict(self.report),
         }
 
@@ -153,12 +202,12 @@ class Quantization:
             content = json.loads(path.read_text(encoding="utf-8"))
             if content["format"] != FORMAT:
                 raise CalibrationError(f"{path} is {content['format']!r}, not {FORMAT}")
-            if content["version"] != VERSION:
+            if content["version"] not in range(1, VERSION + 1):
                 raise CalibrationError(
-                    f"{path} has version {content['version']} of {FORMAT}, this Turbo-Pi reads version {VERSION}. "
-                    "Run `turbopi calibrate` again"
+                    f"{path} has version {content['version']} of {FORMAT}, this Turbo-Pi reads versions 1 to "
+                    f"{VERSION}. Run `turbopi calibrate` again"
                 )
-            found = {name: SiteScale(**values) for name, values in content["sites"].items()}
+            found = {name: SiteScale.from_json(values) for name, values in content["sites"].items()}
             for name, site in found.items():
                 if site.scale is not None and not (0 < site.scale < float("inf")):
                     raise CalibrationError(f"{path} has the scale {site.scale} for {name}; it should be above 0")
@@ -171,11 +220,12 @@ class Quantization:
 
 @dataclass(frozen=True)
 class Plan:
-    """A tier's choice: site -> scale of its activation, and site -> why it stays in bfloat16."""
+    """A tier's choice: site -> scale of its activation, site -> why it stays in bfloat16, site -> directions."""
 
     tier: str
     scales: Mapping[str, float]
     kept: Mapping[str, str]
+    directions: Mapping[str, Directions]
 
     @property
     def expert_weights(self) -> Literal["fp8", "bf16"]:
@@ -204,6 +254,10 @@ def _reason(site: Site, entry: SiteScale, tier: str, parts: Sequence[str]) -> st
     if tier == "fp8-mlp" and (site.kind not in MLP_KINDS or site.part == "expert"):
         return "fp8-mlp takes the feed-forward products of vision and prefix alone"
     return site.refusal or entry.kept
+
+
+def _bytes(codes: torch.Tensor) -> bytes:
+    return codes.contiguous().view(torch.uint8).numpy().tobytes()
 
 
 def shapes_of(config: ModelConfig) -> dict[str, Any]:

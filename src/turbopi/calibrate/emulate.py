@@ -5,13 +5,14 @@ The oracle of the engine's FP8, and the instrument that says what FP8 does to a 
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbopi.calibrate.sites import Site, linears
-from turbopi.engine.fp8 import Fp8Matrix, to_e4m3
+from turbopi.engine.fp8 import Directions, Fp8Matrix, to_e4m3
 from turbopi.model.reference import Pi0Model
 
 Round = Callable[[Tensor], Tensor]
@@ -22,33 +23,38 @@ def round_activation(x: Tensor, scale: float) -> Tensor:
     return (to_e4m3(x, 1 / scale).float() * scale).to(x.dtype)
 
 
-def round_weight(weight: Tensor) -> Tensor:
+def round_weight(weight: Tensor, directions: Directions | None = None) -> Tensor:
     """A matrix [out, in] as E4M3 with a scale an output channel holds it, in its dtype."""
-    return Fp8Matrix.quantize(weight, 1.0).dequantized().to(weight.dtype)
+    return Fp8Matrix.quantize(weight, 1.0, directions).dequantized().to(weight.dtype)
+
+
+class RoundedWeights:
+    """A model's matrices in E4M3, each rounded when it is first asked for and then held, a byte a weight.
+
+    directions  of the sites that have them
+    """
+
+    def __init__(self, directions: Mapping[Site, Directions] | None = None) -> None:
+        self._directions = directions or {}
+        self._held: dict[int, tuple[Tensor, Fp8Matrix]] = {}  # with the weight, so that no other comes to lie there
+
+    def __call__(self, site: Site, weight: Tensor) -> Tensor:
+        if id(weight) not in self._held:
+            self._held[id(weight)] = weight, Fp8Matrix.quantize(weight, 1.0, self._directions.get(site))
+        return self._held[id(weight)][1].dequantized().to(weight.dtype)
 
 
 @contextmanager
-def rounded(model: Pi0Model, scales: Mapping[Site, float]) -> Iterator[None]:
-    """For a while, products of these sites are of E4M3 numbers; a `weights_only` site's scale is ignored.
-
-    Weights are rounded anew in every product, so that nothing is held twice, but for the expert's: they are needed in
-    every step.
-    """
-    held: dict[int, Tensor] = {}
-
-    def once(weight: Tensor) -> Tensor:
-        if id(weight) not in held:
-            held[id(weight)] = round_weight(weight)
-        return held[id(weight)]
-
+def rounded(model: Pi0Model, scales: Mapping[Site, float], weights: RoundedWeights | None = None) -> Iterator[None]:
+    """For a while, products of these sites are of E4M3 numbers; a `weights_only` site's scale is ignored."""
+    rounding = weights or RoundedWeights()
     changes: list[tuple[nn.Linear, Round, Round]] = []
     for site, scale in scales.items():
 
         def inputs(x: Tensor, site: Site = site, scale: float = scale) -> Tensor:
             return x if site.weights_only else round_activation(x, scale)
 
-        weights = once if site.weights_only else round_weight
-        changes += [(linear, inputs, weights) for linear in linears(model, site)]
+        changes += [(linear, inputs, partial(rounding, site)) for linear in linears(model, site)]
     with replaced(changes):
         yield
 

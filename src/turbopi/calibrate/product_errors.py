@@ -6,14 +6,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.calibrate.emulate import Round, replaced, round_activation, round_weight
+from turbopi.calibrate.emulate import Round, RoundedWeights, replaced, round_activation
 from turbopi.calibrate.sites import Site, linears
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 
 
 def product_errors(
-    model: Pi0Model, scales: Mapping[Site, float], batches: Iterable[tuple[Observation, Tensor]], steps: int
+    model: Pi0Model,
+    scales: Mapping[Site, float],
+    batches: Iterable[tuple[Observation, Tensor]],
+    steps: int,
+    weights: RoundedWeights,
 ) -> dict[str, float]:
     """Site -> relative rms of its products (without bias) of rounded numbers, over all batches and steps."""
     sums: dict[str, Tensor] = {}  # of squares: of the difference, of the exact products
@@ -24,7 +28,7 @@ def product_errors(
             def watch(x: Tensor, site: Site = site, scale: float = scale, linear: nn.Linear = linear) -> Tensor:
                 exact = F.linear(x, linear.weight)
                 given = x if site.weights_only else round_activation(x, scale)
-                difference = F.linear(given, round_weight(linear.weight)) - exact
+                difference = F.linear(given, weights(site, linear.weight)) - exact
                 both = torch.stack((difference.square().sum(), exact.square().sum())).double()
                 name = str(site)
                 sums[name] = sums[name] + both if name in sums else both

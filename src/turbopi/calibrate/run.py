@@ -18,12 +18,14 @@ from torch import Tensor
 from turbopi import backends, demo
 from turbopi.calibrate import observations as observed
 from turbopi.calibrate.artifact import RANDOM_NOISE, Quantization, SiteScale, shapes_of
-from turbopi.calibrate.emulate import delta_cosine, relative_rms, rounded
+from turbopi.calibrate.directions import Rows, directions
+from turbopi.calibrate.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.calibrate.observations import Batch, Call
 from turbopi.calibrate.product_errors import product_errors
 from turbopi.calibrate.sites import KINDS, MLP_KINDS, PARTS, Site, sites
 from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
 from turbopi.checkpoint import Checkpoint
+from turbopi.engine.fp8 import Directions
 from turbopi.errors import CheckpointError
 from turbopi.model.reference import Pi0Model, parameter_dtype
 from turbopi.policy import UnifiedPolicy
@@ -125,7 +127,7 @@ def calibrate_model(
     everywhere = sites(model.config)
     eligible = [site for site in everywhere if site.refusal is None]
 
-    def statistics(text: str, calls: Sequence[Call]) -> dict[str, Histogram]:
+    def statistics(text: str, calls: Sequence[Call], rows: dict[str, Rows] | None = None) -> dict[str, Histogram]:
         made = list(observed.batches(calls, settings.batch, model.device))
         progress.begin(text, len(made))
 
@@ -134,16 +136,24 @@ def calibrate_model(
                 yield batch
                 progress.advance()
 
-        return collect(model, everywhere, ticking(), steps)
+        return collect(model, everywhere, ticking(), steps, rows)
 
-    histograms = statistics("what every site sees", calibration)
+    rows: dict[str, Rows] = {}
+    histograms = statistics("what every site sees", calibration, rows)
     unseen = statistics("what held-out ones see", held_out)
-    selection = _Trials(model, calibration[:SELECTION], steps, settings.batch, progress)
+    progress.begin("what its activations have in common", len(eligible))
+    common: dict[Site, Directions] = {}
+    for site in eligible:
+        if (found := directions(rows.pop(str(site)).rows)) is not None:
+            common[site] = found
+        progress.advance()
+    weights = RoundedWeights(common)
+    selection = _Trials(model, calibration[:SELECTION], steps, settings.batch, progress, weights)
     method, methods = _best_method(eligible, histograms, selection, settings.methods, progress)
     scales = {site: histograms[str(site)].scale(method) for site in everywhere}
 
     progress.begin("products of every site", 1)
-    products = product_errors(model, {site: scales[site] for site in eligible}, selection.batches, steps)
+    products = product_errors(model, {site: scales[site] for site in eligible}, selection.batches, steps, weights)
     progress.advance()
     kept = {str(site): f"not possible: {site.refusal}" for site in everywhere if site.refusal is not None}
     kept |= {
@@ -164,8 +174,9 @@ def calibrate_model(
             saturated if not site.weights_only else 0.0,
             products.get(name, 0.0),
             kept.get(name),
+            None if name in kept or site not in common else common[site].to(torch.device("cpu")),
         )
-    final = _Trials(model, held_out, steps, settings.batch, progress)
+    final = _Trials(model, held_out, steps, settings.batch, progress, weights)
     on_held_out = _held_out(model, eligible, scales, kept, final, progress)
     reached = on_held_out["fp8"]["delta_cosine"]
     if reached < settings.target:
@@ -187,8 +198,16 @@ def calibrate_model(
 class _Trials:
     """The same calls again and again with other sites rounded, against what float32 made of them."""
 
-    def __init__(self, model: Pi0Model, calls: Sequence[Call], steps: int, size: int, progress: Progress) -> None:
-        self._model, self._steps = model, steps
+    def __init__(
+        self,
+        model: Pi0Model,
+        calls: Sequence[Call],
+        steps: int,
+        size: int,
+        progress: Progress,
+        weights: RoundedWeights,
+    ) -> None:
+        self._model, self._steps, self._weights = model, steps, weights
         self._made = list(observed.batches(calls, size, model.device))
         progress.begin("float32 reference", len(self._made))
         self.exact: list[Tensor] = []
@@ -209,7 +228,7 @@ class _Trials:
     def actions(self, scales: Mapping[Site, float], model: Pi0Model | None = None) -> list[Tensor]:
         """Of every batch, with these sites rounded."""
         used = model or self._model
-        with rounded(used, scales):
+        with rounded(used, scales, self._weights):
             return [used.sample(observation, noise, self._steps) for observation, noise in self.batches]
 
     def error(self, actions: Sequence[Tensor], against: Sequence[Tensor] | None = None) -> dict[str, float]:

@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from turbopi.calibrate.directions import Rows
 from turbopi.calibrate.sites import Site, linears
 from turbopi.engine.fp8 import E4M3_MAX, to_e4m3
 from turbopi.errors import ObservationError
@@ -69,16 +70,20 @@ class Histogram:
 
 
 def collect(
-    model: Pi0Model, sites: Iterable[Site], batches: Iterable[tuple[Observation, Tensor]], steps: int
+    model: Pi0Model,
+    sites: Iterable[Site],
+    batches: Iterable[tuple[Observation, Tensor]],
+    steps: int,
+    rows: dict[str, Rows] | None = None,
 ) -> dict[str, Histogram]:
     """Run the reference on (observations, noise) and count what every site sees, over all denoising steps.
 
-    The observations of a batch must have the same masks, as padding would be counted, too. Raises ObservationError if
-    a site sees values that aren't finite.
+    `rows`, if given, gets some of each site's activations. The observations of a batch must have the same masks, as
+    padding would be counted, too. Raises ObservationError if a site sees values that aren't finite.
     """
     counts: dict[str, Tensor] = {}
     largest: dict[str, Tensor] = {}
-    with _watched(model, sites, counts, largest):
+    with _watched(model, sites, counts, largest, rows):
         for observation, noise in batches:
             assert bool((observation.token_mask == observation.token_mask[:1]).all())
             assert bool((observation.image_mask == observation.image_mask[:1]).all())
@@ -94,7 +99,11 @@ def collect(
 
 @contextmanager
 def _watched(
-    model: Pi0Model, sites: Iterable[Site], counts: dict[str, Tensor], largest: dict[str, Tensor]
+    model: Pi0Model,
+    sites: Iterable[Site],
+    counts: dict[str, Tensor],
+    largest: dict[str, Tensor],
+    rows: dict[str, Rows] | None,
 ) -> Iterator[None]:
     handles = []
 
@@ -105,6 +114,8 @@ def _watched(
             top = x.amax()
             counts[name] = counts[name] + bins if name in counts else bins
             largest[name] = torch.maximum(largest[name], top) if name in largest else top
+            if rows is not None:
+                rows.setdefault(name, Rows(x.device)).add(inputs[0].detach().flatten(0, -2))
 
         return hook
 

@@ -88,7 +88,7 @@ def calibrate(
     result.save(out)
     _show(result, output)
     output.line(f"wrote {out}")
-    output.document({"out": out, **result.as_json()})
+    output.document({"out": out, **result.as_json(directions=False)})
 
 
 def _show(result: "Quantization", output: Output) -> None:

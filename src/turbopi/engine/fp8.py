@@ -4,6 +4,7 @@ A matrix has one scale an output channel, an activation one scale a site, fixed 
 are float32; the product of both scales is applied to them once, before bias and nonlinearity.
 
 Rounding is to nearest even. What lies beyond ±448, infinities too, becomes ±448; NaN stays NaN, so that damage shows.
+Weights whose activations' `Directions` are known are rounded with error feedback, see `rounding.round_rows`.
 """
 
 from dataclasses import dataclass
@@ -23,6 +24,33 @@ def to_e4m3(x: Tensor, inverse: float | Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+class Directions:
+    """What a site's activations x have in common: E[x xᵀ] ≈ main mainᵀ + rest I.
+
+    `main` is itself kept in E4M3, with a scale a direction: 16 of the full model's take 10 MB so, and what that costs
+    is a fortieth of what they save.
+    """
+
+    codes: Tensor  # e4m3[in, R]
+    scale: Tensor  # float32[R]
+    rest: float
+
+    @property
+    def main(self) -> Tensor:
+        """float32[in, R]"""
+        return self.codes.float() * self.scale
+
+    def to(self, device: torch.device) -> "Directions":
+        return Directions(self.codes.to(device), self.scale.to(device), self.rest)
+
+
+def channel_scales(weight: Tensor) -> Tensor:
+    """float32[out]: with it the largest value of each output channel becomes 448."""
+    largest = weight.abs().amax(dim=1).float()
+    return torch.where(largest > 0, largest / E4M3_MAX, torch.ones_like(largest))
+
+
+@dataclass(frozen=True)
 class Fp8Matrix:
     """A weight [out, in] in E4M3 whose input comes in E4M3, too. Takes a matrix's place in `engine.weights`."""
 
@@ -32,11 +60,12 @@ class Fp8Matrix:
     dtype: torch.dtype  # of results that aren't E4M3
 
     @classmethod
-    def quantize(cls, weight: Tensor, input_scale: float) -> "Fp8Matrix":
-        """weight [out, in] in its channels' own scales: the largest value of each becomes 448."""
-        largest = weight.abs().amax(dim=1).float()
-        scale = torch.where(largest > 0, largest / E4M3_MAX, torch.ones_like(largest))
-        return cls(to_e4m3(weight, 1 / scale[:, None]), scale * input_scale, 1 / input_scale, weight.dtype)
+    def quantize(cls, weight: Tensor, input_scale: float, directions: Directions | None = None) -> "Fp8Matrix":
+        """weight [out, in] in its channels' own scales, rounded for its input's directions."""
+        from turbopi.engine.rounding import round_rows  # which needs what stands here
+
+        scale = channel_scales(weight)
+        return cls(round_rows(weight, 1 / scale, directions), scale * input_scale, 1 / input_scale, weight.dtype)
 
     @property
     def shape(self) -> torch.Size:

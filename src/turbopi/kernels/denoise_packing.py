@@ -3,6 +3,7 @@
 Shapes: N steps, L layers, D width, F feed-forward width, n query heads of K columns.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.engine.fp8 import E4M3, E4M3_MAX, to_e4m3
+from turbopi.engine.fp8 import E4M3, Directions, Fp8Matrix
 from turbopi.engine.weights import GemmaLayer
 from turbopi.errors import BackendError
 
@@ -19,6 +20,8 @@ BLOCK = 16  # rows of a tile, columns of a block
 WARPS = 16  # that multiply
 RANKS = 8  # CTAs of a cluster
 DIVISOR = 16  # of activations before they become float16 to meet FP8 weights
+
+KINDS = ("qkv", "out", "gate_up", "down")  # a layer's matrices, in the order in which they are read
 
 Precision = Literal["bf16", "fp8"]
 
@@ -152,9 +155,10 @@ class PackedExpert:
         layers: list[GemmaLayer],
         clusters: int | None = None,
         weights: Precision = "bf16",
+        directions: Mapping[str, Directions] | None = None,
     ) -> "PackedExpert":
         """`clusters`: at least one per head, which is also the default. `weights` "fp8": E4M3 with a scale for each
-        output channel; activations aren't quantised, so no calibration is needed.
+        output channel, rounded for `directions` by site (activations aren't quantised, so it does without).
 
         Raises BackendError for sizes that the kernel doesn't cover.
         """
@@ -170,13 +174,13 @@ class PackedExpert:
         index = torch.cat(streams).to(device)
         starts = np.cumsum([0, *(size * len(stream) for stream in streams)])
         packed, scales = torch.empty(len(layers), len(index) * size, dtype=torch.uint8, device=device), []
-        for row, layer in zip(packed, layers, strict=True):
+        for i, (row, layer) in enumerate(zip(packed, layers, strict=True)):
             parts = layer.qkv, layer.out, layer.gate_up, layer.down
             if weights == "fp8":
-                largest = [part.abs().amax(dim=1).float() for part in parts]
-                scale = [torch.where(m > 0, m / E4M3_MAX, torch.ones_like(m)) for m in largest]
-                bits = [to_e4m3(m, 1 / s[:, None]).view(torch.uint8) for m, s in zip(parts, scale, strict=True)]
-                scales.append(torch.cat(scale))
+                common = [(directions or {}).get(f"expert.{i}.{kind}") for kind in KINDS]
+                made = [Fp8Matrix.quantize(m, 1.0, d) for m, d in zip(parts, common, strict=True)]
+                bits = [matrix.data.view(torch.uint8) for matrix in made]
+                scales.append(torch.cat([matrix.scale for matrix in made]))
             else:
                 bits = [part.to(torch.bfloat16).contiguous().view(torch.int16) for part in parts]
                 scales.append(torch.empty(0, device=device))

@@ -15,7 +15,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
      const float* sums_of_w, const float* offset,
 #endif
 #if TP_COPY
-     const float2* norm_scale, const float2* norm_shift, unsigned char* copy,
+     const float2* norm_scale, const float2* norm_shift, unsigned char* copy, float2* plain_sums,
 #endif
      int M, int N, int k_blocks, int m_groups, int n_groups, const char* ahead, u32 ahead_bytes) {
     extern __shared__ char raw[];
@@ -166,8 +166,9 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
             float2 scales[BN / 8], shifts[BN / 8];  // of the next norm
 #pragma unroll
             for (int j = 0; j < BN / 8; ++j) {
-                scales[j] = j < blocks ? norm_scale[col / 2 + 4 * j] : make_float2(0.0f, 0.0f);
-                shifts[j] = j < blocks ? norm_shift[col / 2 + 4 * j] : make_float2(0.0f, 0.0f);
+                const bool needed = j < blocks && (!GATHER || owner(j) == t.split);
+                scales[j] = needed ? norm_scale[col / 2 + 4 * j] : make_float2(0.0f, 0.0f);
+                shifts[j] = needed ? norm_shift[col / 2 + 4 * j] : make_float2(0.0f, 0.0f);
             }
 #endif
 #if TP_ROW_PARTS
@@ -314,8 +315,11 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                 } else {
 #if TP_COPY
                     const float shift = -mean[half] * factor[half];
-                    const float beyond = shift * 2 * (TILE_N / 8 - blocks);  // zeros beyond the matrix, in these units
-                    float sum = -beyond, squares = -beyond * shift;
+                    int missing = 0;  // blocks beyond the matrix, which are zeros, in these units `shift`
+#pragma unroll
+                    for (int j = 0; j < TILE_N / 8; ++j) missing += j >= blocks && (!GATHER || owner(j) == t.split);
+                    const float beyond = shift * 2 * missing;
+                    float sum = -beyond, squares = -beyond * shift, plain_sum = 0.0f, plain_squares = 0.0f;
                     u32 copies[TILE_N / 8];
 #elif TP_RESIDUAL
                     float sum = 0.0f, squares = 0.0f;  // of the row's results
@@ -337,6 +341,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                         const u32 both = pack(x, y);
                         x = bf16_low(both), y = bf16_high(both);
 #if TP_COPY
+                        plain_sum += x + y, plain_squares = fmaf(x, x, fmaf(y, y, plain_squares));
                         x = fmaf(x, factor[half], shift), y = fmaf(y, factor[half], shift);
                         copies[j] = pack_e4m3(fmaf(x, scales[j].x, shifts[j].x), fmaf(y, scales[j].y, shifts[j].y));
 #endif
@@ -353,7 +358,7 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
 #if TP_COPY
                     auto copied = [&](int j) { return copies[j]; };
                     store_row(settled(copy + begin + t.n), in_row[half], t.split, lane, copied);
-                    if (t.n == 0 && lane % 4 == 0)  // so that no eps is needed any more
+                    if (t.n == 0 && t.split == 0 && lane % 4 == 0)  // so that no eps is needed any more
                         squares += eps * factor[half] * factor[half] / inverse_width;
 #endif
 #if TP_RESIDUAL
@@ -361,6 +366,11 @@ gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap 
                     const int part = GATHER ? t.n / TILE_N * SPLITS + t.split : t.n / TILE_N;
                     if (in_row[half] && lane % 4 == 0)
                         sums_out[(size_t)part * M + row + half * 8] = make_float2(sum, squares);
+#endif
+#if TP_COPY
+                    plain_sum = sum_of_quad(plain_sum), plain_squares = sum_of_quad(plain_squares);
+                    if (in_row[half] && lane % 4 == 0)
+                        plain_sums[(size_t)part * M + row + half * 8] = make_float2(plain_sum, plain_squares);
 #endif
                 }
             }

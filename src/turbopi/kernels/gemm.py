@@ -94,7 +94,7 @@ class Copy:
     """An E4M3 copy of the result x: round((x - mean) / deviation * scale + shift).
 
     Mean and deviation are those of the *residual*'s rows. `sums_out` are then of (x - mean) / deviation, and what the
-    norm adds to the variance of x is in the squares.
+    norm adds to the variance of x is in the squares; `plain` are of x.
     """
 
     out: Tensor  # e4m3[M, N]
@@ -102,6 +102,7 @@ class Copy:
     scale: Tensor  # float32[N]  of the LayerNorm behind, over the scale of the copy
     shift: Tensor  # float32[N]  the same
     eps: float
+    plain: Sums  # written, as out is
 
 
 @dataclass(frozen=True)
@@ -157,10 +158,10 @@ def matmul(
         shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
         out = torch.empty(shape, dtype=torch.float32 if epilogue == "partial" else torch.bfloat16, device=a.device)
     assert out.is_contiguous()
-    assert copy is None or (residual is not None and copy.out.is_contiguous() and copy.out.shape == (m, n))
-    assert copy is None or (sums is None and not tile.gather and copy.scale.dtype == copy.shift.dtype == torch.float32)
-    copied = 0 if copy is None else copy.sums.count
-    kernel = _kernel(tile, epilogue, residual is not None, 0 if sums is None else sums.count, copied, a.device)
+    assert copy is None or (residual is not None and sums is None)
+    kernel = _kernel(
+        tile, epilogue, residual is not None, 0 if sums is None else sums.count, copied_parts(copy, m, n), a.device
+    )
     arguments = (
         matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
         matrix_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
@@ -168,7 +169,7 @@ def matmul(
         ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
         *residual_arguments(residual, sums_out),
         *(() if folded is None else norm_arguments(sums, k, eps, folded.sums, folded.offset)),
-        *_copy_arguments(copy, n),
+        *copy_arguments(copy, n),
         *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), *groups)),
     )
     launch(kernel, tile, groups, arguments, ahead)
@@ -211,7 +212,17 @@ def norm_arguments(sums: Sums | None, width: int, eps: float, of_weight: Tensor,
     return (*_row_arguments(sums, width, eps), *(ctypes.c_void_p(t.data_ptr()) for t in (of_weight, offset)))
 
 
-def _copy_arguments(copy: Copy | None, width: int) -> tuple[Any, ...]:
+def copied_parts(copy: Copy | None, m: int, n: int) -> int:
+    """TP_COPY of gemm.cu."""
+    if copy is None:
+        return 0
+    assert (
+        copy.out.is_contiguous() and copy.out.shape == (m, n) and copy.scale.dtype == copy.shift.dtype == torch.float32
+    )
+    return copy.sums.count
+
+
+def copy_arguments(copy: Copy | None, width: int) -> tuple[Any, ...]:
     if copy is None:
         return ()
     return (
@@ -219,6 +230,7 @@ def _copy_arguments(copy: Copy | None, width: int) -> tuple[Any, ...]:
         ctypes.c_void_p(copy.scale.data_ptr()),
         ctypes.c_void_p(copy.shift.data_ptr()),
         ctypes.c_void_p(copy.out.data_ptr()),
+        ctypes.c_void_p(copy.plain.parts.data_ptr()),
     )
 
 

@@ -26,7 +26,7 @@
 //
 // The same where the product behind is of E4M3 numbers: TP_COPY (parts of the residual's row sums, or 0) also rounds
 // the result to E4M3 as if the residual's mean and variance were its own, and `sums_out` are of the result in these
-// units. They are close, so it is as good an E4M3 copy as the norm's would be; TP_NORMED then makes up for the
+// units, `plain_sums` of the result itself, whose units the next copy may have. They are close, so it is as good an E4M3 copy as the norm's would be; TP_NORMED then makes up for the
 // difference, in which w times the shift is in `offset`, as it is in the copy already, and the bias goes apart.
 //
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
@@ -38,7 +38,7 @@ constexpr bool GATHER = TP_GATHER;
 constexpr int EPILOGUE = TP_EPILOGUE, PARTS = EPILOGUE == 3 ? 2 : 1;
 constexpr int SHARING = CM * CN, CLUSTER = SHARING * (GATHER ? SPLITS : 1);
 constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
-static_assert(!(TP_COPY && (GATHER || FP8)) && !(TP_COPY && TP_NORMED), "copies leave whole bfloat16 products");
+static_assert(!(TP_COPY && TP_NORMED) && !(TP_COPY && TP_OUT_FP8), "copies leave beside a bfloat16 stream");
 #if TP_OUT_FP8
 typedef unsigned char Element;
 #else
@@ -217,6 +217,17 @@ __device__ __forceinline__ void store_row(u16* to, int count, int split, int lan
 template <typename Value>
 __device__ __forceinline__ void store_row(unsigned char* to, int count, int split, int lane, Value value, int begin = 0,
                                           int end = BLOCKS) {
+    if (GATHER && TOGETHER == 2) {  // lanes of a pair exchange halves of two blocks
+        const bool odd = lane & 1;
+#pragma unroll
+        for (int j = begin; j < end; j += 2) {
+            if (owner(j) != split) continue;
+            const u32 v = value(j) | (j + 1 < end ? value(j + 1) : 0) << 16, other = __shfl_xor_sync(~0u, v, 1);
+            if (j + odd < count)
+                *(u32*)(to + (j + odd) * 8 + lane % 4 / 2 * 4) = __byte_perm(v, other, odd ? 0x3276 : 0x5410);
+        }
+        return;
+    }
     unsigned char* const place = to + lane % 4 * 8;
 #pragma unroll
     for (int j = begin; j + 3 < end; j += 4) {

@@ -14,10 +14,13 @@ from torch import Tensor
 from turbopi.engine.fp8 import ALIGNMENT, E4M3, Fp8Matrix
 from turbopi.kernels.gemm import (
     SPLIT,
+    Copy,
     Epilogue,
     Sums,
     Tile,
     build,
+    copied_parts,
+    copy_arguments,
     launch,
     layout,
     matrix_map,
@@ -75,19 +78,22 @@ def matmul_fp8(
     residual: Tensor | None = None,
     sums_out: Sums | None = None,
     sums: Sums | None = None,
+    copy: Copy | None = None,
     ahead: Tensor | None = None,
 ) -> Tensor:
     """a e4m3[M, K] @ weightᵀ with the epilogue -> bfloat16[M, N], or with `inverse` e4m3[M, N] = round(… * inverse);
     "partial" -> float32, "parts" -> bfloat16[splits, M, N].
 
-    With "bias" alone, `residual` bfloat16[M, N] is added and the sums of the result's rows go into `sums_out`. With a
-    `FoldedFp8` ("bias" or "gelu"), a is a `Copy` and `sums` its `sums_out`: its LayerNorm is multiplied.
+    With "bias" alone, `residual` bfloat16[M, N] is added, the sums of the result's rows go into `sums_out`, and a
+    `copy` may leave, too. With a `FoldedFp8` ("bias" or "gelu"), a is a `Copy` and `sums` its `sums_out`: its LayerNorm
+    is multiplied.
     weight [N, K], for "geglu" [2N, K]; bias bfloat16[N] of any epilogue but "geglu" and "parts". All contiguous, K a
     multiple of 16, N of 8.
     """
     folded, weight = (weight, weight.matrix) if isinstance(weight, FoldedFp8) else (None, weight)
     assert (folded is None) == (sums is None) and (folded is None or epilogue in ("bias", "gelu"))
     assert not tile.gather or folded is None, "sums are gathered after that"
+    assert copy is None or (residual is not None and sums is None and inverse is None)
     m, k = a.shape
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
     assert a.dtype == weight.data.dtype == E4M3 and a.is_contiguous() and weight.data.is_contiguous()
@@ -101,7 +107,8 @@ def matmul_fp8(
     assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
     promote = promotion(tile, k) if promote is None else promote
     normed = 0 if sums is None else sums.count
-    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, a.device)
+    copied = copied_parts(copy, m, n)
+    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, copied, a.device)
     arguments = (
         matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
         matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
@@ -111,6 +118,7 @@ def matmul_fp8(
         ctypes.c_float(1.0 if inverse is None else inverse),
         *residual_arguments(residual, sums_out),
         *(() if folded is None else norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),
+        *copy_arguments(copy, n),
         *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), *groups)),
     )
     launch(kernel, tile, groups, arguments, ahead)
@@ -122,10 +130,16 @@ def _result_dtype(partial: bool, inverse: float | None) -> torch.dtype:
 
 
 def constants(
-    tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool = False, normed: int = 0
+    tile: Tile,
+    epilogue: Epilogue,
+    out_fp8: bool,
+    promote: int,
+    residual: bool = False,
+    normed: int = 0,
+    copied: int = 0,
 ) -> dict[str, int]:
     """What gemm.cu is compiled with."""
-    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": 0}
+    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": copied}
     if out_fp8:
         own["TP_APART"] = 0  # such blocks go in fours, which may need more room than `Tile.apart` counts
     return tile_constants(tile, epilogue, residual, factors=2 if normed else 1) | own
@@ -133,9 +147,16 @@ def constants(
 
 @cache
 def _kernel(
-    tile: Tile, epilogue: Epilogue, out_fp8: bool, promote: int, residual: bool, normed: int, device: torch.device
+    tile: Tile,
+    epilogue: Epilogue,
+    out_fp8: bool,
+    promote: int,
+    residual: bool,
+    normed: int,
+    copied: int,
+    device: torch.device,
 ) -> DependentKernel:
-    sizes = constants(tile, epilogue, out_fp8, promote, residual, normed)
+    sizes = constants(tile, epilogue, out_fp8, promote, residual, normed, copied)
     return build(source(tile.columns, fp8=True), sizes, tile, device)
 
 
@@ -151,19 +172,23 @@ GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that g
 # The fastest of some 25 tiles each, by [rows, out, in]. Rows count in whole 64, the least that a tile has: so fewer
 # kernels are compiled for all the prompt lengths.
 MEASURED = {
+    (256, 3456, 1152): Tile(1, 112, cluster_m=2),
     (256, 4304, 1152): Tile(2, 72),
     (512, 3456, 1152): Tile(2, 112, cluster_m=2),
     (512, 1152, 1152): Tile(1, 96),
     (512, 4304, 1152): Tile(2, 136, ring=5),
+    (768, 3456, 1152): Tile(2, 160, cluster_m=2),
     (768, 4304, 1152): Tile(3, 136),
     (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
+    (320, 2560, 2048): Tile(1, 112),
     (576, 2560, 2048): Tile(3, 64),
     (576, 2048, 2048): Tile(1, 160),
     **{(rows, 16384, 2048): Tile(3, 128, cluster_n=2, overlap=True) for rows in (320, 576, 704, 768, 960)},
     (832, 16384, 2048): Tile(2, 176, cluster_n=2, overlap=True),
     (576, 2048, 16384): Tile(3, 96, splits=2),
-    (832, 2048, 16384): Tile(2, 120, cluster_n=2),
+    (832, 2048, 16384): Tile(2, 128, cluster_n=2),
     (576, 512, 2048): Tile(1, 80),
+    (832, 512, 2048): Tile(1, 64),
 }
 
 

@@ -18,8 +18,8 @@ from turbopi.kernels.products import (
     vision_tile,
 )
 
-# As `products.VISION_TILES`, for products that add their result to the residual stream, in either precision. Where sums
-# are gathered, all clusters must be on the GPU at once: an H200 takes 15 of eight blocks and 30 of four.
+# As `products.VISION_TILES`, for products that add their result to the residual stream. Where sums are gathered, all
+# clusters must be on the GPU at once: an H200 takes 15 of eight blocks and 30 of four.
 RESIDUAL_TILES = {
     (256, 1152, 1152): Tile(1, 64),
     (256, 1152, 4304): Tile(1, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
@@ -27,6 +27,10 @@ RESIDUAL_TILES = {
     (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True, ring=6),
     (768, 1152, 1152): Tile(2, 64),
     (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2, gather=True),
+}
+RESIDUAL_TILES_FP8 = RESIDUAL_TILES | {
+    (512, 1152, 1152): Tile(1, 80, cluster_m=2),
+    (768, 1152, 1152): Tile(1, 128, ring=5),
 }
 
 
@@ -77,7 +81,8 @@ class VisionTower:
         self._last: Tensor | None = None
 
     def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
-        tile = RESIDUAL_TILES.get((x.shape[0], weight.shape[0], weight.shape[1]))
+        tiles = RESIDUAL_TILES_FP8 if isinstance(weight, Fp8Matrix) else RESIDUAL_TILES
+        tile = tiles.get((x.shape[0], weight.shape[0], weight.shape[1]))
         if tile is None or bias is None or num_sms(x.device) < GATHERING_SMS:
             return tuned_residual_linear(x, weight, bias)
         return Product(x, weight, bias, tile)
@@ -94,21 +99,22 @@ class VisionTower:
         before, self._stream = self._stream, None
         if not isinstance(y, Product):
             return norms.residual_layer_norm(x, y, weight, bias, eps, inverse)
-        ahead = self._next(y.weight)
-        sums = Sums.allocate(y.tile, x.shape[0], x.shape[1], x.device)
-        if inverse is not None:
-            if before is None or before.x is not x or isinstance(y.weight, Fp8Matrix) or y.tile.gather:
-                made = tuned_residual_linear(y.x, y.weight, y.bias, ahead)
-                return norms.residual_layer_norm(x, made, weight, bias, eps, inverse)
-            copied = torch.empty_like(x, dtype=E4M3)
-            copy = Copy(copied, before.sums, *self._for_copies(weight, bias, inverse), eps)
-            x = matmul(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, copy=copy, ahead=ahead)
-            return x, NormedCopy(copied, sums, weight, bias)
+        ahead, copy = self._next(y.weight), None
+        sums = plain = Sums.allocate(y.tile, x.shape[0], x.shape[1], x.device)
+        if inverse is not None and before is not None and before.x is x:
+            plain = Sums.allocate(y.tile, x.shape[0], x.shape[1], x.device)
+            copy = Copy(
+                torch.empty_like(x, dtype=E4M3), before.sums, *self._for_copies(weight, bias, inverse), eps, plain
+            )
         if isinstance(y.weight, Fp8Matrix):
-            x = matmul_fp8(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, ahead=ahead)
+            x = matmul_fp8(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, copy=copy, ahead=ahead)
         else:
-            x = matmul(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, ahead=ahead)
-        self._stream = Normed(x, sums, weight, bias, eps)
+            x = matmul(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, copy=copy, ahead=ahead)
+        self._stream = Normed(x, plain, weight, bias, eps)
+        if copy is not None:
+            return x, NormedCopy(copy.out, sums, weight, bias)
+        if inverse is not None:  # of the first layer's input nothing is known
+            return norms.residual_layer_norm(x, None, weight, bias, eps, inverse)
         return x, self._stream
 
     def linear(

@@ -1,0 +1,58 @@
+"""Weights to E4M3 with error feedback. Twin: `engine.rounding.round_with_feedback_plain`."""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from turbopi.kernels.launch import result_dtype
+
+ROWS = 16  # of a program, one warp: a row's columns depend on each other, so rows are all there is to share
+
+
+@triton.jit
+def _to_e4m3(x):
+    """float32 as E4M3 holds it: by hand, as Triton's interpreter rounds differently."""
+    damaged = x != x
+    x = tl.clamp(x, -448.0, 448.0)
+    bits = x.to(tl.int32, bitcast=True)
+    normal = ((bits + 0x7FFFF + ((bits >> 20) & 1)) & -0x100000).to(tl.float32, bitcast=True)  # to nearest even
+    small = (x + 24576.0) - 24576.0  # in steps of 2^-9
+    return tl.where(damaged, float("nan"), tl.where(tl.abs(x) < 0.015625, small, normal))
+
+
+@triton.jit
+def _feedback_kernel(
+    weight, inverse, order, errors, answers, out, rows, columns, NUM: tl.constexpr, R: tl.constexpr, ROWS: tl.constexpr
+):  # fmt: skip
+    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    valid, direction = row < rows, tl.arange(0, R)
+    by = tl.load(inverse + row, valid, 1.0)
+    scale = tl.div_rn(1.0, by)
+    left = tl.zeros((ROWS, R), tl.float32)
+    at = tl.load(order)
+    exact = tl.load(weight + row * columns + at, valid, 0.0).to(tl.float32)
+    for column in range(columns):
+        following = tl.load(order + tl.minimum(column + 1, columns - 1))  # asked for before it is needed
+        next_exact = tl.load(weight + row * columns + following, valid, 0.0).to(tl.float32)
+        error = tl.load(errors + column * NUM + direction, direction < NUM, 0.0)
+        answer = tl.load(answers + column * NUM + direction, direction < NUM, 0.0)
+        rounded = _to_e4m3((exact - tl.sum(left * answer[None, :], 1)) * by)
+        left += (rounded * scale - exact)[:, None] * error[None, :]
+        tl.store(out + row * columns + at, rounded.to(out.dtype.element_ty), valid)
+        at, exact = following, next_exact
+
+
+def round_with_feedback(weight: Tensor, inverse: Tensor, order: Tensor, errors: Tensor, answers: Tensor) -> Tensor:
+    """e4m3[out, in] of weight * inverse; `order`, `errors`, `answers` of `engine.rounding.feedback`."""
+    weight = weight.contiguous()
+    rows, columns = weight.shape
+    num = errors.shape[1]
+    assert order.shape == (columns,) and errors.shape == answers.shape == (columns, num)
+    assert errors.is_contiguous() and answers.is_contiguous() and inverse.shape == (rows,)
+    out = torch.empty(rows, columns, dtype=result_dtype(weight, 1.0), device=weight.device)
+    _feedback_kernel[(triton.cdiv(rows, ROWS),)](
+        weight, inverse, order, errors, answers, out, rows, columns,
+        NUM=num, R=triton.next_power_of_2(num), ROWS=ROWS, num_warps=1,
+    )  # fmt: skip
+    return out

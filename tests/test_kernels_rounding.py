@@ -1,0 +1,155 @@
+"""Weights rounded with error feedback: what it gains, and that the kernel does what its twin does.
+
+Exact in the interpreter and on a GPU where all sums are; elsewhere a sum's last bit may decide.
+"""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("triton", reason="Triton isn't installed")
+
+from turbopi.calibrate.directions import COUNT, ROWS, Rows, directions
+from turbopi.engine.fp8 import Directions, Fp8Matrix, to_e4m3
+from turbopi.engine.rounding import feedback, round_rows, round_with_feedback_plain
+from turbopi.kernels.rounding import round_with_feedback
+
+ON_GPU = torch.cuda.is_available()
+DEVICE = torch.device("cuda" if ON_GPU else "cpu")
+pytestmark = (
+    [pytest.mark.gpu]
+    if ON_GPU
+    else [
+        pytest.mark.filterwarnings("ignore::RuntimeWarning"),
+        pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    ]
+)
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed)).to(DEVICE)
+
+
+def activations(count: int, width: int, seed: int = 1) -> Tensor:
+    """Much in common, three outlier channels, and a tenth of noise."""
+    common = random(4, width, seed=7) * torch.tensor([3.0, 2.0, 1.0, 1.0], device=DEVICE)[:, None]
+    common[:, [5, 20, 33]] *= 20
+    return random(count, 4, seed=seed) @ common + 0.3 * random(count, width, seed=seed + 1)
+
+
+def error(rounded: Tensor, weight: Tensor, x: Tensor) -> float:
+    return float((x @ (rounded - weight).T).norm() / (x @ weight.T).norm())
+
+
+@pytest.mark.parametrize(("out", "width", "count"), [(24, 64, 600), (17, 200, 40), (1, 40, 3)])
+def test_errors_cancel_where_activations_lie(out: int, width: int, count: int) -> None:
+    weight, seen, unseen = random(out, width) / 50, activations(count, width), activations(300, width, seed=3)
+    known = directions(seen)
+    assert known is not None and known.codes.shape == (width, min(COUNT, count, width))
+    nearest, spared = (Fp8Matrix.quantize(weight, 1.0, d).dequantized() for d in (None, known))
+    assert error(spared, weight, seen) < 0.3 * error(nearest, weight, seen)
+    if count > COUNT:
+        assert error(spared, weight, unseen) < 0.3 * error(nearest, weight, unseen)
+    white = random(300, width, seed=5)  # what has nothing in common pays little
+    assert error(spared, weight, white) < 2 * error(nearest, weight, white)
+
+
+def test_answers_are_those_of_the_whole_least_squares_problem() -> None:
+    width, rest = 12, 0.1
+    main = random(width, 3)
+    order, errors, answers = feedback(Directions(to_e4m3(main, 1.0), torch.ones(3, device=DEVICE), rest))
+    hessian = (errors @ errors.T).double() + rest * torch.eye(width, device=DEVICE)
+    assert torch.equal(errors, to_e4m3(main, 1.0).float()[order])
+    assert bool((errors.square().sum(1).diff() <= 0).all())
+    for first in (1, 5, width - 1):
+        off = random(first, seed=first).double()  # of the weights before: those behind change so that least is left
+        best = -torch.linalg.solve(hessian[first:, first:], hessian[first:, :first] @ off)
+        assert float(best[0]) == pytest.approx(-float(answers[first].double() @ (errors[:first].double().T @ off)))
+
+
+def exact_sums(rows: int, columns: int, num: int) -> tuple[Tensor, ...]:
+    """weight, inverse, order, errors, answers of few bits, so that no sum is rounded."""
+    weight = (random(rows, columns) * 64).round() / 64
+    errors, answers = (torch.sign(random(columns, num, seed=s)) * size for s, size in ((1, 0.5), (2, 0.25)))
+    inverse = torch.where(torch.arange(rows, device=DEVICE) % 2 == 0, 2.0, 0.5)
+    return (
+        weight,
+        inverse,
+        torch.randperm(columns, generator=torch.Generator().manual_seed(0)).to(DEVICE),
+        errors,
+        answers,
+    )
+
+
+@pytest.mark.parametrize(("rows", "columns", "num"), [(40, 32, 4), (16, 24, 3), (5, 1, 1)])
+def test_the_kernel_rounds_as_its_twin(rows: int, columns: int, num: int) -> None:
+    given = exact_sums(rows, columns, num)
+    ours, twin = round_with_feedback(*given), round_with_feedback_plain(*given)
+    assert torch.equal(ours.float(), twin.float())
+    assert not torch.equal(twin.float(), to_e4m3(given[0], given[1][:, None]).float()) or columns == 1
+
+
+def test_without_feedback_the_kernel_rounds_every_number_to_nearest() -> None:
+    numbers = torch.arange(256, dtype=torch.uint8).view(torch.float8_e4m3fn).float()
+    numbers = torch.unique(numbers[numbers.isfinite()])
+    between = (numbers[1:] + numbers[:-1]) / 2
+    x = torch.cat((numbers, between, between * 1.001, torch.tensor([449.0, -1e30, torch.inf, -torch.inf])))
+    weight, none = x[:, None].contiguous().to(DEVICE), torch.zeros(1, 1, device=DEVICE)
+    order, inverse = torch.zeros(1, dtype=torch.int64, device=DEVICE), torch.ones(len(x), device=DEVICE)
+    ours = round_with_feedback(weight, inverse, order, none, none)
+    assert torch.equal(ours.float(), to_e4m3(weight, 1.0).float())
+
+
+def test_nan_shows_in_its_row_alone() -> None:
+    weight, known = random(20, 64), directions(activations(100, 64))
+    weight[3, 10] = torch.nan
+    matrix = Fp8Matrix.quantize(weight, 1.0, known).dequantized()
+    assert bool(matrix[3].isnan().any()) and bool(matrix[torch.arange(20) != 3].isfinite().all())
+
+
+def test_rows_of_fused_matrices_are_rounded_as_they_are_alone() -> None:
+    weight, known = random(48, 64), directions(activations(100, 64))
+    whole = Fp8Matrix.quantize(weight, 1.0, known)
+    for rows in (slice(0, 16), slice(16, 48)):
+        assert torch.equal(Fp8Matrix.quantize(weight[rows], 1.0, known).data.float(), whole.data[rows].float())
+
+
+# Directions
+
+
+def test_directions_are_the_largest_of_the_second_moment() -> None:
+    x = activations(500, 64)
+    known = directions(x)
+    assert known is not None
+    moment = x.double().T @ x.double() / len(x)
+    power = torch.linalg.eigvalsh(moment).flip(0)
+    main = known.main.double()
+    assert float((moment - main @ main.T).norm() / moment.norm()) < 0.05  # E4M3's three bits
+    assert known.rest == pytest.approx(float(power[COUNT:].sum()) / 64, rel=1e-3)
+    assert directions(torch.zeros(10, 64)) is None
+    single = directions(torch.ones(10, 64))
+    assert single is not None and single.rest > 0
+
+
+def batches(count: int) -> Iterator[Tensor]:
+    for i in range(count):
+        yield torch.full((300, 4), float(i))
+
+
+def test_rows_stand_for_all_that_came() -> None:
+    few, many, again = (Rows(torch.device("cpu")) for _ in range(3))
+    few.add(activations(10, 40).cpu())
+    assert torch.equal(few.rows.sort(0).values, activations(10, 40).cpu().sort(0).values)
+    for x in batches(20):
+        many.add(x)
+        again.add(x)
+    assert many.rows.shape == (ROWS, 4) and torch.equal(many.rows, again.rows)
+    of_each = torch.bincount(many.rows[:, 0].long(), minlength=20)
+    assert int(of_each.min()) > 8 and int(of_each.max()) < 50  # 25.6 each, expected
+
+
+def test_no_directions_round_to_nearest() -> None:
+    weight, inverse = random(8, 16), torch.full((8,), 3.0, device=DEVICE)
+    assert torch.equal(round_rows(weight, inverse).float(), to_e4m3(weight, inverse[:, None]).float())
