@@ -12,8 +12,14 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.calibrate.directions import COUNT, ROWS, Rows, directions
+from turbopi.calibrate.formats import round_e2m1, round_nvfp4
 from turbopi.engine.fp8 import Directions, Fp8Matrix, to_e4m3
-from turbopi.engine.rounding import feedback, round_rows, round_with_feedback_plain
+from turbopi.engine.rounding import (
+    columns_with_feedback,
+    feedback,
+    round_rows,
+    round_with_feedback_plain,
+)
 from turbopi.kernels.rounding import round_with_feedback
 
 ON_GPU = torch.cuda.is_available()
@@ -89,6 +95,23 @@ def test_the_kernel_rounds_as_its_twin(rows: int, columns: int, num: int) -> Non
     ours, twin = round_with_feedback(*given), round_with_feedback_plain(*given)
     assert torch.equal(ours.float(), twin.float())
     assert not torch.equal(twin.float(), to_e4m3(given[0], given[1][:, None]).float()) or columns == 1
+
+
+def test_e2m1_in_blocks_by_the_kernel_and_its_twin() -> None:
+    weight, _, order, errors, answers = exact_sums(20, 32, 4)
+    inverse = torch.where(torch.arange(40, device=DEVICE).view(20, 2) % 3 == 0, 4.0, 1.0)
+    inverse[5, 1] = 0  # a block of zeros
+    weight[5, 16:] = 0
+
+    def twin(wanted: Tensor, column: int) -> Tensor:
+        by = inverse[:, column // 16]
+        return torch.where(by > 0, round_e2m1(wanted * by) / by.clamp(min=1), 0.0)
+
+    expected = columns_with_feedback(weight, order, errors, answers, twin)
+    assert torch.equal(round_with_feedback(weight, inverse, order, errors, answers), expected)
+    weight, seen = random(20, 64) / 50, activations(200, 64)
+    spared, nearest = round_nvfp4(weight, directions(seen)), round_nvfp4(weight)
+    assert error(spared, weight, seen) < 0.3 * error(nearest, weight, seen)
 
 
 def test_without_feedback_the_kernel_rounds_every_number_to_nearest() -> None:

@@ -9,7 +9,8 @@ from torch import Tensor
 
 import turbopi.model.gemma
 import turbopi.model.vision
-from turbopi.engine.fp8 import E4M3_MAX, to_e4m3
+from turbopi.engine.fp8 import E4M3_MAX, Directions, to_e4m3
+from turbopi.engine.rounding import columns_with_feedback, feedback, uses_kernel
 from turbopi.model.layers import attention
 
 # NVFP4 (Blackwell): E2M1 numbers in blocks of 16 with an E4M3 scale each, and one float32 scale for the tensor.
@@ -25,16 +26,29 @@ def round_e2m1(x: Tensor) -> Tensor:
     return torch.round(x / step) * step
 
 
-def round_nvfp4(x: Tensor) -> Tensor:
-    """x [rows, K] as NVFP4 holds it, K a multiple of 16; scales from its own values."""
+def round_nvfp4(x: Tensor, directions: Directions | None = None) -> Tensor:
+    """x [rows, K] as NVFP4 holds it, K a multiple of 16; scales from its own values. With `directions` x is a weight,
+    rounded for them.
+    """
     blocks = x.float().view(*x.shape[:-1], -1, BLOCK)
     largest = blocks.abs().amax(-1, keepdim=True)
     whole = largest.max() / (E2M1[-1] * E4M3_MAX)
     if whole == 0:
         return x
     scale = to_e4m3(largest / E2M1[-1], 1 / whole).float() * whole
-    rounded = torch.where(scale > 0, round_e2m1(blocks / scale.clamp(min=1e-30)) * scale, 0.0)
-    return rounded.flatten(-2).to(x.dtype)
+    if directions is not None:
+        feeding = feedback(directions.to(x.device))
+        if uses_kernel(x):
+            from turbopi.kernels.rounding import round_with_feedback
+
+            inverse = torch.where(scale > 0, 1 / scale.clamp(min=1e-30), 0.0).squeeze(2)
+            return round_with_feedback(x, inverse, *feeding).to(x.dtype)
+        return columns_with_feedback(x, *feeding, lambda wanted, i: _e2m1(wanted, scale[:, i // BLOCK, 0])).to(x.dtype)
+    return _e2m1(blocks, scale).flatten(-2).to(x.dtype)
+
+
+def _e2m1(x: Tensor, scale: Tensor) -> Tensor:
+    return torch.where(scale > 0, round_e2m1(x / scale.clamp(min=1e-30)) * scale, 0.0)
 
 
 @contextmanager

@@ -5,8 +5,9 @@ Emulated exactly in float32 (emulate.py, formats.py) on three sets of full-size 
 
 import argparse
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,33 +16,41 @@ from torch import Tensor
 
 from turbopi import backends, demo
 from turbopi.bench.provenance import provenance
-from turbopi.calibrate.emulate import Round, delta_cosine, relative_rms, replaced, rounded
+from turbopi.calibrate.directions import Rows, directions
+from turbopi.calibrate.emulate import Round, RoundedWeights, delta_cosine, relative_rms, replaced, rounded
 from turbopi.calibrate.formats import attention_in_fp8, round_nvfp4
 from turbopi.calibrate.observations import Batch, Sample, batches, calls
 from turbopi.calibrate.sites import MLP_KINDS, PARTS, Site, linears, sites
 from turbopi.calibrate.statistics import collect
 from turbopi.calibrate.studied import WEIGHTS, Weights, studied_checkpoint
 from turbopi.checkpoint import random_checkpoint
+from turbopi.engine.fp8 import Directions
 from turbopi.model.reference import Pi0Model
 from turbopi.preprocess import Pipeline
 from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
 
 
 def errors(
-    model: Pi0Model, made: list[Batch], steps: int, formats: Sequence[str] | None = None
+    model: Pi0Model, made: list[Batch], seen: list[Batch], steps: int, formats: Sequence[str] | None = None
 ) -> Iterator[tuple[str, dict[str, float]]]:
-    """Formats and places, all or some, each with the actions' error."""
+    """Formats and places, all or some, each with the actions' error; weights are rounded for what `seen` have in
+    common, where that is said.
+    """
     noise = torch.cat([noise for _, noise in made])
     exact = _actions(model, made, steps)
     every = [site for site in sites(model.config) if site.refusal is None]
     histograms = collect(model, every, made, steps)
     scales = {site: histograms[str(site)].scale("headroom") for site in every}
+    rows: dict[str, Rows] = {}
+    collect(model, every, seen, steps, rows)
+    common = {site: found for site in every if (found := directions(rows.pop(str(site)).rows)) is not None}
 
     def of(*parts: str, mlp: bool = False) -> dict[Site, float]:
         return {s: x for s, x in scales.items() if s.part in parts and (not mlp or s.kind in MLP_KINDS)}
 
     cases: dict[str, Callable[[], AbstractContextManager[None]]] = {
         "FP8": lambda: rounded(model, of(*PARTS)),
+        "FP8, rounded for directions": lambda: rounded(model, of(*PARTS), RoundedWeights(common)),
         "FP8, vision and prefix": lambda: rounded(model, of("vision", "prefix")),
         "FP8, feed-forward of vision and prefix": lambda: rounded(model, of("vision", "prefix", mlp=True)),
         **{f"FP8, {part}": lambda part=part: rounded(model, of(part)) for part in PARTS},  # type: ignore[misc]
@@ -50,6 +59,8 @@ def errors(
         "NVFP4": lambda: in_nvfp4(model, of(*PARTS), activations=True),
         "NVFP4, weights alone": lambda: in_nvfp4(model, of(*PARTS), activations=False),
         "NVFP4, weights of the expert alone": lambda: in_nvfp4(model, of("expert"), activations=False),
+        "NVFP4, rounded for directions": lambda: in_nvfp4(model, of(*PARTS), common, activations=True),
+        "NVFP4, weights alone, rounded for directions": lambda: in_nvfp4(model, of(*PARTS), common, activations=False),
     }
     for name, context in cases.items():
         if formats is not None and name not in formats:
@@ -63,24 +74,25 @@ def errors(
 
 
 @contextmanager
-def in_nvfp4(model: Pi0Model, scales: dict[Site, float], *, activations: bool) -> Iterator[None]:
-    """For a while, these sites' products are of NVFP4 numbers, the expert's activations too if any are."""
-
-    held: dict[int, Tensor] = {}  # the expert's weights, needed in every step
+def in_nvfp4(
+    model: Pi0Model, scales: dict[Site, float], common: Mapping[Site, Directions] | None = None, *, activations: bool
+) -> Iterator[None]:
+    """For a while, these sites' products are of NVFP4 numbers, the expert's activations too if any are; weights are
+    rounded for the sites' directions, if given.
+    """
+    held: dict[int, Tensor] = {}
 
     def same(x: Tensor) -> Tensor:
         return x
 
-    def once(weight: Tensor) -> Tensor:
+    def once(weight: Tensor, site: Site) -> Tensor:
         if id(weight) not in held:
-            held[id(weight)] = round_nvfp4(weight)
+            held[id(weight)] = round_nvfp4(weight, (common or {}).get(site))
         return held[id(weight)]
 
     inputs = round_nvfp4 if activations else same
     changes: list[tuple[torch.nn.Linear, Round, Round]] = [
-        (linear, inputs, once if site.weights_only else round_nvfp4)
-        for site in scales
-        for linear in linears(model, site)
+        (linear, inputs, partial(once, site=site)) for site in scales for linear in linears(model, site)
     ]
     with replaced(changes):
         yield
@@ -113,19 +125,25 @@ def run(
     sizes = checkpoint.config.model
     tokenizer = load_tokenizer(TINY_TOKENIZER, checkpoint_dir=None, candidates=(), vocab_size=sizes.vocab_size)
     pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, tokenizer)
-    frames = demo.load_frames()[:count]
+    frames = demo.load_frames()
+    if not 1 <= count < len(frames):
+        raise SystemExit(f"--count is from 1 to {len(frames) - 1}, as other frames give the directions; it is {count}")
     samples = [  # one prompt, so that they are one batch
         Sample(f"LIBERO frame {i}", pipeline.before(_observation(frame, frames[0].prompt))[0])
         for i, frame in enumerate(frames)
     ]
     shape = (sizes.action_horizon, sizes.action_dim)
-    made = [batch for _, batch in batches(calls(samples, shape, 1, 0), 8, device)]
+    made, seen = (
+        [batch for _, batch in batches(calls(some, shape, 1, seed), 8, device)]
+        for seed, some in enumerate((samples[:count], samples[count:]))
+    )
+    samples = samples[:count]
     about = {"provenance": provenance(device), "preset": preset, "steps": steps, "observations": len(samples)}
     results: dict[str, Any] = {}
     for kind in kinds:
         model = Pi0Model.from_state(sizes, studied_checkpoint(kind, preset, device).load(device, "f32").state)
         results[kind] = {}
-        for name, error in errors(model, made, steps, formats):
+        for name, error in errors(model, made, seen, steps, formats):
             results[kind][name] = error
             print(
                 f"{kind}: {name:42} relative rms {error['relative_rms']:.2e}  cosine {error['delta_cosine']:.6f}",
@@ -140,7 +158,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--preset", default="pi05_libero")
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--count", type=int, default=6, help="observations")
+    parser.add_argument("--count", type=int, default=2, help="observations, of 6")
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--weights", choices=WEIGHTS, action="append", help="one of the three; may be given again")
     parser.add_argument("--format", action="append", help="one of what is printed; may be given again")

@@ -9,6 +9,7 @@ Shapes: a matrix [out, in], R directions.
 """
 
 import importlib.util
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -24,12 +25,16 @@ def round_rows(weight: Tensor, inverse: Tensor, directions: Directions | None = 
     """
     if directions is None:
         return to_e4m3(weight, inverse[:, None])
-    order, errors, answers = feedback(directions.to(weight.device))
-    if weight.is_cuda and importlib.util.find_spec("triton") is not None:
+    feeding = feedback(directions.to(weight.device))
+    if uses_kernel(weight):
         from turbopi.kernels.rounding import round_with_feedback  # Triton isn't imported elsewhere
 
-        return round_with_feedback(weight, inverse, order, errors, answers)
-    return round_with_feedback_plain(weight, inverse, order, errors, answers)
+        return round_with_feedback(weight, inverse, *feeding)
+    return round_with_feedback_plain(weight, inverse, *feeding)
+
+
+def uses_kernel(weight: Tensor) -> bool:
+    return weight.is_cuda and importlib.util.find_spec("triton") is not None
 
 
 def feedback(directions: Directions) -> tuple[Tensor, Tensor, Tensor]:
@@ -52,12 +57,20 @@ def round_with_feedback_plain(
     weight: Tensor, inverse: Tensor, order: Tensor, errors: Tensor, answers: Tensor
 ) -> Tensor:
     """A column at a time: what `kernels.rounding.round_with_feedback` does."""
-    columns = weight.float()[:, order].T.contiguous()
-    scale, left = 1 / inverse, errors.new_zeros(len(weight), errors.shape[1])
-    rounded = torch.empty_like(columns, dtype=torch.float8_e4m3fn)
-    for column, exact in enumerate(columns):
-        rounded[column] = to_e4m3(exact - left @ answers[column], inverse)
-        left += (rounded[column].float() * scale - exact)[:, None] * errors[column]
-    back = torch.empty_like(rounded)
-    back[order] = rounded
-    return back.T.contiguous()
+    scale = 1 / inverse
+    rounded = columns_with_feedback(
+        weight, order, errors, answers, lambda wanted, _: to_e4m3(wanted, inverse).float() * scale
+    )
+    return to_e4m3(rounded, inverse[:, None])
+
+
+def columns_with_feedback(
+    weight: Tensor, order: Tensor, errors: Tensor, answers: Tensor, rounded: Callable[[Tensor, int], Tensor]
+) -> Tensor:
+    """float32[out, in] in any format: `rounded` gets the numbers wanted for a column, float32[out], and its number."""
+    left, result = errors.new_zeros(len(weight), errors.shape[1]), torch.empty_like(weight, dtype=torch.float32)
+    for i, column in enumerate(order.tolist()):
+        exact = weight[:, column].float()
+        result[:, column] = rounded(exact - left @ answers[i], column)
+        left += (result[:, column] - exact)[:, None] * errors[i]
+    return result
