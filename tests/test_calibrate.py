@@ -81,6 +81,24 @@ def test_a_histogram_knows_the_error_of_rounding(scale: float) -> None:
     assert beyond == pytest.approx(float((x.abs() > E4M3_MAX * scale).float().mean()), abs=0.003)
 
 
+def test_histograms_add_up() -> None:
+    x, y = torch.randn(1000, generator=torch.Generator().manual_seed(0)), torch.linspace(0.1, 7, 100)
+    both, whole = histogram_of(x).with_counts_of(histogram_of(y)), histogram_of(torch.cat((x, y)))
+    assert both.largest == whole.largest == 7
+    assert both.error(0.01) == whole.error(0.01) and both.percentile(50) == whole.percentile(50)
+
+
+def test_sites_are_chosen_on_calls_that_gave_no_directions() -> None:
+    case = golden_cases()["b_third_masked"]
+    many = golden_calls(case) * 20
+    for count, of_these in ((20, 8), (7, 3), (2, 1)):
+        given = [dataclasses.replace(call, seed=i) for i, call in enumerate(many[:count])]
+        others, chosen = run._apart(given)
+        assert len(chosen) == of_these and {c.seed for c in others} | {c.seed for c in chosen} == set(range(count))
+        assert len(others) + len(chosen) == count
+    assert run._apart(many[:1]) == (many[:1], many[:1])
+
+
 def test_the_ways_to_choose_a_scale() -> None:
     x = torch.randn(200_000, generator=torch.Generator().manual_seed(0))
     x[0] = 500.0

@@ -34,7 +34,7 @@ TARGET = 0.9975  # cosine of the actions' deltas that automatic choice of sites 
 ROOM = 0.8  # of the error that the target allows, on the few calls that sites are chosen on: others may be harder
 SATURATION_LIMIT = 0.01  # part of a site's held-out values beyond the largest number: more is told loudly
 SITE_LIMIT = 0.25  # relative rms of a site's products beyond which it stays in bfloat16 whatever the actions say
-SELECTION = 8  # calls that ways to choose scales and groups of sites are compared on
+SELECTION = 8  # calls at most that ways to choose scales and groups of sites are compared on, of few the half
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,12 @@ def calibrate_model(
         return collect(model, everywhere, ticking(), steps, rows)
 
     rows: dict[str, Rows] = {}
-    histograms = statistics("what every site sees", calibration, rows)
+    # weights rounded for what some calls have in common are better on those than on any others
+    others, chosen = _apart(calibration)
+    histograms = statistics("what every site sees", others, rows)
+    if chosen is not others:
+        more = statistics("what it sees where sites are chosen", chosen)
+        histograms = {name: one.with_counts_of(more[name]) for name, one in histograms.items()}
     unseen = statistics("what held-out ones see", held_out)
     progress.begin("what its activations have in common", len(eligible))
     common: dict[Site, Directions] = {}
@@ -148,7 +153,7 @@ def calibrate_model(
             common[site] = found
         progress.advance()
     weights = RoundedWeights(common)
-    selection = _Trials(model, calibration[:SELECTION], steps, settings.batch, progress, weights)
+    selection = _Trials(model, chosen, steps, settings.batch, progress, weights)
     method, methods = _best_method(eligible, histograms, selection, settings.methods, progress)
     scales = {site: histograms[str(site)].scale(method) for site in everywhere}
 
@@ -193,6 +198,16 @@ def calibrate_model(
         "warnings": warnings,
     }
     return Measured(entries, report)
+
+
+def _apart(calibration: Sequence[Call]) -> tuple[Sequence[Call], Sequence[Call]]:
+    """(calls to find directions on, calls to choose sites on); of a single call it is both."""
+    count = min(SELECTION, len(calibration) // 2)
+    if count == 0:
+        return calibration, calibration
+    chosen = {i * len(calibration) // count for i in range(count)}
+    others = [call for i, call in enumerate(calibration) if i not in chosen]
+    return others, [calibration[i] for i in sorted(chosen)]
 
 
 class _Trials:

@@ -35,6 +35,13 @@ class Histogram:
         self._bins, self._counts, self._values = used, counts[used], _centres()[used]
         self._scales: dict[Method, float] = {}
 
+    def with_counts_of(self, other: "Histogram") -> "Histogram":
+        """Of all that both have seen."""
+        counts = torch.zeros(BINS, dtype=torch.float64)
+        counts[self._bins] += self._counts
+        counts[other._bins] += other._counts
+        return Histogram(counts, max(self.largest, other.largest))
+
     def error(self, scale: float) -> tuple[float, float]:
         """(relative rms error of rounding to E4M3 with a scale, part of the values that saturates)."""
         values = self._values.double()
