@@ -118,7 +118,8 @@ def golden_calibration(
     model = Pi0Model.from_state(checkpoint.config.model, checkpoint.load(device, "f32").state)
     calls = [call for case in folder.cases() if case.kind == kind for call in golden_calls(case)]
     calls = [call for call in calls if call.noise.shape == calls[0].noise.shape]
-    measured = calibrate_model(model, calls, calls, 3, Settings({}, target=target, batch=1, methods=("headroom",)))
+    twice = sorted(calls * 2, key=lambda call: call.sample.source)  # one gives directions, the other chooses sites
+    measured = calibrate_model(model, twice, calls, 3, Settings({}, target=target, batch=1, methods=("headroom",)))
     report = {**measured.report, "observations": {"source": "the golden cases themselves"}}
     return Quantization(checkpoint.fingerprint(), shapes_of(model.config), measured.sites, report)
 
