@@ -296,6 +296,7 @@ def test_directions_are_read_as_they_were_written(tmp_path: Path) -> None:
     assert read.identity == whole.identity != plain.identity
     plan = read.plan(TINY, "fp8")
     assert set(plan.directions) == set(plan.scales)
+    assert read.describe(plan)["weights"].startswith(f"{len(plan.scales)} of {len(plan.scales)} sites' rounded")
     ours, theirs = plan.directions["expert.0.down"], entries["expert.0.down"].directions
     assert theirs is not None and torch.equal(ours.main, theirs.main) and ours.rest == theirs.rest
     assert not read.only(["prefix"]).plan(TINY, "fp8").directions.keys() & {"vision.0.qkv", "expert.0.qkv"}

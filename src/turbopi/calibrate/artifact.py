@@ -37,7 +37,7 @@ class SiteScale:
     scale       of its activation: x ≈ e4m3 * scale; None where only weights are rounded
     largest     |x| seen in calibration
     saturated   part of the held-out values beyond the largest number
-    error       relative rms of its products on held-out observations, rounded against not
+    error       relative rms of its products on the calls that sites are chosen on, rounded against not
     kept        why it stays in bfloat16; None: it doesn't
     directions  what its activations have in common, for the rounding of its weights; None: rounded to nearest
     """
@@ -53,9 +53,9 @@ class SiteScale:
     def digest(self) -> tuple[str, ...]:
         """What tells its directions from others, if it has any."""
         d = self.directions
-        return (
-            () if d is None else (hashlib.sha256(_bytes(d.codes)).hexdigest(), *map(str, d.scale.tolist()), str(d.rest))
-        )
+        if d is None:
+            return ()
+        return (hashlib.sha256(_bytes(d.codes)).hexdigest(), *map(str, d.scale.tolist()), str(d.rest))
 
     def as_json(self) -> dict[str, Any]:
         content = {one.name: getattr(self, one.name) for one in fields(self)}
@@ -171,6 +171,7 @@ class Quantization:
             "calibration": self.source or "in memory",
             "identity": self.identity,
             "observations": self.report["observations"]["source"],
+            "weights": f"{len(plan.directions)} of {len(plan.scales)} sites' rounded for directions, else to nearest",
             "warnings": self.warnings,
         }
 

@@ -27,8 +27,8 @@ def to_e4m3(x: Tensor, inverse: float | Tensor) -> Tensor:
 class Directions:
     """What a site's activations x have in common: E[x xᵀ] ≈ main mainᵀ + rest I.
 
-    `main` is itself kept in E4M3, with a scale a direction: 16 of the full model's take 10 MB so, and what that costs
-    is a fortieth of what they save.
+    `main` is itself kept in E4M3, with a scale a direction: 16 of the full model's take 10 MB so, and serve as well as
+    in float32 (relative rms of the actions 0.0267 either way).
     """
 
     codes: Tensor  # e4m3[in, R]

@@ -1,7 +1,7 @@
 """Weights to E4M3 so that their errors cancel where activations lie.
 
-Rounded to nearest, a product's weights are off by 2.6 % each, at random. But activations share a few directions: of
-most sites' second moment 16 hold more than nine tenths. So the weights of a row are rounded one after the other, and
+Rounded to nearest, a product's weights are off by 2.6 % each, at random. But activations share a few directions: 16
+hold most of a site's second moment. So the weights of a row are rounded one after the other, and
 what the earlier ones' errors add up to along those directions is made up for by the later ones. This is GPTQ (Frantar
 et al., 2022, arXiv:2210.17323) with a Hessian of low rank, in which an error takes R numbers a row instead of a matrix.
 
@@ -47,9 +47,10 @@ def feedback(directions: Directions) -> tuple[Tensor, Tensor, Tensor]:
     main = directions.main.double()
     order = main.square().sum(dim=1).argsort(descending=True, stable=True)
     main = main[order]
-    behind = (main[:, :, None] * main[:, None, :]).flip(0).cumsum(0).flip(0)  # Σ over this column and later ones
-    rest = directions.rest * torch.eye(main.shape[1], dtype=torch.float64, device=main.device)
-    answers = torch.linalg.solve(behind + rest, main[:, :, None]).squeeze(2)
+    across = main.T.contiguous()  # sums along the last axis are parallel on a GPU
+    behind = (across[:, None] * across[None]).flip(2).cumsum(2).flip(2)  # Σ over this column and later ones
+    rest = directions.rest * torch.eye(len(across), dtype=torch.float64, device=main.device)
+    answers = torch.linalg.solve(behind.permute(2, 0, 1) + rest, main[:, :, None]).squeeze(2)
     return order, main.float(), answers.float()
 
 

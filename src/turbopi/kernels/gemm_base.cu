@@ -26,8 +26,9 @@
 //
 // The same where the product behind is of E4M3 numbers: TP_COPY (parts of the residual's row sums, or 0) also rounds
 // the result to E4M3 as if the residual's mean and variance were its own, and `sums_out` are of the result in these
-// units, `plain_sums` of the result itself, whose units the next copy may have. They are close, so it is as good an E4M3 copy as the norm's would be; TP_NORMED then makes up for the
-// difference, in which w times the shift is in `offset`, as it is in the copy already, and the bias goes apart.
+// units, `plain_sums` of the result itself, as the next copy's units. They are close, so it is as good an E4M3 copy as
+// the norm's would be; TP_NORMED then makes up for the difference, in which w times the shift is in `offset`, as it is
+// in the copy already, and the bias goes apart.
 //
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
 // TP_OVERLAP: see gemm_geglu.cu.
