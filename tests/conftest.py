@@ -30,6 +30,16 @@ def on_hopper(test: Callable[..., None]) -> Callable[..., None]:
     return pytest.mark.gpu(pytest.mark.skipif(other, reason="needs compute capability 9.0")(test))
 
 
+def gpu_or_interpreter() -> list[pytest.MarkDecorator]:
+    """Of a file of Triton kernels and their twins: one claim, two ways to check it. Scripts that pick `-m gpu` on a GPU
+    find these tests there; the interpreter is NumPy, which warns of infinities and turns arrays of one element into
+    numbers.
+    """
+    if torch.cuda.is_available():
+        return [pytest.mark.gpu]
+    return [pytest.mark.filterwarnings(f"ignore::{warning}") for warning in ("RuntimeWarning", "DeprecationWarning")]
+
+
 def packed_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a packed archive by name: one run of bytes, in which equal arrays lie once, and where each is."""
     with np.load(path) as file:

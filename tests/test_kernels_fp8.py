@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import on_hopper
+from conftest import gpu_or_interpreter, on_hopper
 from torch import Tensor
 
 ON_GPU = torch.cuda.is_available()
@@ -23,14 +23,7 @@ from turbopi.kernels.hopper import SHARED_BYTES  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32
-pytestmark = (
-    [pytest.mark.gpu]
-    if ON_GPU
-    else [
-        pytest.mark.filterwarnings("ignore::RuntimeWarning"),
-        pytest.mark.filterwarnings("ignore::DeprecationWarning"),
-    ]
-)
+pytestmark = gpu_or_interpreter()
 seeds = iter(range(10**6))
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from conftest import on_hopper
+from conftest import gpu_or_interpreter, on_hopper
 from torch import Tensor
 
 ON_GPU = torch.cuda.is_available()
@@ -30,16 +30,7 @@ from turbopi.model.layers import rope_tables  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32
-# one claim, two ways to check it: scripts that pick `-m gpu` on a GPU find these tests there
-pytestmark = (
-    [pytest.mark.gpu]
-    if ON_GPU
-    # the interpreter is NumPy, which warns of infinities, and it turns arrays of one element into numbers
-    else [
-        pytest.mark.filterwarnings("ignore::RuntimeWarning"),
-        pytest.mark.filterwarnings("ignore::DeprecationWarning"),
-    ]
-)
+pytestmark = gpu_or_interpreter()
 seeds = iter(range(10**6))
 
 

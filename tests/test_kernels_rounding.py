@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from conftest import gpu_or_interpreter
 from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
@@ -22,16 +23,8 @@ from turbopi.engine.rounding import (
 )
 from turbopi.kernels.rounding import round_with_feedback
 
-ON_GPU = torch.cuda.is_available()
-DEVICE = torch.device("cuda" if ON_GPU else "cpu")
-pytestmark = (
-    [pytest.mark.gpu]
-    if ON_GPU
-    else [
-        pytest.mark.filterwarnings("ignore::RuntimeWarning"),
-        pytest.mark.filterwarnings("ignore::DeprecationWarning"),
-    ]
-)
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+pytestmark = gpu_or_interpreter()
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:

@@ -173,9 +173,8 @@ class FusedBackend(CudaGraphBackend):
             raise BackendUnavailable(reason or "there is no modulation")
         if self._packed_expert is None:
             self._keep_expert_on(self.device)
-            weights, expert = self._expert_weights(), self._weights.expert
             self._packed_expert = PackedExpert.pack(
-                self.config, expert, weights=weights, directions=self._directions if weights == "fp8" else {}
+                self.config, self._weights.expert, weights=self._expert_weights(), directions=self._directions
             )
         packed, small = self._packed_expert, self._weights.small
         kernel = DenoiseKernel(self.config, packed, small, table, cache_rows=rows, suffix=horizon, device=self.device)

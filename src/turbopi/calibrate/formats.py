@@ -10,7 +10,7 @@ from torch import Tensor
 import turbopi.model.gemma
 import turbopi.model.vision
 from turbopi.engine.fp8 import E4M3_MAX, Directions, to_e4m3
-from turbopi.engine.rounding import columns_with_feedback, feedback, uses_kernel
+from turbopi.engine.rounding import by_kernel_or, columns_with_feedback
 from turbopi.model.layers import attention
 
 # NVFP4 (Blackwell): E2M1 numbers in blocks of 16 with an E4M3 scale each, and one float32 scale for the tensor.
@@ -37,13 +37,14 @@ def round_nvfp4(x: Tensor, directions: Directions | None = None) -> Tensor:
         return x
     scale = to_e4m3(largest / E2M1[-1], 1 / whole).float() * whole
     if directions is not None:
-        feeding = feedback(directions.to(x.device))
-        if uses_kernel(x):
-            from turbopi.kernels.rounding import round_with_feedback
+        inverse = torch.where(scale > 0, 1 / scale.clamp(min=1e-30), 0.0).squeeze(2)
 
-            inverse = torch.where(scale > 0, 1 / scale.clamp(min=1e-30), 0.0).squeeze(2)
-            return round_with_feedback(x, inverse, *feeding).to(x.dtype)
-        return columns_with_feedback(x, *feeding, lambda wanted, i: _e2m1(wanted, scale[:, i // BLOCK, 0])).to(x.dtype)
+        def plain(order: Tensor, errors: Tensor, answers: Tensor) -> Tensor:
+            return columns_with_feedback(
+                x, order, errors, answers, lambda wanted, i: _e2m1(wanted, scale[:, i // BLOCK, 0])
+            )
+
+        return by_kernel_or(plain, x, inverse, directions).to(x.dtype)
     return _e2m1(blocks, scale).flatten(-2).to(x.dtype)
 
 

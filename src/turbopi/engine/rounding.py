@@ -10,6 +10,7 @@ Shapes: a matrix [out, in], R directions.
 
 import importlib.util
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -25,16 +26,19 @@ def round_rows(weight: Tensor, inverse: Tensor, directions: Directions | None = 
     """
     if directions is None:
         return to_e4m3(weight, inverse[:, None])
+    return by_kernel_or(partial(round_with_feedback_plain, weight, inverse), weight, inverse, directions)
+
+
+def by_kernel_or(
+    plain: Callable[[Tensor, Tensor, Tensor], Tensor], weight: Tensor, inverse: Tensor, directions: Directions
+) -> Tensor:
+    """`kernels.rounding.round_with_feedback` on a GPU with Triton; elsewhere plain(order, errors, answers)."""
     feeding = feedback(directions.to(weight.device))
-    if uses_kernel(weight):
+    if weight.is_cuda and importlib.util.find_spec("triton") is not None:
         from turbopi.kernels.rounding import round_with_feedback  # Triton isn't imported elsewhere
 
         return round_with_feedback(weight, inverse, *feeding)
-    return round_with_feedback_plain(weight, inverse, *feeding)
-
-
-def uses_kernel(weight: Tensor) -> bool:
-    return weight.is_cuda and importlib.util.find_spec("triton") is not None
+    return plain(*feeding)
 
 
 def feedback(directions: Directions) -> tuple[Tensor, Tensor, Tensor]:
