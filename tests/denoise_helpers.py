@@ -8,10 +8,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import GemmaConfig, ModelConfig, preset
+from turbopi.engine.fp8 import E4M3_MAX
 from turbopi.engine.weights import GemmaLayer
 from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
-from turbopi.kernels.denoise_plain import denoise_plain
+from turbopi.kernels.denoise_packing import KINDS
+from turbopi.kernels.denoise_plain import Operand, denoise_plain
 from turbopi.model.denoise import euler_step
 from turbopi.model.layers import apply_rope, rms_normalize, rope_tables
 
@@ -99,9 +101,22 @@ def problem(
     return Problem(config, layers, small, table, noise, cache[0], cache[1], length)
 
 
-def plain(p: Problem, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+def plain(p: Problem, dtype: torch.dtype, operand: Operand = lambda x, layer, product: x) -> tuple[Tensor, Tensor]:
     noise = p.noise.to(dtype)
-    return denoise_plain(p.config, p.layers, p.small, p.table, noise, p.cache_k, p.cache_v, p.length)
+    return denoise_plain(p.config, p.layers, p.small, p.table, noise, p.cache_k, p.cache_v, p.length, operand)
+
+
+def input_scales(p: Problem) -> dict[str, float]:
+    """What calibration would find for the kernel's E4M3 activations, with room for twice as much."""
+    largest: dict[str, float] = {}
+
+    def watch(x: Tensor, layer: int, product: int) -> Tensor:
+        site = f"expert.{layer}.{KINDS[product]}"
+        largest[site] = max(largest.get(site, 0.0), float(x.abs().max()))
+        return x
+
+    plain(p, torch.float32, watch)
+    return {site: 2 * value / E4M3_MAX for site, value in largest.items()}
 
 
 def ordinary_bf16(p: Problem) -> Tensor:

@@ -28,7 +28,7 @@ STEPS = 2
 
 def scales_of(observation: Observation, noise: Tensor) -> dict[Site, float]:
     model = golden_model("pi05")
-    every = [site for site in sites(model.config) if not site.weights_only]
+    every = [site for site in sites(model.config) if site.part != "expert"]
     histograms = collect(model, every, [(observation, noise)], STEPS)
     return {site: histograms[str(site)].scale("max") for site in every}
 
@@ -136,9 +136,9 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     assert backend.describe()["denoising_clock_mhz"] == {"H=10, 10 steps": 1795}
     plan = backend.describe()["fp8"]["plan"]
     assert plan["expert.qkv"] == "fp8"
-    assert plan["expert"] == "fp8 weights in the denoising kernel; bf16 where operations denoise"
+    assert plan["expert"] == "fp8 in the denoising kernel; bf16 where operations denoise"
     backend._refused = {}
-    assert backend.describe()["fp8"]["plan"]["expert"] == "fp8 weights"
+    assert backend.describe()["fp8"]["plan"]["expert"] == "fp8"
 
 
 def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:

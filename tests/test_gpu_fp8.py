@@ -60,11 +60,11 @@ def emulated(case: Case, precision: Tier, target: float) -> tuple[Tensor, Tensor
     """(float32, float32 with the plan's sites rounded), on the host."""
     model, chosen = on_gpu(case.kind), quantization(case.kind, target)
     plan = chosen.plan(model.config, precision)
-    in_kernel = refusal(model.config) is None and plan.expert_weights == "fp8"
+    in_kernel = refusal(model.config) is None and plan.expert == "fp8"
     used = {
         site: plan.scales[str(site)]
         for site in sites(model.config)
-        if str(site) in plan.scales and (in_kernel or not site.weights_only)
+        if str(site) in plan.scales and (in_kernel or site.part != "expert")
     }
     weights = RoundedWeights({site: plan.directions[str(site)] for site in used})
     observation, noise = case.observation.to("cuda"), case.noise.to("cuda")

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from turbopi.backends.base import LoadState, Tier
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.calibrate.artifact import TIERS, Quantization, check_given
-from turbopi.calibrate.emulate import round_activation, round_weight
-from turbopi.calibrate.sites import linears, sites
+from turbopi.calibrate.emulate import round_activation, round_weight, through_norm
+from turbopi.calibrate.sites import linears, norm_of, sites
 from turbopi.config import ModelConfig
 
 
@@ -42,9 +42,12 @@ class EmulatedFp8Backend(PyTorchBackend):
             scale = self._plan.scales.get(str(site))
             if scale is None:
                 continue
+            norm = norm_of(self.model, site)
+            if norm is not None:
+                norm.__dict__["forward"] = partial(through_norm, norm, partial(round_activation, scale=scale))
             for linear in linears(self.model, site):
                 linear.weight.data = round_weight(linear.weight.data, self._plan.directions.get(str(site)))
-                if not site.weights_only:
+                if norm is None:
                     linear.register_forward_pre_hook(partial(_round_input, scale=scale))
 
     @classmethod

@@ -9,7 +9,7 @@ import importlib.util
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -122,21 +122,21 @@ class FusedBackend(CudaGraphBackend):
     def _directions(self) -> Mapping[str, Directions]:
         return {} if self._plan is None else self._plan.directions
 
-    def _expert_weights(self) -> Literal["bf16", "fp8"]:
-        """What the denoising kernel is to have the expert's weights in."""
-        return "bf16" if self._plan is None else self._plan.expert_weights
+    def _expert_inputs(self) -> Mapping[str, float] | None:
+        """The scales of the expert's activations where the denoising kernel is to run in FP8."""
+        return None if self._plan is None or self._plan.expert == "bf16" else self._plan.scales
 
     def _expert_precision(self) -> str:
-        """What the expert's weights are in, openly."""
-        if self._plan is None or self._plan.expert_weights == "bf16":
+        """What the expert runs in, openly."""
+        if self._plan is None or self._plan.expert == "bf16":
             kept = {} if self._plan is None else self._plan.kept
             why = next((reason for site, reason in kept.items() if site.startswith("expert.")), "it isn't planned")
             return f"bf16, all of it, as its kernel takes one precision; {why}"
         if not self._refused:
-            return "fp8 weights"
+            return "fp8"
         if not self._denoisers:
             return "bf16, as operations denoise"
-        return "fp8 weights in the denoising kernel; bf16 where operations denoise"
+        return "fp8 in the denoising kernel; bf16 where operations denoise"
 
     def _make_ops(self) -> Ops:
         from turbopi.kernels.ops import fused_ops  # Triton isn't imported for other backends
@@ -174,7 +174,7 @@ class FusedBackend(CudaGraphBackend):
         if self._packed_expert is None:
             self._keep_expert_on(self.device)
             self._packed_expert = PackedExpert.pack(
-                self.config, self._weights.expert, weights=self._expert_weights(), directions=self._directions
+                self.config, self._weights.expert, inputs=self._expert_inputs(), directions=self._directions
             )
         packed, small = self._packed_expert, self._weights.small
         kernel = DenoiseKernel(self.config, packed, small, table, cache_rows=rows, suffix=horizon, device=self.device)

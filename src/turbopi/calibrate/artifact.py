@@ -24,7 +24,7 @@ from turbopi.folders import write_whole
 
 logger = logging.getLogger(__name__)
 
-FORMAT, VERSION = "turbopi-quantization", 2  # 1 has no directions
+FORMAT, VERSION = "turbopi-quantization", 3  # 1 has no directions; 2 has no scales for the expert's activations
 RANDOM_NOISE = "random-noise"  # instead of observations: has to be asked for by this name
 Tier = Literal["fp8", "fp8-mlp"]
 TIERS: tuple[Tier, ...] = get_args(Tier)
@@ -34,7 +34,7 @@ TIERS: tuple[Tier, ...] = get_args(Tier)
 class SiteScale:
     """A site's share of the file.
 
-    scale       of its activation: x ≈ e4m3 * scale; None where only weights are rounded
+    scale       of its activation: x ≈ e4m3 * scale; None for the expert's in files of versions 1 and 2
     largest     |x| seen in calibration
     saturated   part of the held-out values beyond the largest number
     error       relative rms of its products on the calls that sites are chosen on, rounded against not
@@ -157,7 +157,8 @@ class Quantization:
             entry = self.sites[str(site)]
             reason = _reason(site, entry, tier, self.parts)
             if reason is None:
-                chosen[str(site)] = 1.0 if entry.scale is None else entry.scale
+                assert entry.scale is not None  # or there is a reason
+                chosen[str(site)] = entry.scale
                 if entry.directions is not None:
                     common[str(site)] = entry.directions
             else:
@@ -229,7 +230,7 @@ class Plan:
     directions: Mapping[str, Directions]
 
     @property
-    def expert_weights(self) -> Literal["fp8", "bf16"]:
+    def expert(self) -> Literal["fp8", "bf16"]:
         """The denoising kernel takes all of the expert's matrices in one precision: FP8 only if none is to be kept."""
         return "bf16" if any(name.startswith("expert.") for name in self.kept) else "fp8"
 
@@ -254,6 +255,8 @@ def _reason(site: Site, entry: SiteScale, tier: str, parts: Sequence[str]) -> st
         return f"FP8 is switched off in the {site.part}"
     if tier == "fp8-mlp" and (site.kind not in MLP_KINDS or site.part == "expert"):
         return "fp8-mlp takes the feed-forward products of vision and prefix alone"
+    if entry.scale is None:
+        return "its calibration is older than FP8 for this activation; run `turbopi calibrate` again"
     return site.refusal or entry.kept
 
 

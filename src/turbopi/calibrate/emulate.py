@@ -11,8 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.calibrate.sites import Site, linears
+from turbopi.calibrate.sites import Site, linears, norm_of
 from turbopi.engine.fp8 import Directions, Fp8Matrix, to_e4m3
+from turbopi.model.layers import AdaRMSNorm, inverse_rms
 from turbopi.model.reference import Pi0Model
 
 Round = Callable[[Tensor], Tensor]
@@ -46,17 +47,37 @@ class RoundedWeights:
 
 @contextmanager
 def rounded(model: Pi0Model, scales: Mapping[Site, float], weights: RoundedWeights | None = None) -> Iterator[None]:
-    """For a while, products of these sites are of E4M3 numbers; a `weights_only` site's scale is ignored."""
+    """For a while, products of these sites are of E4M3 numbers."""
     rounding = weights or RoundedWeights()
     changes: list[tuple[nn.Linear, Round, Round]] = []
+    norms: list[tuple[AdaRMSNorm, Round]] = []
     for site, scale in scales.items():
-
-        def inputs(x: Tensor, site: Site = site, scale: float = scale) -> Tensor:
-            return x if site.weights_only else round_activation(x, scale)
-
+        inputs, norm = partial(round_activation, scale=scale), norm_of(model, site)
+        if norm is not None:
+            norms.append((norm, inputs))
+            inputs = partial(lambda x: x)
         changes += [(linear, inputs, partial(rounding, site)) for linear in linears(model, site)]
-    with replaced(changes):
+    with replaced(changes), replaced_in_norms(norms):
         yield
+
+
+def through_norm(norm: AdaRMSNorm, operand: Round, x: Tensor, cond: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The norm in the order in which the denoising kernel computes it, with what `operand` makes of x (1 + scale)."""
+    scale, shift, gate = norm.modulation(cond)
+    y = operand(x.float() * (1 + scale)) * inverse_rms(x, norm.eps) + shift
+    return y.to(x.dtype), gate.to(x.dtype)
+
+
+@contextmanager
+def replaced_in_norms(changes: list[tuple[AdaRMSNorm, Round]]) -> Iterator[None]:
+    """For a while, these norms are of what the function makes of x (1 + scale)."""
+    try:
+        for norm, operand in changes:
+            norm.__dict__["forward"] = partial(through_norm, norm, operand)
+        yield
+    finally:
+        for norm, _ in changes:
+            norm.__dict__.pop("forward", None)
 
 
 @contextmanager

@@ -1,13 +1,15 @@
 """What rounding does to each site's own products, everything before them exact."""
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.calibrate.emulate import Round, RoundedWeights, replaced, round_activation
-from turbopi.calibrate.sites import Site, linears
+from turbopi.calibrate.emulate import Round, RoundedWeights, replaced, round_activation, through_norm
+from turbopi.calibrate.sites import Site, linears, norm_of
+from turbopi.model.layers import AdaRMSNorm
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 
@@ -21,13 +23,22 @@ def product_errors(
 ) -> dict[str, float]:
     """Site -> relative rms of its products (without bias) of rounded numbers, over all batches and steps."""
     sums: dict[str, Tensor] = {}  # of squares: of the difference, of the exact products
+    behind: dict[Site, Tensor] = {}  # what norms make of rounded activations
     changes: list[tuple[nn.Linear, Round, Round]] = []
+    handles = []
     for site, scale in scales.items():
+        norm = norm_of(model, site)
+        if norm is not None:
+
+            def keep(norm: AdaRMSNorm, inputs: tuple[Tensor, Tensor], site: Site = site, scale: float = scale) -> None:
+                behind[site] = through_norm(norm, partial(round_activation, scale=scale), *inputs)[0]
+
+            handles.append(norm.register_forward_pre_hook(keep))
         for linear in linears(model, site):
 
             def watch(x: Tensor, site: Site = site, scale: float = scale, linear: nn.Linear = linear) -> Tensor:
                 exact = F.linear(x, linear.weight)
-                given = x if site.weights_only else round_activation(x, scale)
+                given = behind[site] if site in behind else round_activation(x, scale)
                 difference = F.linear(given, weights(site, linear.weight)) - exact
                 both = torch.stack((difference.square().sum(), exact.square().sum())).double()
                 name = str(site)
@@ -35,7 +46,11 @@ def product_errors(
                 return x
 
             changes.append((linear, watch, lambda weight: weight))
-    with replaced(changes):
-        for observation, noise in batches:
-            model.sample(observation, noise, steps)
+    try:
+        with replaced(changes):
+            for observation, noise in batches:
+                model.sample(observation, noise, steps)
+    finally:
+        for handle in handles:
+            handle.remove()
     return {name: float((both[0] / both[1]).sqrt()) if both[1] > 0 else 0.0 for name, both in sums.items()}

@@ -171,12 +171,12 @@ def calibrate_model(
     for site in everywhere:
         name, scale = str(site), scales[site]
         saturated = unseen[name].error(scale)[1]
-        if saturated > SATURATION_LIMIT and not site.weights_only:
+        if saturated > SATURATION_LIMIT:
             warnings.append(f"{saturated:.1%} of the held-out values of {name} saturate: more observations may help")
         entries[name] = SiteScale(
-            None if site.weights_only else scale,
+            scale,
             histograms[name].largest,
-            saturated if not site.weights_only else 0.0,
+            saturated,
             products.get(name, 0.0),
             kept.get(name),
             None if name in kept or site not in common else common[site].to(torch.device("cpu")),

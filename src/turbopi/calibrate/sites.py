@@ -2,8 +2,8 @@
 
     vision.3.fc1    part, layer, kind
 
-Of vision and prefix both the activation and the weights are rounded. The expert's products are bound by their weights'
-bytes, so there only the weights are.
+Where an adaRMS norm stands in front of the expert's products, the activation is the residual stream times the norm's
+1 + scale: the denoising kernel rounds that, and divides by the rms and adds the shift behind the product.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,6 +14,7 @@ from torch import nn
 
 from turbopi.config import ModelConfig
 from turbopi.engine.fp8 import ALIGNMENT
+from turbopi.model.layers import AdaRMSNorm
 from turbopi.model.reference import Pi0Model
 
 Part = Literal["vision", "prefix", "expert"]
@@ -41,10 +42,6 @@ class Site:
     def group(self) -> str:
         """The site without its layer: sites of a group are alike in what they cost and gain."""
         return f"{self.part}.{self.kind}"
-
-    @property
-    def weights_only(self) -> bool:
-        return self.part == "expert"
 
     @property
     def refusal(self) -> str | None:
@@ -94,3 +91,12 @@ def linears(model: Pi0Model, site: Site) -> Iterator[nn.Linear]:
     found = modules[site.kind]()
     last = site.part == "prefix" and site.layer + 1 == len(stack.layers)
     yield from found[1:] if last else found  # nothing asks for the last layer's queries
+
+
+def norm_of(model: Pi0Model, site: Site) -> AdaRMSNorm | None:
+    """The adaRMS norm inside which a site's activation is, or None: then it is what the matrices read."""
+    if site.part != "expert" or site.kind not in ("qkv", "gate_up"):
+        return None
+    layer = model.expert.layers[site.layer]
+    norm = layer.input_layernorm if site.kind == "qkv" else layer.post_attention_layernorm
+    return norm if isinstance(norm, AdaRMSNorm) else None

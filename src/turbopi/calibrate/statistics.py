@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from turbopi.calibrate.directions import Rows
-from turbopi.calibrate.sites import Site, linears
+from turbopi.calibrate.sites import Site, linears, norm_of
 from turbopi.engine.fp8 import E4M3_MAX, to_e4m3
 from turbopi.errors import ObservationError
+from turbopi.model.layers import AdaRMSNorm
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 
@@ -114,22 +115,35 @@ def _watched(
 ) -> Iterator[None]:
     handles = []
 
-    def watch(name: str) -> Any:
+    def count(name: str, activation: Tensor) -> None:
+        x = activation.detach().float().abs().flatten()
+        bins = torch.bincount(x.view(torch.int32) >> 16, minlength=0x8000)
+        top = x.amax()
+        counts[name] = counts[name] + bins if name in counts else bins
+        largest[name] = torch.maximum(largest[name], top) if name in largest else top
+
+    def watch(name: str, norm: AdaRMSNorm | None) -> Any:
         def hook(module: torch.nn.Module, inputs: tuple[Tensor, ...]) -> None:
-            x = inputs[0].detach().float().abs().flatten()
-            bins = torch.bincount(x.view(torch.int32) >> 16, minlength=0x8000)
-            top = x.amax()
-            counts[name] = counts[name] + bins if name in counts else bins
-            largest[name] = torch.maximum(largest[name], top) if name in largest else top
+            if norm is None:
+                count(name, inputs[0])
             if rows is not None:
-                rows.setdefault(name, Rows(x.device)).add(inputs[0].detach().flatten(0, -2))
+                rows.setdefault(name, Rows(inputs[0].device)).add(inputs[0].detach().flatten(0, -2))
+
+        return hook
+
+    def watch_norm(name: str) -> Any:
+        def hook(norm: AdaRMSNorm, inputs: tuple[Tensor, ...]) -> None:
+            x, cond = inputs
+            count(name, x.float() * (1 + norm.modulation(cond)[0]))
 
         return hook
 
     try:
         for site in sites:
-            first = next(linears(model, site))  # its siblings read the same
-            handles.append(first.register_forward_pre_hook(watch(str(site))))
+            first, norm = next(linears(model, site)), norm_of(model, site)  # its siblings read the same
+            handles.append(first.register_forward_pre_hook(watch(str(site), norm)))
+            if norm is not None:
+                handles.append(norm.register_forward_pre_hook(watch_norm(str(site))))
         yield
     finally:
         for handle in handles:

@@ -21,14 +21,12 @@ from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import hopper
 from turbopi.kernels.denoise_packing import (
     BLOCK,
-    DIVISOR,
     RANKS,
     WARPS,
     Arrangement,
     PackedExpert,
+    Tables,
     most,
-    shifted_rows,
-    undo_scales,
 )
 from turbopi.kernels.denoise_plain import affine, inverse_frequencies
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
@@ -74,6 +72,7 @@ class _Args(ctypes.Structure):
         ("eps", ctypes.c_float),
         ("zero", ctypes.c_uint32),
         ("row_scales", ctypes.c_void_p),
+        ("values_times", ctypes.c_void_p),
     )
 
 
@@ -86,7 +85,7 @@ def kernel_sizes(
     stream = most(arrangement.clusters, 2) * (g.width // BLOCK) * groups * 32
     scratch = 4 * stream + suffix * g.head_dim
     if suffix > FEW:
-        scratch += g.width // BLOCK * groups * 32 + RANKS * (groups * 4 + 8)
+        scratch += g.width // BLOCK * groups * (16 if fp8 else 32) + RANKS * (groups * 4 + 8)
     return {
         "TP_D": g.width,
         "TP_F": g.mlp_dim,
@@ -99,19 +98,19 @@ def kernel_sizes(
         "TP_NC": arrangement.clusters,
         "TP_KEY_TILES": most(cache_rows, BLOCK),
         "TP_FP8": int(fp8),
-        "TP_DIVISOR": DIVISOR,
         # Larger slots of weights are faster, if enough of them fit.
-        "TP_RPS": 4 if suffix <= ((56 if fp8 else 48) if cache_rows <= 1024 else 24) else 2,
+        "TP_RPS": 4 if suffix <= (48 if cache_rows <= 1024 else 24) else 2,
         "TP_SMEM": shared_bytes,
         "TP_SCRATCH": scratch,
     }
 
 
-def source(suffix: int) -> str:
+def source(suffix: int, fp8: bool) -> str:
     columns = most(suffix, 8) * 8
+    numbers: hopper.Numbers = "e4m3" if fp8 else "bf16"
     products = (
-        hopper.wgmma("add_product", columns),
-        hopper.wgmma("add_product", columns, numbers="f16", from_registers=True),
+        hopper.wgmma("add_product", columns, numbers=numbers),
+        hopper.wgmma("add_from_registers", columns, numbers=numbers, from_registers=True),
         hopper.wgmma("add_rows", columns, from_registers=True),
     )
     return hopper.source(*PARTS, instructions="\n".join(products))
@@ -120,7 +119,7 @@ def source(suffix: int) -> str:
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
     """The kernel's machine code. Raises BackendUnavailable if a block has too little shared memory for these sizes."""
     try:
-        return compile_cubin(source(sizes["TP_T"]), arch, sizes, folder=folder)
+        return compile_cubin(source(sizes["TP_T"], bool(sizes["TP_FP8"])), arch, sizes, folder=folder)
     except BackendError as e:
         if "too little shared memory" not in str(e):
             raise
@@ -193,15 +192,14 @@ class DenoiseKernel:
                 )
         self._suffix, self._blocks = suffix, arrangement.blocks
         self._table = table.to(device).float().contiguous()
-        row_scales, gated = torch.empty(0, device=device), self._table
-        if self._packed.fp8:
-            row_scales, gated = undo_scales(self._packed, self._table)
+        tables = Tables.make(self._packed, self._table)
         self._tensors = {
             "weights": self._packed.weights,
             "starts": self._packed.starts,
-            "table": gated,
-            "row_scales": row_scales,
-            "shifted": shifted_rows(self._packed, self._table),
+            "table": tables.modulation,
+            "row_scales": tables.row_scales,
+            "shifted": tables.shifted,
+            "values_times": tables.values_times,
             "out_w": small["action_out_proj.weight"].float().T.contiguous(),
             "out_shift": affine(small, "action_out_proj", self._table[:, -1, 1].double()).float().contiguous(),
             "in_w": small["action_in_proj.weight"].float().contiguous(),

@@ -15,10 +15,10 @@
 // that never ends would leave them waiting (see `watch`), work that ends only delays them.
 //
 // Units: a "block" is 16 columns of a reduction axis, a "tile" 16 output rows, a "fragment" 512 bytes of a weight
-// matrix (operand A; tokens are operand B): a tile x one block in bfloat16, as the tensor cores read it from shared
-// memory ([8 rows][8 columns][row][16 bytes]), or a tile x two blocks in E4M3, as a warp's lanes hold them. Activations
-// that meet weights lie as [block][8 tokens][8 columns][token][16 bytes], queries and attention's weights as
-// [block][8 columns][8 tokens][token][16 bytes].
+// matrix (operand A; tokens are operand B) as the tensor cores read it from shared memory: a tile x one block in
+// bfloat16 ([8 rows][8 columns][row][16 bytes]), a tile x two blocks in E4M3 ([8 rows][block][row][16 bytes]).
+// Activations that meet weights lie as [block][8 tokens][8 columns][token][16 bytes], of E4M3 [block][8 tokens][token]
+// [16 bytes], queries and attention's weights as [block][8 columns][8 tokens][token][16 bytes].
 
 typedef unsigned char byte;
 
@@ -27,11 +27,9 @@ constexpr int S = TP_S, NC = TP_NC;                                   // CTAs of
 constexpr int KEY_TILES = TP_KEY_TILES;                               // tiles of prefix keys, at most
 constexpr int W = 16, CONSUMERS = W * 32, THREADS = CONSUMERS + 128;  // registers are dealt out by warpgroup
 constexpr int NT = (T + 7) / 8;
-constexpr bool FP8 = TP_FP8;         // weights in E4M3, which become float16, and so do the activations they meet
+constexpr bool FP8 = TP_FP8;         // weights and the activations they meet in E4M3; what scales them is in the tables
 constexpr int KB = FP8 ? 2 : 1;      // blocks of a fragment of weights
-// Activations are made smaller before they become float16, whose range ends at 65504: the stream isn't divided by its
-// rms yet, and hidden units have outliers. What that costs lies 2^-20 below 1.
-constexpr float SMALLER = FP8 ? 1.0f / TP_DIVISOR : 1;
+constexpr int OPERAND = FP8 ? 128 : 256;  // bytes of a block's activations of 8 tokens that meet weights
 constexpr int D16 = D / 16, F16 = F / 16, QT = HD / 16, KVT = HD / 8;
 
 // n things shared out between `parts`: which is the first of part i, and how many a part has at most.
@@ -98,7 +96,7 @@ __host__ __device__ constexpr int rounds_ahead(int tiles, bool all, int blocks, 
              ? imin(rounds, plan_rounds(parts, blocks))
              : 0;
 }
-constexpr int GATE_UP_AHEAD = rounds_ahead(GTL, F16 % NC == 0 && 2 * HC % S == 0, D16, FP8 ? 1 : 4);
+constexpr int GATE_UP_AHEAD = rounds_ahead(GTL, F16 % NC == 0 && 2 * HC % S == 0, D16, FP8 ? 2 : 4);
 constexpr int OUT_AHEAD = rounds_ahead(DX, D16 % S == 0, QT, 1),
               DOWN_AHEAD = rounds_ahead(DX, D16 % S == 0 && F16 % NC == 0, HC, 1),
               RESIDUAL_AHEAD = imin(OUT_AHEAD, DOWN_AHEAD);  // the same code
@@ -126,7 +124,7 @@ constexpr bool IDLE = 2 * (F16 / NC) < S, IDLE_Q = QT < S;  // the same of queri
 //   that the outputs of all ranks, which their warps send when they have weighed
 //   sums of gate|up over the stream, or in M_SUMS: the next slice lands when a peer has this rank's hidden units, made
 //   of those sums
-constexpr int X_BYTES = D16 * NT * 256;
+constexpr int X_BYTES = D16 * NT * OPERAND;
 // Bytes of a partial output's tile for 8 tokens: bfloat16, as weights of the suffix can be large, or float32.
 constexpr int OUTPUT = SPREAD ? 256 : 512;
 constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * OUTPUT;
@@ -140,7 +138,7 @@ constexpr int XS_PART = A > 32 ? 512 : 0, XS_ITEM = imax(XS_PART + A * 32, 512);
 // Attention comes when the suffix's partial logits are no longer needed.
 constexpr int X_ATT = up128(imax(X_SUFFIX + 2 * SUFFIX * RS,
                                  imax(plan_partials(QKV), plan_others(DX)) * PARTIAL)),
-              X_Q = X_ATT + imax(QT, 3) * NT * 256, X_FF_SUMS = HC * NT * 256;
+              X_Q = X_ATT + imax(QT * OPERAND, 3 * 256) * NT, X_FF_SUMS = HC * NT * OPERAND;
 constexpr int X_SUFFIX_SUMS = SPREAD ? X_ATT : X_SUFFIX_SUMS_FEW;
 // Behind them float32 at a step's end: partial sums of v_t [S][V_PARTS][OWN_T][A], the slice [DX * 16][OWN_T], x_t.
 constexpr int OWN_T = OWN_N * 8, V_PARTS = imax(CONSUMERS / A / OWN_T, 1);  // tokens whose x_t a CTA knows
@@ -153,7 +151,8 @@ constexpr int X_SIZE =
                     SPREAD ? 0 : X_XS + DX * NT * XS_ITEM)));
 // Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down. Hidden
 // units, or queries, land when a peer has this rank's slice, which follows out's, or down's, sums.
-constexpr int H_Q = 0, H_ATT = QT * NT * 256, H_BYTES = imax(2 * QT, HC) * NT * 256;
+constexpr int H_Q = 0, H_ATT = QT * NT * 256;
+constexpr int H_BYTES = imax(QT * 256 + imax(QT * OPERAND, QTL * 256), HC * OPERAND) * NT;
 constexpr int H_SIZE = SPREAD ? 0 : up128(imax(H_BYTES, plan_partials(DX) * PARTIAL));
 
 // Sums of squares of the stream, float32[SQ][NT * 8]: by tile if tokens are few, else by slice.
@@ -189,6 +188,12 @@ constexpr int SUMS_SIZE = up128(imax(plan_others(GTL), plan_others(DX)) * PARTIA
 constexpr bool APART = !SPREAD && plan_stages(M_SUMS) == plan_stages(M_SUMS + SUMS_SIZE);
 constexpr int M_RING = SPREAD ? M_H : M_SUMS + (APART ? SUMS_SIZE : 0);
 constexpr int STAGES = SPREAD ? SPREAD_STAGES : plan_stages(M_RING);
+// Many tokens' hidden units in E4M3 go to other ranks by the copy engine, a block of two tiles at a time: by sends they
+// would go in 8 bytes each. Where the warps of two tiles are four, and a block has one rank.
+constexpr bool COPY_HIDDEN =
+    SPREAD && FP8 && F16 % NC == 0 && 2 * HC % S == 0 && GTL % 2 == 0 && GTL <= 8 && group_parts(GTL) == 2;
+constexpr int X_OWN_HIDDEN = X_OWN_V;  // of a rank, before they are sent
+static_assert(!COPY_HIDDEN || X_OWN_HIDDEN + GTL / 2 * NT * OPERAND <= X_SIZE, "room for a rank's hidden units");
 static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little shared memory");
 
 // ring: full and empty, by slot
@@ -202,12 +207,12 @@ enum SpreadBarrier { BAR_DONE = BAR_RING + 2 * 7, BAR_FREE, BAR_ROOM };
 // clusters lie side by side; a word's lowest bit, the flag, is that of every other number.
 constexpr int PAIRS = most(NC, 2);
 constexpr size_t N_STREAM = size_t(D16) * NT * PAIRS * 32;
-// Keeps them within float16's range; sums of E4M3 weights lack their scales yet.
+// Keeps them within float16's range; sums of E4M3 numbers lack their scales yet.
 constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;
 constexpr size_t N_KV = size_t(T) * HD / 2;              // suffix keys and values, float32[T][2 HD]
 constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM;
 // If SPREAD: the stream as products take it, sums of squares float32[S][NT * 8], both twice; flags u32[S][32].
-constexpr size_t N_STAGE = size_t(D16) * NT * 16, N_SQUARES = size_t(S) * NT * 2;
+constexpr size_t N_STAGE = size_t(D16) * NT * (OPERAND / 16), N_SQUARES = size_t(S) * NT * 2;
 constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_SQUARES = B_STAGE + 2 * N_STAGE, B_FLAGS = B_SQUARES + 2 * N_SQUARES;
 constexpr size_t SCRATCH = SPREAD ? B_FLAGS + S * 8 : B_STAGE;
 static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");
@@ -237,7 +242,8 @@ struct Args {
   int steps;
   float dt, eps;
   u32 zero;                 // 0, which the compiler doesn't know
-  const float* row_scales;  // [L][NC * S][TILES][16]: of FP8 weights; those of out and down are in the table's gates
+  const float* row_scales;  // [L][NC * S][TILES][16]: of FP8 products; those of out and down are in the table's gates
+  const float* values_times;  // [L]: FP8, what makes attention's outputs fit E4M3; a power of two
 };
 
 // ---- a CTA's view

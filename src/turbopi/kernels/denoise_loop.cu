@@ -1,6 +1,9 @@
 // Part 12 of 12: the loop, the kernel.
 
-__device__ __forceinline__ u32 hidden_bytes(const Block& b) { return b.hn() * 16 * T * 2 + (IDLE ? S * 4 : 0); }
+__device__ __forceinline__ u32 hidden_bytes(const Block& b) {
+  if (COPY_HIDDEN) return HC * NT * OPERAND;
+  return b.hn() * 16 * T * (OPERAND / 128) + (IDLE ? S * 4 : 0);
+}
 
 __device__ __forceinline__ void consume(Block& b) {
   const Args& a = b.a;

@@ -19,7 +19,6 @@ from turbopi.errors import BackendError
 BLOCK = 16  # rows of a tile, columns of a block
 WARPS = 16  # that multiply
 RANKS = 8  # CTAs of a cluster
-DIVISOR = 16  # of activations before they become float16 to meet FP8 weights
 
 KINDS = ("qkv", "out", "gate_up", "down")  # a layer's matrices, in the order in which they are read
 
@@ -119,14 +118,11 @@ def _rope_rows(tiles: Tensor, head_dim: int) -> Tensor:
 def fragments(tiles: Tensor, max_tiles: int, padding: int, weights: Precision = "bf16") -> Tensor:
     """[tiles, 16, columns] -> flat, in the order in which a CTA reads it; filled up with `padding`."""
     count, _, columns = tiles.shape
-    if weights == "bf16":  # [rows g, or g + 8][8 columns][8 rows][8 values]: the tensor cores' core matrices
-        blocks, size = columns // BLOCK, 256
-        order = tiles.view(count, 2, 8, blocks, 2, 8).permute(0, 3, 1, 4, 2, 5)
-    else:  # of two blocks, 32 lanes (g, t): [block][rows g, g + 8][columns 2t, 2t + 8][2 values]
-        blocks, size = most(columns, 2 * BLOCK), 512
-        tiles = torch.cat((tiles, tiles.new_full((count, BLOCK, blocks * 2 * BLOCK - columns), padding)), dim=2)
-        order = tiles.view(count, 2, 8, blocks, 2, 2, 4, 2).permute(0, 3, 2, 6, 4, 1, 5, 7)
-    ordered = order.reshape(count, blocks, size)
+    per = 8 if weights == "bf16" else 16  # numbers in 16 bytes, two of which are a fragment's columns
+    blocks, size = most(columns, 2 * per), BLOCK * 2 * per
+    tiles = torch.cat((tiles, tiles.new_full((count, BLOCK, blocks * 2 * per - columns), padding)), dim=2)
+    # the tensor cores' core matrices: [rows g, or g + 8][16 bytes of columns][8 rows][16 bytes]
+    ordered = tiles.view(count, 2, 8, blocks, 2, per).permute(0, 3, 1, 4, 2, 5).reshape(count, blocks, size)
     out = []
     for first in range(0, count, 8):
         # groups of 8 tiles, whose reduction has two parts, else four; in rounds of four
@@ -147,6 +143,7 @@ class PackedExpert:
     index: Tensor  # int32[elements]: which element of qkv, out, gate|up, down, 0 each is
     starts: Tensor  # int64[CTAs + 1]: where a CTA's begin in a layer, bytes, and the layer's end
     scales: Tensor  # float32[L, rows of qkv, out, gate|up, down] of E4M3 weights; [L, 0] of others
+    inputs: Tensor  # float32[L, 4] of the activations that meet E4M3 weights, out's a power of two; [L, 0] of others
 
     @classmethod
     def pack(
@@ -154,11 +151,11 @@ class PackedExpert:
         config: ModelConfig,
         layers: list[GemmaLayer],
         clusters: int | None = None,
-        weights: Precision = "bf16",
+        inputs: Mapping[str, float] | None = None,
         directions: Mapping[str, Directions] | None = None,
     ) -> "PackedExpert":
-        """`clusters`: at least one per head, which is also the default. `weights` "fp8": E4M3 with a scale for each
-        output channel, rounded for `directions` by site (activations aren't quantised, so it does without).
+        """`clusters`: at least one per head, which is also the default. `inputs`: the activations' scales by site, and
+        weights become E4M3 with a scale for each output channel, rounded for `directions` by site.
 
         Raises BackendError for sizes that the kernel doesn't cover.
         """
@@ -169,14 +166,14 @@ class PackedExpert:
         arrangement = Arrangement(config, clusters or heads)
         if arrangement.clusters < heads:
             raise BackendError(f"{clusters} clusters are fewer than the model's {heads} heads; give {heads} or more")
-        streams = _streams(arrangement, weights)
-        device, size = layers[0].qkv.device, 1 if weights == "fp8" else 2
+        streams = _streams(arrangement, "bf16" if inputs is None else "fp8")
+        device, size = layers[0].qkv.device, 2 if inputs is None else 1
         index = torch.cat(streams).to(device)
         starts = np.cumsum([0, *(size * len(stream) for stream in streams)])
         packed, scales = torch.empty(len(layers), len(index) * size, dtype=torch.uint8, device=device), []
         for i, (row, layer) in enumerate(zip(packed, layers, strict=True)):
             parts = layer.qkv, layer.out, layer.gate_up, layer.down
-            if weights == "fp8":
+            if inputs is not None:
                 common = [(directions or {}).get(f"expert.{i}.{kind}") for kind in KINDS]
                 made = [Fp8Matrix.quantize(m, 1.0, d) for m, d in zip(parts, common, strict=True)]
                 bits = [matrix.data.view(torch.uint8) for matrix in made]
@@ -186,8 +183,12 @@ class PackedExpert:
                 scales.append(torch.empty(0, device=device))
             flat = torch.cat([*(part.flatten() for part in bits), bits[0].new_zeros(1)])
             torch.index_select(flat, 0, index, out=row.view(flat.dtype))
-        typed = packed.view(E4M3 if weights == "fp8" else torch.bfloat16)
-        return cls(arrangement, typed, index, torch.from_numpy(starts).to(device), torch.stack(scales))
+        typed = packed.view(torch.bfloat16 if inputs is None else E4M3)
+        given = [[] if inputs is None else [inputs[f"expert.{i}.{kind}"] for kind in KINDS] for i in range(len(layers))]
+        of_inputs = torch.tensor(given, dtype=torch.float32, device=device)
+        if inputs is not None:  # exact, as the kernel applies it to values in bfloat16
+            of_inputs[:, 1] = torch.exp2(torch.log2(of_inputs[:, 1]).ceil())
+        return cls(arrangement, typed, index, torch.from_numpy(starts).to(device), torch.stack(scales), of_inputs)
 
     @property
     def layer_bytes(self) -> int:
@@ -271,24 +272,37 @@ def _row_index(a: Arrangement) -> Tensor:
     return index
 
 
-def shifted_rows(packed: PackedExpert, table: Tensor) -> Tensor:
-    """float32[N, L, CTAs, tiles, 16]: what the norms' shifts add to the products behind them."""
-    index, layers = _row_index(packed.arrangement).to(table.device), []
-    for i in range(packed.arrangement.config.expert.depth):
-        qkv, _, gate_up, _ = packed.matrices(i)
-        products = [table[:, 2 * i + j, 1].double() @ m.double().T for j, m in enumerate((qkv, gate_up))]
-        layers.append(torch.cat((*products, products[0].new_zeros(len(table), 1)), dim=1).float()[:, index])
-    return torch.stack(layers, dim=1).contiguous()
+@dataclass(frozen=True)
+class Tables:
+    """What the kernel needs beside the weights. Scales of E4M3 numbers are in it, so that the kernel applies none."""
 
+    modulation: Tensor  # float32[N, 2L + 1, 3, D]
+    shifted: Tensor  # float32[N, L, CTAs, tiles, 16]: what the norms' shifts add to the products behind them
+    row_scales: Tensor  # float32[L, CTAs, tiles, 16] of the rows of qkv and gate|up; empty of bfloat16
+    values_times: Tensor  # float32[L]; empty of bfloat16
 
-def undo_scales(packed: PackedExpert, table: Tensor) -> tuple[Tensor, Tensor]:
-    """What E4M3 weights leave to do: (float32[L, CTAs, tiles, 16] for the rows of qkv and gate|up, the table with its
-    gates times the scales of out and down). Both undo DIVISOR, too.
-    """
-    index, rows, table = _row_index(packed.arrangement).to(table.device), [], table.clone()
-    for i in range(packed.arrangement.config.expert.depth):
-        qkv, out, gate_up, down = (scale * DIVISOR for scale in packed.row_scales(i))
-        rows.append(torch.cat((qkv, gate_up, qkv.new_zeros(1)))[index])
-        table[:, 2 * i, 2] *= out
-        table[:, 2 * i + 1, 2] *= down
-    return torch.stack(rows).contiguous(), table
+    @classmethod
+    def make(cls, packed: PackedExpert, table: Tensor) -> "Tables":
+        """table float32[N, 2L + 1, 3, D], see `engine.weights.modulation`"""
+        index, depth = _row_index(packed.arrangement).to(table.device), packed.arrangement.config.expert.depth
+        modulation, shifted, rows, inputs = table.clone(), [], [], packed.inputs
+        for i in range(depth):
+            qkv, _, gate_up, _ = packed.matrices(i)
+            products = [table[:, 2 * i + j, 1].double() @ m.double().T for j, m in enumerate((qkv, gate_up))]
+            if packed.fp8:
+                of_qkv, of_out, of_gate_up, of_down = packed.row_scales(i)
+                stream, attended, stream_2, hidden = inputs[i]
+                modulation[:, 2 * i, 0] /= stream
+                modulation[:, 2 * i, 2] *= of_out * attended
+                modulation[:, 2 * i + 1, 0] /= stream_2
+                modulation[:, 2 * i + 1, 2] *= of_down * hidden
+                # attention's outputs are means of values, hidden units are linear in up's rows
+                after_qkv, after_gate_up = torch.ones_like(of_qkv), torch.ones_like(of_gate_up)
+                after_qkv[-packed.arrangement.config.expert.head_dim :] /= attended
+                after_gate_up[len(after_gate_up) // 2 :] /= hidden
+                products = [products[0] * after_qkv, products[1] * after_gate_up]
+                scales = of_qkv * stream * after_qkv, of_gate_up * stream_2 * after_gate_up
+                rows.append(torch.cat((*scales, of_qkv.new_zeros(1)))[index])
+            shifted.append(torch.cat((*products, products[0].new_zeros(len(table), 1)), dim=1).float()[:, index])
+        row_scales = torch.stack(rows) if rows else inputs
+        return cls(modulation, torch.stack(shifted, dim=1).contiguous(), row_scales.contiguous(), 1 / inputs[:, 1:2])

@@ -122,6 +122,13 @@ __device__ __forceinline__ void bulk_load(u32 to, const void* from, u32 bytes, u
       : "memory");
 }
 
+// From this CTA's shared memory to a rank's.
+__device__ __forceinline__ void bulk_send(u32 to, u32 from, u32 bytes, u32 bar) {
+  asm volatile("cp.async.bulk.shared::cluster.shared::cta.mbarrier::complete_tx::bytes [%0], [%1], %2, [%3];" ::"r"(to),
+               "r"(from), "r"(bytes), "r"(bar)
+               : "memory");
+}
+
 // Words through L2 whose lowest bit is their flag. Use n of a double buffer carries bit `flag(n)`: 1, 1, 0, 0, 1, ...
 __device__ __forceinline__ u32 flag(int n) { return ((n >> 1) & 1) ^ 1; }
 __device__ __forceinline__ u32 flagged(float v, u32 bit) { return (__float_as_uint(v) & ~1u) | bit; }
@@ -164,11 +171,8 @@ __device__ __forceinline__ float2 unpack_half(u32 v) {
       : "r"(v));
   return f;
 }
-// Two numbers that meet weights.
-__device__ __forceinline__ u32 pack_operand(float lo, float hi) {
-  if (!FP8) return pack(lo, hi);
-  return pack_half(lo * SMALLER, hi * SMALLER);
-}
+// Two numbers that meet weights, in the lower bits if they are E4M3.
+__device__ __forceinline__ u32 pack_operand(float lo, float hi) { return FP8 ? pack_e4m3(lo, hi) : pack(lo, hi); }
 __device__ __forceinline__ void mma(float (&c)[4], uint4 a, uint2 b) {
   asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
       : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
@@ -178,13 +182,6 @@ __device__ __forceinline__ void mma_half(float* c, uint4 a, uint2 b) {
   asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
       : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
       : "r"(a.x), "r"(a.y), "r"(a.z), "r"(a.w), "r"(b.x), "r"(b.y));
-}
-// Weights times activations: float16 if the weights were E4M3.
-__device__ __forceinline__ void mma_weights(float (&c)[4], uint4 a, uint2 b) {
-  if (FP8)
-    mma_half(c, a, b);
-  else
-    mma(c, a, b);
 }
 __device__ __forceinline__ void ldmatrix(uint4& v, u32 address) {
   asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0,%1,%2,%3}, [%4];"
@@ -196,15 +193,13 @@ __device__ __forceinline__ void ldmatrix_transposed(uint4& v, u32 address) {
                : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w)
                : "r"(address));
 }
-// Operand A of a tile x one block: of E4M3 weights a lane has columns 2t, 2t + 1, 2t + 8, 2t + 9 of row g, and of
-// g + 8.
-__device__ __forceinline__ uint4 from_e4m3(u32 row, u32 row_8) {
-  uint4 a;
-  asm("{.reg .b16 lo, hi; mov.b32 {lo, hi}, %4; cvt.rn.f16x2.e4m3x2 %0, lo; cvt.rn.f16x2.e4m3x2 %2, hi;"
-      "mov.b32 {lo, hi}, %5; cvt.rn.f16x2.e4m3x2 %1, lo; cvt.rn.f16x2.e4m3x2 %3, hi;}"
-      : "=r"(a.x), "=r"(a.y), "=r"(a.z), "=r"(a.w)
-      : "r"(row), "r"(row_8));
-  return a;
+// Four E4M3 numbers as float16, for mma: it takes columns in any order that both operands have.
+__device__ __forceinline__ uint2 from_e4m3(u32 four) {
+  uint2 v;
+  asm("{.reg .b16 lo, hi; mov.b32 {lo, hi}, %2; cvt.rn.f16x2.e4m3x2 %0, lo; cvt.rn.f16x2.e4m3x2 %1, hi;}"
+      : "=r"(v.x), "=r"(v.y)
+      : "r"(four));
+  return v;
 }
 template <int N>
 __device__ __forceinline__ void clear(float (&c)[N][4]) {

@@ -3,9 +3,9 @@
 // One thread of a CTA, which never waits for activations. What it loads is the same in every layer, so a list of it is
 // made first: 100 cycles more for a slot are a microsecond in a layer.
 struct Producer {
-  // Few tokens' bfloat16 weights take half of the loop's time to load. At full speed they come in bursts, and what the
+  // Few tokens' weights take up to half of the loop's time to load. At full speed they come in bursts, and what the
   // CTAs tell each other is late: so loads are some cycles apart, and those of gate|up wait for the keys' scores.
-  static constexpr u32 PACE = FEW && !FP8 ? 750 : 0;
+  static constexpr u32 PACE = FEW ? (FP8 ? 450 : 750) : 0;
   static constexpr bool AHEAD = plan_slots(GTL, D16) > STAGES;  // some of gate|up finds no slot before it begins
   Block& b;
   uint2* list;  // of slots: where from, bytes; an odd number of bytes: of keys or values, else of weights
@@ -114,7 +114,9 @@ extern "C" __global__ void __launch_bounds__(256) turbopi_denoise_prepare(const 
       return tile * 16 + row < length ? *(const u32*)(k + size_t(tile * 16 + row) * HD + column + col) : 0;
     };
     auto value = [&](int row, int col) {
-      return tile * 16 + row < length ? u32(v[size_t(tile * 16 + row) * HD + column + col]) : 0;
+      if (tile * 16 + row >= length) return 0u;
+      const u32 bits = v[size_t(tile * 16 + row) * HD + column + col];
+      return FP8 ? pack(bf16_low(bits) * a.values_times[l], 0) & 0xffff : bits;
     };
     auto pair = [&](int row, int col) { return value(row, col) | value(row + 8, col) << 16; };
     to[i] = make_uint4(key(g, 2 * t), key(g + 8, 2 * t), key(g, 2 * t + 8), key(g + 8, 2 * t + 8));

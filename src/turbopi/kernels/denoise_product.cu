@@ -35,23 +35,17 @@ struct Share {
   }
 };
 
-// A lane's share of a fragment of weights; of bfloat16 as operand A.
+// A lane's share of a fragment of weights, as operand A.
 __device__ __forceinline__ uint4 load_weights(const Block& b, u32 at) {
-  if (FP8) return load_fragment(b.smem + at, b.lane());
   uint4 v;  // ldmatrix's second quarter of lanes fetches rows g + 8, which lie behind the other columns of rows g
   ldmatrix(v, b.base + at + b.lane() % 8 * 16 + b.lane() / 8 % 2 * 256 + b.lane() / 16 * 128);
   return v;
 }
-// Operand A of block `half` of it.
-__device__ __forceinline__ uint4 operand_of(uint4 v, int half) {
-  if (!FP8) return v;
-  return half ? from_e4m3(v.z, v.w) : from_e4m3(v.x, v.y);
-}
 
-// This warp's share of the first rounds of a group of tiles, as operand A.
+// This warp's share of the first rounds of a group of tiles, read before its activations are there.
 template <int TILES_, int ROUNDS>
 struct Ahead {
-  uint4 weights[imax(ROUNDS * RPS * KB, 1)];
+  uint4 weights[imax(ROUNDS * RPS, 1)];
 
   __device__ __forceinline__ explicit Ahead(Block& b) {
     constexpr int PARTS = group_parts(TILES_);
@@ -62,46 +56,11 @@ struct Ahead {
       u32 seen = 0;
 #pragma unroll
       for (int i = 0; i < RPS; ++i) {
-        const uint4 v = load_weights(b, at + i * PARTS * TILES_ * FRAGMENT);
-        seen ^= fold(v);
-#pragma unroll
-        for (int half = 0; half < KB; ++half) weights[(r * RPS + i) * KB + half] = operand_of(v, half);
+        weights[r * RPS + i] = load_weights(b, at + i * PARTS * TILES_ * FRAGMENT);
+        seen ^= fold(weights[r * RPS + i]);
       }
       give_slot(b, slot, seen);
     }
-  }
-};
-
-// E4M3: this warp's share of a group's fragments as they lie in the slots, two at a time.
-template <int TILES_>
-struct Reader {
-  static constexpr int STEP = 2, PARTS = group_parts(TILES_);
-  static_assert(RPS % STEP == 0, "whole steps");
-  uint4 weights[STEP];
-  u32 slot = 0, at = 0;
-  int left = 0, tiles;
-
-  __device__ __forceinline__ explicit Reader(int n) : tiles(n) {}
-  __device__ __forceinline__ void ask(Block& b) {
-    if (left == 0) {
-      const Share my(b, PARTS);
-      slot = take_slot(b), left = slot_rounds(PARTS, tiles) * (RPS / STEP),
-      at = M_RING + slot * SLOT + (my.part * tiles + min(my.tile, tiles - 1)) * FRAGMENT;
-    }
-#pragma unroll
-    for (int i = 0; i < STEP; ++i, at += PARTS * tiles * FRAGMENT) weights[i] = load_weights(b, at);
-    --left;
-  }
-};
-
-// What a product of `tiles` tiles reads of its first group before its activations are there.
-template <int TILES_, int ROUNDS>
-struct Early {
-  Ahead<TILES_, ROUNDS> ahead;
-  Reader<TILES_> reader;
-
-  __device__ __forceinline__ Early(Block& b, int tiles, int blocks) : ahead(b), reader(min(tiles, TILES_)) {
-    if (FP8 && SPREAD && tiles > 0 && blocks > 0) reader.ask(b);
   }
 };
 
@@ -121,29 +80,31 @@ struct GroupProduct {
   __device__ __forceinline__ GroupProduct(Block& block, int x, int n, int t, float (&to)[NT * 4])
       : b(block), my(block, PARTS), blocks(n), tiles(t), rounds(plan_rounds(PARTS, blocks)),
         rounds_of_slot(slot_rounds(PARTS, t)),
-        first(behind(operand_place(b.start() + x, 128), EXACT ? my.part * KB * NT * 256 : 0)), sums(to) {
+        first(behind(operand_place(b.start() + x, FP8 ? NT * 128 : 128), EXACT ? my.part * NT * 256 : 0)), sums(to) {
 #pragma unroll
     for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
   }
-  // What this warp's fragment i of round r meets. Blocks that fill up a round have no weight, their activations are any.
-  __device__ __forceinline__ u64 activations(int r, int i, int half) const {
-    const int block = ((r * RPS + i) * PARTS + (EXACT ? 0 : my.part)) * KB + half;
-    return operand_at<256>(behind(first, (EXACT ? block : min(block, blocks - 1)) * NT * 256));
+  // What this warp's fragment i of round r meets. Blocks that fill up a round have no weight, their activations are any
+  // (that are numbers: of a pair's missing block its other).
+  __device__ __forceinline__ u64 activations(int r, int i) const {
+    constexpr int NEXT_TOKENS = FP8 ? 128 : 256;
+    const int fragment = (r * RPS + i) * PARTS;
+    if constexpr (EXACT) return operand_at<NEXT_TOKENS>(behind(first, fragment * NT * 256));
+    const int here = min(fragment + my.part, most(blocks, KB) - 1);
+    const u32 place = behind(first, here * NT * 256);
+    return operand_at<NEXT_TOKENS>(KB * (here + 1) > blocks ? place & 0xffff : place);
   }
   __device__ __forceinline__ void multiply(const Ahead<TILES_, AHEAD>& ahead) {
     begin_products();
 #pragma unroll
-    for (int i = 0; i < AHEAD * RPS * KB; ++i) {
+    for (int i = 0; i < AHEAD * RPS; ++i) {
       const uint4 w = ahead.weights[i];
-      if constexpr (FP8)
-        add_product(sums, w.x, w.y, w.z, w.w, activations(0, i / KB, i % KB), i);
-      else
-        add_rows(sums, w.x, w.y, w.z, w.w, activations(0, i, 0), i);
+      add_from_registers(sums, w.x, w.y, w.z, w.w, activations(0, i), i);
     }
     commit_products();
   }
 
-  // bfloat16: weights from shared memory. A slot is given back when the round behind it has begun.
+  // Weights from shared memory. A slot is given back when the round behind it has begun.
   __device__ __forceinline__ void from_slots() {
     const int tile = my.first < tiles ? my.first : 0;
     const u32 start = b.start(), weights = operand_place(start + M_RING + (my.part * tiles + tile) * FRAGMENT, 128);
@@ -162,7 +123,7 @@ struct GroupProduct {
 #pragma unroll
       for (int i = 0; i < RPS; ++i) {
         const u32 at = behind(from, i * PARTS * tiles * FRAGMENT);
-        add_product(sums, operand_at<256>(at), activations(r, i, 0), 1);
+        add_product(sums, operand_at<256>(at), activations(r, i), 1);
         if (i == 0) {
           commit_products();
           await_products<1>();  // the round before is done
@@ -176,42 +137,13 @@ struct GroupProduct {
     await_products<0>();
     if (rounds > AHEAD) give_slot(b, slot);
   }
-  // E4M3: weights through registers, where they become float16. All of a step's do before its first product, else the
-  // compiler makes products wait for each other; the next are asked for while products read these.
-  __device__ __forceinline__ void through_registers(Reader<TILES_>& reader) {
-    constexpr int STEP = Reader<TILES_>::STEP;
-    const int steps = (rounds - AHEAD) * (RPS / STEP);
-    if (FEW && steps > 0) reader.ask(b);
-#pragma unroll(UNROLL)
-    for (int s = 0; s < steps; ++s) {
-      uint4 a[STEP * KB];
-      u32 seen = 0;
-#pragma unroll
-      for (int i = 0; i < STEP * KB; ++i)
-        a[i] = operand_of(reader.weights[i / KB], i % KB), seen ^= fold(reader.weights[i / KB]);
-      if (reader.left == 0 || s + 1 == steps) give_slot(b, reader.slot, seen);
-      begin_products();
-#pragma unroll
-      for (int i = 0; i < STEP * KB; ++i)
-        add_product(sums, a[i].x, a[i].y, a[i].z, a[i].w, activations(AHEAD, s * STEP + i / KB, i % KB), 1);
-      commit_products();
-      if (s + 1 < steps) reader.ask(b);
-      await_products<0>();  // other warpgroups multiply meanwhile
-#pragma unroll
-      for (int i = 0; i < STEP * KB; ++i) keep_until_here(a[i]);
-    }
-  }
 
-  __device__ __forceinline__ void operator()(Early<TILES_, AHEAD>& early) {
-    if constexpr (AHEAD > 0) multiply(early.ahead);
-    if constexpr (FP8)
-      through_registers(early.reader);
-    else
-      from_slots();
+  __device__ __forceinline__ void operator()(Ahead<TILES_, AHEAD>& ahead) {
+    if constexpr (AHEAD > 0) multiply(ahead);
+    from_slots();
     if constexpr (AHEAD > 0) {
-      if (FP8 && rounds == AHEAD) await_products<0>();
 #pragma unroll
-      for (int i = 0; i < AHEAD * RPS * KB; ++i) keep_until_here(early.ahead.weights[i]);
+      for (int i = 0; i < AHEAD * RPS; ++i) keep_until_here(ahead.weights[i]);
     }
   }
 };
@@ -219,14 +151,14 @@ struct GroupProduct {
 // Up to MT tiles (`tiles` of them) times the activations at x.
 template <int MT, int EVEN, int AHEAD>
 __device__ __forceinline__ void multiply(Block& b, int x, int blocks, int tiles, float (*sums)[NT * 4],
-                                         Early<group_tiles(MT), AHEAD>& early) {
+                                         Ahead<group_tiles(MT), AHEAD>& ahead) {
   constexpr int N = group_tiles(MT);
   if constexpr (AHEAD > 0) {
-    GroupProduct<MT, EVEN, AHEAD>(b, x, blocks, tiles, sums[0])(early);
+    GroupProduct<MT, EVEN, AHEAD>(b, x, blocks, tiles, sums[0])(ahead);
   } else if (tiles > 0) {
-    GroupProduct<N, EVEN, 0>(b, x, blocks, min(tiles, N), sums[0])(early);
+    GroupProduct<N, EVEN, 0>(b, x, blocks, min(tiles, N), sums[0])(ahead);
     if constexpr (N < MT) {
-      Early<group_tiles(MT - N), 0> next(b, tiles - N, blocks);
+      Ahead<group_tiles(MT - N), 0> next(b);
       multiply<MT - N, EVEN>(b, x, blocks, tiles - N, sums + 1, next);
     }
   }

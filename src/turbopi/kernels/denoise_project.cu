@@ -73,27 +73,45 @@ struct QkvProduct {
       for (int i = 0; i < QKV; ++i) {
         const uint4 v = load_weights(b, at + (r * tiles + i) * FRAGMENT);
         seen ^= fold(v);
-#pragma unroll
-        for (int half = 0; half < KB; ++half) weights[r * KB + half][i] = operand_of(v, half);
+        if constexpr (FP8) {
+          const uint2 a = from_e4m3(v.x), a_8 = from_e4m3(v.y), c = from_e4m3(v.z), c_8 = from_e4m3(v.w);
+          weights[r * KB][i] = make_uint4(a.x, a_8.x, a.y, a_8.y);
+          weights[r * KB + KB - 1][i] = make_uint4(c.x, c_8.x, c.y, c_8.y);
+        } else {
+          weights[r][i] = v;
+        }
       }
     }
     give_slot(b, slot, seen, slots);
   }
   __device__ __forceinline__ void multiply(const Block& b) {
     constexpr bool EXACT = D16 % (KB * W) == 0;
+    auto add = [&](int k, int n, uint2 x) {
+#pragma unroll
+      for (int i = 0; i < QKV; ++i)
+        if (FP8)
+          mma_half(sums[i][n], weights[k][i], x);
+        else
+          mma(sums[i][n], weights[k][i], x);
+    };
 #pragma unroll
     for (int i = 0; i < QKV; ++i) clear(sums[i]);
     if (!some()) return;
 #pragma unroll
-    for (int k = 0; k < QKV_ROUNDS * KB; ++k) {
+    for (int k = 0; k < QKV_ROUNDS * KB; k += KB) {
       const int block = b.warp() * QKV_ROUNDS * KB + k;
-      uint4 v;  // of the first 8 tokens 8 columns, the other 8, then of the next 8 tokens
-      ldmatrix(v, b.base + M_X + (EXACT ? block : min(block, D16 - 1)) * NT * 256 + b.lane() * 16);
-#pragma unroll
-      for (int i = 0; i < QKV; ++i)
-#pragma unroll
-        for (int n = 0; n < NT; ++n)
-          mma_weights(sums[i][n], weights[k][i], n ? make_uint2(v.z, v.w) : make_uint2(v.x, v.y));
+      uint4 v;  // of the first 8 tokens 8 (E4M3: 16) columns, the next ones, then of the next 8 tokens
+      if constexpr (FP8) {
+        const int mine = block + (b.lane() >> 3 & 1);
+        ldmatrix(v, b.base + M_X + ((EXACT ? mine : min(mine, D16 - 1)) * NT + (b.lane() >> 4)) * 128 +
+                        (b.lane() & 7) * 16);
+        add(k, 0, from_e4m3(v.x)), add(k + 1, 0, from_e4m3(v.y));
+        if (NT > 1) add(k, NT - 1, from_e4m3(v.z)), add(k + 1, NT - 1, from_e4m3(v.w));
+      } else {
+        ldmatrix(v, b.base + M_X + (EXACT ? block : min(block, D16 - 1)) * NT * 256 + b.lane() * 16);
+        add(k, 0, make_uint2(v.x, v.y));
+        if (NT > 1) add(k, NT - 1, make_uint2(v.z, v.w));
+      }
     }
   }
   // With QKV_PAIRS warps i and i + 8 add up their sums, each of them half.
@@ -160,11 +178,11 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     consumers_sync();
     product.store(b, b.smem + M_X);
   } else {
-    Early<group_tiles(QKV), 0> early(b, qn + kvn, D16);
+    Ahead<group_tiles(QKV), 0> ahead(b);
     await_stream();
     float sums[plan_groups(QKV)][NT * 4];
     if (!SPREAD) show_to_products();
-    multiply<QKV, D16>(b, M_X, D16, qn + kvn, sums, early);
+    multiply<QKV, D16>(b, M_X, D16, qn + kvn, sums, ahead);
     MARK(1)
     consumers_sync();
     if constexpr (SPREAD) give_room(b);

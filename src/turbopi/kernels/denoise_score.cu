@@ -212,7 +212,7 @@ __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[
   for (int n = 0; n < NT; ++n)
     if (n * 8 + 2 * b.t() < T) send(to + n * 32, __float_as_uint(v[n].x), __float_as_uint(v[n].y), at);
 }
-constexpr u32 ATT_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
+constexpr u32 ATT_EXPECT = HD * T * (OPERAND / 128) + (IDLE_Q ? S * 4 : 0);
 constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
 __device__ __forceinline__ u32 outputs_expect(const Block& b) {
   return S * ((T + 1) / 2) * 8 + S * b.qn() * ((T + 1) / 2) * (OUTPUT / 4);

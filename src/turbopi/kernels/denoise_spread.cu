@@ -25,6 +25,13 @@ __device__ __forceinline__ Item stream_item(const Block& b, int j) {
   return {tile, n, n * 8 + 2 * b.t(), i < xn * NT, i < xn * NT && n * 8 + 2 * b.t() < T};
 }
 
+// Of an item's lane pair the four columns 2g.. of one token (even g: 2t, odd g: 2t + 1); in E4M3 the first word alone.
+__device__ __forceinline__ uint2 columns_of(const Block& b, float4 v) {
+  const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
+  const uint2 both = make_uint2(b.g() & 1 ? got : w0, b.g() & 1 ? w1 : got);
+  return FP8 ? make_uint2(both.x | both.y << 16, 0) : both;
+}
+
 // Region X is used for everything, one thing after the other. Before any rank may write where all ranks read, all
 // agree: before the stream comes, spare warps do (DONE, FREE); before queries and hidden units come, which lie over the
 // stream, the consumers do (ROOM).
@@ -77,11 +84,13 @@ __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
     const int place = (b.x0() + item.tile) * NT + item.n, token = 2 * b.t() + (b.g() & 1);
-    const float4 y = scaled(x[j], scales[j]);
-    const u32 w0 = pack_operand(y.x, y.z), w1 = pack_operand(y.y, y.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
-    if (item.real && item.n * 8 + token < T)
-      *(uint2*)(to + place * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8) =
-          make_uint2(b.g() & 1 ? got : w0, b.g() & 1 ? w1 : got);
+    const uint2 columns = columns_of(b, scaled(x[j], scales[j]));
+    if (item.real && item.n * 8 + token < T) {
+      if (FP8)
+        *(u32*)(to + place * OPERAND + token * 16 + (b.g() >> 1) * 4) = columns.x;
+      else
+        *(uint2*)(to + place * OPERAND + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8) = columns;
+    }
   }
   consumers_sync();
   if (b.warp() == W - 1) {  // which mostly has no item: the fence waits for all stores
@@ -162,7 +171,8 @@ __device__ __forceinline__ void fetch_stream(const Block& b) {
       if (b.lane() == 0) {
         const uint4* const squares = b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES + b.rank() * NT * 2;
         const uint4* const from = b.a.scratch + B_STAGE + (turn & 1) * N_STAGE;
-        if (items > 0) load_for_all(b.base + M_X + place * 256, from + place * 16, items * 256, b.bar(BAR_X));
+        if (items > 0)
+          load_for_all(b.base + M_X + place * OPERAND, from + place * (OPERAND / 16), items * OPERAND, b.bar(BAR_X));
         load_for_all(b.base + M_SSQ + b.rank() * NT * 32, squares, NT * 32, b.bar(BAR_X));
       }
       if (i == 2 * L - 1) {  // what the end of the step needs, to L2

@@ -1,19 +1,22 @@
 // Part 7 of 12: the residual stream, and what goes into it: sums across clusters, GeGLU.
 
-// 8 bytes with the lane pair's four columns 2g.. of one token (even g: 2t, odd g: 2t + 1) to all ranks, where
-// `columns_place` says.
+// `columns_of` to all ranks, where `columns_place` says.
 __device__ __forceinline__ u32 columns_place(const Block& b, int region, int block, int n) {
   const int token = 2 * b.t() + (b.g() & 1);
-  return b.base + region + (block * NT + n) * 256 + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8;
+  const int in_row = FP8 ? (b.g() >> 1) * 4 : (b.g() >> 2) * 128 + (b.g() >> 1 & 1) * 8;
+  return b.base + region + (block * NT + n) * OPERAND + token * 16 + in_row;
 }
 __device__ __forceinline__ void send_columns(const Block& b, const Everyone& data, const Everyone& bars, int n,
                                              float4 v, bool real) {
-  const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
+  const uint2 columns = columns_of(b, v);
   const int token = 2 * b.t() + (b.g() & 1);
   if (real && n * 8 + token < T) {
-    const u32 lo = b.g() & 1 ? got : w0, hi = b.g() & 1 ? w1 : got;
 #pragma unroll
-    for (int d = 0; d < S; ++d) send(data.at[d], lo, hi, bars.at[d]);
+    for (int d = 0; d < S; ++d)
+      if (FP8)
+        send(data.at[d], columns.x, bars.at[d]);
+      else
+        send(data.at[d], columns.x, columns.y, bars.at[d]);
   }
 }
 // Sums of squares to all ranks, which add them up. If tokens are few every warp sends those of its tiles, as soon as it
@@ -65,7 +68,7 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
     if (b.lane() == 0) barrier_arrive(b.bar(BAR_RMS));
   }
 }
-constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * 32 + SQUARES_EXPECT;
+constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * (OPERAND / 8) + SQUARES_EXPECT;
 
 // A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
 __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X], const float* row) {
@@ -165,10 +168,8 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
     if (!SPREAD && (send_on || last)) {
       const float4 y = scaled(x[j], scales[j]);
       if (send_on) {
-        float2 q;  // what lanes exchange waits behind sends: bfloat16 gains if it comes first, E4M3 if the columns do
-        if (!FP8) q = squares_of(x[j]);
+        const float2 q = squares_of(x[j]);  // first: what lanes exchange waits behind sends
         send_columns(b, places[j], bars, item.n, y, item.real);
-        if (FP8) q = squares_of(x[j]);
         send_tile_squares(b, q, b.warp() + j * W, BAR_X);
       } else {
         keep_item(b, j, y);
@@ -194,7 +195,7 @@ struct Sent {
 template <int EVEN, typename Await, typename Then>
 __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, int region, uint4* buffer, u32 bit,
                                                  Await await, Then then, const Sent& sent) {
-  Early<group_tiles(DX), RESIDUAL_AHEAD> early(b, b.xn(), blocks);
+  Ahead<group_tiles(DX), RESIDUAL_AHEAD> ahead(b);
   Own<DX> own(b, b.xn());
   uint2* place[plan_groups(DX)][OWN<DX>];  // in the buffer
 #pragma unroll
@@ -209,7 +210,7 @@ __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, in
   await();
   show_to_products();
   float sums[plan_groups(DX)][NT * 4];
-  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, early);
+  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, ahead);
   then();
   own.add_up(b, region, b.xn(), sums);
 #pragma unroll
@@ -247,30 +248,32 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
 #pragma unroll
     for (int k = 0; k < OWN<GTL>; ++k) {
       const int at = b.g0() + own.tile[i];
-      place[i][k] = b.base + M_HID + ((at >> 1) * NT + own.n[i][k]) * 256 + (at & 1) * 128 + token * 16;
+      place[i][k] =
+          b.base + M_HID + ((at >> 1) * NT + own.n[i][k]) * OPERAND + (at & 1) * (FP8 ? 8 : 128) + token * 16;
+      if (COPY_HIDDEN) place[i][k] += X_OWN_HIDDEN - (b.g0() >> 1) * NT * OPERAND;
       if (FEW) place[i][k] = settled(place[i][k]);
     }
   }
-  Early<group_tiles(GTL), GATE_UP_AHEAD> early(b, gn, D16);
+  Ahead<group_tiles(GTL), GATE_UP_AHEAD> ahead(b);
   receive(b, BAR_X, b.x_parity(1), X_EXPECT, WAIT_X);
   MARK(13)
   float sums[GROUPS_][NT * 4];
   if (!SPREAD) show_to_products();  // what the copy engine wrote needs none
-  multiply<GTL, D16>(b, M_X, D16, gn, sums, early);
+  multiply<GTL, D16>(b, M_X, D16, gn, sums, ahead);
   MARK(15)
   if constexpr (SPREAD) consumers_sync(), give_room(b);
   own.add_up(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);
   constexpr int QUARTER = most(S, 4);
   static_assert(S % 4 == 0, "four lanes share the ranks");
   u32 window[QUARTER], hidden_bars[QUARTER];  // if SPREAD: this CTA's shared memory as theirs
-  if constexpr (SPREAD) {
+  if constexpr (SPREAD && !COPY_HIDDEN) {
 #pragma unroll
     for (int d = 0; d < QUARTER; ++d) {
       const int rank = (b.g() >> 1) * QUARTER + d;
       window[d] = at_rank(b.base, rank), hidden_bars[d] = at_rank(b.bar(BAR_HID), rank);
     }
-    inverse_rms(b, 0, 1);
   }
+  if constexpr (SPREAD) inverse_rms(b, 0, 1);
 #pragma unroll
   for (int i = 0; i < GROUPS_; ++i)
 #pragma unroll
@@ -286,9 +289,18 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
         const float got = exchange(b.g() & 1 ? h0 : h1, 4);
         const u32 two = b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got), next = exchange(two, 8);
         const u32 lo = b.g() & 2 ? next : two, hi = b.g() & 2 ? two : next;
-        const u32 far_lo = exchange(lo, 16), far_hi = exchange(hi, 16);
-        const uint4 units =
-            b.g() & 4 ? make_uint4(far_lo, far_hi, lo, hi) : make_uint4(lo, hi, far_lo, far_hi);
+        uint4 units;  // E4M3: the first two words
+        if constexpr (FP8) {
+          const u32 four = lo | hi << 16, far = exchange(four, 16);
+          units = b.g() & 4 ? make_uint4(far, four, 0, 0) : make_uint4(four, far, 0, 0);
+        } else {
+          const u32 far_lo = exchange(lo, 16), far_hi = exchange(hi, 16);
+          units = b.g() & 4 ? make_uint4(far_lo, far_hi, lo, hi) : make_uint4(lo, hi, far_lo, far_hi);
+        }
+        if constexpr (COPY_HIDDEN) {  // four lanes have the same; those of a token that doesn't exist are any
+          if (b.g() < 2) *(uint2*)(b.smem + (place[i][k] - b.base)) = make_uint2(units.x, units.y);
+          continue;
+        }
         if (SPREAD && i + k == 0) await_room(b);
         if (n * 8 + token < T) {
           u32 data[QUARTER], bars[QUARTER];
@@ -299,11 +311,30 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
             bars[d] = SPREAD ? hidden_bars[d] : at_rank(b.bar(BAR_HID), rank);
           }
 #pragma unroll
-          for (int d = 0; d < QUARTER; ++d) send(data[d], units, bars[d]);
+          for (int d = 0; d < QUARTER; ++d)
+            if (FP8)
+              send(data[d], units.x, units.y, bars[d]);
+            else
+              send(data[d], units, bars[d]);
           static_assert(QUARTER == 2, "what `sent` has room for");
           if (FEW) sent = {units, make_uint4(data[0], data[1], bars[0], bars[1])};
         }
       }
+  if constexpr (COPY_HIDDEN) {
+    show_to_products();  // to the copy engine, that is
+    if (const int block = own.tile[0] >> 1; block < GTL / 2) {
+      __syncwarp();
+      asm volatile("bar.sync %0, 128;" ::"r"(2 + block) : "memory");  // attention's barriers are free
+      await_room(b);
+      const int quarter = (own.tile[0] & 1) * 2 + Share(b, group_parts(GTL)).part;  // two ranks a warp
+      if (b.lane() < 2) {
+        const u32 at = block * NT * OPERAND, rank = quarter * 2 + b.lane();
+        bulk_send(at_rank(b.base + M_HID + (b.g0() >> 1) * NT * OPERAND + at, rank), b.base + M_X + X_OWN_HIDDEN + at,
+                  NT * OPERAND, at_rank(b.bar(BAR_HID), rank));
+      }
+      __syncwarp();
+    }
+  }
   if constexpr (SPREAD) await_room(b), ++b.room;
   if (IDLE) {
     inverse_rms(b, 0, 1), consumers_sync();  // no warp may be left behind by a whole use of a barrier

@@ -55,7 +55,7 @@ def source(*names: str, instructions: str) -> str:
     return re.sub(r"^TP_MMA.*$", lambda _: instructions, text, flags=re.MULTILINE)
 
 
-Numbers = Literal["bf16", "f16", "e4m3"]
+Numbers = Literal["bf16", "e4m3"]
 
 
 def wgmma(

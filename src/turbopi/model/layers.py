@@ -32,15 +32,24 @@ class AdaRMSNorm(nn.Module):
 
     def forward(self, x: Tensor, cond: Tensor | None) -> tuple[Tensor, Tensor]:
         """x [B, S, D], cond float32 [B or 1, D] -> (normalised x, gate [B or 1, 1, D])."""
-        assert cond is not None
-        scale, shift, gate = self.dense(cond)[:, None].chunk(3, dim=-1)
+        scale, shift, gate = self.modulation(cond)
         return (rms_normalize(x, self.eps) * (1 + scale) + shift).to(x.dtype), gate.to(x.dtype)
+
+    def modulation(self, cond: Tensor | None) -> tuple[Tensor, ...]:
+        """Scale, shift and gate, float32 [B or 1, 1, D]."""
+        assert cond is not None
+        return self.dense(cond)[:, None].chunk(3, dim=-1)
 
 
 def rms_normalize(x: Tensor, eps: float) -> Tensor:
     """x / sqrt(mean(x²) + eps) over the last axis, in float32 whatever x is."""
     x = x.float()
-    return x * torch.rsqrt(x.square().mean(-1, keepdim=True) + eps)
+    return x * inverse_rms(x, eps)
+
+
+def inverse_rms(x: Tensor, eps: float) -> Tensor:
+    """1 / sqrt(mean(x²) + eps) over the last axis [..., 1], in float32 whatever x is."""
+    return torch.rsqrt(x.float().square().mean(-1, keepdim=True) + eps)
 
 
 def gated_residual(x: Tensor, y: Tensor, gate: Tensor | None) -> Tensor:
