@@ -278,8 +278,8 @@ class Tables:
 
     modulation: Tensor  # float32[N, 2L + 1, 3, D]
     shifted: Tensor  # float32[N, L, CTAs, tiles, 16]: what the norms' shifts add to the products behind them
-    row_scales: Tensor  # float32[L, CTAs, tiles, 16] of the rows of qkv and gate|up; empty of bfloat16
-    values_times: Tensor  # float32[L]; empty of bfloat16
+    row_scales: Tensor  # float32[L, CTAs, tiles, 16] of the rows of qkv and gate|up; [L, 0] of bfloat16
+    values_times: Tensor  # float32[L, 1]; [L, 0] of bfloat16
 
     @classmethod
     def make(cls, packed: PackedExpert, table: Tensor) -> "Tables":
