@@ -371,7 +371,9 @@ def test_files_of_versions_1_and_2_round_to_nearest_and_leave_the_expert_in_bf16
             if name.startswith("expert."):
                 entry["scale"] = None
         (tmp_path / "old.json").write_text(json.dumps(content))
-        plan = Quantization.load(tmp_path / "old.json").plan(TINY, "fp8")
+        old = Quantization.load(tmp_path / "old.json")
+        plan = old.plan(TINY, "fp8")
+        assert ["expert stays in bf16: run it again" in warning for warning in old.warnings] == [True]
         assert not plan.directions and plan.expert == "bf16"
         assert {name.split(".")[0] for name in plan.scales} == {"vision", "prefix"}
         assert "run `turbopi calibrate` again" in plan.kept["expert.0.qkv"]

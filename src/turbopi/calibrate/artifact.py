@@ -100,7 +100,12 @@ class Quantization:
     def warnings(self) -> list[str]:
         """What every output should say."""
         noise = ["calibrated on random noise, not on observations: its errors say nothing"]
-        return [*(noise if self.on_random_noise else []), *self.report.get("warnings", [])]
+        old = ["the calibration has no scales for the expert's activations, so the expert stays in bf16: run it again"]
+        return [
+            *(noise if self.on_random_noise else []),
+            *(old if any(site.scale is None for site in self.sites.values()) else []),
+            *self.report.get("warnings", []),
+        ]
 
     @property
     def identity(self) -> str:

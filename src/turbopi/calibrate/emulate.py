@@ -52,13 +52,17 @@ def rounded(model: Pi0Model, scales: Mapping[Site, float], weights: RoundedWeigh
     changes: list[tuple[nn.Linear, Round, Round]] = []
     norms: list[tuple[AdaRMSNorm, Round]] = []
     for site, scale in scales.items():
-        inputs, norm = partial(round_activation, scale=scale), norm_of(model, site)
-        if norm is not None:
+        inputs: Round = partial(round_activation, scale=scale)
+        if (norm := norm_of(model, site)) is not None:
             norms.append((norm, inputs))
-            inputs = partial(lambda x: x)
+            inputs = _as_it_is
         changes += [(linear, inputs, partial(rounding, site)) for linear in linears(model, site)]
     with replaced(changes), replaced_in_norms(norms):
         yield
+
+
+def _as_it_is(x: Tensor) -> Tensor:
+    return x
 
 
 def through_norm(norm: AdaRMSNorm, operand: Round, x: Tensor, cond: Tensor | None) -> tuple[Tensor, Tensor]:
