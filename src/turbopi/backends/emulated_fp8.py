@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from turbopi.backends.base import LoadState, Tier
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.calibrate.artifact import TIERS, Quantization, check_given
-from turbopi.calibrate.emulate import round_activation, round_weight, through_norm
+from turbopi.calibrate.emulate import put_into_norm, round_activation, round_weight
 from turbopi.calibrate.sites import linears, norm_of, sites
 from turbopi.config import ModelConfig
 
@@ -44,7 +44,7 @@ class EmulatedFp8Backend(PyTorchBackend):
                 continue
             norm = norm_of(self.model, site)
             if norm is not None:
-                norm.__dict__["forward"] = partial(through_norm, norm, partial(round_activation, scale=scale))
+                put_into_norm(norm, partial(round_activation, scale=scale))
             for linear in linears(self.model, site):
                 linear.weight.data = round_weight(linear.weight.data, self._plan.directions.get(str(site)))
                 if norm is None:

@@ -72,12 +72,17 @@ def through_norm(norm: AdaRMSNorm, operand: Round, x: Tensor, cond: Tensor | Non
     return y.to(x.dtype), gate.to(x.dtype)
 
 
+def put_into_norm(norm: AdaRMSNorm, operand: Round) -> None:
+    """From now on `norm` is `through_norm`."""
+    norm.__dict__["forward"] = partial(through_norm, norm, operand)
+
+
 @contextmanager
 def replaced_in_norms(changes: list[tuple[AdaRMSNorm, Round]]) -> Iterator[None]:
     """For a while, these norms are of what the function makes of x (1 + scale)."""
     try:
         for norm, operand in changes:
-            norm.__dict__["forward"] = partial(through_norm, norm, operand)
+            put_into_norm(norm, operand)
         yield
     finally:
         for norm, _ in changes:

@@ -285,7 +285,7 @@ class Tables:
     def make(cls, packed: PackedExpert, table: Tensor) -> "Tables":
         """table float32[N, 2L + 1, 3, D], see `engine.weights.modulation`"""
         index, depth = _row_index(packed.arrangement).to(table.device), packed.arrangement.config.expert.depth
-        modulation, shifted, rows, inputs = table.clone(), [], [], packed.inputs
+        modulation, shifted, rows, inputs = table.clone() if packed.fp8 else table, [], [], packed.inputs
         for i in range(depth):
             qkv, _, gate_up, _ = packed.matrices(i)
             products = [table[:, 2 * i + j, 1].double() @ m.double().T for j, m in enumerate((qkv, gate_up))]
