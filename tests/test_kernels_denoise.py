@@ -393,8 +393,10 @@ SHAPES = pytest.mark.parametrize(
         ("shallow", 2, 16, 968, None),
         ("shallow", 2, 17, 77, None),
         ("shallow", 2, 24, 968, None),
+        ("shallow", 2, 40, 560, None),
         ("shallow", 1, 48, 1000, None),
         ("shallow", 3, 50, 968, None),
+        ("shallow", 1, 50, 1100, None),
         ("shallow", 1, 56, 1000, None),
         ("shallow", 3, 10, 1, None),
         ("full", 10, 10, 559, None),
@@ -459,6 +461,21 @@ def test_weights_of_suffix_keys_far_above_the_prefixs_do_not_overflow(suffix: in
         layer.qkv[-2 * p.config.expert.head_dim : -p.config.expert.head_dim] *= 20
     x_t, v_t = run(p, kernel_of(p))
     assert x_t.isfinite().all() and v_t.isfinite().all()
+
+
+@on_hopper
+@PRECISIONS
+@pytest.mark.parametrize("suffix", [10, 24, 50])
+def test_numbers_that_are_none_come_out_as_such_and_nobody_waits_for_others(
+    suffix: int, precision: packing.Precision
+) -> None:
+    p = problem("shallow", 2, suffix, 300, 4, GPU)
+    kernel = kernel_of(p, precision=precision)
+    p.noise[-1] = torch.nan  # every token sees the last one
+    x_t, v_t = run(p, kernel)
+    assert x_t[1:].isnan().all() and v_t.isnan().all()
+    p.noise[-1] = 0
+    assert all(t.isfinite().all() for t in run(p, kernel))
 
 
 @on_hopper

@@ -85,7 +85,10 @@ def kernel_sizes(
     stream = most(arrangement.clusters, 2) * (g.width // BLOCK) * groups * 32
     scratch = 4 * stream + suffix * g.head_dim
     if suffix > FEW:
-        scratch += g.width // BLOCK * groups * (16 if fp8 else 32) + RANKS * (groups * 4 + 8)
+        words = 8 if fp8 else 16  # of a block's activations of 8 tokens
+        scratch += (4 * g.width // BLOCK * words + RANKS * 4) * groups + arrangement.blocks
+        head, hidden = g.head_dim // BLOCK, most(g.mlp_dim // BLOCK, arrangement.clusters)
+        scratch += arrangement.clusters * groups * (head * (16 + words) + hidden * words)
     return {
         "TP_D": g.width,
         "TP_F": g.mlp_dim,

@@ -33,7 +33,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   auto of_suffix = [&] {
     float c[1][NT][4];
     clear(c[0]);
-    if (!ASYNC && some_keys) suffix_keys.keep(b);
+    if (some_keys) suffix_keys.keep(b);
     __syncwarp();
     if (suffix > 0) score_suffix(b, suffix, c[0]);
     if (b.warp() == SUFFIX_WARP)
@@ -69,7 +69,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
 #pragma unroll
     for (int j = 0; j < CT; ++j)
       if (column + j < QT) {
-        keep_prefix(b, out[j]);
+        if (!ASYNC) keep_prefix(b, out[j]);
         if (suffix > 0) mma_tokens(out[j], last[j], token_address(b, M_X + X_P) + KT * NT * 256);
 #pragma unroll
         for (int n = 0; n < NT; ++n)
@@ -188,15 +188,22 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       send_outputs(out);
     }
   } else if constexpr (ASYNC) {
-    if (some_keys) suffix_keys.ask(), suffix_keys.keep(b);  // while queries come
+    if (some_keys) {  // while queries come
+      pause(u32(clock64()), SUFFIX_PATIENCE);
+      __syncwarp();
+      suffix_keys.ask(), suffix_keys.keep(b);
+    }
+    if (for_suffix) arrive<SUFFIX_KEYS, 5>();
     if (some_values) suffix_values.ask(), suffix_values.keep(b);
     const u32 first_slot = b.slot;
     auto slot_of = [&](u32 i) { return first_slot + i < STAGES ? first_slot + i : first_slot + i - STAGES; };
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) take_slot(b);
-    const bool scores = scorer && b.warp() / 4 * 4 < tiles;
-    const int tile = scores ? min(b.warp(), tiles - 1) : 0;
-    const byte* const from = b.ring(slot_of(tile / SLOT_TILES)) + tile % SLOT_TILES * KEY_TILE;
+    const bool scores = !for_suffix && b.warp() / 4 * 4 <= tiles, its_suffix = b.warp() == tiles;
+    const byte* const from = b.warp() < tiles
+                                 ? b.ring(slot_of(b.warp() / SLOT_TILES)) + b.warp() % SLOT_TILES * KEY_TILE
+                                 : b.smem + M_X + X_KEYS;
+    if (its_suffix) sync<SUFFIX_KEYS, 5>();
     auto fetch = [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane()); };
     uint4 first[SCORE_CHUNK];
 #pragma unroll
@@ -212,11 +219,16 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) give_slot(b, slot_of(i));
     MARK(4)
-    if (scorer) {
-      weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16);
-      arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
+    if (b.warp() <= tiles) {
+      weigh_prefix(b, c, its_suffix ? KT : b.warp(), its_suffix ? suffix : prefix - b.warp() * 16);
+    } else if (b.warp() == TOPS_WARP) {
+      sync<TOPS, TOPS_WARPS>();
+      float2 top[NT];
+      load_tops(b, top);
+      send_by_token(b, top, X_TOPS, BAR_TOPS);
+    } else if (!for_suffix) {
+      arrive<TOPS, TOPS_WARPS>();
     }
-    if (for_suffix) of_suffix();
     show_to_products();
     consumers_sync();
   } else {
@@ -257,6 +269,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     float sums[NT * 4], out[CT][NT][4];
 #pragma unroll
     for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
+    if (b.warp() < NT) send_some_sums(b, b.warp(), tiles, suffix);
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) {
       const u32 slot = take_slot(b);
@@ -280,7 +293,6 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     for (int i = 0; i < NT * 4; ++i) out[0][i / 4][i % 4] = sums[i];
     prepare_outputs();
     send_outputs(out);
-    if (b.warp() == LEADER) send_sums(b, tiles, suffix);
   } else if constexpr (!HOLD) {
     float out[CT][NT][4];
     clear_out(out);
@@ -311,7 +323,8 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   const int qn = b.qn(), tile = b.warp() % imax(qn, 1), n = b.warp() / imax(qn, 1), token = n * 8 + 2 * b.t();
   const bool mine = b.warp() < qn * NT;
   float2 w[S];
-  const Everyone places(columns_place(b, M_ATT, b.q0() + tile, n)), bars(b.bar(BAR_ATT));
+  Everyone places, bars;
+  if (!COPY_ATTENTION) places = Everyone(columns_place(b, M_ATT, b.q0() + tile, n)), bars = Everyone(b.bar(BAR_ATT));
   receive(b, BAR_TOPS, b.n, TOPS_EXPECT, WAIT_TOPS);
   float2 highest = make_float2(LOWEST, LOWEST);
 #pragma unroll
@@ -343,7 +356,32 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       o.x += w[s].x * v.x, o.y += w[s].y * v.y, o.z += w[s].x * v.z, o.w += w[s].y * v.w;
     }
     const float x = __fdividef(1.0f, sum.x), y = __fdividef(1.0f, sum.y);
-    send_columns(b, places, bars, n, make_float4(o.x * x, o.y * y, o.z * x, o.w * y), true);
+    const float4 v = make_float4(o.x * x, o.y * y, o.z * x, o.w * y);
+    if constexpr (COPY_ATTENTION) {
+      const uint2 columns = columns_of(b, v);
+      byte* const p = b.smem + (columns_place(b, M_ATT, b.q0() + tile, n) - b.base);
+      if (FP8)
+        *(u32*)p = columns.x;
+      else
+        *(uint2*)p = columns;
+    } else {
+      send_columns(b, places, bars, n, v, true);
+    }
+  }
+  if constexpr (COPY_ATTENTION) {
+    consumers_sync();
+    if (b.warp() == COPY_WARP) {
+      if (b.lane() == 0) {
+        constexpr u32 BYTES = QTL * NT * OPERAND;
+        const u32 place = b.q0() * NT * OPERAND;
+        byte* const there = (byte*)(b.a.scratch + B_ATT) + size_t(b.cluster()) * QT * NT * OPERAND + place;
+        show_to_products();
+        bulk_store(there, b.base + M_ATT + place, BYTES);
+        await_stored();
+        load_for_all(b.base + M_ATT + place, there, BYTES, b.bar(BAR_ATT));
+      }
+      __syncwarp();
+    }
   }
   MARK(9)
   // A rank without queries has nothing to send now, but what has come may not land over the stream that comes next.

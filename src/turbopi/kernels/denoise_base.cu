@@ -47,7 +47,7 @@ constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
 // Clock cycles before sums are asked for: polls slow down what they wait for.
-constexpr u32 PATIENCE = FEW ? 500 : FP8 ? 450 : 600;
+constexpr u32 PATIENCE = FEW ? 500 : FP8 ? 300 : 600;
 constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see denoise_spread.cu
 constexpr int OWN_N = most(NT, NC);        // if so: 8 tokens of the slice at a time, which a CTA looks after
 constexpr int ITEMS_X = most(SPREAD ? DX * OWN_N : DX * NT, W);  // (tile, 8 tokens) that one warp looks after
@@ -135,10 +135,11 @@ constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);
 constexpr int XS_PART = A > 32 ? 512 : 0, XS_ITEM = imax(XS_PART + A * 32, 512);  // over the item, if read at once
 // If SPREAD, region X holds everything, as each exchange waits until all ranks are done with what lay there: attention
 // and queries behind qkv's sums, hidden units over the stream with the feed-forward's partial sums behind them.
-// Attention comes when the suffix's partial logits are no longer needed.
+// Attention comes when the suffix's partial logits, or keys, are no longer needed.
 constexpr int X_ATT = up128(imax(X_SUFFIX + 2 * SUFFIX * RS,
                                  imax(plan_partials(QKV), plan_others(DX)) * PARTIAL)),
-              X_Q = X_ATT + imax(QT * OPERAND, 3 * 256) * NT, X_FF_SUMS = HC * NT * OPERAND;
+              X_KEYS = X_ATT + QTL * NT * 256,  // of the suffix, as a tile: behind queries that still leave
+              X_Q = imax(X_ATT + imax(QT * OPERAND, 3 * 256) * NT, X_KEYS + KEY_TILE), X_FF_SUMS = HC * NT * OPERAND;
 constexpr int X_SUFFIX_SUMS = SPREAD ? X_ATT : X_SUFFIX_SUMS_FEW;
 // Behind them float32 at a step's end: partial sums of v_t [S][V_PARTS][OWN_T][A], the slice [DX * 16][OWN_T], x_t.
 constexpr int OWN_T = OWN_N * 8, V_PARTS = imax(CONSUMERS / A / OWN_T, 1);  // tokens whose x_t a CTA knows
@@ -188,10 +189,15 @@ constexpr int SUMS_SIZE = up128(imax(plan_others(GTL), plan_others(DX)) * PARTIA
 constexpr bool APART = !SPREAD && plan_stages(M_SUMS) == plan_stages(M_SUMS + SUMS_SIZE);
 constexpr int M_RING = SPREAD ? M_H : M_SUMS + (APART ? SUMS_SIZE : 0);
 constexpr int STAGES = SPREAD ? SPREAD_STAGES : plan_stages(M_RING);
-// Many tokens' hidden units in E4M3 go to other ranks by the copy engine, a block of two tiles at a time: by sends they
-// would go in 8 bytes each. Where the warps of two tiles are four, and a block has one rank.
-constexpr bool COPY_HIDDEN =
-    SPREAD && FP8 && F16 % NC == 0 && 2 * HC % S == 0 && GTL % 2 == 0 && GTL <= 8 && group_parts(GTL) == 2;
+// All ranks' shares of queries, attention or hidden units are wanted by all ranks. CTAs take 18 bytes a cycle from each
+// other, however they are sent, but far more from L2. So of many tokens a share goes into L2 and from there, by one
+// multicast, to all ranks (see `bulk_store`): where its way there and back, a microsecond, is won by that.
+constexpr bool EVEN_HEAD = SPREAD && QT % S == 0;
+constexpr bool COPY_QUERIES = EVEN_HEAD && NT >= (FP8 ? 5 : 6), COPY_ATTENTION = EVEN_HEAD && !FP8 && NT >= 6;
+// A block of two tiles at a time, where four warps have made it.
+constexpr bool COPY_HIDDEN = SPREAD && (FP8 || NT >= 5) && F16 % NC == 0 && 2 * HC % S == 0 && GTL % 2 == 0 &&
+                             GTL <= 8 && group_parts(GTL) == 2;
+constexpr int COPY_WARP = 7;  // has none of the keys and values that others have just published: its fence needn't wait
 constexpr int X_OWN_HIDDEN = X_OWN_V;  // of a rank, before they are sent
 static_assert(!COPY_HIDDEN || X_OWN_HIDDEN + GTL / 2 * NT * OPERAND <= X_SIZE, "room for a rank's hidden units");
 static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little shared memory");
@@ -199,23 +205,34 @@ static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little sha
 // ring: full and empty, by slot
 enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };
 // if SPREAD: region X read by all warps here, by all ranks; the stream multiplied by all ranks
-enum SpreadBarrier { BAR_DONE = BAR_RING + 2 * 7, BAR_FREE, BAR_ROOM };
+enum SpreadBarrier { BAR_DONE = BAR_RING + 2 * 7, BAR_FREE, BAR_ROOM, BAR_HERE, BAR_SQUARES };
 
 // ---- scratch in global memory, in 16-byte words
 
 // Partial sums of the stream, of all clusters: float16, for half the bytes that polls read. A lane's four of two
-// clusters lie side by side; a word's lowest bit, the flag, is that of every other number.
+// clusters lie side by side; a word's lowest bit, the flag, is that of every other number. If SPREAD a cluster's lie
+// together, for sectors of L2 that are half written cost as much as whole ones.
 constexpr int PAIRS = most(NC, 2);
 constexpr size_t N_STREAM = size_t(D16) * NT * PAIRS * 32;
 // Keeps them within float16's range; sums of E4M3 numbers lack their scales yet.
 constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;
 constexpr size_t N_KV = size_t(T) * HD / 2;              // suffix keys and values, float32[T][2 HD]
 constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM;
-// If SPREAD: the stream as products take it, sums of squares float32[S][NT * 8], both twice; flags u32[S][32].
+// If SPREAD: the stream as products take it, four times, and sums of squares float32[S][NT * 8], twice; a word of each
+// CTA, which nobody reads; shares on their way to all ranks.
+constexpr u32 STAGED = 4;
 constexpr size_t N_STAGE = size_t(D16) * NT * (OPERAND / 16), N_SQUARES = size_t(S) * NT * 2;
-constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_SQUARES = B_STAGE + 2 * N_STAGE, B_FLAGS = B_SQUARES + 2 * N_SQUARES;
-constexpr size_t SCRATCH = SPREAD ? B_FLAGS + S * 8 : B_STAGE;
+constexpr size_t N_HEAD = size_t(NC) * QT * NT, N_HIDDEN = size_t(NC) * HC * NT * (OPERAND / 16);
+constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_SQUARES = B_STAGE + STAGED * N_STAGE;
+constexpr size_t B_ORDER = B_SQUARES + 2 * N_SQUARES, B_HIDDEN = B_ORDER + NC * S, B_QUERIES = B_HIDDEN + N_HIDDEN,
+                 B_ATT = B_QUERIES + N_HEAD * 16, SCRATCH = SPREAD ? B_ATT + N_HEAD * (OPERAND / 16) : B_STAGE;
 static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");
+// Stands where a word of the staged stream is still to come. Nothing is rounded to it: the NaN made then is another.
+constexpr u32 ABSENT = ~0u;
+// Whether there is the token whose 8 columns (E4M3: 16) word i of a staged slice has.
+__device__ __forceinline__ bool word_exists(int i) {
+  return T % 8 == 0 || i / (OPERAND / 16) % NT * 8 + i % 8 < T;
+}
 
 struct Args {
   const byte* weights;      // fragments [L][layer_bytes], a CTA's in the order in which it uses them

@@ -136,10 +136,11 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     barrier_init(b.bar(BAR_GO), S), barrier_init(b.bar(BAR_RMS), 1);
     if constexpr (SPREAD) {
       barrier_init(b.bar(BAR_DONE), W), barrier_init(b.bar(BAR_FREE), S);
-      barrier_init(b.bar(BAR_ROOM), S);
+      barrier_init(b.bar(BAR_ROOM), S), barrier_init(b.bar(BAR_HERE), W), barrier_init(b.bar(BAR_SQUARES), 1);
     }
     asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     barrier_expect(b.bar(BAR_X), X_EXPECT);
+    if (SPREAD) barrier_expect(b.bar(BAR_SQUARES), SQUARES_EXPECT);
     barrier_expect(b.bar(BAR_Q), Q_EXPECT);
     barrier_expect(b.bar(BAR_TOPS), TOPS_EXPECT);
     barrier_expect(b.bar(BAR_COMB), outputs_expect(b));

@@ -122,11 +122,23 @@ __device__ __forceinline__ void bulk_load(u32 to, const void* from, u32 bytes, u
       : "memory");
 }
 
-// From this CTA's shared memory to a rank's.
-__device__ __forceinline__ void bulk_send(u32 to, u32 from, u32 bytes, u32 bar) {
-  asm volatile("cp.async.bulk.shared::cluster.shared::cta.mbarrier::complete_tx::bytes [%0], [%1], %2, [%3];" ::"r"(to),
-               "r"(from), "r"(bytes), "r"(bar)
+// From shared memory to L2; until all that this thread has sent so is there.
+__device__ __forceinline__ void bulk_store(void* to, u32 from, u32 bytes) {
+  asm volatile("cp.async.bulk.global.shared::cta.bulk_group [%0], [%1], %2;" ::"l"(to), "r"(from), "r"(bytes)
                : "memory");
+}
+__device__ __forceinline__ void await_stored() {
+  asm volatile("cp.async.bulk.commit_group;" ::: "memory");
+  asm volatile("cp.async.bulk.wait_group 0;" ::: "memory");
+  asm volatile("fence.proxy.async.global;" ::: "memory");
+}
+// `bytes` from L2 to the same place of all ranks, counted in by `bar` of each.
+__device__ __forceinline__ void load_for_all(u32 to, const void* from, u32 bytes, u32 bar) {
+  asm volatile(
+      "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster "
+      "[%0], [%1], %2, [%3], %4;" ::"r"(to),
+      "l"(from), "r"(bytes), "r"(bar), "h"((unsigned short)((1 << S) - 1))
+      : "memory");
 }
 
 // Words through L2 whose lowest bit is their flag. Use n of a double buffer carries bit `flag(n)`: 1, 1, 0, 0, 1, ...
@@ -140,6 +152,11 @@ __device__ __forceinline__ uint4 peek(const uint4* p) {
                : "memory");
   return v;
 }
+__device__ __forceinline__ uint2 peek(const uint2* p) {
+  uint2 v;
+  asm volatile("ld.relaxed.gpu.global.v2.u32 {%0, %1}, [%2];" : "=r"(v.x), "=r"(v.y) : "l"(p) : "memory");
+  return v;
+}
 // The bits in which a word differs, and those of `others`: one instruction, where the compiler makes four of `missing`.
 __device__ __forceinline__ u32 differing(u32 word, u32 bit, u32 others) {
   u32 v;
@@ -148,6 +165,12 @@ __device__ __forceinline__ u32 differing(u32 word, u32 bit, u32 others) {
 }
 __device__ __forceinline__ bool missing(uint4 v, u32 bit) {
   return differing(v.x, bit, differing(v.y, bit, differing(v.z, bit, v.w ^ bit))) & 1;
+}
+__device__ __forceinline__ void put(void* p, u32 v) {
+  asm volatile("st.relaxed.gpu.global.u32 [%0], %1;" ::"l"(p), "r"(v) : "memory");
+}
+__device__ __forceinline__ void put(void* p, uint2 v) {
+  asm volatile("st.relaxed.gpu.global.v2.u32 [%0], {%1, %2};" ::"l"(p), "r"(v.x), "r"(v.y) : "memory");
 }
 __device__ __forceinline__ void publish(float* p, float v, u32 bit) {
   asm volatile("st.relaxed.gpu.global.u32 [%0], %1;" ::"l"(p), "r"(flagged(v, bit)) : "memory");

@@ -100,7 +100,11 @@ struct Producer {
 // has been used yet.
 extern "C" __global__ void __launch_bounds__(256) turbopi_denoise_prepare(const __grid_constant__ Args a) {
   const int first = blockIdx.x * 256 + threadIdx.x;
-  for (size_t at = first; at < SCRATCH; at += size_t(gridDim.x) * 256) a.scratch[at] = make_uint4(0, 0, 0, 0);
+  for (size_t at = first; at < SCRATCH; at += size_t(gridDim.x) * 256) {
+    const bool absent = SPREAD && at >= B_STAGE && at < B_SQUARES && word_exists(int(at - B_STAGE));
+    const u32 v = absent ? ABSENT : 0;
+    a.scratch[at] = make_uint4(v, v, v, v);
+  }
   const int l = blockIdx.x / KEY_TILES, tile = blockIdx.x % KEY_TILES, length = int(*a.length);
   if (tile * 16 >= length) return;
   typedef unsigned short half;

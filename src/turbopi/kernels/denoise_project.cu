@@ -166,6 +166,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     if (FP8) scale[j] = make_float2(__ldg(row_scales + tile * 16 + b.g()), __ldg(row_scales + tile * 16 + b.g() + 8));
   }
   auto await_stream = [&] {
+    if constexpr (SPREAD) note(b, WAIT_X), await_slice(b);
     receive(b, BAR_X, b.x_parity(0), X_EXPECT, WAIT_X);
     MARK(0)
   };
@@ -190,7 +191,8 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   }
   consumers_sync();
   if (b.thread < NT * 8) ((int*)(b.smem + M_PART))[b.thread] = ordered(LOWEST);  // for `weigh_prefix`
-  byte* const staged = b.smem + M_ATT;  // free until all have what attention sends: [item][half][8 tokens][8]
+  // Free until all have what attention sends: [item][half][8 tokens][8], or COPY_QUERIES [half][tile][NT][8 tokens][8].
+  byte* const staged = b.smem + M_ATT;
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
     const int i = b.warp() + j * W, k = i - qn * NT;
@@ -200,6 +202,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
                                : k / kvn,
                 kv_tile = KVL == 1 ? 0 : k % kvn, token = n * 8 + 2 * b.t();
       const int at = k < 0 ? i % qn : qn + kv_tile;
+      constexpr int OTHER_HALF = COPY_QUERIES ? QTL * NT * 64 : 64;
       float4 c = MMA_QKV ? QkvProduct::total(b, b.smem + M_X, at, n) : total<QKV>(b, b.smem + M_X, at, n);
       if (FP8) c = scaled(c, scale[j]);
       const float2 r = inverse_rms(b, token, 0);
@@ -212,9 +215,10 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
                   s1 = c1 * v.x + c0 * v.y;
       if (k < 0) {
         const u32 f = pack(f0, f1), s = pack(s0, s1);
-        unsigned short* p = (unsigned short*)(staged + i * 256 + b.t() * 32) + b.g();
+        const int place = COPY_QUERIES ? (at * NT + n) * 128 : i * 256;
+        unsigned short* p = (unsigned short*)(staged + place + b.t() * 32) + b.g();
         p[0] = (unsigned short)f, p[8] = (unsigned short)(f >> 16);
-        p[64] = (unsigned short)s, p[72] = (unsigned short)(s >> 16);
+        p[OTHER_HALF] = (unsigned short)s, p[OTHER_HALF + 8] = (unsigned short)(s >> 16);
       } else {
         const int tile = b.kv0() + kv_tile, col = tile < QT ? tile * 8 + b.g() : HD + (tile - QT) * 16 + b.g(),
                   up = tile < QT ? HD / 2 : 8;
@@ -230,6 +234,27 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     consumers_arrive();
   else
     consumers_sync();
+  if constexpr (COPY_QUERIES) {
+    if (b.warp() == COPY_WARP) {
+      constexpr u32 BYTES = QTL * NT * 128;  // of each half of the head's columns
+      const u32 place = b.q0() * NT * 128;
+      byte* const there = (byte*)(b.a.scratch + B_QUERIES) + size_t(b.cluster()) * 2 * QT * NT * 128 + place;
+      if (b.lane() == 0) {
+        show_to_products();
+        bulk_store(there, b.base + M_ATT, BYTES), bulk_store(there + QT * NT * 128, b.base + M_ATT + BYTES, BYTES);
+        await_stored();
+      }
+      __syncwarp();
+      await_room(b);
+      if (b.lane() == 0) {
+        load_for_all(b.base + M_Q + place, there, BYTES, b.bar(BAR_Q));
+        load_for_all(b.base + M_Q + place + QT * NT * 128, there + QT * NT * 128, BYTES, b.bar(BAR_Q));
+      }
+      __syncwarp();
+    }
+    ++b.room;
+    return;
+  }
   if constexpr (SPREAD) await_room(b), ++b.room;
   static_assert(S == 8, "half a warp serves half of the ranks");
 #pragma unroll
@@ -249,4 +274,4 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   }
   if (IDLE_Q && b.thread < S) send(at_rank(b.base + M_TOKEN, b.thread), 0, at_rank(b.bar(BAR_Q), b.thread));
 }
-constexpr u32 Q_EXPECT = HD * T * 2 + (IDLE_Q ? S * 4 : 0);
+constexpr u32 Q_EXPECT = HD * (COPY_QUERIES ? NT * 8 : T) * 2 + (IDLE_Q ? S * 4 : 0);

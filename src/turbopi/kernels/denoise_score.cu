@@ -5,7 +5,8 @@
 // If tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries
 // and weights; else all warps weigh, and the third warpgroup fetches the suffix's values. Queries of many tokens are
 // more than shared memory can bring to each warp by itself (ASYNC): a warpgroup's products share them, with keys or
-// values in registers.
+// values in registers. Warps without a tile multiply all the same, so there the suffix's keys, which the last four only
+// fetch, are the tile behind the prefix's, and one maximum is over all.
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
 constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES;  // scored and weighed by wgmma
@@ -13,8 +14,11 @@ constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES; 
 constexpr int HELD_KEYS = QT < 12 ? QT : 12, HELD_TILES = KT < 4 ? KT : 4;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
 constexpr int SUFFIX_STEPS = most(QT, 4);                                   // blocks of columns of a suffix warp
+constexpr int TOPS_WARPS = ASYNC ? SUFFIX_WARP : SCORERS, TOPS_WARP = SUFFIX_WARP - 1;  // ASYNC: who sends them
+// Clock cycles before the suffix's keys are asked for, if ASYNC: asked for too early they come later.
+constexpr u32 SUFFIX_PATIENCE = 400;
 // Barriers of some warps; 1 is consumers_sync's.
-constexpr int TOPS = 2, SUFFIX_SUMS = 3, WEIGHTS = 4, WEIGHTS_FOR_SUFFIX = 5, SUFFIX_WEIGHTS = 6;
+constexpr int TOPS = 2, SUFFIX_SUMS = 3, SUFFIX_KEYS = 3, WEIGHTS = 4, WEIGHTS_FOR_SUFFIX = 5, SUFFIX_WEIGHTS = 6;
 
 // A lane's address for `mma_tokens` in activations [block][half][NT][8 tokens][8 columns], standard order.
 __device__ __forceinline__ u32 token_address(const Block& b, u32 region) {
@@ -112,14 +116,21 @@ struct SuffixPart {
       again = __any_sync(~0u, again);
     }
 #pragma unroll
-    for (int i = 0; i < MOST; ++i)
-      *(uint2*)(b.smem + M_X + X_SUFFIX + (kind * SUFFIX + item(i) / quads) * RS + (first + item(i) % quads) * 8) =
-          make_uint2(pack(__uint_as_float(v[i].x), __uint_as_float(v[i].y)),
-                     pack(__uint_as_float(v[i].z), __uint_as_float(v[i].w)));
+    for (int i = 0; i < MOST; ++i) {
+      const int row = item(i) / quads, quad = first + item(i) % quads;
+      const uint2 four = make_uint2(pack(__uint_as_float(v[i].x), __uint_as_float(v[i].y)),
+                                    pack(__uint_as_float(v[i].z), __uint_as_float(v[i].w)));
+      if (ASYNC && kind == 0) {  // as `turbopi_denoise_prepare` has a tile of keys
+        byte* const p = b.smem + M_X + X_KEYS + quad / 4 * FRAGMENT + (row * 4 + quad % 2 * 2) * 16 + quad / 2 % 2 * 8;
+        *(u32*)p = four.x, *(u32*)(p + 16) = four.y;
+      } else {
+        *(uint2*)(b.smem + M_X + X_SUFFIX + (kind * SUFFIX + row) * RS + quad * 8) = four;
+      }
+    }
   }
 };
 
-// Logits of the rank's suffix keys, by the last four warps; SUFFIX_WARP gets them.
+// Logits of the rank's suffix keys, by the last four warps; SUFFIX_WARP gets them. (Not if ASYNC.)
 __device__ __forceinline__ void score_suffix(const Block& b, int count, float (&c)[NT][4]) {
   const int part = b.warp() - SUFFIX_WARP, first = share(QT, 4, part), steps = share(QT, 4, part + 1) - first;
   const u32 from = b.base + M_X + X_SUFFIX + min(b.lane() & 7, count - 1) * RS + first * 32 + (b.lane() >> 4) * 16;
@@ -179,7 +190,7 @@ __device__ __forceinline__ void store_weights(const Block& b, const float (&c)[N
       *(u32*)(p + n * 128 + i * 16) = pack(exp2_approx(c[n][i] - at), exp2_approx(c[n][i + 2] - at));
     }
 }
-// The largest logits of the rank's prefix.
+// The largest logits of the rank's prefix (ASYNC: of all its keys).
 __device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT]) {
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
@@ -187,7 +198,7 @@ __device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT]) {
     top[n] = make_float2(__int_as_float(ordered(v.x)), __int_as_float(ordered(v.y)));
   }
 }
-// Scoring warps: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist.
+// Warps that score: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist.
 template <int R>
 __device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4], int tile, int rows) {
   float2 top[NT];
@@ -198,7 +209,7 @@ __device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4
       if (b.g() < 2)
         atomicMax((int*)(b.smem + M_PART) + n * 8 + 2 * b.t() + b.g(), ordered(b.g() ? top[n].y : top[n].x));
   }
-  sync<TOPS, SCORERS>();
+  sync<TOPS, TOPS_WARPS>();
   load_tops(b, top);
 #pragma unroll
   for (int r = 0; r < R; ++r)
@@ -212,13 +223,13 @@ __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[
   for (int n = 0; n < NT; ++n)
     if (n * 8 + 2 * b.t() < T) send(to + n * 32, __float_as_uint(v[n].x), __float_as_uint(v[n].y), at);
 }
-constexpr u32 ATT_EXPECT = HD * T * (OPERAND / 128) + (IDLE_Q ? S * 4 : 0);
+constexpr u32 ATT_EXPECT = HD * (COPY_ATTENTION ? NT * 8 : T) * (OPERAND / 128) + (IDLE_Q ? S * 4 : 0);
 constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
 __device__ __forceinline__ u32 outputs_expect(const Block& b) {
   return S * ((T + 1) / 2) * 8 + S * b.qn() * ((T + 1) / 2) * (OUTPUT / 4);
 }
-// The suffix's keys come last. Their weights go by the prefix's largest logits, too, unless theirs are so much larger
-// (2^64) that the prefix's weights count for nothing: then those are dropped, which `X_KEEP` says.
+// The suffix's keys come last (not if ASYNC). Their weights go by the prefix's largest logits, too, unless theirs are
+// so much larger (2^64) that the prefix's weights count for nothing: then those are dropped, which `X_KEEP` says.
 __device__ __forceinline__ void weigh_suffix(const Block& b, float (&c)[1][NT][4], int rows) {
   float2 own[NT], top[NT];
   scale_logits(b, c, rows, own);
@@ -241,7 +252,26 @@ __device__ __forceinline__ void keep_prefix(const Block& b, float (&c)[NT][4]) {
     c[n][0] *= keep.x, c[n][1] *= keep.y, c[n][2] *= keep.x, c[n][3] *= keep.y;
   }
 }
-// The sums of the weights, as rounded: a product with ones.
+// The sums of the weights of 8 tokens, as rounded: a product with ones.
+__device__ __forceinline__ void send_some_sums(const Block& b, int n, int tiles, int suffix) {
+  float c[4] = {0, 0, 0, 0};
+  const u32 one = 0x3f803f80;
+  const u32 from = b.base + M_X + X_P + ((b.lane() >> 3) * NT + n) * 128 + (b.lane() & 7) * 16;
+  auto add = [&](int tile, bool both) {
+    uint4 v;
+    ldmatrix(v, from + tile * NT * 256);
+    mma(c, make_uint4(one, one, one, one), make_uint2(v.x, v.y));
+    if (both) mma(c, make_uint4(one, one, one, one), make_uint2(v.z, v.w));
+  };
+#pragma unroll
+  for (int tile = 0; tile < KT; tile += 2)
+    if (tile < tiles) add(tile, tile + 1 < tiles);
+  if (suffix > 0) add(KT, false);
+  const u32 to = at_rank(b.base + M_X + X_SUMS + ((b.rank() * NT + n) * 8 + 2 * b.t()) * 4, b.g());
+  if (n * 8 + 2 * b.t() < T)
+    send(to, __float_as_uint(c[0]), __float_as_uint(c[1]), at_rank(b.bar(BAR_COMB), b.g()));
+}
+// The same of all tokens, by one warp.
 __device__ __forceinline__ void send_sums(const Block& b, int tiles, int suffix) {
   float c[NT][4];
   clear(c);

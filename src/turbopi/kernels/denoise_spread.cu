@@ -4,8 +4,8 @@
 // If tokens are few, every cluster keeps the whole stream: each CTA adds up its slice for all tokens, and the ranks
 // send their slices to each other. With more tokens the bytes of both cost more than another hop through L2. Then CTA
 // (cluster, rank) keeps its rank's slice of tokens 8 cluster.. (and 8 (cluster + NC)..) alone, adds up for those, and
-// puts what the next products take into L2, behind it a flag. Of each cluster a spare warp of rank r fetches slice r as
-// soon as all its flags are there, and the copy engine writes it to all ranks at once.
+// puts what the next products take into L2. Of each cluster rank r asks for slice r until all of it is there, then a
+// spare warp fetches it, and the copy engine writes it to all ranks at once.
 
 // An item is (tile, 8 tokens); lane (g, t) has columns 2g, 2g + 1 of tokens 2t, 2t + 1 of it, as x y (first column) and
 // z w (second). A warp keeps its items in registers for good.
@@ -76,29 +76,26 @@ __device__ __forceinline__ float slice_squares(const Block& b, int token) {
     sum += *(const float*)(b.smem + M_PART + ((token / 8 * DX + tile) * 8 + token % 8) * 4);
   return sum;
 }
-// What this CTA keeps of the stream, times the next norm's scale, to L2 as products take it, and flags, which say how
-// many times that has been done; the slice's sums of squares meanwhile, with flags of their own in their lowest bits.
+// What this CTA keeps of the stream, times the next norm's scale, to L2 as products take it; behind it the slice's sums
+// of squares, with flags in their lowest bits. A flag for the stream would need a fence before it, of 1,100 to 1,800
+// cycles: instead its words themselves say whether they are there. Those of the turn before are ABSENT again, as all
+// clusters have read them: what was published now follows sums that they made of them.
 __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS_X], const float2 (&scales)[ITEMS_X]) {
-  byte* const to = (byte*)(b.a.scratch + B_STAGE + (b.turn & 1) * N_STAGE);
+  auto stage = [&](u32 turn) { return (byte*)(b.a.scratch + B_STAGE + turn % STAGED * N_STAGE); };
+  byte *const to = stage(b.turn), *const last = stage(b.turn + STAGED - 1);
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
     const int place = (b.x0() + item.tile) * NT + item.n, token = 2 * b.t() + (b.g() & 1);
     const uint2 columns = columns_of(b, scaled(x[j], scales[j]));
+    const int at = FP8 ? place * OPERAND + token * 16 + (b.g() >> 1) * 4
+                       : place * OPERAND + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8;
     if (item.real && item.n * 8 + token < T) {
       if (FP8)
-        *(u32*)(to + place * OPERAND + token * 16 + (b.g() >> 1) * 4) = columns.x;
+        put(to + at, columns.x), put(last + at, ABSENT);
       else
-        *(uint2*)(to + place * OPERAND + (b.g() >> 2) * 128 + token * 16 + (b.g() >> 1 & 1) * 8) = columns;
+        put(to + at, columns), put(last + at, make_uint2(ABSENT, ABSENT));
     }
-  }
-  consumers_sync();
-  if (b.warp() == W - 1) {  // which mostly has no item: the fence waits for all stores
-    u32* const flags = (u32*)(b.a.scratch + B_FLAGS) + b.rank() * 32;
-#pragma unroll
-    for (int k = 0; k < OWN_N; ++k)
-      if (const int n = b.cluster() + k * NC; n < NT && b.lane() == 0)  // behind what the barrier above was behind of
-        asm volatile("st.release.gpu.global.u32 [%0], %1;" ::"l"(flags + n), "r"(b.turn + 1) : "memory");
   }
   constexpr int KEEPERS = imin(DX * OWN_N, W);
   if (b.warp() < KEEPERS) {
@@ -114,30 +111,38 @@ __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS
   ++b.turn;
 }
 
-// `bytes` from L2 to the same place of all ranks, counted in by `bar` of each.
-__device__ __forceinline__ void load_for_all(u32 to, const void* from, u32 bytes, u32 bar) {
-  asm volatile(
-      "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster "
-      "[%0], [%1], %2, [%3], %4;" ::"r"(to),
-      "l"(from), "r"(bytes), "r"(bar), "h"((unsigned short)((1 << S) - 1))
-      : "memory");
+// The warps that multiply: until the slice of the stream that was published last is in L2, all of it. One question at a
+// time: more of them slow down what they ask for.
+__device__ __forceinline__ void await_slice(const Block& b) {
+  constexpr int WORDS = OPERAND / 16, MOST = most(DX * NT * WORDS, CONSUMERS);
+  const uint4* const from = b.a.scratch + B_STAGE + (b.turn - 1) % STAGED * N_STAGE + b.x0() * NT * WORDS;
+  const uint4* words[MOST];  // in the place of those that are never written the first one
+  uint4 v[MOST];
+#pragma unroll
+  for (int k = 0; k < MOST; ++k) {
+    const int i = b.thread + k * CONSUMERS;
+    words[k] = from + (i < b.xn() * NT * WORDS && word_exists(i) ? i : 0);
+    v[k] = peek(words[k]);
+  }
+#pragma unroll 1
+  for (bool again = true; again;) {
+    again = false;
+#pragma unroll
+    for (int k = 0; k < MOST; ++k)
+      if (max(max(v[k].x, v[k].y), max(v[k].z, v[k].w)) == ABSENT) v[k] = peek(words[k]), again = true;
+    again = __any_sync(~0u, again);
+  }
+  if (b.lane() == 0) barrier_arrive(b.bar(BAR_HERE));
 }
-
-// All lanes: until all clusters have published slice and squares, use `turn`. Answers take long, so three questions are
-// on their way at any time.
-__device__ __forceinline__ void await_slice(const Block& b, u32 turn) {
-  const u32* const flags = (const u32*)(b.a.scratch + B_FLAGS) + b.rank() * 32 + imin(b.lane(), NT - 1);
-  const uint2* const squares = (const uint2*)(b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES) + b.rank() * NT * 4 +
-                               imin(b.lane(), NT * 4 - 1);
-  u32 turns[3];
+// All lanes of a spare warp: until the slice's sums of squares, use `turn`, are. Answers take long, so three questions
+// are on their way at any time.
+__device__ __forceinline__ void await_squares(const Block& b, u32 turn) {
+  const uint2* const from = (const uint2*)(b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES) + b.rank() * NT * 4 +
+                            imin(b.lane(), NT * 4 - 1);
   uint2 q[3];
-  auto ask = [&](int i) {
-    asm volatile("ld.relaxed.gpu.global.u32 %0, [%1];" : "=r"(turns[i]) : "l"(flags) : "memory");
-    asm volatile("ld.relaxed.gpu.global.v2.u32 {%0, %1}, [%2];" : "=r"(q[i].x), "=r"(q[i].y) : "l"(squares) : "memory");
-  };
 #pragma unroll
   for (int i = 0; i < 3; ++i) {
-    ask(i);
+    q[i] = peek(from);
     if (i < 2) pause(u32(clock64()), 150);
   }
 #pragma unroll 1
@@ -145,13 +150,12 @@ __device__ __forceinline__ void await_slice(const Block& b, u32 turn) {
 #pragma unroll
     for (int i = 0; i < 3; ++i)
       if (!here) {
-        const u32 bit = flag(turn), missing = differing(q[i].x, bit, q[i].y ^ bit) & 1;
-        here = __all_sync(~0u, int(turns[i] - turn) > 0 && !missing);
-        if (!here) ask(i);
+        here = __all_sync(~0u, !(differing(q[i].x, flag(turn), q[i].y ^ flag(turn)) & 1));
+        if (!here) q[i] = peek(from);
       }
 }
-// A spare warp. Buffers in L2 are free when their turn comes again: who writes them has sums, made of what came after,
-// of all clusters that read them. The flags need no acquire: the copy engine reads L2, and only when they are seen.
+// A spare warp. The copy engine reads L2, as those did who have seen that the slice is there, and only then. Sums of
+// squares have a barrier of their own, as they come later and are needed later.
 __device__ __forceinline__ void fetch_stream(const Block& b) {
   const u32 place = b.x0() * NT, items = b.xn() * NT;
   u32 uses = 0, turn = 0;
@@ -163,18 +167,25 @@ __device__ __forceinline__ void fetch_stream(const Block& b) {
       barrier_wait(b.bar(BAR_DONE), uses & 1);
       __syncwarp();
       if (b.lane() < S) arrive_at(at_rank(b.bar(BAR_FREE), b.lane()));
-      barrier_wait(b.bar(BAR_FREE), uses++ & 1);
+      barrier_wait(b.bar(BAR_FREE), uses & 1);
       __syncwarp();
-      await_slice(b, turn);
+      barrier_wait(b.bar(BAR_HERE), uses++ & 1);
       asm volatile("fence.proxy.async.global;" ::: "memory");
       __syncwarp();
-      if (b.lane() == 0) {
-        const uint4* const squares = b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES + b.rank() * NT * 2;
-        const uint4* const from = b.a.scratch + B_STAGE + (turn & 1) * N_STAGE;
-        if (items > 0)
-          load_for_all(b.base + M_X + place * OPERAND, from + place * (OPERAND / 16), items * OPERAND, b.bar(BAR_X));
-        load_for_all(b.base + M_SSQ + b.rank() * NT * 32, squares, NT * 32, b.bar(BAR_X));
-      }
+      if (b.lane() == 0 && items > 0)
+        load_for_all(b.base + M_X + place * OPERAND,
+                     b.a.scratch + B_STAGE + turn % STAGED * N_STAGE + place * (OPERAND / 16), items * OPERAND,
+                     b.bar(BAR_X));
+      await_squares(b, turn);
+      asm volatile("fence.proxy.async.global;" ::: "memory");
+      __syncwarp();
+      if (b.lane() == 0)
+        load_for_all(b.base + M_SSQ + b.rank() * NT * 32,
+                     b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES + b.rank() * NT * 2, NT * 32, b.bar(BAR_SQUARES));
+      // A release whose word nobody reads: what is ABSENT now is so in L2 before this warp fetches again, and so before
+      // this CTA publishes again, three turns before anybody asks for it.
+      if (b.lane() == 0)
+        asm volatile("st.release.gpu.global.u32 [%0], %1;" ::"l"(b.a.scratch + B_ORDER + b.cta), "r"(turn) : "memory");
       if (i == 2 * L - 1) {  // what the end of the step needs, to L2
 #pragma unroll 1
         for (int at = b.lane() * 32; at < b.xn() * 16 * A; at += 32 * 32) {

@@ -52,7 +52,8 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
   const int uses = b.a.steps * L * (b.attends() ? 2 : 1);
 #pragma unroll 1
   for (int use = 0; use < uses; ++use) {
-    barrier_wait(b.bar(BAR_X), use & 1);
+    barrier_wait(b.bar(SPREAD ? int(BAR_SQUARES) : int(BAR_X)), use & 1);
+    if (SPREAD && b.lane() == 0) barrier_expect(b.bar(BAR_SQUARES), SQUARES_EXPECT);
     constexpr int LANES = imax(32 / (NT * 8), 1), TOKENS = 32 / LANES;  // lanes of a token, tokens at once
 #pragma unroll 1
     for (int token = b.lane() % TOKENS; token < NT * 8; token += 32) {
@@ -68,7 +69,7 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
     if (b.lane() == 0) barrier_arrive(b.bar(BAR_RMS));
   }
 }
-constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * (OPERAND / 8) + SQUARES_EXPECT;
+constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * (OPERAND / 8) + (SPREAD ? 0 : SQUARES_EXPECT);
 
 // A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
 __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X], const float* row) {
@@ -116,6 +117,32 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
   }
 }
 
+// The same if SPREAD, where a word is of one cluster: `parts` of them, without what comes before `from`.
+constexpr int FETCH_SINGLY = imin(NH, 8);
+__device__ __forceinline__ void take_singly(float4& sum, const uint2* p, int from, int parts, u32 bit, bool real) {
+  constexpr int N = FETCH_SINGLY;
+  const int first = min(from, max(parts - N, 0));
+  uint2 v[N];
+  auto ask = [&](int i) { v[i] = peek(p + (first + i) * 32); };
+#pragma unroll
+  for (int i = 0; i < N; ++i) ask(i);
+#pragma unroll 1
+  for (;;) {
+    u32 missing[N], any = 0;
+#pragma unroll
+    for (int i = 0; i < N; ++i) missing[i] = differing(v[i].x, bit, v[i].y ^ bit), any |= missing[i];
+    if (!__any_sync(~0u, real && any & 1)) break;
+#pragma unroll
+    for (int i = 0; i < N; ++i)
+      if (missing[i] & 1) ask(i);
+  }
+#pragma unroll
+  for (int i = 0; i < N; ++i)
+    if (first + i >= from) {
+      const float2 a = unpack_half(v[i].x), c = unpack_half(v[i].y);
+      sum.x += a.x, sum.y += a.y, sum.z += c.x, sum.w += c.y;
+    }
+}
 // For `advance`, of few tokens: a warp's item as [16 columns][8 tokens]. Region X is free: every rank's hidden units have
 // come, so no sums of gate|up are still being read there.
 __device__ __forceinline__ float* kept_item(const Block& b, int i) {
@@ -130,7 +157,7 @@ __device__ __forceinline__ void keep_item(const Block& b, int j, float4 y) {
 
 // Fetch `parts` clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
 // slice times the next norm's scale to all ranks (SPREAD: publish it), if `last` keep it. buffer:
-// [D16][NT][PAIRS][32] 16-byte words.
+// [D16][NT][PAIRS][32] 16-byte words, or [D16][NT][NC][32] 8-byte words with room for an even number of clusters.
 __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
                                        int half, bool last) {
@@ -152,10 +179,16 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
     const uint4* p = words[j];
     if (item.mine) {
       float4 sum = make_float4(0, 0, 0, 0);
+      if constexpr (SPREAD) {
 #pragma unroll 1
-      for (int from = 0, words = most(parts, 2); from < words; from += FETCH) {
-        const int first = min(from, max(words - FETCH, 0));  // the last round may ask for what the one before had
-        take(sum, p + first * 32, first, from, parts, bit, item.real);
+        for (int from = 0; from < parts; from += FETCH_SINGLY)
+          take_singly(sum, (const uint2*)(p - b.lane()) + b.lane(), from, parts, bit, item.real);
+      } else {
+#pragma unroll 1
+        for (int from = 0, words = most(parts, 2); from < words; from += FETCH) {
+          const int first = min(from, max(words - FETCH, 0));  // the last round may ask for what the one before had
+          take(sum, p + first * 32, first, from, parts, bit, item.real);
+        }
       }
       const float2 gate = make_float2(gates[j].x / PARTIAL_SCALE, gates[j].y / PARTIAL_SCALE);
       if (item.real)
@@ -203,7 +236,10 @@ __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, in
 #pragma unroll
     for (int k = 0; k < OWN<DX>; ++k) {
       const uint4* const words = buffer + ((b.x0() + own.tile[i]) * NT + own.n[i][k]) * PAIRS * 32 + b.lane();
-      place[i][k] = (uint2*)(words + b.cluster() / 2 * 32) + (b.cluster() & 1);
+      if (SPREAD)
+        place[i][k] = (uint2*)(words - b.lane()) + b.cluster() * 32 + b.lane();
+      else
+        place[i][k] = (uint2*)(words + b.cluster() / 2 * 32) + (b.cluster() & 1);
       if (FEW) place[i][k] = settled(place[i][k]);
     }
   if (FEW) keep_until_here(sent.units), keep_until_here(sent.places);
@@ -255,6 +291,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
     }
   }
   Ahead<group_tiles(GTL), GATE_UP_AHEAD> ahead(b);
+  if constexpr (SPREAD) note(b, WAIT_X), await_slice(b);
   receive(b, BAR_X, b.x_parity(1), X_EXPECT, WAIT_X);
   MARK(13)
   float sums[GROUPS_][NT * 4];
@@ -287,7 +324,16 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
                     h1 = gelu(c.y * r.y + shift[i].x) * (c.w * r.y + shift[i].y);
         // first two, then four, then all 8 units of a token in a lane: four lanes have the same, they share the ranks
         const float got = exchange(b.g() & 1 ? h0 : h1, 4);
-        const u32 two = b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got), next = exchange(two, 8);
+        const u32 two = b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got);
+        if constexpr (COPY_HIDDEN) {  // of a token that doesn't exist any
+          byte* const p = b.smem + (place[i][k] - b.base) + (b.g() >> 1) * (FP8 ? 2 : 4);
+          if (FP8)
+            *(unsigned short*)p = (unsigned short)two;
+          else
+            *(u32*)p = two;
+          continue;
+        }
+        const u32 next = exchange(two, 8);
         const u32 lo = b.g() & 2 ? next : two, hi = b.g() & 2 ? two : next;
         uint4 units;  // E4M3: the first two words
         if constexpr (FP8) {
@@ -296,10 +342,6 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
         } else {
           const u32 far_lo = exchange(lo, 16), far_hi = exchange(hi, 16);
           units = b.g() & 4 ? make_uint4(far_lo, far_hi, lo, hi) : make_uint4(lo, hi, far_lo, far_hi);
-        }
-        if constexpr (COPY_HIDDEN) {  // four lanes have the same; those of a token that doesn't exist are any
-          if (b.g() < 2) *(uint2*)(b.smem + (place[i][k] - b.base)) = make_uint2(units.x, units.y);
-          continue;
         }
         if (SPREAD && i + k == 0) await_room(b);
         if (n * 8 + token < T) {
@@ -326,11 +368,13 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
       __syncwarp();
       asm volatile("bar.sync %0, 128;" ::"r"(2 + block) : "memory");  // attention's barriers are free
       await_room(b);
-      const int quarter = (own.tile[0] & 1) * 2 + Share(b, group_parts(GTL)).part;  // two ranks a warp
-      if (b.lane() < 2) {
-        const u32 at = block * NT * OPERAND, rank = quarter * 2 + b.lane();
-        bulk_send(at_rank(b.base + M_HID + (b.g0() >> 1) * NT * OPERAND + at, rank), b.base + M_X + X_OWN_HIDDEN + at,
-                  NT * OPERAND, at_rank(b.bar(BAR_HID), rank));
+      if ((own.tile[0] & 1) == 0 && Share(b, group_parts(GTL)).part == 0 && b.lane() == 0) {  // of the four warps one
+        constexpr u32 BYTES = NT * OPERAND;
+        const u32 mine = (b.g0() >> 1) * BYTES + block * BYTES;
+        byte* const there = (byte*)(b.a.scratch + B_HIDDEN) + b.cluster() * (HC * BYTES) + mine;
+        bulk_store(there, b.base + M_X + X_OWN_HIDDEN + block * BYTES, BYTES);
+        await_stored();
+        load_for_all(b.base + M_HID + mine, there, BYTES, b.bar(BAR_HID));
       }
       __syncwarp();
     }
