@@ -376,9 +376,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
         const u32 place = b.q0() * NT * OPERAND;
         byte* const there = (byte*)(b.a.scratch + B_ATT) + size_t(b.cluster()) * QT * NT * OPERAND + place;
         show_to_products();
-        bulk_store(there, b.base + M_ATT + place, BYTES);
-        await_stored();
-        load_for_all(b.base + M_ATT + place, there, BYTES, b.bar(BAR_ATT));
+        copy_to_all(b, M_ATT + place, there, M_ATT + place, BYTES, BAR_ATT);
       }
       __syncwarp();
     }

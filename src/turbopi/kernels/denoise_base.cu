@@ -191,7 +191,7 @@ constexpr int M_RING = SPREAD ? M_H : M_SUMS + (APART ? SUMS_SIZE : 0);
 constexpr int STAGES = SPREAD ? SPREAD_STAGES : plan_stages(M_RING);
 // All ranks' shares of queries, attention or hidden units are wanted by all ranks. CTAs take 18 bytes a cycle from each
 // other, however they are sent, but far more from L2. So of many tokens a share goes into L2 and from there, by one
-// multicast, to all ranks (see `bulk_store`): where its way there and back, a microsecond, is won by that.
+// multicast, to all ranks (`copy_to_all`): where its way there and back, a microsecond, is won by that.
 constexpr bool EVEN_HEAD = SPREAD && QT % S == 0;
 constexpr bool COPY_QUERIES = EVEN_HEAD && NT >= (FP8 ? 5 : 6), COPY_ATTENTION = EVEN_HEAD && !FP8 && NT >= 6;
 // A block of two tiles at a time, where four warps have made it.
@@ -204,7 +204,8 @@ static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little sha
 
 // ring: full and empty, by slot
 enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };
-// if SPREAD: region X read by all warps here, by all ranks; the stream multiplied by all ranks
+// if SPREAD: region X read by all warps here, by all ranks; the stream multiplied by all ranks; all warps have seen
+// this rank's slice of the next; sums of squares here
 enum SpreadBarrier { BAR_DONE = BAR_RING + 2 * 7, BAR_FREE, BAR_ROOM, BAR_HERE, BAR_SQUARES };
 
 // ---- scratch in global memory, in 16-byte words

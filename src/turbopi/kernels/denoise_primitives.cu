@@ -122,15 +122,16 @@ __device__ __forceinline__ void bulk_load(u32 to, const void* from, u32 bytes, u
       : "memory");
 }
 
-// From shared memory to L2; until all that this thread has sent so is there.
+// From shared memory to L2; what is in L2 may be copied from there; until all that this thread has sent so is there.
 __device__ __forceinline__ void bulk_store(void* to, u32 from, u32 bytes) {
   asm volatile("cp.async.bulk.global.shared::cta.bulk_group [%0], [%1], %2;" ::"l"(to), "r"(from), "r"(bytes)
                : "memory");
 }
+__device__ __forceinline__ void show_to_copy_engine() { asm volatile("fence.proxy.async.global;" ::: "memory"); }
 __device__ __forceinline__ void await_stored() {
   asm volatile("cp.async.bulk.commit_group;" ::: "memory");
   asm volatile("cp.async.bulk.wait_group 0;" ::: "memory");
-  asm volatile("fence.proxy.async.global;" ::: "memory");
+  show_to_copy_engine();
 }
 // `bytes` from L2 to the same place of all ranks, counted in by `bar` of each.
 __device__ __forceinline__ void load_for_all(u32 to, const void* from, u32 bytes, u32 bar) {
@@ -139,6 +140,12 @@ __device__ __forceinline__ void load_for_all(u32 to, const void* from, u32 bytes
       "[%0], [%1], %2, [%3], %4;" ::"r"(to),
       "l"(from), "r"(bytes), "r"(bar), "h"((unsigned short)((1 << S) - 1))
       : "memory");
+}
+// From one place in shared memory to one of all ranks, by way of `there` in L2.
+__device__ __forceinline__ void copy_to_all(const Block& b, u32 from, byte* there, u32 to, u32 bytes, int bar) {
+  bulk_store(there, b.base + from, bytes);
+  await_stored();
+  load_for_all(b.base + to, there, bytes, b.bar(bar));
 }
 
 // Words through L2 whose lowest bit is their flag. Use n of a double buffer carries bit `flag(n)`: 1, 1, 0, 0, 1, ...
@@ -166,6 +173,7 @@ __device__ __forceinline__ u32 differing(u32 word, u32 bit, u32 others) {
 __device__ __forceinline__ bool missing(uint4 v, u32 bit) {
   return differing(v.x, bit, differing(v.y, bit, differing(v.z, bit, v.w ^ bit))) & 1;
 }
+__device__ __forceinline__ bool missing(uint2 v, u32 bit) { return differing(v.x, bit, v.y ^ bit) & 1; }
 __device__ __forceinline__ void put(void* p, u32 v) {
   asm volatile("st.relaxed.gpu.global.u32 [%0], %1;" ::"l"(p), "r"(v) : "memory");
 }
@@ -173,7 +181,7 @@ __device__ __forceinline__ void put(void* p, uint2 v) {
   asm volatile("st.relaxed.gpu.global.v2.u32 [%0], {%1, %2};" ::"l"(p), "r"(v.x), "r"(v.y) : "memory");
 }
 __device__ __forceinline__ void publish(float* p, float v, u32 bit) {
-  asm volatile("st.relaxed.gpu.global.u32 [%0], %1;" ::"l"(p), "r"(flagged(v, bit)) : "memory");
+  put(p, flagged(v, bit));
 }
 __device__ __forceinline__ void publish(uint2* p, u32 v, u32 w, u32 bit) {
   asm volatile("st.relaxed.gpu.global.v2.u32 [%0], {%1, %2};" ::"l"(p), "r"((v & ~1u) | bit), "r"((w & ~1u) | bit)

@@ -152,6 +152,25 @@ struct QkvProduct {
   }
 };
 
+// By one warp: this rank's queries, staged [half][tile][NT][8 tokens][8] at M_ATT, to all ranks when there is room.
+__device__ __forceinline__ void copy_queries(const Block& b) {
+  constexpr u32 BYTES = QTL * NT * 128, HALF = QT * NT * 128;  // of half the columns: this rank's, all
+  const u32 place = b.q0() * NT * 128;
+  byte* const there = (byte*)(b.a.scratch + B_QUERIES) + size_t(b.cluster()) * 2 * HALF + place;
+  if (b.lane() == 0) {
+    show_to_products();
+    bulk_store(there, b.base + M_ATT, BYTES), bulk_store(there + HALF, b.base + M_ATT + BYTES, BYTES);
+    await_stored();
+  }
+  __syncwarp();
+  await_room(b);
+  if (b.lane() == 0) {
+    load_for_all(b.base + M_Q + place, there, BYTES, b.bar(BAR_Q));
+    load_for_all(b.base + M_Q + place + HALF, there + HALF, BYTES, b.bar(BAR_Q));
+  }
+  __syncwarp();
+}
+
 // Awaits the stream. q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream; queries are sent when all of those have been read, so what a peer sends after it has them may lie there too.
 __device__ __forceinline__ void project(Block& b, const float* shifted, const float* row_scales, float* kv, u32 bit,
@@ -166,8 +185,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     if (FP8) scale[j] = make_float2(__ldg(row_scales + tile * 16 + b.g()), __ldg(row_scales + tile * 16 + b.g() + 8));
   }
   auto await_stream = [&] {
-    if constexpr (SPREAD) note(b, WAIT_X), await_slice(b);
-    receive(b, BAR_X, b.x_parity(0), X_EXPECT, WAIT_X);
+    receive_stream(b, 0);
     MARK(0)
   };
   if constexpr (MMA_QKV) {
@@ -191,7 +209,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   }
   consumers_sync();
   if (b.thread < NT * 8) ((int*)(b.smem + M_PART))[b.thread] = ordered(LOWEST);  // for `weigh_prefix`
-  // Free until all have what attention sends: [item][half][8 tokens][8], or COPY_QUERIES [half][tile][NT][8 tokens][8].
+  // Free until all have what attention sends: [item][half][8 tokens][8], or see `copy_queries`.
   byte* const staged = b.smem + M_ATT;
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
@@ -235,23 +253,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   else
     consumers_sync();
   if constexpr (COPY_QUERIES) {
-    if (b.warp() == COPY_WARP) {
-      constexpr u32 BYTES = QTL * NT * 128;  // of each half of the head's columns
-      const u32 place = b.q0() * NT * 128;
-      byte* const there = (byte*)(b.a.scratch + B_QUERIES) + size_t(b.cluster()) * 2 * QT * NT * 128 + place;
-      if (b.lane() == 0) {
-        show_to_products();
-        bulk_store(there, b.base + M_ATT, BYTES), bulk_store(there + QT * NT * 128, b.base + M_ATT + BYTES, BYTES);
-        await_stored();
-      }
-      __syncwarp();
-      await_room(b);
-      if (b.lane() == 0) {
-        load_for_all(b.base + M_Q + place, there, BYTES, b.bar(BAR_Q));
-        load_for_all(b.base + M_Q + place + QT * NT * 128, there + QT * NT * 128, BYTES, b.bar(BAR_Q));
-      }
-      __syncwarp();
-    }
+    if (b.warp() == COPY_WARP) copy_queries(b);
     ++b.room;
     return;
   }

@@ -150,7 +150,7 @@ __device__ __forceinline__ void await_squares(const Block& b, u32 turn) {
 #pragma unroll
     for (int i = 0; i < 3; ++i)
       if (!here) {
-        here = __all_sync(~0u, !(differing(q[i].x, flag(turn), q[i].y ^ flag(turn)) & 1));
+        here = __all_sync(~0u, !missing(q[i], flag(turn)));
         if (!here) q[i] = peek(from);
       }
 }
@@ -170,14 +170,14 @@ __device__ __forceinline__ void fetch_stream(const Block& b) {
       barrier_wait(b.bar(BAR_FREE), uses & 1);
       __syncwarp();
       barrier_wait(b.bar(BAR_HERE), uses++ & 1);
-      asm volatile("fence.proxy.async.global;" ::: "memory");
+      show_to_copy_engine();
       __syncwarp();
       if (b.lane() == 0 && items > 0)
         load_for_all(b.base + M_X + place * OPERAND,
                      b.a.scratch + B_STAGE + turn % STAGED * N_STAGE + place * (OPERAND / 16), items * OPERAND,
                      b.bar(BAR_X));
       await_squares(b, turn);
-      asm volatile("fence.proxy.async.global;" ::: "memory");
+      show_to_copy_engine();
       __syncwarp();
       if (b.lane() == 0)
         load_for_all(b.base + M_SSQ + b.rank() * NT * 32,

@@ -70,6 +70,11 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
   }
 }
 constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * (OPERAND / 8) + (SPREAD ? 0 : SQUARES_EXPECT);
+// The stream that comes before attention, or (half 1) the feed-forward.
+__device__ __forceinline__ void receive_stream(const Block& b, int half) {
+  if constexpr (SPREAD) note(b, WAIT_X), await_slice(b);
+  receive(b, BAR_X, b.x_parity(half), X_EXPECT, WAIT_X);
+}
 
 // A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
 __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X], const float* row) {
@@ -78,7 +83,7 @@ __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X
     v[j] = __ldg((const float2*)(row + (b.x0() + stream_item(b, j).tile) * 16 + 2 * b.g()));
 }
 
-// Partial sums of an item of the stream from all clusters, two in a word.
+// Partial sums of an item of the stream from all clusters, two in a word (SPREAD: see `take_singly`).
 constexpr int FETCH = most(NH, 2) < 4 ? most(NH, 2) : 4;  // words at a time: no more than there ever are
 __device__ __forceinline__ const uint4* partials(const Block& b, const uint4* buffer, Item item) {
   return buffer + ((b.x0() + item.tile) * NT + item.n) * PAIRS * 32 + b.lane();
@@ -143,6 +148,7 @@ __device__ __forceinline__ void take_singly(float4& sum, const uint2* p, int fro
       sum.x += a.x, sum.y += a.y, sum.z += c.x, sum.w += c.y;
     }
 }
+
 // For `advance`, of few tokens: a warp's item as [16 columns][8 tokens]. Region X is free: every rank's hidden units have
 // come, so no sums of gate|up are still being read there.
 __device__ __forceinline__ float* kept_item(const Block& b, int i) {
@@ -291,8 +297,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
     }
   }
   Ahead<group_tiles(GTL), GATE_UP_AHEAD> ahead(b);
-  if constexpr (SPREAD) note(b, WAIT_X), await_slice(b);
-  receive(b, BAR_X, b.x_parity(1), X_EXPECT, WAIT_X);
+  receive_stream(b, 1);
   MARK(13)
   float sums[GROUPS_][NT * 4];
   if (!SPREAD) show_to_products();  // what the copy engine wrote needs none
@@ -372,9 +377,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
         constexpr u32 BYTES = NT * OPERAND;
         const u32 mine = (b.g0() >> 1) * BYTES + block * BYTES;
         byte* const there = (byte*)(b.a.scratch + B_HIDDEN) + b.cluster() * (HC * BYTES) + mine;
-        bulk_store(there, b.base + M_X + X_OWN_HIDDEN + block * BYTES, BYTES);
-        await_stored();
-        load_for_all(b.base + M_HID + mine, there, BYTES, b.bar(BAR_HID));
+        copy_to_all(b, M_X + X_OWN_HIDDEN + block * BYTES, there, M_HID + mine, BYTES, BAR_HID);
       }
       __syncwarp();
     }
