@@ -31,6 +31,7 @@ from turbopi.kernels.denoise_packing import (
 from turbopi.kernels.denoise_plain import affine, inverse_frequencies
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
 
+FOLDER = Path(__file__).parent
 PARTS = tuple(
     f"denoise_{part}.cu"
     for part in (
@@ -116,7 +117,7 @@ def source(suffix: int, fp8: bool) -> str:
         hopper.wgmma("add_from_registers", columns, numbers=numbers, from_registers=True),
         hopper.wgmma("add_rows", columns, from_registers=True),
     )
-    return hopper.source(*PARTS, instructions="\n".join(products))
+    return hopper.source(*PARTS, instructions="\n".join(products), folder=FOLDER)
 
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:

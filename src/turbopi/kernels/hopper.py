@@ -7,6 +7,7 @@ import ctypes
 import re
 from functools import lru_cache
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -49,9 +50,10 @@ class DependentKernel(Kernel):
         return config
 
 
-def source(*names: str, instructions: str) -> str:
+def source(*names: str, instructions: str, folder: Path | None = None) -> str:
     """A kernel's source, of those files, with the instructions that its line TP_MMA stands for."""
-    text = "\n".join((files("turbopi.kernels") / name).read_text() for name in ("hopper.cu", *names))
+    here = folder or files("turbopi.kernels")
+    text = "\n".join((here / name).read_text() for name in ("hopper.cu", *names))
     return re.sub(r"^TP_MMA.*$", lambda _: instructions, text, flags=re.MULTILINE)
 
 

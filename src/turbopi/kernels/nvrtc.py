@@ -28,14 +28,19 @@ def bindings(name: str) -> Any:
         raise BackendUnavailable(f"our CUDA kernels need cuda.bindings ({e}); pip install cuda-python") from e
 
 
-def compile_cubin(source: str, arch: str, defines: dict[str, int], *, folder: Path | None = None) -> bytes:
+def compile_cubin(
+    source: str, arch: str, defines: dict[str, int], *, folder: Path | None = None, lines: bool = False
+) -> bytes:
     """Machine code of `source` for `arch` ("sm_90a"), from the cache if it was compiled before.
+
+    lines  also the source line of each instruction, as profilers and disassemblers take it
 
     Raises BackendError with the compiler's log.
     """
     nvrtc = bindings("nvrtc")
     major, minor = _checked(nvrtc, nvrtc.nvrtcVersion())
     options = [f"-arch={arch}", "-std=c++17", *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
+    options += ["-lineinfo"] if lines else []
     key = hashlib.sha256("\0".join((source, *options, f"{major}.{minor}")).encode()).hexdigest()[:32]
     path = (folder or cache_folder()) / f"{key}.cubin"
     if path.is_file():

@@ -1,0 +1,119 @@
+"""Time variants of the denoising kernel in turns: one after the other, again and again, on one problem.
+
+Machines, and hours on one machine, differ by more than most changes do, so a change is timed beside what it changes.
+"""
+
+import statistics
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from denoise_helpers import GPU, Problem, input_scales, plain, problem, relative
+from torch import Tensor
+
+from kernel_turns.variants import Variant
+from turbopi.kernels.denoise_packing import RANKS, PackedExpert
+
+STEPS, CACHE_ROWS, SEED = 10, 976, 1
+# `MARK`s of denoise_base.cu in the order in which a layer comes to them
+MARKS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 21, 12, 13, 15, 16, 17, 18, 22, 14, 19, 20)
+
+
+@dataclass
+class Row:
+    """One variant: milliseconds of ten steps, relative rms of the actions' error to float32, whether they equal the
+    first variant's to the last bit, the clock during the last launch.
+    """
+
+    variant: str
+    milliseconds: float  # the median of the rounds
+    fastest: float
+    error: float
+    same: bool
+    mhz: float
+
+
+class Job:
+    """The full-size expert with random weights: `tokens` suffix tokens behind a prefix of `length`, NaN behind that."""
+
+    def __init__(self, tokens: int, precision: str, length: int, clusters: int = 8) -> None:
+        p = problem("full", STEPS, tokens, length, SEED, GPU)
+        p.cache_k, p.cache_v = _padded(p.cache_k, length), _padded(p.cache_v, length)
+        self.problem: Problem = p
+        self.packed = PackedExpert.pack(p.config, p.layers, clusters, input_scales(p) if precision == "fp8" else None)
+        self.exact = plain(p, torch.float32)[0][-1]
+        self.tokens, self.length = tokens, torch.tensor([length], device=GPU)
+
+    def kernel(self, variant: Variant, trace: bool = False) -> Any:
+        p = self.problem
+        return variant.kernel(
+            *(p.config, self.packed, p.small, p.table),
+            cache_rows=CACHE_ROWS,
+            suffix=self.tokens,
+            device=GPU,
+            trace=trace,
+        )
+
+    def outputs(self) -> tuple[Tensor, Tensor]:
+        shape = self.problem.noise.shape
+        return (
+            torch.full((STEPS + 1, *shape), torch.nan, device=GPU),
+            torch.full((STEPS, *shape), torch.nan, device=GPU),
+        )
+
+    def launch(self, kernel: Any, x_t: Tensor, v_t: Tensor) -> None:
+        p = self.problem
+        kernel.launch(p.noise, p.cache_k, p.cache_v, self.length, x_t, v_t)
+
+
+def _padded(cache: Tensor, length: int) -> Tensor:
+    rows = cache.new_full((cache.shape[0], CACHE_ROWS, *cache.shape[2:]), torch.nan)
+    rows[:, :length] = cache[:, :length]
+    return rows
+
+
+def time_in_turns(job: Job, variants: list[Variant], rounds: int, calls: int = 12) -> list[Row]:
+    """Every variant's CUDA graph in every round, `calls` times."""
+    runs = []
+    for variant in variants:
+        kernel, (x_t, v_t) = job.kernel(variant), job.outputs()
+        job.launch(kernel, x_t, v_t)
+        torch.cuda.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            job.launch(kernel, x_t, v_t)
+        runs.append((variant, kernel, graph, x_t, v_t))  # outputs stay: graphs write there
+    times: list[list[float]] = [[] for _ in runs]
+    for _ in range(rounds):
+        for (_, _, graph, _, _), taken in zip(runs, times, strict=True):
+            for _ in range(2):
+                graph.replay()
+            begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))  # type: ignore[no-untyped-call]
+            begin.record()
+            for _ in range(calls):
+                graph.replay()
+            end.record()
+            torch.cuda.synchronize()
+            taken.append(begin.elapsed_time(end) / calls)
+    first = runs[0][3]
+    return [
+        Row(
+            variant.spec,
+            statistics.median(taken),
+            min(taken),
+            relative(x_t[-1], job.exact),
+            torch.equal(x_t, first),
+            kernel.clock_mhz() or 0.0,
+        )
+        for (variant, kernel, _, x_t, _), taken in zip(runs, times, strict=True)
+    ]
+
+
+def marks_by_rank(job: Job, variant: Variant) -> Tensor:
+    """Cycles of a layer between marks, the mean over steps, layers and clusters: float64[RANKS, marks]."""
+    kernel, (x_t, v_t) = job.kernel(variant, trace=True), job.outputs()
+    job.launch(kernel, x_t, v_t)
+    torch.cuda.synchronize()
+    layers = STEPS * job.problem.config.expert.depth
+    cycles = kernel._tensors["trace"][:, 1:32].double().cpu() / layers
+    return cycles.view(-1, RANKS, cycles.shape[1]).mean(0)

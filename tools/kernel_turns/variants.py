@@ -1,0 +1,81 @@
+"""Variants of the denoising kernel: sources of their own, compile-time constants of their own."""
+
+import importlib.util
+import lzma
+import shutil
+import subprocess
+import tempfile
+import weakref
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from turbopi.kernels import denoise
+
+KERNELS = Path("src/turbopi/kernels")
+
+
+class Variant:
+    """What `SPEC` says: "here", a folder that holds denoise.py and its sources, or a patch of this tree (.patch, or
+    .patch.xz); behind it +NAME=VALUE for constants, as in "rows.patch+TP_RPS=4".
+
+    Raises ValueError for a place that doesn't exist, a constant without a whole number, a patch that doesn't fit.
+    """
+
+    def __init__(self, spec: str) -> None:
+        self.spec = spec
+        place, *constants = spec.split("+")
+        self.constants = dict(_constant(text) for text in constants)
+        self.module = _load(self._folder(place))
+        self._sizes = self.module.kernel_sizes
+
+    def _folder(self, place: str) -> Path:
+        if place == "here":
+            return denoise.FOLDER
+        path = Path(place)
+        if path.is_dir() and (path / "denoise.py").is_file():
+            return path
+        if path.is_file() and ".patch" in path.suffixes:
+            folder = Path(tempfile.mkdtemp())
+            weakref.finalize(self, shutil.rmtree, folder)  # it lives as long as the variant
+            return _patched(path, folder)
+        raise ValueError(f"{place!r}: expected 'here', a folder with denoise.py, or a .patch or .patch.xz file")
+
+    def sizes(self, *args: Any, trace: bool = False, **options: Any) -> dict[str, int]:
+        """`kernel_sizes` with the variant's constants; `trace`: the kernel keeps the cycles between its marks."""
+        traced = {"TP_TRACE": 1} if trace else {}
+        return {**self._sizes(*args, **options), **self.constants, **traced}
+
+    def kernel(self, *args: Any, trace: bool = False, **options: Any) -> denoise.DenoiseKernel:
+        def sizes(*args: Any, **options: Any) -> dict[str, int]:
+            return self.sizes(*args, trace=trace, **options)
+
+        self.module.kernel_sizes = sizes  # type: ignore[attr-defined]
+        kernel: denoise.DenoiseKernel = self.module.DenoiseKernel(*args, **options)
+        return kernel
+
+
+def _constant(text: str) -> tuple[str, int]:
+    name, _, value = text.partition("=")
+    if not name.isidentifier() or not value.lstrip("-").isdigit():
+        raise ValueError(f"+{text}: expected +NAME=VALUE with a whole number, such as +TP_RPS=4")
+    return name, int(value)
+
+
+def _patched(patch: Path, to: Path) -> Path:
+    """A copy of the tree's kernels with a patch that was made in the repository's root."""
+    text = lzma.decompress(patch.read_bytes()) if patch.suffix == ".xz" else patch.read_bytes()
+    shutil.copytree(denoise.FOLDER, to / KERNELS, ignore=shutil.ignore_patterns("__pycache__"))
+    done = subprocess.run(["git", "apply", "-"], cwd=to, input=text, capture_output=True, check=False)
+    if done.returncode:
+        raise ValueError(f"{patch} doesn't fit these kernels: {done.stderr.decode().strip()}")
+    return to / KERNELS
+
+
+def _load(folder: Path) -> ModuleType:
+    """denoise.py of a folder, beside the tree's own."""
+    spec = importlib.util.spec_from_file_location("kernel_turns_denoise", folder / "denoise.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
