@@ -1,5 +1,5 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
-// Part 1 of 13, which denoise.py puts together: sizes, shared memory, a CTA's view.
+// Part 1 of 12, which denoise.py puts together: sizes, shared memory, a CTA's view.
 //
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
@@ -130,26 +130,24 @@ constexpr int OUTPUT = SPREAD ? 256 : 512;
 constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * OUTPUT;
 constexpr int X_SUFFIX_SUMS_FEW = X_P + (KT + 1) * NT * 256,
               X_KEEP = X_SUFFIX_SUMS_FEW + (SPREAD ? 0 : 3 * NT * 256), X_SUFFIX = X_KEEP + up128(NT * 32);
-constexpr int ROWS = SPREAD ? 16 : SUFFIX;  // of keys, and of values, that don't lie in tiles: see `PrefixShare`
 // Between steps, if tokens are few: what ranks add to v_t, then by item the slice in float32 and what it adds to v_t.
 constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);
 constexpr int XS_PART = A > 32 ? 512 : 0, XS_ITEM = imax(XS_PART + A * 32, 512);  // over the item, if read at once
 // If SPREAD, region X holds everything, as each exchange waits until all ranks are done with what lay there: attention
 // and queries behind qkv's sums, hidden units over the stream with the feed-forward's partial sums behind them.
-// Attention comes when the suffix's partial logits are no longer needed.
-constexpr int X_ATT = up128(imax(X_SUFFIX + ROWS * RS,
+// Attention comes when the suffix's partial logits, or keys, are no longer needed.
+constexpr int X_ATT = up128(imax(X_SUFFIX + 2 * SUFFIX * RS,
                                  imax(plan_partials(QKV), plan_others(DX)) * PARTIAL)),
-              X_ROWS = X_ATT + imax(QTL, 3) * NT * 256,  // behind queries that still leave, and partial logits
-              X_Q = imax(X_ATT + QT * OPERAND * NT, X_ROWS + ROWS * RS), X_FF_SUMS = HC * NT * OPERAND;
-constexpr int X_SUFFIX_SUMS = SPREAD ? X_ATT : X_SUFFIX_SUMS_FEW, X_KEY_ROWS = SPREAD ? X_ROWS : X_SUFFIX,
-              X_VALUE_ROWS = SPREAD ? X_SUFFIX : X_SUFFIX + ROWS * RS;
+              X_KEYS = X_ATT + QTL * NT * 256,  // of the suffix, as a tile: behind queries that still leave
+              X_Q = imax(X_ATT + imax(QT * OPERAND, 3 * 256) * NT, X_KEYS + KEY_TILE), X_FF_SUMS = HC * NT * OPERAND;
+constexpr int X_SUFFIX_SUMS = SPREAD ? X_ATT : X_SUFFIX_SUMS_FEW;
 // Behind them float32 at a step's end: partial sums of v_t [S][V_PARTS][OWN_T][A], the slice [DX * 16][OWN_T], x_t.
 constexpr int OWN_T = OWN_N * 8, V_PARTS = imax(CONSUMERS / A / OWN_T, 1);  // tokens whose x_t a CTA knows
 constexpr int X_OWN_V = up128(X_FF_SUMS + imax(plan_others(GTL), plan_others(DX)) * PARTIAL),
               X_OWN_XS = X_OWN_V + S * V_PARTS * OWN_T * A * 4, X_OWN_XT = X_OWN_XS + DX * 16 * OWN_T * 4;
 constexpr int X_SPREAD = imax(X_Q + QT * NT * 256, X_OWN_XT + OWN_T * A * 4);
 constexpr int X_SIZE =
-    up128(imax(imax(X_BYTES, SPREAD ? X_SPREAD : X_SUFFIX + 2 * ROWS * RS),
+    up128(imax(imax(X_BYTES, SPREAD ? X_SPREAD : X_SUFFIX + 2 * SUFFIX * RS),
                imax(imax(MMA_QKV ? QKV * QKV_PARTS : plan_partials(QKV), SPREAD ? 0 : plan_partials(GTL)) * PARTIAL,
                     SPREAD ? 0 : X_XS + DX * NT * XS_ITEM)));
 // Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down. Hidden
@@ -203,26 +201,6 @@ constexpr int COPY_WARP = 7;  // has none of the keys and values that others hav
 constexpr int X_OWN_HIDDEN = X_OWN_V;  // of a rank, before they are sent
 static_assert(!COPY_HIDDEN || X_OWN_HIDDEN + GTL / 2 * NT * OPERAND <= X_SIZE, "room for a rank's hidden units");
 static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little shared memory");
-
-// Who scores prefix keys, a tile a warp and round. ASYNC: by wgmma, see denoise_together.cu.
-constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS);
-constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES;
-// Prefix keys that rank i has: tiles from `first` on, with `keys` keys in all. Ranks with one more would let the others
-// wait. So if tokens are many and what is left behind an even share is little, it is shared out, too: keys `loose0`..,
-// which go with those of the suffix as one more tile (of many keys they don't: see ASYNC).
-struct PrefixShare {
-  int first, tiles, keys, loose0 = 0, loose = 0;
-  __device__ __forceinline__ PrefixShare(int all, int i) {
-    const int even = all / 16 / S * S, left = all - even * 16;
-    if (ASYNC && left <= S * (16 - SUFFIX)) {
-      tiles = even / S, first = tiles * i, keys = tiles * 16;
-      loose0 = even * 16 + share(left, S, i), loose = even * 16 + share(left, S, i + 1) - loose0;
-      return;
-    }
-    const int count = most(all, 16);
-    first = share(count, S, i), tiles = share(count, S, i + 1) - first, keys = min(tiles * 16, all - first * 16);
-  }
-};
 
 // ring: full and empty, by slot
 enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };

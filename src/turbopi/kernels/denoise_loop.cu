@@ -1,4 +1,4 @@
-// Part 13 of 13: the loop, the kernel.
+// Part 12 of 12: the loop, the kernel.
 
 __device__ __forceinline__ u32 hidden_bytes(const Block& b) {
   if (COPY_HIDDEN) return HC * NT * OPERAND;
@@ -133,7 +133,6 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     note(b, WAIT_NONE);
     for (u32 i = 0; i < STAGES; ++i) barrier_init(b.full(i), 1), barrier_init(b.empty(i), W);
     for (int i = BAR_X; i <= BAR_V; ++i) barrier_init(b.bar(i), 1);
-    if (ASYNC) barrier_init(b.bar(BAR_COMB), 1 + b.qn());  // warps that store partial outputs here
     barrier_init(b.bar(BAR_GO), S), barrier_init(b.bar(BAR_RMS), 1);
     if constexpr (SPREAD) {
       barrier_init(b.bar(BAR_DONE), W), barrier_init(b.bar(BAR_FREE), S);

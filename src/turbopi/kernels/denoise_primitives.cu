@@ -1,4 +1,4 @@
-// Part 2 of 13: waiting, moving data, arithmetic.
+// Part 2 of 12: waiting, moving data, arithmetic.
 
 // ---- waiting
 

@@ -1,4 +1,4 @@
-// Part 4 of 13: what brings weights, keys and values.
+// Part 4 of 12: what brings weights, keys and values.
 
 // One thread of a CTA, which never waits for activations. What it loads is the same in every layer, so a list of it is
 // made first: 100 cycles more for a slot are a microsecond in a layer.
@@ -38,8 +38,8 @@ struct Producer {
     for (int k = 0; k < count; k += SLOT_TILES) add(from + k * KEY_TILE, min(SLOT_TILES, count - k) * KEY_TILE, true);
   }
   __device__ void run() {
-    const PrefixShare mine(int(*b.a.length), b.rank());
-    const int first = mine.first, count = mine.tiles;
+    const int tiles = most(int(*b.a.length), 16), first = share(tiles, S, b.rank());
+    const int count = share(tiles, S, b.rank() + 1) - first;
     int last_key = -STAGES;
     if (b.attends()) {
       product<QTL + KVL>(D16, b.qn() + b.kvn());

@@ -1,4 +1,4 @@
-// Part 5 of 13: matrix products.
+// Part 5 of 12: matrix products.
 
 __device__ __forceinline__ u32 take_slot(Block& b) {
   const u32 slot = b.slot;

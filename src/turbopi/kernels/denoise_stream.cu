@@ -1,4 +1,4 @@
-// Part 7 of 13: the residual stream, and what goes into it: sums across clusters, GeGLU.
+// Part 7 of 12: the residual stream, and what goes into it: sums across clusters, GeGLU.
 
 // `columns_of` to all ranks, where `columns_place` says.
 __device__ __forceinline__ u32 columns_place(const Block& b, int region, int block, int n) {
@@ -268,27 +268,9 @@ __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, in
     }
 }
 
-// x (1 + tanh u) / 2 = x / (1 + exp(-2 u)). E4M3 rounds far more coarsely than an approximate tanh, which takes one turn of
-// the special function unit instead of two.
+// x (1 + tanh u) / 2 = x / (1 + exp(-2 u))
 __device__ __forceinline__ float gelu(float x) {
-  if constexpr (FP8 && SPREAD) {
-    float tanh_u;
-    asm("tanh.approx.f32 %0, %1;" : "=f"(tanh_u) : "f"(x * (0.7978845608f + 0.0356774081f * x * x)));
-    return 0.5f * x * tanh_u + 0.5f * x;
-  }
   return __fdividef(x, 1.0f + exp2_approx(-2.302208198f * (x + 0.044715f * x * x * x)));  // 2 sqrt(2 / pi) log2 e
-}
-
-// An item of gate|up to its hidden units, one for each of the lane's tokens.
-__device__ __forceinline__ float2 hidden(float4 c, float2 inverse, float2 shift, float2 scale) {
-  if (FP8) c = scaled(c, scale);
-  return make_float2(gelu(c.x * inverse.x + shift.x) * (c.z * inverse.x + shift.y),
-                     gelu(c.y * inverse.y + shift.x) * (c.w * inverse.y + shift.y));
-}
-// Of an item's lane pair units g, g + 1 (g even) of one token: even g token 2t, odd g 2t + 1.
-__device__ __forceinline__ u32 two_units(const Block& b, float2 h) {
-  const float got = exchange(b.g() & 1 ? h.x : h.y, 4);
-  return b.g() & 1 ? pack_operand(got, h.y) : pack_operand(h.x, got);
 }
 
 // Awaits the stream. gate|up and GeGLU: a tile has 8 units' gate rows, then their up rows. The next slice of the stream
@@ -334,34 +316,28 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
     }
   }
   if constexpr (SPREAD) inverse_rms(b, 0, 1);
-  if constexpr (COPY_HIDDEN) {  // a step of all items after the other, as each waits for the one before
-    float2 inverse[OWN<GTL>], h[OWN<GTL>];
-    u32 two[OWN<GTL>];
 #pragma unroll
-    for (int k = 0; k < OWN<GTL>; ++k) inverse[k] = known_rms(b, own.n[0][k] * 8 + 2 * b.t());
-#pragma unroll
-    for (int k = 0; k < OWN<GTL>; ++k) h[k] = hidden(own.sums[0][k], inverse[k], shift[0], scale[0]);
-#pragma unroll
-    for (int k = 0; k < OWN<GTL>; ++k) two[k] = two_units(b, h[k]);
-#pragma unroll
-    for (int k = 0; k < OWN<GTL>; ++k)
-      if (own.mine[0][k]) {  // of a token that doesn't exist any
-        byte* const p = b.smem + (place[0][k] - b.base) + (b.g() >> 1) * (FP8 ? 2 : 4);
-        if (FP8)
-          *(unsigned short*)p = (unsigned short)two[k];
-        else
-          *(u32*)p = two[k];
-      }
-  }
-#pragma unroll
-  for (int i = 0; i < (COPY_HIDDEN ? 0 : GROUPS_); ++i)
+  for (int i = 0; i < GROUPS_; ++i)
 #pragma unroll
     for (int k = 0; k < OWN<GTL>; ++k)
       if (own.mine[i][k]) {
         const int n = own.n[i][k];
+        float4 c = own.sums[i][k];
+        if (FP8) c = scaled(c, scale[i]);
         const float2 r = SPREAD ? known_rms(b, n * 8 + 2 * b.t()) : inverse_rms(b, n * 8 + 2 * b.t(), 1);
+        const float h0 = gelu(c.x * r.x + shift[i].x) * (c.z * r.x + shift[i].y),
+                    h1 = gelu(c.y * r.y + shift[i].x) * (c.w * r.y + shift[i].y);
         // first two, then four, then all 8 units of a token in a lane: four lanes have the same, they share the ranks
-        const u32 two = two_units(b, hidden(own.sums[i][k], r, shift[i], scale[i]));
+        const float got = exchange(b.g() & 1 ? h0 : h1, 4);
+        const u32 two = b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got);
+        if constexpr (COPY_HIDDEN) {  // of a token that doesn't exist any
+          byte* const p = b.smem + (place[i][k] - b.base) + (b.g() >> 1) * (FP8 ? 2 : 4);
+          if (FP8)
+            *(unsigned short*)p = (unsigned short)two;
+          else
+            *(u32*)p = two;
+          continue;
+        }
         const u32 next = exchange(two, 8);
         const u32 lo = b.g() & 2 ? next : two, hi = b.g() & 2 ? two : next;
         uint4 units;  // E4M3: the first two words
