@@ -58,6 +58,13 @@ def test_what_is_no_variant_is_refused_by_name(spec: str, message: str) -> None:
         Variant(spec)
 
 
+def test_a_folder_that_would_read_this_trees_sources_is_refused(tmp_path: Path) -> None:
+    text = (denoise.FOLDER / "denoise.py").read_text()
+    (tmp_path / "denoise.py").write_text(text.replace("FOLDER", "ELSEWHERE"))
+    with pytest.raises(ValueError, match="would read this tree's sources"):
+        Variant(str(tmp_path))
+
+
 def test_a_patch_of_other_sources_is_refused(patch: Path) -> None:
     patch.write_text(patch.read_text().replace("STAGED = 4;", "STAGED = 3;"))
     with pytest.raises(ValueError, match=r"five\.patch doesn't fit these kernels: .*denoise_base\.cu"):

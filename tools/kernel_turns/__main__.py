@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kernel_turns.variants import Variant
+from turbopi.errors import BackendUnavailable
 
 MULTIPLYING, WARPS = 16, 20  # warps of a block
 
@@ -53,7 +54,7 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         {"time": _time, "launch": _launch, "stalls": _stalls}[arguments.command](arguments)
-    except ValueError as e:
+    except (ValueError, BackendUnavailable) as e:
         parser.error(str(e))
 
 

@@ -12,6 +12,8 @@ from denoise_helpers import GPU, Problem, input_scales, plain, problem, relative
 from torch import Tensor
 
 from kernel_turns.variants import Variant
+from turbopi.errors import BackendUnavailable
+from turbopi.kernels.denoise import unavailable
 from turbopi.kernels.denoise_packing import RANKS, PackedExpert
 
 STEPS, CACHE_ROWS, SEED = 10, 976, 1
@@ -37,6 +39,9 @@ class Job:
     """The full-size expert with random weights: `tokens` suffix tokens behind a prefix of `length`, NaN behind that."""
 
     def __init__(self, tokens: int, precision: str, length: int, clusters: int = 8) -> None:
+        reason = unavailable(GPU) if torch.cuda.is_available() else "no NVIDIA GPU is here"
+        if reason is not None:
+            raise BackendUnavailable(reason)
         p = problem("full", STEPS, tokens, length, SEED, GPU)
         p.cache_k, p.cache_v = _padded(p.cache_k, length), _padded(p.cache_v, length)
         self.problem: Problem = p

@@ -31,7 +31,7 @@ class Variant:
 
     def _folder(self, place: str) -> Path:
         if place == "here":
-            return denoise.FOLDER
+            return denoise.FOLDER.resolve()
         path = Path(place)
         if path.is_dir() and (path / "denoise.py").is_file():
             return path
@@ -74,8 +74,10 @@ def _patched(patch: Path, to: Path) -> Path:
 
 def _load(folder: Path) -> ModuleType:
     """denoise.py of a folder, beside the tree's own."""
-    spec = importlib.util.spec_from_file_location("kernel_turns_denoise", folder / "denoise.py")
+    spec = importlib.util.spec_from_file_location("kernel_turns_denoise", folder.resolve() / "denoise.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    if getattr(module, "FOLDER", None) != folder.resolve():
+        raise ValueError(f"{folder}/denoise.py would read this tree's sources: it must give FOLDER to hopper.source")
     return module
