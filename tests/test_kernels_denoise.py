@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -21,6 +20,7 @@ from denoise_helpers import (
     problem,
     relative,
 )
+from kernel_turns.stalls import disassembled
 from torch import Tensor
 
 from turbopi.calibrate.directions import directions
@@ -282,11 +282,8 @@ def machine_code(name: str, folder: Path, *, suffix: int, fp8: bool = False) -> 
     """The kernel's, as text."""
     arrangement = packing.Arrangement(CONFIGS[name], 8)
     sizes = denoise.kernel_sizes(arrangement, cache_rows=48, suffix=suffix, shared_bytes=232448, fp8=fp8)
-    file = folder / "kernel.cubin"
-    file.write_bytes(denoise.compiled("sm_90a", sizes, folder=folder / "kept"))
-    triton = pytest.importorskip("triton")
-    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "nvdisasm"
-    return subprocess.run([tool, "-c", file], capture_output=True, text=True, check=True).stdout
+    pytest.importorskip("triton")
+    return disassembled(denoise.compiled("sm_90a", sizes, folder=folder / "kept"), folder)
 
 
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from conftest import on_hopper
 from denoise_helpers import CONFIGS, has_nvrtc
-from kernel_turns.stalls import Instruction, by_function, compiled, functions, instructions, waits
+from kernel_turns.stalls import Instruction, by_function, compiled, disassembled, functions, instructions, waits
+from kernel_turns.turns import Job, marks_by_rank, time_in_turns
 from kernel_turns.variants import Variant
 
 from turbopi.kernels import denoise
@@ -20,8 +21,6 @@ SIZES: dict[str, Any] = {"cache_rows": 976, "suffix": 50, "shared_bytes": 232448
 @pytest.fixture
 def patch(tmp_path: Path) -> Path:
     """Of this tree's kernels: five staged streams, not four."""
-    kernels = tmp_path / "src" / "turbopi" / "kernels"
-    kernels.mkdir(parents=True)
     text = (denoise.FOLDER / "denoise_base.cu").read_text()
     assert text.count("STAGED = 4;") == 1
     for name, version in (("a", text), ("b", text.replace("STAGED = 4;", "STAGED = 5;"))):
@@ -56,6 +55,12 @@ def test_constants_replace_or_join_the_kernels_own() -> None:
 def test_what_is_no_variant_is_refused_by_name(spec: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Variant(spec)
+
+
+@pytest.mark.parametrize(("precision", "length"), [("fp7", 300), ("bf16", 977), ("bf16", 0)])
+def test_what_is_no_job_is_refused_by_name(precision: str, length: int) -> None:
+    with pytest.raises(ValueError, match=f"'{precision}', {length}: expected bf16 or fp8, 1 to 976"):
+        Job(10, precision, length)
 
 
 def test_a_folder_that_would_read_this_trees_sources_is_refused(tmp_path: Path) -> None:
@@ -117,15 +122,13 @@ def test_every_instruction_of_the_kernel_has_lines(tmp_path: Path, monkeypatch: 
     pytest.importorskip("triton")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     source, cubin, _ = compiled(Variant("here"), 10, fp8=False)
-    code, names = cubin.instructions(tmp_path), functions(source)
+    code, names = instructions(disassembled(cubin, tmp_path, "-gi")), functions(source)
     assert len(code) > 1000 and all(instruction.lines for instruction in code)
     assert {"gate_up", "project", "attend", "gather"} <= {names[line] for one in code for line in one.lines}
 
 
 @on_hopper
 def test_a_variant_that_changes_nothing_computes_the_same() -> None:
-    from kernel_turns.turns import Job, marks_by_rank, time_in_turns
-
     job, variants = Job(10, "bf16", 300), [Variant("here"), Variant("here+NOTHING=1")]
     rows = time_in_turns(job, variants, rounds=1, calls=2)
     assert all(row.same and row.error < 0.01 and row.milliseconds >= row.fastest > 0 for row in rows)

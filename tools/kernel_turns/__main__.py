@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kernel_turns.variants import Variant
-from turbopi.errors import BackendUnavailable
+from turbopi.errors import BackendError
 
 MULTIPLYING, WARPS = 16, 20  # warps of a block
 
@@ -54,7 +54,7 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         {"time": _time, "launch": _launch, "stalls": _stalls}[arguments.command](arguments)
-    except (ValueError, BackendUnavailable) as e:
+    except (ValueError, BackendError) as e:
         parser.error(str(e))
 
 
@@ -95,12 +95,13 @@ def _launch(arguments: argparse.Namespace) -> None:
 
 
 def _stalls(arguments: argparse.Namespace) -> None:
-    from kernel_turns.stalls import by_function, compiled, functions, read, waits
+    from kernel_turns.stalls import by_function, compiled, disassembled, functions, instructions, read, waits
     from kernel_turns.turns import STEPS
 
     source, cubin, arrangement = compiled(Variant(arguments.variant), arguments.tokens, arguments.precision == "fp8")
     with tempfile.TemporaryDirectory() as folder:
-        found = waits(read(arguments.samples), cubin.instructions(Path(folder)), 32 << arguments.interval, WARPS)
+        code = instructions(disassembled(cubin, Path(folder), "-gi"))
+    found = waits(read(arguments.samples), code, 32 << arguments.interval, WARPS)
     names, lines, console = functions(source), source.splitlines(), Console()
     passes = STEPS * arrangement.config.expert.depth * arrangement.blocks  # of a block through a layer
     table = Table("function", "cycles a layer", "samples by what was waited for", title="mean of the multiplying warps")

@@ -39,32 +39,27 @@ class Waited:
     reasons: Counter[str]  # samples by what was waited for
 
 
-@dataclass
-class Cubin:
-    code: bytes
-
-    def instructions(self, folder: Path) -> list[Instruction]:
-        """Of the denoising kernel, by nvdisasm, which comes with Triton. Raises BackendUnavailable without it."""
-        try:
-            import triton
-        except ImportError as e:
-            raise BackendUnavailable(f"nvdisasm comes with Triton ({e}); pip install triton") from e
-        file, tool = folder / "kernel.cubin", Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "nvdisasm"
-        file.write_bytes(self.code)
-        done = subprocess.run([tool, "-c", "-gi", file], capture_output=True, text=True, check=True)
-        return instructions(done.stdout)
+def disassembled(cubin: bytes, folder: Path, *options: str) -> str:
+    """What nvdisasm prints, which comes with Triton. Raises BackendUnavailable without it."""
+    try:
+        import triton
+    except ImportError as e:
+        raise BackendUnavailable(f"nvdisasm comes with Triton ({e}); pip install triton") from e
+    file, tool = folder / "kernel.cubin", Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "nvdisasm"
+    file.write_bytes(cubin)
+    return subprocess.run([tool, "-c", *options, file], capture_output=True, text=True, check=True).stdout
 
 
-def compiled(variant: Variant, tokens: int, fp8: bool) -> tuple[str, Cubin, Arrangement]:
+def compiled(variant: Variant, tokens: int, fp8: bool) -> tuple[str, bytes, Arrangement]:
     """The full-size kernel's source, its machine code with lines, who does what."""
     arrangement = Arrangement(preset("pi05_libero").model, clusters=8)
     sizes = variant.sizes(arrangement, cache_rows=CACHE_ROWS, suffix=tokens, shared_bytes=SHARED_BYTES, fp8=fp8)
     source: str = variant.module.source(tokens, fp8)
-    return source, Cubin(nvrtc.compile_cubin(source, "sm_90a", sizes, lines=True)), arrangement
+    return source, nvrtc.compile_cubin(source, "sm_90a", sizes, lines=True), arrangement
 
 
 def instructions(text: str) -> list[Instruction]:
-    """Of what nvdisasm prints, the denoising kernel's."""
+    """Of what nvdisasm prints with -gi, the denoising kernel's."""
     found: list[Instruction] = []
     lines: list[int] = []
     ended = False

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from denoise_helpers import GPU, Problem, input_scales, plain, problem, relative
+from denoise_helpers import GPU, input_scales, plain, problem, relative
 from torch import Tensor
 
 from kernel_turns.variants import Variant
+from turbopi.backends import resolve_device
 from turbopi.errors import BackendUnavailable
 from turbopi.kernels.denoise import unavailable
 from turbopi.kernels.denoise_packing import RANKS, PackedExpert
@@ -36,15 +37,18 @@ class Row:
 
 
 class Job:
-    """The full-size expert with random weights: `tokens` suffix tokens behind a prefix of `length`, NaN behind that."""
+    """The full-size expert with random weights: `tokens` suffix tokens behind a prefix of `length`, NaN behind that.
+
+    Raises ValueError for another precision or length, or without a GPU, BackendUnavailable for one that isn't Hopper.
+    """
 
     def __init__(self, tokens: int, precision: str, length: int, clusters: int = 8) -> None:
-        reason = unavailable(GPU) if torch.cuda.is_available() else "no NVIDIA GPU is here"
-        if reason is not None:
+        if precision not in ("bf16", "fp8") or not 1 <= length <= CACHE_ROWS:
+            raise ValueError(f"{precision!r}, {length}: expected bf16 or fp8, 1 to {CACHE_ROWS} prefix tokens")
+        if (reason := unavailable(resolve_device(GPU))) is not None:
             raise BackendUnavailable(reason)
         p = problem("full", STEPS, tokens, length, SEED, GPU)
-        p.cache_k, p.cache_v = _padded(p.cache_k, length), _padded(p.cache_v, length)
-        self.problem: Problem = p
+        self.problem = p
         self.packed = PackedExpert.pack(p.config, p.layers, clusters, input_scales(p) if precision == "fp8" else None)
         self.exact = plain(p, torch.float32)[0][-1]
         self.tokens, self.length = tokens, torch.tensor([length], device=GPU)
@@ -69,12 +73,6 @@ class Job:
     def launch(self, kernel: Any, x_t: Tensor, v_t: Tensor) -> None:
         p = self.problem
         kernel.launch(p.noise, p.cache_k, p.cache_v, self.length, x_t, v_t)
-
-
-def _padded(cache: Tensor, length: int) -> Tensor:
-    rows = cache.new_full((cache.shape[0], CACHE_ROWS, *cache.shape[2:]), torch.nan)
-    rows[:, :length] = cache[:, :length]
-    return rows
 
 
 def time_in_turns(job: Job, variants: list[Variant], rounds: int, calls: int = 12) -> list[Row]:

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import tempfile
 import weakref
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -47,10 +48,7 @@ class Variant:
         return {**self._sizes(*args, **options), **self.constants, **traced}
 
     def kernel(self, *args: Any, trace: bool = False, **options: Any) -> denoise.DenoiseKernel:
-        def sizes(*args: Any, **options: Any) -> dict[str, int]:
-            return self.sizes(*args, trace=trace, **options)
-
-        self.module.kernel_sizes = sizes  # type: ignore[attr-defined]
+        self.module.kernel_sizes = partial(self.sizes, trace=trace)  # type: ignore[attr-defined]
         kernel: denoise.DenoiseKernel = self.module.DenoiseKernel(*args, **options)
         return kernel
 
