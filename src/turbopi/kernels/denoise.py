@@ -36,7 +36,7 @@ PARTS = tuple(
     f"denoise_{part}.cu"
     for part in (
         *("base", "primitives", "wgmma", "producer", "product", "spread", "stream"),
-        *("project", "score", "attention", "step", "loop"),
+        *("project", "score", "together", "attention", "step", "loop"),
     )
 )
 THREADS = (WARPS + 4) * 32
@@ -103,7 +103,7 @@ def kernel_sizes(
         "TP_KEY_TILES": most(cache_rows, BLOCK),
         "TP_FP8": int(fp8),
         # Larger slots of weights are faster, if enough of them fit.
-        "TP_RPS": 4 if suffix <= (48 if cache_rows <= 1024 else 24) else 2,
+        "TP_RPS": 4 if suffix <= (40 if cache_rows <= 1024 else 24) else 2,
         "TP_SMEM": shared_bytes,
         "TP_SCRATCH": scratch,
     }
@@ -116,6 +116,7 @@ def source(suffix: int, fp8: bool) -> str:
         hopper.wgmma("add_product", columns, numbers=numbers),
         hopper.wgmma("add_from_registers", columns, numbers=numbers, from_registers=True),
         hopper.wgmma("add_rows", columns, from_registers=True),
+        hopper.wgmma("add_keys", 2 * 8),
     )
     return hopper.source(*PARTS, instructions="\n".join(products), folder=FOLDER)
 

@@ -1,12 +1,8 @@
-// Part 10 of 12: attention. The keys are split over the ranks of the head's cluster.
+// Part 11 of 13: attention. The keys are split over the ranks of the head's cluster.
 
-// Attention of this cluster's head, sent to all ranks. Everything local lies in region X.
-__device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix_all) {
-  b.forget();
-  asm volatile("" : "+r"(prefix_all));
-  const int all = most(prefix_all, 16), tile0 = share(all, S, b.rank()), tiles = share(all, S, b.rank() + 1) - tile0;
-  const int prefix = min(tiles * 16, prefix_all - tile0 * 16), slots = most(tiles, SLOT_TILES);
-  const int suffix0 = share(T, S, b.rank()), suffix = share(T, S, b.rank() + 1) - suffix0;
+// The same (see `attend_together`) with each warp's products its own: few tokens, or many keys.
+__device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 bit, const Keys& keys) {
+  const int tiles = keys.tiles, prefix = keys.keys, slots = keys.slots, suffix0 = keys.suffix0, suffix = keys.suffix;
   const bool scorer = b.warp() < SCORERS, for_suffix = b.warp() >= SUFFIX_WARP;
   const int column = (b.warp() - (W - WEIGHERS)) * CT;  // this warp's first tile of them
   constexpr int MOST_SLOTS = most(KT, SLOT_TILES);
@@ -54,7 +50,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       const int tile = min(column + j, QT - 1), owner = ((tile + 1) * S - 1) / QT, in = tile - share(QT, S, owner);
       last[j] = make_uint4(0, 0, 0, 0);
       if (suffix > 0)
-        ldmatrix_transposed(last[j], b.base + M_X + X_SUFFIX + (SUFFIX + row) * RS + (tile * 16 + (b.lane() & 8)) * 2);
+        ldmatrix_transposed(last[j], b.base + M_X + X_VALUE_ROWS + row * RS + (tile * 16 + (b.lane() & 8)) * 2);
       constexpr bool ONE_OWNER = QT % S == 0 && QTL % CT == 0;
       if (ONE_OWNER && j > 0) {
         to[j] = to[0] + j * NT * OUTPUT, to_bar[j] = to_bar[0];
@@ -69,7 +65,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
 #pragma unroll
     for (int j = 0; j < CT; ++j)
       if (column + j < QT) {
-        if (!ASYNC) keep_prefix(b, out[j]);
+        keep_prefix(b, out[j]);
         if (suffix > 0) mma_tokens(out[j], last[j], token_address(b, M_X + X_P) + KT * NT * 256);
 #pragma unroll
         for (int n = 0; n < NT; ++n)
@@ -187,50 +183,6 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
       }
       send_outputs(out);
     }
-  } else if constexpr (ASYNC) {
-    if (some_keys) {  // while queries come
-      pause(u32(clock64()), SUFFIX_PATIENCE);
-      __syncwarp();
-      suffix_keys.ask(), suffix_keys.keep(b);
-    }
-    if (for_suffix) arrive<SUFFIX_KEYS, 5>();
-    if (some_values) suffix_values.ask(), suffix_values.keep(b);
-    const u32 first_slot = b.slot;
-    auto slot_of = [&](u32 i) { return first_slot + i < STAGES ? first_slot + i : first_slot + i - STAGES; };
-#pragma unroll 1
-    for (int i = 0; i < slots; ++i) take_slot(b);
-    const bool scores = !for_suffix && b.warp() / 4 * 4 <= tiles, its_suffix = b.warp() == tiles;
-    const byte* const from = b.warp() < tiles
-                                 ? b.ring(slot_of(b.warp() / SLOT_TILES)) + b.warp() % SLOT_TILES * KEY_TILE
-                                 : b.smem + M_X + X_KEYS;
-    if (its_suffix) sync<SUFFIX_KEYS, 5>();
-    auto fetch = [&](int k) { return load_fragment(from + k * FRAGMENT, b.lane()); };
-    uint4 first[SCORE_CHUNK];
-#pragma unroll
-    for (int k = 0; k < SCORE_CHUNK; ++k) first[k] = fetch(k);
-    receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
-    MARK(3)
-    float c[1][NT][4];
-    clear(c[0]);
-    if (scores) {
-      show_to_products();
-      score_together(b, first, fetch, c[0]);
-    }
-#pragma unroll 1
-    for (int i = 0; i < slots; ++i) give_slot(b, slot_of(i));
-    MARK(4)
-    if (b.warp() <= tiles) {
-      weigh_prefix(b, c, its_suffix ? KT : b.warp(), its_suffix ? suffix : prefix - b.warp() * 16);
-    } else if (b.warp() == TOPS_WARP) {
-      sync<TOPS, TOPS_WARPS>();
-      float2 top[NT];
-      load_tops(b, top);
-      send_by_token(b, top, X_TOPS, BAR_TOPS);
-    } else if (!for_suffix) {
-      arrive<TOPS, TOPS_WARPS>();
-    }
-    show_to_products();
-    consumers_sync();
   } else {
     receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
     MARK(3)
@@ -263,37 +215,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     consumers_sync();
   }
   MARK(5)
-  if constexpr (ASYNC) {
-    static_assert(!ASYNC || CT == 1, "a tile of columns for a warp");
-    const u32 weights = operand_place(b.start() + M_X + X_P, NT * 128);
-    float sums[NT * 4], out[CT][NT][4];
-#pragma unroll
-    for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
-    if (b.warp() < NT) send_some_sums(b, b.warp(), tiles, suffix);
-#pragma unroll 1
-    for (int i = 0; i < slots; ++i) {
-      const u32 slot = take_slot(b);
-      const byte* from = b.ring(slot) + min(b.warp(), QT - 1) * FRAGMENT;
-      uint4 v[SLOT_TILES];
-#pragma unroll
-      for (int sub = 0; sub < SLOT_TILES; ++sub) {  // missing tiles are zeros
-        v[sub] = make_uint4(0, 0, 0, 0);
-        if (i * SLOT_TILES + sub < tiles) v[sub] = load_fragment(from + sub * KEY_TILE, b.lane());
-      }
-      begin_products();
-#pragma unroll
-      for (int sub = 0; sub < SLOT_TILES; ++sub)
-        add_rows(sums, v[sub].x, v[sub].y, v[sub].z, v[sub].w,
-                 operand_at<128>(behind(weights, min(i * SLOT_TILES + sub, tiles - 1) * NT * 256)), 1);
-      commit_products();
-      await_products<0>();
-      give_slot(b, slot);
-    }
-#pragma unroll
-    for (int i = 0; i < NT * 4; ++i) out[0][i / 4][i % 4] = sums[i];
-    prepare_outputs();
-    send_outputs(out);
-  } else if constexpr (!HOLD) {
+  if constexpr (!HOLD) {
     float out[CT][NT][4];
     clear_out(out);
 #pragma unroll 1
@@ -316,8 +238,10 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     send_outputs(out);
     if (b.warp() == LEADER) send_sums(b, tiles, suffix);
   }
-  MARK(6)
-  // Ranks' outputs, by their largest logits, which come first.
+}
+
+// Ranks' outputs of this one's columns, by their largest logits, which come first; then attention to all ranks.
+__device__ __forceinline__ void combine(Block& b) {
   b.forget();
   static_assert(QTL * NT <= W, "a warp for 8 tokens of a tile");
   const int qn = b.qn(), tile = b.warp() % imax(qn, 1), n = b.warp() / imax(qn, 1), token = n * 8 + 2 * b.t();
@@ -384,4 +308,17 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   MARK(9)
   // A rank without queries has nothing to send now, but what has come may not land over the stream that comes next.
   if (IDLE_Q && b.thread < S) send(at_rank(b.base + M_TOKEN, b.thread), 0, at_rank(b.bar(BAR_ATT), b.thread));
+}
+
+// Attention of this cluster's head, sent to all ranks. Everything local lies in region X.
+__device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix) {
+  b.forget();
+  asm volatile("" : "+r"(prefix));
+  const Keys keys(b, prefix);
+  if constexpr (ASYNC)
+    attend_together(b, kv, bit, keys);
+  else
+    attend_by_warps(b, kv, bit, keys);
+  MARK(6)
+  combine(b);
 }

@@ -1,5 +1,5 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
-// Part 1 of 12, which denoise.py puts together: sizes, shared memory, a CTA's view.
+// Part 1 of 13, which denoise.py puts together: sizes, shared memory, a CTA's view.
 //
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
@@ -47,7 +47,7 @@ constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
 // Clock cycles before sums are asked for: polls slow down what they wait for.
-constexpr u32 PATIENCE = FEW ? 500 : FP8 ? 300 : 600;
+constexpr u32 PATIENCE = FEW ? 500 : FP8 ? 300 : 400;
 constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see denoise_spread.cu
 constexpr int OWN_N = most(NT, NC);        // if so: 8 tokens of the slice at a time, which a CTA looks after
 constexpr int ITEMS_X = most(SPREAD ? DX * OWN_N : DX * NT, W);  // (tile, 8 tokens) that one warp looks after
@@ -56,9 +56,10 @@ static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64
 
 // A product's tiles are multiplied in groups of up to 8. A warpgroup multiplies 4 tiles at once, a warp one of them;
 // the warpgroups form rows of tiles and `parts` of the reduction. Tiles that are missing are multiplied, too: whatever
-// lies there, it makes rows of its own, which nobody reads.
+// lies there, it makes rows of its own, which nobody reads. Many tokens' sums are so large that two warpgroups rather
+// rest than have parts of their own.
 __host__ __device__ constexpr int group_tiles(int left) { return left < 8 ? left : 8; }
-__host__ __device__ constexpr int group_parts(int tiles) { return tiles > 4 ? W / 8 : W / 4; }
+__host__ __device__ constexpr int group_parts(int tiles) { return SPREAD || tiles > 4 ? W / 8 : W / 4; }
 __host__ __device__ constexpr int plan_groups(int mt) { return most(mt, 8); }
 // Partial sums of all tiles, or of all but one part of each.
 __host__ __device__ constexpr int plan_partials(int mt) {
@@ -74,9 +75,11 @@ constexpr int PARTIAL = (NT - 1) * 512 + TAIL * 128;  // bytes of one tile's par
 
 constexpr int RS = HD * 2 + 16;  // bytes of a suffix key's or value's row: no bank conflicts for ldmatrix
 constexpr int FRAGMENT = 512, RPS = TP_RPS, SLOT = RPS * W * FRAGMENT;
-// A round: RPS fragments of the reduction for each part of it. Weights are filled up to whole rounds (of 4) with zeros.
-__host__ __device__ constexpr int plan_rounds(int parts, int blocks) {
-  return most(most(blocks, KB), parts * 4) * (4 / RPS);
+// A round: RPS fragments of the reduction for each part of it. Weights of a group of tiles are filled up with zeros to a
+// multiple of `filled` fragments.
+__host__ __device__ constexpr int filled(int tiles) { return 4 * (tiles > 4 ? W / 8 : W / 4); }
+__host__ __device__ constexpr int plan_rounds(int tiles, int blocks) {
+  return most(most(blocks, KB), filled(tiles)) * filled(tiles) / (RPS * group_parts(tiles));
 }
 __host__ __device__ constexpr int slot_rounds(int parts, int tiles) {  // W / (parts * tiles), for they are few
   int n = W / parts;
@@ -85,15 +88,15 @@ __host__ __device__ constexpr int slot_rounds(int parts, int tiles) {  // W / (p
 }
 // With few tokens q|k|v are multiplied by mma: see `QkvProduct`. Its parts are the warps', or of two warps each if all
 // would need more memory than the stream that they lie over.
-constexpr int QKV = QTL + KVL, QKV_ROUNDS = plan_rounds(group_parts(group_tiles(QKV)), D16);
+constexpr int QKV = QTL + KVL, QKV_ROUNDS = plan_rounds(group_tiles(QKV), D16);
 constexpr bool MMA_QKV = FEW && QKV <= 3 && QKV_ROUNDS * KB <= 4 && (QKV_ROUNDS & (QKV_ROUNDS - 1)) == 0;
 static_assert(!MMA_QKV || RPS * group_parts(QKV) == W, "a fragment of each round for a warp");
 // Of other products' weights the first rounds wait in registers for activations, if tokens are few: that is room for as
 // many more behind them. A round is a slot then, and all CTAs have as many.
 __host__ __device__ constexpr int rounds_ahead(int tiles, bool all, int blocks, int rounds) {
   const int parts = group_parts(group_tiles(tiles));
-  return FEW && RPS == 4 && all && tiles <= 8 && slot_rounds(parts, tiles) == 1 && blocks % (KB * parts * 4) == 0
-             ? imin(rounds, plan_rounds(parts, blocks))
+  return FEW && RPS == 4 && all && tiles <= 8 && slot_rounds(parts, tiles) == 1 && blocks % (KB * filled(tiles)) == 0
+             ? imin(rounds, plan_rounds(group_tiles(tiles), blocks))
              : 0;
 }
 constexpr int GATE_UP_AHEAD = rounds_ahead(GTL, F16 % NC == 0 && 2 * HC % S == 0, D16, FP8 ? 2 : 4);
@@ -130,24 +133,28 @@ constexpr int OUTPUT = SPREAD ? 256 : 512;
 constexpr int X_TOPS = 0, X_SUMS = S * NT * 32, X_COMB = 2 * X_SUMS, X_P = X_COMB + S * QTL * NT * OUTPUT;
 constexpr int X_SUFFIX_SUMS_FEW = X_P + (KT + 1) * NT * 256,
               X_KEEP = X_SUFFIX_SUMS_FEW + (SPREAD ? 0 : 3 * NT * 256), X_SUFFIX = X_KEEP + up128(NT * 32);
+constexpr int ROWS = SPREAD ? 16 : SUFFIX;  // of keys, and of values, that don't lie in tiles: see `PrefixShare`
+// If SPREAD such keys are an operand: 8 columns of 8 keys and of the next 8, then what keeps banks apart.
+constexpr int KEY_COLUMNS = 2 * 128 + 16, KEY_ROWS = SPREAD ? HD / 8 * KEY_COLUMNS : ROWS * RS;
 // Between steps, if tokens are few: what ranks add to v_t, then by item the slice in float32 and what it adds to v_t.
 constexpr int X_VPART = 0, X_XS = up128(S * T * A * 4);
 constexpr int XS_PART = A > 32 ? 512 : 0, XS_ITEM = imax(XS_PART + A * 32, 512);  // over the item, if read at once
 // If SPREAD, region X holds everything, as each exchange waits until all ranks are done with what lay there: attention
 // and queries behind qkv's sums, hidden units over the stream with the feed-forward's partial sums behind them.
-// Attention comes when the suffix's partial logits, or keys, are no longer needed.
-constexpr int X_ATT = up128(imax(X_SUFFIX + 2 * SUFFIX * RS,
+// Attention comes when the suffix's partial logits are no longer needed.
+constexpr int X_ATT = up128(imax(X_SUFFIX + ROWS * RS,
                                  imax(plan_partials(QKV), plan_others(DX)) * PARTIAL)),
-              X_KEYS = X_ATT + QTL * NT * 256,  // of the suffix, as a tile: behind queries that still leave
-              X_Q = imax(X_ATT + imax(QT * OPERAND, 3 * 256) * NT, X_KEYS + KEY_TILE), X_FF_SUMS = HC * NT * OPERAND;
-constexpr int X_SUFFIX_SUMS = SPREAD ? X_ATT : X_SUFFIX_SUMS_FEW;
+              X_ROWS = X_ATT + imax(QTL, 3) * NT * 256,  // behind queries that still leave, and partial logits
+              X_Q = imax(X_ATT + QT * OPERAND * NT, X_ROWS + KEY_ROWS), X_FF_SUMS = HC * NT * OPERAND;
+constexpr int X_SUFFIX_SUMS = SPREAD ? X_ATT : X_SUFFIX_SUMS_FEW, X_KEY_ROWS = SPREAD ? X_ROWS : X_SUFFIX,
+              X_VALUE_ROWS = SPREAD ? X_SUFFIX : X_SUFFIX + ROWS * RS;
 // Behind them float32 at a step's end: partial sums of v_t [S][V_PARTS][OWN_T][A], the slice [DX * 16][OWN_T], x_t.
 constexpr int OWN_T = OWN_N * 8, V_PARTS = imax(CONSUMERS / A / OWN_T, 1);  // tokens whose x_t a CTA knows
 constexpr int X_OWN_V = up128(X_FF_SUMS + imax(plan_others(GTL), plan_others(DX)) * PARTIAL),
               X_OWN_XS = X_OWN_V + S * V_PARTS * OWN_T * A * 4, X_OWN_XT = X_OWN_XS + DX * 16 * OWN_T * 4;
 constexpr int X_SPREAD = imax(X_Q + QT * NT * 256, X_OWN_XT + OWN_T * A * 4);
 constexpr int X_SIZE =
-    up128(imax(imax(X_BYTES, SPREAD ? X_SPREAD : X_SUFFIX + 2 * SUFFIX * RS),
+    up128(imax(imax(X_BYTES, SPREAD ? X_SPREAD : X_SUFFIX + 2 * ROWS * RS),
                imax(imax(MMA_QKV ? QKV * QKV_PARTS : plan_partials(QKV), SPREAD ? 0 : plan_partials(GTL)) * PARTIAL,
                     SPREAD ? 0 : X_XS + DX * NT * XS_ITEM)));
 // Region H: queries and attention's output, or the hidden units; then the partial sums of out and of down. Hidden
@@ -162,7 +169,7 @@ __host__ __device__ constexpr int plan_slots(int mt, int blocks) {
   int n = 0;
   for (; mt > 0; mt -= 8) {
     const int tiles = group_tiles(mt), parts = group_parts(tiles);
-    n += most(plan_rounds(parts, blocks), slot_rounds(parts, tiles));
+    n += most(plan_rounds(tiles, blocks), slot_rounds(parts, tiles));
   }
   return n;
 }
@@ -196,11 +203,31 @@ constexpr bool EVEN_HEAD = SPREAD && QT % S == 0;
 constexpr bool COPY_QUERIES = EVEN_HEAD && NT >= (FP8 ? 5 : 6), COPY_ATTENTION = EVEN_HEAD && !FP8 && NT >= 6;
 // A block of two tiles at a time, where four warps have made it.
 constexpr bool COPY_HIDDEN = SPREAD && (FP8 || NT >= 5) && F16 % NC == 0 && 2 * HC % S == 0 && GTL % 2 == 0 &&
-                             GTL <= 8 && group_parts(GTL) == 2;
+                             GTL > 4 && GTL <= 8;
 constexpr int COPY_WARP = 7;  // has none of the keys and values that others have just published: its fence needn't wait
 constexpr int X_OWN_HIDDEN = X_OWN_V;  // of a rank, before they are sent
 static_assert(!COPY_HIDDEN || X_OWN_HIDDEN + GTL / 2 * NT * OPERAND <= X_SIZE, "room for a rank's hidden units");
 static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little shared memory");
+
+// Who scores prefix keys, a tile a warp and round. ASYNC: by wgmma, see denoise_together.cu.
+constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS);
+constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES;
+// Prefix keys that rank i has: tiles from `first` on, with `keys` keys in all. Ranks with one more would let the others
+// wait. So if tokens are many and what is left behind an even share is little, it is shared out, too: keys `loose0`..,
+// which go with those of the suffix as one more tile (of many keys they don't: see ASYNC).
+struct PrefixShare {
+  int first, tiles, keys, loose0 = 0, loose = 0;
+  __device__ __forceinline__ PrefixShare(int all, int i) {
+    const int even = all / 16 / S * S, left = all - even * 16;
+    if (ASYNC && left <= S * (16 - SUFFIX)) {
+      tiles = even / S, first = tiles * i, keys = tiles * 16;
+      loose0 = even * 16 + share(left, S, i), loose = even * 16 + share(left, S, i + 1) - loose0;
+      return;
+    }
+    const int count = most(all, 16);
+    first = share(count, S, i), tiles = share(count, S, i + 1) - first, keys = min(tiles * 16, all - first * 16);
+  }
+};
 
 // ring: full and empty, by slot
 enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };

@@ -1,4 +1,4 @@
-// Part 2 of 12: waiting, moving data, arithmetic.
+// Part 2 of 13: waiting, moving data, arithmetic.
 
 // ---- waiting
 
@@ -27,49 +27,6 @@ __device__ __forceinline__ void pause(u32 since, u32 cycles) {
   }
 }
 __device__ __forceinline__ void prefetch_line(const float* at) { asm volatile("prefetch.global.L2 [%0];" ::"l"(at)); }
-// What the norms of layer n need, to L2: it is read once, by everybody at the same time, while memory is busy with
-// weights.
-__device__ __forceinline__ void prefetch(const Block& b, int n) {
-  const int step = n / L, l = n % L;
-  if (step >= b.a.steps) return;
-  auto lines = [&](const float* from, int floats) {
-#pragma unroll 1
-    for (int i = b.lane() * 32; i < floats; i += 32 * 32) prefetch_line(from + i);
-  };
-  const float* table = b.a.table + (size_t(step) * (2 * L + 1) + 2 * l) * 3 * D + b.x0() * 16;
-  lines(b.a.shifted + (size_t(n) * (NC * S) + b.cluster() * S + b.rank()) * TILES * 16, TILES * 16);
-  lines(table + 2 * D, b.xn() * 16), lines(table + 3 * D, b.xn() * 16);
-  lines(table + 5 * D, b.xn() * 16), lines(table + 6 * D, b.xn() * 16);
-}
-__device__ __forceinline__ long long nanoseconds() {
-  long long v;
-  asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(v));
-  return v;
-}
-__device__ __forceinline__ void watch(const Block& b) {
-  u32 last = 0, layer = ~0u;
-  const long long begun = clock64(), begun_at = nanoseconds();
-  long long since = begun;
-  prefetch(b, 0);
-#pragma unroll 1
-  for (u32 now = 0; now >> 20 != FINISHED; __nanosleep(500)) {
-    now = *(volatile u32*)(b.smem + M_PROGRESS);
-    if ((now & 0xfffff) != layer) layer = now & 0xfffff, prefetch(b, int(layer) + 1);
-    if (now != last) {
-      last = now, since = clock64();
-    } else if (clock64() - since > 4000000000ll) {
-      *(volatile u32*)(b.a.hang + blockIdx.x) = 1u << 31 | now;
-      __threadfence_system();
-      const long long end = clock64() + 1000000000ll;  // for the other CTAs to say where they are
-#pragma unroll 1
-      while (clock64() < end) __nanosleep(10000);
-      __trap();
-    }
-  }
-  if (blockIdx.x == 0 && b.lane() == 0)
-    b.a.clock[0] = clock64() - begun, b.a.clock[1] = nanoseconds() - begun_at;
-}
-
 // All threads wait for use n of an exchange in the cluster; one of them arms the barrier for the next.
 __device__ __forceinline__ void receive(const Block& b, int bar, int n, u32 bytes, int what) {
   note(b, what);

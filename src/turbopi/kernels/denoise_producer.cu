@@ -1,4 +1,4 @@
-// Part 4 of 12: what brings weights, keys and values.
+// Part 4 of 13: what brings weights, keys and values.
 
 // One thread of a CTA, which never waits for activations. What it loads is the same in every layer, so a list of it is
 // made first: 100 cycles more for a slot are a microsecond in a layer.
@@ -21,7 +21,7 @@ struct Producer {
     if constexpr (FIRST < MT) {
       constexpr int N = group_tiles(MT - FIRST), PARTS = group_parts(N);
       if (FIRST < tiles) {
-        const int n = min(tiles - FIRST, N), rounds = plan_rounds(PARTS, blocks), most_rounds = slot_rounds(PARTS, n);
+        const int n = min(tiles - FIRST, N), rounds = plan_rounds(N, blocks), most_rounds = slot_rounds(PARTS, n);
         const u32 round = PARTS * RPS * n * FRAGMENT;
 #pragma unroll 1
         for (int r = 0; r < rounds; r += most_rounds) {
@@ -38,8 +38,8 @@ struct Producer {
     for (int k = 0; k < count; k += SLOT_TILES) add(from + k * KEY_TILE, min(SLOT_TILES, count - k) * KEY_TILE, true);
   }
   __device__ void run() {
-    const int tiles = most(int(*b.a.length), 16), first = share(tiles, S, b.rank());
-    const int count = share(tiles, S, b.rank() + 1) - first;
+    const PrefixShare mine(int(*b.a.length), b.rank());
+    const int first = mine.first, count = mine.tiles;
     int last_key = -STAGES;
     if (b.attends()) {
       product<QTL + KVL>(D16, b.qn() + b.kvn());
@@ -48,8 +48,9 @@ struct Producer {
       keys(KEY_TILES * KEY_TILE, count);
       product<DX>(QT, b.xn());
     }
-    const int gate_up = slots, back = gate_up - last_key;  // slots from the last of the keys on
-    const int late = PACE && back < STAGES ? gate_up : -1;
+    // When the keys have been scored, memory has nothing else to do for a while. Asked for earlier, gate|up is in the way
+    // of what the scores wait for.
+    const int gate_up = slots, scored = min(gate_up, last_key + STAGES), back = scored - last_key;
     product<GTL>(D16, b.gn());
     const int gate_up_end = slots;
     product<DX>(b.hn(), b.xn());
@@ -74,13 +75,12 @@ struct Producer {
           const uint2 what = list[i];
           const bool key = what.y & 1;
           const u32 bytes = what.y & ~1u, full = b.full(slot);
-          if (i == late) {
+          if (i == scored && (PACE || AHEAD)) {
             const bool wrapped = int(slot) < back;
             barrier_wait(b.empty(slot - back + (wrapped ? STAGES : 0)), free ^ !wrapped);
-          }
-          if (AHEAD && i == gate_up) {  // attention leaves memory idle
+            if (AHEAD)
 #pragma unroll 1
-            for (int k = gate_up + STAGES; k < gate_up_end; ++k) prefetch(weights, list[k]);
+              for (int k = gate_up + STAGES; k < gate_up_end; ++k) prefetch(weights, list[k]);
           }
           barrier_wait(full + 8, free);  // until its last contents have been read
           barrier_expect(full, bytes);

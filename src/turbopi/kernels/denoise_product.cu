@@ -1,4 +1,4 @@
-// Part 5 of 12: matrix products.
+// Part 5 of 13: matrix products.
 
 __device__ __forceinline__ u32 take_slot(Block& b) {
   const u32 slot = b.slot;
@@ -69,7 +69,8 @@ struct Ahead {
 template <int TILES_, int EVEN, int AHEAD>
 struct GroupProduct {
   static constexpr int PARTS = group_parts(TILES_);
-  static constexpr bool EXACT = EVEN % (KB * PARTS * 4) == 0;
+  static constexpr bool EXACT = EVEN % (KB * filled(TILES_)) == 0;
+  static constexpr bool SOME_REST = TILES_ <= 4 && PARTS == 2;  // warpgroups that have no tile
   static constexpr int UNROLL = EXACT && SPREAD ? 16 : 1;  // where the number of rounds is known
   Block& b;
   const Share my;
@@ -78,7 +79,7 @@ struct GroupProduct {
   float (&sums)[NT * 4];
 
   __device__ __forceinline__ GroupProduct(Block& block, int x, int n, int t, float (&to)[NT * 4])
-      : b(block), my(block, PARTS), blocks(n), tiles(t), rounds(plan_rounds(PARTS, blocks)),
+      : b(block), my(block, PARTS), blocks(n), tiles(t), rounds(plan_rounds(TILES_, blocks)),
         rounds_of_slot(slot_rounds(PARTS, t)),
         first(behind(operand_place(b.start() + x, FP8 ? NT * 128 : 128), EXACT ? my.part * NT * 256 : 0)), sums(to) {
 #pragma unroll
@@ -140,7 +141,12 @@ struct GroupProduct {
 
   __device__ __forceinline__ void operator()(Ahead<TILES_, AHEAD>& ahead) {
     if constexpr (AHEAD > 0) multiply(ahead);
-    from_slots();
+    if (SOME_REST && my.first >= 4) {
+#pragma unroll 1
+      for (int r = AHEAD; r < rounds; r += rounds_of_slot) give_slot(b, take_slot(b));
+    } else {
+      from_slots();
+    }
     if constexpr (AHEAD > 0) {
 #pragma unroll
       for (int i = 0; i < AHEAD * RPS; ++i) keep_until_here(ahead.weights[i]);

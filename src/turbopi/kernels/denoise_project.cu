@@ -1,4 +1,4 @@
-// Part 8 of 12: queries, keys and values of the suffix.
+// Part 8 of 13: queries, keys and values of the suffix.
 
 constexpr int ITEMS_Q =
     most((QTL + KVL) * NT, W);  // (tile, 8 tokens) of queries, keys and values that one warp finishes

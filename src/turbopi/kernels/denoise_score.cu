@@ -1,24 +1,28 @@
-// Part 9 of 12: attention's steps, of which denoise_attention.cu makes the whole.
+// Part 9 of 13: attention's steps, of which denoise_together.cu and denoise_attention.cu make the whole.
 
 // Who does what: the first SCORERS warps score a tile of prefix keys each, and the next if there are more; the last
 // four score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries.
 // If tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries
 // and weights; else all warps weigh, and the third warpgroup fetches the suffix's values. Queries of many tokens are
-// more than shared memory can bring to each warp by itself (ASYNC): a warpgroup's products share them, with keys or
-// values in registers. Warps without a tile multiply all the same, so there the suffix's keys, which the last four only
-// fetch, are the tile behind the prefix's, and one maximum is over all.
-constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS), LEADER = SCORERS - 1, SUFFIX_WARP = 12;
+// more than shared memory can bring to each warp by itself (ASYNC): see denoise_together.cu.
+constexpr int LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
-constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES;  // scored and weighed by wgmma
 // Blocks of its keys that a scoring warp holds, tiles of values that a weighing warp does: more would spill.
 constexpr int HELD_KEYS = QT < 12 ? QT : 12, HELD_TILES = KT < 4 ? KT : 4;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
 constexpr int SUFFIX_STEPS = most(QT, 4);                                   // blocks of columns of a suffix warp
-constexpr int TOPS_WARPS = ASYNC ? SUFFIX_WARP : SCORERS, TOPS_WARP = SUFFIX_WARP - 1;  // ASYNC: who sends them
-// Clock cycles before the suffix's keys are asked for, if ASYNC: asked for too early they come later.
-constexpr u32 SUFFIX_PATIENCE = 400;
 // Barriers of some warps; 1 is consumers_sync's.
-constexpr int TOPS = 2, SUFFIX_SUMS = 3, SUFFIX_KEYS = 3, WEIGHTS = 4, WEIGHTS_FOR_SUFFIX = 5, SUFFIX_WEIGHTS = 6;
+constexpr int TOPS = 2, SUFFIX_SUMS = 3, WEIGHTS = 4, WEIGHTS_FOR_SUFFIX = 5, SUFFIX_WEIGHTS = 6;
+
+// The keys of this rank.
+struct Keys : PrefixShare {
+  int slots;            // that tiles of prefix keys, or values, take
+  int suffix0, suffix;  // the first of the suffix's keys, how many
+  __device__ __forceinline__ Keys(const Block& b, int all) : PrefixShare(all, b.rank()) {
+    slots = most(tiles, SLOT_TILES);
+    suffix0 = share(T, S, b.rank()), suffix = share(T, S, b.rank() + 1) - suffix0;
+  }
+};
 
 // A lane's address for `mma_tokens` in activations [block][half][NT][8 tokens][8 columns], standard order.
 __device__ __forceinline__ u32 token_address(const Block& b, u32 region) {
@@ -59,33 +63,9 @@ __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int
   return seen;
 }
 
-// The same for a warpgroup, each warp with 16 keys of its own, whose first blocks it has.
-constexpr int SCORE_CHUNK = QT % 4 == 0 ? 4 : 1;
-template <typename Fetch>
-__device__ __forceinline__ void score_together(const Block& b, uint4 (&now)[SCORE_CHUNK], Fetch fetch,
-                                               float (&c)[NT][4]) {
-  const u32 queries = operand_place(b.start() + M_Q, NT * 128);
-  float sums[NT * 4];
-#pragma unroll
-  for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
-  uint4 next[SCORE_CHUNK];
-#pragma unroll
-  for (int k = 0; k < QT; k += SCORE_CHUNK) {
-    begin_products();
-#pragma unroll
-    for (int i = 0; i < SCORE_CHUNK; ++i)
-      add_rows(sums, now[i].x, now[i].y, now[i].z, now[i].w,
-               operand_at<128>(behind(queries, (k + i) * NT * 256)), 1);
-    commit_products();
-    if (k + SCORE_CHUNK < QT)
-#pragma unroll
-      for (int i = 0; i < SCORE_CHUNK; ++i) next[i] = fetch(k + SCORE_CHUNK + i);
-    await_products<0>();
-#pragma unroll
-    for (int i = 0; i < SCORE_CHUNK; ++i) keep_until_here(now[i]), now[i] = next[i];
-  }
-#pragma unroll
-  for (int i = 0; i < NT * 4; ++i) c[i / 4][i % 4] = sums[i];
+// Where 8 columns of a key among the rows (ASYNC) lie.
+__device__ __forceinline__ int key_row(int row, int eight) {
+  return M_X + X_KEY_ROWS + eight * KEY_COLUMNS + row / 8 * 128 + row % 8 * 16;
 }
 
 // Suffix keys (kind 0) or values (1) from all clusters to shared memory, asked for first and kept later: of `rows` of
@@ -120,20 +100,16 @@ struct SuffixPart {
       const int row = item(i) / quads, quad = first + item(i) % quads;
       const uint2 four = make_uint2(pack(__uint_as_float(v[i].x), __uint_as_float(v[i].y)),
                                     pack(__uint_as_float(v[i].z), __uint_as_float(v[i].w)));
-      if (ASYNC && kind == 0) {  // as `turbopi_denoise_prepare` has a tile of keys
-        byte* const p = b.smem + M_X + X_KEYS + quad / 4 * FRAGMENT + (row * 4 + quad % 2 * 2) * 16 + quad / 2 % 2 * 8;
-        *(u32*)p = four.x, *(u32*)(p + 16) = four.y;
-      } else {
-        *(uint2*)(b.smem + M_X + X_SUFFIX + (kind * SUFFIX + row) * RS + quad * 8) = four;
-      }
+      const int rows_at = M_X + (kind ? X_VALUE_ROWS : X_KEY_ROWS) + row * RS + quad * 8;
+      *(uint2*)(b.smem + (SPREAD && ASYNC && !kind ? key_row(row, quad / 2) + quad % 2 * 8 : rows_at)) = four;
     }
   }
 };
 
-// Logits of the rank's suffix keys, by the last four warps; SUFFIX_WARP gets them. (Not if ASYNC.)
+// Logits of the rank's suffix keys, by the last four warps; SUFFIX_WARP gets them.
 __device__ __forceinline__ void score_suffix(const Block& b, int count, float (&c)[NT][4]) {
   const int part = b.warp() - SUFFIX_WARP, first = share(QT, 4, part), steps = share(QT, 4, part + 1) - first;
-  const u32 from = b.base + M_X + X_SUFFIX + min(b.lane() & 7, count - 1) * RS + first * 32 + (b.lane() >> 4) * 16;
+  const u32 from = b.base + M_X + X_KEY_ROWS + min(b.lane() & 7, count - 1) * RS + first * 32 + (b.lane() >> 4) * 16;
   auto fetch = [&](int k) {  // rows beyond the last key hold anything
     uint4 v;
     ldmatrix(v, from + k * 32);
@@ -190,7 +166,7 @@ __device__ __forceinline__ void store_weights(const Block& b, const float (&c)[N
       *(u32*)(p + n * 128 + i * 16) = pack(exp2_approx(c[n][i] - at), exp2_approx(c[n][i + 2] - at));
     }
 }
-// The largest logits of the rank's prefix (ASYNC: of all its keys).
+// The largest logits of the rank's prefix.
 __device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT]) {
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
@@ -209,7 +185,7 @@ __device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4
       if (b.g() < 2)
         atomicMax((int*)(b.smem + M_PART) + n * 8 + 2 * b.t() + b.g(), ordered(b.g() ? top[n].y : top[n].x));
   }
-  sync<TOPS, TOPS_WARPS>();
+  sync<TOPS, SCORERS>();
   load_tops(b, top);
 #pragma unroll
   for (int r = 0; r < R; ++r)
@@ -226,9 +202,9 @@ __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[
 constexpr u32 ATT_EXPECT = HD * (COPY_ATTENTION ? NT * 8 : T) * (OPERAND / 128) + (IDLE_Q ? S * 4 : 0);
 constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
 __device__ __forceinline__ u32 outputs_expect(const Block& b) {
-  return S * ((T + 1) / 2) * 8 + S * b.qn() * ((T + 1) / 2) * (OUTPUT / 4);
+  return S * ((T + 1) / 2) * 8 + (S - ASYNC) * b.qn() * ((T + 1) / 2) * (OUTPUT / 4);  // ASYNC: its own by stores
 }
-// The suffix's keys come last (not if ASYNC). Their weights go by the prefix's largest logits, too, unless theirs are
+// The suffix's keys come last. Their weights go by the prefix's largest logits, too, unless theirs are
 // so much larger (2^64) that the prefix's weights count for nothing: then those are dropped, which `X_KEEP` says.
 __device__ __forceinline__ void weigh_suffix(const Block& b, float (&c)[1][NT][4], int rows) {
   float2 own[NT], top[NT];

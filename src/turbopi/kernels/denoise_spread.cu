@@ -1,4 +1,4 @@
-// Part 6 of 12: who keeps which part of the residual stream, and how the parts come together if tokens are many
+// Part 6 of 13: who keeps which part of the residual stream, and how the parts come together if tokens are many
 // (SPREAD).
 //
 // If tokens are few, every cluster keeps the whole stream: each CTA adds up its slice for all tokens, and the ranks
@@ -134,25 +134,32 @@ __device__ __forceinline__ void await_slice(const Block& b) {
   }
   if (b.lane() == 0) barrier_arrive(b.bar(BAR_HERE));
 }
-// All lanes of a spare warp: until the slice's sums of squares, use `turn`, are. Answers take long, so three questions
-// are on their way at any time.
-__device__ __forceinline__ void await_squares(const Block& b, u32 turn) {
-  const uint2* const from = (const uint2*)(b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES) + b.rank() * NT * 4 +
-                            imin(b.lane(), NT * 4 - 1);
+// All lanes of a spare warp: the slice's sums of squares, use `turn`, to all ranks when they are there. Answers take long,
+// so three questions are on their way at any time.
+__device__ __forceinline__ void pass_on_squares(const Block& b, u32 turn) {
+  const int mine = imin(b.lane(), NT * 4 - 1);
+  const uint2* const from =
+      (const uint2*)(b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES) + b.rank() * NT * 4 + mine;
   uint2 q[3];
 #pragma unroll
   for (int i = 0; i < 3; ++i) {
     q[i] = peek(from);
     if (i < 2) pause(u32(clock64()), 150);
   }
+  uint2 seen;
 #pragma unroll 1
   for (bool here = false; !here;)
 #pragma unroll
     for (int i = 0; i < 3; ++i)
       if (!here) {
-        here = __all_sync(~0u, !missing(q[i], flag(turn)));
+        here = __all_sync(~0u, !missing(q[i], flag(turn))), seen = q[i];
         if (!here) q[i] = peek(from);
       }
+  if (b.lane() < NT * 4)
+#pragma unroll
+    for (int d = 0; d < S; ++d)
+      send(at_rank(b.base + M_SSQ + (b.rank() * NT * 4 + mine) * 8, d), seen.x, seen.y, at_rank(b.bar(BAR_SQUARES), d));
+  __syncwarp();
 }
 // A spare warp. The copy engine reads L2, as those did who have seen that the slice is there, and only then. Sums of
 // squares have a barrier of their own, as they come later and are needed later.
@@ -176,12 +183,7 @@ __device__ __forceinline__ void fetch_stream(const Block& b) {
         load_for_all(b.base + M_X + place * OPERAND,
                      b.a.scratch + B_STAGE + turn % STAGED * N_STAGE + place * (OPERAND / 16), items * OPERAND,
                      b.bar(BAR_X));
-      await_squares(b, turn);
-      show_to_copy_engine();
-      __syncwarp();
-      if (b.lane() == 0)
-        load_for_all(b.base + M_SSQ + b.rank() * NT * 32,
-                     b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES + b.rank() * NT * 2, NT * 32, b.bar(BAR_SQUARES));
+      pass_on_squares(b, turn);
       // A release whose word nobody reads: what is ABSENT now is so in L2 before this warp fetches again, and so before
       // this CTA publishes again, three turns before anybody asks for it.
       if (b.lane() == 0)

@@ -1,4 +1,4 @@
-// Part 11 of 12: between steps.
+// Part 12 of 13: between steps.
 
 constexpr u32 V_EXPECT = SPREAD ? S * (V_PARTS * A + 1) * OWN_T * 4 : S * T * A * 4 + SQUARES_EXPECT;
 

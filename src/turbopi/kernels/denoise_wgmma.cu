@@ -1,4 +1,4 @@
-// Part 3 of 12: asynchronous products of the tensor cores (wgmma). The four warps of a warpgroup together add 64 rows x
+// Part 3 of 13: asynchronous products of the tensor cores (wgmma). The four warps of a warpgroup together add 64 rows x
 // 16 columns of operand A, from shared memory or registers, times 16 columns x NT * 8 tokens of operand B, from shared
 // memory, to float32 sums: warp i has rows 16 i.., laid out as those of mma.m16n8k16, 8 tokens after 8.
 //
@@ -20,6 +20,7 @@ __device__ __forceinline__ void keep_until_here(uint4 v) { asm volatile("" ::"r"
 // What threads wrote to shared memory (or peers, whose barrier was waited for) before may now be read by products.
 __device__ __forceinline__ void show_to_products() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
 // add_product(float (&sums)[NT * 4], u64 a, u64 b, int keep), add_from_registers(.., u32 * 4, ..): weights, in bfloat16
-// or (32 columns) E4M3; add_rows: as the second, always bfloat16. The compiler makes all of them wait for each other if
+// or (32 columns) E4M3; add_rows: as the second, always bfloat16; add_keys(float (&sums)[8], u64 a, u64 b, int keep): bfloat16
+// queries times those of 16 keys. The compiler makes all of them wait for each other if
 // one stands in a branch of its own.
 TP_MMA
