@@ -316,7 +316,7 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
   asm volatile("" : "+r"(prefix));
   const Keys keys(b, prefix);
   if constexpr (ASYNC)
-    attend_together(b, keys);
+    attend_together(b, kv, bit, keys);
   else
     attend_by_warps(b, kv, bit, keys);
   MARK(6)

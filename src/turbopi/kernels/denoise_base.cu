@@ -244,21 +244,18 @@ constexpr int PAIRS = most(NC, 2);
 constexpr size_t N_STREAM = size_t(D16) * NT * PAIRS * 32;
 // Keeps them within float16's range; sums of E4M3 numbers lack their scales yet.
 constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;
-// Suffix keys and values: float32[T][2 HD] with flags, twice. ASYNC: bfloat16[KVT][T][4][rows g, g + 1; g + 8, g + 9],
-// g even, for whole sectors of one writer; four times, without flags (see ABSENT).
-constexpr u32 KV_STAGED = ASYNC ? 4 : 2;
-constexpr size_t N_KV = size_t(T) * HD / KV_STAGED;
+constexpr size_t N_KV = size_t(T) * HD / 2;              // suffix keys and values, float32[T][2 HD]
 constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM;
 // If SPREAD: the stream as products take it, four times, and sums of squares float32[S][NT * 8], twice; a word of each
 // CTA, which nobody reads; shares on their way to all ranks.
 constexpr u32 STAGED = 4;
 constexpr size_t N_STAGE = size_t(D16) * NT * (OPERAND / 16), N_SQUARES = size_t(S) * NT * 2;
 constexpr size_t N_HEAD = size_t(NC) * QT * NT, N_HIDDEN = size_t(NC) * HC * NT * (OPERAND / 16);
-constexpr size_t B_STAGE = B_KV + KV_STAGED * N_KV, B_SQUARES = B_STAGE + STAGED * N_STAGE;
+constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_SQUARES = B_STAGE + STAGED * N_STAGE;
 constexpr size_t B_ORDER = B_SQUARES + 2 * N_SQUARES, B_HIDDEN = B_ORDER + NC * S, B_QUERIES = B_HIDDEN + N_HIDDEN,
                  B_ATT = B_QUERIES + N_HEAD * 16, SCRATCH = SPREAD ? B_ATT + N_HEAD * (OPERAND / 16) : B_STAGE;
 static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");
-// Stands where a word of the staged stream, or of suffix keys and values, is still to come. Nothing is rounded to it: the NaN made then is another.
+// Stands where a word of the staged stream is still to come. Nothing is rounded to it: the NaN made then is another.
 constexpr u32 ABSENT = ~0u;
 // Whether there is the token whose 8 columns (E4M3: 16) word i of a staged slice has.
 __device__ __forceinline__ bool word_exists(int i) {

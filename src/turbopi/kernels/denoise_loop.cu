@@ -55,7 +55,7 @@ __device__ __forceinline__ void consume(Block& b) {
             MARK(16)
             load_norm();
           } else {
-            float* const kv = (float*)(a.scratch + B_KV + b.n % KV_STAGED * N_KV);
+            float* const kv = (float*)(a.scratch + B_KV + (b.n & 1) * N_KV);
             project(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L), kv, bit, rope);
             MARK(2)
             attend(b, kv, bit, prefix);

@@ -101,8 +101,7 @@ struct Producer {
 extern "C" __global__ void __launch_bounds__(256) turbopi_denoise_prepare(const __grid_constant__ Args a) {
   const int first = blockIdx.x * 256 + threadIdx.x;
   for (size_t at = first; at < SCRATCH; at += size_t(gridDim.x) * 256) {
-    const bool absent = (SPREAD && at >= B_STAGE && at < B_SQUARES && word_exists(int(at - B_STAGE))) ||
-                        (ASYNC && at >= B_KV && at < B_STAGE);
+    const bool absent = SPREAD && at >= B_STAGE && at < B_SQUARES && word_exists(int(at - B_STAGE));
     const u32 v = absent ? ABSENT : 0;
     a.scratch[at] = make_uint4(v, v, v, v);
   }

@@ -171,13 +171,7 @@ __device__ __forceinline__ void copy_queries(const Block& b) {
   __syncwarp();
 }
 
-// ASYNC: suffix keys and values of layer n. Those of the layer before are ABSENT again when these are published, as all
-// clusters have read them: these follow sums that they made of them.
-__device__ __forceinline__ uint2* kv_stage(const Block& b, u32 n) {
-  return (uint2*)(b.a.scratch + B_KV + n % KV_STAGED * N_KV);
-}
-
-// Awaits the stream. q to all ranks, k and v to all clusters (if not ASYNC as float32 with their flags). The partial sums lie over the
+// Awaits the stream. q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream; queries are sent when all of those have been read, so what a peer sends after it has them may lie there too.
 __device__ __forceinline__ void project(Block& b, const float* shifted, const float* row_scales, float* kv, u32 bit,
                                         const float2 (&rope)[ITEMS_Q][2]) {
@@ -243,12 +237,6 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
         unsigned short* p = (unsigned short*)(staged + place + b.t() * 32) + b.g();
         p[0] = (unsigned short)f, p[8] = (unsigned short)(f >> 16);
         p[OTHER_HALF] = (unsigned short)s, p[OTHER_HALF + 8] = (unsigned short)(s >> 16);
-      } else if constexpr (ASYNC) {  // a lane of each pair has a token's four numbers of both
-        const bool odd = b.g() & 1;
-        const float got_f = exchange(odd ? f0 : f1, 4), got_s = exchange(odd ? s0 : s1, 4);
-        const uint2 four = odd ? make_uint2(pack(got_f, f1), pack(got_s, s1)) : make_uint2(pack(f0, got_f), pack(s0, got_s));
-        const int mine = n * 8 + 2 * b.t() + odd, place = ((b.kv0() + kv_tile) * T + mine) * 4 + (b.g() >> 1);
-        if (mine < T) put(kv_stage(b, b.n) + place, four), put(kv_stage(b, b.n - 1) + place, make_uint2(ABSENT, ABSENT));
       } else {
         const int tile = b.kv0() + kv_tile, col = tile < QT ? tile * 8 + b.g() : HD + (tile - QT) * 16 + b.g(),
                   up = tile < QT ? HD / 2 : 8;

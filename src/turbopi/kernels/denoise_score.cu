@@ -63,6 +63,11 @@ __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int
   return seen;
 }
 
+// Where 8 columns of a key among the rows (ASYNC) lie.
+__device__ __forceinline__ int key_row(int row, int eight) {
+  return M_X + X_KEY_ROWS + eight * KEY_COLUMNS + row / 8 * 128 + row % 8 * 16;
+}
+
 // Suffix keys (kind 0) or values (1) from all clusters to shared memory, asked for first and kept later: of `rows` of
 // them, from `row0` on, `quads` times four columns from quad `first` on, by `threads` threads.
 template <int MOST>
@@ -95,7 +100,8 @@ struct SuffixPart {
       const int row = item(i) / quads, quad = first + item(i) % quads;
       const uint2 four = make_uint2(pack(__uint_as_float(v[i].x), __uint_as_float(v[i].y)),
                                     pack(__uint_as_float(v[i].z), __uint_as_float(v[i].w)));
-      *(uint2*)(b.smem + M_X + (kind ? X_VALUE_ROWS : X_KEY_ROWS) + row * RS + quad * 8) = four;
+      const int rows_at = M_X + (kind ? X_VALUE_ROWS : X_KEY_ROWS) + row * RS + quad * 8;
+      *(uint2*)(b.smem + (SPREAD && ASYNC && !kind ? key_row(row, quad / 2) + quad % 2 * 8 : rows_at)) = four;
     }
   }
 };

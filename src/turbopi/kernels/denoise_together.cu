@@ -92,47 +92,6 @@ __device__ __forceinline__ float2 load_top(const Block& b, int n) {
 }
 __device__ __forceinline__ float weight(float logit, float top) { return exp2_approx(logit * logit_scale() - top); }
 
-// Where 8 columns of a key among the rows lie.
-__device__ __forceinline__ int key_row(int row, int eight) {
-  return M_X + X_KEY_ROWS + eight * KEY_COLUMNS + row / 8 * 128 + row % 8 * 16;
-}
-// This rank's suffix keys (KIND 0) or values (1) from all clusters: asked for first and kept later, by THREADS_ threads.
-template <int KIND, int THREADS_>
-struct SuffixRows {
-  static constexpr int WORDS = SUFFIX * 2, MOST = most(QT * WORDS, THREADS_);  // of a tile; of a thread
-  const uint4* from;  // the first of them
-  int me, rows;
-  uint4 v[MOST];
-  __device__ __forceinline__ SuffixRows(const Block& b, int thread, const Keys& keys)
-      : from((const uint4*)kv_stage(b, b.n) + (KIND * QT * T + keys.suffix0) * 2), me(thread), rows(keys.suffix) {}
-  // Rows that this rank lacks, and words behind the last, are another's.
-  __device__ __forceinline__ int tile(int i) const { return min(me + i * THREADS_, QT * WORDS - 1) / WORDS; }
-  __device__ __forceinline__ int word(int i) const {
-    return min(min(me + i * THREADS_, QT * WORDS - 1) % WORDS, rows * 2 - 1);
-  }
-  __device__ __forceinline__ const uint4* place(int i) const { return from + tile(i) * (T * 2) + word(i); }
-  __device__ __forceinline__ void ask() {
-#pragma unroll
-    for (int i = 0; i < MOST; ++i) v[i] = peek(place(i));
-  }
-  __device__ __forceinline__ void keep(const Block& b) {
-#pragma unroll 1
-    for (bool again = true; again;) {
-      again = false;
-#pragma unroll
-      for (int i = 0; i < MOST; ++i)
-        if (max(max(v[i].x, v[i].y), max(v[i].z, v[i].w)) == ABSENT) v[i] = peek(place(i)), again = true;
-      again = __any_sync(~0u, again);
-    }
-#pragma unroll
-    for (int i = 0; i < MOST; ++i) {
-      const int row = word(i) / 2, half = word(i) % 2 * 8;
-      byte* const p = b.smem + half + (KIND ? M_X + X_VALUE_ROWS + row * RS + tile(i) * 32 : key_row(row, tile(i)));
-      *(uint2*)p = make_uint2(v[i].x, v[i].z);  // a key's columns, half of all apart, a value's next 8
-      *(uint2*)(p + (KIND ? 16 : QT * KEY_COLUMNS)) = make_uint2(v[i].y, v[i].w);
-    }
-  }
-};
 // The rank's loose prefix keys (kind 0) or values (1), behind those of the suffix: asked for first and kept later, by
 // THREADS_ threads.
 template <int THREADS_>
@@ -223,7 +182,7 @@ __device__ __forceinline__ void weigh_some(Block& b, int i, u32 first, int tiles
   await_products<0>();
 }
 // Partial outputs of the rank's keys for all tokens: each rank's columns to it.
-__device__ __forceinline__ void attend_together(Block& b, const Keys& keys) {
+__device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 bit, const Keys& keys) {
   const int tiles = keys.tiles, slots = keys.slots, rows = keys.suffix + keys.loose;
   const u32 first_keys = b.slot;
   if (b.warp() < SCORERS) {
@@ -277,7 +236,7 @@ __device__ __forceinline__ void attend_together(Block& b, const Keys& keys) {
     const bool for_values = b.warp() < SUFFIX_WARP;
     LooseRows<FETCHERS> loose_keys{0, me, keys.suffix, keys.loose};
     LooseRows<FETCHERS / 2> loose_values{1, me, keys.suffix, keys.loose};
-    SuffixRows<0, FETCHERS> suffix_keys(b, me, keys);
+    SuffixPart<most(SUFFIX * (HD / 4), FETCHERS)> suffix_keys{kv, bit, 0, me, FETCHERS, keys.suffix0, keys.suffix, 0, HD / 4};
     loose_keys.ask(b, keys.loose0);
     if (for_values) loose_values.ask(b, keys.loose0);
 #pragma unroll 1
@@ -290,7 +249,8 @@ __device__ __forceinline__ void attend_together(Block& b, const Keys& keys) {
     show_to_products();
     if (for_values) {
       arrive<ROWS_HERE, W - SCORERS>();
-      SuffixRows<1, FETCHERS / 2> suffix_values(b, me, keys);
+      SuffixPart<most(SUFFIX * (HD / 4), FETCHERS / 2)> suffix_values{
+          kv, bit, 1, me, FETCHERS / 2, keys.suffix0, keys.suffix, 0, HD / 4};
       suffix_values.ask(), loose_values.keep(b), suffix_values.keep(b);
     } else {
       sync<ROWS_HERE, W - SCORERS>();
