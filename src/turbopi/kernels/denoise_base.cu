@@ -75,8 +75,8 @@ constexpr int PARTIAL = (NT - 1) * 512 + TAIL * 128;  // bytes of one tile's par
 
 constexpr int RS = HD * 2 + 16;  // bytes of a suffix key's or value's row: no bank conflicts for ldmatrix
 constexpr int FRAGMENT = 512, RPS = TP_RPS, SLOT = RPS * W * FRAGMENT;
-// A round: RPS fragments of the reduction for each part of it. Weights of a group of tiles are filled up with zeros to a
-// multiple of `filled` fragments.
+// A round: RPS fragments of the reduction for each part of it. Weights of a group of tiles are filled up with zeros to
+// a multiple of `filled` fragments.
 __host__ __device__ constexpr int filled(int tiles) { return 4 * (tiles > 4 ? W / 8 : W / 4); }
 __host__ __device__ constexpr int plan_rounds(int tiles, int blocks) {
   return most(most(blocks, KB), filled(tiles)) * filled(tiles) / (RPS * group_parts(tiles));

@@ -109,8 +109,8 @@ __device__ __forceinline__ void consume(Block& b) {
 #endif
 }
 
-// Tensor cores that have rested for most of a microsecond slow the clock down when they begin again (measured: 1.73 GHz,
-// at 50 tokens 1.76, where it is 1.80 if they never rest so long). A spare warp multiplies zeros now and then.
+// Tensor cores that have rested for most of a microsecond slow the clock down when they begin again (measured: 1.73
+// GHz, at 50 tokens 1.76, where it is 1.80 if they never rest so long). A spare warp multiplies zeros now and then.
 __device__ __forceinline__ void stay_awake(float (&c)[4], u32 zero) {
   mma_half(c, make_uint4(zero, zero, zero, zero), make_uint2(zero, zero));
   __nanosleep(100);
@@ -179,7 +179,6 @@ __device__ __forceinline__ void watch(const Block& b) {
   if (blockIdx.x == 0 && b.lane() == 0)
     b.a.clock[0] = clock64() - begun, b.a.clock[1] = nanoseconds() - begun_at;
 }
-
 
 extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 1)
     turbopi_denoise(const __grid_constant__ Args args) {

@@ -48,8 +48,8 @@ struct Producer {
       keys(KEY_TILES * KEY_TILE, count);
       product<DX>(QT, b.xn());
     }
-    // When the keys have been scored, memory has nothing else to do for a while. Asked for earlier, gate|up is in the way
-    // of what the scores wait for.
+    // When the keys have been scored, memory has nothing else to do for a while. Asked for earlier, gate|up is in the
+    // way of what the scores wait for.
     const int gate_up = slots, scored = min(gate_up, last_key + STAGES), back = scored - last_key;
     product<GTL>(D16, b.gn());
     const int gate_up_end = slots;

@@ -134,8 +134,8 @@ __device__ __forceinline__ void await_slice(const Block& b) {
   }
   if (b.lane() == 0) barrier_arrive(b.bar(BAR_HERE));
 }
-// All lanes of a spare warp: the slice's sums of squares, use `turn`, to all ranks when they are there. Answers take long,
-// so three questions are on their way at any time.
+// All lanes of a spare warp: the slice's sums of squares, use `turn`, to all ranks when they are there. Answers take
+// long, so three questions are on their way at any time.
 __device__ __forceinline__ void pass_on_squares(const Block& b, u32 turn) {
   const int mine = imin(b.lane(), NT * 4 - 1);
   const uint2* const from =

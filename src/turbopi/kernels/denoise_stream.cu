@@ -268,8 +268,8 @@ __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, in
     }
 }
 
-// x (1 + tanh u) / 2 = x / (1 + exp(-2 u)). E4M3 rounds far more coarsely than an approximate tanh, which takes one turn of
-// the special function unit instead of two.
+// x (1 + tanh u) / 2 = x / (1 + exp(-2 u)). E4M3 rounds far more coarsely than an approximate tanh, which takes one
+// turn of the special function unit instead of two.
 __device__ __forceinline__ float gelu(float x) {
   if constexpr (FP8 && SPREAD) {
     float tanh_u;

@@ -2,9 +2,9 @@
 //
 // Queries of many tokens are more than shared memory can bring to each warp by itself, so the four warps of a warpgroup
 // share them, with keys or values in registers. The first eight warps score a tile of prefix keys each (those without
-// one multiply, too, whatever they read). The suffix's keys come through L2 and so later, so other warps fetch them, and
-// what the rank has of loose prefix keys; four of them score these rows as one more tile, for 16 tokens each. Then all
-// weigh values, a tile of columns a warp.
+// one multiply, too, whatever they read). The suffix's keys come through L2 and so later, so other warps fetch them,
+// and what the rank has of loose prefix keys; four of them score these rows as one more tile, for 16 tokens each, while
+// the others fetch the rows' values. Then all weigh values, a tile of columns a warp.
 
 // Barriers: of those who fetch rows; of those who score tiles of the prefix; of all but those who only fetch.
 constexpr int ROWS_HERE = 3, TOPS_FOR_ROWS = 4, TOPS_FOR_ROWS_WARPS = SUFFIX_WARP;
@@ -51,7 +51,8 @@ __device__ __forceinline__ void score_rows(float (&c)[2][4]) {
   begin_products();
 #pragma unroll
   for (int k = 0; k < QT; ++k)
-    add_keys(sums, operand_at<128>(behind(queries, k * NT * 256)), operand_at<128>(behind(keys, k * 2 * KEY_COLUMNS)), 1);
+    add_keys(sums, operand_at<128>(behind(queries, k * NT * 256)),
+             operand_at<128>(behind(keys, k * 2 * KEY_COLUMNS)), 1);
   commit_products();
   await_products<0>();
 #pragma unroll
@@ -62,7 +63,8 @@ __device__ __forceinline__ float no_logit() { return __int_as_float(0xff800000);
 __device__ __forceinline__ void raise_top(const Block& b, int n, float logit) {
   if (n < NT) atomicMax((int*)(b.smem + M_PART) + n * 8 + 2 * b.t() + (b.g() & 1), ordered(logit));
 }
-// Of each pair one number goes to the lane that bit O of g tells apart, which keeps the other: the larger of both stays.
+// Of each pair one number goes to the lane that bit O of g tells apart, which keeps the other: the larger of both
+// stays.
 template <int PAIRS_, int O, int N>
 __device__ __forceinline__ void exchange_tops(const Block& b, float (&v)[N]) {
   const bool upper = b.g() >> O & 1;
@@ -121,7 +123,7 @@ struct LooseRows {
 };
 // Of 16 tokens from 8 n on the rows' logits, `count` of which exist, to weights of the tile behind all others, as
 // `store_weights` has them. They go by the largest logits of the prefix's tiles, too, unless theirs are 2^100 times as
-// large: then the tiles' weights count for nothing, whatever they go by. What all weights of a token go by to all ranks.
+// large: then the tiles' weights count for nothing, whatever they go by. What a token's weights go by to all ranks.
 __device__ __forceinline__ void weigh_rows(const Block& b, int n, int count) {
   float c[2][4], own[2] = {no_logit(), no_logit()};
   score_rows(c);
@@ -156,8 +158,8 @@ __device__ __forceinline__ void weigh_rows(const Block& b, int n, int count) {
 __device__ __forceinline__ u32 slot_behind(u32 first, u32 i) {
   return first + i < STAGES ? first + i : first + i - STAGES;
 }
-// Values times weights, of a warp's tile of columns: of so many slots from the i-th on (missing tiles are zeros), and of
-// the rows behind the tiles.
+// Values times weights, of a warp's tile of columns: of so many slots from the i-th on (missing tiles are zeros), and,
+// if given, of the rows behind the tiles.
 template <int SLOTS>
 __device__ __forceinline__ void weigh_some(Block& b, int i, u32 first, int tiles, u32 weights, float (&sums)[NT * 4],
                                            const uint4* rows = nullptr) {
@@ -236,7 +238,8 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
     const bool for_values = b.warp() < SUFFIX_WARP;
     LooseRows<FETCHERS> loose_keys{0, me, keys.suffix, keys.loose};
     LooseRows<FETCHERS / 2> loose_values{1, me, keys.suffix, keys.loose};
-    SuffixPart<most(SUFFIX * (HD / 4), FETCHERS)> suffix_keys{kv, bit, 0, me, FETCHERS, keys.suffix0, keys.suffix, 0, HD / 4};
+    SuffixPart<most(SUFFIX * (HD / 4), FETCHERS)> suffix_keys{
+        kv, bit, 0, me, FETCHERS, keys.suffix0, keys.suffix, 0, HD / 4};
     loose_keys.ask(b, keys.loose0);
     if (for_values) loose_values.ask(b, keys.loose0);
 #pragma unroll 1
