@@ -44,8 +44,8 @@ def test_a_patch_changes_its_variants_source_alone(patch: Path) -> None:
 def test_constants_replace_or_join_the_kernels_own() -> None:
     arrangement = Arrangement(CONFIGS["full"], 8)
     own = denoise.kernel_sizes(arrangement, **SIZES)
-    sizes = Variant("here+TP_RPS=4+MORE=-1").sizes(arrangement, trace=True, **SIZES)
-    assert sizes == {**own, "TP_RPS": 4, "MORE": -1, "TP_TRACE": 1} != own
+    sizes = Variant("here+TP_RPS=4+MORE=-1").sizes(arrangement, trace=12, **SIZES)
+    assert sizes == {**own, "TP_RPS": 4, "MORE": -1, "TP_TRACE": 13} != own
 
 
 @pytest.mark.parametrize(

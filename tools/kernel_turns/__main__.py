@@ -38,6 +38,7 @@ def main() -> None:
     time.add_argument("--precisions", default="bf16,fp8")
     time.add_argument("--rounds", type=int, default=8)
     time.add_argument("--marks", action="store_true", help="also cycles between the kernel's marks, by rank")
+    time.add_argument("--warp", type=int, default=0, choices=range(MULTIPLYING), metavar="0..15", help="whose marks")
     time.add_argument("--json", type=Path, help="also write the rows here")
     launch = commands.add_parser("launch", help="launch one variant three times, for ncu")
     stalls = commands.add_parser("stalls", help="ncu's samples beside the source")
@@ -74,8 +75,9 @@ def _time(arguments: argparse.Namespace) -> None:
                 rows.append({"tokens": tokens, "precision": precision, "length": arguments.length, **asdict(row)})
             console.print(table)
             for variant in variants if arguments.marks else ():
-                table = Table("rank", *map(str, MARKS), title=f"cycles a layer up to each mark, {variant.spec}")
-                for rank, cycles in enumerate(marks_by_rank(job, variant)):
+                title = f"cycles a layer up to each mark, warp {arguments.warp}, {variant.spec}"
+                table = Table("rank", *map(str, MARKS), title=title)
+                for rank, cycles in enumerate(marks_by_rank(job, variant, arguments.warp)):
                     table.add_row(str(rank), *(f"{cycles[mark]:.0f}" for mark in MARKS))
                 console.print(table)
     if arguments.json is not None:

@@ -19,7 +19,7 @@ from turbopi.kernels.denoise_packing import RANKS, PackedExpert
 
 STEPS, CACHE_ROWS, SEED = 10, 976, 1
 # `MARK`s of denoise_base.cu in the order in which a layer comes to them
-MARKS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 21, 12, 13, 15, 16, 17, 18, 22, 14, 19, 20)
+MARKS = (0, 1, 2, 3, 4, 23, 24, 25, 5, 6, 7, 8, 9, 10, 11, 21, 12, 13, 15, 16, 17, 18, 22, 14, 19, 20)
 
 
 @dataclass
@@ -53,7 +53,7 @@ class Job:
         self.exact = plain(p, torch.float32)[0][-1]
         self.tokens, self.length = tokens, torch.tensor([length], device=GPU)
 
-    def kernel(self, variant: Variant, trace: bool = False) -> Any:
+    def kernel(self, variant: Variant, trace: int | None = None) -> Any:
         p = self.problem
         return variant.kernel(
             *(p.config, self.packed, p.small, p.table),
@@ -112,9 +112,9 @@ def time_in_turns(job: Job, variants: list[Variant], rounds: int, calls: int = 1
     ]
 
 
-def marks_by_rank(job: Job, variant: Variant) -> Tensor:
-    """Cycles of a layer between marks, the mean over steps, layers and clusters: float64[RANKS, marks]."""
-    kernel, (x_t, v_t) = job.kernel(variant, trace=True), job.outputs()
+def marks_by_rank(job: Job, variant: Variant, warp: int = 0) -> Tensor:
+    """A warp's cycles of a layer between marks, the mean over steps, layers and clusters: float64[RANKS, marks]."""
+    kernel, (x_t, v_t) = job.kernel(variant, warp), job.outputs()
     job.launch(kernel, x_t, v_t)
     torch.cuda.synchronize()
     layers = STEPS * job.problem.config.expert.depth

@@ -42,12 +42,12 @@ class Variant:
             return _patched(path, folder)
         raise ValueError(f"{place!r}: expected 'here', a folder with denoise.py, or a .patch or .patch.xz file")
 
-    def sizes(self, *args: Any, trace: bool = False, **options: Any) -> dict[str, int]:
-        """`kernel_sizes` with the variant's constants; `trace`: the kernel keeps the cycles between its marks."""
-        traced = {"TP_TRACE": 1} if trace else {}
+    def sizes(self, *args: Any, trace: int | None = None, **options: Any) -> dict[str, int]:
+        """`kernel_sizes` with the variant's constants; `trace`: a warp whose cycles between marks are kept."""
+        traced = {} if trace is None else {"TP_TRACE": trace + 1}
         return {**self._sizes(*args, **options), **self.constants, **traced}
 
-    def kernel(self, *args: Any, trace: bool = False, **options: Any) -> denoise.DenoiseKernel:
+    def kernel(self, *args: Any, trace: int | None = None, **options: Any) -> denoise.DenoiseKernel:
         self.module.kernel_sizes = partial(self.sizes, trace=trace)  # type: ignore[attr-defined]
         kernel: denoise.DenoiseKernel = self.module.DenoiseKernel(*args, **options)
         return kernel

@@ -358,9 +358,10 @@ struct Block {
 // weights stored (beyond 16 tokens: all weights here), 6 sent what this warp has of outputs, 7 largest logits of all
 // ranks here, 8 outputs here, 9 combined, 10 attention here, 11 out, 12 sent, 13 stream here, 15 gate|up multiplied,
 // 16 sent, 17 hidden here, 18 down, 14 sent, 19 embedded, 20 step done. Before 12 and 14: 21 and 22 partial sums here.
+// Of warps that score rows instead of the prefix: 23 keys here, 24 scored, 25 weights sent. TP_TRACE: warp 0's are 1.
 #ifdef TP_TRACE
 #define MARK(i)                              \
-  if (b.thread == 0) {                       \
+  if (b.thread == (TP_TRACE - 1) * 32) {     \
     const u32 now_ = u32(clock64());         \
     u32* m_ = (u32*)(b.smem + M_BAR + 256); \
     m_[1 + (i)] += now_ - m_[0];             \

@@ -127,6 +127,7 @@ struct LooseRows {
 __device__ __forceinline__ void weigh_rows(const Block& b, int n, int count) {
   float c[2][4], own[2] = {no_logit(), no_logit()};
   score_rows(c);
+  MARK(24)
 #pragma unroll
   for (int j = 0; j < 2; ++j)
 #pragma unroll
@@ -257,10 +258,12 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
       suffix_values.ask(), loose_values.keep(b), suffix_values.keep(b);
     } else {
       sync<ROWS_HERE, W - SCORERS>();
+      MARK(23)
       barrier_wait(b.bar(BAR_Q), b.n & 1);
       __syncwarp();
       show_to_products();
       weigh_rows(b, (b.warp() - SUFFIX_WARP) * 2, rows);
+      MARK(25)
     }
   }
   show_to_products();
