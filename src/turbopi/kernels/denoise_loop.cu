@@ -115,7 +115,7 @@ __device__ __forceinline__ void stay_awake(float (&c)[4], u32 zero) {
   mma_half(c, make_uint4(zero, zero, zero, zero), make_uint2(zero, zero));
   __nanosleep(100);
 }
-__device__ __forceinline__ void use(const Block& b, const float (&c)[4]) {
+__device__ __forceinline__ void pretend_to_need(const Block& b, const float (&c)[4]) {
   if (c[0] != 0) *(volatile u32*)(b.smem + M_TOKEN) = 0;  // never, but the compiler can't know
 }
 __device__ __forceinline__ void keep_awake(const Block& b) {
@@ -126,7 +126,7 @@ __device__ __forceinline__ void keep_awake(const Block& b) {
 #pragma unroll
     for (int i = 0; i < 8; ++i) stay_awake(c, zero);  // to look seldom: who looks takes time from others
   }
-  use(b, c);
+  pretend_to_need(b, c);
 }
 // Of many tokens this warp watches, too: half a microsecond.
 __device__ __forceinline__ void rest(const Block& b) {
@@ -135,7 +135,7 @@ __device__ __forceinline__ void rest(const Block& b) {
   const u32 zero = b.a.zero;
 #pragma unroll 1
   for (int i = 0; i < 5; ++i) stay_awake(c, zero);
-  use(b, c);
+  pretend_to_need(b, c);
 }
 // What the norms of layer n need, to L2: it is read once, by everybody at the same time, while memory is busy with
 // weights.
