@@ -36,7 +36,7 @@ PARTS = tuple(
     f"denoise_{part}.cu"
     for part in (
         *("base", "primitives", "wgmma", "producer", "product", "spread", "stream"),
-        *("project", "score", "together", "attention", "step", "loop"),
+        *("project", "score", "attention_many", "attention", "step", "loop"),
     )
 )
 THREADS = (WARPS + 4) * 32

@@ -59,7 +59,8 @@ static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64
 // lies there, it makes rows of its own, which nobody reads. Many tokens' sums are so large that two warpgroups rather
 // rest than have parts of their own.
 __host__ __device__ constexpr int group_tiles(int left) { return left < 8 ? left : 8; }
-__host__ __device__ constexpr int group_parts(int tiles) { return SPREAD || tiles > 4 ? W / 8 : W / 4; }
+__host__ __device__ constexpr int packed_parts(int tiles) { return tiles > 4 ? W / 8 : W / 4; }  // see `filled`
+__host__ __device__ constexpr int group_parts(int tiles) { return SPREAD ? W / 8 : packed_parts(tiles); }
 __host__ __device__ constexpr int plan_groups(int mt) { return most(mt, 8); }
 // Partial sums of all tiles, or of all but one part of each.
 __host__ __device__ constexpr int plan_partials(int mt) {
@@ -77,7 +78,7 @@ constexpr int RS = HD * 2 + 16;  // bytes of a suffix key's or value's row: no b
 constexpr int FRAGMENT = 512, RPS = TP_RPS, SLOT = RPS * W * FRAGMENT;
 // A round: RPS fragments of the reduction for each part of it. Weights of a group of tiles are filled up with zeros to
 // a multiple of `filled` fragments.
-__host__ __device__ constexpr int filled(int tiles) { return 4 * (tiles > 4 ? W / 8 : W / 4); }
+__host__ __device__ constexpr int filled(int tiles) { return 4 * packed_parts(tiles); }
 __host__ __device__ constexpr int plan_rounds(int tiles, int blocks) {
   return most(most(blocks, KB), filled(tiles)) * filled(tiles) / (RPS * group_parts(tiles));
 }
@@ -209,7 +210,7 @@ constexpr int X_OWN_HIDDEN = X_OWN_V;  // of a rank, before they are sent
 static_assert(!COPY_HIDDEN || X_OWN_HIDDEN + GTL / 2 * NT * OPERAND <= X_SIZE, "room for a rank's hidden units");
 static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little shared memory");
 
-// Who scores prefix keys, a tile a warp and round. ASYNC: by wgmma, see denoise_together.cu.
+// Who scores prefix keys, a tile a warp and round. ASYNC: by wgmma, see denoise_attention_many.cu.
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS);
 constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES;
 // Prefix keys that rank i has: tiles from `first` on, with `keys` keys in all. Ranks with one more would let the others

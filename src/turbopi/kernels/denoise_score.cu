@@ -1,10 +1,10 @@
-// Part 9 of 13: attention's steps, of which denoise_together.cu and denoise_attention.cu make the whole.
+// Part 9 of 13: attention's steps, of which denoise_attention_many.cu and denoise_attention.cu make the whole.
 
 // Who does what: the first SCORERS warps score a tile of prefix keys each, and the next if there are more; the last
 // four score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries.
 // If tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries
 // and weights; else all warps weigh, and the third warpgroup fetches the suffix's values. Queries of many tokens are
-// more than shared memory can bring to each warp by itself (ASYNC): see denoise_together.cu.
+// more than shared memory can bring to each warp by itself (ASYNC): see denoise_attention_many.cu.
 constexpr int LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
 // Blocks of its keys that a scoring warp holds, tiles of values that a weighing warp does: more would spill.
@@ -101,7 +101,7 @@ struct SuffixPart {
       const uint2 four = make_uint2(pack(__uint_as_float(v[i].x), __uint_as_float(v[i].y)),
                                     pack(__uint_as_float(v[i].z), __uint_as_float(v[i].w)));
       const int rows_at = M_X + (kind ? X_VALUE_ROWS : X_KEY_ROWS) + row * RS + quad * 8;
-      *(uint2*)(b.smem + (SPREAD && ASYNC && !kind ? key_row(row, quad / 2) + quad % 2 * 8 : rows_at)) = four;
+      *(uint2*)(b.smem + (ASYNC && !kind ? key_row(row, quad / 2) + quad % 2 * 8 : rows_at)) = four;
     }
   }
 };
@@ -133,10 +133,12 @@ __device__ __forceinline__ void score_suffix(const Block& b, int count, float (&
   }
 }
 
-// Logits times the scale and log2 e, or -inf in rows that don't exist; the largest of each token.
+__device__ __forceinline__ float no_logit() { return __int_as_float(0xff800000); }  // of a key that doesn't exist
+__device__ __forceinline__ float logit_scale() { return rsqrtf(float(HD)) * 1.4426950408889634f; }  // and log2 e
+// Logits times the scale, or none in rows that don't exist; the largest of each token.
 template <int R>
 __device__ __forceinline__ void scale_logits(const Block& b, float (&c)[R][NT][4], int rows, float2 (&top)[NT]) {
-  const float scale = rsqrtf(float(HD)) * 1.4426950408889634f, none = __int_as_float(0xff800000);
+  const float scale = logit_scale(), none = no_logit();
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
     top[n] = make_float2(none, none);
@@ -153,25 +155,30 @@ __device__ __forceinline__ void scale_logits(const Block& b, float (&c)[R][NT][4
       top[n] = make_float2(fmaxf(top[n].x, exchange(top[n].x, o)), fmaxf(top[n].y, exchange(top[n].y, o)));
   }
 }
-// Unnormalised weights of 16 keys to shared memory: operand B of the next product, in which column 2i is row i, column
-// 2i + 1 row i + 8.
-__device__ __forceinline__ void store_weights(const Block& b, const float (&c)[NT][4], int tile,
-                                              const float2 (&top)[NT]) {
-  byte* p = b.smem + M_X + X_P + (tile * 2 + (b.g() >> 2)) * NT * 128 + b.t() * 32 + (b.g() & 3) * 4;
+// Unnormalised weights of logits that lack a scale, by `top`. 16 keys' to shared memory, `to` a tile's place: operand B
+// of the next product, in which column 2i is row i, column 2i + 1 row i + 8.
+__device__ __forceinline__ float weight(float logit, float top, float scale = 1) {
+  return exp2_approx(logit * scale - top);
+}
+__device__ __forceinline__ byte* weights_place(const Block& b, int tile) {
+  return b.smem + M_X + X_P + (tile * 2 + (b.g() >> 2)) * NT * 128 + b.t() * 32 + (b.g() & 3) * 4;
+}
+__device__ __forceinline__ void store_weights(byte* to, const float (&c)[NT][4], const float2 (&top)[NT],
+                                              float scale = 1) {
 #pragma unroll
   for (int n = 0; n < NT; ++n)
 #pragma unroll
     for (int i = 0; i < 2; ++i) {
       const float at = i ? top[n].y : top[n].x;
-      *(u32*)(p + n * 128 + i * 16) = pack(exp2_approx(c[n][i] - at), exp2_approx(c[n][i + 2] - at));
+      *(u32*)(to + n * 128 + i * 16) = pack(weight(c[n][i], at, scale), weight(c[n][i + 2], at, scale));
     }
 }
 // The largest logits of the rank's prefix.
-__device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT]) {
+__device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT], float scale = 1) {
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
     const int2 v = *(const int2*)(b.smem + M_PART + (n * 8 + 2 * b.t()) * 4);
-    top[n] = make_float2(__int_as_float(ordered(v.x)), __int_as_float(ordered(v.y)));
+    top[n] = make_float2(__int_as_float(ordered(v.x)) * scale, __int_as_float(ordered(v.y)) * scale);
   }
 }
 // Warps that score: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist.
@@ -189,7 +196,7 @@ __device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4
   load_tops(b, top);
 #pragma unroll
   for (int r = 0; r < R; ++r)
-    if (rows > r * SCORERS * 16) store_weights(b, c[r], tile + r * SCORERS, top);
+    if (rows > r * SCORERS * 16) store_weights(weights_place(b, tile + r * SCORERS), c[r], top);
 }
 // Of each token something of this rank, to all ranks.
 __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[NT], int region, int bar) {
@@ -217,7 +224,7 @@ __device__ __forceinline__ void weigh_suffix(const Block& b, float (&c)[1][NT][4
     if (b.g() == 0) *(float2*)(b.smem + M_X + X_KEEP + (n * 8 + 2 * b.t()) * 4) = make_float2(x, y);
     top[n] = make_float2(x ? top[n].x : own[n].x, y ? top[n].y : own[n].y);
   }
-  store_weights(b, c[0], KT, top);
+  store_weights(weights_place(b, KT), c[0], top);
   if (HOLD) arrive<SUFFIX_WEIGHTS, WEIGHERS + 1>();
   send_by_token(b, top, X_TOPS, BAR_TOPS);
 }

@@ -8,9 +8,8 @@
 
 // Barriers: of those who fetch rows; of those who score tiles of the prefix; of all but those who only fetch.
 constexpr int ROWS_HERE = 3, TOPS_FOR_ROWS = 4, TOPS_FOR_ROWS_WARPS = SUFFIX_WARP;
-// Clock cycles before the suffix's keys are asked for.
+// Clock cycles before the suffix's keys are asked for, at least: with loose keys it takes longer anyway.
 constexpr u32 SUFFIX_PATIENCE = 200;
-constexpr float LOG2_E = 1.4426950408889634f;
 static_assert(!ASYNC || (W == 16 && QT <= W && KT <= SCORERS && NT <= 8), "a warp's share");
 
 // Logits of a warpgroup's keys: each warp has 16 of its own, whose first blocks it holds; fetch(k) is the k-th block.
@@ -58,7 +57,6 @@ __device__ __forceinline__ void score_rows(float (&c)[2][4]) {
 #pragma unroll
   for (int i = 0; i < 8; ++i) c[i / 4][i % 4] = sums[i];
 }
-__device__ __forceinline__ float no_logit() { return __int_as_float(0xff800000); }  // of a key that doesn't exist
 // To the rank's largest logits: this one of token 2t + g % 2 of 8 tokens n.
 __device__ __forceinline__ void raise_top(const Block& b, int n, float logit) {
   if (n < NT) atomicMax((int*)(b.smem + M_PART) + n * 8 + 2 * b.t() + (b.g() & 1), ordered(logit));
@@ -86,13 +84,6 @@ __device__ __forceinline__ void raise_tops(const Block& b, const float (&c)[NT][
 #pragma unroll
   for (int i = 0; i < N / 8; ++i) raise_top(b, (b.g() >> 1) + 4 * i, v[i]);
 }
-// The scale of logits goes into the exponents of their weights.
-__device__ __forceinline__ float logit_scale() { return rsqrtf(float(HD)) * LOG2_E; }
-__device__ __forceinline__ float2 load_top(const Block& b, int n) {
-  const int2 v = *(const int2*)(b.smem + M_PART + (n * 8 + 2 * b.t()) * 4);
-  return make_float2(__int_as_float(ordered(v.x)) * logit_scale(), __int_as_float(ordered(v.y)) * logit_scale());
-}
-__device__ __forceinline__ float weight(float logit, float top) { return exp2_approx(logit * logit_scale() - top); }
 
 // The rank's loose prefix keys (kind 0) or values (1), behind those of the suffix: asked for first and kept later, by
 // THREADS_ threads.
@@ -146,7 +137,8 @@ __device__ __forceinline__ void weigh_rows(const Block& b, int n, int count) {
       const int token = (n + i) * 8 + b.g();
       const float tiles_top = __int_as_float(ordered(*(const int*)(b.smem + M_PART + token * 4))) * logit_scale();
       const float top = fmaxf(tiles_top, own[i] * logit_scale() - 100);
-      auto both = [&](int key) { return pack(weight(c[0][2 * i + key], top), weight(c[1][2 * i + key], top)); };
+      auto of = [&](float logit) { return weight(logit, top, logit_scale()); };
+      auto both = [&](int key) { return pack(of(c[0][2 * i + key]), of(c[1][2 * i + key])); };
       *(uint2*)(b.smem + M_X + X_P + ((KT * 2 + (b.t() >> 1)) * NT + n + i) * 128 + b.g() * 16 + (b.t() & 1) * 8) =
           make_uint2(both(0), both(1));
       const u32 to = b.base + M_X + X_TOPS + (b.rank() * NT * 8 + token) * 4;
@@ -219,15 +211,10 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
       raise_tops(b, c);
       arrive<TOPS_FOR_ROWS, TOPS_FOR_ROWS_WARPS>();
       sync<TOPS, SCORERS>();
-      byte* const p = b.smem + M_X + X_P + (b.warp() * 2 + (b.g() >> 2)) * NT * 128 + b.t() * 32 + (b.g() & 3) * 4;
+      byte* const to = weights_place(b, b.warp());
       float2 top[NT];
-#pragma unroll
-      for (int n = 0; n < NT; ++n) top[n] = load_top(b, n);
-#pragma unroll
-      for (int n = 0; n < NT; ++n) {  // as `store_weights` has them
-        *(u32*)(p + n * 128) = pack(weight(c[n][0], top[n].x), weight(c[n][2], top[n].x));
-        *(u32*)(p + n * 128 + 16) = pack(weight(c[n][1], top[n].y), weight(c[n][3], top[n].y));
-      }
+      load_tops(b, top, logit_scale());  // the scale goes into the exponents of the weights
+      store_weights(to, c, top, logit_scale());
     } else {
       arrive<TOPS_FOR_ROWS, TOPS_FOR_ROWS_WARPS>();
       arrive<TOPS, SCORERS>();
