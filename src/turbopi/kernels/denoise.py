@@ -85,7 +85,6 @@ def kernel_sizes(
     groups = most(suffix, 8)
     stream = most(arrangement.clusters, 2) * (g.width // BLOCK) * groups * 32
     scratch = 4 * stream + suffix * g.head_dim
-    scratch += 40 * suffix * g.head_dim // 2
     if suffix > FEW:
         words = 8 if fp8 else 16  # of a block's activations of 8 tokens
         scratch += (4 * g.width // BLOCK * words + RANKS * 4) * groups + arrangement.blocks
@@ -115,7 +114,6 @@ def source(suffix: int, fp8: bool) -> str:
     numbers: hopper.Numbers = "e4m3" if fp8 else "bf16"
     products = (
         hopper.wgmma("add_product", columns, numbers=numbers),
-        *((hopper.wgmma("add_product", (most(suffix, 8) + 1) // 2 * 8, numbers=numbers),) if suffix > FEW else ()),
         hopper.wgmma("add_from_registers", columns, numbers=numbers, from_registers=True),
         hopper.wgmma("add_rows", columns, from_registers=True),
         hopper.wgmma("add_keys", 2 * 8),

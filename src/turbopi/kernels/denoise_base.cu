@@ -252,25 +252,10 @@ constexpr size_t B_X1 = 0, B_X2 = 2 * N_STREAM, B_KV = 4 * N_STREAM;
 constexpr u32 STAGED = 4;
 constexpr size_t N_STAGE = size_t(D16) * NT * (OPERAND / 16), N_SQUARES = size_t(S) * NT * 2;
 constexpr size_t N_HEAD = size_t(NC) * QT * NT, N_HIDDEN = size_t(NC) * HC * NT * (OPERAND / 16);
-#ifndef TP_KEEP
-#define TP_KEEP 0
-#endif
-#ifndef TP_HALVES
-#define TP_HALVES 0
-#endif
-#ifndef TP_LASTSUMS
-#define TP_LASTSUMS 0
-#endif
-#ifndef TP_CHUNK
-#define TP_CHUNK 4
-#endif
-#ifndef TP_KVT
-#define TP_KVT 2
-#endif
-constexpr size_t B_STAGE = B_KV + TP_KVT * N_KV, B_SQUARES = B_STAGE + STAGED * N_STAGE;
+constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_SQUARES = B_STAGE + STAGED * N_STAGE;
 constexpr size_t B_ORDER = B_SQUARES + 2 * N_SQUARES, B_HIDDEN = B_ORDER + NC * S, B_QUERIES = B_HIDDEN + N_HIDDEN,
                  B_ATT = B_QUERIES + N_HEAD * 16, SCRATCH = SPREAD ? B_ATT + N_HEAD * (OPERAND / 16) : B_STAGE;
-static_assert(SCRATCH <= TP_SCRATCH, "denoise.py disagrees on the scratch memory");
+static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");
 // Stands where a word of the staged stream is still to come. Nothing is rounded to it: the NaN made then is another.
 constexpr u32 ABSENT = ~0u;
 // Whether there is the token whose 8 columns (E4M3: 16) word i of a staged slice has.

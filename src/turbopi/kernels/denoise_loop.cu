@@ -55,11 +55,10 @@ __device__ __forceinline__ void consume(Block& b) {
             MARK(16)
             load_norm();
           } else {
-            const u32 kv_bit = ((b.n / TP_KVT) & 1) ^ 1;
-            float* const kv = (float*)(a.scratch + B_KV + (b.n % TP_KVT) * N_KV);
-            project(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L), kv, kv_bit, rope);
+            float* const kv = (float*)(a.scratch + B_KV + (b.n & 1) * N_KV);
+            project(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L), kv, bit, rope);
             MARK(2)
-            attend(b, kv, kv_bit, prefix);
+            attend(b, kv, bit, prefix);
           }
         }
         uint4* const buffer = a.scratch + (half ? B_X1 : B_X2) + (settled(b.n) & 1) * N_STREAM;

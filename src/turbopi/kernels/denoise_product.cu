@@ -66,38 +66,32 @@ struct Ahead {
 
 // One group of tiles, this warp's share of it. x: where activations lie in shared memory; `blocks` of the reduction, a
 // multiple of EVEN, of whose rounds AHEAD have been loaded.
-template <int TILES_, int EVEN, int AHEAD, bool HALVES = false>
+template <int TILES_, int EVEN, int AHEAD>
 struct GroupProduct {
   static constexpr int PARTS = group_parts(TILES_);
   static constexpr bool EXACT = EVEN % (KB * filled(TILES_)) == 0;
   static constexpr bool SOME_REST = TILES_ <= 4 && PARTS == 2;  // warpgroups that have no tile
-  static constexpr int MINE = HALVES ? RPS * PARTS : RPS, COLUMNS = HALVES ? most(NT, 2) : NT;
-  static constexpr int UNROLL = EXACT && SPREAD ? 16 : 1;
+  static constexpr int UNROLL = EXACT && SPREAD ? 16 : 1;  // where the number of rounds is known
   Block& b;
   const Share my;
   const int blocks, tiles, rounds, rounds_of_slot;
   const u32 first;  // this part's first activations, as an operand's place
-  float (&sums)[COLUMNS * 4];
+  float (&sums)[NT * 4];
 
-  __device__ __forceinline__ GroupProduct(Block& block, int x, int n, int t, float (&to)[COLUMNS * 4])
+  __device__ __forceinline__ GroupProduct(Block& block, int x, int n, int t, float (&to)[NT * 4])
       : b(block), my(block, PARTS), blocks(n), tiles(t), rounds(plan_rounds(TILES_, blocks)),
         rounds_of_slot(slot_rounds(PARTS, t)),
-        first(behind(operand_place(b.start() + x, FP8 ? NT * 128 : 128),
-                     HALVES  ? my.part * COLUMNS * OPERAND
-                     : EXACT ? my.part * NT * 256
-                             : 0)),
-        sums(to) {
-    if (!TP_KEEP)
+        first(behind(operand_place(b.start() + x, FP8 ? NT * 128 : 128), EXACT ? my.part * NT * 256 : 0)), sums(to) {
 #pragma unroll
-      for (int i = 0; i < COLUMNS * 4; ++i) sums[i] = 0;
+    for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
   }
   // What this warp's fragment i of round r meets. Blocks that fill up a round have no weight, their activations are any
   // (that are numbers: of a pair's missing block its other).
   __device__ __forceinline__ u64 activations(int r, int i) const {
     constexpr int NEXT_TOKENS = FP8 ? 128 : 256;
-    const int fragment = HALVES ? r * MINE + i : (r * RPS + i) * PARTS;
+    const int fragment = (r * RPS + i) * PARTS;
     if constexpr (EXACT) return operand_at<NEXT_TOKENS>(behind(first, fragment * NT * 256));
-    const int here = min(HALVES ? fragment : fragment + my.part, most(blocks, KB) - 1);
+    const int here = min(fragment + my.part, most(blocks, KB) - 1);
     const u32 place = behind(first, here * NT * 256);
     return operand_at<NEXT_TOKENS>(KB * (here + 1) > blocks ? place & 0xffff : place);
   }
@@ -114,7 +108,7 @@ struct GroupProduct {
   // Weights from shared memory. A slot is given back when the round behind it has begun.
   __device__ __forceinline__ void from_slots() {
     const int tile = my.first < tiles ? my.first : 0;
-    const u32 start = b.start(), weights = operand_place(start + M_RING + ((HALVES ? 0 : my.part * tiles) + tile) * FRAGMENT, 128);
+    const u32 start = b.start(), weights = operand_place(start + M_RING + (my.part * tiles + tile) * FRAGMENT, 128);
     u32 next = of_warp(b.slot), phase = of_warp(b.phase), slot = 0, previous = 0, from = weights;
     int left = 0;  // rounds of the slot
 #pragma unroll(UNROLL)
@@ -128,9 +122,9 @@ struct GroupProduct {
       }
       begin_products();
 #pragma unroll
-      for (int i = 0; i < MINE; ++i) {
-        const u32 at = behind(from, i * (HALVES ? 1 : PARTS) * tiles * FRAGMENT);
-        add_product(sums, operand_at<256>(at), activations(r, i), !TP_KEEP || AHEAD > 0 || r + i > 0);
+      for (int i = 0; i < RPS; ++i) {
+        const u32 at = behind(from, i * PARTS * tiles * FRAGMENT);
+        add_product(sums, operand_at<256>(at), activations(r, i), 1);
         if (i == 0) {
           commit_products();
           await_products<1>();  // the round before is done
@@ -227,7 +221,7 @@ struct Own {
   float4 sums[plan_groups(MT)][OWN<MT>];
   int tile[plan_groups(MT)], n[plan_groups(MT)][OWN<MT>];
   bool mine[plan_groups(MT)][OWN<MT>];
-  __device__ __forceinline__ Own(const Block& b, int tiles, bool halves = false) {
+  __device__ __forceinline__ Own(const Block& b, int tiles) {
 #pragma unroll
     for (int i = 0; i < plan_groups(MT); ++i) {
       const int size = group_tiles(MT - i * 8), parts = group_parts(size);
@@ -235,7 +229,7 @@ struct Own {
       tile[i] = i * 8 + my.tile;
 #pragma unroll
       for (int k = 0; k < OWN<MT>; ++k)
-        n[i][k] = halves ? my.part * OWN<MT> + k : k * parts + my.part, mine[i][k] = my.tile < size && tile[i] < tiles && n[i][k] < NT;
+        n[i][k] = k * parts + my.part, mine[i][k] = my.tile < size && tile[i] < tiles && n[i][k] < NT;
     }
   }
   __device__ __forceinline__ void meet() const {  // the warps of my tile, in the one group

@@ -235,10 +235,8 @@ template <int EVEN, typename Await, typename Then>
 __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, int region, uint4* buffer, u32 bit,
                                                  Await await, Then then, const Sent& sent) {
   Ahead<group_tiles(DX), RESIDUAL_AHEAD> ahead(b);
-  constexpr bool HALVES = SPREAD && plan_groups(DX) == 1 && (TP_HALVES & (EVEN == QT ? 1 : 2)) != 0;
-  Own<DX> own(b, b.xn(), HALVES);
+  Own<DX> own(b, b.xn());
   uint2* place[plan_groups(DX)][OWN<DX>];  // in the buffer
-  auto make_places = [&] {
 #pragma unroll
   for (int i = 0; i < plan_groups(DX); ++i)
 #pragma unroll
@@ -250,28 +248,13 @@ __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, in
         place[i][k] = (uint2*)(words + b.cluster() / 2 * 32) + (b.cluster() & 1);
       if (FEW) place[i][k] = settled(place[i][k]);
     }
-  };
-  if (!HALVES) make_places();
   if (FEW) keep_until_here(sent.units), keep_until_here(sent.places);
   await();
   show_to_products();
-  if constexpr (HALVES) {
-    float sums[OWN<DX> * 4];
-    if (b.xn() > 0) GroupProduct<group_tiles(DX), EVEN, 0, true>(b, x, blocks, b.xn(), sums)(ahead);
-    then();
-  if (EVEN == QT) { MARK(26) }
-#pragma unroll
-    for (int k = 0; k < OWN<DX>; ++k)
-      own.sums[0][k] = make_float4(sums[k * 4], sums[k * 4 + 1], sums[k * 4 + 2], sums[k * 4 + 3]);
-  } else {
-    float sums[plan_groups(DX)][NT * 4];
-    multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, ahead);
-  if (EVEN == QT) { MARK(26) }
-    then();
-    own.add_up(b, region, b.xn(), sums);
-  }
-  if (EVEN == QT) { MARK(27) }
-  if (HALVES) make_places();
+  float sums[plan_groups(DX)][NT * 4];
+  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, ahead);
+  then();
+  own.add_up(b, region, b.xn(), sums);
 #pragma unroll
   for (int i = 0; i < plan_groups(DX); ++i)
 #pragma unroll
@@ -327,9 +310,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
   multiply<GTL, D16>(b, M_X, D16, gn, sums, ahead);
   MARK(15)
   if constexpr (SPREAD) consumers_sync(), give_room(b);
-  MARK(26 + 3 - 0)
   own.add_up(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);
-  MARK(30)
   constexpr int QUARTER = most(S, 4);
   static_assert(S % 4 == 0, "four lanes share the ranks");
   u32 window[QUARTER], hidden_bars[QUARTER];  // if SPREAD: this CTA's shared memory as theirs
