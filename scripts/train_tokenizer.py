@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Train the project's own small SentencePiece model, `src/turbopi/data/tiny_tokenizer.model`.
+"""Train the project's own small SentencePiece model, `src/turbopi/data/small_policy/tokenizer.model`.
 
 It stands in for PaliGemma's tokenizer where no trained weights are at stake: tests, the demo, random weights. It
 behaves like Gemma's: BPE with byte fallback, pad 0, eos 1, bos 2, unk 3, text taken as it is (no normalisation, no
@@ -19,7 +19,7 @@ from pathlib import Path
 import sentencepiece
 
 VOCAB_SIZE = 1024  # pi05_tiny's
-OUT = Path(__file__).parent.parent / "src" / "turbopi" / "data" / "tiny_tokenizer.model"
+OUT = Path(__file__).parent.parent / "src" / "turbopi" / "data" / "small_policy" / "tokenizer.model"
 
 OBJECTS = """alphabet soup|basket|black bowl|blue block|book|bottle|bowl|box|bread|butter|cabbage|can|carrot|cheese
 chocolate pudding|cloth|cookies box|corn|cream cheese|cream cheese box|cube|cup|dish|fork|frying pan|glass

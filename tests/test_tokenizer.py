@@ -207,7 +207,7 @@ def test_the_script_makes_the_same_file_each_time() -> None:
 
 
 def test_the_tiny_tokenizer_is_part_of_the_package() -> None:
-    assert TINY_TOKENIZER.parent.parent == Path(tokenizer.__file__).parent
+    assert TINY_TOKENIZER.is_relative_to(Path(tokenizer.__file__).parent)
 
 
 def test_the_newline_behind_a_prompt_is_encoded_once() -> None:

@@ -17,7 +17,7 @@ from turbopi.errors import ObservationError, TokenizerError
 
 logger = logging.getLogger(__name__)
 
-TINY_TOKENIZER = Path(__file__).parent / "data" / "tiny_tokenizer.model"  # 1024 pieces, for pi05_tiny; ours
+TINY_TOKENIZER = Path(__file__).parent / "data" / "small_policy" / "tokenizer.model"  # 1024 pieces; ours
 FILE_NAMES = ("tokenizer.model", "paligemma_tokenizer.model")
 MAX_PROMPT_CHARACTERS = 20_000  # far past any model's tokens; keeps a hostile prompt from stalling the robot
 _STATE_EDGES = np.linspace(-1, 1, 257)[:-1]

@@ -54,5 +54,4 @@ def export(state: dict[str, Tensor], stats: NormStats, folder: Path, precision: 
         tokenizer_candidates=(TINY_TOKENIZER,),
     )
     convert(checkpoint, folder, precision=precision)
-    (folder / TINY_TOKENIZER.name).rename(folder / "tokenizer.model")
     return folder
