@@ -1,5 +1,6 @@
 """`config=`: presets, turbopi.json, and what is refused because nothing records it."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,7 @@ def test_every_key_of_turbopi_json_reaches_the_config(tmp_path: Path) -> None:
         "default_prompt": "go",
         "image_resize": "lerobot",
         "time_grid": "multiplied",
+        "num_denoising_steps": 5,
         "vision_heads": 4,
     }
     write_json(tmp_path / "mine.json", values)
@@ -80,13 +82,19 @@ def test_every_key_of_turbopi_json_reaches_the_config(tmp_path: Path) -> None:
     model = config.model
     assert (model.action_horizon, model.max_prompt_tokens, model.time_grid) == (16, 64, "multiplied")
     assert model.vision.num_heads == 4
-    for key in ("name", "robot", "robot_options", "discrete_state_input", "asset_id", "default_prompt", "image_resize"):
-        assert getattr(config, key) == values[key]
+    for key in values.keys() & {field.name for field in dataclasses.fields(config)} - {"normalization"}:
+        assert getattr(config, key) == values[key], key
 
 
 def test_a_robot_given_without_options_has_none_of_the_presets(tmp_path: Path) -> None:
     write_json(tmp_path / "mine.json", {"preset": "pi05_aloha", "robot": "libero", "asset_id": LIBERO})
     assert open_checkpoint(PI05, tmp_path / "mine.json").config.robot_options == {}
+
+
+def test_the_presets_robot_named_again_keeps_its_options(tmp_path: Path) -> None:
+    write_json(tmp_path / "mine.json", {"preset": "pi05_aloha", "robot": "aloha", "asset_id": LIBERO})
+    config = open_checkpoint(PI05, tmp_path / "mine.json").config
+    assert config.robot_options == {"adapt_to_pi": True, "delta_actions": True}
 
 
 def test_a_robots_own_file_is_found_beside_the_json(tmp_path: Path) -> None:
@@ -106,6 +114,7 @@ WRONG: dict[str, list[Any]] = {
     "discrete_state_input": [1, "true", None],
     "action_horizon": [0, -1, 2.0, "10", True],
     "max_prompt_tokens": [0, None],
+    "num_denoising_steps": [0, 2.0, None],
     "asset_id": [3, ""],
     "default_prompt": [["a"], ""],
     "image_resize": ["bicubic"],

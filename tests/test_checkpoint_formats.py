@@ -137,6 +137,14 @@ def test_params_itself_and_a_trailing_slash_are_understood(pi05: Checkpoint) -> 
         assert open_checkpoint(path, "pi05_libero").path == pi05.path
 
 
+def test_params_are_understood_by_any_name(tmp_path: Path, pi05: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert pi05.path is not None
+    (tmp_path / "weights").symlink_to(pi05.path / "params")
+    assert open_checkpoint(tmp_path / "weights", "pi05_libero").asset_id == pi05.asset_id
+    monkeypatch.chdir(pi05.path / "params")
+    assert open_checkpoint(".", "pi05_libero").asset_id == pi05.asset_id
+
+
 def test_shards_are_read_through_their_index(tmp_path: Path, pi05: Checkpoint) -> None:
     folder = torch_copy(tmp_path / "copy")
     tensors = load_file(folder / "model.safetensors")

@@ -40,7 +40,7 @@ def test_a_lerobot_folder_describes_itself(tmp_path: Path) -> None:
         "state_dim": 8,
         "action_dim": 7,
     }
-    assert checkpoint.info()["num_inference_steps"] == 7
+    assert config.num_denoising_steps == checkpoint.info()["num_denoising_steps"] == 7  # its num_inference_steps
 
 
 def test_its_weights_are_openpis(tmp_path: Path) -> None:
@@ -127,6 +127,11 @@ def test_a_preset_does_not_fit_a_lerobot_folder(tmp_path: Path) -> None:
             {"normalization_mapping": {"STATE": "MEAN_STD"}},
             "normalises STATE by QUANTILES, but config.json says MEAN_STD",
         ),
+        ({"normalization_mapping": None}, "config.json: normalization_mapping is None; expected an object"),
+        (
+            {"input_features": {"observation.images.a": {"type": None, "shape": [3, 224, 224]}}},
+            "observation.images.a has type None; expected one of STATE, VISUAL",
+        ),
     ],
 )
 def test_what_turbopi_does_not_compute_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
@@ -156,6 +161,12 @@ def test_what_turbopi_does_not_compute_is_refused(tmp_path: Path, change: dict[s
             {"rename_map": {"state": "observation.state"}},
             "observations call the state 'state'",
         ),
+        (PRE, "rename_observations_processor", {"rename_map": [1]}, r"rename_map is \[1\]; expected an object"),
+        (PRE, "rename_observations_processor", {"rename_map": {"a": [1]}}, "rename_map is .*; expected a new name"),
+        (PRE, "normalizer_processor", {"norm_map": None}, "policy_preprocessor.json: norm_map is None; expected"),
+        (PRE, "normalizer_processor", {"norm_map": {"STATE": []}}, r"normalises STATE by \[\]"),
+        (PRE, "normalizer_processor", {"features": True}, "features is True; expected an object"),
+        (PRE, "normalizer_processor", {"normalize_observation_keys": 3}, "normalize_observation_keys is 3; expected a"),
     ],
 )
 def test_processors_that_do_something_else_are_refused(
@@ -165,6 +176,23 @@ def test_processors_that_do_something_else_are_refused(
     edit_json(folder / file, lambda c: step(c, name)["config"].update(change))
     with pytest.raises(CheckpointError, match=message):
         open_checkpoint(folder)
+
+
+@pytest.mark.parametrize("value", [None, [], 3, "x"])
+def test_a_steps_config_is_an_object(tmp_path: Path, value: Any) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    edit_json(folder / PRE, lambda c: c["steps"][0].update(config=value))
+    with pytest.raises(CheckpointError, match=r"policy_preprocessor\.json: config is .*; expected an object"):
+        open_checkpoint(folder)
+
+
+def test_what_the_config_asks_for_and_isnt_done_is_noted(tmp_path: Path) -> None:
+    plain = lerobot_copy(tmp_path / "a", rtc_config=None, pretrained_revision=None)
+    assert open_checkpoint(plain).info()["notes"] == []
+    asks = lerobot_copy(tmp_path / "b", rtc_config={"enabled": True}, mixture="x")
+    unknown, rtc = open_checkpoint(asks).info()["notes"]
+    assert "doesn't know or follow: mixture" in unknown
+    assert "enables rtc_config" in rtc
 
 
 def test_unknown_steps_and_relative_actions_are_refused(tmp_path: Path) -> None:

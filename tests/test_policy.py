@@ -1,15 +1,17 @@
 """UnifiedPolicy: openpi's actions end to end, its arguments, and every refusal."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from conftest import GOLDEN, golden_folder
 
 from turbopi.checkpoint import Checkpoint, load_norm_stats, open_checkpoint, random_checkpoint
-from turbopi.config import Kind, Normalization, NormMode, PolicyConfig
+from turbopi.config import Kind, Normalization, NormMode, PolicyConfig, preset
 from turbopi.errors import BackendUnavailable, ConfigError, ObservationError, TokenizerError
 from turbopi.policy import UnifiedPolicy
 
@@ -141,10 +143,39 @@ def test_warmup_runs_the_policy(policy: UnifiedPolicy) -> None:
     assert policy.warmup() > 0
 
 
-@pytest.mark.parametrize("value", [0, -1, 1001, 2.5, True, "10", None])
+@pytest.mark.parametrize("value", [0, -1, 1001, 2.5, True, "10"])
 def test_a_wrong_number_of_steps_is_refused_at_construction(value: Any) -> None:
     with pytest.raises(ConfigError, match="whole number from 1 to 1000"):
         UnifiedPolicy(random_checkpoint("pi05_tiny"), num_denoising_steps=value)
+
+
+def test_the_number_of_steps_is_the_configs_unless_it_is_given() -> None:
+    checkpoint = random_checkpoint(dataclasses.replace(preset("pi05_tiny"), num_denoising_steps=7))
+    assert UnifiedPolicy(checkpoint).metadata["num_denoising_steps"] == 7
+    assert UnifiedPolicy(checkpoint, num_denoising_steps=3).metadata["num_denoising_steps"] == 3
+    wrong = random_checkpoint(dataclasses.replace(preset("pi05_tiny"), num_denoising_steps=0))
+    with pytest.raises(ConfigError, match="whole number from 1 to 1000"):
+        UnifiedPolicy(wrong)
+
+
+def test_noise_may_bring_its_batch_axis(policy: UnifiedPolicy) -> None:
+    noise = np.random.default_rng(0).standard_normal((1, 10, 32))
+    with_axis, without = (policy.infer(policy.example_observation(), noise=n)["actions"] for n in (noise, noise[0]))
+    np.testing.assert_array_equal(with_axis, without)
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        (0.5, r"noise has shape \[\]"),
+        ([], r"noise has shape \[0\]"),
+        (np.zeros((1, 10, 32), np.complex64), "noise isn't an array of numbers: its dtype is complex64"),
+        (torch.zeros(1, 10, 32, requires_grad=True), "noise isn't an array of numbers: Can't call numpy"),
+    ],
+)
+def test_odd_noise_of_a_batch_is_refused(policy: UnifiedPolicy, noise: Any, message: str) -> None:
+    with pytest.raises(ObservationError, match=message):
+        policy.infer_batch([policy.example_observation()], noise=noise)
 
 
 @pytest.mark.parametrize(

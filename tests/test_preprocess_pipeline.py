@@ -12,12 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats, load_norm_stats
-from turbopi.config import CAMERAS, PRESETS, ModelConfig, Normalization, PolicyConfig, preset
+from turbopi.config import CAMERAS, PRESETS, ModelConfig, Normalization, NormMode, PolicyConfig, preset
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.images import resize_unit_into
 from turbopi.observation import Observation
 from turbopi.preprocess import Pipeline
-from turbopi.robots import Robot, RobotInputs
+from turbopi.robots import Robot, RobotInputs, create_robot
+from turbopi.robots.libero import Libero
 from turbopi.tokenizer import PromptTokenizer, prompt_texts
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -356,17 +357,63 @@ def test_an_observation_is_a_dict(observation: Any) -> None:
         pipeline(LIBERO).before(observation)
 
 
-def test_states_wider_than_the_model_or_the_statistics_are_refused() -> None:
-    edges = pipeline(PLAIN, 32, 32)
-    for width, message in ((33, "the state has 33 values, but the model takes at most 32"), (1, None)):
-        observation = {**edges.example(), "state": np.zeros(width)}
-        if message is None:
-            edges.before(observation)
-        else:
-            with pytest.raises(ObservationError, match=message):
-                edges.before(observation)
+def test_states_wider_than_pi0_or_the_statistics_are_refused() -> None:
+    unscaled = dataclasses.replace(preset("pi0_base"), normalization=Normalization("identity", "identity"))
+    edges = pipeline(unscaled, 32, 32)
+    edges.before({**edges.example(), "state": np.zeros(1)})
+    with pytest.raises(ObservationError, match="the state has 33 values, but the model takes at most 32"):
+        edges.before({**edges.example(), "state": np.zeros(33)})
     with pytest.raises(ObservationError, match="state has 8 values, but the checkpoint's statistics cover 6"):
         pipeline(PLAIN, 6, 32).before(edges.example())
+
+
+def test_pi05_takes_states_wider_than_its_actions_as_they_are_only_in_its_prompt() -> None:
+    edges = pipeline(PLAIN, 40, 32)
+    stats = plausible(40)
+    assert stats.q01 is not None
+    assert stats.q99 is not None
+    raw = np.random.default_rng(0).uniform(-1, 1, 40)
+    inputs, state = edges.before({**edges.example(), "state": raw})
+    np.testing.assert_array_equal(state, (raw - stats.q01) / (stats.q99 - stats.q01 + 1e-6) * 2 - 1)
+    np.testing.assert_array_equal(inputs.state, state[:32].astype(np.float32), strict=True)
+    encoder: Any = edges.tokenizer.encoder
+    assert encoder.calls == [list(call) for call in prompt_texts(edges.example()["prompt"], state)]
+    assert edges.before({**edges.example(), "state": raw[:8]})[1].shape == (40,)
+    with pytest.raises(ObservationError, match="state value 39 is 1e\\+39 once normalised"):
+        pipeline(dataclasses.replace(PLAIN, normalization=Normalization("identity", "identity"))).before(
+            {**edges.example(), "state": np.append(raw[:39], 1e39)}
+        )
+
+
+@pytest.mark.parametrize("mode", ["quantile", "lerobot_quantile"])
+@pytest.mark.parametrize("width", [3, 7, 8, 14])
+def test_the_plain_robots_example_fits_the_statistics(mode: NormMode, width: int) -> None:
+    edges = pipeline(dataclasses.replace(PLAIN, normalization=Normalization(mode, "identity")), width)
+    edges.before(edges.example())
+
+
+def test_cameras_of_a_robot_that_has_the_models_order_keep_it_whatever_their_names() -> None:
+    keys = ["left_wrist_0_rgb", "base_0_rgb"]
+    options = {"image_keys": keys, "state_dim": 6, "action_dim": 5}
+    edges = pipeline(dataclasses.replace(LIBERO, robot="lerobot", robot_options=options), 6, 5)
+    pictures = {key: np.full((3, 224, 224), shade, np.uint8) for key, shade in zip(keys, (10, 20), strict=True)}
+    inputs, _ = edges.before({**pictures, "observation.state": np.zeros(6), "task": "go"})
+    assert [int(image[0, 0, 0]) for image in inputs.images] == [10, 20]
+
+
+def test_naming_the_configs_own_robot_again_keeps_its_options() -> None:
+    assert pipeline(preset("pi0_libero"), robot="libero").robot.delta_mask == (True,) * 6 + (False,)
+    aloha = dataclasses.replace(preset("pi05_aloha"), robot_options={"adapt_to_pi": False, "delta_actions": False})
+    assert pipeline(aloha, 14, 14, robot="aloha").robot == create_robot("aloha", aloha.robot_options)
+    assert pipeline(preset("pi0_libero"), 14, 14, robot="aloha").robot == create_robot("aloha")
+
+
+def test_relative_actions_beyond_the_models_are_refused_at_once() -> None:
+    class Wide(Libero):
+        delta_mask = (True,) * 40
+
+    with pytest.raises(ConfigError, match="robot libero has a delta_mask of 40 dimensions, but the model's actions"):
+        pipeline(LIBERO, robot=Wide())
 
 
 @pytest.mark.parametrize("huge", [1e60, 1.7e308, -1e300])
@@ -388,7 +435,13 @@ def test_pictures_too_narrow_to_resize_are_refused() -> None:
         (LIBERO, 7, 7, {}, "robot libero has 8 values of state, but the statistics cover 7"),
         (LIBERO, 8, 6, {}, "robot libero has 7 values of actions, but the statistics cover 6"),
         (LIBERO, 8, 33, {}, "the statistics cover 33 values of actions, but the model has 32"),
-        (LIBERO.with_model(action_dim=7), 7, 7, {}, "robot libero has 8 values of state, but the model takes 7"),
+        (
+            preset("pi0_libero").with_model(action_dim=7),
+            7,
+            7,
+            {},
+            "robot libero has 8 values of state, but the model takes 7",
+        ),
         (preset("pi0_base"), 8, 7, {"robot": "libro"}, "unknown robot 'libro'"),
         (dataclasses.replace(preset("pi0_base"), discrete_state_input=True), 8, 7, {}, "only Pi0.5 reads the state"),
         (dataclasses.replace(LIBERO, image_resize=cast(Any, "bicubic")), 8, 7, {}, "image_resize is openpi or lerobot"),

@@ -325,6 +325,38 @@ def test_the_plain_robot_masks_what_it_isnt_given_and_refuses_other_names() -> N
 # Names and options
 
 
+def test_the_plain_robots_masked_cameras_are_as_if_not_sent() -> None:
+    plain = create_robot("plain")
+    example = plain.example(np.random.default_rng(0))
+    pictures, rest = example.pop("images"), example
+    for mask in (
+        {"image_mask": {"base_0_rgb": True, "right_wrist_0_rgb": False}},
+        {"image_mask/right_wrist_0_rgb": np.False_},
+        {"image_mask": {"right_wrist_0_rgb": np.array([False])}},
+    ):
+        inputs = plain.inputs({"image": pictures, **rest, **mask})
+        assert inputs.image_mask == {"base_0_rgb": True, "left_wrist_0_rgb": True, "right_wrist_0_rgb": False}
+        assert not inputs.images["right_wrist_0_rgb"].any()
+    del pictures["left_wrist_0_rgb"]
+    for wrong, message in (
+        ({"left_wrist_0_rgb": True}, "image_mask/left_wrist_0_rgb is True, but image has no left_wrist_0_rgb"),
+        ({"wrist": True}, "image_mask/wrist is of no camera; the model's are base_0_rgb"),
+        ({"base_0_rgb": 1}, r"image_mask/base_0_rgb is int64\[\]; expected one bool"),
+        ({"base_0_rgb": np.zeros(2, bool)}, r"image_mask/base_0_rgb is bool\[2\]; expected one bool"),
+        ({"base_0_rgb": False, "right_wrist_0_rgb": False}, "image_mask leaves out all of base_0_rgb, right_wrist"),
+        (3, "'image_mask' is a int, expected a dict"),
+    ):
+        with pytest.raises(ObservationError, match=message):
+            plain.inputs({"image": pictures, **rest, "image_mask": wrong})
+
+
+@pytest.mark.parametrize("value", ["no", "false", None, 0, 0.0, []])
+def test_options_that_are_true_or_false_are_nothing_else(value: Any) -> None:
+    for robot, option in (("aloha", "adapt_to_pi"), ("aloha", "delta_actions"), ("libero", "delta_actions")):
+        with pytest.raises(ConfigError, match=f"robot {robot}: the option {option} is .*; expected true or false"):
+            create_robot(robot, {option: value})
+
+
 def test_every_presets_robot_can_be_made() -> None:
     for preset in PRESETS.values():
         assert create_robot(preset.robot, preset.robot_options).name == preset.robot
@@ -413,9 +445,11 @@ def test_a_description_may_name_its_prompt_key_and_reset_pose() -> None:
         ({"delta_action_dims": [6, 0]}, "delta_action_dims must be a list such as"),
         ({"delta_action_dims": [6, -2]}, r"delta_action_dims \[6, -2\] covers 8 dimensions, but action_dim is 7"),
         ({"delta_action_dims": [4], "state": {"a": 3}}, "covers 4 dimensions, but the state's width is 3"),
+        ({"delta_action_dims": [10**12]}, "covers 1000000000000 dimensions, but action_dim is 7"),
         ({"default_prompt": 3}, "default_prompt must be text"),
         ({"reset_pose": ["a"]}, "reset_pose must be a list of numbers"),
         ({"reset_pose": [float("nan")]}, "reset_pose must be a list of numbers"),
+        ({"reset_pose": [10**400]}, "reset_pose must be a list of numbers"),
     ],
 )
 def test_wrong_descriptions_name_the_field(changes: dict[str, Any], message: str) -> None:

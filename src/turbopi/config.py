@@ -102,6 +102,7 @@ class PolicyConfig:
     robot_options: Mapping[str, Any] = field(default_factory=dict)
     default_prompt: str | None = None
     image_resize: Literal["openpi", "lerobot"] = "openpi"
+    num_denoising_steps: int = 10  # unless whoever runs the policy says otherwise
 
     def with_model(self, **changes: Any) -> "PolicyConfig":
         """The same policy with some of its model's fields replaced."""

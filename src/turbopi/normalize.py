@@ -75,6 +75,12 @@ class Normalizer:
                 case _:  # lerobot_quantile, lerobot_min_max
                     return np.asarray(2.0 * (x.astype(np.float32) - a) / _nonzero(b - a) - 1.0, np.float64)
 
+    def fitted(self, x: np.ndarray) -> np.ndarray:
+        """float[d] made as wide as `normalize` takes it: cut, or for LeRobot's modes repeated."""
+        if self.width is None or (len(x) <= self.width and not self._is_lerobot):
+            return x
+        return np.resize(x, self.width)
+
     def unnormalize(self, x: np.ndarray) -> np.ndarray:
         """float[..., d] to float64[..., d], the inverse. Raises ConfigError if d is less than the statistics cover."""
         if self.width is None:

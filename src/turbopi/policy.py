@@ -39,7 +39,8 @@ class UnifiedPolicy:
         precision: "bf16" as openpi serves it, "f32", or with a calibration "fp8" or "fp8-mlp" (docs/quantization.md).
         quantization: what `turbopi calibrate` wrote for this checkpoint, for the FP8 precisions alone. None: the
             `turbopi_fp8.json` beside the weights.
-        num_denoising_steps: Euler steps a call, unless `infer` is told otherwise. openpi's default is 10.
+        num_denoising_steps: Euler steps a call, unless `infer` is told otherwise. None: the config's, which has them
+            from turbopi.json, else from LeRobot's `num_inference_steps`, else openpi's 10.
         device: "auto", "cpu", "cuda" or "cuda:N".
         tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
             the checkpoint folder or in openpi's cache.
@@ -60,14 +61,15 @@ class UnifiedPolicy:
         backend: str = "auto",
         precision: Tier = "bf16",
         quantization: str | Path | Quantization | None = None,
-        num_denoising_steps: int = 10,
+        num_denoising_steps: int | None = None,
         device: str | torch.device = "auto",
         tokenizer: Any = None,
         default_prompt: str | None = None,
         robot: str | Robot | None = None,
         progress: bool = False,
     ) -> None:
-        self._num_steps = _checked_steps(num_denoising_steps, ConfigError)
+        if num_denoising_steps is not None:
+            _checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
         self._device = backends.resolve_device(device)
         name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "asked for")
 
@@ -77,6 +79,8 @@ class UnifiedPolicy:
         if checkpoint.format == "random" and tokenizer is None:
             tokenizer = TINY_TOKENIZER  # any will do: no weight knows a word
         self.config = checkpoint.config
+        steps = self.config.num_denoising_steps if num_denoising_steps is None else num_denoising_steps
+        self._num_steps = _checked_steps(steps, ConfigError)
         prompt_tokenizer = load_tokenizer(
             tokenizer,
             checkpoint_dir=checkpoint.path,
@@ -112,7 +116,8 @@ class UnifiedPolicy:
 
         Args:
             obs: the observation under the robot's own keys (docs/robots.md), on the host, without a batch axis.
-            noise: float32[H, action_dim], x at t = 1. Given noise, or a seed, makes the result deterministic.
+            noise: float32[H, action_dim] or [1, H, action_dim], x at t = 1. Given noise, or a seed, makes the result
+                deterministic.
             seed: draws the noise from `numpy.random.default_rng(seed)`; neither: fresh noise every call.
             num_steps: denoising steps for this call alone.
 
@@ -296,11 +301,17 @@ class UnifiedPolicy:
 
 def _checked_noise(noise: Sequence[np.ndarray] | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     try:
-        array = np.asarray(noise, dtype=np.float32)
-    except (TypeError, ValueError) as error:
+        array = np.asarray(noise)
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a torch tensor that wants gradients
         raise ObservationError(f"noise isn't an array of numbers: {error}") from None
+    if array.dtype.kind not in "fiu":
+        raise ObservationError(f"noise isn't an array of numbers: its dtype is {array.dtype}")
+    if array.ndim == 4 and array.shape[:2] == (1, 1):  # one row that brought its batch axis
+        array = array[0]
+    with np.errstate(over="ignore"):  # refused below
+        array = array.astype(np.float32, copy=False)
     if array.shape != shape:
-        given, expected = (array.shape[1:], shape[1:]) if len(array) == shape[0] else (array.shape, shape)
+        given, expected = (array.shape[1:], shape[1:]) if array.shape[:1] == shape[:1] else (array.shape, shape)
         raise ObservationError(f"noise has shape {list(given)}, but this policy needs {list(expected)}")
     if not np.isfinite(array).all():
         raise ObservationError("noise has values that aren't finite")

@@ -19,6 +19,7 @@ from turbopi.normalize import Normalizer, absolute_actions, pad_last
 from turbopi.observation import ModelInputs
 from turbopi.robots import Robot, RobotInputs, create_robot
 from turbopi.robots.base import read_prompt, read_state
+from turbopi.robots.plain import Plain
 from turbopi.tokenizer import PromptTokenizer
 
 
@@ -27,8 +28,8 @@ class Incoming:
     """One observation on its way in: `Pipeline.see` fills the first half, `Pipeline.read` the rest.
 
     pictures        (uint8|float32)[224, 224, 3] of each camera that `image_mask` has; some may be the observation's own
-    state           float64[action_dim]  normalised, padded
-    model_state     float32[action_dim]  the same, as the model reads it
+    state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt
+    model_state     float32[action_dim]  what fits of it, as the model reads it
     """
 
     observation: Mapping[str, Any]
@@ -48,7 +49,7 @@ class _Result:
     """One action chunk on its way out."""
 
     actions: np.ndarray  # [H, d]
-    state: np.ndarray  # [action_dim]
+    state: np.ndarray  # [s], s from action_dim
 
 
 class Pipeline:
@@ -58,7 +59,8 @@ class Pipeline:
     stats           the checkpoint's statistics
     tokenizer       see `turbopi.tokenizer.load_tokenizer`
     default_prompt  for observations without one; before the config's and the robot's
-    robot           instead of the config's: a name, a description's path, or an object (its options are its own)
+    robot           instead of the config's: a name, a description's path, or an object. The config's options are for
+                    the robot that it names alone
 
     Raises ConfigError if these don't fit each other. Calls change nothing in it but which long prompt was warned about.
     """
@@ -72,7 +74,8 @@ class Pipeline:
         robot: str | Robot | None = None,
     ) -> None:
         self.config, self.tokenizer = config, tokenizer
-        self.robot = create_robot(config.robot, config.robot_options) if robot is None else create_robot(robot)
+        chosen = config.robot if robot is None else robot
+        self.robot = create_robot(chosen, config.robot_options if chosen == config.robot else None)
         prompts = (default_prompt, config.default_prompt, self.robot.default_prompt)
         self.default_prompt = next((prompt for prompt in prompts if prompt is not None), None)
         self.state_scale = Normalizer(config.normalization.state, stats.state, "state")
@@ -95,7 +98,7 @@ class Pipeline:
         )
 
     def before(self, observation: Mapping[str, Any]) -> tuple[ModelInputs, np.ndarray]:
-        """The model's inputs, and the state float64[action_dim] (normalised, padded) that `after` needs.
+        """The model's inputs, and the state float64[s] (normalised, padded) that `after` needs.
 
         The observation isn't changed, and nothing returned shares memory with it. Raises ObservationError if it can't
         be used.
@@ -137,7 +140,10 @@ class Pipeline:
 
     def example(self, seed: int = 0) -> dict[str, Any]:
         """A random valid observation in the robot's own keys; the same for the same seed."""
-        return self.robot.example(np.random.default_rng(seed))
+        made = self.robot.example(np.random.default_rng(seed))
+        if isinstance(self.robot, Plain):  # takes any width, the statistics don't
+            made["state"] = self.state_scale.fitted(made["state"])
+        return made
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -165,13 +171,14 @@ class Pipeline:
 
     def _normalize_state(self, sample: Incoming) -> None:
         state, limit = read_state(sample.robot.state, "state", self.robot.state_dim), self.config.model.action_dim
-        if len(state) > limit:
+        if len(state) > limit and self.config.model.kind == "pi0":  # Pi0.5 has it in the prompt or nowhere
             raise ObservationError(f"the state has {len(state)} values, but the model takes at most {limit}")
         sample.state = self.state_scale.normalize(state)
 
     def _resize_images(self, sample: Incoming) -> None:
         pictures, present = sample.robot.images, sample.robot.image_mask
-        cameras = list(CAMERAS) if set(pictures) <= set(CAMERAS) else list(pictures)
+        final = sample.robot.in_order or not set(pictures) <= set(CAMERAS)
+        cameras = list(pictures) if final else list(CAMERAS)
         valid = [present.get(camera, camera in pictures) for camera in cameras]
         sample.image_mask = np.array(valid, np.bool_)
         sample.pictures = [self._fitted(pictures.get(camera), camera) for camera in itertools.compress(cameras, valid)]
@@ -202,11 +209,13 @@ class Pipeline:
         )
 
     def _pad_state(self, sample: Incoming) -> None:
-        sample.state = pad_last(sample.state, self.config.model.action_dim)
+        width = self.config.model.action_dim
+        sample.state = pad_last(sample.state, max(width, self.state_scale.width or 0))
         with np.errstate(over="ignore"):
-            sample.model_state = sample.state.astype(np.float32)
-        if not np.isfinite(sample.model_state).all():
-            at = int(np.flatnonzero(~np.isfinite(sample.model_state))[0])
+            state = sample.state.astype(np.float32)
+        sample.model_state = state[:width]
+        if not np.isfinite(state).all():
+            at = int(np.flatnonzero(~np.isfinite(state))[0])
             raise ObservationError(f"state value {at} is {sample.state[at]:g} once normalised, too large for the model")
 
     # After the model
@@ -230,12 +239,18 @@ class Pipeline:
         if config.image_resize not in ("openpi", "lerobot"):
             raise ConfigError(f"{config.name}: image_resize is openpi or lerobot, not {config.image_resize!r}")
         dims = (("state", robot.state_dim, self.state_scale), ("actions", robot.action_dim, self.action_scale))
+        if robot.delta_mask is not None and len(robot.delta_mask) > limit:
+            raise ConfigError(
+                f"robot {robot.name} has a delta_mask of {len(robot.delta_mask)} dimensions, but the model's actions "
+                f"have {limit}"
+            )
         for name, width, scale in dims:
-            if width is not None and width > limit:
+            limited = name == "actions" or config.model.kind == "pi0"  # no weight of Pi0.5 depends on the state's width
+            if width is not None and limited and width > limit:
                 raise ConfigError(f"robot {robot.name} has {width} values of {name}, but the model takes {limit}")
             if scale.width is None:
                 continue
-            if scale.width > limit:
+            if limited and scale.width > limit:
                 raise ConfigError(f"the statistics cover {scale.width} values of {name}, but the model has {limit}")
             if width is not None and width > scale.width:
                 raise ConfigError(

@@ -2,9 +2,9 @@
 
 import hashlib
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from math import prod
 from pathlib import Path
@@ -44,7 +44,6 @@ class Checkpoint:
     source: WeightSource
     asset_id: str | None = None
     tokenizer_candidates: tuple[Path, ...] = ()
-    details: Mapping[str, Any] = field(default_factory=dict)  # further lines of `info`, of this format alone
 
     @property
     def format(self) -> str:
@@ -124,6 +123,7 @@ class Checkpoint:
             "config_source": self.config_source,
             "robot": self.config.robot,
             "action_horizon": self.config.model.action_horizon,
+            "num_denoising_steps": self.config.num_denoising_steps,
             "max_prompt_tokens": self.config.model.max_prompt_tokens,
             "discrete_state_input": self.config.discrete_state_input,
             "normalization": {
@@ -133,7 +133,6 @@ class Checkpoint:
             "asset_id": self.asset_id,
             "norm_stats": norm_stats_info(self.norm_stats),
             "tokenizers": [str(file) for file in self.tokenizer_candidates],
-            **self.details,
         }
 
 

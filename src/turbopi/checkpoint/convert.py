@@ -181,6 +181,7 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, Any], Path
         "default_prompt": config.default_prompt,
         "image_resize": config.image_resize,
         "time_grid": config.model.time_grid,
+        "num_denoising_steps": config.num_denoising_steps,
         "vision_heads": config.model.vision.num_heads,
     }
     parsed = Settings(SETTINGS, values=parse_values(json.loads(json.dumps(values)), SETTINGS))

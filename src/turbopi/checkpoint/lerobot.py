@@ -28,6 +28,7 @@ _MODES: dict[str, NormMode] = {
     "IDENTITY": "identity",
 }
 _EPS = 1e-8
+_FEATURE_TYPES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
 _TOKENIZER = "google/paligemma-3b-pt-224"
 _STEPS = {
     PREPROCESSOR: (
@@ -57,8 +58,8 @@ _KNOWN = set(_FIXED) | {
     *("time_sampling_beta_alpha", "time_sampling_beta_beta", "time_sampling_scale", "time_sampling_offset"),
     *("relative_exclude_joints", "action_feature_names", "rtc_config", "gradient_checkpointing", "use_peft"),
     *("freeze_vision_encoder", "train_expert_only", "push_to_hub", "repo_id", "private", "tags", "license"),
-    *("pretrained_path", "optimizer_lr", "optimizer_betas", "optimizer_eps", "optimizer_weight_decay"),
-    *("optimizer_grad_clip_norm", "optimizer_fused"),
+    *("pretrained_path", "pretrained_revision", "optimizer_lr", "optimizer_betas", "optimizer_eps"),
+    *("optimizer_weight_decay", "optimizer_grad_clip_norm", "optimizer_fused"),
     *("scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"),
 }
 
@@ -75,14 +76,16 @@ class LeRobotFolder:
         self._check_config()
         self.steps = {name: self._read_steps(name) for name in (PREPROCESSOR, POSTPROCESSOR)}
 
-    @property
-    def num_inference_steps(self) -> int:
-        return self._count("num_inference_steps", 10)
-
     def notes(self) -> list[str]:
-        """Keys of config.json that LeRobot's Pi0.5 doesn't have: another program may compute something from them."""
+        """What config.json asks for and Turbo-Pi doesn't do; keys that LeRobot's Pi0.5 doesn't have, from which another
+        program may compute something.
+        """
         unknown = sorted(self.config.keys() - _KNOWN)
-        return [f"config.json has keys that Turbo-Pi doesn't know or follow: {', '.join(unknown)}"] if unknown else []
+        notes = [f"config.json has keys that Turbo-Pi doesn't know or follow: {', '.join(unknown)}"] if unknown else []
+        rtc = self.config.get("rtc_config")
+        if isinstance(rtc, dict) and rtc.get("enabled"):
+            notes.append("config.json enables rtc_config: Turbo-Pi answers each observation with a chunk of its own")
+        return notes
 
     def policy_config(self, settings: Settings) -> PolicyConfig:
         """What the folder says, with a turbopi.json's values over it. A preset would be a second description."""
@@ -105,6 +108,7 @@ class LeRobotFolder:
             normalization=Normalization("identity", "identity"),  # until the next line
             robot_options=self._robot_options(),
             image_resize="lerobot",
+            num_denoising_steps=self._count("num_inference_steps", 10),
         )
         if "normalization" not in settings.values:
             described = with_values(described, Settings("", values={"normalization": self._normalization()}))
@@ -146,7 +150,7 @@ class LeRobotFolder:
                     f"{file} has a step {name!r} that Turbo-Pi doesn't know; known are {', '.join(_STEPS[file_name])}"
                 )
             found[name] = entry
-            if entry.get("config", {}).get("enabled") is True:
+            if _object(entry, "config", file).get("enabled") is True:
                 raise CheckpointError(f"{file}: {name} is enabled; Turbo-Pi doesn't do LeRobot's relative actions")
         return found
 
@@ -157,12 +161,12 @@ class LeRobotFolder:
             ("STATE", PREPROCESSOR, "normalizer_processor"),
             ("ACTION", POSTPROCESSOR, "unnormalizer_processor"),
         ):
-            config = self.steps[file_name].get(step, {}).get("config", {})
             file = self.folder / file_name
-            mapping = {**config.get("norm_map", {})}
+            config = _object(self.steps[file_name].get(step, {}), "config", file)
+            mapping = _object(config, "norm_map", file)
             mode = mapping.get(key, "IDENTITY")
-            claimed = self.config.get("normalization_mapping", {}).get(key, mode)
-            if mode not in _MODES:
+            claimed = _object(self.config, "normalization_mapping", self.folder / CONFIG).get(key, mode)
+            if mode not in list(_MODES):  # a list: it may be anything, hashable or not
                 raise CheckpointError(f"{file} normalises {key} by {mode}; Turbo-Pi knows {', '.join(_MODES)}")
             if mode != claimed:
                 raise CheckpointError(
@@ -189,16 +193,20 @@ class LeRobotFolder:
             tensors = load_file(file)
         except (SafetensorError, OSError) as error:
             raise CheckpointError(f"{file} can't be read as safetensors ({error})") from error
-        config = entry.get("config", {})
+        config = _object(entry, "config", Path(where))
         selected = config.get("normalize_observation_keys")
-        applied = feature in config.get("features", {}) and (selected is None or feature in selected)
+        if not isinstance(selected, list | None):
+            raise CheckpointError(
+                f"{where}: normalize_observation_keys is {selected!r}; expected a list of keys or null"
+            )
+        applied = feature in _object(config, "features", Path(where)) and (selected is None or feature in selected)
         if feature == STATE and not applied:  # LeRobot then passes the state through, whatever statistics there are
             return None, f"{file} (the {step}'s features leave out {STATE})"
         values = {name: tensors[f"{feature}.{name}"] for name in STATISTICS if f"{feature}.{name}" in tensors}
         return (feature_stats(values, f"{file}: {feature}") if values else None), str(file)
 
     def _prompt_tokens(self) -> int:
-        step = self.steps[PREPROCESSOR].get("tokenizer_processor", {}).get("config", {})
+        step = _object(self.steps[PREPROCESSOR].get("tokenizer_processor", {}), "config", self.folder / PREPROCESSOR)
         claimed = self._count("tokenizer_max_length", 200)
         length = step.get("max_length", claimed)
         if length != claimed:
@@ -226,11 +234,20 @@ class LeRobotFolder:
         """Cameras in the model's order, by the keys that observations use, and the widths of state and actions."""
         inputs, outputs = self._features("input_features"), self._features("output_features")
         rename_step = self.steps[PREPROCESSOR].get("rename_observations_processor", {})
-        renames = rename_step.get("config", {}).get("rename_map", {})
+        file = self.folder / PREPROCESSOR
+        renames = _object(_object(rename_step, "config", file), "rename_map", file)
+        if not all(isinstance(new, str) for new in renames.values()):
+            raise CheckpointError(f"{file}: rename_map is {renames!r}; expected a new name for each key")
         original = {new: old for old, new in renames.items()}  # what the observation calls a feature of the policy
         if STATE in original:
             raise CheckpointError(f"{self.folder}: observations call the state {original[STATE]!r}; expected {STATE}")
-        visual = [key for key, feature in inputs.items() if feature.get("type") == "VISUAL"]
+        for key, feature in inputs.items():
+            if feature.get("type") not in _FEATURE_TYPES:
+                raise CheckpointError(
+                    f"{self.folder / CONFIG}: {key} has type {feature.get('type')!r}; expected one of "
+                    f"{', '.join(_FEATURE_TYPES)}"
+                )
+        visual = [key for key, feature in inputs.items() if feature["type"] == "VISUAL"]
         cameras = [original.get(key, key) for key in visual if not key.startswith(EMPTY_CAMERA)]
         if not cameras:
             raise CheckpointError(f"{self.folder / CONFIG} lists no camera among its input_features")
@@ -248,6 +265,14 @@ def is_lerobot(folder: Path) -> bool:
     """LeRobot's config.json has a `type`; openpi's has none."""
     file = folder / CONFIG
     return file.is_file() and "type" in _read_json(file)
+
+
+def _object(owner: Mapping[str, Any], key: str, file: Path) -> dict[str, Any]:
+    """The object at `key`, {} if there is none. CheckpointError for anything else, null too."""
+    found = owner.get(key, {})
+    if not isinstance(found, dict):
+        raise CheckpointError(f"{file}: {key} is {found!r}; expected an object")
+    return found
 
 
 def _width(features: Mapping[str, Any], key: str, default: int) -> int:

@@ -105,7 +105,6 @@ def _open_lerobot(location: Location, settings: Settings, source: WeightSource) 
         norm_stats=folder.norm_stats(policy.normalization),
         source=source,
         tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
-        details={"num_inference_steps": folder.num_inference_steps},
     )
 
 

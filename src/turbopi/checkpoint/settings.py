@@ -8,7 +8,7 @@ itself.
     preset                a name of turbopi.config.PRESETS, of the same kind (Pi0 or Pi0.5) as the weights
     name                  what the policy is called
     robot                 "libero", "droid", ... or a robot's .json, relative to this file
-    robot_options         object, passed to the robot in place of the preset's; a `robot` without it has none
+    robot_options         object, passed to the robot in place of the preset's, which are for the preset's robot alone
     normalization         a mode ("quantile", "zscore", ...) or {"state": mode, "actions": mode}
     discrete_state_input  true if the state is written into the prompt (Pi0.5 only)
     action_horizon        H >= 1, the number of actions in a chunk
@@ -17,6 +17,7 @@ itself.
     default_prompt        text or null
     image_resize          "openpi" or "lerobot"
     time_grid             "accumulated" (openpi) or "multiplied" (LeRobot)
+    num_denoising_steps   >= 1, unless whoever runs the policy says otherwise; else LeRobot's num_inference_steps, or 10
     vision_heads          attention heads of a vision tower of a non-standard width
     lora_alpha            number, or {"vlm": number, "expert": number}: see lora.py
     lora_rslora           true if adapters were trained rank-stabilised
@@ -107,8 +108,9 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
         "asset_id",
         "default_prompt",
         "image_resize",
+        "num_denoising_steps",
     )
-    if "robot" in values:  # the options were the other robot's
+    if values.get("robot", config.robot) != config.robot:  # the options were the other robot's
         config = replace(config, robot_options={})
     config = replace(config, **{key: values[key] for key in fields if key in values})
     model = {key: values[key] for key in ("action_horizon", "max_prompt_tokens", "time_grid") if key in values}
@@ -249,6 +251,7 @@ _SCHEMA: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "default_prompt": ("a text or null", _text_or_null),
     "image_resize": ("'openpi' or 'lerobot'", _choice("openpi", "lerobot")),
     "time_grid": ("'accumulated' or 'multiplied'", _choice("accumulated", "multiplied")),
+    "num_denoising_steps": ("a whole number, 1 or more", _count),
     "vision_heads": ("a whole number, 1 or more", _count),
     "lora_alpha": ("a positive number, or an object with vlm and expert", _lora_alpha),
     "lora_rslora": ("true or false", _flag),

@@ -56,7 +56,9 @@ def calibrate(
             help="Cosine of what denoising does, against float32: sites are kept in bf16 until it is met.",
         ),
     ] = 0.9975,
-    steps: Annotated[int, typer.Option("--steps", min=1, metavar="N", help="Denoising steps.")] = 10,
+    steps: Annotated[
+        int | None, typer.Option("--steps", min=1, metavar="N", help="Denoising steps; else the checkpoint's.")
+    ] = None,
     batch: Annotated[
         int, typer.Option("--batch", min=1, metavar="N", help="Observations at once; fewer take less memory.")
     ] = 8,

@@ -86,7 +86,7 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
         facts += [
             ("configuration", f"{info['name']}, from {info['config_source']}"),
             ("robot", info["robot"]),
-            ("action horizon", str(info["action_horizon"])),
+            ("action horizon", f"{info['action_horizon']}, {info['num_denoising_steps']} denoising steps"),
             ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
             ("statistics", _statistics_source(info)),
             ("  of the state", _statistics(info["norm_stats"]["state"], normalization["state"])),

@@ -93,6 +93,8 @@ def _run_variants(
     from turbopi.evaluate.visited import Visited, action_error
 
     options.check(checkpoint)
+    if options.steps is None:
+        options = replace(options, steps=options.open(checkpoint).config.num_denoising_steps)
     variants = [parse_variant(text, options) for text in texts]
     if len(set(variants)) < len(variants):
         raise ConfigError(f"the same way to run is named twice in {' '.join(texts)}")

@@ -154,7 +154,15 @@ class PolicyOptions(WeightOptions):
             help="FP8 in these parts alone: vision, prefix, expert. Unless given, in all that the calibration allows.",
         ),
     ] = None
-    steps: Annotated[int, _option("--steps", panel=_RUNNING, metavar="N", help="Denoising steps of an inference.")] = 10
+    steps: Annotated[
+        int | None,
+        _option(
+            "--steps",
+            panel=_RUNNING,
+            metavar="N",
+            help="Denoising steps of an inference. Unless given: what the checkpoint says, else 10.",
+        ),
+    ] = None
     device: Annotated[
         str,
         _option("--device", panel=_RUNNING, metavar="DEVICE", help="cpu, cuda, cuda:N, or auto: the GPU if any."),

@@ -57,6 +57,10 @@ def create_robot(robot: str | Path | Robot, options: Mapping[str, Any] | None = 
         raise ConfigError(f"robot {robot} has no option {', '.join(unknown)}; it has {', '.join(fields) or 'none'}")
     if missing:
         raise ConfigError(f"robot {robot} needs the option {', '.join(missing)}")
+    for field in dataclasses.fields(cls):
+        value = options.get(field.name, field.default)
+        if isinstance(field.default, bool) and not isinstance(value, bool):
+            raise ConfigError(f"robot {robot}: the option {field.name} is {value!r}; expected true or false")
     created: Robot = cls(**options)
     return created
 

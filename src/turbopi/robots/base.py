@@ -25,6 +25,7 @@ class RobotInputs:
     image_mask  camera -> whether there is such a picture; left out: if `images` has one
     state       float[s]       in the robot's units, before normalisation
     prompt      the task, or None if the observation has none
+    in_order    whether `images` has all of the model's cameras, in its order, whatever their names
 
     Cameras are the model's (`base_0_rgb`, `left_wrist_0_rgb`, `right_wrist_0_rgb`; their order here doesn't matter and
     those left out are masked), or, for models trained with other names, names in the model's order.
@@ -34,6 +35,7 @@ class RobotInputs:
     image_mask: dict[str, bool]
     state: np.ndarray
     prompt: str | None = None
+    in_order: bool = False
 
 
 @runtime_checkable

@@ -1,6 +1,7 @@
 """A robot described by a small JSON file; docs/robots.md has an example and says what each field means."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -131,12 +132,12 @@ def _delta_mask(dims: Any, described: dict[str, Any]) -> tuple[bool, ...] | None
         return None
     is_dims = isinstance(dims, list) and all(isinstance(n, int) and not isinstance(n, bool) and n != 0 for n in dims)
     _expect(is_dims, "delta_action_dims", "a list such as [6, -1]: six relative, one absolute", dims)
-    mask = action_mask(dims)
+    covered = sum(map(abs, dims))
     widths = {"action_dim": described["action_dim"], "the state's width": sum(described["state"].values())}
     for name, width in widths.items():
-        if len(mask) > width:
-            raise ConfigError(f"delta_action_dims {dims} covers {len(mask)} dimensions, but {name} is {width}")
-    return mask
+        if covered > width:
+            raise ConfigError(f"delta_action_dims {dims} covers {covered} dimensions, but {name} is {width}")
+    return action_mask(dims)
 
 
 def _is_count(value: Any) -> bool:
@@ -144,7 +145,10 @@ def _is_count(value: Any) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # a whole number beyond float64
+        return False
 
 
 def _expect(right: bool, name: str, expected: str, got: Any) -> None:

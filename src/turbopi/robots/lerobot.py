@@ -71,6 +71,7 @@ class LeRobot(Robot):
             dict.fromkeys(present, True) | dict.fromkeys(masked, False),
             read_state(require(observation, STATE, expected), STATE, self.state_dim),
             self._prompt(observation),
+            in_order=True,
         )
 
     def _check_cameras(self, observation: Mapping[str, Any], present: list[str], absent: list[str]) -> None:

@@ -29,6 +29,7 @@ class Plain(Robot):
 
     in      images/{base_0_rgb, left_wrist_0_rgb, right_wrist_0_rgb}   (uint8|float)[h, w, 3] or [3, h, w]; at least
             one, the others are masked; the folder may be called `image`, as inside openpi
+            image_mask/{the same}   bool, may be left out; False: as if there were no such picture
             state   float[s], s up to the model's action_dim
             prompt
     out     [H, action_dim], all of the model's dimensions
@@ -46,9 +47,29 @@ class Plain(Robot):
         pictures = {
             camera: parse_image(find(observation, f"{folder}/{camera}"), f"{folder}/{camera}") for camera in sent
         }
-        images, mask = with_missing_cameras(pictures, like=sent[0])
+        pictures = self._unmasked(observation, folder, pictures)
+        images, mask = with_missing_cameras(pictures, like=next(iter(pictures)))
         state = read_state(require(observation, "state", keys), "state", None)
         return RobotInputs(images, mask, state, optional_prompt(observation))
+
+    def _unmasked(
+        self, observation: Mapping[str, Any], folder: str, pictures: dict[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Those that `image_mask` doesn't leave out."""
+        masks = {}
+        for camera in names_in(observation, "image_mask"):
+            key, value = f"image_mask/{camera}", np.asarray(find(observation, f"image_mask/{camera}"))
+            if camera not in CAMERAS:
+                raise ObservationError(f"{key} is of no camera; the model's are {', '.join(CAMERAS)}")
+            if value.dtype != np.bool_ or value.size != 1:
+                raise ObservationError(f"{key} is {value.dtype}{list(value.shape)}; expected one bool")
+            masks[camera] = bool(value.item())
+            if masks[camera] and camera not in pictures:
+                raise ObservationError(f"{key} is True, but {folder} has no {camera}")
+        left = {camera: picture for camera, picture in pictures.items() if masks.get(camera, True)}
+        if not left:
+            raise ObservationError(f"image_mask leaves out all of {', '.join(pictures)}; the model needs one camera")
+        return left
 
     def _sent(self, observation: Mapping[str, Any]) -> tuple[str, list[str]]:
         """The folder that the pictures are in, and their names."""
