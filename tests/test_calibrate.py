@@ -13,9 +13,17 @@ from cli_helpers import refusal, turbopi
 from conftest import golden_cases, golden_folder, golden_model
 from torch import nn
 
-from turbopi import backends
+from turbopi import backends, demo
 from turbopi.calibrate import formats, run
-from turbopi.calibrate.artifact import BESIDE, VERSION, Quantization, SiteScale, for_policy, shapes_of
+from turbopi.calibrate.artifact import (
+    BESIDE,
+    VERSION,
+    Quantization,
+    SiteScale,
+    calibration_of,
+    for_policy,
+    shapes_of,
+)
 from turbopi.calibrate.emulate import Round, RoundedWeights, relative_rms, replaced, through_norm
 from turbopi.calibrate.observations import calls, read_samples, split
 from turbopi.calibrate.run import Settings, by_harm, calibrate_model
@@ -29,7 +37,8 @@ from turbopi.engine.fp8 import E4M3, E4M3_MAX, Directions, to_e4m3
 from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, ObservationError
 from turbopi.judge.check_golden import check_case, golden_calibration, golden_calls
 from turbopi.judge.verdict import ACTIONS, Compared, Repetition, Rule, judge
-from turbopi.judge.verify_inputs import Call, Sample
+from turbopi.judge.verify import verify
+from turbopi.judge.verify_inputs import Call, Plan, Sample
 from turbopi.model.layers import AdaRMSNorm
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
@@ -288,6 +297,17 @@ def test_a_file_comes_back_as_it_was(tmp_path: Path) -> None:
     back.check(TINY, random_checkpoint("pi05_tiny").fingerprint())
 
 
+WRONG_SITES: tuple[tuple[dict[str, Any], str], ...] = (
+    ({"scale": 1e300}, "the scale 1e[+]300 should be a number from"),
+    ({"scale": True}, "the scale True should be"),
+    ({"scale": 10**400}, "isn't a calibration that"),
+    ({"kept": False}, "the reason kept False should be"),
+    ({"largest": None}, "largest None should be a number"),
+    ({"directions": {"e4m3": "AAAA", "scale": [], "rest": 1.0}}, "isn't a calibration that"),
+    ({"directions": {"e4m3": "AAAA", "scale": [1.0, 1.0], "rest": 1.0}}, "isn't a calibration that"),
+)
+
+
 def test_other_weights_shapes_and_versions_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "q.json"
     made_up().save(file)
@@ -295,23 +315,47 @@ def test_other_weights_shapes_and_versions_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"q\.json was made for other weights: their hash is .*calibrate"):
         calibration.check(TINY, random_checkpoint("pi05_tiny", 1).fingerprint())
     wider = dataclasses.replace(TINY, expert=dataclasses.replace(TINY.expert, mlp_dim=512))
-    with pytest.raises(CalibrationError, match="a model of other shapes: expert is"):
+    with pytest.raises(CalibrationError, match=r"a model of other shapes: expert is .*'mlp_dim': 256.* there and"):
         calibration.check(wider, calibration.fingerprint)
     content = json.loads(file.read_text())
+    site = content["sites"]["vision.0.qkv"]
     for change, message in (
         ({"version": VERSION + 1}, "this Turbo-Pi reads version"),
         ({"format": "something"}, "is 'something', not turbopi-quantization"),
         ({"sites": {"vision.0.qkv": {"scale": -1, "largest": 1, "saturated": 0, "error": 0}}}, "the scale -1"),
         ({"sites": {"vision.0.qkv": {"size": 1}}}, "isn't a calibration that"),
+        ({"sites": []}, "sites .* should be an object"),
+        ({"sites": {"vision.0.qkv": None}}, "the site None should be an object"),
+        ({"shapes": [1]}, "shapes .* should be an object"),
+        ({"report": {}}, "KeyError"),
+        ({"report": None}, "report None should be an object"),
+        (
+            {"report": {"observations": {"source": "x"}, "warnings": "hello"}},
+            "warnings hello should be a list of texts",
+        ),
+        ({"weights_sha256": 5}, "weights_sha256 5 should be text"),
+        *(({"sites": {"vision.0.qkv": site | change}}, message) for change, message in WRONG_SITES),
     ):
         file.write_text(json.dumps(content | change))
         with pytest.raises(CalibrationError, match=message):
             Quantization.load(file)
+    file.write_text("[" * 100_000)
+    with pytest.raises(CalibrationError, match="isn't a calibration that"):
+        Quantization.load(file)
     file.write_text("{")
     with pytest.raises(CalibrationError, match="isn't a calibration that"):
         Quantization.load(file)
     with pytest.raises(CalibrationError, match="there is no file"):
         Quantization.load(tmp_path / "nothing.json")
+
+
+def test_a_calibration_that_leaves_nothing_in_fp8_is_refused(tmp_path: Path) -> None:
+    checkpoint, calibration = random_checkpoint("pi05_tiny"), made_up()
+    kept = {name: dataclasses.replace(site, kept="it hurts") for name, site in calibration.sites.items()}
+    with pytest.raises(ConfigError, match=r"leaves nothing in fp8 \(\d+ sites: it hurts\); take 'bf16'"):
+        calibration_of(dataclasses.replace(calibration, sites=kept), "fp8", checkpoint)
+    with pytest.raises(ConfigError, match=r"leaves nothing in fp8-mlp \(.*sites: fp8-mlp takes the feed-forward"):
+        calibration_of(calibration.only(["expert"]), "fp8-mlp", checkpoint)
 
 
 def test_a_policy_finds_the_file_beside_its_weights(tmp_path: Path) -> None:
@@ -588,7 +632,49 @@ def test_the_command_writes_a_file_that_this_checkpoint_alone_takes(tmp_path: Pa
     with pytest.raises(BackendUnavailable, match=r"backend 'fused' can't run on cpu: .*NVIDIA GPU"):
         UnifiedPolicy(random_checkpoint("pi05_tiny"), **arguments)  # type: ignore[arg-type]
     with pytest.raises(CalibrationError, match="made for other weights"):
-        UnifiedPolicy(random_checkpoint("pi05_tiny", 1), **arguments)  # type: ignore[arg-type]
+        UnifiedPolicy(random_checkpoint("pi05_tiny", 1), backend="emulated_fp8", **arguments)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="precision 'bf16' takes no FP8 calibration; with one take fp8 or fp8-mlp"):
+        UnifiedPolicy(random_checkpoint("pi05_tiny"), **arguments | {"precision": "bf16"})  # type: ignore[arg-type]
+
+
+def test_the_command_replaces_nothing_but_a_calibration(tmp_path: Path) -> None:
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(b"weights")
+    quick = ("--count", 2, "--steps", 1, "--device", "cpu", "--target", 0)
+    refused = refusal(turbopi("calibrate", "--random-weights", "pi05_tiny", "--out", weights, *quick))
+    assert "is there and no calibration, so it isn't replaced" in refused
+    assert weights.read_bytes() == b"weights"
+    made_up().save(tmp_path / "q.json")
+    result = turbopi("calibrate", "--random-weights", "pi05_tiny", "--out", tmp_path / "q.json", *quick)
+    assert result.exit_code == 0, result.output
+    assert "in place of the calibration on" in " ".join(result.output.split())
+    assert "there is no folder nowhere" in refusal(turbopi("calibrate", "nowhere", *quick))
+
+
+def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Path) -> None:
+    checkpoint = random_checkpoint("pi05_tiny")
+    policy = UnifiedPolicy(demo.with_libero_stats(checkpoint), backend="pytorch", device="cpu")
+    for number in range(2):
+        call = RecordedCall(policy.example_observation(number), {"actions": np.zeros((10, 7))}, 0.0)
+        save_call(tmp_path / f"{number}.npz", call)
+    seen = [sample.sha256 for sample in read_samples(policy, str(tmp_path), 2)[1]]
+    report = {"observations": {"source": "x", "calibration": {"1": seen[1], "other": "0" * 64}}, "warnings": []}
+    arguments = {"backend": "emulated_fp8", "precision": "fp8", "device": "cpu", "num_denoising_steps": 1}
+    plan = Plan(arguments | {"quantization": made_up(report=report)}, tmp_path, noises=1)
+    document = verify(checkpoint, plan)
+    assert document["observations"]["calibrated_on"] == 1
+    assert document["policy"]["backend_details"]["fp8"]["observations"] == "x"
+
+
+def test_held_out_observations_that_are_none_are_warned_of(tmp_path: Path) -> None:
+    policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu")
+    call = RecordedCall(policy.example_observation(0), {"actions": np.zeros((10, 7))}, 0.0)
+    for number in range(2):
+        save_call(tmp_path / f"{number}.npz", call)
+    arguments = {"device": "cpu", "num_denoising_steps": 1}
+    made = run.calibrate(random_checkpoint("pi05_tiny"), Settings(arguments, str(tmp_path), 2, target=1.0, noises=1))
+    assert "1 of 1 held-out observations were calibrated on, too: the same inputs" in made.warnings
+    assert any(warning.startswith("no site is left in FP8") for warning in made.warnings)
 
 
 def test_the_command_needs_a_place_to_write() -> None:

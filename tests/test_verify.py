@@ -14,7 +14,7 @@ from cli_helpers import refusal, turbopi
 from turbopi import backends
 from turbopi.checkpoint import random_checkpoint
 from turbopi.errors import CheckpointError
-from turbopi.judge import certificates
+from turbopi.judge import certificates, verify_inputs
 from turbopi.judge.intermediates import Errors, Place, first_suspect, in_order, tensors_of
 from turbopi.judge.verdict import ACTIONS, Rule
 from turbopi.judge.verify import verify
@@ -166,7 +166,7 @@ def test_overridden_bounds_decide_and_are_recorded() -> None:
     assert document["bounds"]["overridden"] is True
     assert document["bounds"]["actions_relative_rms"] == 1e-9
     assert document["bounds"]["reason"] == "given by the user"
-    assert "is not within 1.00e-09" in document["verdict"]
+    assert "is not within 1.00e-09 (the bound that was given)" in document["verdict"]
 
 
 def test_a_recording_is_verified_by_its_files(tmp_path: Path) -> None:
@@ -177,6 +177,30 @@ def test_a_recording_is_verified_by_its_files(tmp_path: Path) -> None:
     document = verify(random_checkpoint("pi05_tiny"), quick_plan(observations=tmp_path, count=2))
     assert document["observations"]["names"] == ["000000.npz", "000001.npz"]
     assert document["observations"]["count"] == 2
+
+
+def test_observations_made_by_hand_are_verified_too_evenly_spread(tmp_path: Path) -> None:
+    for number in range(4):
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "observation.json").write_text("{}")
+    assert [path.name for path in verify_inputs._chosen(tmp_path, 2)] == ["0", "2"]
+    assert len(verify_inputs._chosen(tmp_path, None)) == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--backend", "emulated_fp8", "--precision", "fp8"], "precision 'fp8' needs a calibration"),
+        (["--backend", "emulated_fp8", "--precision", "fp8", "--quantization", "none.json"], "no file none.json"),
+        (["--precision", "f32", "--quantization", "none.json"], "precision 'f32' takes no FP8 calibration"),
+        (["--precision", "fp8"], "fp8 needs an NVIDIA GPU of compute capability 9.0; take precision 'bf16'"),
+    ],
+)
+def test_calibrations_are_looked_at_before_anything_runs(
+    monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+) -> None:
+    monkeypatch.delattr("turbopi.judge.verify._Reference")
+    assert message in refusal_of("--device", "cpu", *arguments)
 
 
 def test_an_observation_that_cannot_be_used_is_named(tmp_path: Path) -> None:

@@ -72,6 +72,7 @@ class UnifiedPolicy:
             _checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
         self._device = backends.resolve_device(device)
         name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "asked for")
+        backends.check(name, self._device, precision)  # before a calibration is asked for, and weights are read
 
         checkpoint = (
             checkpoint_dir if isinstance(checkpoint_dir, Checkpoint) else open_checkpoint(checkpoint_dir, config)

@@ -156,8 +156,12 @@ def check(name: str, device: torch.device, precision: Tier) -> None:
         raise ConfigError(f"backend {name!r} runs in {' or '.join(cls.precisions)}, not in {precision!r}")
     reason = cls.unavailable(device)
     if reason is not None:
-        hint = "; to judge FP8 without such a GPU there is 'emulated_fp8'" if precision in TIERS else ""
-        raise BackendUnavailable(f"backend {name!r} can't run on {device}: {reason}{hint}")
+        if precision in TIERS:
+            reason = (
+                f"{precision} needs an NVIDIA GPU of compute capability 9.0; take precision 'bf16', or to judge FP8 "
+                "without such a GPU backend 'emulated_fp8'"
+            )
+        raise BackendUnavailable(f"backend {name!r} can't run on {device}: {reason}")
     reason = cls.unavailable_in(device, precision) if precision in TIERS else None  # type: ignore[attr-defined]
     if reason is not None:
         raise BackendUnavailable(f"backend {name!r} can't run in {precision} on {device}: {reason}")

@@ -57,7 +57,11 @@ class EmulatedFp8Backend(PyTorchBackend):
     def describe(self) -> dict[str, Any]:
         return {
             "attention": "explicit float32",
-            "fp8": {"emulated": "in float32", **self._quantization.describe(self._plan)},
+            "fp8": {
+                "emulated": "in float32",
+                "sites in bf16": "run in float32 here",
+                **self._quantization.describe(self._plan),
+            },
         }
 
 

@@ -18,8 +18,9 @@ from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.provenance import provenance
 from turbopi.bench.summary import linear_models
 from turbopi.bench.work import Job, floor_ms, stage_work
+from turbopi.calibrate.artifact import TIERS
 from turbopi.checkpoint import Checkpoint
-from turbopi.errors import TurboPiError
+from turbopi.errors import ConfigError, TurboPiError
 from turbopi.policy import UnifiedPolicy
 
 Answered = tuple[dict[str, Any], Job, np.ndarray]  # a result, its job, and the policy's `answers`
@@ -61,6 +62,14 @@ class Plan:
 
     def check(self, device: torch.device) -> None:
         """Raise ConfigError or BackendUnavailable for a backend or precision that can't run, before anything is run."""
+        if not self.backends or not self.precisions:
+            raise ConfigError("there is nothing to measure: name a backend and a precision")
+        if self.quantization is not None and not set(self.precisions) & set(TIERS):
+            raise ConfigError(f"a calibration was given, but none of the precisions is of FP8: {', '.join(TIERS)}")
+        for precision in self.precisions:
+            named = [*self.backends, *self.beside]
+            if precision in PRECISIONS and not any(precision in backends.precisions(name) for name in named):
+                raise ConfigError(f"none of {', '.join(named)} runs in {precision}")
         for precision, name in itertools.product(self.precisions, [*self.backends, *self.beside]):
             if len(self.precisions) == 1 or precision not in PRECISIONS or precision in backends.precisions(name):
                 backends.check(name, device, precision)

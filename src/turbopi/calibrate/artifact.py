@@ -8,6 +8,7 @@ import base64
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -69,7 +70,14 @@ class SiteScale:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "SiteScale":
-        """Raises ValueError, KeyError or TypeError for what `as_json` didn't make."""
+        """Raises ValueError, KeyError, TypeError or RuntimeError for what `as_json` didn't make."""
+        _expect(isinstance(content, dict), "the site", "an object", content)
+        scale, kept = content.get("scale"), content.get("kept")
+        is_scale = scale is None or (_is_number(scale) and _SCALES[0] <= scale <= _SCALES[1])
+        _expect(is_scale, "the scale", f"a number from {_SCALES[0]:g} to {_SCALES[1]:g}", scale)
+        _expect(kept is None or isinstance(kept, str), "the reason kept", "a reason or null", kept)
+        for name in ("largest", "saturated", "error"):
+            _expect(_is_number(content[name]), name, "a number", content[name])
         given = content.get("directions")
         if given is None:
             return cls(**content)
@@ -123,11 +131,11 @@ class Quantization:
             raise ConfigError("FP8 in no part at all; use precision 'bf16'")
         return replace(self, parts=tuple(part for part in PARTS if part in parts))
 
-    def check(self, config: ModelConfig, fingerprint: str) -> None:
-        """Raise CalibrationError unless this was made for these weights and this model."""
+    def check_shapes(self, config: ModelConfig) -> None:
+        """Raise CalibrationError unless this was made for a model of these sizes."""
         where = self.source or "this calibration"
         wrong = [
-            f"{name} is {ours!r} there and {self.shapes.get(name)!r} here"[:200]
+            f"{name} is {self.shapes.get(name)!r} there and {ours!r} here"[:200]
             for name, ours in shapes_of(config).items()
             if self.shapes.get(name) != ours
         ]
@@ -145,10 +153,15 @@ class Quantization:
                     f"{where} has directions of {len(common.codes)} numbers for {site}, which is {site.width} wide: "
                     "it is damaged"
                 )
+
+    def check(self, config: ModelConfig, fingerprint: str) -> None:
+        """Raise CalibrationError unless this was made for these weights and this model."""
+        self.check_shapes(config)
         if fingerprint != self.fingerprint:
             raise CalibrationError(
-                f"{where} was made for other weights: their hash is {self.fingerprint[:16]}…, that of these weights "
-                f"{fingerprint[:16]}…. Run `turbopi calibrate` on this checkpoint"
+                f"{self.source or 'this calibration'} was made for other weights: their hash is "
+                f"{self.fingerprint[:16]}…, that of these weights {fingerprint[:16]}…. Run `turbopi calibrate` on this "
+                "checkpoint"
             )
 
     def plan(self, config: ModelConfig, tier: str) -> "Plan":
@@ -214,14 +227,25 @@ class Quantization:
                     f"{path} has version {content['version']} of {FORMAT}, this Turbo-Pi reads versions 1 to "
                     f"{VERSION}. Run `turbopi calibrate` again"
                 )
+            for name in ("sites", "shapes", "report"):
+                _expect(isinstance(content[name], dict), name, "an object", content[name])
+            report = content["report"]
+            _expect(isinstance(content["weights_sha256"], str), "weights_sha256", "text", content["weights_sha256"])
+            source, warnings = report["observations"]["source"], report.get("warnings", [])
+            _expect(isinstance(source, str), "the source of observations", "text", source)
+            listed = isinstance(warnings, list) and all(isinstance(one, str) for one in warnings)
+            _expect(listed, "warnings", "a list of texts", warnings)
             found = {name: SiteScale.from_json(values) for name, values in content["sites"].items()}
-            for name, site in found.items():
-                if site.scale is not None and not (0 < site.scale < float("inf")):
-                    raise CalibrationError(f"{path} has the scale {site.scale} for {name}; it should be above 0")
-            return cls(content["weights_sha256"], content["shapes"], found, content["report"], source=str(path))
+            return cls(content["weights_sha256"], content["shapes"], found, report, source=str(path))
         except CalibrationError:
             raise
-        except (KeyError, TypeError, ValueError) as error:
+        except (
+            KeyError,
+            TypeError,
+            ValueError,
+            OverflowError,
+            RuntimeError,
+        ) as error:  # the last: tensors, deep nesting
             raise CalibrationError(f"{path} isn't a calibration that `turbopi calibrate` wrote: {error!r}") from error
 
 
@@ -265,6 +289,18 @@ def _reason(site: Site, entry: SiteScale, tier: str, parts: Sequence[str]) -> st
     return site.refusal or entry.kept
 
 
+_SCALES = (1e-30, 1e30)  # of an activation; further out float32 has no room for products
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _expect(right: bool, name: str, expected: str, got: Any) -> None:
+    if not right:
+        raise ValueError(f"{name} {str(got)[:80]} should be {expected}")
+
+
 def _bytes(codes: torch.Tensor) -> bytes:
     return codes.contiguous().view(torch.uint8).numpy().tobytes()
 
@@ -299,7 +335,21 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
     ConfigError if there is none, CalibrationError if it doesn't fit.
     """
     if tier not in TIERS:
+        if given is not None:
+            raise ConfigError(f"precision {tier!r} takes no FP8 calibration; with one take {' or '.join(TIERS)}")
         return None
+    quantization = calibration_of(given, tier, checkpoint)
+    quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
+    for warning in quantization.warnings:
+        logger.warning("FP8: %s", warning)
+    return quantization
+
+
+def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization:
+    """What `for_policy` takes for an FP8 tier, checked as far as that goes without reading the weights.
+
+    Raises ConfigError too where it leaves no site at all in FP8: such a policy would be bfloat16 under FP8's name.
+    """
     if given is None:
         beside = None if checkpoint.path is None else checkpoint.path / BESIDE
         if beside is None or not beside.is_file():
@@ -309,7 +359,18 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
             )
         given = beside
     quantization = given if isinstance(given, Quantization) else Quantization.load(given)
-    quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
-    for warning in quantization.warnings:
-        logger.warning("FP8: %s", warning)
+    quantization.check_shapes(checkpoint.config.model)
+    plan = quantization.plan(checkpoint.config.model, tier)
+    if not plan.scales:
+        reasons = "; ".join(f"{len(names)} sites: {why}" for why, names in _by_reason(plan).items())
+        raise ConfigError(
+            f"{quantization.source or 'the calibration'} leaves nothing in {tier} ({reasons}); take 'bf16'"
+        )
     return quantization
+
+
+def _by_reason(plan: Plan) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for name, why in plan.kept.items():
+        found.setdefault(why, []).append(name)
+    return found

@@ -30,11 +30,14 @@ class Sample:
 
     @property
     def sha256(self) -> str:
-        digest = hashlib.sha256()
-        for name, value in asdict(self.inputs).items():
-            digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-            digest.update(np.ascontiguousarray(value).tobytes())
-        return digest.hexdigest()
+        return hashlib.sha256(b"".join(inputs_bytes(self.inputs))).hexdigest()
+
+
+def inputs_bytes(inputs: ModelInputs) -> Iterator[bytes]:
+    """All of the model's inputs, to be hashed."""
+    for name, value in asdict(inputs).items():
+        yield f"{name} {value.dtype} {list(value.shape)}".encode()
+        yield np.ascontiguousarray(value).tobytes()
 
 
 @dataclass(frozen=True)
@@ -84,14 +87,15 @@ def _observations(
                 "`turbopi serve --record` writes"
             )
         listed = demo.observations(policy, demo.load_frames())
-        return LIBERO, ((f"LIBERO frame {i}", listed[i]) for i in _spread(len(listed), count))
+        return LIBERO, ((f"LIBERO frame {i}", listed[i]) for i in spread(len(listed), count))
     path = Path(source)
-    files = _files(path)
-    chosen = [files[i] for i in _spread(len(files), count)]
+    files = observation_files(path)
+    chosen = [files[i] for i in spread(len(files), count)]
     return str(path), ((_name(file, path), load_observation(file)) for file in chosen)
 
 
-def _files(path: Path) -> list[Path]:
+def observation_files(path: Path) -> list[Path]:
+    """The observations of a recording, of a folder of them, or the one at `path`. Raises ObservationError for none."""
     if not path.exists():
         raise ObservationError(f"{path} doesn't exist")
     if path.is_dir():
@@ -106,7 +110,7 @@ def _name(file: Path, path: Path) -> str:
     return file.name if file == path else str(file.relative_to(path))
 
 
-def _spread(available: int, count: int) -> list[int]:
+def spread(available: int, count: int) -> list[int]:
     """`count` numbers below `available`, evenly spread; all if there are fewer."""
     return [i * available // count for i in range(count)] if available > count else list(range(available))
 

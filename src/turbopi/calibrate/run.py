@@ -97,6 +97,11 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     }
     if source == RANDOM_NOISE:
         report["target_reached"] = None
+    twice = len({sample.sha256 for sample in held} & {sample.sha256 for sample in chosen})
+    if twice:
+        report["warnings"].append(
+            f"{twice} of {len(held)} held-out observations were calibrated on, too: the same inputs"
+        )
     fingerprint = checkpoint.fingerprint()
     report["seconds"] = {
         "loading": round(loaded - started, 2),
@@ -184,6 +189,8 @@ def calibrate_model(
     final = _Trials(model, held_out, steps, settings.batch, progress, weights)
     on_held_out = _held_out(model, eligible, scales, kept, final, progress)
     reached = on_held_out["fp8"]["delta_cosine"]
+    if len(kept) == len(everywhere):
+        warnings.append("no site is left in FP8, so no policy can be made of this: a lower target may leave some")
     if reached < settings.target:
         warnings.append(f"the held-out actions' cosine is {reached:.5f}, below the target {settings.target}")
     report = {

@@ -1,5 +1,6 @@
 """`turbopi bench`: the machine's floors, then the policy's calls beside them."""
 
+import itertools
 import json
 import sys
 from contextlib import nullcontext
@@ -10,12 +11,15 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from turbopi.cli.files import check_folder
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, WeightOptions
 from turbopi.errors import ConfigError
 from turbopi.folders import write_whole
 
 if TYPE_CHECKING:
+    import torch
+
     from turbopi.bench.run import Plan
 
 _ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps": "10"}
@@ -41,6 +45,19 @@ def _names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
 
 
+def _backends(names: list[str], precisions: list[Any], device: "torch.device") -> list[str]:
+    """The same with "auto" as what it stands for in each precision. Raises what `backends.check` raises for that."""
+    from turbopi import backends
+
+    found = []
+    for name, precision in itertools.product(names, precisions):
+        if name == "auto":
+            chosen = backends.choose(device, precision)[0]
+            backends.check(chosen, device, precision)
+        found.append(chosen if name == "auto" else name)
+    return list(dict.fromkeys(found))
+
+
 @command(
     "bench",
     shared=WeightOptions,
@@ -48,6 +65,7 @@ def _names(text: str) -> list[str]:
         "turbopi bench --random-weights pi05_tiny --calls 20",
         "turbopi bench --random-weights pi05_libero --backends pytorch,cuda_graph --steps 1,3,10",
         "turbopi bench checkpoints/pi05_libero --table --main-calls 2000 --ready --profile --report bench-report",
+        "turbopi bench checkpoints/pi05_libero --backends fused --precisions bf16,fp8 --quantization fp8.json",
     ),
 )
 def bench(
@@ -103,10 +121,11 @@ def bench(
         opened = options.open(checkpoint)
         options.tell_if_random(opened, output)
         resolved = registry.resolve_device(device)
-        names = [registry.choose(resolved)[0] if name == "auto" else name for name in _names(backends)]
+        tiers = _names(precisions)
+        names = _backends(_names(backends), tiers, resolved)
         plan = Plan(
             names,
-            _names(precisions),  # type: ignore[arg-type]  # checked when a backend is created
+            tiers,  # type: ignore[arg-type]  # checked when a backend is created
             cameras=_axis("--cameras", cameras, table),
             prompt_tokens=_axis("--prompt-tokens", prompt_tokens, table),
             horizons=_axis("--horizons", horizons, table),
@@ -121,6 +140,8 @@ def bench(
             quantization=quantization,
         )
         plan.check(resolved)
+        if report is not None:
+            check_folder(report)
         starts = _starts(checkpoint, options, plan, str(resolved)) if ready else []
         document = _run_with_bar(lambda progress: run(opened, plan, resolved, progress), plan, report, output)
     document["provenance"]["command"] = ["turbopi", *sys.argv[1:]]

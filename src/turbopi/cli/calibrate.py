@@ -77,9 +77,10 @@ def calibrate(
         raise ConfigError("there is no checkpoint's folder to write beside: name a file with --out FILE")
     from turbopi.calibrate.artifact import BESIDE
 
+    opened = options.open(checkpoint)
     out = out or Path(str(checkpoint)) / BESIDE
     check_writable(out)
-    opened = options.open(checkpoint)
+    replaced = _replaced(out)
     options.tell_if_random(opened, output)
     from turbopi.calibrate.run import Progress, Settings
     from turbopi.calibrate.run import calibrate as run
@@ -89,8 +90,25 @@ def calibrate(
     result = with_stages(lambda progress: run(opened, settings, progress), Progress, output)
     result.save(out)
     _show(result, output)
-    output.line(f"wrote {out}")
+    output.line(f"wrote {out}" + (f", in place of the calibration on {replaced} that was there" if replaced else ""))
     output.document({"out": out, **result.as_json(directions=False)})
+
+
+def _replaced(out: Path) -> str | None:
+    """What the calibration that stands at `out` was made on; None if nothing stands there. ConfigError for anything
+    else: it would be lost.
+    """
+    from turbopi.calibrate.artifact import Quantization
+    from turbopi.errors import CalibrationError
+
+    if not out.exists():
+        return None
+    try:
+        return str(Quantization.load(out).report["observations"]["source"])
+    except CalibrationError as error:
+        raise ConfigError(
+            f"{out} is there and no calibration, so it isn't replaced; give another --out: {error}"
+        ) from error
 
 
 def _show(result: "Quantization", output: Output) -> None:
@@ -104,7 +122,7 @@ def _show(result: "Quantization", output: Output) -> None:
     output.line(f"scales by {report['method']} (actions' relative rms: {methods})")
     output.table(_table("one group of sites in FP8 alone, calibration observations", report["groups_alone"]))
     held = {name: error for name, error in report["held_out"].items() if name != "worst"}
-    output.table(_table("held-out observations, against float32", held))
+    output.table(_table("held-out observations, against float32; sites that are kept run in float32 here", held))
     worst = report["held_out"]["worst"]
     output.line(
         f"worst: {worst['observation']}, noise seed {worst['seed']}: relative rms {worst['relative_rms']:.4f}; "

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         "turbopi compare turbopi-eval/run-a turbopi-eval/run-b",
         "turbopi compare pytorch:f32 pytorch:bf16 pytorch:bf16:5 --checkpoint checkpoints/pi05_libero "
         "--config pi05_libero --trials 10 --out turbopi-compare",
+        "turbopi compare pytorch:f32 fused:bf16 fused:fp8 --checkpoint checkpoints/pi05_libero --quantization fp8.json",
     ),
 )
 def compare_command(
@@ -98,12 +99,13 @@ def _run_variants(
     variants = [parse_variant(text, options) for text in texts]
     if len(set(variants)) < len(variants):
         raise ConfigError(f"the same way to run is named twice in {' '.join(texts)}")
+    _check_variants(variants, options, checkpoint)
     simulator = options.simulator(simulator_name, output)
     protocol = options.protocol(simulator, simulator_name)
     jobs = options.jobs(simulator, protocol.suite)
     results, samples = [], []
     for variant in variants:
-        own = replace(options, backend=variant.backend, precision=variant.precision, steps=variant.steps)
+        own = _options_of(variant, options)
         source = own.local_policy(checkpoint, output)
         folder = out / variant.folder
         if options.restart and (folder / "visited.npz").exists():
@@ -120,9 +122,35 @@ def _run_variants(
             source.close()
         samples.append(visited.entries)
     output.line(f"float32 reference, {variants[0].steps} steps, on {sum(map(len, samples))} observations")
-    reference_options = replace(options, backend="pytorch", precision="f32", steps=variants[0].steps)
-    reference = reference_options.local_policy(checkpoint, output)
+    exact = replace(variants[0], backend="pytorch", precision="f32")
+    reference = _options_of(exact, options).local_policy(checkpoint, output)
     return results, [action_error(entries, reference) for entries in samples]
+
+
+def _options_of(variant: "Variant", options: EvalOptions) -> EvalOptions:
+    """The options that a way to run is run with; a calibration is for FP8 alone."""
+    from turbopi.calibrate.artifact import TIERS
+
+    own = replace(options, backend=variant.backend, precision=variant.precision, steps=variant.steps)
+    return own if variant.precision in TIERS else replace(own, quantization=None, fp8_parts=None)
+
+
+def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint: str | None) -> None:
+    """Refuse what can't run before hours of what can."""
+    from turbopi import backends
+    from turbopi.calibrate.artifact import TIERS, calibration_of
+
+    device, opened = backends.resolve_device(options.device), options.open(checkpoint)
+    tiers = [variant.precision for variant in variants if variant.precision in TIERS]
+    for variant in variants:
+        backends.check(variant.backend, device, variant.precision)  # type: ignore[arg-type]  # parsed
+    if not tiers and (options.quantization is not None or options.fp8_parts is not None):
+        raise ConfigError("--quantization and --fp8-parts are for ways to run in FP8, and none of these is")
+    for tier in tiers:
+        given = options.policy_arguments()["quantization"]
+        calibration = calibration_of(given, tier, opened)
+        if opened.path is not None:  # else the weights have to be made to be hashed
+            calibration.check(opened.config.model, opened.fingerprint(trust_files=True))
 
 
 def parse_variant(text: str, options: EvalOptions) -> "Variant":

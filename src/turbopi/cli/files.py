@@ -25,6 +25,9 @@ def check_writable(file: Path) -> None:
         raise ConfigError(f"{file} is a folder; give a file's name")
     if not file.absolute().parent.is_dir():
         raise ConfigError(f"can't write {file}: there is no folder {file.absolute().parent}")
+    for path in (file.absolute().parent, file):
+        if path.exists() and not os.access(path, os.W_OK):
+            raise ConfigError(f"can't write {file}: {path} isn't writable")
 
 
 def load_noise(file: Path) -> "np.ndarray":

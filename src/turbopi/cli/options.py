@@ -230,7 +230,7 @@ class PolicyOptions(WeightOptions):
             raise ConfigError("--fp8-parts narrows a calibration: name it with --quantization FILE")
         from turbopi.calibrate.artifact import Quantization
 
-        return Quantization.load(self.quantization).only(self.fp8_parts.split(","))
+        return Quantization.load(self.quantization).only([part.strip() for part in self.fp8_parts.split(",")])
 
     def _robot(self) -> Any:
         """What UnifiedPolicy takes as `robot`; "module:Class" runs that module's code, as was asked for."""

@@ -21,6 +21,8 @@ from turbopi.cli.progress import with_stages
         "turbopi verify checkpoints/pi05_libero --config pi05_libero --backend fused --report certificate",
         "turbopi verify checkpoints/pi05_droid --observations recordings/20260101T120000Z --count 32 --noises 4",
         "turbopi verify checkpoints/pi05_libero --precision f32 --bound 2e-6 --json",
+        "turbopi verify checkpoints/pi05_libero --precision fp8 --quantization fp8.json --observations recordings/new "
+        "--count 32",
     ),
 )
 def verify(
@@ -37,7 +39,9 @@ def verify(
     ] = None,
     count: Annotated[
         int | None,
-        typer.Option("--count", min=1, metavar="N", help="Observations.", show_default="8, or all of PATH"),
+        typer.Option(
+            "--count", min=1, metavar="N", help="Observations, evenly spread over PATH.", show_default="8, or all"
+        ),
     ] = None,
     noises: Annotated[int, typer.Option("--noises", min=1, metavar="M", help="Noises for each observation.")] = 2,
     seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the first noise.")] = 0,
@@ -110,6 +114,10 @@ def _show(document: dict[str, Any], output: Output) -> None:
     )
     output.line(f"weights {weights['fingerprint'] or 'not hashed'}")
     output.line(f"observations {observed['sha256']}")
+    if "fp8" in document["policy"]["backend_details"]:
+        output.line(_calibration(document["policy"]["backend_details"]["fp8"]))
+        seen = observed["calibrated_on"]
+        output.line(f"{seen} of {observed['count']} observations were calibrated on", "yellow" if seen else None)
     output.table(_intermediates(document))
     output.line(
         f"Where a name has layers or steps, the worst beside its control. Control: {document['control']}.", "dim"
@@ -138,6 +146,14 @@ def _show(document: dict[str, Any], output: Output) -> None:
     output.line(f"bound{own}: actions' relative rms {bounds['actions_relative_rms']:.2e}: {bounds['reason']}")
     for check in document["checks"]:
         output.line(f"{'ok  ' if check['ok'] else 'FAIL'} {check['text']}", None if check["ok"] else "red")
+
+
+def _calibration(fp8: dict[str, Any]) -> str:
+    """Which products run in FP8, by what."""
+    groups = {name: state if isinstance(state, str) else "in part" for name, state in fp8["plan"].items()}
+    others = sorted(name for name, state in groups.items() if not state.startswith("fp8"))
+    kept = f"all but {', '.join(others)}" if others else "every site"
+    return f"FP8 in {kept}; calibration {fp8['calibration']} ({fp8['identity'][:16]}…), on {fp8['observations']}"
 
 
 def _intermediates(document: dict[str, Any]) -> Table:

@@ -187,7 +187,8 @@ def _checks(
 ) -> list[dict[str, Any]]:
     """What decides, the actions first."""
     error, plain = compared.actions.relative_rms, control.actions.relative_rms
-    origin = f"{rule.factor:g} x the control's {plain:.2e}" if rule.bound is None else "the stated bound"
+    stated = "the bound that was given" if rule.overridden else "the stated bound"
+    origin = f"{rule.factor:g} x the control's {plain:.2e}" if rule.bound is None else stated
     ok = bool(error <= limit)
     relation = "within" if ok else "not within"
     if compared.actions.finite:

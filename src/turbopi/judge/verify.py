@@ -9,7 +9,7 @@ import gc
 import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ import torch
 
 from turbopi import backends, demo
 from turbopi.bench.provenance import provenance
+from turbopi.calibrate.artifact import TIERS, Quantization, calibration_of, for_policy
+from turbopi.calibrate.observations import inputs_bytes
 from turbopi.checkpoint import Checkpoint
 from turbopi.errors import BackendError, CheckpointError
 from turbopi.judge.intermediates import Tensors, in_order, tensors_of
@@ -53,9 +55,16 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
     backends.check(name, device, precision)
     rule = Rule.of(name, precision, plan.bound, plan.factor, trained=checkpoint.format != "random")
     check_observations(plan)
+    quantization = None
+    if precision in TIERS:
+        quantization = calibration_of(arguments.get("quantization"), precision, checkpoint)
+        if checkpoint.path is not None:  # else the weights have to be made to be hashed
+            quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
+    elif arguments.get("quantization") is not None:
+        for_policy(arguments["quantization"], precision, checkpoint)  # says that it fits no such precision
     if arguments.get("robot") is None:
         checkpoint = demo.with_libero_stats(checkpoint)
-    arguments |= {"backend": name, "device": device}
+    arguments |= {"backend": name, "device": device, "quantization": None}  # of reference and control
 
     reference = _Reference(checkpoint, arguments, plan, progress)
     control = reference.control(rule, checkpoint, arguments, progress)
@@ -63,7 +72,7 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
     reference.release()
     # before the policy is made: its calibration is then checked against what was read
     fingerprint = checkpoint.fingerprint() if plan.fingerprint else None
-    subject = UnifiedPolicy(checkpoint, **arguments)
+    subject = UnifiedPolicy(checkpoint, **arguments | {"quantization": quantization})
     progress.begin(f"{name} {precision}", 3 * len(calls))
     warmup = subject.warmup()
     compared = reference.compare(subject, progress)
@@ -87,7 +96,7 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
         "latency_ms": {"backend": _latency(repetition.milliseconds), "oracle": _latency(reference.milliseconds)},
         "warmup_seconds": round(warmup, 3),
         "gpu_bytes": memory,  # after all calls: weights, and all else that stays
-        "observations": reference.describe(plan),
+        "observations": reference.describe(plan, quantization),
         "weights": {
             "path": None if checkpoint.path is None else str(checkpoint.path),
             "format": checkpoint.format,
@@ -175,14 +184,16 @@ class _Reference:
             return np.full(shape, np.nan)
         return self._pipeline.after(chunk, call.sample.state)["actions"]
 
-    def describe(self, plan: Plan) -> dict[str, Any]:
+    def describe(self, plan: Plan, quantization: Quantization | None) -> dict[str, Any]:
         """What it was run on, with a hash of all of the model's inputs."""
-        digest = hashlib.sha256()
+        digest, calibrated = hashlib.sha256(), 0
+        known = {} if quantization is None else quantization.report["observations"].get("calibration", {})
         for sample in self.samples:
-            for name, value in asdict(sample.inputs).items():
-                digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-                digest.update(np.ascontiguousarray(value).tobytes())
+            inputs = list(inputs_bytes(sample.inputs))
+            digest.update(b"".join(inputs))
+            calibrated += hashlib.sha256(b"".join(inputs)).hexdigest() in known.values()
         return {
+            "calibrated_on": None if quantization is None else calibrated,
             "path": None if plan.observations is None else str(plan.observations),
             "count": len(self.samples),
             "names": [sample.source for sample in self.samples],

@@ -9,10 +9,11 @@ import numpy as np
 import torch
 
 from turbopi import demo
+from turbopi.calibrate.observations import observation_files, spread
 from turbopi.errors import ObservationError
 from turbopi.observation import ModelInputs, Observation
 from turbopi.policy import UnifiedPolicy
-from turbopi.serve.record import load_observation, recorded_files
+from turbopi.serve.record import load_observation
 
 DEFAULT_OBSERVATIONS = 8
 
@@ -20,7 +21,7 @@ DEFAULT_OBSERVATIONS = 8
 @dataclass(frozen=True)
 class Plan:
     """What to verify and on what. `arguments` are UnifiedPolicy's besides the checkpoint; `observations` a path or None
-    for Turbo-Pi's own; `count` at most so many of them."""
+    for Turbo-Pi's own; `count` at most so many of them, evenly spread."""
 
     arguments: Mapping[str, Any]
     observations: Path | None = None
@@ -60,14 +61,14 @@ def check_observations(plan: Plan) -> None:
     """Refuse now what can't be read, before minutes of loading."""
     if plan.observations is None:
         return
-    load_observation(plan.observations)
-    for number, _ in enumerate(_files(plan.observations), start=1):
-        if plan.count is not None and number >= plan.count:
-            break
+    for file in _chosen(plan.observations, plan.count)[:1]:
+        load_observation(file)
 
 
-def _files(path: Path) -> list[Path]:
-    return [path] if not path.is_dir() or (path / "observation.json").is_file() else recorded_files(path)
+def _chosen(path: Path, count: int | None) -> list[Path]:
+    """All observations there, or so many, evenly spread over them."""
+    files = observation_files(path)
+    return files if count is None else [files[i] for i in spread(len(files), count)]
 
 
 def read_samples(policy: UnifiedPolicy, plan: Plan) -> Iterator[Sample]:
@@ -82,7 +83,7 @@ def read_samples(policy: UnifiedPolicy, plan: Plan) -> Iterator[Sample]:
 
 def _observations(policy: UnifiedPolicy, plan: Plan) -> Iterator[tuple[str, Mapping[str, Any]]]:
     if plan.observations is not None:
-        for file in _files(plan.observations)[: plan.count]:
+        for file in _chosen(plan.observations, plan.count):
             name = file.name if file == plan.observations else str(file.relative_to(plan.observations))
             yield name, load_observation(file)
         return
