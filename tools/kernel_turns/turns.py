@@ -19,7 +19,7 @@ from turbopi.kernels.denoise_packing import RANKS, PackedExpert
 
 STEPS, CACHE_ROWS, SEED = 10, 976, 1
 # `MARK`s of denoise_base.cu in the order in which a layer comes to them
-MARKS = (0, 1, 2, 3, 4, 23, 24, 25, 5, 28, 6, 7, 8, 9, 10, 26, 27, 11, 21, 12, 13, 15, 29, 30, 16, 17, 18, 22, 14, 19, 20)
+MARKS = (0, 1, 2, 3, 4, 23, 24, 25, 5, 6, 7, 8, 9, 10, 11, 21, 12, 13, 15, 16, 17, 18, 22, 14, 19, 20)
 
 
 @dataclass

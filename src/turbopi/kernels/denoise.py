@@ -114,7 +114,6 @@ def source(suffix: int, fp8: bool) -> str:
     numbers: hopper.Numbers = "e4m3" if fp8 else "bf16"
     products = (
         hopper.wgmma("add_product", columns, numbers=numbers),
-        *((hopper.wgmma("add_product", (most(suffix, 8) + 1) // 2 * 8, numbers=numbers),) if suffix > FEW else ()),
         hopper.wgmma("add_from_registers", columns, numbers=numbers, from_registers=True),
         hopper.wgmma("add_rows", columns, from_registers=True),
         hopper.wgmma("add_keys", 2 * 8),

@@ -289,13 +289,7 @@ __device__ __forceinline__ void combine(Block& b) {
       else
         *(uint2*)p = columns;
     } else {
-      if constexpr (OWN_ATTENTION) {
-        send_columns<true>(b, places, bars, n, v, true);
-        __syncwarp();
-        if (b.lane() == 0) barrier_arrive(b.bar(BAR_ATT));
-      } else {
-        send_columns(b, places, bars, n, v, true);
-      }
+      send_columns(b, places, bars, n, v, true);
     }
   }
   if constexpr (COPY_ATTENTION) {

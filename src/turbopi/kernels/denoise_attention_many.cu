@@ -13,22 +13,21 @@ constexpr u32 SUFFIX_PATIENCE = 200;
 static_assert(!ASYNC || (W == 16 && QT <= W && KT <= SCORERS && NT <= 8), "a warp's share");
 
 // Logits of a warpgroup's keys: each warp has 16 of its own, whose first blocks it holds; fetch(k) is the k-th block.
-constexpr int SCORE_CHUNK = QT % TP_CHUNK == 0 ? TP_CHUNK : 1;
+constexpr int SCORE_CHUNK = QT % 4 == 0 ? 4 : 1;
 template <typename Fetch>
 __device__ __forceinline__ void score_together(const Block& b, uint4 (&now)[SCORE_CHUNK], Fetch fetch,
                                                float (&c)[NT][4]) {
   const u32 queries = operand_place(b.start() + M_Q, NT * 128);
   float sums[NT * 4];
-  if (!TP_KEEP)
 #pragma unroll
-    for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
+  for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
   uint4 next[SCORE_CHUNK];
 #pragma unroll
   for (int k = 0; k < QT; k += SCORE_CHUNK) {
     begin_products();
 #pragma unroll
     for (int i = 0; i < SCORE_CHUNK; ++i)
-      add_rows(sums, now[i].x, now[i].y, now[i].z, now[i].w, operand_at<128>(behind(queries, (k + i) * NT * 256)), !TP_KEEP || k + i > 0);
+      add_rows(sums, now[i].x, now[i].y, now[i].z, now[i].w, operand_at<128>(behind(queries, (k + i) * NT * 256)), 1);
     commit_products();
     if (k + SCORE_CHUNK < QT)
 #pragma unroll
@@ -46,14 +45,13 @@ __device__ __forceinline__ void score_rows(float (&c)[2][4]) {
   const u32 queries = operand_place(Block::start() + M_Q, NT * 128),
             keys = operand_place(Block::start() + M_X + X_KEY_ROWS, KEY_COLUMNS);
   float sums[8];
-  if (!TP_KEEP)
 #pragma unroll
-    for (int i = 0; i < 8; ++i) sums[i] = 0;
+  for (int i = 0; i < 8; ++i) sums[i] = 0;
   begin_products();
 #pragma unroll
   for (int k = 0; k < QT; ++k)
     add_keys(sums, operand_at<128>(behind(queries, k * NT * 256)),
-             operand_at<128>(behind(keys, k * 2 * KEY_COLUMNS)), !TP_KEEP || k > 0);
+             operand_at<128>(behind(keys, k * 2 * KEY_COLUMNS)), 1);
   commit_products();
   await_products<0>();
 #pragma unroll
@@ -269,7 +267,7 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
     const int k = (b.lane() & 7) + (b.lane() >> 4 << 3), row = min((k >> 1) + (k & 1) * 8, rows - 1);  // others weigh 0
     ldmatrix_transposed(last, b.base + M_X + X_VALUE_ROWS + row * RS + (column * 16 + (b.lane() & 8)) * 2);
   }
-  if (!TP_LASTSUMS && b.warp() < NT) send_some_sums(b, b.warp(), tiles, rows);
+  if (b.warp() < NT) send_some_sums(b, b.warp(), tiles, rows);
   int i = imin(slots, 2);
   if (slots > 1)
     weigh_some<2>(b, 0, first_values, tiles, weights, sums, &last);
@@ -283,7 +281,6 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
   for (i = 0; i < slots; ++i) give_slot(b, slot_behind(first_values, i));
 #pragma unroll
   for (int i = 0; i < NT * 4; ++i) out[i / 4][i % 4] = sums[i];
-  MARK(28)
   if (b.warp() < QT) {
     const u32 at = M_X + X_COMB + (b.rank() * QTL + in) * NT * OUTPUT + b.lane() * (OUTPUT / 32);
     const u32 to = at_rank(b.base + at, owner), to_bar = at_rank(b.bar(BAR_COMB), owner);
@@ -300,6 +297,4 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
     __syncwarp();
     if (own && b.lane() == 0) barrier_arrive(b.bar(BAR_COMB));
   }
-  if (TP_LASTSUMS == 1 && b.warp() < NT) send_some_sums(b, b.warp(), tiles, rows);
-  if (TP_LASTSUMS == 2 && b.warp() >= W - NT) send_some_sums(b, b.warp() - W + NT, tiles, rows);
 }

@@ -22,34 +22,6 @@
 
 typedef unsigned char byte;
 
-#ifndef TP_KEEP
-#define TP_KEEP 0
-#endif
-#ifndef TP_HALVES
-#define TP_HALVES 0
-#endif
-#ifndef TP_LASTSUMS
-#define TP_LASTSUMS 0
-#endif
-#ifndef TP_CHUNK
-#define TP_CHUNK 4
-#endif
-#ifndef TP_PACK
-#define TP_PACK 0
-#endif
-#ifndef TP_ONE
-#define TP_ONE 0
-#endif
-#ifndef TP_DEEP
-#define TP_DEEP 0
-#endif
-#ifndef TP_OWNATT
-#define TP_OWNATT 0
-#endif
-#ifndef TP_ROTATE
-#define TP_ROTATE 0
-#endif
-
 constexpr int D = TP_D, F = TP_F, L = TP_L, NH = TP_NH, HD = TP_HD, T = TP_T, A = TP_A;
 constexpr int S = TP_S, NC = TP_NC;                                   // CTAs of a cluster, clusters
 constexpr int KEY_TILES = TP_KEY_TILES;                               // tiles of prefix keys, at most
@@ -88,9 +60,7 @@ static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64
 // rest than have parts of their own.
 __host__ __device__ constexpr int group_tiles(int left) { return left < 8 ? left : 8; }
 __host__ __device__ constexpr int packed_parts(int tiles) { return tiles > 4 ? W / 8 : W / 4; }  // see `filled`
-__host__ __device__ constexpr int group_parts(int tiles) {
-  return !SPREAD ? packed_parts(tiles) : TP_ONE & (tiles > 4 ? 1 : 2) ? 1 : W / 8;
-}
+__host__ __device__ constexpr int group_parts(int tiles) { return SPREAD ? W / 8 : packed_parts(tiles); }
 __host__ __device__ constexpr int plan_groups(int mt) { return most(mt, 8); }
 // Partial sums of all tiles, or of all but one part of each.
 __host__ __device__ constexpr int plan_partials(int mt) {

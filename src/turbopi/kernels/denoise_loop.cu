@@ -188,7 +188,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 
     note(b, WAIT_NONE);
     for (u32 i = 0; i < STAGES; ++i) barrier_init(b.full(i), 1), barrier_init(b.empty(i), W);
     for (int i = BAR_X; i <= BAR_V; ++i)  // warps that store partial outputs here arrive, too
-      barrier_init(b.bar(i), ASYNC && i == BAR_COMB ? 1 + b.qn() : OWN_ATTENTION && i == BAR_ATT ? 1 + b.qn() * NT : 1);
+      barrier_init(b.bar(i), ASYNC && i == BAR_COMB ? 1 + b.qn() : 1);
     barrier_init(b.bar(BAR_GO), S), barrier_init(b.bar(BAR_RMS), 1);
     if constexpr (SPREAD) {
       barrier_init(b.bar(BAR_DONE), W), barrier_init(b.bar(BAR_FREE), S);

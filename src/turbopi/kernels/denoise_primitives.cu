@@ -54,11 +54,8 @@ struct Everyone {
   u32 at[S];
   Everyone() = default;
   __device__ __forceinline__ explicit Everyone(u32 address) {
-    u32 rank;
-    asm("mov.u32 %0, %%cluster_ctarank;" : "=r"(rank));
 #pragma unroll
-    for (int d = 0; d < S; ++d) at[d] = at_rank(address, SPREAD && (TP_ROTATE || TP_OWNATT) ? (rank + d) % S : d);
-    if (SPREAD && TP_OWNATT) at[0] = address;
+    for (int d = 0; d < S; ++d) at[d] = at_rank(address, d);
   }
 };
 __device__ __forceinline__ void send(u32 to, u32 v, u32 bar) {

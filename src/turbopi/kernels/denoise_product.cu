@@ -66,38 +66,32 @@ struct Ahead {
 
 // One group of tiles, this warp's share of it. x: where activations lie in shared memory; `blocks` of the reduction, a
 // multiple of EVEN, of whose rounds AHEAD have been loaded.
-template <int TILES_, int EVEN, int AHEAD, bool HALVES = false>
+template <int TILES_, int EVEN, int AHEAD>
 struct GroupProduct {
   static constexpr int PARTS = group_parts(TILES_);
   static constexpr bool EXACT = EVEN % (KB * filled(TILES_)) == 0;
-  static constexpr bool SOME_REST = TILES_ <= 16 / PARTS - 4;  // warpgroups that have no tile
-  static constexpr int MINE = HALVES ? RPS * PARTS : RPS, COLUMNS = HALVES ? most(NT, 2) : NT;
-  static constexpr int UNROLL = EXACT && SPREAD ? 16 : 1;
+  static constexpr bool SOME_REST = TILES_ <= 4 && PARTS == 2;  // warpgroups that have no tile
+  static constexpr int UNROLL = EXACT && SPREAD ? 16 : 1;  // where the number of rounds is known
   Block& b;
   const Share my;
   const int blocks, tiles, rounds, rounds_of_slot;
   const u32 first;  // this part's first activations, as an operand's place
-  float (&sums)[COLUMNS * 4];
+  float (&sums)[NT * 4];
 
-  __device__ __forceinline__ GroupProduct(Block& block, int x, int n, int t, float (&to)[COLUMNS * 4])
+  __device__ __forceinline__ GroupProduct(Block& block, int x, int n, int t, float (&to)[NT * 4])
       : b(block), my(block, PARTS), blocks(n), tiles(t), rounds(plan_rounds(TILES_, blocks)),
         rounds_of_slot(slot_rounds(PARTS, t)),
-        first(behind(operand_place(b.start() + x, FP8 ? NT * 128 : 128),
-                     HALVES  ? my.part * COLUMNS * OPERAND
-                     : EXACT ? my.part * NT * 256
-                             : 0)),
-        sums(to) {
-    if (!TP_KEEP)
+        first(behind(operand_place(b.start() + x, FP8 ? NT * 128 : 128), EXACT ? my.part * NT * 256 : 0)), sums(to) {
 #pragma unroll
-      for (int i = 0; i < COLUMNS * 4; ++i) sums[i] = 0;
+    for (int i = 0; i < NT * 4; ++i) sums[i] = 0;
   }
   // What this warp's fragment i of round r meets. Blocks that fill up a round have no weight, their activations are any
   // (that are numbers: of a pair's missing block its other).
   __device__ __forceinline__ u64 activations(int r, int i) const {
     constexpr int NEXT_TOKENS = FP8 ? 128 : 256;
-    const int fragment = HALVES ? r * MINE + i : (r * RPS + i) * PARTS;
+    const int fragment = (r * RPS + i) * PARTS;
     if constexpr (EXACT) return operand_at<NEXT_TOKENS>(behind(first, fragment * NT * 256));
-    const int here = min(HALVES ? fragment : fragment + my.part, most(blocks, KB) - 1);
+    const int here = min(fragment + my.part, most(blocks, KB) - 1);
     const u32 place = behind(first, here * NT * 256);
     return operand_at<NEXT_TOKENS>(KB * (here + 1) > blocks ? place & 0xffff : place);
   }
@@ -114,7 +108,7 @@ struct GroupProduct {
   // Weights from shared memory. A slot is given back when the round behind it has begun.
   __device__ __forceinline__ void from_slots() {
     const int tile = my.first < tiles ? my.first : 0;
-    const u32 start = b.start(), weights = operand_place(start + M_RING + ((HALVES ? 0 : my.part * tiles) + tile) * FRAGMENT, 128);
+    const u32 start = b.start(), weights = operand_place(start + M_RING + (my.part * tiles + tile) * FRAGMENT, 128);
     u32 next = of_warp(b.slot), phase = of_warp(b.phase), slot = 0, previous = 0, from = weights;
     int left = 0;  // rounds of the slot
 #pragma unroll(UNROLL)
@@ -128,20 +122,16 @@ struct GroupProduct {
       }
       begin_products();
 #pragma unroll
-      for (int i = 0; i < MINE; ++i) {
-        const u32 at = behind(from, i * (HALVES ? 1 : PARTS) * tiles * FRAGMENT);
-        add_product(sums, operand_at<256>(at), activations(r, i), !TP_KEEP || AHEAD > 0 || r + i > 0);
-        if (!TP_DEEP && i == 0) {
+      for (int i = 0; i < RPS; ++i) {
+        const u32 at = behind(from, i * PARTS * tiles * FRAGMENT);
+        add_product(sums, operand_at<256>(at), activations(r, i), 1);
+        if (i == 0) {
           commit_products();
           await_products<1>();  // the round before is done
           give_slot_if(b, previous, another && r > AHEAD);
         }
       }
       commit_products();
-      if (TP_DEEP) {
-        await_products<1>();
-        give_slot_if(b, previous, another && r > AHEAD);
-      }
       --left, from = behind(from, RPS * PARTS * tiles * FRAGMENT);
     }
     b.slot = next, b.phase = phase;
@@ -151,7 +141,7 @@ struct GroupProduct {
 
   __device__ __forceinline__ void operator()(Ahead<TILES_, AHEAD>& ahead) {
     if constexpr (AHEAD > 0) multiply(ahead);
-    if (SOME_REST && my.first >= most(TILES_, 4) * 4) {
+    if (SOME_REST && my.first >= 4) {
 #pragma unroll 1
       for (int r = AHEAD; r < rounds; r += rounds_of_slot) give_slot(b, take_slot(b));
     } else {
@@ -181,24 +171,15 @@ __device__ __forceinline__ void multiply(Block& b, int x, int blocks, int tiles,
 }
 
 // Where a lane's partial sums of 8 tokens lie. Of the last 8 only pairs that exist are kept.
-template <int BYTES = 16>
 __device__ __forceinline__ int partial_place(const Block& b, int n) {
-  return n * 32 * BYTES + (TAIL == 4 || n + 1 < NT ? b.lane() : b.g() * TAIL + min(b.t(), TAIL - 1)) * BYTES;
+  return n * 512 + (TAIL == 4 || n + 1 < NT ? b.lane() : b.g() * TAIL + min(b.t(), TAIL - 1)) * 16;
 }
 // So many parts of a tile, always in the same order.
-constexpr bool PACK_QKV = SPREAD && FP8 && (TP_PACK & 4) != 0;
 template <int PARTS>
 __device__ __forceinline__ float4 add_up(const byte* p) {
   float4 v[PARTS];
 #pragma unroll
-  for (int i = 0; i < PARTS; ++i) {
-    if constexpr (PACK_QKV) {
-      const uint2 w = *(const uint2*)(p + i * PARTIAL);
-      v[i] = make_float4(bf16_low(w.x), bf16_high(w.x), bf16_low(w.y), bf16_high(w.y));
-    } else {
-      v[i] = *(const float4*)(p + i * PARTIAL);
-    }
-  }
+  for (int i = 0; i < PARTS; ++i) v[i] = *(const float4*)(p + i * PARTIAL);
 #pragma unroll
   for (int d = 1; d < PARTS; d *= 2)
 #pragma unroll
@@ -216,15 +197,9 @@ __device__ __forceinline__ void store_partials(const Block& b, byte* to, int til
     if (FIRST + my.tile < tiles && my.tile < N) {
 #pragma unroll
       for (int n = 0; n < NT; ++n)
-        if (n + 1 < NT || b.t() < TAIL) {
-          byte* const at = to + (plan_partials(FIRST) + my.tile * PARTS + my.part) * PARTIAL;
-          if constexpr (PACK_QKV)
-            *(uint2*)(at + partial_place<8>(b, n)) =
-                make_uint2(pack(sum[n * 4], sum[n * 4 + 1]), pack(sum[n * 4 + 2], sum[n * 4 + 3]));
-          else
-            *(float4*)(at + partial_place(b, n)) =
-                make_float4(sum[n * 4], sum[n * 4 + 1], sum[n * 4 + 2], sum[n * 4 + 3]);
-        }
+        if (n + 1 < NT || b.t() < TAIL)
+          *(float4*)(to + (plan_partials(FIRST) + my.tile * PARTS + my.part) * PARTIAL + partial_place(b, n)) =
+              make_float4(sum[n * 4], sum[n * 4 + 1], sum[n * 4 + 2], sum[n * 4 + 3]);
     }
     store_partials<MT, FIRST + N>(b, to, tiles, sums);
   }
@@ -234,7 +209,7 @@ __device__ __forceinline__ float4 total(const Block& b, const byte* from, int ti
   constexpr int N = group_tiles(MT - FIRST), PARTS = group_parts(N);
   if constexpr (FIRST + N < MT)
     if (tile >= FIRST + N) return total<MT, FIRST + N>(b, from, tile, n);
-  return add_up<PARTS>(from + (plan_partials(FIRST) + (tile - FIRST) * PARTS) * PARTIAL + partial_place<PACK_QKV ? 8 : 16>(b, n));
+  return add_up<PARTS>(from + (plan_partials(FIRST) + (tile - FIRST) * PARTS) * PARTIAL + partial_place(b, n));
 }
 
 // Or else: the warps that share a tile divide its tokens, part p has 8 tokens n = p, p + parts, ... An item is (tile, 8
@@ -246,7 +221,7 @@ struct Own {
   float4 sums[plan_groups(MT)][OWN<MT>];
   int tile[plan_groups(MT)], n[plan_groups(MT)][OWN<MT>];
   bool mine[plan_groups(MT)][OWN<MT>];
-  __device__ __forceinline__ Own(const Block& b, int tiles, bool halves = false) {
+  __device__ __forceinline__ Own(const Block& b, int tiles) {
 #pragma unroll
     for (int i = 0; i < plan_groups(MT); ++i) {
       const int size = group_tiles(MT - i * 8), parts = group_parts(size);
@@ -254,7 +229,7 @@ struct Own {
       tile[i] = i * 8 + my.tile;
 #pragma unroll
       for (int k = 0; k < OWN<MT>; ++k)
-        n[i][k] = halves ? my.part * OWN<MT> + k : k * parts + my.part, mine[i][k] = my.tile < size && tile[i] < tiles && n[i][k] < NT;
+        n[i][k] = k * parts + my.part, mine[i][k] = my.tile < size && tile[i] < tiles && n[i][k] < NT;
     }
   }
   __device__ __forceinline__ void meet() const {  // the warps of my tile, in the one group
@@ -262,33 +237,20 @@ struct Own {
     asm volatile("bar.sync %0, %1;" ::"r"(8 + (tile[0] & 7)), "n"(group_parts(group_tiles(MT)) * 32) : "memory");
   }
   // Of two parts: the other's to `to`, the rest to `sums`.
-  template <int PART, bool PACKED>
+  template <int PART>
   __device__ __forceinline__ void share_out(const Block& b, byte* to, bool real, const float (&mixed)[NT * 4]) {
 #pragma unroll
     for (int n = 0; n < NT; ++n) {
       const float4 sum = make_float4(mixed[n * 4], mixed[n * 4 + 1], mixed[n * 4 + 2], mixed[n * 4 + 3]);
       if (n % 2 == PART)
         sums[0][n / 2] = sum;
-      else if (real && (n + 1 < NT || b.t() < TAIL)) {
-        if (PACKED)
-          *(uint2*)(to + partial_place<8>(b, n)) = make_uint2(pack(sum.x, sum.y), pack(sum.z, sum.w));
-        else
-          *(float4*)(to + partial_place(b, n)) = sum;
-      }
+      else if (real && (n + 1 < NT || b.t() < TAIL))
+        *(float4*)(to + partial_place(b, n)) = sum;
     }
   }
   // To `sums` come all parts' sums of what is mine. They lie APART, or in `region`: over the operand of the
   // product unless SPREAD.
-  template <bool PACK_ = false>
   __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
-    constexpr int PARTS_ = plan_groups(MT) == 1 ? group_parts(group_tiles(MT)) : 0;
-    constexpr bool PACKED = PACK_ && SPREAD && FP8 && PARTS_ == 2;
-    if constexpr (PARTS_ == 1) {
-#pragma unroll
-      for (int n = 0; n < NT; ++n)
-        sums[0][n] = make_float4(mixed[0][n * 4], mixed[0][n * 4 + 1], mixed[0][n * 4 + 2], mixed[0][n * 4 + 3]);
-      return;
-    }
     byte* const place = b.smem + (APART ? M_SUMS : region);
     auto other = [&](int i, int parts, int part, int n) {
       return (float4*)(place + (plan_others(i * 8) + (tile[i] & 7) * (parts - 1) + part) * PARTIAL +
@@ -299,9 +261,9 @@ struct Own {
       const bool real = tile[0] < imin(tiles, group_tiles(MT));
       byte* const to = place + (tile[0] & 7) * PARTIAL;
       if (n[0][0] == 1)
-        share_out<1, PACKED>(b, to, real, mixed[0]);
+        share_out<1>(b, to, real, mixed[0]);
       else
-        share_out<0, PACKED>(b, to, real, mixed[0]);
+        share_out<0>(b, to, real, mixed[0]);
     } else {
 #pragma unroll
       for (int i = 0; i < plan_groups(MT); ++i) {
@@ -331,13 +293,7 @@ struct Own {
         if (mine[i][k])
 #pragma unroll
           for (int part = 0; part + 1 < parts; ++part) {
-            float4 v;
-            if (PACKED) {
-              const uint2 w = *(const uint2*)(place + (tile[0] & 7) * PARTIAL + partial_place<8>(b, n[0][k]));
-              v = make_float4(bf16_low(w.x), bf16_high(w.x), bf16_low(w.y), bf16_high(w.y));
-            } else {
-              v = *other(i, parts, part, n[i][k]);
-            }
+            const float4 v = *other(i, parts, part, n[i][k]);
             sums[i][k].x += v.x, sums[i][k].y += v.y, sums[i][k].z += v.z, sums[i][k].w += v.w;
           }
     }

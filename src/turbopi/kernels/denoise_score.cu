@@ -206,8 +206,7 @@ __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[
   for (int n = 0; n < NT; ++n)
     if (n * 8 + 2 * b.t() < T) send(to + n * 32, __float_as_uint(v[n].x), __float_as_uint(v[n].y), at);
 }
-constexpr bool OWN_ATTENTION = TP_OWNATT && ASYNC && EVEN_HEAD && !COPY_ATTENTION;
-constexpr u32 ATT_EXPECT = (OWN_ATTENTION ? HD - HD / S : HD) * (COPY_ATTENTION ? NT * 8 : T) * (OPERAND / 128) + (IDLE_Q ? S * 4 : 0);
+constexpr u32 ATT_EXPECT = HD * (COPY_ATTENTION ? NT * 8 : T) * (OPERAND / 128) + (IDLE_Q ? S * 4 : 0);
 constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
 __device__ __forceinline__ u32 outputs_expect(const Block& b) {
   return S * ((T + 1) / 2) * 8 + (S - ASYNC) * b.qn() * ((T + 1) / 2) * (OUTPUT / 4);  // ASYNC: its own by stores

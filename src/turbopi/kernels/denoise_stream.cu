@@ -6,17 +6,13 @@ __device__ __forceinline__ u32 columns_place(const Block& b, int region, int blo
   const int in_row = FP8 ? (b.g() >> 1) * 4 : (b.g() >> 2) * 128 + (b.g() >> 1 & 1) * 8;
   return b.base + region + (block * NT + n) * OPERAND + token * 16 + in_row;
 }
-template <bool OWN = false>
 __device__ __forceinline__ void send_columns(const Block& b, const Everyone& data, const Everyone& bars, int n,
                                              float4 v, bool real) {
   const uint2 columns = columns_of(b, v);
   const int token = 2 * b.t() + (b.g() & 1);
   if (real && n * 8 + token < T) {
-    if (OWN && FP8) asm volatile("st.shared.u32 [%0], %1;" ::"r"(data.at[0]), "r"(columns.x) : "memory");
-    if (OWN && !FP8)
-      asm volatile("st.shared.v2.u32 [%0], {%1, %2};" ::"r"(data.at[0]), "r"(columns.x), "r"(columns.y) : "memory");
 #pragma unroll
-    for (int d = OWN ? 1 : 0; d < S; ++d)
+    for (int d = 0; d < S; ++d)
       if (FP8)
         send(data.at[d], columns.x, bars.at[d]);
       else
@@ -239,10 +235,8 @@ template <int EVEN, typename Await, typename Then>
 __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, int region, uint4* buffer, u32 bit,
                                                  Await await, Then then, const Sent& sent) {
   Ahead<group_tiles(DX), RESIDUAL_AHEAD> ahead(b);
-  constexpr bool HALVES = SPREAD && plan_groups(DX) == 1 && group_parts(group_tiles(DX)) == 2 && (TP_HALVES & (EVEN == QT ? 1 : 2)) != 0;
-  Own<DX> own(b, b.xn(), HALVES);
+  Own<DX> own(b, b.xn());
   uint2* place[plan_groups(DX)][OWN<DX>];  // in the buffer
-  auto make_places = [&] {
 #pragma unroll
   for (int i = 0; i < plan_groups(DX); ++i)
 #pragma unroll
@@ -254,28 +248,13 @@ __device__ __forceinline__ void residual_product(Block& b, int x, int blocks, in
         place[i][k] = (uint2*)(words + b.cluster() / 2 * 32) + (b.cluster() & 1);
       if (FEW) place[i][k] = settled(place[i][k]);
     }
-  };
-  if (!HALVES) make_places();
   if (FEW) keep_until_here(sent.units), keep_until_here(sent.places);
   await();
   show_to_products();
-  if constexpr (HALVES) {
-    float sums[OWN<DX> * 4];
-    if (b.xn() > 0) GroupProduct<group_tiles(DX), EVEN, 0, true>(b, x, blocks, b.xn(), sums)(ahead);
-    then();
-  if (EVEN == QT) { MARK(26) }
-#pragma unroll
-    for (int k = 0; k < OWN<DX>; ++k)
-      own.sums[0][k] = make_float4(sums[k * 4], sums[k * 4 + 1], sums[k * 4 + 2], sums[k * 4 + 3]);
-  } else {
-    float sums[plan_groups(DX)][NT * 4];
-    multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, ahead);
-  if (EVEN == QT) { MARK(26) }
-    then();
-    own.template add_up<(TP_PACK & 1) != 0>(b, region, b.xn(), sums);
-  }
-  if (EVEN == QT) { MARK(27) }
-  if (HALVES) make_places();
+  float sums[plan_groups(DX)][NT * 4];
+  multiply<DX, EVEN>(b, x, blocks, b.xn(), sums, ahead);
+  then();
+  own.add_up(b, region, b.xn(), sums);
 #pragma unroll
   for (int i = 0; i < plan_groups(DX); ++i)
 #pragma unroll
@@ -331,9 +310,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
   multiply<GTL, D16>(b, M_X, D16, gn, sums, ahead);
   MARK(15)
   if constexpr (SPREAD) consumers_sync(), give_room(b);
-  MARK(26 + 3 - 0)
-  own.template add_up<(TP_PACK & 2) != 0>(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);
-  MARK(30)
+  own.add_up(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);
   constexpr int QUARTER = most(S, 4);
   static_assert(S % 4 == 0, "four lanes share the ranks");
   u32 window[QUARTER], hidden_bars[QUARTER];  // if SPREAD: this CTA's shared memory as theirs
@@ -400,7 +377,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
     show_to_products();  // to the copy engine, that is
     if (const int block = own.tile[0] >> 1; block < GTL / 2) {
       __syncwarp();
-      asm volatile("bar.sync %0, %1;" ::"r"(2 + block), "n"(group_parts(GTL) * 64) : "memory");  // attention's barriers are free
+      asm volatile("bar.sync %0, 128;" ::"r"(2 + block) : "memory");  // attention's barriers are free
       await_room(b);
       if ((own.tile[0] & 1) == 0 && Share(b, group_parts(GTL)).part == 0 && b.lane() == 0) {  // of the four warps one
         constexpr u32 BYTES = NT * OPERAND;
