@@ -8,7 +8,6 @@ import base64
 import hashlib
 import json
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -73,7 +72,7 @@ class SiteScale:
         """Raises ValueError, KeyError, TypeError or RuntimeError for what `as_json` didn't make."""
         _expect(isinstance(content, dict), "the site", "an object", content)
         scale, kept = content.get("scale"), content.get("kept")
-        is_scale = scale is None or (_is_number(scale) and _SCALES[0] <= scale <= _SCALES[1])
+        is_scale = scale is None or (_is_number(scale) and _SCALES[0] <= scale <= _SCALES[1])  # NaN isn't
         _expect(is_scale, "the scale", f"a number from {_SCALES[0]:g} to {_SCALES[1]:g}", scale)
         _expect(kept is None or isinstance(kept, str), "the reason kept", "a reason or null", kept)
         for name in ("largest", "saturated", "error"):
@@ -239,13 +238,7 @@ class Quantization:
             return cls(content["weights_sha256"], content["shapes"], found, report, source=str(path))
         except CalibrationError:
             raise
-        except (
-            KeyError,
-            TypeError,
-            ValueError,
-            OverflowError,
-            RuntimeError,
-        ) as error:  # the last: tensors, deep nesting
+        except _UNSOUND as error:
             raise CalibrationError(f"{path} isn't a calibration that `turbopi calibrate` wrote: {error!r}") from error
 
 
@@ -289,11 +282,12 @@ def _reason(site: Site, entry: SiteScale, tier: str, parts: Sequence[str]) -> st
     return site.refusal or entry.kept
 
 
+_UNSOUND = (KeyError, TypeError, ValueError, OverflowError, RuntimeError)  # the last: tensors, or nested too deeply
 _SCALES = (1e-30, 1e30)  # of an activation; further out float32 has no room for products
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _expect(right: bool, name: str, expected: str, got: Any) -> None:
