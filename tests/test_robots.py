@@ -341,8 +341,9 @@ def test_the_plain_robots_masked_cameras_are_as_if_not_sent() -> None:
     for wrong, message in (
         ({"left_wrist_0_rgb": True}, "image_mask/left_wrist_0_rgb is True, but image has no left_wrist_0_rgb"),
         ({"wrist": True}, "image_mask/wrist is of no camera; the model's are base_0_rgb"),
-        ({"base_0_rgb": 1}, r"image_mask/base_0_rgb is int64\[\]; expected one bool"),
-        ({"base_0_rgb": np.zeros(2, bool)}, r"image_mask/base_0_rgb is bool\[2\]; expected one bool"),
+        ({"base_0_rgb": 1}, "image_mask/base_0_rgb is 1; expected true or false"),
+        ({"base_0_rgb": np.zeros(2, bool)}, r"image_mask/base_0_rgb is \[False False\]; expected"),
+        ({"base_0_rgb": [[1], [2, 3]]}, r"image_mask/base_0_rgb is \[\[1\], \[2, 3\]\]; expected true or false"),
         ({"base_0_rgb": False, "right_wrist_0_rgb": False}, "image_mask leaves out all of base_0_rgb, right_wrist"),
         (3, "'image_mask' is a int, expected a dict"),
     ):

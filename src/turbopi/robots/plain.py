@@ -30,7 +30,7 @@ class Plain(Robot):
     in      images/{base_0_rgb, left_wrist_0_rgb, right_wrist_0_rgb}   (uint8|float)[h, w, 3] or [3, h, w]; at least
             one, the others are masked; the folder may be called `image`, as inside openpi
             image_mask/{the same}   bool, may be left out; False: as if there were no such picture
-            state   float[s], s up to the model's action_dim
+            state   float[s], for Pi0 s up to the model's action_dim
             prompt
     out     [H, action_dim], all of the model's dimensions
     """
@@ -58,12 +58,15 @@ class Plain(Robot):
         """Those that `image_mask` doesn't leave out."""
         masks = {}
         for camera in names_in(observation, "image_mask"):
-            key, value = f"image_mask/{camera}", np.asarray(find(observation, f"image_mask/{camera}"))
+            key = f"image_mask/{camera}"
+            value = find(observation, key)
             if camera not in CAMERAS:
                 raise ObservationError(f"{key} is of no camera; the model's are {', '.join(CAMERAS)}")
-            if value.dtype != np.bool_ or value.size != 1:
-                raise ObservationError(f"{key} is {value.dtype}{list(value.shape)}; expected one bool")
-            masks[camera] = bool(value.item())
+            if isinstance(value, np.ndarray) and value.size == 1:
+                value = value.item()
+            if not isinstance(value, bool | np.bool_):
+                raise ObservationError(f"{key} is {str(value)[:60]}; expected true or false")
+            masks[camera] = bool(value)
             if masks[camera] and camera not in pictures:
                 raise ObservationError(f"{key} is True, but {folder} has no {camera}")
         left = {camera: picture for camera, picture in pictures.items() if masks.get(camera, True)}
