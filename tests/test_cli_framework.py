@@ -157,6 +157,13 @@ def test_a_file_that_cannot_be_used_is_named(capsys: Any) -> None:
     assert errors_of(raising(error), capsys) == (2, "error: /x/actions.npz: Permission denied\n")
 
 
+def test_a_full_disk_is_no_fault_of_ours(capsys: Any) -> None:
+    assert errors_of(raising(OSError(28, "No space left on device")), capsys) == (
+        2,
+        "error: can't write: No space left on device\n",
+    )
+
+
 def test_running_out_of_memory_says_what_the_model_needs(capsys: Any) -> None:
     code, text = errors_of(raising(MemoryError("8 GB")), capsys)
     assert code == 2

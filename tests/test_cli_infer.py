@@ -108,6 +108,23 @@ def test_a_recording_is_run_call_by_call(npz: Path, recording: Path, tmp_path: P
     np.testing.assert_array_equal(actions_in(tmp_path), chunks[0])
 
 
+def test_no_observation_is_overwritten(npz: Path, recording: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "by hand"
+    folder.mkdir()
+    (folder / "observation.json").write_text('{"observation/image": {"file": "table.png"}}')
+    (folder / "table.png").write_bytes(b"picture")
+    call = next(recording.rglob("*.npz"))
+    for source, *targets in (
+        (npz, "-o", npz),
+        (call.parent, "-o", call, "--no-plot"),
+        (folder, "-o", folder / "observation.json", "--no-plot"),
+        (folder, "-o", folder / "table.npz"),  # whose plot would be table.png
+    ):
+        refused = refusal(turbopi("infer", *TINY, source, *targets))
+        assert "is the observation itself, or part of it: write to another file" in refused
+    assert (folder / "table.png").read_bytes() == b"picture"
+
+
 def test_noise_from_a_file_is_what_the_model_starts_from(npz: Path, tmp_path: Path) -> None:
     infer(tmp_path, npz, "--seed", 5, "--no-plot")
     expected = actions_in(tmp_path)
@@ -157,7 +174,7 @@ def test_wrong_paths_are_told_what_infer_takes() -> None:
         (["OBS", "--plot", "x.xyz"], "the plot x.xyz should end in one of .png, .pdf, .svg"),
         (["OBS", "--noise", "nowhere.npy"], "the noise nowhere.npy can't be read: No such file or directory"),
         (["OBS", "--noise", "OBS"], "has no array named noise, only observation/image"),
-        (["OBS", "-o", "OBS"], "is the observation itself: write to another file"),
+        (["OBS", "-o", "OBS"], "is the observation itself, or part of it: write to another file"),
         (["OBS", "-o", "no/folder/actions.npz"], "can't write no/folder/actions.npz: there is no folder"),
         (["OBS", "-o", "."], ". is a folder; give a file's name"),
         (["OBS", "-o", "both.png"], "would both be written to both.png"),

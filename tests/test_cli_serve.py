@@ -108,6 +108,39 @@ def test_no_warmup_hides_the_policys_warmup_from_the_server(monkeypatch: Any) ->
     assert (served["host"], served["port"], served["api_key"], served["record_dir"]) == ("127.0.0.1", 0, None, None)
 
 
+def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
+    command = [sys.executable, "-m", "turbopi.cli", "serve", *TINY[:2], "--steps", "300", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            while "Warming up" not in (line := process.stdout.readline()):
+                assert line
+            time.sleep(0.5)  # it is said just before it begins
+            process.send_signal(signal.SIGINT)
+            rest, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 0, errors
+    assert "Stopping" in rest and "Serving at" not in rest and "Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--api-key", "a b"], "the API key must be printable ASCII without spaces"),
+        (["--max-message-mb", "0"], "max_message_mb must be more than 0"),
+        (["--record", __file__], "is a file"),
+    ],
+)
+def test_bad_options_are_refused_before_weights_are_loaded(options: list[str], message: str) -> None:
+    assert message in refusal(turbopi("serve", *TINY, *options))
+
+
+def test_an_empty_key_in_the_environment_lets_nobody_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TURBOPI_API_KEY", "")
+    assert "TURBOPI_API_KEY is empty" in refusal(turbopi("serve", *TINY))
+
+
 def test_a_taken_port_is_refused_before_weights_are_loaded() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

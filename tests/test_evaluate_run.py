@@ -12,7 +12,7 @@ import pytest
 from evaluate_fakes import NO_VIDEOS, SeekingPolicy, TroubledSimulator, jobs_for, run
 
 from turbopi.errors import ConfigError, TurboPiError
-from turbopi.evaluate.plan import noise_seed
+from turbopi.evaluate.plan import VideoPlan, noise_seed
 from turbopi.evaluate.results import Results, load_results
 from turbopi.evaluate.schedule import TooManyCrashes
 from turbopi.sim import SimulatorUnavailable
@@ -146,6 +146,17 @@ def test_a_run_is_not_continued_in_another_way(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"policy\.precision = 'f32', but this one has 'bf16'"):
         run(tmp_path, other, states=(0,))
     assert run(tmp_path, other, states=(1,), restart=True).planned == {(0, 1)}
+
+
+def test_a_restart_that_cannot_begin_leaves_the_earlier_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise ConfigError("no ffmpeg")
+
+    run(tmp_path, SeekingPolicy(), states=(0,))
+    monkeypatch.setattr("turbopi.evaluate.run.check_can_write", refuse)
+    with pytest.raises(ConfigError, match="no ffmpeg"):
+        run(tmp_path, SeekingPolicy(), states=(1,), restart=True, videos=VideoPlan("all"))
+    assert load_results(tmp_path).planned == {(0, 0)}
 
 
 def test_more_episodes_can_be_added_to_a_run(tmp_path: Path) -> None:

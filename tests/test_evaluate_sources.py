@@ -54,6 +54,18 @@ def test_no_server_is_said_with_the_way_to_start_one() -> None:
         PolicyLost, match=r"no policy server at ws://127\.0\.0\.1:9: .*turbopi serve CHECKPOINT --port 9"
     ):
         RemotePolicy("127.0.0.1", 9)
+    with pytest.raises(PolicyLost, match=r"no policy server at wss://127\.0\.0\.1:9: "):
+        RemotePolicy("wss://127.0.0.1", 9)
+    with pytest.raises(ConfigError, match=r"ws://a:b:9 is no address of a server"):
+        RemotePolicy("ws://a:b", 9)
+
+
+def test_a_server_is_found_by_its_url_and_its_key_is_asked_for() -> None:
+    with serve.running(SeekingPolicy(), api_key="secret") as server:
+        RemotePolicy(server.url, api_key="secret").close()
+        for key in (None, "other"):
+            with pytest.raises(ConfigError, match="wants its API key: --api-key KEY, or TURBOPI_API_KEY"):
+                RemotePolicy("127.0.0.1", server.port, key)
 
 
 def test_a_server_that_refuses_the_observations_is_quoted() -> None:

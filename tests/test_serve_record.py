@@ -283,7 +283,7 @@ def test_files_that_are_no_recordings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ObservationError, match="holds no recording"):
         load_observation(tmp_path)
     (tmp_path / "text.npz").write_text("text")
-    with pytest.raises(ObservationError, match=r"text\.npz isn't a readable \.npz file"):
+    with pytest.raises(ObservationError, match=r"text\.npz isn't a readable \.npz file: it is no zip archive"):
         load_observation(tmp_path / "text.npz")
     np.save(tmp_path / "array.npy", np.zeros(2))
     with pytest.raises(ObservationError, match=r"array\.npy isn't an \.npz file"):
@@ -301,6 +301,7 @@ def test_files_that_are_no_recordings_are_refused(tmp_path: Path) -> None:
     [
         (b"{", "damaged index"),
         (b"[]", "damaged index"),
+        (b'{"format":"turbopi-recording","version":1,"time":1,"observation":[],"result":{"dict":[]}}', "damaged index"),
         (b'{"format": "turbopi-recording", "version": 2}', "version 2; this reads turbopi-recording of version 1"),
         (b'{"format": "turbopi-recording", "version": 1, "time": 0, "observation": {"array": "x"}}', "damaged index"),
         (b'{"format": "turbopi-recording", "version": 1, "time": 0, "observation": {"what": "x"}}', "damaged index"),

@@ -69,7 +69,7 @@ class UnifiedPolicy:
         progress: bool = False,
     ) -> None:
         if num_denoising_steps is not None:
-            _checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
+            checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
         self._device = backends.resolve_device(device)
         name, why = backends.choose(self._device, precision) if backend == "auto" else (backend, "asked for")
         backends.check(name, self._device, precision)  # before a calibration is asked for, and weights are read
@@ -81,7 +81,7 @@ class UnifiedPolicy:
             tokenizer = TINY_TOKENIZER  # any will do: no weight knows a word
         self.config = checkpoint.config
         steps = self.config.num_denoising_steps if num_denoising_steps is None else num_denoising_steps
-        self._num_steps = _checked_steps(steps, ConfigError)
+        self._num_steps = checked_steps(steps, ConfigError)
         prompt_tokenizer = load_tokenizer(
             tokenizer,
             checkpoint_dir=checkpoint.path,
@@ -148,7 +148,7 @@ class UnifiedPolicy:
         start = time.perf_counter()
         if not observations:
             raise ObservationError("infer_batch was given no observation")
-        steps = self._num_steps if num_steps is None else _checked_steps(num_steps, ObservationError)
+        steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
         if len(observations) == 1 and hasattr(self.backend, "begin"):
             seen = self._pipeline.see(observations[0])
             with self._lock:
@@ -205,7 +205,7 @@ class UnifiedPolicy:
             done.set_result(self.infer(obs, noise=noise, seed=seed, num_steps=num_steps))
             return done
         start = time.perf_counter()
-        steps = self._num_steps if num_steps is None else _checked_steps(num_steps, ObservationError)
+        steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
         inputs, state = self._pipeline.before(obs)
         x_1 = torch.from_numpy(self._noise(1, None if noise is None else [noise], seed))
         infer_start = time.perf_counter()
@@ -235,7 +235,7 @@ class UnifiedPolicy:
         """Make the first real call as fast as later ones: compile, allocate, capture. Returns the seconds it took."""
         start = time.perf_counter()
         example = self.example_observation()
-        steps = self._num_steps if num_steps is None else _checked_steps(num_steps, ObservationError)
+        steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
         with self._lock:
             self.backend.warmup(Observation.stack([self._pipeline.before(example)[0]]), steps)
         self.infer(example, seed=0, num_steps=steps)
@@ -319,7 +319,7 @@ def _checked_noise(noise: Sequence[np.ndarray] | np.ndarray, shape: tuple[int, .
     return np.ascontiguousarray(array)
 
 
-def _checked_steps(num_steps: int, error: type[ConfigError] | type[ObservationError]) -> int:
+def checked_steps(num_steps: int, error: type[ConfigError] | type[ObservationError]) -> int:
     whole = isinstance(num_steps, int | np.integer) and not isinstance(num_steps, bool)
     if not whole or not 1 <= num_steps <= MAX_STEPS:
         raise error(

@@ -7,14 +7,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from turbopi.cli.framework import JsonFlag, Output, command
-from turbopi.errors import ConfigError
+from turbopi.errors import BackendUnavailable, ConfigError
 
 
 @command("backends", examples=("turbopi backends", "turbopi backends --device cpu --json"))
 def backends(
     device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     precision: Annotated[
-        str, typer.Option("--precision", metavar="bf16|f32", help="For which auto would choose.")
+        str, typer.Option("--precision", metavar="bf16|f32|fp8|fp8-mlp", help="For which auto would choose.")
     ] = "bf16",
     as_json: JsonFlag = False,
 ) -> None:
@@ -46,7 +46,12 @@ def backends(
         about = str(entry["summary"] if entry["available"] else entry["reason"])
         table.add_row(name, mark, ", ".join(registry.precisions(str(entry["name"]))), escape(about))
     output.table(table)
-    output.line(f"auto takes {chosen} in {precision}: {why.removeprefix('auto: ')}")
+    try:
+        registry.check(chosen, resolved, precision)
+        output.line(f"auto takes {chosen} in {precision}: {why.removeprefix('auto: ')}")
+    except BackendUnavailable as error:
+        why = f"auto can't run in {precision} here: {error}"
+        output.line(why, "yellow")
     output.document(
         {"device": str(resolved), "precision": precision, "auto": chosen, "auto_reason": why, "backends": listed}
     )

@@ -93,6 +93,8 @@ def _run_variants(
     """Evaluate each way to run into a folder of its own, then ask the reference about what they met."""
     from turbopi.evaluate.visited import Visited, action_error
 
+    for text in texts:
+        parse_variant(text, options if options.steps else replace(options, steps=1))
     options.check(checkpoint)
     if options.steps is None:
         options = replace(options, steps=options.open(checkpoint).config.num_denoising_steps)
@@ -139,10 +141,12 @@ def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint:
     """Refuse what can't run before hours of what can."""
     from turbopi import backends
     from turbopi.calibrate.artifact import TIERS, calibration_of
+    from turbopi.policy import checked_steps
 
     device, opened = backends.resolve_device(options.device), options.open(checkpoint)
     tiers = [variant.precision for variant in variants if variant.precision in TIERS]
     for variant in variants:
+        checked_steps(variant.steps, ConfigError)
         backends.check(variant.backend, device, variant.precision)  # type: ignore[arg-type]  # parsed
     if not tiers and (options.quantization is not None or options.fp8_parts is not None):
         raise ConfigError("--quantization and --fp8-parts are for ways to run in FP8, and none of these is")

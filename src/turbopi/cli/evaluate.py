@@ -1,5 +1,6 @@
 """`turbopi eval`."""
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from turbopi.cli.files import check_folder
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.errors import ConfigError
@@ -213,6 +215,10 @@ def evaluate_command(
     remote = host is not None or port is not None
     if remote and (checkpoint is not None or options.random_weights is not None):
         raise ConfigError("--host and --port name a server's policy; give no weights beside them")
+    if remote:
+        _refuse_policy_options(options)
+    if options.out is not None:
+        check_folder(options.out)
     if not remote:
         options.check(checkpoint)
     chosen = options.simulator(simulator, output)
@@ -221,7 +227,7 @@ def evaluate_command(
     if remote:
         from turbopi.evaluate.sources import RemotePolicy
 
-        source: PolicySource = RemotePolicy(host or "127.0.0.1", port or 8000, api_key)
+        source: PolicySource = RemotePolicy(host or "127.0.0.1", port, api_key)
     else:
         source = options.local_policy(checkpoint, output)
     try:
@@ -238,6 +244,17 @@ def evaluate_command(
     output.document({"folder": results.folder, **results.summary()})
     if not results.complete:
         raise typer.Exit(CHECK_FAILED)
+
+
+def _refuse_policy_options(options: EvalOptions) -> None:
+    """A server's policy is as the server made it. Raises ConfigError for options that would say otherwise."""
+    given = [
+        f"--{field.name.replace('_', '-')}"
+        for field in dataclasses.fields(PolicyOptions)
+        if getattr(options, field.name) != field.default
+    ]
+    if given:
+        raise ConfigError(f"the server decides about {', '.join(given)}: start it with them (turbopi serve)")
 
 
 def run_with_progress(

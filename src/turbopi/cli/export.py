@@ -58,6 +58,8 @@ def export(
         raise ConfigError(f"unknown precision {precision!r} for an export; choose one of {', '.join(PRECISIONS)}")
     if precision == "f32" and calibration is not None:
         raise ConfigError("--calibration is for --precision fp8")
+    if precision == "f32" and method != "max":
+        raise ConfigError("--method is for --precision fp8")
     if format not in FORMATS:
         raise ConfigError(f"unknown format {format!r}; choose one of {', '.join(FORMATS)}")
     source, target = options.split("export onnx", paths, "new folder")

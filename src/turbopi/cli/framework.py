@@ -4,6 +4,7 @@ Exit codes: 0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of 
 Nothing here or at the top of a command's module imports torch, so that `turbopi --help` answers at once.
 """
 
+import errno
 import functools
 import inspect
 import json
@@ -177,12 +178,17 @@ def _users_message(error: Exception) -> str | None:
         return str(error)
     if isinstance(error, OSError) and error.filename is not None:  # a file of the user's: unwritable, vanished, …
         return f"{os.fsdecode(error.filename)}: {error.strerror}"
+    if isinstance(error, OSError) and error.errno in _NO_ROOM:  # of writes, which know no name
+        return f"can't write: {error.strerror}"
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # torch's, unimported
         return (
             f"out of memory: {error}. Full-size models need 7.2 GB in bf16 and 14.5 GB in f32; "
             "`turbopi doctor` shows what there is"
         )
     return None
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 class _StderrHandler(logging.Handler):

@@ -131,12 +131,22 @@ def _check_targets(source: Path, out: Path, drawing: Path | None) -> None:
     if drawing is not None:
         check_writable(drawing)
     for file in (out, drawing):
-        if file is not None and file.exists() and source.exists() and file.samefile(source):
-            raise ConfigError(f"{file} is the observation itself: write to another file")
+        if file is not None and file.exists() and source.exists() and _is_of(file, source):
+            raise ConfigError(f"{file} is the observation itself, or part of it: write to another file")
     if drawing is not None and drawing.absolute() == out.absolute():
         raise ConfigError(f"the actions and the plot would both be written to {out}: end the former's name in .npz")
     if drawing is not None and drawing.suffix not in PLOT_SUFFIXES:
         raise ConfigError(f"the plot {drawing} should end in one of {', '.join(PLOT_SUFFIXES)}")
+
+
+def _is_of(file: Path, source: Path) -> bool:
+    """Whether a file is the observation, or one of a recording's, or one that a folder's observation.json names."""
+    if not source.is_dir() or file.resolve().parent != source.resolve():
+        return file.samefile(source) or file.resolve().is_relative_to(source.resolve())
+    described = source / "observation.json"
+    if described.is_file():
+        return file.name == described.name or file.name in described.read_text(encoding="utf-8", errors="replace")
+    return file.suffix in (".npz", ".json", ".jsonl")
 
 
 def _sources(path: Path, call: int | None) -> list[Path]:
@@ -184,6 +194,8 @@ def _run(
             try:
                 result = policy.infer(observation, noise=noise)
             except ObservationError as error:
+                if str(error).startswith("noise "):
+                    raise
                 raise ObservationError(f"{source}: {error}") from error
             kept = observation if number < MAX_ROWS else None
             answers.append(_Answer(kept, noise, result["actions"], result["policy_timing"]))

@@ -1,11 +1,13 @@
 """`turbopi serve`."""
 
 import logging
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from turbopi.cli.files import check_folder
 from turbopi.cli.framework import Output, command
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.ports import why_not_free
@@ -60,6 +62,13 @@ def serve(
     """
     output = Output()
     options.check(checkpoint)
+    if api_key is None and "TURBOPI_API_KEY" in os.environ:  # which the option takes for none, and would let all in
+        raise ConfigError("TURBOPI_API_KEY is empty; give it the key, or unset it to serve without one")
+    from turbopi.serve.server import check_options
+
+    check_options(port=port, api_key=api_key, max_message_mb=max_message_mb, queue_limit=queue_limit)
+    if record is not None:
+        check_folder(record)
     reason = why_not_free(host, port)
     if reason is not None:  # before minutes of loading, not after
         raise ConfigError(f"can't listen on {host}:{port}: {reason}. Choose another --host or --port")

@@ -85,6 +85,7 @@ class Results:
         self.planned: set[tuple[int, int]] = set()
         self.started = _now()
         self.wall_seconds = 0.0
+        self.replaces = False  # what an earlier run left in the folder
         self._saved_at = float("-inf")
 
     @property

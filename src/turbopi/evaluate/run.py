@@ -32,7 +32,8 @@ def default_workers() -> int:
 def prepare(
     folder: Path, protocol: Protocol, source: PolicySource, simulator: Simulator, jobs: Sequence[Job], *, restart: bool
 ) -> Results:
-    """Results for these jobs, with the episodes that the folder holds already unless `restart`.
+    """Results for these jobs, with the episodes that the folder holds already unless `restart`: then `evaluate` removes
+    them, once it can begin.
 
     Raises ConfigError if those were run in another way, or by another policy.
     """
@@ -40,7 +41,7 @@ def prepare(
     versions = {"simulator": simulator.versions(), **provenance(torch.device("cpu"))}
     results = Results(folder, protocol_json(protocol), policy, [job.task for job in jobs], versions, {})
     if restart:
-        _clear(folder)
+        results.replaces = True
     elif (folder / FILE).exists():
         results.continue_from(load_results(folder))
     results.planned |= {job.key for job in jobs}
@@ -71,6 +72,8 @@ def evaluate(
     """
     if videos.which != "none":
         check_can_write()
+    if results.replaces:
+        _clear(results.folder)
     results.folder.mkdir(parents=True, exist_ok=True)
     results.options = {"workers": num_workers, "max_batch": max_batch, "videos": asdict(videos)}
 

@@ -86,13 +86,19 @@ class RemotePolicy:
 
     max_batch: int | None = 1
 
-    def __init__(self, host: str, port: int, api_key: str | None = None) -> None:
-        """Connects. Raises PolicyLost if nobody answers there."""
-        from websockets.exceptions import WebSocketException
+    def __init__(self, host: str, port: int | None = None, api_key: str | None = None) -> None:
+        """Connects. `host` may be a URL, ws:// or wss://, as openpi's client has it. Raises PolicyLost if nobody
+        answers there, ConfigError for a key that isn't the server's.
+        """
+        from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
         from websockets.sync.client import connect
 
-        self._where = f"{host}:{port}"
-        url = f"ws://{f'[{host}]' if ':' in host else host}:{port}"
+        if host.startswith(("ws://", "wss://")):
+            url = host if port is None else f"{host}:{port}"
+        else:
+            port = 8000 if port is None else port
+            url = f"ws://{f'[{host}]' if ':' in host else host}:{port}"
+        self._where = url.removeprefix("ws://")
         self._open = contextlib.ExitStack()
         headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
         try:
@@ -107,9 +113,14 @@ class RemotePolicy:
                 )
             )
             greeting = self._socket.recv(timeout=CONNECT_S)
+        except (InvalidURI, ValueError) as error:
+            raise ConfigError(f"{url} is no address of a server: {error}") from error
         except (OSError, TimeoutError, WebSocketException) as error:
+            if isinstance(error, InvalidStatus) and error.response.status_code in (401, 403):
+                raise ConfigError(f"{url} wants its API key: --api-key KEY, or TURBOPI_API_KEY") from error
+            chosen = "" if port is None else f" --port {port}"
             raise PolicyLost(
-                f"no policy server at {url}: {_reason(error)}. Start one (turbopi serve CHECKPOINT --port {port}), "
+                f"no policy server at {url}: {_reason(error)}. Start one (turbopi serve CHECKPOINT{chosen}), "
                 "then give the same command again: finished episodes are kept"
             ) from error
         metadata = _unpacked(greeting, self._where)

@@ -11,6 +11,12 @@ from turbopi.errors import ConfigError
 from turbopi.serve.metrics import CONTENT_TYPE, Metrics
 
 
+def check_key(api_key: str | None) -> None:
+    """Raise ConfigError for a key that no header can carry."""
+    if api_key is not None and not (api_key and api_key.isascii() and api_key.isprintable() and " " not in api_key):
+        raise ConfigError("the API key must be printable ASCII without spaces, and not empty")
+
+
 class Gate:
     """Decides about each HTTP request on the server's port.
 
@@ -19,8 +25,7 @@ class Gate:
     """
 
     def __init__(self, api_key: str | None, metrics: Metrics) -> None:
-        if api_key is not None and not (api_key and api_key.isascii() and api_key.isprintable() and " " not in api_key):
-            raise ConfigError("the API key must be printable ASCII without spaces, and not empty")
+        check_key(api_key)
         self._key = None if api_key is None else api_key.encode()
         self._metrics = metrics
 

@@ -84,7 +84,7 @@ def _to_call(members: dict[str, np.ndarray], path: str | Path) -> Call:
         return Call(observation, _from_node(index["result"], members), float(index["time"]))
     except ObservationError:
         raise
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise ObservationError(f"{path} has a damaged index: {error!r}") from error
 
 
@@ -95,7 +95,9 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
             with archive:
                 return {name: archive[name] for name in archive.files}
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ObservationError(f"{path} isn't a readable .npz file: {error}") from error
+        # of what is neither, NumPy says that it holds pickles
+        reason = error if zipfile.is_zipfile(path) else "it is no zip archive"
+        raise ObservationError(f"{path} isn't a readable .npz file: {reason}") from error
     raise ObservationError(f"{path} isn't an .npz file")
 
 
@@ -231,7 +233,10 @@ def _load_file(value: dict[str, Any], name: str, folder: Path) -> np.ndarray:
         try:
             return np.asarray(np.load(file, allow_pickle=False))
         except (ValueError, EOFError) as error:
-            raise ObservationError(f"{file} isn't a readable .npy file: {error}") from error
+            with file.open("rb") as stream:
+                is_array = stream.read(6) == b"\x93NUMPY"
+            reason = error if is_array else "it doesn't begin as one"
+            raise ObservationError(f"{file} isn't a readable .npy file: {reason}") from error
     from PIL import Image, UnidentifiedImageError
 
     try:

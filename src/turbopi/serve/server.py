@@ -30,7 +30,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
 from turbopi.errors import ConfigError, ObservationError
-from turbopi.serve.gate import Gate
+from turbopi.serve.gate import Gate, check_key
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.record import Recorder
 from turbopi.serve.signals import stop_signals
@@ -76,6 +76,17 @@ class _PolicyFailed(Exception):
     """The policy raised something that isn't the client's fault; holds the traceback's text."""
 
 
+def check_options(*, port: int, api_key: str | None, max_message_mb: float, queue_limit: int) -> None:
+    """Raise ConfigError for options of a server that can't be right."""
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"port must be between 0 and 65535, not {port}")
+    if not 0 < max_message_mb < math.inf:
+        raise ConfigError(f"max_message_mb must be more than 0 and finite, not {max_message_mb}")
+    if queue_limit < 0:
+        raise ConfigError(f"queue_limit must be 0 or more, not {queue_limit}")
+    check_key(api_key)
+
+
 class PolicyServer:
     """Serves one policy over openpi's websocket protocol. Good for one start.
 
@@ -99,12 +110,7 @@ class PolicyServer:
         queue_limit: int = 16,
         record_dir: str | Path | None = None,
     ) -> None:
-        if not 0 <= port <= 65535:
-            raise ConfigError(f"port must be between 0 and 65535, not {port}")
-        if not 0 < max_message_mb < math.inf:
-            raise ConfigError(f"max_message_mb must be more than 0 and finite, not {max_message_mb}")
-        if queue_limit < 0:
-            raise ConfigError(f"queue_limit must be 0 or more, not {queue_limit}")
+        check_options(port=port, api_key=api_key, max_message_mb=max_message_mb, queue_limit=queue_limit)
         self.host, self.port = host, port
         self.metrics = Metrics()
         self._policy = policy
@@ -200,13 +206,24 @@ class PolicyServer:
         """
 
         async def main() -> None:
-            await self.start()
-            with stop_signals() as stop:
-                try:
-                    on_ready(self)
-                    await stop.wait()
+            with stop_signals() as stop:  # from here on: a warm-up may take minutes
+                starting, stopped = asyncio.ensure_future(self.start()), asyncio.ensure_future(stop.wait())
+                await asyncio.wait((starting, stopped), return_when=asyncio.FIRST_COMPLETED)
+                early = not starting.done()
+                if early:
                     on_stopping(self)
+                try:
+                    await starting
+                except BaseException:
+                    stopped.cancel()
+                    raise
+                try:
+                    if not early:
+                        on_ready(self)
+                        await stopped
+                        on_stopping(self)
                 finally:
+                    stopped.cancel()
                     await self.stop()
 
         asyncio.run(main())
@@ -298,7 +315,7 @@ class PolicyServer:
     def _refuse(self, kind: str, text: str) -> str:
         self.metrics.error(kind)
         text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
-        logger.warning("%s", text)
+        logger.warning("%s", "".join(c if c.isprintable() else repr(c)[1:-1] for c in text))  # it may quote a client
         return text
 
     async def _infer(self, connection: ServerConnection, observation: dict[str, Any]) -> _Outcome:
