@@ -333,14 +333,15 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
             raise ConfigError(f"precision {tier!r} takes no FP8 calibration; with one take {' or '.join(TIERS)}")
         return None
     quantization = calibration_of(given, tier, checkpoint)
-    quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
+    if checkpoint.path is None:  # so not yet
+        quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
     for warning in quantization.warnings:
         logger.warning("FP8: %s", warning)
     return quantization
 
 
 def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization:
-    """What `for_policy` takes for an FP8 tier, checked as far as that goes without reading the weights.
+    """What `for_policy` takes for an FP8 tier, checked before any work: against the weights only if they are on disk.
 
     Raises ConfigError too where it leaves no site at all in FP8: such a policy would be bfloat16 under FP8's name.
     """
@@ -354,6 +355,8 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
         given = beside
     quantization = given if isinstance(given, Quantization) else Quantization.load(given)
     quantization.check_shapes(checkpoint.config.model)
+    if checkpoint.path is not None:  # else weights would have to be made to be hashed
+        quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
     plan = quantization.plan(checkpoint.config.model, tier)
     if not plan.scales:
         reasons = "; ".join(f"{len(names)} sites: {why}" for why, names in _by_reason(plan).items())
