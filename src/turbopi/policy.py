@@ -290,7 +290,7 @@ class UnifiedPolicy:
         if noise is not None:
             if seed is not None:
                 raise ObservationError("noise and seed were both given; give one of them")
-            return _checked_noise(noise, (batch, *shape))
+            return checked_noise(noise, (batch, *shape))
         if seed is None:
             return self._generator.standard_normal((batch, *shape), dtype=np.float32)
         seeds = [seed + row for row in range(batch)] if isinstance(seed, int | np.integer) else seed
@@ -300,7 +300,7 @@ class UnifiedPolicy:
         return np.stack([np.random.default_rng(one).standard_normal(shape, dtype=np.float32) for one in seeds])
 
 
-def _checked_noise(noise: Sequence[np.ndarray] | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def checked_noise(noise: Sequence[np.ndarray] | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     try:
         array = np.asarray(noise)
     except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a torch tensor that wants gradients

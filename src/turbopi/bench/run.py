@@ -66,11 +66,11 @@ class Plan:
             raise ConfigError("there is nothing to measure: name a backend and a precision")
         if self.quantization is not None and not set(self.precisions) & set(TIERS):
             raise ConfigError(f"a calibration was given, but none of the precisions is of FP8: {', '.join(TIERS)}")
+        named = [*self.backends, *self.beside]
         for precision in self.precisions:
-            named = [*self.backends, *self.beside]
             if precision in PRECISIONS and not any(precision in backends.precisions(name) for name in named):
                 raise ConfigError(f"none of {', '.join(named)} runs in {precision}")
-        for precision, name in itertools.product(self.precisions, [*self.backends, *self.beside]):
+        for precision, name in itertools.product(self.precisions, named):
             if len(self.precisions) == 1 or precision not in PRECISIONS or precision in backends.precisions(name):
                 backends.check(name, device, precision)
 

@@ -8,6 +8,7 @@ import base64
 import hashlib
 import json
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -310,12 +311,14 @@ def shapes_of(config: ModelConfig) -> dict[str, Any]:
     }
 
 
-def check_given(precision: str, quantization: Quantization | None) -> None:
+def check_given(precision: str, quantization: "str | Path | Quantization | None") -> None:
     """Raise ConfigError unless a calibration is given exactly where the precision needs one."""
-    if (precision in TIERS) != (quantization is not None):
+    if precision not in TIERS and quantization is not None:
+        raise ConfigError(f"precision {precision!r} takes no FP8 calibration; with one take {' or '.join(TIERS)}")
+    if precision in TIERS and quantization is None:
         raise ConfigError(
-            f"precision {precision!r} {'needs' if precision in TIERS else 'takes no'} FP8 calibration; "
-            "make one with `turbopi calibrate` and give it as `quantization`"
+            f"precision {precision!r} needs FP8 calibration; make one with `turbopi calibrate` and give it as "
+            "`quantization`"
         )
 
 
@@ -328,11 +331,9 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
     Hashes all weights, which takes some seconds at full size, unless their files were hashed before. Raises
     ConfigError if there is none, CalibrationError if it doesn't fit.
     """
-    if tier not in TIERS:
-        if given is not None:
-            raise ConfigError(f"precision {tier!r} takes no FP8 calibration; with one take {' or '.join(TIERS)}")
-        return None
     quantization = calibration_of(given, tier, checkpoint)
+    if quantization is None:
+        return None
     if checkpoint.path is None:  # so not yet
         quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
     for warning in quantization.warnings:
@@ -340,11 +341,14 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
     return quantization
 
 
-def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization:
-    """What `for_policy` takes for an FP8 tier, checked before any work: against the weights only if they are on disk.
+def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:
+    """What `for_policy` takes, checked before any work: against the weights only if they are on disk.
 
     Raises ConfigError too where it leaves no site at all in FP8: such a policy would be bfloat16 under FP8's name.
     """
+    if tier not in TIERS:
+        check_given(tier, given)
+        return None
     if given is None:
         beside = None if checkpoint.path is None else checkpoint.path / BESIDE
         if beside is None or not beside.is_file():
@@ -354,20 +358,14 @@ def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpo
             )
         given = beside
     quantization = given if isinstance(given, Quantization) else Quantization.load(given)
-    quantization.check_shapes(checkpoint.config.model)
-    if checkpoint.path is not None:  # else weights would have to be made to be hashed
+    if checkpoint.path is None:  # weights would have to be made to be hashed
+        quantization.check_shapes(checkpoint.config.model)
+    else:
         quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
     plan = quantization.plan(checkpoint.config.model, tier)
     if not plan.scales:
-        reasons = "; ".join(f"{len(names)} sites: {why}" for why, names in _by_reason(plan).items())
+        reasons = "; ".join(f"{count} sites: {why}" for why, count in Counter(plan.kept.values()).items())
         raise ConfigError(
             f"{quantization.source or 'the calibration'} leaves nothing in {tier} ({reasons}); take 'bf16'"
         )
     return quantization
-
-
-def _by_reason(plan: Plan) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
-    for name, why in plan.kept.items():
-        found.setdefault(why, []).append(name)
-    return found

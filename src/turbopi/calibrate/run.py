@@ -97,7 +97,8 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     }
     if source == RANDOM_NOISE:
         report["target_reached"] = None
-    twice = len({sample.sha256 for sample in held} & {sample.sha256 for sample in chosen})
+    hashes = report["observations"]
+    twice = len(set(hashes["held_out"].values()) & set(hashes["calibration"].values()))
     if twice:
         report["warnings"].append(
             f"{twice} of {len(held)} held-out observations were calibrated on, too: the same inputs"

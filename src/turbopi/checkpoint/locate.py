@@ -43,8 +43,8 @@ def locate(path: str | Path) -> Location:
     """
     folder = _local(path)
     if (folder / MANIFEST).is_file():  # openpi's params/ itself
-        named = next((one for one in (folder, folder.resolve()) if one.name == "params"), None)  # "." and links aren't
-        return Location("openpi_jax", folder if named is None else named.parent, folder)
+        named = folder if folder.name == "params" else folder.resolve()  # "." and links have other names
+        return Location("openpi_jax", named.parent if named.name == "params" else folder, folder)
     if (folder / "pretrained_model").is_dir():  # one step of LeRobot's training output
         folder = folder / "pretrained_model"
     _refuse_other_formats(folder)

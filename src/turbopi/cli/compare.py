@@ -12,6 +12,7 @@ from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.errors import ConfigError
 
 if TYPE_CHECKING:
+    from turbopi.checkpoint import Checkpoint
     from turbopi.evaluate.compare import Variant
     from turbopi.evaluate.results import Results
 
@@ -91,17 +92,17 @@ def _run_variants(
     options: EvalOptions, texts: list[str], checkpoint: str | None, simulator_name: str, out: Path, output: Output
 ) -> "tuple[list[Results], list[dict[str, float] | None]]":
     """Evaluate each way to run into a folder of its own, then ask the reference about what they met."""
+    from turbopi.evaluate.compare import Variant
     from turbopi.evaluate.visited import Visited, action_error
 
-    for text in texts:
-        parse_variant(text, options if options.steps else replace(options, steps=1))
+    parsed = [parse_variant(text, options) for text in texts]  # first: a mistyped folder is no way to run
     options.check(checkpoint)
-    if options.steps is None:
-        options = replace(options, steps=options.open(checkpoint).config.num_denoising_steps)
-    variants = [parse_variant(text, options) for text in texts]
+    opened = options.open(checkpoint)
+    own_steps = opened.config.num_denoising_steps
+    variants = [Variant(name, tier, own_steps if steps is None else steps) for name, tier, steps in parsed]
     if len(set(variants)) < len(variants):
         raise ConfigError(f"the same way to run is named twice in {' '.join(texts)}")
-    _check_variants(variants, options, checkpoint)
+    _check_variants(variants, options, opened)
     simulator = options.simulator(simulator_name, output)
     protocol = options.protocol(simulator, simulator_name)
     jobs = options.jobs(simulator, protocol.suite)
@@ -137,13 +138,13 @@ def _options_of(variant: "Variant", options: EvalOptions) -> EvalOptions:
     return own if variant.precision in TIERS else replace(own, quantization=None, fp8_parts=None)
 
 
-def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint: str | None) -> None:
+def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint: "Checkpoint") -> None:
     """Refuse what can't run before hours of what can."""
     from turbopi import backends
     from turbopi.calibrate.artifact import TIERS, calibration_of
     from turbopi.policy import checked_steps
 
-    device, opened = backends.resolve_device(options.device), options.open(checkpoint)
+    device = backends.resolve_device(options.device)
     tiers = [variant.precision for variant in variants if variant.precision in TIERS]
     for variant in variants:
         checked_steps(variant.steps, ConfigError)
@@ -151,22 +152,24 @@ def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint:
     if not tiers and (options.quantization is not None or options.fp8_parts is not None):
         raise ConfigError("--quantization and --fp8-parts are for ways to run in FP8, and none of these is")
     for tier in tiers:
-        calibration_of(options.policy_arguments()["quantization"], tier, opened)
+        calibration_of(options.policy_arguments()["quantization"], tier, checkpoint)
 
 
-def parse_variant(text: str, options: EvalOptions) -> "Variant":
-    """ "pytorch:bf16:5"; what is left out is --precision's and --steps'. Raises ConfigError for anything else."""
+def parse_variant(text: str, options: EvalOptions) -> tuple[str, str, int | None]:
+    """ "pytorch:bf16:5"; what is left out is --precision's and --steps', steps then None for the checkpoint's.
+
+    Raises ConfigError for anything else.
+    """
     from turbopi import backends
     from turbopi.backends import BACKENDS
-    from turbopi.evaluate.compare import Variant
 
     parts = text.split(":")
     backend = parts[0]
     precision = parts[1] if len(parts) > 1 else options.precision
-    steps = parts[2] if len(parts) > 2 else str(options.steps)
-    if backend not in BACKENDS or precision not in backends.PRECISIONS or not steps.isdigit() or len(parts) > 3:
+    known = backend in BACKENDS and precision in backends.PRECISIONS
+    if not known or len(parts) > 3 or not all(steps.isdigit() for steps in parts[2:]):
         raise ConfigError(
             f"{text!r} is neither the folder of an evaluation nor a way to run: BACKEND[:PRECISION[:STEPS]], "
             f"with a backend of {', '.join(BACKENDS)}, and {' or '.join(backends.PRECISIONS)}"
         )
-    return Variant(backend, precision, int(steps))
+    return backend, precision, int(parts[2]) if len(parts) > 2 else options.steps

@@ -1,9 +1,8 @@
 """`turbopi eval`."""
 
-import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -213,14 +212,14 @@ def evaluate_command(
     """
     output = Output(as_json)
     remote = host is not None or port is not None
-    if remote and (checkpoint is not None or options.random_weights is not None):
-        raise ConfigError("--host and --port name a server's policy; give no weights beside them")
     if remote:
+        if checkpoint is not None or options.random_weights is not None:
+            raise ConfigError("--host and --port name a server's policy; give no weights beside them")
         _refuse_policy_options(options)
+    else:
+        options.check(checkpoint)
     if options.out is not None:
         check_folder(options.out)
-    if not remote:
-        options.check(checkpoint)
     chosen = options.simulator(simulator, output)
     protocol = options.protocol(chosen, simulator)
     jobs = options.jobs(chosen, protocol.suite)
@@ -250,7 +249,7 @@ def _refuse_policy_options(options: EvalOptions) -> None:
     """A server's policy is as the server made it. Raises ConfigError for options that would say otherwise."""
     given = [
         f"--{field.name.replace('_', '-')}"
-        for field in dataclasses.fields(PolicyOptions)
+        for field in fields(PolicyOptions)
         if getattr(options, field.name) != field.default
     ]
     if given:

@@ -141,8 +141,11 @@ def _check_targets(source: Path, out: Path, drawing: Path | None) -> None:
 
 def _is_of(file: Path, source: Path) -> bool:
     """Whether a file is the observation, or one of a recording's, or one that a folder's observation.json names."""
-    if not source.is_dir() or file.resolve().parent != source.resolve():
-        return file.samefile(source) or file.resolve().is_relative_to(source.resolve())
+    if not source.is_dir():
+        return file.samefile(source)
+    place, folder = file.resolve(), source.resolve()
+    if place.parent != folder:  # of a recording's run, or a picture in a folder of its own
+        return place.is_relative_to(folder)
     described = source / "observation.json"
     if described.is_file():
         return file.name == described.name or file.name in described.read_text(encoding="utf-8", errors="replace")
@@ -171,12 +174,15 @@ def _noise(
     """Call i -> float32[H, action_dim]: the given noise for all, or what UnifiedPolicy draws for seed + i."""
     import numpy as np
 
+    from turbopi.policy import checked_noise
+
+    shape = (policy.config.model.action_horizon, policy.config.model.action_dim)
     if given is not None:
+        checked_noise([given], (1, *shape))  # now: it is no observation's fault
         return lambda number: given
     first = secrets.randbelow(2**31) if seed is None else seed
     if seed is None:
         output.line(f"noise: seed {first} (--seed {first} gives these actions again)")
-    shape = (policy.config.model.action_horizon, policy.config.model.action_dim)
     return lambda number: np.random.default_rng(first + number).standard_normal(shape, dtype=np.float32)
 
 
@@ -194,8 +200,6 @@ def _run(
             try:
                 result = policy.infer(observation, noise=noise)
             except ObservationError as error:
-                if str(error).startswith("noise "):
-                    raise
                 raise ObservationError(f"{source}: {error}") from error
             kept = observation if number < MAX_ROWS else None
             answers.append(_Answer(kept, noise, result["actions"], result["policy_timing"]))

@@ -17,7 +17,7 @@ import torch
 
 from turbopi import backends, demo
 from turbopi.bench.provenance import provenance
-from turbopi.calibrate.artifact import TIERS, Quantization, calibration_of, for_policy
+from turbopi.calibrate.artifact import Quantization, calibration_of
 from turbopi.calibrate.observations import inputs_bytes
 from turbopi.checkpoint import Checkpoint
 from turbopi.errors import BackendError, CheckpointError
@@ -55,11 +55,7 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
     backends.check(name, device, precision)
     rule = Rule.of(name, precision, plan.bound, plan.factor, trained=checkpoint.format != "random")
     check_observations(plan)
-    quantization = None
-    if precision in TIERS:
-        quantization = calibration_of(arguments.get("quantization"), precision, checkpoint)
-    elif arguments.get("quantization") is not None:
-        for_policy(arguments["quantization"], precision, checkpoint)  # says that it fits no such precision
+    quantization = calibration_of(arguments.get("quantization"), precision, checkpoint)
     if arguments.get("robot") is None:
         checkpoint = demo.with_libero_stats(checkpoint)
     arguments |= {"backend": name, "device": device, "quantization": None}  # of reference and control
@@ -187,9 +183,9 @@ class _Reference:
         digest, calibrated = hashlib.sha256(), 0
         known = {} if quantization is None else quantization.report["observations"].get("calibration", {})
         for sample in self.samples:
-            inputs = list(inputs_bytes(sample.inputs))
-            digest.update(b"".join(inputs))
-            calibrated += hashlib.sha256(b"".join(inputs)).hexdigest() in known.values()
+            inputs = b"".join(inputs_bytes(sample.inputs))
+            digest.update(inputs)
+            calibrated += hashlib.sha256(inputs).hexdigest() in known.values()
         return {
             "calibrated_on": None if quantization is None else calibrated,
             "path": None if plan.observations is None else str(plan.observations),

@@ -208,23 +208,21 @@ class PolicyServer:
         async def main() -> None:
             with stop_signals() as stop:  # from here on: a warm-up may take minutes
                 starting, stopped = asyncio.ensure_future(self.start()), asyncio.ensure_future(stop.wait())
-                await asyncio.wait((starting, stopped), return_when=asyncio.FIRST_COMPLETED)
-                early = not starting.done()
-                if early:
-                    on_stopping(self)
                 try:
-                    await starting
-                except BaseException:
-                    stopped.cancel()
-                    raise
-                try:
-                    if not early:
-                        on_ready(self)
-                        await stopped
+                    await asyncio.wait((starting, stopped), return_when=asyncio.FIRST_COMPLETED)
+                    early = not starting.done()
+                    if early:
                         on_stopping(self)
+                    await starting
+                    try:
+                        if not early:
+                            on_ready(self)
+                            await stopped
+                            on_stopping(self)
+                    finally:
+                        await self.stop()
                 finally:
                     stopped.cancel()
-                    await self.stop()
 
         asyncio.run(main())
 
