@@ -7,7 +7,9 @@
     ├── CalibrationError       an FP8 calibration that isn't one, or was made for others  (also a ValueError)
     ├── ObservationError       an observation the policy can't use                         (also a ValueError)
     ├── BackendError           a backend can't do what it was asked to
-    │   └── BackendUnavailable it can't run here at all; says why and what to do
+    │   ├── BackendUnavailable it can't run here at all; says why and what to do
+    │   └── DeviceLost         the GPU failed under it: no later call of this process can work
+    ├── ActionError            the model computed actions that no robot may be given: NaN, infinite
     ├── sim.base.SimulatorUnavailable      a simulator isn't installed or can't draw
     ├── evaluate.sources.PolicyLost        a policy server went away; the run can be continued
     ├── evaluate.sources.PolicyRefused     a policy doesn't fit the simulator
@@ -47,3 +49,11 @@ class BackendError(TurboPiError, RuntimeError):
 
 class BackendUnavailable(BackendError):
     """A backend can't run on this machine; the message says why and what to do."""
+
+
+class DeviceLost(BackendError):
+    """The device failed (a CUDA error that sticks to the process). Every later call fails: start the process again."""
+
+
+class ActionError(TurboPiError, ArithmeticError):
+    """The model computed an action chunk that no robot may be given: a number in it is NaN or infinite."""
