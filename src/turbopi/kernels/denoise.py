@@ -242,7 +242,7 @@ class DenoiseKernel:
             zero=0,
         )
         self._prepare.launch(self._tiles, 256, args)
-        self._kernel.launch(self._blocks, THREADS, args)
+        self._kernel.launch_cooperative(self._blocks, THREADS, args)  # clusters wait for one another
 
     def clock_mhz(self) -> float | None:
         """The multiprocessors' clock during the last launch that has ended, in MHz, which may be lower than what

@@ -11,8 +11,8 @@
 // the receiver: no cluster barriers). What crosses clusters are sums over heads or over hidden units, two exchanges a
 // layer between the CTAs of equal rank, and the suffix's keys and values. Those words go through L2 and carry their own
 // flag: the lowest bit of 32 tells its use of the buffer, so the reader asks for a word until that bit is right.
-// So all clusters must run at once. The host asks whether they fit on an idle GPU; work of other streams or processes
-// that never ends would leave them waiting (see `watch`), work that ends only delays them.
+// So all clusters must run at once. The launch is cooperative: the driver starts all of them or none, also where another
+// process uses the GPU at the same time. `watch` ends a launch that makes no progress for seconds all the same.
 //
 // Units: a "block" is 16 columns of a reduction axis, a "tile" 16 output rows, a "fragment" 512 bytes of a weight
 // matrix (operand A; tokens are operand B) as the tensor cores read it from shared memory: a tile x one block in

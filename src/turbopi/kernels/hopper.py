@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 import torch
 
-from turbopi.kernels.nvrtc import Kernel, bindings
+from turbopi.errors import BackendUnavailable
+from turbopi.kernels.nvrtc import Kernel, bindings, checked
 
 SHARED_BYTES = 227 * 1024
 
@@ -30,15 +31,19 @@ class DependentKernel(Kernel):
         clusters.value.clusterDim.x, clusters.value.clusterDim.y, clusters.value.clusterDim.z = cluster, 1, 1
         self._attributes = [dependent, clusters]
         self._threads = threads
-        status, self.max_clusters = d.cuOccupancyMaxActiveClusters(self._function, self._config(cluster))
-        assert int(status) == 0 and self.max_clusters > 0, f"no room for clusters of {cluster}: {status!r}"
+        self.max_clusters = self.max_active_clusters(cluster, threads)
+        if self.max_clusters == 0:
+            raise BackendUnavailable(
+                f"kernel {name!r} needs a cluster of {cluster} blocks of {threads} threads with {shared_bytes} bytes "
+                "of shared memory each, and the GPU has no room for one; does MPS or MIG limit this process?"
+            )
 
     def launch_dependent(self, blocks: int, arguments: tuple[Any, ...]) -> None:
         """Launch on PyTorch's current stream; `arguments` are ctypes values."""
         pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(value) for value in arguments))
         config = self._config(blocks)
-        (status,) = self._driver.cuLaunchKernelEx(config, self._function, ctypes.addressof(pointers), 0)
-        assert int(status) == 0, f"launch failed: {status!r}"
+        launched = self._driver.cuLaunchKernelEx(config, self._function, ctypes.addressof(pointers), 0)
+        checked("cuLaunchKernelEx", launched)
 
     def _config(self, blocks: int) -> Any:
         config = self._driver.CUlaunchConfig()
@@ -105,7 +110,7 @@ def tensor_map(
     size = 1 if fp8 else 2
     assert box[0] * size == 128, f"a box is 128 bytes wide, not {box[0] * size}"
     types = d.CUtensorMapDataType
-    status, encoded = d.cuTensorMapEncodeTiled(
+    encoded = d.cuTensorMapEncodeTiled(
         types.CU_TENSOR_MAP_DATA_TYPE_UINT8 if fp8 else types.CU_TENSOR_MAP_DATA_TYPE_BFLOAT16,
         len(sizes),
         address,
@@ -118,7 +123,7 @@ def tensor_map(
         d.CUtensorMapL2promotion.CU_TENSOR_MAP_L2_PROMOTION_L2_256B,
         d.CUtensorMapFloatOOBfill.CU_TENSOR_MAP_FLOAT_OOB_FILL_NONE,
     )
-    assert int(status) == 0, f"no tensor map for {sizes} at {address:#x}: {status!r}"
+    made = checked(f"cuTensorMapEncodeTiled for {sizes} at {address:#x}", encoded)
     result = _TensorMap()
-    ctypes.memmove(ctypes.addressof(result), encoded.getPtr(), 128)
+    ctypes.memmove(ctypes.addressof(result), made.getPtr(), 128)
     return result

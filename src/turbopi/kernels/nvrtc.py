@@ -38,7 +38,7 @@ def compile_cubin(
     Raises BackendError with the compiler's log.
     """
     nvrtc = bindings("nvrtc")
-    major, minor = _checked(nvrtc, nvrtc.nvrtcVersion())
+    major, minor = checked("nvrtcVersion", nvrtc.nvrtcVersion())
     options = [f"-arch={arch}", "-std=c++17", *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
     options += ["-lineinfo"] if lines else []
     key = hashlib.sha256("\0".join((source, *options, f"{major}.{minor}")).encode()).hexdigest()[:32]
@@ -55,14 +55,14 @@ def compile_cubin(
 
 
 def _compile(nvrtc: Any, source: str, options: list[str]) -> bytes:
-    program = _checked(nvrtc, nvrtc.nvrtcCreateProgram(source.encode(), b"kernel.cu", 0, [], []))
+    program = checked("nvrtcCreateProgram", nvrtc.nvrtcCreateProgram(source.encode(), b"kernel.cu", 0, [], []))
     (status,) = nvrtc.nvrtcCompileProgram(program, len(options), [option.encode() for option in options])
     if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
-        log = b" " * _checked(nvrtc, nvrtc.nvrtcGetProgramLogSize(program))
+        log = b" " * checked("nvrtcGetProgramLogSize", nvrtc.nvrtcGetProgramLogSize(program))
         nvrtc.nvrtcGetProgramLog(program, log)
         raise BackendError(f"a kernel doesn't compile with {' '.join(options)}:\n{log.decode().rstrip(chr(0))}")
-    code = b" " * _checked(nvrtc, nvrtc.nvrtcGetCUBINSize(program))
-    _checked(nvrtc, nvrtc.nvrtcGetCUBIN(program, code))
+    code = b" " * checked("nvrtcGetCUBINSize", nvrtc.nvrtcGetCUBINSize(program))
+    checked("nvrtcGetCUBIN", nvrtc.nvrtcGetCUBIN(program, code))
     nvrtc.nvrtcDestroyProgram(program)
     return code
 
@@ -73,11 +73,11 @@ class Kernel:
     def __init__(self, cubin: bytes, name: str, shared_bytes: int) -> None:
         self._driver = bindings("driver")
         d = self._driver
-        self._module = _checked(d, d.cuModuleLoadData(cubin))
-        self._function = _checked(d, d.cuModuleGetFunction(self._module, name.encode()))
+        self._module = checked("cuModuleLoadData", d.cuModuleLoadData(cubin))
+        self._function = checked("cuModuleGetFunction", d.cuModuleGetFunction(self._module, name.encode()))
         self._shared = shared_bytes
         attribute = d.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
-        _checked(d, d.cuFuncSetAttribute(self._function, attribute, shared_bytes))
+        checked("cuFuncSetAttribute", d.cuFuncSetAttribute(self._function, attribute, shared_bytes))
 
     def max_active_clusters(self, ranks: int, threads: int) -> int:
         """How many clusters of `ranks` blocks the device holds at once."""
@@ -90,32 +90,39 @@ class Kernel:
         config.blockDimX, config.blockDimY, config.blockDimZ = threads, 1, 1
         config.sharedMemBytes = self._shared
         config.attrs, config.numAttrs = [attribute], 1
-        return int(_checked(d, d.cuOccupancyMaxActiveClusters(self._function, config)))
+        return int(checked("cuOccupancyMaxActiveClusters", d.cuOccupancyMaxActiveClusters(self._function, config)))
 
     def launch(self, blocks: int, threads: int, args: ctypes.Structure) -> None:
         """Launch on PyTorch's current stream; `args` is the kernel's one parameter."""
-        d = self._driver
-        pointers = (ctypes.c_void_p * 1)(ctypes.addressof(args))
+        d, pointers = self._driver, (ctypes.c_void_p * 1)(ctypes.addressof(args))
         stream = torch.cuda.current_stream().cuda_stream
         result = d.cuLaunchKernel(
             self._function, blocks, 1, 1, threads, 1, 1, self._shared, stream, ctypes.addressof(pointers), 0
         )
-        _checked(d, result)
+        checked("cuLaunchKernel", result)
 
     def launch_cooperative(self, blocks: int, threads: int, args: ctypes.Structure) -> None:
-        """Launch on PyTorch's current stream, all blocks resident at once; `args` is the kernel's one parameter."""
-        d = self._driver
-        pointers = (ctypes.c_void_p * 1)(ctypes.addressof(args))
+        """Launch on PyTorch's current stream, all blocks resident at once; `args` is the kernel's one parameter.
+
+        The driver starts all blocks together or none: a kernel whose blocks wait for one another can't hang half
+        started. Raises BackendUnavailable if they don't fit on what this process may use of the GPU.
+        """
+        d, pointers = self._driver, (ctypes.c_void_p * 1)(ctypes.addressof(args))
         stream = torch.cuda.current_stream().cuda_stream
         result = d.cuLaunchCooperativeKernel(
             self._function, blocks, 1, 1, threads, 1, 1, self._shared, stream, ctypes.addressof(pointers)
         )
-        _checked(d, result)
+        if result[0] == d.CUresult.CUDA_ERROR_COOPERATIVE_LAUNCH_TOO_LARGE:
+            raise BackendUnavailable(
+                f"a kernel needs {blocks} blocks of {threads} threads on the GPU at once, and they don't fit; if MPS "
+                "limits this process to a part of the GPU, give it more (CUDA_MPS_ACTIVE_THREAD_PERCENTAGE)"
+            )
+        checked("cuLaunchCooperativeKernel", result)
 
 
-def _checked(module: Any, result: tuple[Any, ...]) -> Any:
-    """The value(s) behind the status of a driver or NVRTC call, which must be 0."""
+def checked(call: str, result: tuple[Any, ...]) -> Any:
+    """The value(s) behind the status that `call`, of the driver or NVRTC, returned. BackendError unless that is 0."""
     status, *values = result
     if int(status) != 0:
-        raise BackendError(f"{module.__name__.rpartition('.')[2]} call failed: {status!r}")
+        raise BackendError(f"{call} failed: {getattr(status, 'name', status)}")
     return values[0] if len(values) == 1 else tuple(values)
