@@ -127,8 +127,8 @@ def test_more_blocks_than_the_gpu_holds_are_refused_and_cost_nothing_else() -> N
     device = torch.device("cuda", 0)
     properties = torch.cuda.get_device_properties(device)
     cubin = nvrtc.compile_cubin(barrier.SOURCE, f"sm_{properties.major}{properties.minor}", {})
+    counter = torch.zeros(1, dtype=torch.int32, device=device)  # before the kernel, which is loaded into its context
     kernel = nvrtc.Kernel(cubin, "turbopi_barriers", 0)
-    counter = torch.zeros(1, dtype=torch.int32, device=device)
     args = barrier._Args(counter.data_ptr(), 3)
     with pytest.raises(BackendUnavailable, match="at once"):
         kernel.launch_cooperative(100 * properties.multi_processor_count, barrier.THREADS, args)
