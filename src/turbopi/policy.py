@@ -12,6 +12,7 @@ import torch
 
 from turbopi import backends
 from turbopi.backends import Tier
+from turbopi.backends.lost import Guard
 from turbopi.calibrate.artifact import Quantization, for_policy
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.config import PolicyConfig
@@ -102,6 +103,7 @@ class UnifiedPolicy:
         )
         self._generator = np.random.default_rng()
         self._lock = threading.Lock()
+        self._guard = Guard(self._device)
         self._backend_reason = why
         self._checkpoint = checkpoint
 
@@ -128,7 +130,8 @@ class UnifiedPolicy:
         backend with `begin` starts on the pictures: then `infer_ms` begins there, and tokenising, beside it, is in it;
         `prefix_ms` is from vision's end, so time in which the device waits for the host is in that.
 
-        Raises ObservationError for anything wrong with the arguments, naming it.
+        Raises ObservationError for anything wrong with the arguments, naming it, and DeviceLost once the GPU has failed
+        for good (`lost`).
         """
         return self.infer_batch([obs], noise=None if noise is None else [noise], seed=seed, num_steps=num_steps)[0]
 
@@ -146,12 +149,13 @@ class UnifiedPolicy:
         number, or one for each row.
         """
         start = time.perf_counter()
+        self._guard.refuse_if_lost()
         if not observations:
             raise ObservationError("infer_batch was given no observation")
         steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
         if len(observations) == 1 and hasattr(self.backend, "begin"):
             seen = self._pipeline.see(observations[0])
-            with self._lock:
+            with self._lock, self._guard:
                 infer_start = time.perf_counter()
                 begun: backends.Begun = self.backend.begin(seen.pictures)
                 self._pipeline.read(seen)  # while the device is at the pictures
@@ -164,7 +168,7 @@ class UnifiedPolicy:
             inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
             states = [state for _, state in prepared]
             noises = torch.from_numpy(self._noise(len(observations), noise, seed))
-            with self._lock:
+            with self._lock, self._guard:
                 infer_start = time.perf_counter()
                 sample = self.backend.sample(inputs, noises, steps)
                 infer_end = time.perf_counter()
@@ -205,16 +209,22 @@ class UnifiedPolicy:
             done.set_result(self.infer(obs, noise=noise, seed=seed, num_steps=num_steps))
             return done
         start = time.perf_counter()
+        self._guard.refuse_if_lost()
         steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
         inputs, state = self._pipeline.before(obs)
         x_1 = torch.from_numpy(self._noise(1, None if noise is None else [noise], seed))
         infer_start = time.perf_counter()
-        running: Future[backends.Sample] = self.backend.submit(Observation.stack([inputs]), x_1, steps)
+        with self._guard:
+            running: Future[backends.Sample] = self.backend.submit(Observation.stack([inputs]), x_1, steps)
         answer: Future[dict[str, Any]] = Future()
 
         def finish(ran: "Future[backends.Sample]") -> None:
             try:
-                sample = ran.result()
+                try:
+                    sample = ran.result()
+                except Exception as error:
+                    self._guard.examine(error)
+                    raise
                 infer_end = time.perf_counter()
                 result = self._pipeline.after(sample.actions.numpy()[0], state)
                 timing = {
@@ -236,7 +246,7 @@ class UnifiedPolicy:
         start = time.perf_counter()
         example = self.example_observation()
         steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
-        with self._lock:
+        with self._lock, self._guard:
             self.backend.warmup(Observation.stack([self._pipeline.before(example)[0]]), steps)
         self.infer(example, seed=0, num_steps=steps)
         return time.perf_counter() - start
@@ -248,6 +258,15 @@ class UnifiedPolicy:
     def example_observation(self, seed: int = 0) -> dict[str, Any]:
         """A random observation in this robot's keys, shapes and dtypes."""
         return self._pipeline.example(seed)
+
+    @property
+    def lost(self) -> str | None:
+        """Why the GPU failed for good, and with it this process; None while it works.
+
+        Found out by the call that fails: it and all later ones raise DeviceLost with this reason, the later ones
+        without touching the GPU. Out of memory isn't such a failure.
+        """
+        return self._guard.lost
 
     @property
     def pipelined(self) -> bool:

@@ -254,7 +254,7 @@ class CudaGraphBackend:
         return call, graph
 
     def _explain(self, error: RuntimeError) -> None:
-        """A subclass that knows why the GPU failed raises a BackendError that says so."""
+        """A subclass that knows why the GPU failed for good raises a DeviceLost that says so."""
 
     def _graph(self, of: CallShape | Pictures, part: str) -> Graph:
         """The "vision" of pictures; of a shape the "answer" behind it, or its "prefix" or "denoise" alone.

@@ -16,13 +16,14 @@ from torch import Tensor
 
 from turbopi.backends.base import LoadState, Tier
 from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, _bucket
+from turbopi.backends.lost import ADVICE
 from turbopi.calibrate.artifact import TIERS, Quantization, check_given
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape, Denoiser
 from turbopi.engine.fp8 import Directions, Fp8Matrix, Matrix
 from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights, pack
-from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.errors import BackendUnavailable, DeviceLost
 
 if TYPE_CHECKING:
     from turbopi.kernels.denoise import DenoiseKernel
@@ -184,9 +185,8 @@ class FusedBackend(CudaGraphBackend):
     def _explain(self, error: RuntimeError) -> None:
         for kernel in self._denoisers.values():
             if (why := kernel.why_it_trapped()) is not None:
-                raise BackendError(
-                    f"{why}. This process can't use the GPU any more: start it again, and free the GPU of other "
-                    "work; if that doesn't help, use backend 'cuda_graph'"
+                raise DeviceLost(
+                    f"{why}; {ADVICE}, and free the GPU of other work; if that doesn't help, use backend 'cuda_graph'"
                 ) from error
 
     def _put_expert_away(self) -> None:
