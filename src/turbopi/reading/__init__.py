@@ -1,0 +1,38 @@
+"""Reading files that others wrote: JSON and NumPy arrays.
+
+A file may be damaged, made by another program, or hostile. Whatever is wrong with it becomes one line: an error of the
+caller's class that names the file, the key, the value and what was expected. Before anything is built from a file, its
+size, its depth and the sizes that it claims are checked, so that it costs neither gigabytes nor minutes.
+
+    content = read_json(file)                        an object, or CheckpointError
+    fields = Fields(content, file)                   its values, one by one, checked
+    horizon = fields.integer("action_horizon", 1, 1024)
+    arrays = read_npz(file)                          name -> array
+    noise = read_npy(file)
+
+An .npz is checked by its CRC-32, so damage to its numbers is found. Neither an .npy nor a JSON file has a checksum: a
+flipped digit in one that still reads well stays unnoticed.
+"""
+
+from turbopi.reading.arrays import MAX_ARRAY_BYTES, Npz, read_npy, read_npz
+from turbopi.reading.fields import Fields, is_finite, is_integer
+from turbopi.reading.files import file_inside, open_file, read_bytes, shown
+from turbopi.reading.json import MAX_JSON_BYTES, MAX_JSON_DEPTH, parse_json, read_json
+
+__all__ = [
+    "MAX_ARRAY_BYTES",
+    "MAX_JSON_BYTES",
+    "MAX_JSON_DEPTH",
+    "Fields",
+    "Npz",
+    "file_inside",
+    "is_finite",
+    "is_integer",
+    "open_file",
+    "parse_json",
+    "read_bytes",
+    "read_json",
+    "read_npy",
+    "read_npz",
+    "shown",
+]

@@ -1,0 +1,67 @@
+"""Opening files that may be anything, and showing values that may be anything."""
+
+import os
+import re
+import reprlib
+import stat
+from pathlib import Path
+from typing import IO, Any
+
+from turbopi.errors import CheckpointError, TurboPiError
+
+Error = type[TurboPiError]
+
+
+class _Short(reprlib.Repr):
+    """`repr` that stays on one line, stays short, and costs little, however large the value."""
+
+    maxstring = maxother = 80
+    maxlevel = 3
+
+    def repr_bytes(self, value: bytes, level: int) -> str:
+        return repr(value) if len(value) <= 40 else f"{value[:40]!r}…"
+
+    def repr_int(self, value: int, level: int) -> str:
+        return repr(value) if abs(value) < 10**40 else f"a whole number of {value.bit_length()} bits"
+
+
+shown = _Short().repr
+
+
+def read_bytes(file: str | Path, error: Error = CheckpointError, *, limit: int, hint: str = "") -> bytes:
+    """The content of a file of at most `limit` bytes; `hint` is put behind the reason for which it can't be read."""
+    try:
+        with open_file(file, error, hint=hint) as stream:
+            data = stream.read(limit + 1)
+    except OSError as reason:
+        raise error(f"{file} can't be read: {reason.strerror or reason}{hint}") from reason
+    if len(data) > limit:
+        raise error(f"{file} has more than {limit} bytes, the most that is read of a file of its kind")
+    return data
+
+
+def open_file(file: str | Path, error: Error = CheckpointError, *, hint: str = "") -> IO[bytes]:
+    """An existing regular file, opened to read bytes; nothing that could block, such as a named pipe, is opened."""
+    try:
+        if stat.S_ISREG(os.stat(file).st_mode):
+            return open(file, "rb")
+        kind = "a folder" if os.path.isdir(file) else "no regular file"
+    except (OSError, ValueError) as reason:  # ValueError: a name with a NUL in it
+        what = reason.strerror if isinstance(reason, OSError) else reason
+        name = file if str(file).isprintable() and len(str(file)) < 500 else shown(str(file))
+        raise error(f"{name} can't be read: {what}{hint}") from reason
+    raise error(f"{file} can't be read: it is {kind}{hint}")
+
+
+def file_inside(folder: Path, name: Any, where: object, error: Error = CheckpointError) -> Path:
+    """The file `name` in `folder` or below it, as a text in `where` names it; it needn't exist.
+
+    Raises `error` for what is no name, is absolute, or leads out of the folder by "..". Links are followed: whoever
+    owns the folder made them.
+    """
+    if not isinstance(name, str) or not name or not name.isprintable():
+        raise error(f"{where} names the file {shown(name)}; expected the name of a file in {folder}")
+    path = Path(name)
+    if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:|\\", name):
+        raise error(f"{where} names the file {shown(name)}, which leads out of {folder}; expected one in that folder")
+    return folder / path
