@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from checkpoint_helpers import GOLDEN, edit_json, edit_tensors, lerobot_copy, lerobot_statistics, write_json
+from safetensors.torch import load_file
 
 from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
 from turbopi.config import PRESETS, GemmaConfig, Normalization, VisionConfig
@@ -215,6 +216,17 @@ def test_a_base_model_without_statistics_is_never_a_silent_identity(tmp_path: Pa
         open_checkpoint(folder)
     write_json(folder / "turbopi.json", {"normalization": {"state": "identity", "actions": "lerobot_quantile"}})
     assert open_checkpoint(folder).norm_stats.state is None
+
+
+def test_the_embedding_is_read_where_the_head_differs(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    head = load_file(folder / "model.safetensors")["model.paligemma_with_expert.paligemma.lm_head.weight"]
+    name = "model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
+    edit_tensors(folder, **{name.replace(".", "__"): head + 1})
+    assert torch.equal(open_checkpoint(folder).load("cpu", "f32").state["vlm.embed_tokens.weight"], (head + 1).float())
+    edit_tensors(folder, **{name.replace(".", "__"): head.double()})
+    with pytest.raises(CheckpointError, match="tied in the model but differ"):
+        open_checkpoint(folder)
 
 
 def test_missing_files_are_named(tmp_path: Path) -> None:

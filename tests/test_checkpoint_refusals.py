@@ -8,8 +8,9 @@ import torch
 from checkpoint_helpers import GOLDEN, Tree, edit_tensors, jax_copy, read_tree, torch_copy, write_json, write_tree
 from safetensors.torch import load_file
 
-from turbopi.checkpoint import open_checkpoint
+from turbopi.checkpoint import convert, open_checkpoint
 from turbopi.errors import CheckpointError
+from turbopi.model.reference import Precision
 
 V = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 
@@ -198,3 +199,61 @@ def test_a_tree_with_another_root_is_refused(tmp_path: Path) -> None:
     params = write_tree(tmp_path / "c" / "params", {"a": np.zeros(2, np.float32)}, root="opt_state.")
     with pytest.raises(CheckpointError, match=f"{params} holds opt_state.a; expected arrays below the root `params`"):
         open_checkpoint(tmp_path / "c", "pi05_libero")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("precision", ["f32", "bf16"])
+def test_a_value_that_is_no_number_is_found_at_loading(tmp_path: Path, value: float, precision: Precision) -> None:
+    folder = torch_copy(tmp_path / "copy")
+    weight = load_file(folder / "model.safetensors")["action_out_proj.weight"]
+    weight[3, 5] = value
+    edit_tensors(folder, action_out_proj__weight=weight)
+    checkpoint = open_checkpoint(folder)
+    found = (
+        rf"/copy: 1 of {weight.numel()} values of action_out_proj.weight are NaN or infinite \(the first is {value}\)"
+    )
+    with pytest.raises(CheckpointError, match=found + ".*take an earlier checkpoint"):
+        checkpoint.load("cpu", precision)
+    with pytest.raises(CheckpointError, match=found):
+        convert(folder, tmp_path / "converted", precision=precision)
+    assert not (tmp_path / "converted").exists()
+
+
+def test_infinities_that_cancel_are_found(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "copy")
+    bias = torch.tensor([float("inf"), -float("inf")] + 30 * [0.0])
+    edit_tensors(folder, action_out_proj__bias=bias)
+    with pytest.raises(CheckpointError, match=r"2 of 32 values of action_out_proj.bias are NaN or infinite"):
+        open_checkpoint(folder).load("cpu", "f32")
+
+
+def test_what_a_precision_makes_infinite_is_found(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "copy")
+    name = "paligemma_with_expert.gemma_expert.model.layers.0.mlp.up_proj.weight"
+    weight = load_file(folder / "model.safetensors")[name].float()
+    weight[:, :2] = 3.4028e38
+    edit_tensors(folder, **{name.replace(".", "__"): weight})
+    loaded = open_checkpoint(folder).load("cpu", "f32").state["expert.layers.0.mlp.up_proj.weight"]
+    assert loaded.isfinite().all() and not loaded.sum().isfinite()
+    with pytest.raises(CheckpointError, match=rf"{2 * len(weight)} of {weight.numel()} values of {name}"):
+        open_checkpoint(folder).load("cpu", "bf16")
+
+
+def test_a_value_that_is_no_number_is_found_in_openpis_jax_format(tmp_path: Path, tree: Tree) -> None:
+    tree["action_out_proj/kernel"] = tree["action_out_proj/kernel"].copy()
+    tree["action_out_proj/kernel"][0, 0] = np.nan
+    folder = jax_copy(tmp_path / "copy", tree)
+    with pytest.raises(CheckpointError, match=r"values of .*action_out_proj.* are NaN or infinite"):
+        open_checkpoint(folder, "pi05_libero").load("cpu", "f32")
+
+
+@pytest.mark.parametrize(
+    "name", ["../other.safetensors", "/etc/passwd", "sub/a.safetensors", "..", "a\\b.safetensors", "a.bin"]
+)
+def test_an_index_names_files_of_its_own_folder_alone(tmp_path: Path, name: str) -> None:
+    folder = torch_copy(tmp_path / "copy")
+    (folder / "model.safetensors").rename(tmp_path / "other.safetensors")
+    write_json(folder / "model.safetensors.index.json", {"weight_map": {"time_mlp_in.bias": name}})
+    with pytest.raises(CheckpointError, match=r"expected plain names of .safetensors files beside it") as told:
+        open_checkpoint(folder)
+    assert name in str(told.value)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from turbopi.checkpoint import known_hashes
 from turbopi.checkpoint.norm_stats import NormStats
-from turbopi.checkpoint.source import Piece, WeightSource
+from turbopi.checkpoint.source import Piece, WeightSource, check_finite
 from turbopi.config import PolicyConfig
 from turbopi.model.reference import Precision, parameter_dtype
 
@@ -54,19 +54,24 @@ class Checkpoint:
         """Read all weights straight into their final dtype and device, a piece at a time.
 
         Host memory besides the result stays small: safetensors are mapped, Orbax arrays decoded one chunk at a time.
+        Raises CheckpointError if a value is NaN or infinite, as it is stored or in that precision.
         """
         device = torch.device(device)
         began = time.perf_counter()
         shapes = self.source.shapes
         state: dict[str, Tensor] = {}
+        sums: list[Tensor] = []  # of the pieces: one is finite only if all of its values are
         with progress_bar(progress, f"loading {self.format}", self.stored_bytes) as advance:
             for piece in self.source.pieces(device):
                 if piece.name not in state:
                     dtype = parameter_dtype(piece.name, precision)
                     state[piece.name] = torch.empty(shapes[piece.name], dtype=dtype, device=device)
-                put(state[piece.name], piece)
+                sums.append(put(state[piece.name], piece).sum())
                 advance.update(piece.values.numel() * piece.values.element_size())
         assert state.keys() == shapes.keys(), state.keys() ^ shapes.keys()
+        if not all(torch.stack(sums).isfinite().tolist()):  # a sum may also have overflowed
+            for name, tensor in state.items():
+                check_finite(tensor, self.source.native_name(name), self.path)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
@@ -136,15 +141,13 @@ class Checkpoint:
         }
 
 
-def put(target: Tensor, piece: Piece) -> None:
-    """Copy a piece into its place, rounding to the target's dtype."""
+def put(target: Tensor, piece: Piece) -> Tensor:
+    """Copy a piece into its place, rounding to the target's dtype. That place."""
     values = piece.values
     if not values.is_contiguous() and values.dtype != target.dtype:
         values = values.to(target.dtype)  # torch transposes within one dtype much faster than across two
-    if values.ndim:
-        target[piece.start : piece.start + values.shape[0]].copy_(values)
-    else:
-        target.copy_(values)
+    place = target[piece.start : piece.start + values.shape[0]] if values.ndim else target
+    return place.copy_(values)
 
 
 def describe_weights(source: WeightSource) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import struct
 from dataclasses import asdict, dataclass, fields
 from math import prod
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 
@@ -30,7 +30,7 @@ from turbopi.checkpoint.opening import open_checkpoint
 from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.checkpoint.settings import FILE_NAME as SETTINGS
 from turbopi.checkpoint.settings import ConfigSource, Settings, parse_values, policy_config
-from turbopi.checkpoint.source import Piece, Shape
+from turbopi.checkpoint.source import Shape, check_finite
 from turbopi.checkpoint.torch_files import WEIGHTS
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
@@ -117,7 +117,11 @@ def _write_weights(checkpoint: Checkpoint, file: Path, precision: Precision, pro
         out.write(header)
         out.truncate(len(header) + size)
         for piece in checkpoint.source.pieces(torch.device("cpu")):
-            _write_piece(out, slots[to_openpi(piece.name)], piece, dtype)
+            values = piece.values.to(dtype).contiguous()
+            check_finite(values, checkpoint.source.native_name(piece.name), checkpoint.path)
+            slot = slots[to_openpi(piece.name)]
+            out.seek(slot.offset + piece.start * slot.row_bytes)
+            out.write(values.reshape(-1).view(torch.uint8).numpy().data)
             advance.update(piece.values.numel() * piece.values.element_size())
         out.flush()
         os.fsync(out.fileno())
@@ -136,12 +140,6 @@ def _header(shapes: dict[str, Shape], stored: str, itemsize: int) -> tuple[bytes
     header = struct.pack("<Q", len(text)) + text
     slots = {name: _Slot(len(header) + start, prod(shapes[name][1:]) * itemsize) for name, start in spans.items()}
     return header, slots, end
-
-
-def _write_piece(out: BinaryIO, slot: _Slot, piece: Piece, dtype: torch.dtype) -> None:
-    values = piece.values.to(dtype).contiguous()
-    out.seek(slot.offset + piece.start * slot.row_bytes)
-    out.write(values.reshape(-1).view(torch.uint8).numpy().data)
 
 
 # -- what goes beside them ---------------------------------------------------------------------------------------------

@@ -77,6 +77,18 @@ def check_tensors(source: WeightSource, expected: Mapping[str, Shape], path: Pat
         raise CheckpointError(f"{path}: the weights don't fit the model: " + "; ".join(problems) + adapter_hint(extra))
 
 
+def check_finite(values: Tensor, name: str, path: Path | None) -> None:
+    """CheckpointError if one of `values` is NaN or infinite. `name` is what the checkpoint calls them."""
+    if values.sum().isfinite() or values.isfinite().all():  # the first takes a thirtieth of the second's time
+        return
+    odd = values.flatten()[~values.isfinite().flatten()]
+    raise CheckpointError(
+        f"{path}: {odd.numel()} of {values.numel()} values of {name} are NaN or infinite (the first is "
+        f"{odd[0].item()}): no action computed from them would be one. The training diverged or the file is damaged: "
+        "take an earlier checkpoint, or copy this one anew"
+    )
+
+
 def adapter_hint(names: Sequence[str]) -> str:
     """What to do when leftover names look like adapters that were never merged."""
     if any("lora" in name.lower() or "base_layer" in name for name in names):

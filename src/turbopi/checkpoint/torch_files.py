@@ -1,6 +1,7 @@
 """openpi's PyTorch layout and LeRobot's: safetensors, memory-mapped, tensor by tensor."""
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,17 +80,22 @@ class TorchSource:
                 yield Piece(name, start, values[start:stop])
 
     def _tied(self, heads: dict[str, _Stored], folder: Path) -> _Stored:
-        """openpi ties the prompt embedding to the head: one of them is stored, or both with equal values."""
-        stored = next(iter(heads.values()))
+        """openpi ties the prompt embedding to the head: one of them is stored, or both with equal values.
+
+        LeRobot (from 0.5) trains both, untied, and computes with the embedding alone.
+        """
         if len(heads) == 1:
-            return stored
-        a, b = heads.values()
-        if a.shape != b.shape or a.dtype != b.dtype or not _equal(_read(a), _read(b)):
+            return next(iter(heads.values()))
+        head, embedding = heads[TIED_HEAD], heads[TIED_EMBEDDING]
+        alike = head.shape == embedding.shape and head.dtype == embedding.dtype
+        # LeRobot loads the file's tensors in its order, sorted by dtype, then name; each of the two ends up as the
+        # embedding, the last one for good
+        if not alike or not (self.format == "lerobot" or _equal(_read(head), _read(embedding))):
             raise CheckpointError(
-                f"{folder}: {a.key} and {b.key} are tied in the model but differ in the file, so it's unclear which "
-                "one the model was trained with. Remove the wrong one from the file"
+                f"{folder}: {head.key} and {embedding.key} are tied in the model but differ in the file, so it's "
+                "unclear which one the model was trained with. Remove the wrong one from the file"
             )
-        return stored
+        return embedding
 
 
 def _weight_files(folder: Path) -> list[Path]:
@@ -99,8 +105,14 @@ def _weight_files(folder: Path) -> list[Path]:
     try:
         weight_map: dict[str, Any] = json.loads(index.read_text())["weight_map"]
         names = sorted(set(weight_map.values()))
+        odd = [name for name in names if not re.fullmatch(r"[^/\\]+\.safetensors", name)]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise CheckpointError(f"{index} isn't a safetensors index: {error!r}") from error
+    if odd:
+        raise CheckpointError(
+            f"{index} names {listing(odd)}; expected plain names of .safetensors files beside it. Weights are read "
+            "from that folder alone"
+        )
     absent = [name for name in names if not (folder / name).is_file()]
     if absent:
         raise CheckpointError(f"{index} lists files that aren't there: {listing(absent)}; the download is incomplete")
