@@ -5,6 +5,7 @@ import torch
 
 from turbopi import backends
 from turbopi.backends.fused import FusedBackend
+from turbopi.errors import BackendUnavailable
 
 GPU = torch.device("cuda", 0)
 
@@ -55,3 +56,24 @@ def test_fused_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, package: st
     monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/gcc")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name.startswith(package) else object())
     assert reason in str(FusedBackend.unavailable(GPU))
+
+
+@pytest.mark.parametrize(
+    ("capability", "missing", "says", "doesnt_say"),
+    [
+        ((9, 0), "cuda", "cuda.bindings, which isn't installed; `pip install cuda-python`", "9.0"),
+        ((9, 0), "triton", "Triton, which isn't installed", "9.0"),
+        ((8, 9), "cuda", "written for compute capability 9.0, this GPU has 8.9", "cuda.bindings"),
+        ((8, 6), None, "have no FP8: that begins with 8.9, this GPU has 8.6", "9.0"),
+    ],
+)
+def test_fp8_names_what_is_truly_missing(
+    monkeypatch: pytest.MonkeyPatch, capability: tuple[int, int], missing: str | None, says: str, doesnt_say: str
+) -> None:
+    found = lambda name: None if missing and name.startswith(missing) else object()  # noqa: E731
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/gcc")
+    monkeypatch.setattr("importlib.util.find_spec", found)
+    with pytest.raises(BackendUnavailable) as refused:
+        backends.check("fused", GPU, "fp8")
+    assert says in str(refused.value) and doesnt_say not in str(refused.value)

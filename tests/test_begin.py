@@ -99,7 +99,7 @@ def test_actions_are_the_references(policy: UnifiedPolicy, reference: UnifiedPol
         np.testing.assert_allclose(result["actions"], expected, rtol=0, atol=2e-5)
         timing = result["policy_timing"]
         assert {"vision_ms", "prefix_ms", "denoise_ms"} <= timing.keys()
-        parts = timing["preprocess_ms"] + timing["infer_ms"] + timing["postprocess_ms"]
+        parts = timing["preprocess_ms"] + timing["queue_ms"] + timing["infer_ms"] + timing["postprocess_ms"]
         assert parts == pytest.approx(timing["total_ms"], rel=1e-6)
 
 

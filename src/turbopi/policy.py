@@ -1,5 +1,6 @@
 """The whole policy on one screen: preprocess → backend → postprocess."""
 
+import logging
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -16,12 +17,14 @@ from turbopi.backends.lost import Guard
 from turbopi.calibrate.artifact import Quantization, for_policy
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.config import PolicyConfig
-from turbopi.errors import ConfigError, ObservationError
+from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.model.reference import Precision
 from turbopi.observation import ModelInputs, Observation
 from turbopi.preprocess import Pipeline
 from turbopi.robots import Robot
 from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
+
+logger = logging.getLogger(__name__)
 
 MAX_STEPS = 1000  # far beyond any use; a larger number is a mistake, not a wish
 
@@ -124,14 +127,20 @@ class UnifiedPolicy:
             seed: draws the noise from `numpy.random.default_rng(seed)`; neither: fresh noise every call.
             num_steps: denoising steps for this call alone.
 
-        Returns {"actions": float64[H, d], "policy_timing": {...}} in milliseconds: `infer_ms` is the model alone, from
-        inputs on the host to actions on the host, as openpi counts; `total_ms` the whole call; `preprocess_ms`,
-        `vision_ms`, `prefix_ms`, `denoise_ms`, `postprocess_ms` its stages, where the backend can tell them apart. A
-        backend with `begin` starts on the pictures: then `infer_ms` begins there, and tokenising, beside it, is in it;
-        `prefix_ms` is from vision's end, so time in which the device waits for the host is in that.
+        Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
 
-        Raises ObservationError for anything wrong with the arguments, naming it, and DeviceLost once the GPU has failed
-        for good (`lost`).
+            preprocess_ms    reading, resizing, tokenising, up to the model
+            queue_ms         waiting for calls of other threads
+            infer_ms         the model alone, from inputs on the host to actions on the host, as openpi counts. With a
+                             backend that starts on the pictures (`begin`), tokenising runs beside it and is in it
+            vision_ms, prefix_ms, denoise_ms
+                             stages of infer_ms on the device, where the backend can tell them apart. prefix_ms begins
+                             where vision ends: time in which the device waits for the host is in it
+            postprocess_ms   un-normalising and the robot's own outputs
+            total_ms         preprocess_ms + queue_ms + infer_ms + postprocess_ms: the whole call
+
+        Raises ObservationError for anything wrong with the arguments, naming it; ActionError if an action is NaN or
+        infinite; DeviceLost once the GPU has failed for good (`lost`).
         """
         return self.infer_batch([obs], noise=None if noise is None else [noise], seed=seed, num_steps=num_steps)[0]
 
@@ -155,6 +164,7 @@ class UnifiedPolicy:
         steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
         if len(observations) == 1 and hasattr(self.backend, "begin"):
             seen = self._pipeline.see(observations[0])
+            asked = time.perf_counter()
             with self._lock, self._guard:
                 infer_start = time.perf_counter()
                 begun: backends.Begun = self.backend.begin(seen.pictures)
@@ -168,21 +178,14 @@ class UnifiedPolicy:
             inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
             states = [state for _, state in prepared]
             noises = torch.from_numpy(self._noise(len(observations), noise, seed))
+            asked = time.perf_counter()
             with self._lock, self._guard:
                 infer_start = time.perf_counter()
                 sample = self.backend.sample(inputs, noises, steps)
                 infer_end = time.perf_counter()
 
-        actions = sample.actions.numpy()
-        results = [self._pipeline.after(chunk, state) for chunk, state in zip(actions, states, strict=True)]
-        end = time.perf_counter()
-        timing = {
-            "infer_ms": (infer_end - infer_start) * 1e3,
-            "preprocess_ms": (infer_start - start) * 1e3,
-            **{f"{stage}_ms": milliseconds for stage, milliseconds in sample.stage_ms.items()},
-            "postprocess_ms": (end - infer_end) * 1e3,
-            "total_ms": (end - start) * 1e3,
-        }
+        results = self._results(sample, states)
+        timing = _timing(sample, start, asked, infer_start, infer_end, time.perf_counter())
         return [result | {"policy_timing": dict(timing)} for result in results]
 
     def submit(
@@ -213,7 +216,7 @@ class UnifiedPolicy:
         steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
         inputs, state = self._pipeline.before(obs)
         x_1 = torch.from_numpy(self._noise(1, None if noise is None else [noise], seed))
-        infer_start = time.perf_counter()
+        asked = time.perf_counter()
         with self._guard:
             running: Future[backends.Sample] = self.backend.submit(Observation.stack([inputs]), x_1, steps)
         answer: Future[dict[str, Any]] = Future()
@@ -226,14 +229,9 @@ class UnifiedPolicy:
                     self._guard.examine(error)
                     raise
                 infer_end = time.perf_counter()
-                result = self._pipeline.after(sample.actions.numpy()[0], state)
-                timing = {
-                    "infer_ms": (infer_end - infer_start) * 1e3,
-                    "preprocess_ms": (infer_start - start) * 1e3,
-                    **{f"{stage}_ms": milliseconds for stage, milliseconds in sample.stage_ms.items()},
-                    "postprocess_ms": (time.perf_counter() - infer_end) * 1e3,
-                    "total_ms": (time.perf_counter() - start) * 1e3,
-                }
+                result = self._results(sample, [state])[0]
+                infer_start = asked + sample.queue_ms / 1e3
+                timing = _timing(sample, start, asked, infer_start, infer_end, time.perf_counter())
                 answer.set_result(result | {"policy_timing": timing})
             except BaseException as error:
                 answer.set_exception(error)
@@ -248,7 +246,10 @@ class UnifiedPolicy:
         steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
         with self._lock, self._guard:
             self.backend.warmup(Observation.stack([self._pipeline.before(example)[0]]), steps)
-        self.infer(example, seed=0, num_steps=steps)
+        try:
+            self.infer(example, seed=0, num_steps=steps)
+        except ActionError as error:  # of a random observation: whether the weights are at fault, real ones show
+            logger.warning("warm-up: %s", error)
         return time.perf_counter() - start
 
     def prepare(self, obs: Mapping[str, Any]) -> ModelInputs:
@@ -301,6 +302,18 @@ class UnifiedPolicy:
             **self._pipeline.metadata,
         }
 
+    def _results(self, sample: backends.Sample, states: Sequence[np.ndarray]) -> list[dict[str, Any]]:
+        """The robot's actions of each row. An ActionError names the row, if there are several."""
+        chunks, results = sample.actions.numpy(), []
+        for row, (chunk, state) in enumerate(zip(chunks, states, strict=True)):
+            try:
+                results.append(self._pipeline.after(chunk, state))
+            except ActionError as error:
+                if len(states) == 1:
+                    raise
+                raise ActionError(f"observation {row} of {len(states)} (from 0): {error}") from None
+        return results
+
     def _noise(
         self, batch: int, noise: Sequence[np.ndarray] | np.ndarray | None, seed: int | Sequence[int] | None
     ) -> np.ndarray:
@@ -317,6 +330,20 @@ class UnifiedPolicy:
         if not whole or len(seeds) != batch:
             raise ObservationError(f"seed {seed!r} should be a whole number from 0, or one for each of {batch} rows")
         return np.stack([np.random.default_rng(one).standard_normal(shape, dtype=np.float32) for one in seeds])
+
+
+def _timing(
+    sample: backends.Sample, start: float, asked: float, infer_start: float, infer_end: float, end: float
+) -> dict[str, float]:
+    """`policy_timing` of a call's times in seconds: see `infer`."""
+    return {
+        "infer_ms": (infer_end - infer_start) * 1e3,
+        "preprocess_ms": (asked - start) * 1e3,
+        "queue_ms": (infer_start - asked) * 1e3,
+        **{f"{stage}_ms": milliseconds for stage, milliseconds in sample.stage_ms.items()},
+        "postprocess_ms": (end - infer_end) * 1e3,
+        "total_ms": (end - start) * 1e3,
+    }
 
 
 def checked_noise(noise: Sequence[np.ndarray] | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

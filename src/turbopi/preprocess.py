@@ -13,7 +13,7 @@ import numpy as np
 
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.config import CAMERAS, PolicyConfig
-from turbopi.errors import ConfigError, ObservationError
+from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.images import check_hwc, resize_into, resize_unit_into, to_uint8
 from turbopi.normalize import Normalizer, absolute_actions, pad_last
 from turbopi.observation import ModelInputs
@@ -127,16 +127,33 @@ class Pipeline:
             step(one)
 
     def after(self, model_actions: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
-        """{"actions": float64[H, d]} in the robot's units.
+        """{"actions": float64[H, d]} in the robot's units, all finite.
 
         model_actions  float32[H, action_dim]
         state          as `before` returned it
+
+        Raises ActionError if any of the model's numbers, also of dimensions that the robot doesn't have, or any of the
+        robot's is NaN or infinite.
         """
         assert model_actions.shape[1:] == (self.config.model.action_dim,), model_actions.shape
+        if not np.isfinite(model_actions).all():
+            raise ActionError(
+                f"{_first_not_finite(model_actions, 'the model computed')}. Look at the checkpoint's weights "
+                "(`turbopi inspect`) and, in FP8, at its calibration: `turbopi verify` compares this backend with the "
+                "float32 reference"
+            )
         result = _Result(model_actions, state)
-        for step in self.after_model:
-            step(result)
-        return {"actions": np.array(result.actions, np.float64)}
+        with np.errstate(over="ignore", invalid="ignore"):  # refused below
+            for step in self.after_model:
+                step(result)
+            actions = np.array(result.actions, np.float64)
+        if not np.isfinite(actions).all():
+            raise ActionError(
+                f"{_first_not_finite(actions, f'un-normalised, robot {self.robot.name} gets')}, though the model's "
+                "numbers are finite. Look at the checkpoint's statistics of actions, and of the state if actions are "
+                "relative to it, and at the robot's `outputs`"
+            )
+        return {"actions": actions}
 
     def example(self, seed: int = 0) -> dict[str, Any]:
         """A random valid observation in the robot's own keys; the same for the same seed."""
@@ -257,3 +274,14 @@ class Pipeline:
                     f"robot {robot.name} has {width} values of {name}, but the statistics cover {scale.width}; "
                     f"are they this robot's?"
                 )
+
+
+def _first_not_finite(actions: np.ndarray, who: str) -> str:
+    """What an ActionError says of actions [H, d] that aren't all finite."""
+    places = np.argwhere(~np.isfinite(actions))
+    first = tuple(int(axis) for axis in places[0])
+    where = f"row {first[0]}, column {first[1]}" if len(first) == 2 else f"place {list(first)}"
+    return (
+        f"{who} actions that no robot may be given: {len(places)} of {actions.size} numbers aren't finite, the first "
+        f"one, {actions[first]}, in {where} (both from 0)"
+    )

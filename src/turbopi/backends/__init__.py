@@ -154,17 +154,17 @@ def check(name: str, device: torch.device, precision: Tier) -> None:
     cls = _backend_class(name)
     if precision not in cls.precisions:
         raise ConfigError(f"backend {name!r} runs in {' or '.join(cls.precisions)}, not in {precision!r}")
-    reason = cls.unavailable(device)
-    if reason is not None:
-        if precision in TIERS:
+    reason, what = cls.unavailable(device), "run"
+    if precision in TIERS:
+        if reason is not None and device.type != "cuda":
             reason = (
                 f"{precision} needs an NVIDIA GPU of compute capability 9.0; take precision 'bf16', or to judge FP8 "
                 "without such a GPU backend 'emulated_fp8'"
             )
-        raise BackendUnavailable(f"backend {name!r} can't run on {device}: {reason}")
-    reason = cls.unavailable_in(device, precision) if precision in TIERS else None  # type: ignore[attr-defined]
+        elif (other_gpu := cls.unavailable_in(device, precision)) is not None:  # type: ignore[attr-defined]
+            reason, what = other_gpu, f"run in {precision}"  # before what a package would mend
     if reason is not None:
-        raise BackendUnavailable(f"backend {name!r} can't run in {precision} on {device}: {reason}")
+        raise BackendUnavailable(f"backend {name!r} can't {what} on {device}: {reason}")
 
 
 def create(

@@ -7,6 +7,7 @@ replay); the latency of a single observation is no better, and is worse while tw
 """
 
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
@@ -65,10 +66,12 @@ class TensorRTPipelinedBackend(TensorRTBackend):
         if observation.batch_size != 1:
             raise BackendError(f"submit takes one observation at a time, not {observation.batch_size}")
         row = self._row(observation, 0)
+        asked = time.perf_counter()
         with self._submitting:
             shape = self._shape(len(row.images), len(row.tokens), noise.shape[1])
             slot, buffers = self._slots[self._next], self._next
             slot.free.acquire()
+            queue_ms = (time.perf_counter() - asked) * 1e3
             try:
                 key = CallKey(shape, num_steps, row.images.dtype == np.float32, buffers)
                 encode, denoise = self._captured(key)
@@ -81,7 +84,8 @@ class TensorRTPipelinedBackend(TensorRTBackend):
             self._next = (self._next + 1) % BUFFERS
 
         def collect() -> Sample:
-            return Sample(call.actions.clone()[None], {**_ends(encode.stage_ms()), **denoise.stage_ms()})
+            stage_ms = {**_ends(encode.stage_ms()), **denoise.stage_ms()}
+            return Sample(call.actions.clone()[None], stage_ms, queue_ms)
 
         future: Future[Sample] = Future()
         self._collect(_Job(wait, collect, future, slot))

@@ -77,7 +77,7 @@ def _one_call(policy: UnifiedPolicy, observation: dict[str, Any], job: Job) -> t
         end = max((e.time_range.end for e in kernels), default=0.0)
     else:
         call = next(e for e in events if e.name == _CALL)
-        begin = call.time_range.start + timing["preprocess_ms"] * 1e3
+        begin = call.time_range.start + (timing["preprocess_ms"] + timing["queue_ms"]) * 1e3
         ran = [Ran(e.name, e.time_range.start, e.self_cpu_time_total) for e in events if e.name != _CALL]
         ran = [one for one in ran if one.start_us >= begin]
         end = begin + sum(timing.get(f"{stage}_ms", 0.0) for stage in STAGES) * 1e3

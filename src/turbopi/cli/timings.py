@@ -5,6 +5,7 @@ from collections.abc import Mapping
 # `model` is openpi's infer_ms: the stages between, from inputs on the host to actions on the host
 _COLUMNS = {
     "preprocess": "preprocess_ms",
+    "queue": "queue_ms",
     "vision": "vision_ms",
     "prefix": "prefix_ms",
     "denoise": "denoise_ms",
