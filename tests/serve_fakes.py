@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ObservationError
+from turbopi.errors import ActionError, DeviceLost, ObservationError
 
 OBSERVATION = {
     "observation/image": np.arange(12, dtype=np.uint8).reshape(2, 2, 3),
@@ -60,6 +60,10 @@ class FakePolicy:
             assert self.release.wait(30)
         if prompt == "crash":
             raise RuntimeError("CUDA error: an illegal memory access was encountered")
+        if prompt == "nan actions":
+            raise ActionError("the actions hold nan at [0, 3]")
+        if prompt.endswith("lost"):
+            raise DeviceLost("CUDA error: an illegal memory access was encountered")
         if prompt == "stop iteration":
             next(iter(()))
         if prompt == "exit":

@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
@@ -16,21 +17,23 @@ from typing import Any
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from serve_fakes import FakePolicy, http_get, observation
+from serve_fakes import FakePolicy, PipelinedFakePolicy, http_get, observation
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidStatus
 
-from turbopi.errors import ConfigError
+from turbopi.errors import ConfigError, DeviceLost
 from turbopi.serve import PolicyServer, running
 from turbopi.serve.record import iter_recording
 from turbopi.serve.wire import pack, unpack
 
 
-def served(test: Callable[..., Awaitable[None]], **options: Any) -> None:
+def served(
+    test: Callable[..., Awaitable[None]], *, policy_class: type[FakePolicy] = FakePolicy, **options: Any
+) -> None:
     """Run `test(server, policy)` beside a server on a free port."""
 
     async def main() -> None:
-        policy = FakePolicy()
+        policy = policy_class()
         try:
             async with PolicyServer(policy, port=0, **options) as server:
                 try:
@@ -334,6 +337,71 @@ def test_a_failing_policy_sends_its_traceback_closes_1011_and_the_server_goes_on
             assert metric(server, "turbopi_errors_total", kind="policy") == 1
 
     served(test)
+
+
+@pytest.mark.parametrize("policy_class", [FakePolicy, PipelinedFakePolicy])
+def test_actions_that_no_robot_may_get_are_a_text_frame_and_the_connection_stays(
+    policy_class: type[FakePolicy],
+) -> None:
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with client(server) as connection:
+            assert await refused(connection, pack(observation("nan actions"))) == (
+                "bad actions: the actions hold nan at [0, 3]"
+            )
+            assert (await infer(connection, observation("after")))["prompt"] == "after"
+            assert metric(server, "turbopi_errors_total", kind="actions") == 1
+            assert metric(server, "turbopi_errors_total", kind="policy") == 0
+
+    served(test, policy_class=policy_class)
+
+
+@pytest.mark.parametrize("policy_class", [FakePolicy, PipelinedFakePolicy])
+def test_once_the_device_is_lost_every_request_is_refused_with_the_reason(policy_class: type[FakePolicy]) -> None:
+    lost = "the device is lost: CUDA error: an illegal memory access was encountered"
+
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with client(server) as first, client(server) as other:
+            assert server.lost is None
+            assert await refused(first, pack(observation("lost"))) == lost
+            assert server.lost == "CUDA error: an illegal memory access was encountered"
+            for connection in (first, other):
+                assert await refused(connection, pack(observation("after"))) == lost
+            assert policy.seen == ["lost"]
+            assert metric(server, "turbopi_errors_total", kind="lost") == 3
+
+    served(test, policy_class=policy_class)
+
+
+def test_a_device_that_is_lost_is_noticed_though_its_client_left() -> None:
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with client(server) as connection:
+            await connection.send(pack(observation("hold lost")))
+            await eventually(policy.started.is_set)
+        await eventually(lambda: metric(server, "turbopi_clients") == 0)
+        policy.release.set()
+        await eventually(lambda: server.lost is not None)
+
+    served(test)
+
+
+def test_serving_for_ever_ends_with_the_reason_when_the_device_is_lost() -> None:
+    def crash(server: PolicyServer) -> None:
+        async def call() -> None:
+            async with client(server) as connection:
+                await refused(connection, pack(observation("lost")))
+                with pytest.raises(ConnectionClosed) as closed:
+                    await connection.recv()
+                assert closed.value.rcvd is not None
+                assert closed.value.rcvd.code == 1001
+
+        threads.append(threading.Thread(target=lambda: asyncio.run(call())))
+        threads[0].start()
+
+    threads: list[threading.Thread] = []
+    with pytest.raises(DeviceLost, match="an illegal memory access"):
+        PolicyServer(FakePolicy(), port=0).serve_forever(on_ready=crash)
+    threads[0].join(30)
+    assert not threads[0].is_alive()
 
 
 # --- health, pings, metrics -------------------------------------------------------------------------------------------

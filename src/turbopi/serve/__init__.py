@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from turbopi.serve.launch import run
-    from turbopi.serve.server import Policy, PolicyServer, running
+    from turbopi.serve.calls import Policy
+    from turbopi.serve.server import PolicyServer, running
 
 __all__ = ["Policy", "PolicyServer", "run", "running"]
 
-_MODULES = {"run": "launch", "Policy": "server", "PolicyServer": "server", "running": "server"}
+_MODULES = {"run": "launch", "Policy": "calls", "PolicyServer": "server", "running": "server"}
 
 
 def __getattr__(name: str) -> Any:

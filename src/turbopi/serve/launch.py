@@ -5,7 +5,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from turbopi.serve.server import Policy, PolicyServer
+from turbopi.serve.calls import Policy
+from turbopi.serve.server import PolicyServer
 
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 

@@ -7,7 +7,8 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 
-# Kinds of `turbopi_errors_total`. The first six are the client's, "policy" is ours, the last two are nobody's.
+# Kinds of `turbopi_errors_total`. The first six are the client's; "policy", "actions" and "lost" are ours; the last two
+# are nobody's.
 ERROR_KINDS = (
     "malformed",
     "observation",
@@ -16,6 +17,8 @@ ERROR_KINDS = (
     "unauthorized",
     "origin",
     "policy",
+    "actions",
+    "lost",
     "disconnected",
     "stopping",
 )

@@ -21,15 +21,15 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
-from turbopi.errors import ConfigError, ObservationError
+from turbopi.errors import ConfigError, DeviceLost
+from turbopi.serve.calls import Outcome, Policy, PolicyCalls
 from turbopi.serve.gate import Gate, check_key
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.record import Recorder
@@ -42,30 +42,12 @@ logger = logging.getLogger(__name__)
 _protocol_logger = logging.getLogger(f"{__name__}.protocol")
 _protocol_logger.setLevel(logging.CRITICAL)
 
+_REFUSALS = {
+    "observation": "bad observation: {}",
+    "actions": "bad actions: {}",
+    "lost": "the device is lost: {}",
+}
 MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
-
-
-class Policy(Protocol):
-    """What can be served. `warmup()` is called once before the first client, if there is one.
-
-    With a true `pipelined`, requests go to `submit(obs)` instead, which returns a Future of what `infer` returns: the
-    next request is handed over while the one before it is still computed.
-    """
-
-    @property
-    def metadata(self) -> dict[str, Any]: ...
-
-    def infer(self, obs: dict[str, Any], /) -> dict[str, Any]: ...
-
-
-@dataclass(frozen=True)
-class _Outcome:
-    """What became of one call of the policy: a `result`, a `refusal` (the client's fault) or a `failure` (ours)."""
-
-    seconds: float
-    result: dict[str, Any] | None = None
-    refusal: str | None = None
-    failure: str | None = None
 
 
 class _ClientGone(Exception):
@@ -114,12 +96,13 @@ class PolicyServer:
         self.host, self.port = host, port
         self.metrics = Metrics()
         self._policy = policy
-        self._pipelined = bool(getattr(policy, "pipelined", False))
         self._gate = Gate(api_key, self.metrics)
         self._max_bytes = int(max_message_mb * 2**20)
         self._record_dir = None if record_dir is None else Path(record_dir)
         self._recorder: Recorder | None = None
         self._worker = Worker(queue_limit)
+        self._calls = PolicyCalls(policy, self._worker, self.metrics, on_lost=self._lose)
+        self._lost: Future[str] = Future()  # set from the worker's thread
         self.metrics.watch(lambda: self._worker.waiting, lambda: self._worker.running)
         self._server: Server | None = None
         self._idle: set[ServerConnection] = set()  # connections that wait for a request
@@ -132,6 +115,16 @@ class PolicyServer:
     def url(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"ws://{host}:{self.port}"
+
+    @property
+    def lost(self) -> str | None:
+        """Why no request can be served any more: the device failed for good. None as long as it works."""
+        return self._lost.result() if self._lost.done() else None
+
+    def _lose(self, reason: str) -> None:
+        if not self._lost.done():
+            logger.error("the device is lost, and every request is refused from here on: %s", reason)
+            self._lost.set_result(reason)
 
     @property
     def recording(self) -> Path | None:
@@ -162,9 +155,7 @@ class PolicyServer:
             raise ConfigError(f"can't listen on {self.url}: {error}. Choose another --host or --port.") from error
         try:
             self.port = self._server.sockets[0].getsockname()[1]
-            warmup = getattr(self._policy, "warmup", None)
-            if warmup is not None:
-                await self._worker.call(lambda _: warmup(), None)
+            await self._calls.warm_up()
             metadata = self._policy.metadata
             self._greeting = pack(metadata)
             if self._record_dir is not None:
@@ -202,7 +193,8 @@ class PolicyServer:
     ) -> None:
         """Serve until SIGINT or SIGTERM, then stop gracefully. A second signal kills the process.
 
-        `on_ready` is called once clients can connect, `on_stopping` when the first signal has come.
+        `on_ready` is called once clients can connect, `on_stopping` when the first signal has come. Raises DeviceLost,
+        once it has stopped, when the device has failed for good: a supervisor can start the process again.
         """
 
         async def main() -> None:
@@ -217,14 +209,18 @@ class PolicyServer:
                     try:
                         if not early:
                             on_ready(self)
-                            await stopped
-                            on_stopping(self)
+                            lost = asyncio.wrap_future(self._lost)
+                            await asyncio.wait((stopped, lost), return_when=asyncio.FIRST_COMPLETED)
+                            if not lost.done():
+                                on_stopping(self)
                     finally:
                         await self.stop()
                 finally:
                     stopped.cancel()
 
         asyncio.run(main())
+        if self.lost is not None:
+            raise DeviceLost(self.lost)
 
     # --- the protocol -------------------------------------------------------------------------------------------------
 
@@ -291,6 +287,8 @@ class PolicyServer:
 
         Raises _PolicyFailed and _ClientGone.
         """
+        if self.lost is not None:
+            return self._refuse("lost", _REFUSALS["lost"].format(self.lost))
         try:
             outcome = await self._infer(connection, _decode(message, self._max_bytes))
         except WireError as error:
@@ -300,10 +298,10 @@ class PolicyServer:
             return self._refuse("busy", f"busy: {limit} requests wait already (--queue-limit {limit}); try again")
         except Stopping:
             return self._refuse("stopping", "the server is shutting down")
-        if outcome.refusal is not None:
-            return self._refuse("observation", f"bad observation: {outcome.refusal}")
-        if outcome.failure is not None:
-            raise _PolicyFailed(outcome.failure)
+        if outcome.wrong == "policy":
+            raise _PolicyFailed(outcome.text)
+        if outcome.wrong is not None:
+            return self._refuse(outcome.wrong, _REFUSALS[outcome.wrong].format(outcome.text))
         assert outcome.result is not None
         timing = {"infer_ms": outcome.seconds * 1e3}
         if previous_total is not None:
@@ -316,20 +314,9 @@ class PolicyServer:
         logger.warning("%s", "".join(c if c.isprintable() else repr(c)[1:-1] for c in text))  # it may quote a client
         return text
 
-    async def _infer(self, connection: ServerConnection, observation: dict[str, Any]) -> _Outcome:
+    async def _infer(self, connection: ServerConnection, observation: dict[str, Any]) -> Outcome:
         """Run the policy when it is this request's turn, unless the client leaves first."""
-        asked = time.perf_counter()
-
-        def call(observation: dict[str, Any]) -> _Outcome:
-            self.metrics.queue_seconds.observe(time.perf_counter() - asked)
-            return self._call_policy(observation)
-
-        def submit(observation: dict[str, Any]) -> Future[_Outcome]:
-            self.metrics.queue_seconds.observe(time.perf_counter() - asked)
-            return self._submit_to_policy(observation)
-
-        turn = self._worker.begin(submit, observation) if self._pipelined else self._worker.call(call, observation)
-        work = asyncio.ensure_future(turn)
+        work = asyncio.ensure_future(self._calls.run(observation))
         gone = asyncio.ensure_future(connection.wait_closed())
         try:
             await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
@@ -339,37 +326,6 @@ class PolicyServer:
         finally:
             gone.cancel()
             work.cancel()
-
-    def _call_policy(self, observation: dict[str, Any]) -> _Outcome:
-        """Call the policy, on the worker's thread."""
-        return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation))
-
-    def _submit_to_policy(self, observation: dict[str, Any]) -> "Future[_Outcome]":
-        """Hand the observation to a pipelined policy, on the worker's thread. The Future never holds an exception."""
-        started = time.perf_counter()
-        outcome: Future[_Outcome] = Future()
-        try:
-            answer: Future[dict[str, Any]] = self._policy.submit(observation)  # type: ignore[attr-defined]
-        except BaseException as error:
-            answer = Future()
-            answer.set_exception(error)
-        answer.add_done_callback(lambda done: outcome.set_result(self._outcome(started, done.result)))
-        return outcome
-
-    def _outcome(self, started: float, get: Callable[[], dict[str, Any]]) -> _Outcome:
-        """What `get` returns or raises. Never raises: an exception couldn't tell whose fault it is."""
-        try:
-            result = get()
-            if not isinstance(result, dict) or "actions" not in result:
-                raise TypeError(f'the policy\'s result must be a dict with "actions", not {type(result).__name__}')
-            return _Outcome(time.perf_counter() - started, result=result)
-        except ObservationError as error:
-            return _Outcome(time.perf_counter() - started, refusal=str(error))
-        except BaseException:  # sys.exit() in a policy mustn't end the server either
-            logger.exception("the policy failed")
-            return _Outcome(time.perf_counter() - started, failure=traceback.format_exc())
-        finally:
-            self.metrics.inference_seconds.observe(time.perf_counter() - started)
 
 
 def _decode(message: str | bytes, max_bytes: int) -> dict[str, Any]:
