@@ -1,5 +1,15 @@
-"""`python -m turbopi` is `turbopi`."""
+"""`python -m turbopi` and the console script `turbopi`."""
 
-from turbopi.cli import main
+import os
 
-main()
+
+def main() -> None:
+    try:
+        from turbopi.cli import main as run
+    except KeyboardInterrupt:  # the import takes a while, too
+        os._exit(130)
+    run()
+
+
+if __name__ == "__main__":
+    main()

@@ -27,6 +27,7 @@ from turbopi.cli import (  # noqa: F401
     backends,
     doctor,
 )
+from turbopi.cli import process
 from turbopi.cli.framework import app
 # isort: on
 
@@ -43,7 +44,8 @@ def _show_version(wanted: bool) -> None:
 
 
 @app.callback(
-    epilog="[bold]Exit codes[/]: 0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of Turbo-Pi's own."
+    epilog="[bold]Exit codes[/]: 0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of Turbo-Pi's own, "
+    "4 the GPU failed for good, 130 Ctrl-C, 141 the output's reader has left."
 )
 def _root(
     version: Annotated[
@@ -57,4 +59,4 @@ def _root(
 
 
 def main() -> None:
-    app(prog_name="turbopi")
+    process.run(lambda: app(prog_name="turbopi"))

@@ -1,9 +1,11 @@
 """What every command shares: how it is declared, where its output goes, and how it fails.
 
-Exit codes: 0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of Turbo-Pi's own, 130 Ctrl-C.
+Exit codes: 0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of Turbo-Pi's own, 4 the GPU failed for
+good, 130 Ctrl-C, 141 whoever read the output has left.
 Nothing here or at the top of a command's module imports torch, so that `turbopi --help` answers at once.
 """
 
+import contextlib
 import errno
 import functools
 import inspect
@@ -15,6 +17,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,9 +28,10 @@ from rich.markup import escape
 from rich.table import Table
 from typer.core import TyperCommand
 
-from turbopi.errors import TurboPiError
+from turbopi.cli.process import BAD_INPUT, INTERRUPTED, OUTPUT_CLOSED, can_encode_all, forget_output, is_closed_pipe
+from turbopi.errors import DeviceLost, TurboPiError
 
-CHECK_FAILED, BAD_INPUT, OUR_FAULT, INTERRUPTED = 1, 2, 3, 130
+CHECK_FAILED, OUR_FAULT, DEVICE_LOST = 1, 3, 4
 PLAIN_WIDTH = 140  # columns of tables where there is no terminal
 
 app = typer.Typer(
@@ -68,7 +72,8 @@ class Output:
     def document(self, content: Mapping[str, Any]) -> None:
         """The JSON document, if one was asked for."""
         if self.as_json:
-            sys.stdout.write(json.dumps(plain(content), indent=1, ensure_ascii=False) + "\n")
+            text = json.dumps(plain(content), indent=1, ensure_ascii=not can_encode_all(sys.stdout))
+            print(text, flush=True)
 
     @property
     def shows_progress(self) -> bool:
@@ -154,14 +159,17 @@ def _epilog(examples: Sequence[str]) -> str:
 def with_errors_told(work: Callable[[], None], *, debug: bool) -> None:
     """Run a command; an error becomes one red line on stderr and an exit code, and only our faults a traceback."""
     rich.reconfigure(stderr=True)  # progress bars of the library use rich's own console
-    _log_to_stderr()
+    log_to_stderr()
     try:
         work()
-    except (typer.Exit, typer.Abort, BrokenPipeError):
+    except (typer.Exit, typer.Abort):
         raise
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and (is_closed_pipe(sys.stdout) or is_closed_pipe(sys.stderr)):
+            forget_output()
+            raise typer.Exit(OUTPUT_CLOSED) from None
         message = _users_message(error)
         if debug or message is None:
             traceback.print_exc()
@@ -169,7 +177,13 @@ def with_errors_told(work: Callable[[], None], *, debug: bool) -> None:
             message = f"this is a fault of Turbo-Pi's own ({type(error).__name__}); please report it with the traceback"
         console = new_console(stderr=True)
         console.print(f"[bold red]error:[/] {escape(message)}", highlight=False, soft_wrap=True)
-        raise typer.Exit(OUR_FAULT if _users_message(error) is None else BAD_INPUT) from None
+        raise typer.Exit(_exit_code(error)) from None
+
+
+def _exit_code(error: Exception) -> int:
+    if isinstance(error, DeviceLost):
+        return DEVICE_LOST
+    return OUR_FAULT if _users_message(error) is None else BAD_INPUT
 
 
 def _users_message(error: Exception) -> str | None:
@@ -192,16 +206,29 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 class _StderrHandler(logging.Handler):
-    """Log records as short lines on whatever sys.stderr is when they come."""
+    """Log records as short lines on whatever sys.stderr is when they come; `stamped`: each begins with its time."""
+
+    stamped = False
 
     def emit(self, record: logging.LogRecord) -> None:
+        time = f"{_iso(record.created)} " if self.stamped else ""
         level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
-        print(f"{level}{record.getMessage()}", file=sys.stderr, flush=True)
-        if record.exc_info:
-            traceback.print_exception(*record.exc_info, file=sys.stderr)
+        with contextlib.suppress(OSError, ValueError):  # whoever read the log has left: no reason to stop working
+            print(f"{time}{level}{record.getMessage()}", file=sys.stderr, flush=True)
+            if record.exc_info:
+                traceback.print_exception(*record.exc_info, file=sys.stderr)
 
 
-def _log_to_stderr() -> None:
+def _iso(seconds: float) -> str:
+    """2026-01-31T09:30:00.123+01:00"""
+    return datetime.fromtimestamp(seconds).astimezone().isoformat(timespec="milliseconds")
+
+
+def log_to_stderr(*, stamped: bool = False) -> None:
+    """Show the library's log on stderr. `stamped`: with the time, for commands that run for days."""
     logger = logging.getLogger("turbopi")
-    if not any(isinstance(handler, _StderrHandler) for handler in logger.handlers):
-        logger.addHandler(_StderrHandler())
+    found = [handler for handler in logger.handlers if isinstance(handler, _StderrHandler)]
+    if not found:
+        found = [_StderrHandler()]
+        logger.addHandler(found[0])
+    found[0].stamped = stamped

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from turbopi.cli.framework import Output
+from turbopi.cli.process import interrupts_end_at_once
 from turbopi.config import PRESETS
 from turbopi.errors import ConfigError
 
@@ -75,12 +76,13 @@ class WeightOptions:
     def open(self, checkpoint: str | None) -> "Checkpoint":
         """The checkpoint that the user means. Raises ConfigError unless exactly one is named."""
         self.check(checkpoint)
-        from turbopi.checkpoint import open_checkpoint, random_checkpoint
+        with interrupts_end_at_once():
+            from turbopi.checkpoint import open_checkpoint, random_checkpoint
 
-        if self.random_weights is not None:
-            return random_checkpoint(self.random_weights, self.weights_seed or 0)
-        assert checkpoint is not None
-        return open_checkpoint(checkpoint, "auto" if self.config is None else self.config)
+            if self.random_weights is not None:
+                return random_checkpoint(self.random_weights, self.weights_seed or 0)
+            assert checkpoint is not None
+            return open_checkpoint(checkpoint, "auto" if self.config is None else self.config)
 
     def split(self, command: str, paths: Sequence[str], other: str) -> tuple[str | None, str]:
         """`[CHECKPOINT] OTHER` as it was typed: the checkpoint, if there should be one, and the other path."""
@@ -208,11 +210,12 @@ class PolicyOptions(WeightOptions):
 
     def make_policy(self, checkpoint: "Checkpoint", output: Output) -> "UnifiedPolicy":
         """The policy, with what it is printed."""
-        from turbopi.policy import UnifiedPolicy
+        with interrupts_end_at_once():
+            from turbopi.policy import UnifiedPolicy
 
-        if checkpoint.stored_bytes > SHOW_LOADING_BYTES:
-            output.line(f"Loading {checkpoint.stored_bytes / 1e9:.1f} GB of weights …")
-        policy = UnifiedPolicy(checkpoint, progress=output.shows_progress, **self.policy_arguments())
+            if checkpoint.stored_bytes > SHOW_LOADING_BYTES:
+                output.line(f"Loading {checkpoint.stored_bytes / 1e9:.1f} GB of weights …")
+            policy = UnifiedPolicy(checkpoint, progress=output.shows_progress, **self.policy_arguments())
         about = policy.metadata
         output.line(
             f"{about['config']} for {about['robot']}, {about['precision']} on {about['device']} "
