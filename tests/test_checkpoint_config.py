@@ -10,7 +10,7 @@ from checkpoint_helpers import GOLDEN, LIBERO, jax_copy, read_tree, torch_copy, 
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.checkpoint.settings import parse_values
-from turbopi.config import PRESETS, Normalization
+from turbopi.config import PRESETS, GemmaConfig, ModelConfig, Normalization, VisionConfig
 from turbopi.errors import CheckpointError, ConfigError
 
 PI05, PI0 = GOLDEN / "pi05" / "jax", GOLDEN / "pi0" / "jax"
@@ -108,19 +108,20 @@ def test_a_robots_own_file_is_found_beside_the_json(tmp_path: Path) -> None:
 
 WRONG: dict[str, list[Any]] = {
     "preset": ["pi06", 3, None],
-    "robot": [None, "", 4],
+    "robot": [None, "", 4, "a\0b"],
+    "name": ["a\nb"],
     "robot_options": [[], "x"],
     "normalization": ["median", {"state": "zscore"}, {"state": "zscore", "actions": "x"}, 1],
     "discrete_state_input": [1, "true", None],
-    "action_horizon": [0, -1, 2.0, "10", True],
-    "max_prompt_tokens": [0, None],
-    "num_denoising_steps": [0, 2.0, None],
+    "action_horizon": [0, -1, 2.0, "10", True, 1001, 10**18],
+    "max_prompt_tokens": [0, None, 10**18],
+    "num_denoising_steps": [0, 2.0, None, 10**18],
     "asset_id": [3, ""],
     "default_prompt": [["a"], ""],
     "image_resize": ["bicubic"],
     "time_grid": ["exact"],
-    "vision_heads": [0, "4"],
-    "lora_alpha": [0, -1, "16", {}, {"llm": 16}, {"vlm": True}],
+    "vision_heads": [0, "4", 10**18],
+    "lora_alpha": [1e300, 10**18, 0, -1, "16", {}, {"llm": 16}, {"vlm": True}],
     "lora_rslora": ["yes"],
 }
 
@@ -130,6 +131,33 @@ def test_values_of_the_wrong_type_are_refused_by_name(key: str, value: Any) -> N
     with pytest.raises(ConfigError) as caught:
         parse_values({key: value}, "turbopi.json")
     assert str(caught.value).startswith(f"turbopi.json: {key} is {value!r}; expected ")
+
+
+@pytest.mark.parametrize(("key", "value"), [(key, 10**18) for key in ("action_dim", "action_horizon")])
+def test_absurd_sizes_in_config_json_are_refused(tmp_path: Path, key: str, value: int) -> None:
+    checkpoint = torch_copy(tmp_path / "c")
+    write_json(checkpoint / "config.json", {key: value})
+    with pytest.raises(
+        CheckpointError, match=rf"config\.json: {key} is 1000000000000000000; expected a whole number from"
+    ):
+        open_checkpoint(checkpoint, "pi05_libero")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"action_horizon": 10**18},
+        {"action_dim": 0},
+        {"vocab_size": True},
+        {"vlm": GemmaConfig(width=2048, mlp_dim=16384, depth=300_000)},
+        {"vision": VisionConfig(image_size=10**9)},
+        {"rope_base": float("nan")},
+        {"rms_norm_eps": -1.0},
+    ],
+)
+def test_no_model_is_beyond_the_limits(changes: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="expected a (whole )?number"):
+        ModelConfig(**changes)
 
 
 def test_unknown_keys_are_refused_with_the_known_ones(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from turbopi.checkpoint.norm_stats import (
     NormStats,
     asset_ids,
     dump_norm_stats,
+    feature_stats,
     find_norm_stats,
     load_norm_stats,
 )
@@ -67,11 +68,17 @@ GOOD = {"mean": [0.0, 1.0], "std": [1.0, 1.0], "q01": None, "q99": None}
             {"norm_stats": {"state": GOOD, "actions": GOOD | {"std": [1.0]}}},
             "actions: statistics have different lengths",
         ),
-        ({"norm_stats": {"state": GOOD | {"mean": [[0.0, 1.0]]}, "actions": GOOD}}, r"state: mean must be .*\[1, 2\]"),
-        ({"norm_stats": {"state": GOOD | {"mean": [0.0, float("nan")]}, "actions": GOOD}}, "must be a list of finite"),
+        (
+            {"norm_stats": {"state": GOOD | {"mean": [[0.0, 1.0]]}, "actions": GOOD}},
+            r"state: mean must be .*\[\[0.0, 1.0\]\]",
+        ),
+        (
+            {"norm_stats": {"state": GOOD | {"mean": [0.0, float("nan")]}, "actions": GOOD}},
+            r"norm_stats.state.mean\[1\] is nan",
+        ),
         (
             {"norm_stats": {"state": GOOD | {"mean": ["a", "b"]}, "actions": GOOD}},
-            "state: mean isn't a list of numbers",
+            "state: mean must be a list of finite numbers, not",
         ),
         ({"norm_stats": {"state": GOOD | {"mean": []}, "actions": GOOD}}, "must be a list of finite"),
     ],
@@ -81,6 +88,64 @@ def test_broken_files_are_refused(tmp_path: Path, content: Any, message: str) ->
     file.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(CheckpointError, match=message):
         load_norm_stats(file)
+
+
+SOUND = {
+    "mean": [0.0, 1.0],
+    "std": [1.0, 0.0],
+    "q01": [-1.0, 1.0],
+    "q99": [1.0, 1.0],
+    "min": [-2.0, 1.0],
+    "max": [2.0, 1.0],
+}
+UNSOUND: list[tuple[dict[str, Any], str]] = [
+    ({"q01": [-1.0, 1.5]}, r"q01\[1\] is 1.5, q99\[1\] is 1; expected q01 <= q99 \(in 1 of 2 dimensions\)"),
+    ({"min": [3.0, 3.0]}, r"min\[0\] is 3, max\[0\] is 2; expected min <= max \(in 2 of 2 dimensions\)"),
+    ({"std": [1.0, -0.1]}, r"std\[1\] is -0.1; expected a deviation, 0 or more"),
+    ({"q99": [1.0, 1.7e308]}, r"q99\[1\] is 1.7e\+308; expected at most 1e\+09 in size"),
+    ({"mean": [-2e9, 0.0]}, r"mean\[0\] is -2e\+09; expected at most 1e\+09 in size"),
+    ({"q01": [-1.0]}, "statistics have different lengths"),
+]
+
+
+@pytest.mark.parametrize(("changed", "message"), UNSOUND)
+def test_statistics_that_would_mirror_or_blow_up_actions_are_refused(
+    tmp_path: Path, changed: dict[str, Any], message: str
+) -> None:
+    file = tmp_path / "norm_stats.json"
+    for feature in ("state", "actions"):
+        content = {"state": SOUND, "actions": SOUND} | {feature: SOUND | changed}
+        file.write_text(json.dumps({"norm_stats": content}))
+        with pytest.raises(CheckpointError, match=f"norm_stats.json: {feature}: {message}"):
+            load_norm_stats(file)
+    arrays = {name: np.array(values) for name, values in (SOUND | changed).items()}
+    with pytest.raises(CheckpointError, match=rf"^stats.safetensors: {message}"):
+        feature_stats(arrays, "stats.safetensors")  # LeRobot's come as arrays
+
+
+@pytest.mark.parametrize(
+    "value", [True, 1.0, "0 1", ["0", "1"], [True, 1.0], [None, 1.0], [[0.0], [1.0]], {"0": 1.0}, [10**400, 1], b"01"]
+)
+def test_statistics_of_other_types_are_refused(value: Any) -> None:
+    with pytest.raises(CheckpointError, match=r"^here: std must be a list of finite numbers, not"):
+        feature_stats(SOUND | {"std": value}, "here")
+
+
+@pytest.mark.parametrize("dtype", [np.bool_, np.complex64, "U4"])
+def test_tensors_that_hold_no_numbers_are_no_statistics(dtype: Any) -> None:
+    with pytest.raises(CheckpointError, match=r"^here: std must be a list of finite numbers, not"):
+        feature_stats({"std": np.ones(2).astype(dtype)}, "here")
+
+
+def test_constant_dimensions_are_sound() -> None:
+    stats = feature_stats(SOUND, "here")
+    assert stats.available == ("mean", "std", "q01", "q99", "min", "max") and stats.dim == 2
+
+
+def test_statistics_made_by_hand_are_checked_too() -> None:
+    stats = NormStats(FeatureStats(q01=np.ones(2), q99=np.zeros(2)), FeatureStats(mean=np.zeros(2), std=np.ones(2)))
+    with pytest.raises(CheckpointError, match=r"^here: state: q01\[0\] is 1, q99\[0\] is 0"):
+        stats.check(Normalization("quantile", "zscore"), "here")
 
 
 def test_a_normalisation_without_its_statistics_is_refused() -> None:

@@ -3,6 +3,8 @@
 `ModelConfig` is the network; `PolicyConfig` adds the edges (robot, statistics, prompt). Sizes are read from a
 checkpoint's tensors when it is loaded, so a preset's sizes only matter for random weights and for what shapes can't
 tell (vision heads of a non-standard width, the horizon). Sources: openpi's `gemma.py`, `siglip.py` and `config.py`.
+
+Every size has a limit, LIMITS: a number beyond it is damage or a slip, and believing it would cost gigabytes.
 """
 
 import dataclasses
@@ -11,11 +13,28 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from turbopi.errors import ConfigError
+from turbopi.reading import is_finite, is_integer, shown
 
 Kind = Literal["pi05", "pi0"]
 NormMode = Literal["quantile", "zscore", "lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"]
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's order; prefix tokens follow it
+
+LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 and Pi0 stay far below
+    "action_horizon": 1000,
+    "action_dim": 1024,
+    "max_prompt_tokens": 8192,
+    "num_denoising_steps": 1000,
+    "vocab_size": 2**24,
+    "depth": 256,
+    "width": 2**16,
+    "mlp_dim": 2**20,
+    "num_heads": 1024,
+    "num_kv_heads": 1024,
+    "head_dim": 4096,
+    "patch_size": 1024,
+    "image_size": 4096,
+}
 
 
 @dataclass(frozen=True)
@@ -69,6 +88,9 @@ class ModelConfig:
     time_grid: Literal["accumulated", "multiplied"] = "accumulated"
 
     def __post_init__(self) -> None:
+        """Raises ConfigError for sizes beyond LIMITS, and for sizes that don't fit each other."""
+        for name, part in (("", self), ("vision ", self.vision), ("vlm ", self.vlm), ("expert ", self.expert)):
+            _check_sizes(name, part)
         for attribute in ("depth", "num_heads", "num_kv_heads", "head_dim"):
             ours, theirs = getattr(self.vlm, attribute), getattr(self.expert, attribute)
             if ours != theirs:
@@ -79,6 +101,15 @@ class ModelConfig:
             raise ConfigError(f"{self.vlm.num_heads} query heads don't divide by {self.vlm.num_kv_heads} KV heads")
         if self.expert.head_dim % 2 or self.expert.width % 2:
             raise ConfigError("RoPE and the time embedding need an even head_dim and an even expert width")
+
+
+def _check_sizes(name: str, part: ModelConfig | VisionConfig | GemmaConfig) -> None:
+    for one in dataclasses.fields(part):
+        value, limit = getattr(part, one.name), LIMITS.get(one.name)
+        if limit is not None and not (is_integer(value) and 1 <= value <= limit):
+            raise ConfigError(f"{name}{one.name} is {shown(value)}; expected a whole number from 1 to {limit}")
+        if one.type in (float, "float") and not (is_finite(value) and 0 < value <= 1e9):
+            raise ConfigError(f"{name}{one.name} is {shown(value)}; expected a number above 0, at most 1e9")
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Finding out what a path holds, and telling users what to do about what Turbo-Pi can't read."""
 
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,9 @@ from turbopi.checkpoint.lerobot import is_lerobot
 from turbopi.checkpoint.openpi_jax import MANIFEST
 from turbopi.checkpoint.source import listing
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS
+from turbopi.config import LIMITS
 from turbopi.errors import CheckpointError
+from turbopi.reading import Fields, read_json
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "random"]
 
@@ -66,19 +67,12 @@ def recorded_config(location: Location) -> dict[str, int]:
     file = location.folder / "config.json"
     if location.format != "openpi_torch" or not file.is_file():
         return {}
-    try:
-        content = json.loads(file.read_text())
-    except ValueError as error:
-        raise CheckpointError(f"{file} isn't JSON: {error}") from error
-    found = {}
-    for key in ("action_dim", "action_horizon"):
-        value = content.get(key) if isinstance(content, dict) else None
-        if value is None:
-            continue
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise CheckpointError(f"{file}: {key} is {value!r}; expected a whole number, 1 or more")
-        found[key] = value
-    return found
+    fields = Fields(read_json(file), file)
+    return {
+        key: fields.integer(key, 1, LIMITS[key])
+        for key in ("action_dim", "action_horizon")
+        if fields.values.get(key) is not None
+    }
 
 
 def _local(path: str | Path) -> Path:

@@ -78,7 +78,7 @@ def find_adapters(paths: Mapping[str, tuple[int, ...]]) -> dict[str, Adapter]:
 
 def _check_shapes(weight: str, w: tuple[int, ...], a: tuple[int, ...], b: tuple[int, ...]) -> None:
     rank = a[-1] if a else 0
-    if a != (*w[:-1], rank) or b != (*w[:-2], rank, w[-1]):
+    if rank < 1 or a != (*w[:-1], rank) or b != (*w[:-2], rank, w[-1]):
         raise CheckpointError(
             f"the LoRA adapter of {weight} {list(w)} has shapes {list(a)} and {list(b)}; expected "
             f"{[*w[:-1], 'r']} and {[*w[:-2], 'r', w[-1]]}"

@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from turbopi.checkpoint.source import listing
 from turbopi.config import Normalization, NormMode
 from turbopi.errors import CheckpointError, ConfigError
+from turbopi.reading import is_finite, read_json, shown
 
 FILE_NAME = "norm_stats.json"
 STATISTICS = ("mean", "std", "q01", "q99", "min", "max")
+MAX_MAGNITUDE = 1e9  # of a statistic: metres, radians and encoder ticks are far below it, damaged floats mostly above
 
 NEEDS: dict[NormMode, tuple[str, ...]] = {
     "quantile": ("q01", "q99"),
@@ -43,6 +46,41 @@ class FeatureStats:
     def dim(self) -> int:
         return max((len(getattr(self, name)) for name in self.available), default=0)
 
+    def check(self, where: object) -> None:
+        """CheckpointError for statistics that no data has, and that would mirror or blow up what they scale.
+
+        Every statistic is float[dim] of finite numbers, |x| <= MAX_MAGNITUDE, and of one length; std >= 0, q01 <= q99,
+        min <= max. Equal ones are right: that dimension was constant, and the epsilons of normalize.py are for it.
+        """
+        arrays = {name: np.asarray(getattr(self, name)) for name in self.available}
+        for name, array in arrays.items():
+            if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
+                raise CheckpointError(
+                    f"{where}: {name} must be a list of finite numbers, but has shape {list(array.shape)}: "
+                    f"{shown(array.tolist())}"
+                )
+            _refuse(np.abs(array) > MAX_MAGNITUDE, where, f"expected at most {MAX_MAGNITUDE:g} in size", {name: array})
+        lengths = {name: len(array) for name, array in arrays.items()}
+        if len(set(lengths.values())) > 1:
+            raise CheckpointError(f"{where}: statistics have different lengths: {lengths}")
+        if "std" in arrays:
+            _refuse(arrays["std"] < 0, where, "expected a deviation, 0 or more", {"std": arrays["std"]})
+        for low, high in (("q01", "q99"), ("min", "max")):
+            if low in arrays and high in arrays:
+                pair = {low: arrays[low], high: arrays[high]}
+                _refuse(arrays[low] > arrays[high], where, f"expected {low} <= {high}", pair)
+
+
+def _refuse(wrong: np.ndarray, where: object, expected: str, values: Mapping[str, np.ndarray]) -> None:
+    """CheckpointError about the first dimension that is wrong, if there is one."""
+    if wrong.any():
+        i = int(wrong.argmax())
+        told = ", ".join(f"{name}[{i}] is {array[i]:g}" for name, array in values.items())
+        raise CheckpointError(
+            f"{where}: {told}; {expected} (in {int(wrong.sum())} of {len(wrong)} dimensions). The file is damaged, or "
+            "isn't one of statistics"
+        )
+
 
 @dataclass(frozen=True)
 class NormStats:
@@ -52,10 +90,12 @@ class NormStats:
     actions: FeatureStats | None = None
 
     def check(self, normalization: Normalization, where: object) -> None:
-        """CheckpointError unless every statistic that `normalization` uses is there."""
+        """CheckpointError unless every statistic that `normalization` uses is there, and all are sound."""
         for feature in fields(self):
             mode: NormMode = getattr(normalization, feature.name)
             stats: FeatureStats | None = getattr(self, feature.name)
+            if stats is not None:
+                stats.check(f"{where}: {feature.name}")
             available = stats.available if stats else ()
             absent = [name for name in NEEDS[mode] if name not in available]
             if absent:
@@ -69,41 +109,33 @@ class NormStats:
 def feature_stats(values: Mapping[str, Any], where: str) -> FeatureStats:
     """FeatureStats from lists or arrays by name; absent or null ones stay None.
 
-    Raises CheckpointError for anything but finite numbers in one dimension, of equal length.
+    Raises CheckpointError for anything but numbers (text and booleans aren't), and for what `FeatureStats.check` does.
     """
     arrays: dict[str, np.ndarray] = {}
     for name in STATISTICS:
-        if values.get(name) is None:
+        value = values.get(name)
+        if value is None:
             continue
-        try:
-            array = np.asarray(values[name], dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise CheckpointError(f"{where}: {name} isn't a list of numbers ({error})") from error
-        if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
-            raise CheckpointError(
-                f"{where}: {name} must be a list of finite numbers, but has shape {list(array.shape)}: {array}"
-            )
-        arrays[name] = array
-    lengths = {name: len(array) for name, array in arrays.items()}
-    if len(set(lengths.values())) > 1:
-        raise CheckpointError(f"{where}: statistics have different lengths: {lengths}")
-    return FeatureStats(**arrays)
+        if isinstance(value, np.ndarray):
+            is_numbers = value.dtype.kind in "fiu"
+        else:
+            is_numbers = isinstance(value, list) and all(map(is_finite, value))
+        if not is_numbers:
+            raise CheckpointError(f"{where}: {name} must be a list of finite numbers, not {shown(value)}")
+        arrays[name] = np.asarray(value, dtype=np.float64)
+    stats = FeatureStats(**arrays)
+    stats.check(where)
+    return stats
 
 
 def load_norm_stats(file: str | Path) -> NormStats:
     """Read openpi's `norm_stats.json`. Quantiles may be null (Pi0's files). CheckpointError if it isn't one."""
     file = Path(file)
-    try:
-        content = json.loads(file.read_text())
-    except OSError as error:
-        raise CheckpointError(f"norm stats {file} can't be read: {error.strerror}") from error
-    except ValueError as error:
-        raise CheckpointError(f"{file} isn't JSON: {error}") from error
-    stats = content.get("norm_stats") if isinstance(content, dict) else None
+    stats = read_json(file).get("norm_stats")
     if not isinstance(stats, dict) or not all(isinstance(entry, dict) for entry in stats.values()):
         raise CheckpointError(f'{file}: expected {{"norm_stats": {{"state": {{...}}, "actions": {{...}}}}}}')
     if set(stats) != {"state", "actions"}:
-        found = ", ".join(sorted(stats)) or "nothing"
+        found = listing(sorted(stats)) or "nothing"
         raise CheckpointError(f"{file} has statistics of {found}; expected state and actions")
     return NormStats(**{name: feature_stats(entry, f"{file}: {name}") for name, entry in stats.items()})
 

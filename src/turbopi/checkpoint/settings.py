@@ -11,32 +11,33 @@ itself.
     robot_options         object, passed to the robot in place of the preset's, which are for the preset's robot alone
     normalization         a mode ("quantile", "zscore", ...) or {"state": mode, "actions": mode}
     discrete_state_input  true if the state is written into the prompt (Pi0.5 only)
-    action_horizon        H >= 1, the number of actions in a chunk
-    max_prompt_tokens     >= 1
+    action_horizon        H, the number of actions in a chunk: 1 to 1000
+    max_prompt_tokens     1 to 8192
     asset_id              folder of norm_stats.json below assets/; null for the only one there
     default_prompt        text or null
     image_resize          "openpi" or "lerobot"
     time_grid             "accumulated" (openpi) or "multiplied" (LeRobot)
-    num_denoising_steps   >= 1, unless whoever runs the policy says otherwise; else LeRobot's num_inference_steps, or 10
+    num_denoising_steps   1 to 1000, unless whoever runs it says otherwise; else LeRobot's num_inference_steps, or 10
     vision_heads          attention heads of a vision tower of a non-standard width
     lora_alpha            number, or {"vlm": number, "expert": number}: see lora.py
     lora_rslora           true if adapters were trained rank-stabilised
 
-Unknown keys and wrong types are errors. `config=` replaces a turbopi.json beside the weights as a whole.
+Unknown keys, wrong types and numbers beyond turbopi.config.LIMITS are errors. `config=` replaces a turbopi.json beside
+the weights as a whole.
 
 The horizon: the .json's, else config.json's `action_horizon`, else the preset's. A PolicyConfig is taken at its word,
 except for sizes, which always come from the tensors.
 """
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
 from turbopi.checkpoint.lora import LoraScale
-from turbopi.config import PRESETS, Kind, Normalization, NormMode, PolicyConfig
+from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, PolicyConfig
 from turbopi.errors import ConfigError
+from turbopi.reading import is_finite, is_integer, read_json, shown
 
 FILE_NAME = "turbopi.json"
 ConfigSource = str | Path | PolicyConfig
@@ -145,15 +146,7 @@ def _undetectable(fitting: list[str], kind: Kind, assets: list[str], where: Path
 
 
 def _read_file(file: Path) -> Settings:
-    try:
-        values = json.loads(file.read_text())
-    except OSError as error:
-        raise ConfigError(f"config {file} can't be read: {error.strerror}") from error
-    except ValueError as error:
-        raise ConfigError(f"{file} isn't JSON: {error}") from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"{file} is a {type(values).__name__}; expected an object with keys such as preset")
-    parsed = parse_values(values, str(file))
+    parsed = parse_values(read_json(file, ConfigError), str(file))
     robot = parsed.get("robot")
     if robot is not None and robot.endswith(".json"):
         path = file.parent / robot
@@ -167,14 +160,14 @@ def parse_values(values: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Check a settings object and bring it into PolicyConfig's types. ConfigError names the key and what it may be."""
     unknown = [key for key in values if key not in _SCHEMA]
     if unknown:
-        raise ConfigError(f"{where}: unknown keys {', '.join(map(repr, unknown))}; known are {', '.join(_SCHEMA)}")
+        raise ConfigError(f"{where}: unknown keys {', '.join(map(shown, unknown[:5]))}; known are {', '.join(_SCHEMA)}")
     parsed = {}
     for key, value in values.items():
         expected, parse = _SCHEMA[key]
         try:
             parsed[key] = parse(value)
         except (TypeError, ValueError, KeyError):
-            raise ConfigError(f"{where}: {key} is {value!r}; expected {expected}") from None
+            raise ConfigError(f"{where}: {key} is {shown(value)}; expected {expected}") from None
     return parsed
 
 
@@ -192,14 +185,28 @@ def _text_or_null(value: Any) -> str | None:
     return None if value is None else _text(value)
 
 
+def _name(value: Any) -> str:
+    _require(isinstance(value, str) and value.isprintable())
+    return _text(value)
+
+
+def _name_or_null(value: Any) -> str | None:
+    return None if value is None else _name(value)
+
+
 def _flag(value: Any) -> bool:
     _require(isinstance(value, bool))
     return bool(value)
 
 
-def _count(value: Any) -> int:
-    _require(isinstance(value, int) and not isinstance(value, bool) and value >= 1)
-    return int(value)
+def _count(limit: int) -> tuple[str, Callable[[Any], int]]:
+    """What is expected, and the parser of it."""
+
+    def parse(value: Any) -> int:
+        _require(is_integer(value) and 1 <= value <= limit)
+        return int(value)
+
+    return f"a whole number from 1 to {limit}", parse
 
 
 def _object(value: Any) -> dict[str, Any]:
@@ -226,8 +233,11 @@ def _normalization(value: Any) -> Normalization:
     return Normalization(mode(value["state"]), mode(value["actions"]))  # type: ignore[arg-type]
 
 
+_ALPHAS = (1e-6, 1e6)  # in use are 8 to 128
+
+
 def _number(value: Any) -> float:
-    _require(isinstance(value, int | float) and not isinstance(value, bool) and value > 0)
+    _require(is_finite(value) and _ALPHAS[0] <= value <= _ALPHAS[1])
     return float(value)
 
 
@@ -240,19 +250,19 @@ def _lora_alpha(value: Any) -> dict[str, float]:
 
 _SCHEMA: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "preset": (f"one of {', '.join(PRESETS)}", _choice(*PRESETS)),
-    "name": ("a text", _text),
-    "robot": ("a robot's name or a path to its .json", _text),
+    "name": ("a text on one line", _name),
+    "robot": ("a robot's name or a path to its .json", _name),
     "robot_options": ("an object", _object),
     "normalization": (f"one of {', '.join(_MODES)}, or {{'state': ..., 'actions': ...}} of them", _normalization),
     "discrete_state_input": ("true or false", _flag),
-    "action_horizon": ("a whole number, 1 or more", _count),
-    "max_prompt_tokens": ("a whole number, 1 or more", _count),
-    "asset_id": ("a folder's name below assets/, or null", _text_or_null),
+    "action_horizon": _count(LIMITS["action_horizon"]),
+    "max_prompt_tokens": _count(LIMITS["max_prompt_tokens"]),
+    "asset_id": ("a folder's name below assets/, or null", _name_or_null),
     "default_prompt": ("a text or null", _text_or_null),
     "image_resize": ("'openpi' or 'lerobot'", _choice("openpi", "lerobot")),
     "time_grid": ("'accumulated' or 'multiplied'", _choice("accumulated", "multiplied")),
-    "num_denoising_steps": ("a whole number, 1 or more", _count),
-    "vision_heads": ("a whole number, 1 or more", _count),
-    "lora_alpha": ("a positive number, or an object with vlm and expert", _lora_alpha),
+    "num_denoising_steps": _count(LIMITS["num_denoising_steps"]),
+    "vision_heads": _count(LIMITS["num_heads"]),
+    "lora_alpha": ("a number from 1e-6 to 1e6, or an object with vlm and expert", _lora_alpha),
     "lora_rslora": ("true or false", _flag),
 }

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from turbopi.errors import CheckpointError
+from turbopi.reading import shown
 
 PIECE_BYTES = (
     8 * 2**20
@@ -97,8 +98,8 @@ def adapter_hint(names: Sequence[str]) -> str:
 
 
 def listing(names: Sequence[str], limit: int = 5) -> str:
-    """`a, b, c and 7 more (10 tensors)`"""
-    shown = ", ".join(names[:limit])
+    """`a, b, c and 7 more (10 in all)`; a name that can't be printed on a line as it is in quotes."""
+    told = ", ".join(name if name.isprintable() and len(name) < 200 else shown(name) for name in names[:limit])
     if len(names) > limit:
-        shown += f" and {len(names) - limit} more ({len(names)} in all)"
-    return shown
+        told += f" and {len(names) - limit} more ({len(names)} in all)"
+    return told

@@ -4,6 +4,7 @@ import os
 import re
 import reprlib
 import stat
+from itertools import islice
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,6 +18,13 @@ class _Short(reprlib.Repr):
 
     maxstring = maxother = 80
     maxlevel = 3
+
+    def repr_dict(self, value: dict[Any, Any], level: int) -> str:
+        """As it is ordered: `Repr` sorts the keys."""
+        if level <= 0:
+            return "{...}"
+        pieces = [f"{self.repr1(key, level - 1)}: {self.repr1(value[key], level - 1)}" for key in islice(value, 4)]
+        return "{" + ", ".join(pieces + ["..."] * (len(value) > 4)) + "}"
 
     def repr_bytes(self, value: bytes, level: int) -> str:
         return repr(value) if len(value) <= 40 else f"{value[:40]!r}…"

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from turbopi.errors import CheckpointError
 from turbopi.reading.files import Error, read_bytes, shown
@@ -44,14 +44,15 @@ def parse_json(data: bytes, where: object, error: Error = CheckpointError, *, de
             data.decode("utf-8"),
             parse_int=_whole,
             parse_float=_finite,
-            parse_constant=_constant,
             object_pairs_hook=_unique,
         )
+        _check_depth(value, depth, where, error)
     except RecursionError as reason:
         raise error(f"{where} holds objects and lists more than {depth} deep") from reason
     except ValueError as reason:  # not UTF-8, not JSON, or refused by a hook below
         raise error(f"{where} isn't JSON: {reason if data.strip() else 'it is empty'}") from reason
-    _check_depth(value, depth, where, error)
+    if b"NaN" in data or b"Infinity" in data:
+        _check_constants(value, where, error)
     if rb"\u" in data:
         _check_text(value, where, error)
     return value
@@ -68,10 +69,6 @@ def _finite(digits: str) -> float:
     if math.isinf(value):
         raise ValueError(f"the number {digits[:40]} is beyond float64")
     return value
-
-
-def _constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no number of JSON")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -99,6 +96,25 @@ def _check_depth(value: Any, depth: int, where: object, error: Error) -> None:
     for number, _ in enumerate(_levels(value)):
         if number > depth:
             raise error(f"{where} holds objects and lists more than {depth} deep")
+
+
+def _check_constants(value: Any, where: object, error: Error) -> None:
+    """Python reads and writes NaN, Infinity and -Infinity; JSON has none of them."""
+    found = next(_constants(value, ""), None)
+    if found is not None:
+        path, number = found
+        raise error(f"{where}: {path[1:] or 'its value'} is {number}, which no JSON has; expected a finite number")
+
+
+def _constants(value: Any, path: str) -> Iterator[tuple[str, float]]:
+    if isinstance(value, float) and not math.isfinite(value):
+        yield path, value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _constants(item, f"{path}.{key if key.isidentifier() else shown(key)}")
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            yield from _constants(item, f"{path}[{i}]")
 
 
 def _check_text(value: Any, where: object, error: Error) -> None:
