@@ -7,8 +7,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from turbopi.serve.launch import run
     from turbopi.serve.calls import Policy
+    from turbopi.serve.launch import run
     from turbopi.serve.server import PolicyServer, running
 
 __all__ = ["Policy", "PolicyServer", "run", "running"]
