@@ -7,6 +7,8 @@ from typing import Literal
 
 from turbopi.checkpoint.lerobot import is_lerobot
 from turbopi.checkpoint.openpi_jax import MANIFEST
+from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
+from turbopi.checkpoint.peft_adapter import is_adapter
 from turbopi.checkpoint.source import listing
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS
 from turbopi.config import LIMITS
@@ -31,6 +33,7 @@ class Location:
     format: CheckpointFormat
     folder: Path  # what holds assets/, config.json and turbopi.json
     weights: Path  # the folder of the safetensors files, or of the Orbax tree
+    adapter: bool = False  # the weights are an adapter of the peft library
 
     @property
     def assets(self) -> Path:
@@ -48,6 +51,8 @@ def locate(path: str | Path) -> Location:
         return Location("openpi_jax", named.parent if named.name == "params" else folder, folder)
     if (folder / "pretrained_model").is_dir():  # one step of LeRobot's training output
         folder = folder / "pretrained_model"
+    if is_lerobot(folder) and is_adapter(folder):
+        return Location("lerobot", folder, folder, adapter=True)
     _refuse_other_formats(folder)
     if _has_safetensors(folder):  # before params/, as openpi does
         return Location("lerobot" if is_lerobot(folder) else "openpi_torch", folder, folder)
@@ -97,10 +102,11 @@ def _has_safetensors(folder: Path) -> bool:
 
 
 def _refuse_other_formats(folder: Path) -> None:
-    if (folder / "adapter_config.json").is_file():
+    if (folder / ADAPTER).is_file() and not _has_safetensors(folder):
         raise CheckpointError(
-            f"{folder} holds adapters of the peft library, to be used with another model's weights. Merge them there "
-            "(merge_and_unload), save the whole model, and give that folder"
+            f"{folder} holds adapters of the peft library without LeRobot's config.json and processors, which describe "
+            "the policy. Put them there, or merge the adapters (peft's merge_and_unload), save the whole model, and "
+            "give that folder"
         )
     pickled = [file.name for suffix in ("bin", "pt", "pth", "ckpt") for file in sorted(folder.glob(f"*.{suffix}"))]
     if pickled and not _has_safetensors(folder) and not (folder / "params").is_dir():

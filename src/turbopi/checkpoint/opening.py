@@ -9,6 +9,7 @@ from turbopi.checkpoint.lerobot import LeRobotFolder
 from turbopi.checkpoint.locate import Location, locate, recorded_config, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.openpi_jax import JaxSource
+from turbopi.checkpoint.peft_adapter import PeftSource, base_model
 from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
 from turbopi.checkpoint.sizes import detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
@@ -69,7 +70,7 @@ def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[
         return open_checkpoint(path, config).info()
     except ConfigError as error:
         location = locate(path)
-        source = open_weights(location, Settings("none"))
+        source = open_weights(location, _base_only(config, location))
         return {
             **describe_weights(source),
             "path": str(location.folder),
@@ -82,14 +83,37 @@ def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[
         }
 
 
+def _base_only(config: ConfigSource, location: Location) -> Settings:
+    """Of `config`, what an adapter can't be read without."""
+    try:
+        values = read_settings(config, location.folder).values if location.adapter else {}
+    except ConfigError:
+        values = {}
+    return Settings("none", values={key: values[key] for key in ("base_model",) if key in values})
+
+
 def open_weights(location: Location, settings: Settings) -> WeightSource:
     """The weights at a location, names and shapes only."""
     if location.format == "openpi_jax":
         return JaxSource(location.weights, settings.lora)
     if settings.values.keys() & {"lora_alpha", "lora_rslora"}:
         raise ConfigError(f"{settings.source}: lora_alpha and lora_rslora only apply to openpi's JAX checkpoints")
+    if location.adapter:
+        return _open_adapter(location, settings)
+    if "base_model" in settings.values:
+        raise ConfigError(f"{settings.source}: base_model only applies to adapters, and {location.weights} has weights")
     prefix = "model." if location.format == "lerobot" else ""
     return TorchSource(location.weights, format=location.format, prefix=prefix)
+
+
+def _open_adapter(location: Location, settings: Settings) -> WeightSource:
+    folder = base_model(location.folder, settings.values.get("base_model"))
+    base = locate(folder)
+    if base.adapter or base.format == "openpi_jax":
+        what = "an adapter itself: merge it" if base.adapter else "openpi's JAX format: convert it (turbopi convert)"
+        raise CheckpointError(f"the base model of {location.folder} is {base.folder}, which is {what} first")
+    weights = TorchSource(base.weights, format="lerobot", prefix="model.")
+    return PeftSource(location.folder, weights, base.folder)
 
 
 def _open_lerobot(location: Location, settings: Settings, source: WeightSource) -> Checkpoint:

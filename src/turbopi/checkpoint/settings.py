@@ -21,6 +21,7 @@ itself.
     vision_heads          attention heads of a vision tower of a non-standard width
     lora_alpha            number, or {"vlm": number, "expert": number}: see lora.py
     lora_rslora           true if adapters were trained rank-stabilised
+    base_model            folder of the weights that a peft adapter is for, relative to this file
 
 Unknown keys, wrong types and numbers beyond turbopi.config.LIMITS are errors. `config=` replaces a turbopi.json beside
 the weights as a whole.
@@ -147,6 +148,8 @@ def _undetectable(fitting: list[str], kind: Kind, assets: list[str], where: Path
 
 def _read_file(file: Path) -> Settings:
     parsed = parse_values(read_json(file, ConfigError), str(file))
+    if "base_model" in parsed:
+        parsed["base_model"] = str((file.parent / Path(parsed["base_model"]).expanduser()).resolve())
     robot = parsed.get("robot")
     if robot is not None and robot.endswith(".json"):
         path = file.parent / robot
@@ -265,4 +268,5 @@ _SCHEMA: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "vision_heads": _count(LIMITS["num_heads"]),
     "lora_alpha": ("a number from 1e-6 to 1e6, or an object with vlm and expert", _lora_alpha),
     "lora_rslora": ("true or false", _flag),
+    "base_model": ("a folder", _text),
 }

@@ -20,7 +20,7 @@ WEIGHTS, INDEX = "model.safetensors", "model.safetensors.index.json"
 
 
 @dataclass(frozen=True)
-class _Stored:
+class Stored:
     """One tensor of a file."""
 
     file: Path
@@ -38,10 +38,10 @@ class TorchSource:
         self.format = format
         self.notes: list[str] = []
         self._prefix = prefix
-        self._stored: dict[str, _Stored] = {}
-        heads: dict[str, _Stored] = {}
+        self._stored: dict[str, Stored] = {}
+        heads: dict[str, Stored] = {}
         for file in _weight_files(folder):
-            for stored in _read_header(file):
+            for stored in read_header(file):
                 key = stored.key.removeprefix(prefix) if prefix else stored.key
                 if key == UNUSED_HEAD:
                     continue
@@ -72,14 +72,14 @@ class TorchSource:
         by_size = sorted(self._stored, key=lambda name: -_nbytes(self._stored[name]))
         for name in by_size:
             stored = self._stored[name]
-            values = _read(stored)  # maps the file; only what is copied from it is ever read
+            values = read_tensor(stored)
             if not stored.shape:
                 yield Piece(name, 0, values)
                 continue
             for start, stop in row_ranges(stored.shape, ITEMSIZE[stored.dtype]):
                 yield Piece(name, start, values[start:stop])
 
-    def _tied(self, heads: dict[str, _Stored], folder: Path) -> _Stored:
+    def _tied(self, heads: dict[str, Stored], folder: Path) -> Stored:
         """openpi ties the prompt embedding to the head: one of them is stored, or both with equal values.
 
         LeRobot (from 0.5) trains both, untied, and computes with the embedding alone.
@@ -90,7 +90,7 @@ class TorchSource:
         alike = head.shape == embedding.shape and head.dtype == embedding.dtype
         # LeRobot loads the file's tensors in its order, sorted by dtype, then name; each of the two ends up as the
         # embedding, the last one for good
-        if not alike or not (self.format == "lerobot" or _equal(_read(head), _read(embedding))):
+        if not alike or not (self.format == "lerobot" or _equal(read_tensor(head), read_tensor(embedding))):
             raise CheckpointError(
                 f"{folder}: {head.key} and {embedding.key} are tied in the model but differ in the file, so it's "
                 "unclear which one the model was trained with. Remove the wrong one from the file"
@@ -119,19 +119,21 @@ def _weight_files(folder: Path) -> list[Path]:
     return [folder / name for name in names]
 
 
-def _read_header(file: Path) -> list[_Stored]:
+def read_header(file: Path) -> list[Stored]:
+    """The tensors of a safetensors file, without their values. CheckpointError if it can't be read."""
     try:
         with safe_open(file, "pt") as handle:
             stored = []
             for key in handle.keys():  # noqa: SIM118  (not a dict)
                 tensor = handle.get_slice(key)
-                stored.append(_Stored(file, key, tuple(tensor.get_shape()), tensor.get_dtype()))
+                stored.append(Stored(file, key, tuple(tensor.get_shape()), tensor.get_dtype()))
             return stored
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{file} can't be read as safetensors ({error}); is the download complete?") from error
 
 
-def _read(stored: _Stored) -> Tensor:
+def read_tensor(stored: Stored) -> Tensor:
+    """A tensor's values, mapped: only what is copied from it is ever read."""
     with safe_open(stored.file, "pt") as handle:
         tensor: Tensor = handle.get_tensor(stored.key)
     return tensor
@@ -142,7 +144,7 @@ def _equal(a: Tensor, b: Tensor) -> bool:
     return all(torch.equal(a[start:stop], b[start:stop]) for start, stop in ranges)
 
 
-def _nbytes(stored: _Stored) -> int:
+def _nbytes(stored: Stored) -> int:
     count = ITEMSIZE[stored.dtype]
     for size in stored.shape:
         count *= size

@@ -1,0 +1,33 @@
+"""What LeRobot's own code computed from checkpoints that it saved; see golden_lerobot/README.md."""
+
+from pathlib import Path
+
+import pytest
+from lerobot_golden import GOLDEN, GoldenCase
+from safetensors.torch import load_file
+
+CASES = sorted(file.parent.name for file in GOLDEN.glob("*/case.json"))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_turbopi_computes_what_lerobot_computed(tmp_path: Path, name: str) -> None:
+    case = GoldenCase(GOLDEN / name)
+    assert case.wrong(case.assemble(tmp_path)) == {}
+
+
+def test_other_weights_and_inputs_are_noticed(tmp_path: Path) -> None:
+    """The comparison's own control."""
+    case = GoldenCase(GOLDEN / "mean_std")
+    checkpoint = case.assemble(tmp_path)
+    other = GoldenCase(GOLDEN / "trained_embedding")
+    wrong = other.wrong(checkpoint)
+    assert {"tokens", "normalized_state", "keys", "values", "v_1", "actions"} <= wrong.keys()
+
+
+def test_the_trained_embedding_is_not_the_head(tmp_path: Path) -> None:
+    weights = load_file(GoldenCase(GOLDEN / "trained_embedding").assemble(tmp_path) / "model.safetensors")
+    paligemma = "model.paligemma_with_expert.paligemma."
+    embedding, head = (
+        weights[paligemma + name + ".weight"] for name in ("model.language_model.embed_tokens", "lm_head")
+    )
+    assert (head != embedding).any(1).all()

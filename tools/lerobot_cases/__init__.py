@@ -1,0 +1,1 @@
+"""Makes small LeRobot checkpoints and records what LeRobot's own code computes with them; see __main__.py."""
