@@ -384,7 +384,9 @@ def test_a_device_that_is_lost_is_noticed_though_its_client_left() -> None:
     served(test)
 
 
-def test_serving_for_ever_ends_with_the_reason_when_the_device_is_lost() -> None:
+def test_serving_for_ever_ends_with_the_reason_when_the_device_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("turbopi.serve.server.LOST_NOTICE", 0.1)
+
     def crash(server: PolicyServer) -> None:
         async def call() -> None:
             async with client(server) as connection:

@@ -28,10 +28,18 @@ from rich.markup import escape
 from rich.table import Table
 from typer.core import TyperCommand
 
-from turbopi.cli.process import BAD_INPUT, INTERRUPTED, OUTPUT_CLOSED, can_encode_all, forget_output, is_closed_pipe
+from turbopi.cli.process import (
+    BAD_INPUT,
+    DEVICE_LOST,
+    INTERRUPTED,
+    OUTPUT_CLOSED,
+    can_encode_all,
+    forget_output,
+    is_closed_pipe,
+)
 from turbopi.errors import DeviceLost, TurboPiError
 
-CHECK_FAILED, OUR_FAULT, DEVICE_LOST = 1, 3, 4
+CHECK_FAILED, OUR_FAULT = 1, 3
 PLAIN_WIDTH = 140  # columns of tables where there is no terminal
 
 app = typer.Typer(

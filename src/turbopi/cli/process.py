@@ -3,7 +3,8 @@
 A process that Ctrl-C ends leaves by `os._exit`. Interpreters that shut down in the ordinary way are not safe here: a
 daemon thread may be inside a write to the terminal (progress bars) or inside a library's C code, and Python then aborts
 with "Fatal Python error"; and a KeyboardInterrupt that went through an `exec` while a module was imported changes the
-exit code. Nothing is lost: the command has cleaned up by then, and files are written whole or not at all.
+exit code. Nothing is lost: the command has cleaned up by then, and files are written whole or not at all. The same
+holds when the GPU has failed for good: libraries that free its memory at the end abort, or wait for it.
 """
 
 import contextlib
@@ -16,7 +17,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import IO, Any
 
-BAD_INPUT, INTERRUPTED, OUTPUT_CLOSED = 2, 130, 141  # 128 + the signal's number, as shells say it
+BAD_INPUT, DEVICE_LOST = 2, 4
+INTERRUPTED, OUTPUT_CLOSED = 130, 141  # 128 + the signal's number, as shells say it
 _SHOW_CURSOR = b"\x1b[?25h"  # progress bars hide it
 
 _ours = False  # whether this process runs one command and nothing else
@@ -40,7 +42,7 @@ def run(work: Callable[[], None]) -> None:
     except OSError as error:  # of --version and --help; commands tell their own
         code = _unwritable(error)
     code = _flush(code)
-    if code == INTERRUPTED:
+    if code in (INTERRUPTED, DEVICE_LOST):
         os._exit(code)
     sys.exit(code)
 

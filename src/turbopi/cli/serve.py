@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from turbopi.cli.files import check_folder
-from turbopi.cli.framework import Output, command
+from turbopi.cli.framework import Output, command, log_to_stderr
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.ports import why_not_free
 from turbopi.errors import ConfigError
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     shared=PolicyOptions,
     examples=(
         "turbopi serve checkpoints/pi05_libero --config pi05_libero",
-        "turbopi serve checkpoints/pi05_droid --config pi05_droid --host 0.0.0.0 --api-key SECRET --record recordings",
+        "turbopi serve checkpoints/pi05_droid --host 0.0.0.0 --api-key-file key --record recordings",
+        "TURBOPI_API_KEY=… turbopi serve checkpoints/pi05_libero --host 0.0.0.0 --allowed-hosts robot.lab",
         "turbopi serve --random-weights pi05_tiny --port 8001",
     ),
 )
@@ -39,7 +40,24 @@ def serve(
             "--api-key",
             envvar="TURBOPI_API_KEY",
             metavar="KEY",
-            help="Clients must send `Authorization: Api-Key KEY`. The variable keeps it out of the list of processes.",
+            hidden=True,  # `ps` shows a key on the command line to everyone on this machine
+        ),
+    ] = None,
+    api_key_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--api-key-file",
+            metavar="FILE",
+            help="Clients must send `Authorization: Api-Key KEY`; the file's one line is the key. The variable "
+            "TURBOPI_API_KEY does the same.",
+        ),
+    ] = None,
+    allowed_hosts: Annotated[
+        str | None,
+        typer.Option(
+            "--allowed-hosts",
+            metavar="NAME,NAME",
+            help="Names, besides this machine's, by which web pages may address the server. Robots need none.",
         ),
     ] = None,
     max_message_mb: Annotated[
@@ -62,16 +80,23 @@ def serve(
     """
     output = Output()
     options.check(checkpoint)
-    if api_key is None and "TURBOPI_API_KEY" in os.environ:  # which the option takes for none, and would let all in
-        raise ConfigError("TURBOPI_API_KEY is empty; give it the key, or unset it to serve without one")
+    shown = api_key is not None and api_key != os.environ.get("TURBOPI_API_KEY")
+    api_key = _key(api_key, api_key_file)
+    hosts = [] if allowed_hosts is None else [name.strip() for name in allowed_hosts.split(",")]
+    from turbopi.serve.hosts import AllowedHosts
     from turbopi.serve.server import check_options
 
     check_options(port=port, api_key=api_key, max_message_mb=max_message_mb, queue_limit=queue_limit)
+    AllowedHosts(host, hosts)
     if record is not None:
         check_folder(record)
     reason = why_not_free(host, port)
     if reason is not None:  # before minutes of loading, not after
         raise ConfigError(f"can't listen on {host}:{port}: {reason}. Choose another --host or --port")
+    if shown:
+        output.line(
+            "note: `ps` shows a key on the command line to all; --api-key-file or TURBOPI_API_KEY hides it", "yellow"
+        )
     opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
     policy = options.make_policy(opened, output)
@@ -79,6 +104,7 @@ def serve(
     from turbopi import serve as serving
 
     logging.getLogger("turbopi").setLevel(logging.INFO)
+    log_to_stderr(stamped=True)
     serving.run(
         policy if warmup else _Cold(policy),
         host=host,
@@ -87,8 +113,28 @@ def serve(
         max_message_mb=max_message_mb,
         queue_limit=queue_limit,
         record_dir=record,
+        allowed_hosts=hosts,
         console=output.console,
     )
+
+
+def _key(given: str | None, file: Path | None) -> str | None:
+    """The API key that the user means, None for none. Raises ConfigError if it can't be known."""
+    if given is None and "TURBOPI_API_KEY" in os.environ:  # which the option takes for none, and would let all in
+        raise ConfigError("TURBOPI_API_KEY is empty; give it the key, or unset it to serve without one")
+    if file is None:
+        return given
+    if given is not None:
+        raise ConfigError("--api-key-file was given, and a key besides it (TURBOPI_API_KEY or --api-key); give one")
+    try:
+        key = file.read_bytes()[:10_000].decode("ascii").strip()
+    except OSError as error:
+        raise ConfigError(f"the API key can't be read from {file}: {error.strerror}") from error
+    except UnicodeDecodeError:
+        raise ConfigError(f"{file} holds no API key: it should be one line of printable ASCII") from None
+    if not key:
+        raise ConfigError(f"{file} is empty; it should hold the API key")
+    return key
 
 
 class _Cold:

@@ -1,14 +1,19 @@
 """The HTTP side of the port: health, metrics, and who may become a websocket client."""
 
 import hmac
+import logging
+from collections.abc import Callable
 from http import HTTPStatus
-from urllib.parse import urlsplit
 
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from turbopi.errors import ConfigError
+from turbopi.serve.hosts import AllowedHosts
+from turbopi.serve.limited_log import LimitedLog
 from turbopi.serve.metrics import CONTENT_TYPE, Metrics
+
+logger = logging.getLogger(__name__)
 
 
 def check_key(api_key: str | None) -> None:
@@ -20,37 +25,68 @@ def check_key(api_key: str | None) -> None:
 class Gate:
     """Decides about each HTTP request on the server's port.
 
-    `/healthz` is open to all: load balancers carry no key. With an `api_key`, everything else needs
-    `Authorization: Api-Key <api_key>`, `/metrics` too. Raises ConfigError for a key that no header can carry.
+    api_key   with it, everything but `/healthz` needs `Authorization: Api-Key <api_key>`; load balancers carry no key
+    hosts     the names by which web pages may address the server; without a key, `/metrics` too
+    why_lost  why no request can be served any more (the GPU failed for good), None while all is well: until the
+              process ends, `/healthz` answers 503 with it, and so does every new client
+
+    Raises ConfigError for a key that no header can carry.
     """
 
-    def __init__(self, api_key: str | None, metrics: Metrics) -> None:
+    def __init__(
+        self,
+        api_key: str | None,
+        metrics: Metrics,
+        hosts: AllowedHosts,
+        why_lost: Callable[[], str | None] = lambda: None,
+    ) -> None:
         check_key(api_key)
         self._key = None if api_key is None else api_key.encode()
-        self._metrics = metrics
+        self._metrics, self._hosts, self._why_lost = metrics, hosts, why_lost
+        self._log = LimitedLog(logger)
 
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a plain HTTP request, or None to go on with the websocket handshake."""
-        path = request.path.partition("?")[0]
+        path, lost = request.path.partition("?")[0], self._why_lost()
         if path == "/healthz":
-            return connection.respond(HTTPStatus.OK, "OK\n")
+            if lost is None:
+                return connection.respond(HTTPStatus.OK, "OK\n")
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"the device is lost: {lost}\n")
         if not self._authorized(request):
-            self._metrics.error("unauthorized")
-            response = connection.respond(HTTPStatus.UNAUTHORIZED, "Send the header `Authorization: Api-Key <key>`.\n")
-            response.headers["WWW-Authenticate"] = "Api-Key"
-            return response
+            return self._unauthorized(connection, request)
         if path == "/metrics":
-            response = connection.respond(HTTPStatus.OK, self._metrics.text())
-            del response.headers["Content-Type"]
-            response.headers["Content-Type"] = CONTENT_TYPE
-            return response
-        hosts = request.headers.get_all("Host")
-        for origin in request.headers.get_all("Origin"):
-            # Browsers let every web page connect to 127.0.0.1, but say which page it is. Robots send no Origin.
-            if [urlsplit(origin).netloc] != hosts:
-                self._metrics.error("origin")
-                return connection.respond(HTTPStatus.FORBIDDEN, f"Pages of {origin} may not use this server.\n")
+            return self._metrics_page(connection, request)
+        host = _only(request, "Host")
+        for origin in request.headers.get_all("Origin"):  # of browsers, always; robots send none
+            if host is None or not self._hosts.has_page(origin, host):
+                return self._forbidden(connection, f"pages of {_short(origin)} may not use {_short(host)}")
+        if lost is not None:
+            self._metrics.error("lost")
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"the device is lost: {lost}\n")
         return None
+
+    def _metrics_page(self, connection: ServerConnection, request: Request) -> Response:
+        host = _only(request, "Host")
+        if self._key is None and (host is None or not self._hosts.has(host)):
+            # A page's GET of its own origin has no Origin, so a rebound name shows in Host alone
+            return self._forbidden(connection, f"/metrics is not for {_short(host)}")
+        response = connection.respond(HTTPStatus.OK, self._metrics.text())
+        del response.headers["Content-Type"]
+        response.headers["Content-Type"] = CONTENT_TYPE
+        return response
+
+    def _forbidden(self, connection: ServerConnection, why: str) -> Response:
+        self._metrics.error("origin")
+        self._log.warning(f"{_peer(connection)} refused: {why}")
+        return connection.respond(HTTPStatus.FORBIDDEN, f"{why}; --allowed-hosts names those that may.\n")
+
+    def _unauthorized(self, connection: ServerConnection, request: Request) -> Response:
+        self._metrics.error("unauthorized")
+        what = "a wrong API key" if request.headers.get_all("Authorization") else "no API key"
+        self._log.warning(f"{_peer(connection)} refused: it sent {what}")
+        response = connection.respond(HTTPStatus.UNAUTHORIZED, "Send the header `Authorization: Api-Key <key>`.\n")
+        response.headers["WWW-Authenticate"] = "Api-Key"
+        return response
 
     def _authorized(self, request: Request) -> bool:
         if self._key is None:
@@ -59,3 +95,21 @@ class Gate:
         scheme, _, key = headers[0].partition(" ") if len(headers) == 1 else ("", "", "")
         given = key.strip().encode(errors="replace")
         return scheme.lower() == "api-key" and hmac.compare_digest(given, self._key)  # in constant time
+
+
+def _only(request: Request, name: str) -> str | None:
+    """A header that should be there once; None if it isn't."""
+    values = request.headers.get_all(name)
+    return values[0] if len(values) == 1 else None
+
+
+def _short(value: str | None) -> str:
+    if value is None:
+        return "a request without one Host"
+    return repr(value if len(value) <= 80 else value[:80] + "…")
+
+
+def _peer(connection: ServerConnection) -> str:
+    """Address and port of whoever asks."""
+    address = connection.remote_address
+    return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else str(address)

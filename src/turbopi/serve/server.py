@@ -19,7 +19,7 @@ import math
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from websockets.frames import CloseCode
 from turbopi.errors import ConfigError, DeviceLost
 from turbopi.serve.calls import Outcome, Policy, PolicyCalls
 from turbopi.serve.gate import Gate, check_key
+from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.record import Recorder
 from turbopi.serve.signals import stop_signals
@@ -47,6 +48,9 @@ _REFUSALS = {
     "actions": "bad actions: {}",
     "lost": "the device is lost: {}",
 }
+LOST_NOTICE = (
+    5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers look now and then
+)
 MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
 
 
@@ -77,6 +81,7 @@ class PolicyServer:
     max_message_mb  larger messages end the connection with close code 1009
     queue_limit     requests that may wait while another one runs; more get a text frame "busy: ..."
     record_dir      if given, every observation and its actions are written below this folder
+    allowed_hosts   names, besides its own, by which web pages may address this server (`hosts.AllowedHosts`)
 
     Raises ConfigError for options that can't be right.
     """
@@ -91,12 +96,13 @@ class PolicyServer:
         max_message_mb: float = 64,
         queue_limit: int = 16,
         record_dir: str | Path | None = None,
+        allowed_hosts: Sequence[str] = (),
     ) -> None:
         check_options(port=port, api_key=api_key, max_message_mb=max_message_mb, queue_limit=queue_limit)
         self.host, self.port = host, port
         self.metrics = Metrics()
         self._policy = policy
-        self._gate = Gate(api_key, self.metrics)
+        self._gate = Gate(api_key, self.metrics, AllowedHosts(host, allowed_hosts), lambda: self.lost)
         self._max_bytes = int(max_message_mb * 2**20)
         self._record_dir = None if record_dir is None else Path(record_dir)
         self._recorder: Recorder | None = None
@@ -193,8 +199,9 @@ class PolicyServer:
     ) -> None:
         """Serve until SIGINT or SIGTERM, then stop gracefully. A second signal kills the process.
 
-        `on_ready` is called once clients can connect, `on_stopping` when the first signal has come. Raises DeviceLost,
-        once it has stopped, when the device has failed for good: a supervisor can start the process again.
+        `on_ready` is called once clients can connect, `on_stopping` when the first signal has come. When the device has
+        failed for good, all requests are refused and /healthz answers 503 for LOST_NOTICE seconds; then it stops and
+        raises DeviceLost, so that a supervisor can start the process again.
         """
 
         async def main() -> None:
@@ -211,7 +218,9 @@ class PolicyServer:
                             on_ready(self)
                             lost = asyncio.wrap_future(self._lost)
                             await asyncio.wait((stopped, lost), return_when=asyncio.FIRST_COMPLETED)
-                            if not lost.done():
+                            if lost.done():
+                                await asyncio.wait((stopped,), timeout=LOST_NOTICE)
+                            else:
                                 on_stopping(self)
                     finally:
                         await self.stop()
