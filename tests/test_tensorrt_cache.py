@@ -3,8 +3,10 @@
 import dataclasses
 import importlib.util
 import json
+import multiprocessing
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +15,12 @@ import pytest
 import torch
 from cli_helpers import refusal, turbopi
 from conftest import golden_model
+from file_helpers import no_room
 from tensorrt_fakes import ENVIRONMENT
 
 from turbopi import tensorrt
 from turbopi.config import Kind
-from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.errors import BackendError, BackendUnavailable, OutputError
 from turbopi.tensorrt.cache import CorruptEngine, EngineCache, StaleEngine
 from turbopi.tensorrt.engine import Input, Kernels, Specification, build
 from turbopi.tensorrt.networks import Fp8Scales
@@ -98,17 +101,18 @@ def test_other_weights_share_nothing(cache: EngineCache) -> None:
 
 def test_a_corrupt_engine_is_built_again(cache: EngineCache) -> None:
     cache.get_or_build(specification(), Builder())
-    plan = cache.folder / "part" / "engine.plan"
-    plan.write_bytes(b"plaN")
+    file = cache.file("part")
+    file.write_bytes(file.read_bytes()[:-1] + b"N")
     with pytest.raises(CorruptEngine, match="isn't as it was written"):
         cache.get(specification())
     assert cache.get_or_build(specification(), Builder(), lambda line: None)[1] == "built"
-    plan.write_bytes(b"pl")
-    with pytest.raises(CorruptEngine, match="hasn't 4 bytes"):
+    file.write_bytes(file.read_bytes()[:-2])
+    with pytest.raises(CorruptEngine, match="an engine of 2 bytes instead of 4"):
         cache.get(specification())
-    (cache.folder / "part" / "engine.json").write_text("{")
-    with pytest.raises(CorruptEngine, match=r"engine\.json can't be read"):
-        cache.get(specification())
+    for damaged in (b"", b"{", b"[]\nplan", b'{"key": {}, "key": {}}\nplan', b'{"key": 1}\nplan'):
+        file.write_bytes(damaged)
+        with pytest.raises(CorruptEngine, match=r"part\.engine's first line"):
+            cache.get(specification())
 
 
 def test_a_build_that_fails_leaves_nothing_and_keeps_what_was_there(cache: EngineCache) -> None:
@@ -124,18 +128,38 @@ def test_a_build_that_fails_leaves_nothing_and_keeps_what_was_there(cache: Engin
     assert cache.get(specification()) == b"plan"
 
 
-def test_a_write_that_fails_leaves_nothing(cache: EngineCache, monkeypatch: pytest.MonkeyPatch) -> None:
-    write = Path.write_text
-
-    def full(self: Path, *args: object, **more: object) -> int:
-        if self.name == "engine.json":
-            raise OSError(28, "No space left on device")
-        return write(self, *args, **more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(OSError, match="No space left"):
+def test_a_full_disk_leaves_what_was_there(cache: EngineCache) -> None:
+    with no_room(100), pytest.raises(OutputError, match=r"can't write .*part\.engine: File too large; make room"):
         cache.get_or_build(specification(), Builder())
     assert list(cache.folder.iterdir()) == []
+    cache.get_or_build(specification(), Builder())
+    with no_room(100), pytest.raises(OutputError):
+        cache.get_or_build(specification(), Builder(b"other"), rebuild=True)
+    assert cache.get(specification()) == b"plan" and list(cache.folder.iterdir()) == [cache.file("part")]
+
+
+def store(folder: Path, number: int, times: int) -> None:
+    """What a process does that builds an engine over and over; each stores another plan."""
+    cache = EngineCache(folder, ENVIRONMENT)
+    for _ in range(times):
+        cache.get_or_build(specification(), Builder(bytes([number]) * 50_000), rebuild=True)
+
+
+def test_an_engine_that_many_store_at_once_is_always_whole(cache: EngineCache) -> None:
+    """Two processes and four threads store it, and it is read all the while: no store and no read fails."""
+    store(cache.root, 255, 1)
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, mp_context=spawn) as processes, ThreadPoolExecutor(4) as threads:
+        stores = [processes.submit(store, cache.root, number, 25) for number in range(4)]
+        stores += [threads.submit(store, cache.root, 100 + number, 25) for number in range(4)]
+        reads = 0
+        while not all(one.done() for one in stores):
+            plan = cache.get(specification())
+            assert plan is not None and len(set(plan)) == 1 and len(plan) == 50_000
+            reads += 1
+        for one in stores:
+            one.result()
+    assert reads and list(cache.folder.iterdir()) == [cache.file("part")]
 
 
 def test_fingerprints_tell_weights_apart() -> None:
@@ -261,7 +285,7 @@ def test_build_refuses_before_it_loads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_manifest_names_everything_an_engine_depends_on(cache: EngineCache) -> None:
     cache.get_or_build(specification(precision="f16"), Builder())
-    about = json.loads((cache.folder / "part" / "engine.json").read_text())
+    about = json.loads(cache.file("part").read_bytes().split(b"\n")[0])
     assert about["key"].keys() == {f.name for f in dataclasses.fields(ENVIRONMENT)} | {"name", "inputs", "precision"}
     assert about["bytes"] == 4 and len(about["sha256"]) == 64
 

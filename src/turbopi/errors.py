@@ -10,6 +10,7 @@
     │   ├── BackendUnavailable it can't run here at all; says why and what to do
     │   └── DeviceLost         the GPU failed under it: no later call of this process can work
     ├── ActionError            the model computed actions that no robot may be given: NaN, infinite
+    ├── OutputError            a file that can't be written: a full disk, no permission        (also an OSError)
     ├── sim.base.SimulatorUnavailable      a simulator isn't installed or can't draw
     ├── evaluate.sources.PolicyLost        a policy server went away; the run can be continued
     ├── evaluate.sources.PolicyRefused     a policy doesn't fit the simulator
@@ -57,3 +58,7 @@ class DeviceLost(BackendError):
 
 class ActionError(TurboPiError, ArithmeticError):
     """The model computed an action chunk that no robot may be given: a number in it is NaN or infinite."""
+
+
+class OutputError(TurboPiError, OSError):
+    """A file that can't be written: the disk is full or read-only, there is no permission, no such folder."""

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from turbopi.errors import ConfigError
+from turbopi.files import write_whole
 
 _DPI = 110
 _WARNING = "#b00020"
@@ -77,7 +78,7 @@ class Row:
 def plot_chunks(file: Path, rows: Sequence[Row], *, robot: str, title: str, random_weights: bool) -> None:
     """Write a PNG with one row an observation: its pictures, then its action chunk by groups of one unit.
 
-    Raises ConfigError if `file` can't be written.
+    Raises as `write_figure` does.
     """
     groups = action_groups(robot, rows[0].actions.shape[1])
     num_pictures = max(len(row.pictures) for row in rows)
@@ -92,9 +93,17 @@ def plot_chunks(file: Path, rows: Sequence[Row], *, robot: str, title: str, rand
         _draw_pictures(axes[:num_pictures], row.pictures)
         for ax, group in zip(axes[num_pictures:], groups, strict=True):
             _draw_group(ax, group, row)
+    write_figure(file, figure)
+
+
+def write_figure(file: Path, figure: Figure, dpi: int = _DPI) -> None:
+    """Write a figure in the format that the file's ending names, whole or not at all.
+
+    Raises ConfigError for an unknown ending, OutputError if the file can't be written.
+    """
     try:
-        figure.savefig(file)
-    except (OSError, ValueError) as error:  # ValueError: an unknown ending
+        write_whole(file, lambda stream: figure.savefig(stream, dpi=dpi, format=file.suffix.removeprefix(".") or "png"))
+    except ValueError as error:
         raise ConfigError(f"can't write the plot {file}: {error}") from error
 
 

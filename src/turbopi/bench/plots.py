@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from turbopi.plots import write_figure
+
 SHAPE = ("cameras", "prompt_tokens", "horizon")
 STAGES = {"vision": "#4c72b0", "prefix": "#dd8452", "denoise": "#55a868"}
 
@@ -60,7 +62,7 @@ def _stages(document: dict[str, Any], path: Path) -> Path:
     axes.set_title(f"{document['model']}: {job_label(job)}", fontsize=10)
     axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
     axes.margins(x=0.08)
-    figure.savefig(path, dpi=110)
+    write_figure(path, figure)
     return path
 
 
@@ -90,7 +92,7 @@ def _steps(document: dict[str, Any], path: Path) -> Path:
     axes.set_ylim(bottom=0)
     axes.set_title(f"{document['model']}: {main['cameras']} cameras, {main['prompt_tokens']} tokens", fontsize=10)
     axes.legend()
-    figure.savefig(path, dpi=110)
+    write_figure(path, figure)
     return path
 
 
@@ -124,5 +126,5 @@ def _roofline(document: dict[str, Any], path: Path) -> Path:
     axes.set_ylabel("least operations / median time [TFLOP/s]")
     axes.set_title(f"{document['model']}: {job_label(document['main_job'])}", fontsize=10)
     axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    write_figure(path, figure)
     return path

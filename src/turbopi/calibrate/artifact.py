@@ -21,7 +21,7 @@ from turbopi.checkpoint import Checkpoint
 from turbopi.config import ModelConfig
 from turbopi.engine.fp8 import E4M3, Directions
 from turbopi.errors import CalibrationError, ConfigError
-from turbopi.folders import write_whole
+from turbopi.files import write_whole
 
 logger = logging.getLogger(__name__)
 

@@ -25,6 +25,7 @@ from turbopi.calibrate.statistics import collect
 from turbopi.calibrate.studied import WEIGHTS, Weights, studied_checkpoint
 from turbopi.checkpoint import random_checkpoint
 from turbopi.engine.fp8 import Directions
+from turbopi.files import write_whole
 from turbopi.model.reference import Pi0Model
 from turbopi.preprocess import Pipeline
 from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
@@ -149,7 +150,7 @@ def run(
                 f"{kind}: {name:42} relative rms {error['relative_rms']:.2e}  cosine {error['delta_cosine']:.6f}",
                 flush=True,
             )
-            out.write_text(json.dumps({**about, "errors": results}, indent=1) + "\n", encoding="utf-8")
+            write_whole(out, json.dumps({**about, "errors": results}, indent=1) + "\n")
         del model
     return results
 

@@ -34,7 +34,7 @@ from turbopi.checkpoint.source import Shape, check_finite
 from turbopi.checkpoint.torch_files import WEIGHTS
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
-from turbopi.folders import new_folder
+from turbopi.files import new_folder
 from turbopi.model.reference import Precision
 
 _DTYPES: dict[Precision, tuple[str, torch.dtype]] = {"bf16": ("BF16", torch.bfloat16), "f32": ("F32", torch.float32)}

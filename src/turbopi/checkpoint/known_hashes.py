@@ -7,13 +7,11 @@ must not rest on that (`turbopi inspect --hash`, calibrations, certificates) has
 
 import hashlib
 import json
-import os
-import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from turbopi.folders import cache_folder
+from turbopi.files import cache_folder, write_whole
 
 _SETTLED_S = 2.0  # a file that was changed since may be changed again within the clock's tick: not remembered
 _VERSION = 1  # of what a fingerprint is made from
@@ -52,9 +50,7 @@ def remember(key: str, fingerprint: str) -> None:
     file = _file(key)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=file.parent, delete=False, encoding="ascii") as written:
-            written.write(fingerprint + "\n")
-        os.replace(written.name, file)
+        write_whole(file, fingerprint + "\n")
     except OSError:
         return
 

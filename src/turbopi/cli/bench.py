@@ -15,7 +15,7 @@ from turbopi.cli.files import check_folder
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, WeightOptions
 from turbopi.errors import ConfigError
-from turbopi.folders import write_whole
+from turbopi.files import write_whole
 
 if TYPE_CHECKING:
     import torch
@@ -192,7 +192,7 @@ def _write(document: dict[str, Any], folder: Path) -> list[Path]:
     from turbopi.bench.report import report
 
     results, page = _write_results(document, folder), folder / "report.md"
-    page.write_text(report(document))
+    write_whole(page, report(document))
     return [results, page, *write_plots(document, folder)]
 
 

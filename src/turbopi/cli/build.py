@@ -106,7 +106,7 @@ def build(
     engines.parts(shape)  # TensorRT-RTX compiles an engine's kernels when it is loaded, and they are kept
     loading = time.perf_counter() - started
     counts = {kind: sum(origin == kind for origin in engines.origin.values()) for kind in ("built", "cached")}
-    size = sum(file.stat().st_size for name in engines.origin for file in (engines.cache.folder / name).iterdir())
+    size = sum(engines.cache.file(name).stat().st_size for name in engines.origin)
     output.line(
         f"{len(engines.origin)} engines for {shape}: {counts['built']} built, {counts['cached']} from the cache, "
         f"{size / 1e9:.2f} GB in {engines.cache.folder}, {seconds:.1f} s, and {loading:.1f} s to load them"

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.files import write_whole
 
 PART_NAMES = {
     "vision": "vision tower (SigLIP)",
@@ -188,5 +189,5 @@ def _complete_random(folder: Path, seed: int) -> Path:
 
     settings = json.loads((folder / FILE_NAME).read_text())
     settings["name"] += f" with random weights, seed {seed}"
-    (folder / FILE_NAME).write_text(json.dumps(settings, indent=2) + "\n")
+    write_whole(folder / FILE_NAME, json.dumps(settings, indent=2) + "\n")
     return Path(shutil.copyfile(TINY_TOKENIZER, folder / FILE_NAMES[0]))

@@ -12,6 +12,7 @@ from turbopi.cli.files import check_folder
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console, plain
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.timings import timing_columns
+from turbopi.files import write_whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -211,10 +212,11 @@ class _Run:
 
         folder.mkdir(parents=True, exist_ok=True)
         actions = np.stack([result["actions"] for result in self.results])
-        np.savez(folder / "actions.npz", actions=actions, oracle_actions=self.check.oracle_actions)
+        oracle = self.check.oracle_actions
+        write_whole(folder / "actions.npz", lambda stream: np.savez(stream, actions=actions, oracle_actions=oracle))
         document = self._document()
         text = json.dumps(plain(document), indent=1, ensure_ascii=False)
-        (folder / "report.json").write_text(text + "\n", encoding="utf-8")
+        write_whole(folder / "report.json", text + "\n")
         self._plot(folder / "demo.png")
         self.output.line(f"written to {folder}: demo.png, actions.npz, report.json")
         self.output.document(document)

@@ -15,6 +15,7 @@ from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command, new
 from turbopi.cli.options import PolicyOptions
 from turbopi.cli.timings import timing_columns
 from turbopi.errors import ConfigError, ObservationError
+from turbopi.files import write_whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -217,8 +218,8 @@ def _write(out: Path, answers: list[_Answer], output: Output) -> None:
     import numpy as np
 
     actions = _joined([answer.actions for answer in answers])
-    with out.open("wb") as stream:  # np.savez would add .npz to a name that doesn't end so
-        np.savez(stream, actions=actions, noise=_joined([answer.noise for answer in answers]))
+    noise = _joined([answer.noise for answer in answers])
+    write_whole(out, lambda stream: np.savez(stream, actions=actions, noise=noise))
     output.line(f"actions [{' x '.join(map(str, actions.shape))}] written to {out}")
 
 

@@ -10,6 +10,7 @@ from rich.table import Table
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, WeightOptions
 from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.files import write_whole
 
 if TYPE_CHECKING:
     import torch
@@ -98,7 +99,7 @@ def study(
         document["throughput"] = _throughput(opened, given, resolved, steps, calls)
         output.table(_throughput_table(document["throughput"]))
     if out is not None:
-        out.write_text(json.dumps(document, indent=1) + "\n")
+        write_whole(out, json.dumps(document, indent=1) + "\n")
         output.line(f"wrote {out}")
     output.document(document)
 

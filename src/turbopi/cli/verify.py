@@ -11,6 +11,7 @@ from turbopi.cli.files import check_folder
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, plain
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
+from turbopi.files import write_whole
 
 
 @command(
@@ -100,7 +101,7 @@ def _write(document: dict[str, Any], folder: Path, output: Output) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "verify.json"
-    file.write_text(json.dumps(plain(document), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_whole(file, json.dumps(plain(document), indent=1, ensure_ascii=False) + "\n")
     written = [file, *write_plots(document, folder)]
     output.line(f"wrote {', '.join(str(path) for path in written)}")
 

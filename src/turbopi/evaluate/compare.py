@@ -13,6 +13,7 @@ from turbopi.evaluate.plots import write_comparison_plot
 from turbopi.evaluate.report import page, table
 from turbopi.evaluate.results import Episode, Results
 from turbopi.evaluate.statistics import Paired, Rate, percentiles
+from turbopi.files import write_whole
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,7 @@ def write_comparison(folder: Path, compared: Sequence[Compared]) -> list[Path]:
     """compare.json, compare.png and compare.html."""
     folder.mkdir(parents=True, exist_ok=True)
     told = folder / "compare.json"
-    told.write_text(json.dumps(document(compared), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_whole(told, json.dumps(document(compared), indent=1, ensure_ascii=False) + "\n")
     plot = write_comparison_plot(folder / "compare.png", [(run.label, run.rate) for run in compared])
     shown = folder / "compare.html"
     suite = str(compared[0].results.protocol["suite"])
@@ -210,7 +211,7 @@ def write_comparison(folder: Path, compared: Sequence[Compared]) -> list[Path]:
         f'<div class=plots><img src="{plot.name}" alt="success of each run"></div>'
         f"<h2>Episodes that not all runs agree on</h2>{_disagreements(compared)}"
     )
-    shown.write_text(page(f"{suite}: comparison", body), encoding="utf-8")
+    write_whole(shown, page(f"{suite}: comparison", body))
     return [told, plot, shown]
 
 

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from turbopi.evaluate.results import Results, rate
 from turbopi.evaluate.statistics import Rate
+from turbopi.plots import write_figure
 
 _DPI = 120
 BLUE, GREEN, RED, GRAY = "#3b6fb6", "#2f8f5b", "#c0504d", "#9aa0a6"
@@ -40,7 +41,7 @@ def _success(results: Results, path: Path) -> Path:
     axes.set_xlim(0, 100)
     axes.set_xlabel("success [%], with Wilson's 95 % interval")
     axes.grid(axis="x", alpha=0.3)
-    figure.savefig(path, dpi=_DPI)
+    write_figure(path, figure, dpi=_DPI)
     return path
 
 
@@ -69,7 +70,7 @@ def _steps(results: Results, path: Path) -> Path:
     axes.set_xlabel("control steps")
     axes.set_ylabel("solved by then [% of episodes]")
     axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=_DPI)
+    write_figure(path, figure, dpi=_DPI)
     return path
 
 
@@ -87,7 +88,7 @@ def _latency(results: Results, path: Path) -> Path:
     axes.set_xlabel("one call of the policy [ms]")
     axes.set_ylabel("calls")
     axes.legend(fontsize=8, frameon=False)
-    figure.savefig(path, dpi=_DPI)
+    write_figure(path, figure, dpi=_DPI)
     return path
 
 
@@ -102,7 +103,7 @@ def write_comparison_plot(path: Path, rows: Sequence[tuple[str, Rate]]) -> Path:
     axes.set_xlim(0, 100)
     axes.set_xlabel("success on the common episodes [%], with Wilson's 95 % interval")
     axes.grid(axis="x", alpha=0.3)
-    figure.savefig(path, dpi=_DPI)
+    write_figure(path, figure, dpi=_DPI)
     return path
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from turbopi.evaluate.plots import write_plots
 from turbopi.evaluate.results import Episode, Results, rate
 from turbopi.evaluate.statistics import Rate, percentiles
+from turbopi.files import write_whole
 
 FILE = "report.html"
 
@@ -40,7 +41,7 @@ def write_report(results: Results) -> Path:
     """Plots and the page, of whatever episodes there are."""
     plots = write_plots(results)
     path = results.folder / FILE
-    path.write_text(page(f"{results.protocol['suite']}: {results.label}", _body(results, plots)), encoding="utf-8")
+    write_whole(path, page(f"{results.protocol['suite']}: {results.label}", _body(results, plots)))
     return path
 
 

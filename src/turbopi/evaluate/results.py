@@ -1,7 +1,6 @@
 """results.json: every episode of a run, written so that an interruption at any moment leaves a valid file."""
 
 import json
-import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -12,6 +11,7 @@ from typing import Any, Literal
 from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.statistics import Rate, percentiles
+from turbopi.files import write_whole
 from turbopi.sim import Task
 
 FORMAT = 1
@@ -126,12 +126,7 @@ class Results:
     def save(self) -> None:
         """Write the file as a whole: a reader, or a crash, sees the old one or the new one."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        unfinished = self.path.with_suffix(".json.tmp")
-        with open(unfinished, "w", encoding="utf-8") as file:
-            file.write(json.dumps(self.as_json(), ensure_ascii=False))
-            file.flush()
-            os.fsync(file.fileno())  # or a power cut could leave the new name with nothing in it
-        os.replace(unfinished, self.path)
+        write_whole(self.path, json.dumps(self.as_json(), ensure_ascii=False))
         self._saved_at = time.monotonic()
 
     def summary(self) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from turbopi.evaluate.plan import Job
 from turbopi.evaluate.sources import Answer, PolicySource
+from turbopi.files import write_whole
 from turbopi.serve.record import Recorder
 
 FILE = "visited.npz"
@@ -45,9 +46,11 @@ class Visited:
             self.entries[place] = entry
 
     def save(self) -> None:
-        stored = {f"{row}|{name}": value for row, entry in enumerate(self.entries) for name, value in entry.items()}
+        stored: dict[str, Any] = {"seen": self.seen, "count": len(self.entries)}
+        for row, entry in enumerate(self.entries):
+            stored |= {f"{row}|{name}": value for name, value in entry.items()}
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(self._path, seen=self.seen, count=len(self.entries), **stored)
+        write_whole(self._path, lambda stream: np.savez_compressed(stream, **stored))
 
 
 class Recording:

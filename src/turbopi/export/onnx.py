@@ -25,7 +25,7 @@ from turbopi.config import GemmaConfig, ModelConfig, VisionConfig
 from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError
 from turbopi.export.graphs import Graph, graphs
 from turbopi.export.quantized import quantize_mlps
-from turbopi.folders import new_folder
+from turbopi.files import new_folder
 from turbopi.model.reference import Pi0Model
 from turbopi.tensorrt.calibrate import Calibration
 from turbopi.tensorrt.networks import Fp8Scales

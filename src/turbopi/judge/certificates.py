@@ -21,6 +21,7 @@ from turbopi.calibrate.artifact import TIERS, Quantization
 from turbopi.calibrate.run import Settings, calibrate
 from turbopi.calibrate.studied import WEIGHTS, Weights, studied_checkpoint
 from turbopi.checkpoint import Checkpoint
+from turbopi.files import write_whole
 from turbopi.judge.verify import verify
 from turbopi.judge.verify_inputs import Plan
 from turbopi.serve.record import Call, save_call
@@ -147,7 +148,7 @@ def run(
                 found[tier] = condensed(certificate)
                 print(f"{kind}, {tier}: {certificate['verdict']}", flush=True)
                 text = json.dumps(document, indent=1, ensure_ascii=False)
-                (out / "certificates.json").write_text(text + "\n", encoding="utf-8")
+                write_whole(out / "certificates.json", text + "\n")
     return document
 
 

@@ -6,6 +6,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from turbopi.plots import write_figure
+
 _BY_LAYER = {"kv_k": "K", "kv_v": "V"}
 _BY_STEP = {"v_t": "velocity v_t", "x_t": "actions so far x_t"}
 
@@ -38,7 +40,7 @@ def _plot(document: dict[str, Any], names: dict[str, str], axis: str, path: Path
     verdict = "PASS" if document["ok"] else "FAIL"
     title = f"{document['model']}, {document['backend']} {document['precision']}: {verdict}"
     axes.set_title(f"{title}\ncontrol: {document['control']}", fontsize=10)
-    figure.savefig(path, dpi=110)
+    write_figure(path, figure)
     return path
 
 

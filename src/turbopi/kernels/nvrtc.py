@@ -7,15 +7,13 @@ import ctypes
 import hashlib
 import importlib
 import logging
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from turbopi.errors import BackendError, BackendUnavailable
-from turbopi.folders import cache_folder
+from turbopi.files import cache_folder, write_whole
 
 logger = logging.getLogger(__name__)
 
@@ -47,9 +45,7 @@ def compile_cubin(
         return path.read_bytes()
     code = _compile(nvrtc, source, options)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:  # several processes may start at once
-        file.write(code)
-    os.replace(file.name, path)
+    write_whole(path, code)
     logger.info("compiled a kernel for %s: %s", arch, path)
     return code
 

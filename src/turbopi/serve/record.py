@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from turbopi.errors import ConfigError
+from turbopi.files import append_line, write_whole
 from turbopi.serve.record_format import (
     FORMAT,
     VERSION,
@@ -55,7 +56,7 @@ class Recorder:
         try:
             self.folder = _new_folder(Path(record_dir))
             manifest = {"format": FORMAT, "version": VERSION, "started": time.time(), "metadata": metadata}
-            (self.folder / "manifest.json").write_text(json.dumps(manifest, indent=1, default=_plain), encoding="utf-8")
+            write_whole(self.folder / "manifest.json", json.dumps(manifest, indent=1, default=_plain))
         except OSError as error:
             raise ConfigError(f"can't record into {record_dir}: {error}") from error
         self._thread = threading.Thread(target=self._write_all, name="turbopi-recorder", daemon=True)
@@ -118,8 +119,7 @@ class Recorder:
         save_call(self.folder / name, call)
         timing = call.result.get("server_timing", {})
         line = {"file": name, "time": call.time, "infer_ms": timing.get("infer_ms")}
-        with (self.folder / "index.jsonl").open("a", encoding="utf-8") as index:
-            index.write(json.dumps(line) + "\n")
+        append_line(self.folder / "index.jsonl", json.dumps(line))
 
     def _release(self, size: int) -> None:
         with self._lock:

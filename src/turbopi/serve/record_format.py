@@ -16,7 +16,6 @@ A folder with an `observation.json` is an observation written by hand: see `load
 
 import base64
 import json
-import os
 import re
 import zipfile
 from collections.abc import Iterator
@@ -27,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from turbopi.errors import ObservationError
+from turbopi.files import write_whole
 
 FORMAT = "turbopi-recording"
 VERSION = 1
@@ -55,14 +55,8 @@ def save_call(path: Path, call: Call) -> None:
         "result": _to_node(call.result, "result", members),
     }
     members["index"] = np.frombuffer(json.dumps(index).encode(), np.uint8)
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        with temporary.open("wb") as file:
-            np.savez(file, **members)  # type: ignore[arg-type]
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    # a robot's calls come many a second: the last ones may be lost in a power cut, as those that still wait are
+    write_whole(path, lambda stream: np.savez(stream, **members), sync=False)  # type: ignore[arg-type]
 
 
 def load_call(path: str | Path) -> Call:

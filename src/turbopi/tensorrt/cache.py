@@ -1,7 +1,10 @@
-"""Engines on disk, each in a folder of its own that appears whole or not at all.
+"""Engines on disk, each in one file, which appears whole or not at all.
 
-<cache>/<weights>/<engine's name>/engine.plan   the serialised engine
-                                 /engine.json   everything that it depends on, its length and SHA-256
+<cache>/<weights>/<engine's name>.engine   one line of JSON: everything that it depends on, its length and SHA-256;
+                                           then the serialised engine
+
+Several processes may build and store the same engine at once: the last one's stays, and whoever reads meanwhile finds
+one of them, whole.
 
 An engine is asked for by weights and name. One that was made for something else (another library or version, GPU,
 precision, calibration, or an older Turbo-Pi) is stale: it is never used, and the reason is told. One whose bytes aren't
@@ -18,15 +21,18 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from turbopi.errors import BackendError
-from turbopi.folders import cache_folder, new_folder
+from turbopi.files import cache_folder, write_whole
+from turbopi.reading import parse_json
 from turbopi.tensorrt.engine import Specification
 
 logger = logging.getLogger(__name__)
 
 FOLDER_VARIABLE = "TURBOPI_ENGINES"
+_ENDING = ".engine"
+_LONGEST_LINE = 2**24  # of JSON: scales of every activation are part of a key
 Build = Callable[[Specification], bytes]
 Report = Callable[[str], None]
 
@@ -85,32 +91,38 @@ class EngineCache:
 
         Raises StaleEngine or CorruptEngine, with the reason.
         """
-        folder = self.folder / specification.name
-        if not folder.is_dir():
+        file = self.file(specification.name)
+        try:
+            with file.open("rb") as stream:
+                about, plan = _about(stream.readline(_LONGEST_LINE), file), stream.read()
+        except FileNotFoundError:
             return None
-        plan, about = folder / "engine.plan", self._about(folder)
+        except OSError as error:
+            raise CorruptEngine(f"{file} can't be read: {error.strerror or error}") from error
         expected = self._key(specification)
         different = [f"{name} {about['key'].get(name)!r} instead of {value!r}" for name, value in expected.items()
                      if about["key"].get(name) != value]  # fmt: skip
         if different:
-            raise StaleEngine(f"{folder} was built for {_shortened('; '.join(different))}")
-        if not plan.is_file() or plan.stat().st_size != about["bytes"]:
-            raise CorruptEngine(f"{plan} is missing or hasn't {about['bytes']} bytes")
-        content = plan.read_bytes()
-        if hashlib.sha256(content).hexdigest() != about["sha256"]:
-            raise CorruptEngine(f"{plan} isn't as it was written (SHA-256 differs)")
-        return content
+            raise StaleEngine(f"{file} was built for {_shortened('; '.join(different))}")
+        if len(plan) != about.get("bytes"):
+            raise CorruptEngine(f"{file} holds an engine of {len(plan)} bytes instead of {about.get('bytes')}")
+        if hashlib.sha256(plan).hexdigest() != about.get("sha256"):
+            raise CorruptEngine(f"{file} isn't as it was written (SHA-256 differs)")
+        return plan
 
     def put(self, specification: Specification, plan: bytes, seconds: float) -> None:
-        """Store an engine in place of whatever is there under its name."""
-        folder = self.folder / specification.name
+        """Store an engine in place of whatever is there under its name. Raises OutputError, and leaves that then."""
         key = self._key(specification)
         about = {"key": key, "bytes": len(plan), "sha256": hashlib.sha256(plan).hexdigest(), "build_seconds": seconds}
-        if folder.exists():
-            shutil.rmtree(folder)
-        with new_folder(folder) as temporary:
-            (temporary / "engine.plan").write_bytes(plan)
-            (temporary / "engine.json").write_text(json.dumps(about, indent=1) + "\n")
+        file = self.file(specification.name)
+
+        def write(stream: IO[bytes]) -> None:
+            stream.write(json.dumps(about).encode() + b"\n")
+            stream.write(plan)
+
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file, write)
+        shutil.rmtree(self.folder / specification.name, ignore_errors=True)  # where 0.1.0 kept it
 
     def get_or_build(
         self, specification: Specification, build: Build, report: Report = logger.info, *, rebuild: bool = False
@@ -135,7 +147,11 @@ class EngineCache:
     def names(self) -> Iterator[str]:
         """Of the engines of these weights, stale ones too."""
         if self.folder.is_dir():
-            yield from sorted(one.name for one in self.folder.iterdir() if (one / "engine.json").is_file())
+            yield from sorted(file.name.removesuffix(_ENDING) for file in self.folder.glob(f"[!.]*{_ENDING}"))
+
+    def file(self, name: str) -> Path:
+        """Where the engine of that name is, or would be."""
+        return self.folder / f"{name}{_ENDING}"
 
     def _key(self, specification: Specification) -> dict[str, Any]:
         inputs = {name: [list(one.shape), one.dtype] for name, one in specification.inputs.items()}
@@ -143,14 +159,13 @@ class EngineCache:
         plain: dict[str, Any] = json.loads(json.dumps(key))  # as it is read back
         return plain
 
-    @staticmethod
-    def _about(folder: Path) -> Mapping[str, Any]:
-        try:
-            about = json.loads((folder / "engine.json").read_text())
-            assert isinstance(about["key"], dict) and isinstance(about["bytes"], int), about
-            return about
-        except (OSError, ValueError, KeyError, TypeError, AssertionError) as error:
-            raise CorruptEngine(f"{folder / 'engine.json'} can't be read ({error!r})") from error
+
+def _about(line: bytes, file: Path) -> Mapping[str, Any]:
+    """The first line of an engine's file."""
+    about = parse_json(line, f"{file}'s first line", CorruptEngine)
+    if not isinstance(about, dict) or not isinstance(about.get("key"), dict):
+        raise CorruptEngine(f"{file}'s first line doesn't tell what the engine depends on")
+    return about
 
 
 def _shortened(text: str, most: int = 400) -> str:

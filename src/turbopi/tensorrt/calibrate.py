@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from turbopi.calibrate.artifact import Quantization
 from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.folders import write_whole
+from turbopi.files import write_whole
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.tensorrt.networks import Fp8Scales

@@ -6,7 +6,6 @@ the engine wasn't built for is an error, never another code path.
 
 import hashlib
 import logging
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor
 
 from turbopi.errors import BackendError
+from turbopi.files import write_whole
 from turbopi.tensorrt import Library
 from turbopi.tensorrt.ops import Dtype, TensorRTOps, Value
 
@@ -177,11 +177,9 @@ class Kernels:
         content = bytes(self._cache.serialize())
         if content == self._stored:
             return
-        temporary = self._file.with_name(f".{self._file.name}.{os.getpid()}")
         try:
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(hashlib.sha256(content).digest() + content)
-            temporary.replace(self._file)
+            write_whole(self._file, hashlib.sha256(content).digest() + content)
         except OSError as error:
             logger.warning("compiled kernels aren't kept: %s", error)
             return

@@ -1,0 +1,324 @@
+"""Files appear whole or not at all, whatever happens while they are written."""
+
+import errno
+import json
+import multiprocessing
+import os
+import stat
+import threading
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import pytest
+from file_helpers import no_room
+from matplotlib.figure import Figure
+
+from turbopi.errors import CheckpointError, ConfigError, OutputError
+from turbopi.files import append_line, new_file, new_folder, whole_lines, write_whole
+from turbopi.plots import write_figure
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+# -- one file ----------------------------------------------------------------------------------------------------------
+
+
+def test_text_bytes_and_what_a_function_writes_arrive_alone(tmp_path: Path) -> None:
+    write_whole(tmp_path / "text", "größer\n")
+    write_whole(tmp_path / "bytes", b"\0\1")
+    write_whole(tmp_path / "arrays.npz", lambda stream: np.savez(stream, a=np.arange(3)))
+    assert (tmp_path / "text").read_text(encoding="utf-8") == "größer\n"
+    assert (tmp_path / "bytes").read_bytes() == b"\0\1"
+    with np.load(tmp_path / "arrays.npz") as arrays:
+        assert arrays["a"].tolist() == [0, 1, 2]
+    assert names(tmp_path) == ["arrays.npz", "bytes", "text"]
+
+
+def large_figure(file: Path) -> None:
+    figure = Figure(figsize=(4, 4))
+    figure.subplots().imshow(np.random.default_rng(0).random((200, 200)))
+    write_figure(file, figure)
+
+
+def fill(stream: IO[bytes]) -> None:
+    for _ in range(100):
+        stream.write(b"x" * 1000)
+
+
+WRITERS = {
+    "text": lambda file: write_whole(file, "new " * 1000),
+    "function": lambda file: write_whole(file, fill),
+    "npz": lambda file: write_whole(file, lambda stream: np.savez(stream, a=np.zeros(9999), b=np.zeros(3))),
+    "npz, compressed": lambda file: write_whole(
+        file, lambda stream: np.savez_compressed(stream, a=np.random.default_rng(0).random(9999))
+    ),
+    "png": lambda file: large_figure(file.with_suffix(".png")),
+    "svg": lambda file: large_figure(file.with_suffix(".svg")),
+    "pdf": lambda file: large_figure(file.with_suffix(".pdf")),
+}
+
+
+@pytest.mark.parametrize("room", [0, 100, 1000])
+@pytest.mark.parametrize("writer", WRITERS)
+def test_a_full_disk_keeps_the_earlier_file_and_names_it(writer: str, room: int, tmp_path: Path) -> None:
+    ending = f".{writer}" if writer in ("png", "svg", "pdf") else ""
+    file = tmp_path / f"result{ending}"
+    file.write_text("earlier")
+    with no_room(room), pytest.raises(OutputError) as told:
+        WRITERS[writer](file)
+    assert str(told.value) == f"can't write {file}: File too large; make room, or write to another place"
+    assert file.read_text() == "earlier" and names(tmp_path) == [file.name]
+
+
+def test_a_disk_that_is_full_only_when_it_is_synced_counts_as_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on disks that give out room late."""
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    file = tmp_path / "result"
+    file.write_text("earlier")
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputError, match=r"can't write .*result: No space left on device; make room"):
+        write_whole(file, "new")
+    assert file.read_text() == "earlier" and names(tmp_path) == ["result"]
+
+
+def test_a_disk_that_cant_sync_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(descriptor: int) -> None:
+        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+
+    monkeypatch.setattr(os, "fsync", unknown)
+    write_whole(tmp_path / "result", "new")
+    assert (tmp_path / "result").read_text() == "new"
+
+
+def test_whatever_ends_the_writing_leaves_the_earlier_file(tmp_path: Path) -> None:
+    file = tmp_path / "result"
+    file.write_text("earlier")
+    for reason in (KeyboardInterrupt(), ValueError("a wrong value"), ConfigError("refused")):
+
+        def stop(stream: IO[bytes], reason: BaseException = reason) -> None:
+            stream.write(b"half")
+            raise reason
+
+        with pytest.raises(type(reason)) as told:
+            write_whole(file, stop)
+        assert told.value is reason
+        assert file.read_text() == "earlier" and names(tmp_path) == ["result"]
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    happened = []
+    sync, replace = os.fsync, os.replace
+
+    def synced(descriptor: int) -> None:
+        happened.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")))
+        sync(descriptor)
+
+    def replaced(source: Path, target: Path) -> None:
+        assert source.read_text() == "new"
+        happened.append(Path(target))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", replaced)
+    write_whole(tmp_path / "result", "new")
+    temporary, target, folder = happened
+    assert temporary.parent == tmp_path and temporary.name.startswith(".result.") and str(os.getpid()) in temporary.name
+    assert (target, folder) == (tmp_path / "result", tmp_path)
+
+
+def test_messages_name_the_file_the_reason_and_are_of_the_callers_class(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=f"^can't write {tmp_path}/no/file: there is no folder {tmp_path}/no$"):
+        write_whole(tmp_path / "no" / "file", "", CheckpointError)
+    with pytest.raises(OutputError, match=f"^can't write {tmp_path}: Is a directory$") as told:
+        write_whole(tmp_path, "")
+    assert isinstance(told.value, OSError)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=f"^can't write {tmp_path}/file/below: there is no folder {tmp_path}/file$"):
+        write_whole(tmp_path / "file" / "below", "")
+
+
+def test_a_fault_of_another_file_is_told_as_that_files(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="another") as told:
+        write_whole(tmp_path / "result", lambda stream: stream.write((tmp_path / "sub" / "another").read_bytes()))
+    assert not isinstance(told.value, OutputError) and names(tmp_path) == []
+
+
+def test_permissions_and_links_stay(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    file, link = tmp_path / "elsewhere" / "private", tmp_path / "link"
+    file.write_text("earlier")
+    file.chmod(0o600)
+    link.symlink_to(file)
+    write_whole(link, "new")
+    assert link.is_symlink() and file.read_text() == "new" and stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert names(tmp_path) == ["elsewhere", "link"] and names(file.parent) == ["private"]
+
+
+def test_a_new_files_permissions_are_the_users_usual_ones(tmp_path: Path) -> None:
+    write_whole(tmp_path / "ours", "")
+    (tmp_path / "usual").write_text("")
+    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+def test_what_cant_be_replaced_is_written_to(tmp_path: Path) -> None:
+    write_whole(Path(os.devnull), "nothing")
+    assert stat.S_ISCHR(os.stat(os.devnull).st_mode)
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    read: list[bytes] = []
+    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()))
+    reader.start()
+    write_whole(pipe, "through")
+    reader.join(60)
+    assert read == [b"through"] and stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_a_long_name_leaves_room_for_the_temporary_one(tmp_path: Path) -> None:
+    for letter in ("x", "ö", "🤖"):
+        name = letter * (250 // len(letter.encode()))
+        write_whole(tmp_path / name, "new")
+        assert (tmp_path / name).read_text() == "new"
+
+
+def write_often(file: Path, number: int) -> None:
+    for _ in range(50):
+        write_whole(file, str(number) * 20_000)
+
+
+def test_of_many_writers_at_once_none_fails_and_readers_find_a_whole_file(tmp_path: Path) -> None:
+    file = tmp_path / "shared"
+    write_often(file, 9)
+    with ProcessPoolExecutor(3, mp_context=multiprocessing.get_context("spawn")) as pool:
+        writers = [pool.submit(write_often, file, number) for number in range(6)]
+        while not all(writer.done() for writer in writers):
+            text = file.read_text()
+            assert len(text) == 20_000 and len(set(text)) == 1
+        for writer in writers:
+            writer.result()
+    assert names(tmp_path) == ["shared"]
+
+
+def test_a_path_that_another_writer_fills_becomes_the_file(tmp_path: Path) -> None:
+    with new_file(tmp_path / "film.mp4") as temporary:
+        temporary.write_text("frames")
+        assert names(tmp_path) == [temporary.name] and temporary.name.startswith(".film.mp4.")
+    assert names(tmp_path) == ["film.mp4"]
+
+
+# -- folders -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+
+    def fail(folder: Path) -> None:
+        (folder / "half").write_text("")
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError), new_folder(tmp_path / "made") as folder:
+        fail(folder)
+    assert names(tmp_path) == []
+    with new_folder(tmp_path / "deep" / "made") as folder:
+        (folder / "below").mkdir()
+        (folder / "below" / "file").write_text("whole")
+        assert not (tmp_path / "deep" / "made").exists()
+    assert (tmp_path / "deep" / "made" / "below" / "file").read_text() == "whole"
+    assert names(tmp_path / "deep") == ["made"]
+
+
+def test_a_folder_on_a_full_disk_leaves_nothing_and_is_named(tmp_path: Path) -> None:
+    target = tmp_path / "made"
+    with (
+        no_room(10),
+        pytest.raises(CheckpointError, match=f"can't write {target}: File too large"),
+        new_folder(target, CheckpointError) as folder,
+    ):
+        (folder / "file").write_bytes(b"x" * 100)
+    assert names(tmp_path) == []
+
+
+def test_what_somebody_put_there_meanwhile_stays(tmp_path: Path) -> None:
+    target = tmp_path / "made"
+
+    def fill_both(folder: Path) -> None:
+        (folder / "ours").write_text("")
+        target.mkdir()
+        (target / "theirs").write_text("")
+
+    with pytest.raises(OutputError, match=f"can't write {target}: Directory not empty"), new_folder(target) as folder:
+        fill_both(folder)
+    assert names(tmp_path) == ["made"] and names(target) == ["theirs"]
+
+
+def test_an_empty_folder_that_cant_be_replaced_is_filled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as a container's mounted folder: it has no neighbours on its disk, and can't be removed."""
+    target = tmp_path / "mounted"
+    target.mkdir()
+    before = target.stat().st_ino
+    monkeypatch.setattr(Path, "is_mount", lambda self: self == target)
+    with new_folder(target) as folder:
+        assert folder.parent == target
+        (folder / "below").mkdir()
+        (folder / "below" / "file").write_text("whole")
+    assert target.stat().st_ino == before and names(target) == ["below"] and names(tmp_path) == ["mounted"]
+
+
+# -- lines -------------------------------------------------------------------------------------------------------------
+
+
+def test_lines_are_appended_whole(tmp_path: Path) -> None:
+    file = tmp_path / "index.jsonl"
+    for number in range(3):
+        append_line(file, json.dumps({"number": number, "text": "\u2028 ö"}, ensure_ascii=False))
+    assert [json.loads(line)["number"] for line in whole_lines(file)] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("half", ['{"number": 1, "te', "{", "1", "\0" * 200_000, '{"a": "' + "x" * 200_000])
+def test_a_half_line_is_ignored_and_never_damages_the_next_one(half: str, tmp_path: Path) -> None:
+    file = tmp_path / "index.jsonl"
+    for first in ("", '{"number": 0}\n'):
+        file.write_text(first + half)
+        assert "".join(f"{line}\n" for line in whole_lines(file)) == first
+        append_line(file, '{"number": 2}')
+        assert file.read_text() == first + '{"number": 2}\n'
+
+
+def test_a_last_line_that_lacks_only_its_line_break_is_kept(tmp_path: Path) -> None:
+    file = tmp_path / "index.jsonl"
+    file.write_text('{"number": 0}\n{"number": 1}')
+    assert whole_lines(file) == ['{"number": 0}', '{"number": 1}']
+    append_line(file, '{"number": 2}')
+    assert file.read_text() == '{"number": 0}\n{"number": 1}\n{"number": 2}\n'
+
+
+def test_a_full_disk_leaves_no_half_line(tmp_path: Path) -> None:
+    file = tmp_path / "index.jsonl"
+    append_line(file, '{"number": 0}')
+    with no_room(20), pytest.raises(OutputError, match=rf"can't write {file}: File too large; make room"):
+        append_line(file, '{"number": 1}')
+    assert file.read_text() == '{"number": 0}\n'
+    append_line(file, '{"number": 2}')
+    assert whole_lines(file) == ['{"number": 0}', '{"number": 2}']
+
+
+def append_often(file: Path, number: int) -> None:
+    for _ in range(100):
+        append_line(file, json.dumps({"number": number, "text": str(number) * 5000}))
+
+
+def test_several_processes_may_append_to_one_file(tmp_path: Path) -> None:
+    file = tmp_path / "index.jsonl"
+    with ProcessPoolExecutor(3, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for writer in [pool.submit(append_often, file, number) for number in range(3)]:
+            writer.result()
+    lines = [json.loads(line) for line in whole_lines(file)]
+    assert sorted(line["number"] for line in lines) == [0] * 100 + [1] * 100 + [2] * 100
+    assert all(line["text"] == str(line["number"]) * 5000 for line in lines)
