@@ -225,6 +225,7 @@ def lerobot_copy(folder: Path, mode: str = "QUANTILES", **config: Any) -> Path:
         "empty_cameras": 1,
         "tokenizer_max_length": 180,
         "normalization_mapping": mapping,
+        "use_relative_actions": False,
         "dtype": "bfloat16",
     }
     write_json(folder / "config.json", described | config)

@@ -11,9 +11,11 @@ from safetensors.torch import load_file
 
 from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
 from turbopi.config import PRESETS, GemmaConfig, Normalization, VisionConfig
-from turbopi.errors import CheckpointError, ConfigError
+from turbopi.errors import CheckpointError, ConfigError, ObservationError
+from turbopi.robots import create_robot
 
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
+EMBEDDING = "model__paligemma_with_expert__paligemma__model__language_model__embed_tokens__weight"
 
 
 @pytest.fixture(autouse=True)
@@ -78,12 +80,21 @@ def test_the_training_outputs_folder_is_understood(tmp_path: Path) -> None:
     assert open_checkpoint(tmp_path / "020000").path == folder
 
 
-def test_cameras_are_called_what_observations_call_them(tmp_path: Path) -> None:
+def test_cameras_are_called_what_observations_call_them_or_what_the_policy_does(tmp_path: Path) -> None:
     folder = lerobot_copy(tmp_path / "c")
     renames = {"observation.images.top": "observation.images.image"}
     edit_json(folder / PRE, lambda c: step(c, "rename_observations_processor")["config"].update(rename_map=renames))
-    keys = open_checkpoint(folder).config.robot_options["image_keys"]
-    assert keys == ["observation.images.top", "observation.images.image2"]
+    options = open_checkpoint(folder).config.robot_options
+    assert options["image_keys"] == ["observation.images.image", "observation.images.image2"]
+    assert options["rename_map"] == renames
+    robot = create_robot("lerobot", options)
+    example = robot.example(np.random.default_rng(0))
+    assert set(example) == {"observation.images.top", "observation.images.image2", "observation.state", "task"}
+    sent = robot.inputs(example)
+    assert list(sent.images)[:2] == options["image_keys"]
+    named = {renames.get(key, key): value for key, value in example.items()}
+    again = robot.inputs(named)
+    assert all(np.array_equal(sent.images[key], again.images[key]) for key in options["image_keys"])
 
 
 def test_empty_cameras_count_even_if_the_features_leave_them_out(tmp_path: Path) -> None:
@@ -114,15 +125,19 @@ def test_a_preset_does_not_fit_a_lerobot_folder(tmp_path: Path) -> None:
         ({"type": "pi0"}, "LeRobot checkpoint of type 'pi0'; Turbo-Pi reads LeRobot's 'pi05'"),
         ({"type": "pi0_fast"}, "of type 'pi0_fast'"),
         ({"image_resolution": [448, 448]}, r"image_resolution = \[448, 448\], which Turbo-Pi doesn't compute"),
-        ({"use_relative_actions": True}, "use_relative_actions = True"),
-        ({"n_obs_steps": 2}, "n_obs_steps = 2"),
+        ({"min_period": 0.001}, "min_period = 0.001"),
         ({"max_period": 8.0}, "max_period = 8.0"),
         ({"chunk_size": None}, "chunk_size is None; expected a whole number from 1"),
         ({"chunk_size": "50"}, "chunk_size is '50'; expected a whole number"),
         ({"empty_cameras": -1}, "empty_cameras is -1; expected a whole number from 0"),
         ({"input_features": {"observation.state": [8]}}, "expected features with type and shape"),
         ({"output_features": {"action": {"type": "ACTION", "shape": [2, 7]}}}, r"action has shape \[2, 7\]"),
-        ({"tokenizer_max_length": 64}, "prompts have 180 tokens in .* but 64"),
+        ({"tokenizer_max_length": 0}, "tokenizer_max_length is 0; expected a whole number from 1"),
+        (
+            {"output_features": {"action": {"type": "ACTION", "shape": [6]}}},
+            "says 6 values of action.*statistics have 7",
+        ),
+        ({"output_features": None}, "says 32 values of action, but the statistics have 7; LeRobot can't run it either"),
         ({"input_features": {}}, "lists no camera"),
         (
             {"normalization_mapping": {"STATE": "MEAN_STD"}},
@@ -160,10 +175,30 @@ def test_what_turbopi_does_not_compute_is_refused(tmp_path: Path, change: dict[s
             PRE,
             "rename_observations_processor",
             {"rename_map": {"state": "observation.state"}},
-            "observations call the state 'state'",
+            "observations call observation.state 'state', which LeRobot never reads",
         ),
         (PRE, "rename_observations_processor", {"rename_map": [1]}, r"rename_map is \[1\]; expected an object"),
         (PRE, "rename_observations_processor", {"rename_map": {"a": [1]}}, "rename_map is .*; expected a new name"),
+        (
+            PRE,
+            "rename_observations_processor",
+            {"rename_map": {"observation.state": "observation.joints"}},
+            "makes observation.state 'observation.joints', so there is no state",
+        ),
+        (PRE, "tokenizer_processor", {"truncation": False}, "truncation is false, so LeRobot's prompts may be longer"),
+        (PRE, "tokenizer_processor", {"padding": False}, "padding is False; expected one of max_length, longest"),
+        (PRE, "tokenizer_processor", {"task_key": "subtask"}, "task_key is 'subtask'; expected task"),
+        (PRE, "tokenizer_processor", {"max_length": None}, "max_length is None; expected a whole number"),
+        (PRE, "pi05_prepare_state_tokenizer_processor_step", {"task_key": "subtask"}, "task_key is 'subtask'"),
+        (PRE, "device_processor", {"float_dtype": "bfloat16"}, "float_dtype is 'bfloat16'; expected null or float32"),
+        (POST, "device_processor", {"float_dtype": "float16"}, "float_dtype is 'float16'; expected null or float32"),
+        (
+            PRE,
+            "normalizer_processor",
+            {"stats": {}},
+            "normalizer_processor has stats = {}, which Turbo-Pi doesn't know",
+        ),
+        (PRE, "to_batch_processor", {"size": 2}, "to_batch_processor has size = 2.*knows no key of this step"),
         (PRE, "normalizer_processor", {"norm_map": None}, "policy_preprocessor.json: norm_map is None; expected"),
         (PRE, "normalizer_processor", {"norm_map": {"STATE": []}}, r"normalises STATE by \[\]"),
         (PRE, "normalizer_processor", {"features": True}, "features is True; expected an object"),
@@ -188,7 +223,7 @@ def test_a_steps_config_is_an_object(tmp_path: Path, value: Any) -> None:
 
 
 def test_what_the_config_asks_for_and_isnt_done_is_noted(tmp_path: Path) -> None:
-    plain = lerobot_copy(tmp_path / "a", rtc_config=None, pretrained_revision=None)
+    plain = lerobot_copy(tmp_path / "a", rtc_config=None, pretrained_revision=None, n_obs_steps=2)
     assert open_checkpoint(plain).info()["notes"] == []
     asks = lerobot_copy(tmp_path / "b", rtc_config={"enabled": True}, mixture="x")
     unknown, rtc = open_checkpoint(asks).info()["notes"]
@@ -196,17 +231,37 @@ def test_what_the_config_asks_for_and_isnt_done_is_noted(tmp_path: Path) -> None
     assert "enables rtc_config" in rtc
 
 
-def test_unknown_steps_and_relative_actions_are_refused(tmp_path: Path) -> None:
+def test_the_preprocessors_prompt_length_wins(tmp_path: Path) -> None:
+    checkpoint = open_checkpoint(lerobot_copy(tmp_path / "c", tokenizer_max_length=64))
+    assert checkpoint.config.model.max_prompt_tokens == 180
+    assert checkpoint.info()["notes"] == [
+        "config.json says 64 tokens of prompt, but policy_preprocessor.json 180: so many are read, as LeRobot runs it"
+    ]
+
+
+def test_the_statistics_width_wins_over_the_state_feature(tmp_path: Path) -> None:
     folder = lerobot_copy(tmp_path / "c")
-    relative = {"registry_name": "relative_actions_processor", "config": {"enabled": False}}
-    edit_json(folder / PRE, lambda c: c["steps"].insert(2, relative))
-    open_checkpoint(folder)
-    edit_json(folder / PRE, lambda c: c["steps"][2]["config"].update(enabled=True))
-    with pytest.raises(CheckpointError, match="relative_actions_processor is enabled"):
-        open_checkpoint(folder)
-    edit_json(folder / PRE, lambda c: c["steps"][2].update(registry_name="noise_processor"))
-    with pytest.raises(CheckpointError, match="has a step 'noise_processor' that Turbo-Pi doesn't know"):
-        open_checkpoint(folder)
+    edit_json(folder / "config.json", lambda c: c["input_features"]["observation.state"].update(shape=[32]))
+    checkpoint = open_checkpoint(folder)
+    assert checkpoint.config.robot_options["state_dim"] == 8
+    assert checkpoint.info()["notes"] == [
+        "config.json says 32 values of state, but the statistics have 8: observations have 8, as LeRobot runs it"
+    ]
+    robot = create_robot("lerobot", checkpoint.config.robot_options)
+    observation = robot.example(np.random.default_rng(0))
+    for width in (1, 7, 32):  # where LeRobot's subtraction fails, or repeats one value
+        with pytest.raises(ObservationError, match=rf"observation.state has shape \({width},\), expected shape \(8,\)"):
+            robot.inputs({**observation, "observation.state": np.zeros(width, np.float32)})
+
+
+def test_lm_head_that_differs_from_the_embedding_is_said(tmp_path: Path) -> None:
+    folder = lerobot_copy(tmp_path / "c")
+    head = load_file(folder / "model.safetensors")["model.paligemma_with_expert.paligemma.lm_head.weight"]
+    edit_tensors(folder, **{EMBEDDING: head.clone()})
+    assert open_checkpoint(folder).info()["notes"] == []
+    edit_tensors(folder, **{EMBEDDING: head + 1})
+    (note,) = open_checkpoint(folder).info()["notes"]
+    assert note == "lm_head and embed_tokens differ: prompts are embedded by embed_tokens, as LeRobot does"
 
 
 def test_a_base_model_without_statistics_is_never_a_silent_identity(tmp_path: Path) -> None:
@@ -221,10 +276,9 @@ def test_a_base_model_without_statistics_is_never_a_silent_identity(tmp_path: Pa
 def test_the_embedding_is_read_where_the_head_differs(tmp_path: Path) -> None:
     folder = lerobot_copy(tmp_path / "c")
     head = load_file(folder / "model.safetensors")["model.paligemma_with_expert.paligemma.lm_head.weight"]
-    name = "model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
-    edit_tensors(folder, **{name.replace(".", "__"): head + 1})
+    edit_tensors(folder, **{EMBEDDING: head + 1})
     assert torch.equal(open_checkpoint(folder).load("cpu", "f32").state["vlm.embed_tokens.weight"], (head + 1).float())
-    edit_tensors(folder, **{name.replace(".", "__"): head.double()})
+    edit_tensors(folder, **{EMBEDDING: head.double()})
     with pytest.raises(CheckpointError, match="tied in the model but differ"):
         open_checkpoint(folder)
 
@@ -241,7 +295,7 @@ def test_a_state_file_never_leads_out_of_the_folder(tmp_path: Path) -> None:
     folder = lerobot_copy(tmp_path / "c")
     (folder / "pre_stats.safetensors").rename(tmp_path / "pre_stats.safetensors")
     edit_json(folder / PRE, lambda c: step(c, "normalizer_processor").update(state_file="../pre_stats.safetensors"))
-    with pytest.raises(CheckpointError, match=r"names \.\./pre_stats.safetensors, which isn't there"):
+    with pytest.raises(CheckpointError, match=r"names the file '\.\./pre_stats.safetensors', which leads out of"):
         open_checkpoint(folder)
 
 

@@ -136,6 +136,32 @@ def test_lerobots_edges_from_end_to_end() -> None:
     np.testing.assert_array_equal(edges.after(chunk, context)["actions"], actions.astype(np.float64), strict=True)
 
 
+@pytest.mark.parametrize("mode", ["lerobot_quantile", "lerobot_zscore", "lerobot_min_max", "identity"])
+def test_lerobots_relative_actions_are_added_to_the_state_that_came(mode: NormMode) -> None:
+    keys, mask = ["observation.images.top"], [True, False, True, True, False]
+    config = PolicyConfig(
+        "lerobot",
+        dataclasses.replace(LIBERO.model, vocab_size=512),
+        "lerobot",
+        Normalization(mode, "lerobot_quantile"),
+        robot_options={"image_keys": keys, "state_dim": 6, "action_dim": 5, "relative_dims": mask},
+        image_resize="lerobot",
+    )
+    stats = plausible(6)
+    constant = np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])  # a joint that never moved: scaling back would lose the state
+    stats = dataclasses.replace(stats, **{name: getattr(stats, name) * constant for name in stats.available})
+    edges = Pipeline(config, NormStats(stats, plausible(5)), PromptTokenizer(ByteTokenizer(), vocab_size=512))
+    rng = np.random.default_rng(0)
+    state = rng.normal(size=6).astype(np.float32)
+    observation = {keys[0]: rng.random((3, 40, 60), np.float32), "observation.state": state, "task": "go"}
+    chunk = rng.normal(size=(10, 32)).astype(np.float32)
+    _, context = edges.before(observation)
+    unscaled = edges.action_scale.unnormalize(chunk)[:, :5].astype(np.float32)
+    expected = unscaled + state[:5] * np.array(mask, np.float32)
+    np.testing.assert_array_equal(edges.after(chunk, context)["actions"], expected.astype(np.float64), strict=True)
+    assert not np.shares_memory(context, state)
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_presets_example_goes_through_and_comes_back(name: str) -> None:
     config = preset(name)

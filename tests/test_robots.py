@@ -17,6 +17,7 @@ from turbopi.robots.base import find, keys_of, read_prompt, read_state
 
 FOLDER = Path(__file__).parent / "golden" / "preprocess"
 DOCS = Path(__file__).parent.parent / "docs" / "robots.md"
+LEROBOT_WRIST = "observation.images.wrist"
 LEROBOT = {"image_keys": ["observation.images.top", "observation.images.wrist"], "state_dim": 6, "action_dim": 6}
 CREATED = {
     "libero": create_robot("libero"),
@@ -274,16 +275,59 @@ def test_lerobots_pictures_stay_in_their_precision() -> None:
     assert wrist.dtype == np.float32
 
 
-def test_a_misspelt_lerobot_camera_is_refused() -> None:
-    observation = lerobot_observation()
-    observation["observation.images.topp"] = observation.pop("observation.images.top")
-    with pytest.raises(
-        ObservationError, match=r"cameras are observation\.images\.wrist, observation\.images\.topp; this"
-    ):
-        CREATED["lerobot"].inputs(observation)
+def test_lerobot_runs_with_a_camera_too_many_and_one_too_few_and_warns_once(caplog: pytest.LogCaptureFixture) -> None:
+    robot = create_robot("lerobot", {**LEROBOT, "image_keys": ["observation.images.warned_about", LEROBOT_WRIST]})
+    observation = robot.example(np.random.default_rng(0))
+    observation["observation.images.topp"] = observation.pop("observation.images.warned_about")
+    for _ in range(3):
+        inputs = robot.inputs(observation)
+    assert list(inputs.image_mask.items()) == [(LEROBOT_WRIST, True), ("observation.images.warned_about", False)]
+    (record,) = caplog.records
+    assert "has observation.images.topp, which this checkpoint doesn't read, and lacks" in record.message
+    assert "observation.images.warned_about, which is masked" in record.message
+
+
+def test_an_observation_without_any_of_lerobots_cameras_is_refused() -> None:
     none = {key: value for key, value in lerobot_observation().items() if "images" not in key}
     with pytest.raises(ObservationError, match=r"cameras are nothing; this checkpoint's are observation\.images\.top"):
         CREATED["lerobot"].inputs(none)
+    with pytest.raises(ObservationError, match=r"cameras are observation\.images\.x; this checkpoint's are"):
+        CREATED["lerobot"].inputs({**none, "observation.images.x": np.zeros((3, 8, 8), np.uint8)})
+
+
+def test_lerobots_names_and_new_names_are_both_read_and_the_later_wins() -> None:
+    renames = {"observation.images.a": "observation.images.top", "observation.joints": "observation.state"}
+    robot = create_robot("lerobot", {**LEROBOT, "rename_map": renames})
+    example = robot.example(np.random.default_rng(0))
+    assert set(example) == {"observation.images.a", LEROBOT_WRIST, "observation.joints", "task"}
+    shades = {"observation.images.a": 10, "observation.images.top": 20}
+    for names in (
+        ("observation.images.a", "observation.images.top"),
+        ("observation.images.top", "observation.images.a"),
+    ):
+        pictures = {name: np.full((3, 8, 8), shades[name], np.uint8) for name in names}
+        inputs = robot.inputs({**pictures, "observation.state": np.arange(6.0), "task": "go"})
+        assert inputs.images["observation.images.top"].max() == shades[names[-1]]
+        assert inputs.state.tolist() == [0, 1, 2, 3, 4, 5]
+    with pytest.raises(ObservationError, match=r"expected .*observation\.joints"):
+        robot.inputs({"observation.images.a": np.zeros((3, 8, 8), np.uint8), "task": "go"})
+
+
+def test_lerobots_names_can_be_swapped() -> None:
+    top = "observation.images.top"
+    robot = create_robot("lerobot", {**LEROBOT, "rename_map": {top: LEROBOT_WRIST, LEROBOT_WRIST: top}})
+    example = robot.example(np.random.default_rng(0))
+    inputs = robot.inputs(example)
+    assert np.array_equal(inputs.images[top], example[LEROBOT_WRIST].transpose(1, 2, 0))
+    assert np.array_equal(inputs.images[LEROBOT_WRIST], example[top].transpose(1, 2, 0))
+
+
+def test_a_picture_of_an_empty_camera_is_read_as_lerobot_reads_it() -> None:
+    robot = create_robot("lerobot", {**LEROBOT, "num_missing_cameras": 2})
+    extra = {"observation.images.empty_camera_1": np.full((3, 8, 8), 9, np.uint8)}
+    inputs = robot.inputs(lerobot_observation() | extra)
+    assert list(inputs.image_mask.values()) == [True, True, True, False]
+    assert list(inputs.images)[2:] == ["observation.images.empty_camera_1", "missing_0"]
 
 
 def test_lerobots_task_may_be_a_list_of_one() -> None:
@@ -299,6 +343,13 @@ def test_lerobots_task_may_be_a_list_of_one() -> None:
         ({"image_keys": "observation.images.top"}, "image_keys must be a list"),
         ({"image_keys": ["a", "a"]}, "image_keys must be a list of different keys"),
         ({"state_dim": 0}, "state_dim must be an integer of at least 1, got 0"),
+        ({"rename_map": {"a": 1}}, "rename_map must be an object of keys and their new names, got {'a': 1}"),
+        ({"rename_map": ["a"]}, "rename_map must be an object"),
+        ({"relative_dims": [1, 0]}, r"relative_dims must be a list of true and false, got \[1, 0\]"),
+        (
+            {"relative_dims": [True] * 7},
+            "relative_dims has 7 dimensions, but there are 6 of actions and 6 of the state",
+        ),
         ({"num_missing_cameras": -1}, "num_missing_cameras must be an integer of at least 0"),
     ],
 )

@@ -132,7 +132,8 @@ class PolicyConfig:
     asset_id: str | None = None  # folder of norm_stats.json below assets/; None: the only one there
     robot_options: Mapping[str, Any] = field(default_factory=dict)
     default_prompt: str | None = None
-    image_resize: Literal["openpi", "lerobot"] = "openpi"
+    image_resize: Literal["openpi", "lerobot", "lerobot_0.4"] = "openpi"
+    prompt_state_dim: int | None = None  # zeros fill the state up to it in the prompt, as in LeRobot 0.4; None: nothing
     num_denoising_steps: int = 10  # unless whoever runs the policy says otherwise
 
     def with_model(self, **changes: Any) -> "PolicyConfig":

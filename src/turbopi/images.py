@@ -3,7 +3,8 @@
 Two ways, because a model must see pictures resized as they were in its training:
 
 - openpi's: everything becomes uint8; Pillow's bilinear filter (which averages when it shrinks) on uint8; black padding.
-- LeRobot's: float32 in [0, 1]; bilinear without averaging; black padding; then [-1, 1].
+- LeRobot's: float32 in [0, 1]; bilinear without averaging; black padding; then [-1, 1]. LeRobot 0.4 padded with -1
+  before that, so with -3 after it.
 
 Both keep the aspect ratio and centre the picture. Sources: openpi's `image_tools.py` and policies; LeRobot's
 `vla_utils.resize_with_pad_torch` and `PI05Policy._preprocess_images` (0.6.1).
@@ -137,10 +138,11 @@ def _copy(image: np.ndarray, out: np.ndarray) -> None:
         out[..., channel] = image[..., channel]
 
 
-def resize_unit_into(image: np.ndarray, out: np.ndarray) -> None:
-    """LeRobot's way: one picture in [0, 1] into `out` float32[height, width, 3] in [-1, 1], which holds -1.
+def resize_unit_into(image: np.ndarray, out: np.ndarray, *, low: float = 0.0) -> None:
+    """LeRobot's way: one picture in [0, 1] into `out` float32[height, width, 3] in [-1, 1], which holds the padding.
 
     image   uint8[h, w, 3], divided by 255 first, or float32[h, w, 3] in [0, 1]
+    low     what is below it becomes it where a picture is resized: 0, in LeRobot 0.4 -1
     """
     planes = np.empty((3, *image.shape[:2]), np.float32)  # by channel: torch's layout, and faster than a transpose
     for channel in range(3):
@@ -153,7 +155,7 @@ def resize_unit_into(image: np.ndarray, out: np.ndarray) -> None:
         out = out[rows, columns]
         tensor = torch.from_numpy(planes)[None]
         resized = torch.nn.functional.interpolate(tensor, size=out.shape[:2], mode="bilinear", align_corners=False)
-        planes = resized[0].clamp_(0.0, 1.0).numpy()
+        planes = resized[0].clamp_(low, 1.0).numpy()
     for channel in range(3):
         out[..., channel] = planes[channel] * np.float32(2) - np.float32(1)
 

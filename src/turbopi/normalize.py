@@ -50,10 +50,11 @@ class Normalizer:
         a, b = (np.asarray(getattr(stats, name), np.float64) for name in names)
         if a.ndim != 1 or a.shape != b.shape:
             raise ConfigError(f"{self.feature} statistics {names[0]} {a.shape} and {names[1]} {b.shape} don't match")
-        return (a.astype(np.float32), b.astype(np.float32)) if self._is_lerobot else (a, b)
+        return (a.astype(np.float32), b.astype(np.float32)) if self.is_lerobot else (a, b)
 
     @property
-    def _is_lerobot(self) -> bool:
+    def is_lerobot(self) -> bool:
+        """Whether it computes in float32, as LeRobot does."""
         return self.mode.startswith("lerobot_")
 
     def normalize(self, x: np.ndarray) -> np.ndarray:
@@ -61,7 +62,7 @@ class Normalizer:
         if self.width is None:
             return np.array(x, np.float64)  # a copy, as in every other mode
         d = x.shape[-1]
-        if d > self.width or (self._is_lerobot and d != self.width):
+        if d > self.width or (self.is_lerobot and d != self.width):
             raise ObservationError(f"{self.feature} has {d} values, but the checkpoint's statistics cover {self.width}")
         a, b = self._a[:d], self._b[:d]
         with np.errstate(over="ignore"):  # absurd inputs become inf, which the pipeline refuses
@@ -77,7 +78,7 @@ class Normalizer:
 
     def fitted(self, x: np.ndarray) -> np.ndarray:
         """float[d] made as wide as `normalize` takes it: cut, or for LeRobot's modes repeated."""
-        if self.width is None or (len(x) <= self.width and not self._is_lerobot):
+        if self.width is None or (len(x) <= self.width and not self.is_lerobot):
             return x
         return np.resize(x, self.width)
 
@@ -96,7 +97,7 @@ class Normalizer:
 
     def _unscaled(self, x: np.ndarray) -> np.ndarray:
         a, b = self._a, self._b
-        if self._is_lerobot:
+        if self.is_lerobot:
             x = x.astype(np.float32)
         match self.mode:
             case "quantile":

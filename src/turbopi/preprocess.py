@@ -1,9 +1,11 @@
 """The policy's two edges: a robot's observation to the model's inputs, and the model's actions to the robot's.
 
-Each edge is a list of steps, in openpi's order; the second undoes the first. Two facts that are easy to get wrong: the
-state goes into the prompt normalised but not padded, and relative actions are added to the un-normalised state.
+Each edge is a list of steps, in openpi's order; the second undoes the first. Facts that are easy to get wrong: the
+state goes into the prompt normalised but not padded (but by LeRobot 0.4), and relative actions are added to the state
+un-normalised: openpi un-normalises what it has normalised, LeRobot has kept what came.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -22,13 +24,21 @@ from turbopi.robots.base import read_prompt, read_state
 from turbopi.robots.plain import Plain
 from turbopi.tokenizer import PromptTokenizer
 
+# image_resize: what pictures are padded with, the dtype that the model gets, and how
+_RESIZING: dict[str, tuple[int, type, Callable[[np.ndarray, np.ndarray], None]]] = {
+    "openpi": (0, np.uint8, resize_into),
+    "lerobot": (-1, np.float32, resize_unit_into),
+    "lerobot_0.4": (-3, np.float32, functools.partial(resize_unit_into, low=-1.0)),
+}
+
 
 @dataclass
 class Incoming:
     """One observation on its way in: `Pipeline.see` fills the first half, `Pipeline.read` the rest.
 
     pictures        (uint8|float32)[224, 224, 3] of each camera that `image_mask` has; some may be the observation's own
-    state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt
+    state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt.
+                                In the end what `Pipeline.after` needs: as it came, where LeRobot adds it to actions
     model_state     float32[action_dim]  what fits of it, as the model reads it
     """
 
@@ -90,6 +100,7 @@ class Pipeline:
             self._normalize_state,
             self._tokenize,
             self._pad_state,
+            self._keep_raw_state,
         )
         self.after_model: tuple[Callable[[_Result], None], ...] = (
             self._unnormalize,
@@ -98,14 +109,15 @@ class Pipeline:
         )
 
     def before(self, observation: Mapping[str, Any]) -> tuple[ModelInputs, np.ndarray]:
-        """The model's inputs, and the state float64[s] (normalised, padded) that `after` needs.
+        """The model's inputs, and the state float64[s] that `after` needs (normalised and padded, see `Incoming`).
 
         The observation isn't changed, and nothing returned shares memory with it. Raises ObservationError if it can't
         be used.
         """
         one = self.see(observation)
         self.read(one)
-        size, (black, dtype) = self.config.model.vision.image_size, self._black
+        size = self.config.model.vision.image_size
+        black, dtype = (0, np.uint8) if self.config.image_resize == "openpi" else (-1, np.float32)
         images: np.ndarray = np.empty((len(one.image_mask), size, size, 3), dtype)
         pictures = iter(one.pictures)
         for valid, image in zip(one.image_mask, images, strict=True):
@@ -201,26 +213,22 @@ class Pipeline:
         sample.pictures = [self._fitted(pictures.get(camera), camera) for camera in itertools.compress(cameras, valid)]
 
     def _fitted(self, picture: Any, camera: str) -> np.ndarray:
-        picture, size, (black, dtype) = check_hwc(picture, camera), self.config.model.vision.image_size, self._black
-        unit = dtype == np.float32
-        if not unit:
+        picture, size = check_hwc(picture, camera), self.config.model.vision.image_size
+        padding, dtype, resize = _RESIZING[self.config.image_resize]
+        if dtype == np.uint8:
             picture = to_uint8(picture, camera)
             if picture.shape == (size, size, 3) and picture.flags.c_contiguous:
                 return picture
         out: np.ndarray = np.empty((size, size, 3), dtype)
         if picture.shape != out.shape:
-            out.fill(black)  # what stays of it is the padding
-        resize = resize_unit_into if unit else resize_into
+            out.fill(padding)  # what stays of it
         resize(picture, out)
         return out
 
-    @property
-    def _black(self) -> tuple[int, type]:
-        """What pictures are padded with, and their dtype."""
-        return (-1, np.float32) if self.config.image_resize == "lerobot" else (0, np.uint8)
-
     def _tokenize(self, sample: Incoming) -> None:
-        state = sample.state if self.config.discrete_state_input else None
+        state = None
+        if self.config.discrete_state_input:
+            state = pad_last(sample.state, self.config.prompt_state_dim or 0)
         sample.tokens, sample.token_mask = self.tokenizer.tokenize(
             sample.prompt, state, max_tokens=self.config.model.max_prompt_tokens
         )
@@ -235,13 +243,26 @@ class Pipeline:
             at = int(np.flatnonzero(~np.isfinite(state))[0])
             raise ObservationError(f"state value {at} is {sample.state[at]:g} once normalised, too large for the model")
 
+    def _keep_raw_state(self, sample: Incoming) -> None:
+        if self._adds_raw_state:
+            sample.state = pad_last(np.array(sample.robot.state, np.float64), self.config.model.action_dim)
+
+    @property
+    def _adds_raw_state(self) -> bool:
+        """Whether actions become absolute as in LeRobot: by the state that came, in float32."""
+        scaled = self.state_scale.is_lerobot or self.action_scale.is_lerobot
+        return self.robot.delta_mask is not None and scaled
+
     # After the model
 
     def _unnormalize(self, result: _Result) -> None:
         result.actions = self.action_scale.unnormalize(result.actions)
 
     def _make_absolute(self, result: _Result) -> None:
-        if self.robot.delta_mask is not None:
+        if self._adds_raw_state:
+            actions, state = result.actions.astype(np.float32), result.state.astype(np.float32)
+            result.actions = absolute_actions(actions, state, self.robot.delta_mask or ())
+        elif self.robot.delta_mask is not None:
             state = self.state_scale.unnormalize(result.state)
             result.actions = absolute_actions(result.actions, state, self.robot.delta_mask)
 
@@ -253,8 +274,10 @@ class Pipeline:
         config, robot, limit = self.config, self.robot, self.config.model.action_dim
         if config.discrete_state_input and config.model.kind != "pi05":
             raise ConfigError(f"{config.name}: only Pi0.5 reads the state from the prompt; Pi0 needs it set to false")
-        if config.image_resize not in ("openpi", "lerobot"):
-            raise ConfigError(f"{config.name}: image_resize is openpi or lerobot, not {config.image_resize!r}")
+        if config.image_resize not in _RESIZING:
+            raise ConfigError(
+                f"{config.name}: image_resize is openpi or lerobot or lerobot_0.4, not {config.image_resize!r}"
+            )
         dims = (("state", robot.state_dim, self.state_scale), ("actions", robot.action_dim, self.action_scale))
         if robot.delta_mask is not None and len(robot.delta_mask) > limit:
             raise ConfigError(

@@ -178,6 +178,7 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, Any], Path
         "asset_id": asset_id,
         "default_prompt": config.default_prompt,
         "image_resize": config.image_resize,
+        "prompt_state_dim": config.prompt_state_dim,
         "time_grid": config.model.time_grid,
         "num_denoising_steps": config.num_denoising_steps,
         "vision_heads": config.model.vision.num_heads,

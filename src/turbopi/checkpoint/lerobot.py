@@ -1,25 +1,36 @@
 """LeRobot's `pi05` checkpoints: `config.json` and the two processor pipelines, which describe a policy fully.
 
-Facts from LeRobot 0.6: the processors' files decide over config.json, steps are found by `registry_name` and their
-tensors by `state_file`; QUANTILES and MIN_MAX replace a zero range by 1e-8, MEAN_STD adds 1e-8; the normalised state
-is always written into the prompt; cameras that aren't there come last; t is 1 + step * dt.
+Facts from LeRobot 0.6: the processors' files decide over config.json; their tensors are found by `state_file`;
+QUANTILES and MIN_MAX replace a zero range by 1e-8, MEAN_STD adds 1e-8; the normalised state is always written into the
+prompt; cameras that aren't there come last; t is 1 + step * dt. What 0.4 did otherwise is in lerobot_versions.py, what
+the processors' steps may be in lerobot_pipeline.py.
 """
 
-import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
+from turbopi.checkpoint import lerobot_versions as versions
+from turbopi.checkpoint.lerobot_pipeline import (
+    ACTION,
+    NORMALIZER,
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    STATE,
+    UNNORMALIZER,
+    Pipelines,
+)
 from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, feature_stats
 from turbopi.checkpoint.settings import Settings, with_values
-from turbopi.config import ModelConfig, Normalization, NormMode, PolicyConfig
+from turbopi.config import LIMITS, ModelConfig, Normalization, NormMode, PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
+from turbopi.reading import Fields, file_inside, read_json, shown
 
-CONFIG, PREPROCESSOR, POSTPROCESSOR = "config.json", "policy_preprocessor.json", "policy_postprocessor.json"
-STATE, ACTION, EMPTY_CAMERA = "observation.state", "action", "observation.images.empty_camera_"
+CONFIG, EMPTY_CAMERA = "config.json", "observation.images.empty_camera_"
 
 _MODES: dict[str, NormMode] = {
     "QUANTILES": "lerobot_quantile",
@@ -29,66 +40,42 @@ _MODES: dict[str, NormMode] = {
 }
 _EPS = 1e-8
 _FEATURE_TYPES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
-_TOKENIZER = "google/paligemma-3b-pt-224"
-_STEPS = {
-    PREPROCESSOR: (
-        "rename_observations_processor",
-        "to_batch_processor",
-        "relative_actions_processor",
-        "normalizer_processor",
-        "pi05_prepare_state_tokenizer_processor_step",
-        "tokenizer_processor",
-        "device_processor",
-    ),
-    POSTPROCESSOR: ("unnormalizer_processor", "absolute_actions_processor", "device_processor"),
-}
 # values of config.json that change what the model computes, and the only ones that Turbo-Pi computes
 _FIXED = {
-    "n_obs_steps": (1, "one observation a step"),
     "image_resolution": ([224, 224], "224 x 224 pictures"),
     "min_period": (4e-3, "the time embedding's shortest period 0.004"),
     "max_period": (4.0, "the time embedding's longest period 4.0"),
-    "use_relative_actions": (False, "absolute actions"),
 }
-# the rest of LeRobot 0.6's keys: read here, or about training and the hub
-_KNOWN = set(_FIXED) | {
-    *("type", "chunk_size", "n_action_steps", "max_state_dim", "max_action_dim", "num_inference_steps"),
-    *("input_features", "output_features", "normalization_mapping", "empty_cameras", "tokenizer_max_length"),
-    *("paligemma_variant", "action_expert_variant", "dtype", "device", "use_amp", "compile_model", "compile_mode"),
-    *("time_sampling_beta_alpha", "time_sampling_beta_beta", "time_sampling_scale", "time_sampling_offset"),
-    *("relative_exclude_joints", "action_feature_names", "rtc_config", "gradient_checkpointing", "use_peft"),
-    *("freeze_vision_encoder", "train_expert_only", "push_to_hub", "repo_id", "private", "tags", "license"),
-    *("pretrained_path", "pretrained_revision", "optimizer_lr", "optimizer_betas", "optimizer_eps"),
-    *("optimizer_weight_decay", "optimizer_grad_clip_norm", "optimizer_fused"),
-    *("scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"),
-}
+# what LeRobot writes: read here, in no use for Pi0.5 (n_obs_steps), or about training and the hub
+_KNOWN = versions.FIRST_KEYS | versions.LATER_KEYS
 
 
 class LeRobotFolder:
     """The description in a LeRobot folder; the weights are read by TorchSource.
 
+    settings  what a turbopi.json puts over it
+    untied    whether the weights hold lm_head beside the embedding, see lerobot_versions.py
+
     Raises CheckpointError for what isn't Pi0.5, is incomplete, or asks for what Turbo-Pi doesn't compute.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.config = _read_json(folder / CONFIG)
+    def __init__(self, folder: Path, settings: Settings, *, untied: bool = False) -> None:
+        self.folder, self.settings, self.file = folder, settings, folder / CONFIG
+        self.config = Fields(_read_config(folder), self.file)
         self._check_config()
-        self.steps = {name: self._read_steps(name) for name in (PREPROCESSOR, POSTPROCESSOR)}
+        self.pipelines = Pipelines(folder)
+        self.stats, self._stats_files = self._read_stats()
+        self.action_dim = self._width("output_features", ACTION, "max_action_dim")
+        self.described_state_dim = self._width("input_features", STATE, "max_state_dim")
+        # LeRobot scales by the statistics, whatever config.json says: a fine-tune keeps its base's input_features
+        self.state_dim = self.described_state_dim if self.stats.state is None else self.stats.state.dim
+        self.written_by = versions.detect(self.config.values, untied=untied)
+        chosen = settings.values.get("lerobot_semantics", "auto")
+        self.semantics: versions.Semantics = (self.written_by or "0.6") if chosen == "auto" else chosen
 
-    def notes(self) -> list[str]:
-        """What config.json asks for and Turbo-Pi doesn't do; keys that LeRobot's Pi0.5 doesn't have, from which another
-        program may compute something.
-        """
-        unknown = sorted(self.config.keys() - _KNOWN)
-        notes = [f"config.json has keys that Turbo-Pi doesn't know or follow: {', '.join(unknown)}"] if unknown else []
-        rtc = self.config.get("rtc_config")
-        if isinstance(rtc, dict) and rtc.get("enabled"):
-            notes.append("config.json enables rtc_config: Turbo-Pi answers each observation with a chunk of its own")
-        return notes
-
-    def policy_config(self, settings: Settings) -> PolicyConfig:
+    def policy_config(self) -> PolicyConfig:
         """What the folder says, with a turbopi.json's values over it. A preset would be a second description."""
+        settings = self.settings
         if settings.policy is not None:
             return settings.policy
         if "preset" in settings.values:
@@ -96,199 +83,207 @@ class LeRobotFolder:
                 f"{self.folder} is a LeRobot checkpoint, which describes itself, so {settings.source} doesn't fit: use "
                 'config="auto", and put single differences, such as {"robot": "libero"}, into a turbopi.json there'
             )
-        model = ModelConfig(
-            action_horizon=self._count("chunk_size", None),
-            max_prompt_tokens=self._prompt_tokens(),
-            time_grid="multiplied",
-        )
+        old = self.semantics == "0.4"
+        summed = old and versions.sums_up_time(self.config.values)
         described = PolicyConfig(
             name="lerobot_pi05",
-            model=model,
+            model=ModelConfig(
+                action_horizon=self.config.integer("chunk_size", 1, LIMITS["action_horizon"], default=50),
+                max_prompt_tokens=self.pipelines.max_tokens,
+                time_grid="accumulated" if summed else "multiplied",
+            ),
             robot="lerobot",
             normalization=Normalization("identity", "identity"),  # until the next line
             robot_options=self._robot_options(),
-            image_resize="lerobot",
-            num_denoising_steps=self._count("num_inference_steps", 10),
+            image_resize="lerobot_0.4" if old else "lerobot",
+            prompt_state_dim=self.pipelines.prompt_width if old else None,
+            num_denoising_steps=self.config.integer(
+                "num_inference_steps", 1, LIMITS["num_denoising_steps"], default=10
+            ),
         )
         if "normalization" not in settings.values:
-            described = with_values(described, Settings("", values={"normalization": self._normalization()}))
-        return with_values(described, settings)
+            described = replace(described, normalization=self._normalization())
+        config = with_values(described, settings)
+        if config.robot == described.robot:
+            self._check_actions(config.normalization)
+        return config
 
     def norm_stats(self, normalization: Normalization) -> NormStats:
         """The statistics that the processors load. CheckpointError if `normalization` needs others."""
-        state, state_file = self._stats(PREPROCESSOR, "normalizer_processor", STATE)
-        actions, actions_file = self._stats(POSTPROCESSOR, "unnormalizer_processor", ACTION)
-        stats = NormStats(state, actions)
-        stats.check(normalization, " and ".join(dict.fromkeys((state_file, actions_file))))
-        return stats
+        self.stats.check(normalization, self._stats_files)
+        return self.stats
+
+    def notes(self) -> list[str]:
+        """Where the files say two things or what isn't done, and what is done then; keys that LeRobot's Pi0.5 doesn't
+        have, from which another program may compute something.
+        """
+        notes = []
+        unknown = sorted(self.config.values.keys() - _KNOWN)
+        if unknown:
+            notes.append(f"{CONFIG} has keys that Turbo-Pi doesn't know or follow: {', '.join(unknown)}")
+        rtc = self.config.values.get("rtc_config")
+        if isinstance(rtc, dict) and rtc.get("enabled"):
+            notes.append(f"{CONFIG} enables rtc_config: Turbo-Pi answers each observation with a chunk of its own")
+        if self.settings.policy is not None:
+            return notes
+        if self.settings.values.get("lerobot_semantics", "auto") == "auto" and self.written_by != "0.6":
+            notes.append(versions.note(self.semantics, self.written_by, self.pipelines.prompt_width))
+        if self.described_state_dim != self.state_dim:
+            notes.append(
+                f"{CONFIG} says {self.described_state_dim} values of state, but the statistics have {self.state_dim}: "
+                f"observations have {self.state_dim}, as LeRobot runs it"
+            )
+        tokens = self.config.integer("tokenizer_max_length", 1, LIMITS["max_prompt_tokens"], default=200)
+        if tokens != self.pipelines.max_tokens:
+            notes.append(
+                f"{CONFIG} says {tokens} tokens of prompt, but {PREPROCESSOR} {self.pipelines.max_tokens}: so many "
+                "are read, as LeRobot runs it"
+            )
+        made_absolute = self.pipelines.relative_mask(self.action_dim) is not None
+        if self.pipelines.leaves_actions_relative:
+            notes.append(f"answers are relative to the state: {POSTPROCESSOR} doesn't add it, nor does LeRobot")
+        elif self.config.flag("use_relative_actions", made_absolute) != made_absolute:
+            notes.append(
+                f"{CONFIG} says use_relative_actions = {str(not made_absolute).lower()}, but the processors' steps "
+                "otherwise: they are followed, as by LeRobot"
+            )
+        return notes
 
     def _check_config(self) -> None:
-        kind = self.config.get("type")
+        kind = self.config.values.get("type")
         if kind != "pi05":
             raise CheckpointError(
-                f"{self.folder} is a LeRobot checkpoint of type {kind!r}; Turbo-Pi reads LeRobot's 'pi05' "
+                f"{self.folder} is a LeRobot checkpoint of type {shown(kind)}; Turbo-Pi reads LeRobot's 'pi05' "
                 "(and openpi's own checkpoints of Pi0 and Pi0.5)"
             )
         for key, (expected, meaning) in _FIXED.items():
-            value = self.config.get(key, expected)
+            value = self.config.values.get(key, expected)
             if value != expected:
                 raise CheckpointError(
-                    f"{self.folder / CONFIG} has {key} = {value!r}, which Turbo-Pi doesn't compute; it does {meaning}"
+                    f"{self.file} has {key} = {shown(value)}, which Turbo-Pi doesn't compute; it does {meaning}"
                 )
 
-    def _read_steps(self, file_name: str) -> dict[str, dict[str, Any]]:
-        """Registry name -> entry of one pipeline."""
-        file = self.folder / file_name
-        entries = _read_json(file).get("steps")
-        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise CheckpointError(f"{file} has no list of steps; is it a LeRobot processor?")
-        found: dict[str, dict[str, Any]] = {}
-        for entry in entries:
-            name = entry.get("registry_name", entry.get("class"))
-            if name not in _STEPS[file_name] or name in found:
-                raise CheckpointError(
-                    f"{file} has a step {name!r} that Turbo-Pi doesn't know; known are {', '.join(_STEPS[file_name])}"
-                )
-            found[name] = entry
-            if _object(entry, "config", file).get("enabled") is True:
-                raise CheckpointError(f"{file}: {name} is enabled; Turbo-Pi doesn't do LeRobot's relative actions")
-        return found
+    # -- scaling -------------------------------------------------------------------------------------------------------
 
     def _normalization(self) -> Normalization:
         """The processors' modes; config.json must agree."""
-        modes = {}
-        for key, file_name, step in (
-            ("STATE", PREPROCESSOR, "normalizer_processor"),
-            ("ACTION", POSTPROCESSOR, "unnormalizer_processor"),
-        ):
-            file = self.folder / file_name
-            config = _object(self.steps[file_name].get(step, {}), "config", file)
-            mapping = _object(config, "norm_map", file)
-            mode = mapping.get(key, "IDENTITY")
-            claimed = _object(self.config, "normalization_mapping", self.folder / CONFIG).get(key, mode)
-            if mode not in list(_MODES):  # a list: it may be anything, hashable or not
-                raise CheckpointError(f"{file} normalises {key} by {mode}; Turbo-Pi knows {', '.join(_MODES)}")
-            if mode != claimed:
-                raise CheckpointError(
-                    f"{file} normalises {key} by {mode}, but {CONFIG} says {claimed}. LeRobot itself follows the "
-                    'processor; if that is right, correct config.json, or say {"normalization": ...} in turbopi.json'
-                )
-            if mapping.get("VISUAL", "IDENTITY") != "IDENTITY":
-                raise CheckpointError(f"{file} normalises pictures by {mapping['VISUAL']}; expected IDENTITY")
-            if config.get("eps", _EPS) != _EPS:
-                raise CheckpointError(f"{file}: {step} has eps {config['eps']}; Turbo-Pi computes with {_EPS}")
-            modes[key] = _MODES[mode]
-        return Normalization(modes["STATE"], modes["ACTION"])
+        return Normalization(
+            self._mode(PREPROCESSOR, NORMALIZER, "STATE"), self._mode(POSTPROCESSOR, UNNORMALIZER, "ACTION")
+        )
 
-    def _stats(self, file_name: str, step: str, feature: str) -> tuple[FeatureStats | None, str]:
-        """A feature's statistics and where they are, or should be."""
-        entry = self.steps[file_name].get(step)
-        where = str(self.folder / file_name)
-        if entry is None or "state_file" not in entry:
-            return None, f"{where} (its {step} has no state_file)"
-        file = self.folder / str(entry["state_file"])
-        if file.parent != self.folder or not file.is_file():
-            raise CheckpointError(f"norm stats are missing: {where} names {entry['state_file']}, which isn't there")
+    def _mode(self, file_name: str, name: str, kind: str) -> NormMode:
+        file, step = self.folder / file_name, self.pipelines.steps.get(name)
+        mapping = {} if step is None else step.config.object("norm_map", {}).values
+        if step is not None and kind == "STATE":  # LeRobot goes by the type that the step itself gives the state
+            kind = str(step.config.object("features", {}).object(STATE, {}).values.get("type", kind))
+        mode = mapping.get(kind, "IDENTITY")
+        claimed = self.config.object("normalization_mapping", {}).values.get(kind, mode)
+        if not isinstance(mode, str) or mode not in _MODES:
+            raise CheckpointError(f"{file} normalises {kind} by {_bare(mode)}; Turbo-Pi knows {', '.join(_MODES)}")
+        if mode != claimed:
+            raise CheckpointError(
+                f"{file} normalises {kind} by {mode}, but {CONFIG} says {_bare(claimed)}. LeRobot itself follows the "
+                'processor; if that is right, correct config.json, or say {"normalization": ...} in turbopi.json'
+            )
+        if mapping.get("VISUAL", "IDENTITY") != "IDENTITY":
+            raise CheckpointError(f"{file} normalises pictures by {_bare(mapping['VISUAL'])}; expected IDENTITY")
+        if step is not None and step.config.number("eps", default=_EPS) != _EPS:
+            raise CheckpointError(f"{file}: {name} has eps {step.config.values['eps']}; Turbo-Pi computes with {_EPS}")
+        return _MODES[mode]
+
+    def _read_stats(self) -> tuple[NormStats, str]:
+        """The statistics, and where they are or should be."""
+        state, state_file = self._feature_stats(PREPROCESSOR, NORMALIZER, STATE)
+        actions, actions_file = self._feature_stats(POSTPROCESSOR, UNNORMALIZER, ACTION)
+        return NormStats(state, actions), " and ".join(dict.fromkeys((state_file, actions_file)))
+
+    def _feature_stats(self, file_name: str, name: str, feature: str) -> tuple[FeatureStats | None, str]:
+        where, step = self.folder / file_name, self.pipelines.steps.get(name)
+        if step is None or step.state_file is None:
+            return None, f"{where} (its {name} has no state_file)"
+        file = file_inside(self.folder, step.state_file, where)
+        if not file.is_file():
+            raise CheckpointError(f"norm stats are missing: {where} names {step.state_file}, which isn't there")
         try:
             tensors = load_file(file)
         except (SafetensorError, OSError) as error:
             raise CheckpointError(f"{file} can't be read as safetensors ({error})") from error
-        config = _object(entry, "config", Path(where))
-        selected = config.get("normalize_observation_keys")
+        selected = step.config.values.get("normalize_observation_keys")
         if not isinstance(selected, list | None):
-            raise CheckpointError(
-                f"{where}: normalize_observation_keys is {selected!r}; expected a list of keys or null"
-            )
-        applied = feature in _object(config, "features", Path(where)) and (selected is None or feature in selected)
+            step.config.refuse("normalize_observation_keys", "a list of keys or null")
+        applied = feature in step.config.object("features", {}).values and (selected is None or feature in selected)
         if feature == STATE and not applied:  # LeRobot then passes the state through, whatever statistics there are
-            return None, f"{file} (the {step}'s features leave out {STATE})"
-        values = {name: tensors[f"{feature}.{name}"] for name in STATISTICS if f"{feature}.{name}" in tensors}
+            return None, f"{file} (the {name}'s features leave out {STATE})"
+        values = {key: tensors[f"{feature}.{key}"] for key in STATISTICS if f"{feature}.{key}" in tensors}
         return (feature_stats(values, f"{file}: {feature}") if values else None), str(file)
 
-    def _prompt_tokens(self) -> int:
-        step = _object(self.steps[PREPROCESSOR].get("tokenizer_processor", {}), "config", self.folder / PREPROCESSOR)
-        claimed = self._count("tokenizer_max_length", 200)
-        length = step.get("max_length", claimed)
-        if length != claimed:
-            raise CheckpointError(
-                f"{self.folder}: prompts have {length} tokens in {PREPROCESSOR} but {claimed} in {CONFIG}; correct one"
-            )
-        name = str(step.get("tokenizer_name", _TOKENIZER))
-        if "paligemma" not in name.lower():
-            raise CheckpointError(f"{self.folder / PREPROCESSOR} tokenises with {name}; expected {_TOKENIZER}")
-        return claimed
-
-    def _count(self, key: str, default: int | None, least: int = 1) -> int:
-        value = self.config.get(key, default)
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise CheckpointError(f"{self.folder / CONFIG}: {key} is {value!r}; expected a whole number from {least}")
-        return value
-
-    def _features(self, key: str) -> dict[str, dict[str, Any]]:
-        found = self.config.get(key) or {}
-        if not isinstance(found, dict) or not all(isinstance(feature, dict) for feature in found.values()):
-            raise CheckpointError(f"{self.folder / CONFIG}: {key} is {found!r}; expected features with type and shape")
-        return found
+    # -- the robot -----------------------------------------------------------------------------------------------------
 
     def _robot_options(self) -> dict[str, Any]:
-        """Cameras in the model's order, by the keys that observations use, and the widths of state and actions."""
-        inputs, outputs = self._features("input_features"), self._features("output_features")
-        rename_step = self.steps[PREPROCESSOR].get("rename_observations_processor", {})
-        file = self.folder / PREPROCESSOR
-        renames = _object(_object(rename_step, "config", file), "rename_map", file)
-        if not all(isinstance(new, str) for new in renames.values()):
-            raise CheckpointError(f"{file}: rename_map is {renames!r}; expected a new name for each key")
-        original = {new: old for old, new in renames.items()}  # what the observation calls a feature of the policy
-        if STATE in original:
-            raise CheckpointError(f"{self.folder}: observations call the state {original[STATE]!r}; expected {STATE}")
+        """Cameras in the model's order and names, what observations call them, and the widths of state and actions."""
+        inputs = self._features("input_features")
         for key, feature in inputs.items():
             if feature.get("type") not in _FEATURE_TYPES:
                 raise CheckpointError(
-                    f"{self.folder / CONFIG}: {key} has type {feature.get('type')!r}; expected one of "
+                    f"{self.file}: {key} has type {shown(feature.get('type'))}; expected one of "
                     f"{', '.join(_FEATURE_TYPES)}"
                 )
         visual = [key for key, feature in inputs.items() if feature["type"] == "VISUAL"]
-        cameras = [original.get(key, key) for key in visual if not key.startswith(EMPTY_CAMERA)]
+        cameras = [key for key in visual if not key.startswith(EMPTY_CAMERA)]
         if not cameras:
-            raise CheckpointError(f"{self.folder / CONFIG} lists no camera among its input_features")
+            raise CheckpointError(f"{self.file} lists no camera among its input_features")
         empty = {key for key in visual if key.startswith(EMPTY_CAMERA)}
-        empty |= {f"{EMPTY_CAMERA}{index}" for index in range(self._count("empty_cameras", 0, least=0))}
-        return {
+        empty |= {f"{EMPTY_CAMERA}{index}" for index in range(self.config.integer("empty_cameras", 0, 64, default=0))}
+        mask = self.pipelines.relative_mask(self.action_dim)
+        if mask is not None and self.state_dim < self.action_dim:
+            raise CheckpointError(
+                f"{self.folder / POSTPROCESSOR} adds the state to {self.action_dim} relative actions, but the state "
+                f"has {self.state_dim} values; LeRobot can't run it either"
+            )
+        options: dict[str, Any] = {
             "image_keys": cameras,
             "num_missing_cameras": len(empty),
-            "state_dim": _width(inputs, STATE, self._count("max_state_dim", 32)),
-            "action_dim": _width(outputs, ACTION, self._count("max_action_dim", 32)),
+            "state_dim": self.state_dim,
+            "action_dim": self.action_dim,
         }
+        if self.pipelines.rename_map:
+            options["rename_map"] = self.pipelines.rename_map
+        return options if mask is None else options | {"relative_dims": mask}
+
+    def _check_actions(self, normalization: Normalization) -> None:
+        width = self.action_dim if self.stats.actions is None else self.stats.actions.dim
+        if normalization.actions != "identity" and width != self.action_dim:
+            raise CheckpointError(
+                f"{self.file} says {self.action_dim} values of action, but the statistics have {width}; LeRobot can't "
+                "run it either"
+            )
+
+    def _features(self, key: str) -> dict[str, dict[str, Any]]:
+        found = self.config.values.get(key) or {}
+        if not isinstance(found, dict) or not all(isinstance(feature, dict) for feature in found.values()):
+            self.config.refuse(key, "features with type and shape")
+        return found
+
+    def _width(self, features: str, key: str, otherwise: str) -> int:
+        """A feature's width; one that isn't listed is as wide as the model, by LeRobot."""
+        shape = (
+            self._features(features)
+            .get(key, {})
+            .get("shape", [self.config.integer(otherwise, 1, LIMITS["action_dim"], 32)])
+        )
+        if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int) or shape[0] < 1:
+            raise CheckpointError(f"{self.file}: {key} has shape {shown(shape)}; expected one dimension, not empty")
+        return shape[0]
 
 
 def is_lerobot(folder: Path) -> bool:
     """LeRobot's config.json has a `type`; openpi's has none."""
-    file = folder / CONFIG
-    return file.is_file() and "type" in _read_json(file)
+    return (folder / CONFIG).is_file() and "type" in _read_config(folder)
 
 
-def _object(owner: Mapping[str, Any], key: str, file: Path) -> dict[str, Any]:
-    """The object at `key`, {} if there is none. CheckpointError for anything else, null too."""
-    found = owner.get(key, {})
-    if not isinstance(found, dict):
-        raise CheckpointError(f"{file}: {key} is {found!r}; expected an object")
-    return found
+def _bare(value: Any) -> str:
+    return shown(value).strip("'")
 
 
-def _width(features: Mapping[str, Any], key: str, default: int) -> int:
-    shape = features.get(key, {}).get("shape", [default])
-    if not isinstance(shape, list) or len(shape) != 1 or not isinstance(shape[0], int):
-        raise CheckpointError(f"{CONFIG}: {key} has shape {shape}; expected one dimension")
-    return shape[0]
-
-
-def _read_json(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text())
-    except OSError as error:
-        raise CheckpointError(f"{file} can't be read: {error.strerror}; is the download complete?") from error
-    except ValueError as error:
-        raise CheckpointError(f"{file} isn't JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise CheckpointError(f"{file} is a {type(content).__name__}; expected an object")
-    return content
+def _read_config(folder: Path) -> Mapping[str, Any]:
+    return read_json(folder / CONFIG, hint="; is the download complete?")

@@ -83,7 +83,7 @@ class PeftSource:
         self._pairs: dict[str, _Pair] = {}
         self._replaced: dict[str, Stored] = {}
         self._sort(read_header(self._where))
-        self.shapes = base.shapes
+        self.shapes, self.untied = base.shapes, base.untied
         self.dtypes = base.dtypes | dict.fromkeys(self._pairs, "F32")
         self.dtypes |= {name: stored.dtype for name, stored in self._replaced.items()}
         self.files = [*base.files, config, self._where]

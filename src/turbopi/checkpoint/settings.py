@@ -15,7 +15,9 @@ itself.
     max_prompt_tokens     1 to 8192
     asset_id              folder of norm_stats.json below assets/; null for the only one there
     default_prompt        text or null
-    image_resize          "openpi" or "lerobot"
+    image_resize          "openpi", "lerobot", or "lerobot_0.4", which pads pictures with -3 instead of -1
+    prompt_state_dim      zeros fill the state up to so many numbers in the prompt (LeRobot 0.4: 32); null: nothing does
+    lerobot_semantics     of LeRobot's checkpoints alone: "0.4", "0.6" (0.5, too), or "auto" for the one that wrote it
     time_grid             "accumulated" (openpi) or "multiplied" (LeRobot)
     num_denoising_steps   1 to 1000, unless whoever runs it says otherwise; else LeRobot's num_inference_steps, or 10
     vision_heads          attention heads of a vision tower of a non-standard width
@@ -92,6 +94,10 @@ def policy_config(
     fitting = [name for name, preset in PRESETS.items() if preset.model.kind == kind and not name.endswith("_tiny")]
     if "preset" not in settings.values:
         raise ConfigError(_undetectable(fitting, kind, assets, where, settings))
+    if "lerobot_semantics" in settings.values:
+        raise ConfigError(
+            f"{settings.source}: lerobot_semantics only applies to LeRobot's own checkpoints; {where} isn't"
+        )
     preset = PRESETS[settings.values["preset"]]
     _check_kind(preset, kind, settings.source, where)
     config = preset if horizon is None else preset.with_model(action_horizon=horizon)
@@ -110,6 +116,7 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
         "asset_id",
         "default_prompt",
         "image_resize",
+        "prompt_state_dim",
         "num_denoising_steps",
     )
     if values.get("robot", config.robot) != config.robot:  # the options were the other robot's
@@ -212,6 +219,11 @@ def _count(limit: int) -> tuple[str, Callable[[Any], int]]:
     return f"a whole number from 1 to {limit}", parse
 
 
+def _count_or_null(limit: int) -> tuple[str, Callable[[Any], int | None]]:
+    expected, parse = _count(limit)
+    return f"{expected}, or null", lambda value: None if value is None else parse(value)
+
+
 def _object(value: Any) -> dict[str, Any]:
     _require(isinstance(value, dict))
     return dict(value)
@@ -262,7 +274,9 @@ _SCHEMA: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "max_prompt_tokens": _count(LIMITS["max_prompt_tokens"]),
     "asset_id": ("a folder's name below assets/, or null", _name_or_null),
     "default_prompt": ("a text or null", _text_or_null),
-    "image_resize": ("'openpi' or 'lerobot'", _choice("openpi", "lerobot")),
+    "image_resize": ("'openpi', 'lerobot' or 'lerobot_0.4'", _choice("openpi", "lerobot", "lerobot_0.4")),
+    "prompt_state_dim": _count_or_null(LIMITS["action_dim"]),
+    "lerobot_semantics": ("'0.4', '0.6' or 'auto'", _choice("0.4", "0.6", "auto")),
     "time_grid": ("'accumulated' or 'multiplied'", _choice("accumulated", "multiplied")),
     "num_denoising_steps": _count(LIMITS["num_denoising_steps"]),
     "vision_heads": _count(LIMITS["num_heads"]),

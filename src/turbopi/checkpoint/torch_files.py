@@ -40,6 +40,7 @@ class TorchSource:
         self._prefix = prefix
         self._stored: dict[str, Stored] = {}
         heads: dict[str, Stored] = {}
+        self.untied = False  # whether lm_head and the embedding are both stored
         for file in _weight_files(folder):
             for stored in read_header(file):
                 key = stored.key.removeprefix(prefix) if prefix else stored.key
@@ -54,6 +55,7 @@ class TorchSource:
                 self._stored[name] = stored
         if heads:
             self._stored[EMBEDDING] = self._tied(heads, folder)
+            self.untied = len(heads) == 2
         unusable = [s.key for s in self._stored.values() if s.dtype not in ITEMSIZE]
         if unusable:
             kinds = sorted({s.dtype for s in self._stored.values()} - set(ITEMSIZE))
@@ -95,6 +97,9 @@ class TorchSource:
                 f"{folder}: {head.key} and {embedding.key} are tied in the model but differ in the file, so it's "
                 "unclear which one the model was trained with. Remove the wrong one from the file"
             )
+        # a look at the first rows will do: weight decay changes all of them
+        if not torch.equal(read_tensor(head)[:1024], read_tensor(embedding)[:1024]):
+            self.notes.append("lm_head and embed_tokens differ: prompts are embedded by embed_tokens, as LeRobot does")
         return embedding
 
 

@@ -1,9 +1,10 @@
 """A robot as a LeRobot checkpoint describes it: the keys of its config.json's features.
 
-LeRobot puts the cameras that an observation has first, in its config's order, and masks the others after them. Source:
-LeRobot's `PI05Policy._preprocess_images` (0.6.1).
+LeRobot renames an observation's keys, puts the cameras that it has first, in its config's order, and masks the others
+after them. Sources: LeRobot's `RenameObservationsProcessorStep` and `PI05Policy._preprocess_images` (0.6.1).
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,6 +26,8 @@ from turbopi.robots.base import (
     require,
 )
 
+logger = logging.getLogger(__name__)
+
 STATE, TASK, IMAGES = "observation.state", "task", "observation.images."
 
 
@@ -37,16 +40,20 @@ class LeRobot(Robot):
             task                   text
     out     [H, action_dim]
 
-    image_keys           the checkpoint's cameras, full keys in its order. One that an observation lacks is masked, as
-                         LeRobot does, unless the observation has a camera of another name: then one of them is
-                         misspelt, and it is refused
-    num_missing_cameras  masked cameras after them (LeRobot's empty_cameras)
+    image_keys           the checkpoint's cameras, full keys in its order. One that an observation lacks is masked, and
+                         cameras of other names aren't read, as in LeRobot; both at once are warned about, in the log
+    num_missing_cameras  LeRobot's empty_cameras after them: masked, unless an observation has observation.images.empty_
+                         camera_0, ...
+    rename_map           observations' keys -> the checkpoint's; where an observation has both, the later one is read
+    relative_dims        per action, whether the model's is relative to the state
     """
 
     image_keys: Sequence[str]
     state_dim: int = field()  # field(): no default, where the protocol has one
     action_dim: int = field()
     num_missing_cameras: int = 0
+    rename_map: Mapping[str, str] | None = None
+    relative_dims: Sequence[bool] | None = None
 
     name = "lerobot"
 
@@ -57,32 +64,58 @@ class LeRobot(Robot):
             value = getattr(self, option)
             if not isinstance(value, int) or value < least:
                 raise ConfigError(f"{option} must be an integer of at least {least}, got {value!r}")
+        renames = {} if self.rename_map is None else self.rename_map
+        if not isinstance(renames, Mapping) or not all(
+            isinstance(text, str) for pair in renames.items() for text in pair
+        ):
+            raise ConfigError(f"rename_map must be an object of keys and their new names, got {self.rename_map!r}")
+        relative = () if self.relative_dims is None else self.relative_dims
+        if not isinstance(relative, list | tuple) or not all(isinstance(flag, bool) for flag in relative):
+            raise ConfigError(f"relative_dims must be a list of true and false, got {self.relative_dims!r}")
+        if len(relative) > min(self.action_dim, self.state_dim):
+            raise ConfigError(
+                f"relative_dims has {len(relative)} dimensions, but there are {self.action_dim} of actions and "
+                f"{self.state_dim} of the state"
+            )
+
+    @property
+    def delta_mask(self) -> tuple[bool, ...] | None:  # type: ignore[override]
+        return None if self.relative_dims is None else tuple(self.relative_dims)
 
     def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
-        expected = (*self.image_keys, STATE, TASK)
-        present = [key for key in self.image_keys if has(observation, key)]
+        named = self._renamed(observation)
+        spare = [f"{IMAGES}empty_camera_{i}" for i in range(self.num_missing_cameras)]
+        present = [key for key in (*self.image_keys, *spare) if has(named, key)]
         absent = [key for key in self.image_keys if key not in present]
-        self._check_cameras(observation, present, absent)
-        images = {key: parse_unit_image(find(observation, key), key) for key in present}
+        others = [key for key in names_in_prefix(named, IMAGES) if key not in (*self.image_keys, *spare)]
+        if not present:
+            raise ObservationError(
+                f"the observation's cameras are {listed(others)}; this checkpoint's are "
+                f"{', '.join(map(self._sent_as, self.image_keys))}. Rename them; a camera that the robot doesn't have "
+                "can be left out"
+            )
+        if absent and others:
+            _warn_once(others, [self._sent_as(key) for key in absent])
+        images = {key: parse_unit_image(find(named, key), key) for key in present}
         black = black_like(next(iter(images.values())))
-        masked = [*absent, *(f"missing_{i}" for i in range(self.num_missing_cameras))]
+        masked = [*absent, *(f"missing_{i}" for i, key in enumerate(spare) if key not in present)]
+        expected = (*map(self._sent_as, self.image_keys), self._sent_as(STATE), TASK)
         return RobotInputs(
             images | dict.fromkeys(masked, black),
             dict.fromkeys(present, True) | dict.fromkeys(masked, False),
-            read_state(require(observation, STATE, expected), STATE, self.state_dim),
+            read_state(require(named, STATE, expected), STATE, self.state_dim),
             self._prompt(observation),
             in_order=True,
         )
 
-    def _check_cameras(self, observation: Mapping[str, Any], present: list[str], absent: list[str]) -> None:
-        others = [key for key in names_in_prefix(observation, IMAGES) if key not in self.image_keys]
-        if present and not (absent and others):
-            return
-        raise ObservationError(
-            f"the observation's cameras are {listed([*present, *others])}; "
-            f"this checkpoint's are {', '.join(self.image_keys)}. Rename them; a camera that the robot "
-            f"doesn't have can be left out"
-        )
+    def _renamed(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
+        if not self.rename_map:
+            return observation
+        return {self.rename_map.get(key, key): value for key, value in observation.items()}
+
+    def _sent_as(self, key: str) -> str:
+        """What observations call a key of the checkpoint's."""
+        return next((old for old, new in (self.rename_map or {}).items() if new == key), key)
 
     def _prompt(self, observation: Mapping[str, Any]) -> str | None:
         if TASK not in observation:
@@ -96,6 +129,26 @@ class LeRobot(Robot):
         return actions[:, : self.action_dim]
 
     def example(self, rng: np.random.Generator) -> dict[str, Any]:
-        pictures = {key: rng.random((3, 224, 224), dtype=np.float32) for key in self.image_keys}
+        pictures = {self._sent_as(key): rng.random((3, 224, 224), dtype=np.float32) for key in self.image_keys}
         state = rng.uniform(-1, 1, self.state_dim).astype(np.float32)
-        return {**pictures, STATE: state, TASK: "pick up the black bowl and place it on the plate"}
+        return {
+            **pictures,
+            self._sent_as(STATE): state,
+            TASK: "pick up the black bowl and place it on the plate",
+        }
+
+
+_warned: set[tuple[str, ...]] = set()  # absent cameras: at most every choice of a checkpoint's
+
+
+def _warn_once(others: list[str], absent: list[str]) -> None:
+    """Not at every step of an episode, and whatever names a client makes up."""
+    if tuple(absent) in _warned:
+        return
+    _warned.add(tuple(absent))
+    logger.warning(
+        "the observation has %s, which this checkpoint doesn't read, and lacks %s, which is masked, as in LeRobot. Is "
+        "one of them misspelt?",
+        listed(others),
+        listed(absent),
+    )

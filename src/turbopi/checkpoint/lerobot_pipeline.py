@@ -1,0 +1,207 @@
+"""LeRobot's two processor pipelines: which steps they have, in which order, and what each asks for.
+
+LeRobot runs whatever steps the files list, in their order. Turbo-Pi runs an edge of its own that computes what the
+steps below compute in the order below. Everything else is refused by its name: a step, an order, a value or a key that
+asks for something that isn't done never passes unnoticed.
+
+Preprocessor. The state's step and the tokenizer must be there; without a normalizer the state stays as it is:
+
+    rename_observations_processor                   names of observations to names of the policy
+    relative_actions_processor                      keeps the raw state (0.5.1: delta_actions_processor)
+    normalizer_processor                            scales the state
+    pi05_prepare_state_tokenizer_processor_step     writes the state into the prompt
+    tokenizer_processor                             prompt to tokens
+
+Postprocessor; both may be missing:
+
+    unnormalizer_processor                          scales actions back
+    absolute_actions_processor                      adds the state that was kept
+
+These change no number of a single observation, and may stand anywhere and often: to_batch_processor and its three
+parts; device_processor without a float_dtype, or with float32. So may the two new-line steps before the state's, which
+strips the prompt.
+
+Sources: LeRobot 0.4.0 to 0.6.1, `processor/` and `policies/pi05/processor_pi05.py`.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from turbopi.config import LIMITS
+from turbopi.errors import CheckpointError
+from turbopi.reading import Fields, read_json, shown
+
+PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+STATE, ACTION, OBSERVATION = "observation.state", "action", "observation."
+
+RENAME, RELATIVE, NORMALIZER = "rename_observations_processor", "relative_actions_processor", "normalizer_processor"
+STATE_STEP, TOKENIZER = "pi05_prepare_state_tokenizer_processor_step", "tokenizer_processor"
+UNNORMALIZER, ABSOLUTE, DEVICE = "unnormalizer_processor", "absolute_actions_processor", "device_processor"
+PALIGEMMA = "google/paligemma-3b-pt-224"
+
+_OTHER_NAMES = {"delta_actions_processor": RELATIVE}
+_BATCH = ("", "_action", "_observation", "_complementary_data")
+_NEW_LINES = ("smolvla_new_line_processor", "pi0_new_line_processor")
+_SCALING = ("eps", "features", "norm_map", "normalize_observation_keys")
+# name: the keys that its config may have
+_HARMLESS: dict[str, tuple[str, ...]] = {DEVICE: ("device", "float_dtype")} | {
+    f"to_batch_processor{part}": () for part in _BATCH
+}
+_STEPS: dict[str, dict[str, tuple[str, ...]]] = {
+    PREPROCESSOR: {
+        RENAME: ("rename_map",),
+        RELATIVE: ("enabled", "exclude_joints", "action_names"),
+        NORMALIZER: _SCALING,
+        STATE_STEP: ("max_state_dim", "task_key"),
+        TOKENIZER: ("tokenizer_name", "max_length", "task_key", "padding", "padding_side", "truncation"),
+        **_HARMLESS,
+        **dict.fromkeys(_NEW_LINES, ()),
+    },
+    POSTPROCESSOR: {UNNORMALIZER: _SCALING, ABSOLUTE: ("enabled",), **_HARMLESS},
+}
+_OFTEN = {*_HARMLESS, *_NEW_LINES}
+_NEEDED = {PREPROCESSOR: (STATE_STEP, TOKENIZER), POSTPROCESSOR: ()}
+_ORDER = (RENAME, RELATIVE, NORMALIZER, *_NEW_LINES, STATE_STEP, TOKENIZER, UNNORMALIZER, ABSOLUTE)
+_BEFORE = {(first, then) for i, first in enumerate(_ORDER) for then in _ORDER[i + 1 :] if then not in _NEW_LINES}
+_SAME_NUMBERS = (None, "float32", "float")  # a device step's float_dtype: everything is float32 already
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a pipeline, checked."""
+
+    name: str
+    config: Fields
+    file: Path  # that lists it
+    state_file: str | None  # of its tensors, beside `file`
+
+
+class Pipelines:
+    """What the two files of a folder ask for. Raises CheckpointError for all that Turbo-Pi doesn't compute.
+
+    steps           the steps that compute something, by name
+    rename_map      observations' names -> the policy's
+    max_tokens      of a prompt
+    prompt_width    numbers of state that LeRobot 0.4 wrote into the prompt at least; newer ones don't read it
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.steps = {step.name: step for name in _STEPS for step in _read(folder / name)}
+        self.rename_map = self._rename_map()
+        self._check_task_keys()
+        self.max_tokens = self._tokenizer()
+        self.prompt_width = self.steps[STATE_STEP].config.integer("max_state_dim", 1, LIMITS["action_dim"], default=32)
+
+    def relative_mask(self, action_dim: int) -> list[bool] | None:
+        """Which of the actions are relative to the state when they leave the model, and absolute in the answer.
+
+        None: the postprocessor adds nothing. A name is left out if an excluded joint's is a part of it, in any case;
+        without names or exclusions nothing is.
+        """
+        absolute, relative = self.steps.get(ABSOLUTE), self.steps.get(RELATIVE)
+        if absolute is None or not absolute.config.flag("enabled", False):
+            return None
+        if relative is None:
+            raise CheckpointError(
+                f"{absolute.file}: {ABSOLUTE} is enabled, but {PREPROCESSOR} has no {RELATIVE} whose state it could "
+                "add; LeRobot can't run it either"
+            )
+        excluded = [str(joint).lower() for joint in _list_or_null(relative, "exclude_joints") if joint]
+        names = [str(name).lower() for name in _list_or_null(relative, "action_names")][:action_dim]
+        mask = [not any(joint in name for joint in excluded) for name in names]
+        return mask + [True] * (action_dim - len(mask))
+
+    @property
+    def leaves_actions_relative(self) -> bool:
+        """Whether the model was trained on relative actions, and nothing makes them absolute."""
+        relative, absolute = (
+            name in self.steps and self.steps[name].config.flag("enabled", False) for name in (RELATIVE, ABSOLUTE)
+        )
+        return relative and not absolute
+
+    def _rename_map(self) -> dict[str, str]:
+        if RENAME not in self.steps:
+            return {}
+        step = self.steps[RENAME]
+        renames = step.config.object("rename_map", {}).values
+        for old, new in renames.items():
+            if not isinstance(new, str):
+                raise CheckpointError(f"{step.file}: rename_map is {shown(renames)}; expected a new name for each key")
+            if not old.startswith(OBSERVATION):
+                raise CheckpointError(
+                    f"{step.file}: rename_map has observations call {new} {old!r}, which LeRobot never reads: its "
+                    f"keys begin with {OBSERVATION!r}"
+                )
+        if renames.get(STATE, STATE) != STATE and STATE not in renames.values():
+            raise CheckpointError(
+                f"{step.file}: rename_map makes {STATE} {renames[STATE]!r}, so there is no state; LeRobot can't run "
+                "it either"
+            )
+        return dict(renames)
+
+    def _check_task_keys(self) -> None:
+        for name in (STATE_STEP, TOKENIZER):
+            step = self.steps[name]
+            if step.config.text("task_key", "task") != "task":
+                step.config.refuse("task_key", "task, where Turbo-Pi looks for the prompt")
+
+    def _tokenizer(self) -> int:
+        step = self.steps[TOKENIZER]
+        name = step.config.text("tokenizer_name", PALIGEMMA)
+        if "paligemma" not in name.lower():
+            raise CheckpointError(f"{step.file} tokenises with {name}; expected {PALIGEMMA}")
+        if not step.config.flag("truncation", True):
+            raise CheckpointError(
+                f"{step.file}: truncation is false, so LeRobot's prompts may be longer than max_length; Turbo-Pi cuts "
+                "them. Set it to true if prompts are short enough"
+            )
+        # masked tokens change nothing, wherever they stand
+        step.config.choice("padding", ("max_length", "longest"), "max_length")
+        step.config.choice("padding_side", ("right", "left"), "right")
+        return step.config.integer("max_length", 1, LIMITS["max_prompt_tokens"], default=512)  # LeRobot's own default
+
+
+def _read(file: Path) -> list[Step]:
+    """The steps of one pipeline that compute something, each once and in the one order that Turbo-Pi has."""
+    entries = read_json(file, hint="; is the download complete?").get("steps")
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise CheckpointError(f"{file} has no list of steps; is it a LeRobot processor?")
+    steps = [_step(entry, file) for entry in entries]
+    names = [step.name for step in steps]
+    for i, name in enumerate(names):
+        if name in names[:i] and name not in _OFTEN:
+            raise CheckpointError(f"{file} has the step {name} twice; Turbo-Pi does it once")
+        late = next((earlier for earlier in names[:i] if (name, earlier) in _BEFORE), None)
+        if late is not None:
+            order = ", ".join(step for step in _ORDER if step in _STEPS[file.name] and step not in _NEW_LINES)
+            raise CheckpointError(f"{file} has {late} before {name}, which computes something else than {order}")
+    for name in _NEEDED[file.name]:
+        if name not in names:
+            raise CheckpointError(f"{file} has no step {name}, which every policy of Pi0.5 is trained with")
+    return [step for step in steps if step.name not in _OFTEN]
+
+
+def _step(entry: dict[str, Any], file: Path) -> Step:
+    known = _STEPS[file.name]
+    given = entry.get("registry_name", entry.get("class"))
+    name = _OTHER_NAMES.get(given, given) if isinstance(given, str) else None
+    if name not in known:
+        raise CheckpointError(
+            f"{file} has a step {str(given)[:200]!r} that Turbo-Pi doesn't know; known are {', '.join(known)}"
+        )
+    config = Fields(Fields(entry, file).object("config", {}).values, file)
+    unknown = [key for key in config.values if key not in known[name]]
+    if unknown:
+        raise CheckpointError(
+            f"{file}: {name} has {unknown[0]} = {shown(config.values[unknown[0]])}, which Turbo-Pi doesn't know; it "
+            f"knows {', '.join(known[name]) or 'no key of this step'}"
+        )
+    if config.values.get("float_dtype") not in _SAME_NUMBERS:
+        config.refuse("float_dtype", "null or float32: Turbo-Pi rounds neither observations nor actions to others")
+    state_file = None if "state_file" not in entry else Fields(entry, file).text("state_file")
+    return Step(name, config, file, state_file)
+
+
+def _list_or_null(step: Step, key: str) -> list[Any]:
+    return [] if step.config.values.get(key) is None else step.config.list(key)

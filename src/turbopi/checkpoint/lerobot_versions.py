@@ -1,0 +1,67 @@
+"""Which LeRobot wrote a checkpoint of Pi0.5: 0.4 computed other things than 0.5 and 0.6 do, from the same files.
+
+    version         prompt                              letterbox    t
+    0.4.0 - 0.4.2   the state, and zeros up to 32       -3           summed up in float32
+    0.4.3, 0.4.4    the state, and zeros up to 32       -3           1 + step * dt
+    0.5.0 - 0.6.1   the state as wide as it is          -1           1 + step * dt
+
+No file holds a version. But LeRobot writes every field of its config, and has added some: `freeze_vision_encoder` in
+0.4.3, `use_relative_actions` in 0.5.1. The config of 0.5.0 is that of 0.4.4, but 0.4 ties lm_head to the embedding and
+stores one of them, 0.5 stores both. Sources: LeRobot's `policies/pi05` of each version.
+"""
+
+from collections.abc import Collection
+from typing import Literal
+
+Semantics = Literal["0.4", "0.6"]  # 0.6 is 0.5, too
+
+# what 0.4.0 writes into config.json, and every later one
+FIRST_KEYS = frozenset(
+    {
+        *("type", "n_obs_steps", "input_features", "output_features", "device", "use_amp", "push_to_hub", "repo_id"),
+        *("private", "tags", "license", "pretrained_path", "paligemma_variant", "action_expert_variant", "dtype"),
+        *("chunk_size", "n_action_steps", "max_state_dim", "max_action_dim", "num_inference_steps"),
+        *("time_sampling_beta_alpha", "time_sampling_beta_beta", "time_sampling_scale", "time_sampling_offset"),
+        *("min_period", "max_period", "image_resolution", "empty_cameras", "tokenizer_max_length"),
+        *("normalization_mapping", "gradient_checkpointing", "compile_model", "compile_mode", "optimizer_lr"),
+        *("optimizer_betas", "optimizer_eps", "optimizer_weight_decay", "optimizer_grad_clip_norm"),
+        *("scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"),
+    }
+)
+LATER_KEYS = frozenset(
+    {
+        *("rtc_config", "use_peft", "freeze_vision_encoder", "train_expert_only", "use_relative_actions"),
+        *("relative_exclude_joints", "action_feature_names", "pretrained_revision", "optimizer_fused"),
+    }
+)
+
+
+def detect(keys: Collection[str], *, untied: bool) -> Semantics | None:
+    """What the files say: `keys` of config.json, and whether the weights hold lm_head and the embedding.
+
+    None: a config.json that no LeRobot has written as it is.
+    """
+    if "use_relative_actions" in keys:
+        return "0.6"
+    if not set(keys) >= FIRST_KEYS:
+        return None
+    return "0.6" if untied and "freeze_vision_encoder" in keys else "0.4"
+
+
+def sums_up_time(keys: Collection[str]) -> bool:
+    """Whether it was 0.4.0 to 0.4.2."""
+    return set(keys) >= FIRST_KEYS and "freeze_vision_encoder" not in keys
+
+
+def note(done: Semantics, written_by: Semantics | None, prompt_width: int) -> str:
+    """What `inspect` should say where LeRobot's versions differ about a checkpoint, and nobody has chosen."""
+    computes = {
+        "0.4": f"at least {prompt_width} numbers of state in the prompt, pictures padded with -3",
+        "0.6": "the robot's own numbers of state in the prompt, pictures padded with -1",
+    }
+    other: Semantics = "0.6" if done == "0.4" else "0.4"
+    who = f"LeRobot {written_by} wrote this checkpoint" if written_by else "no file tells which LeRobot wrote this"
+    return (
+        f"{who}: what LeRobot {done} computes is done ({computes[done]}). LeRobot {other} computes something else from "
+        f'the same files ({computes[other]}): {{"lerobot_semantics": "{other}"}} in a turbopi.json does that'
+    )
