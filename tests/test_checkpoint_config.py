@@ -159,7 +159,7 @@ def test_absurd_sizes_in_config_json_are_refused(tmp_path: Path, key: str, value
     ],
 )
 def test_no_model_is_beyond_the_limits(changes: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match="expected a (whole )?number"):
+    with pytest.raises(ConfigError, match=r"expected a (whole )?number"):
         ModelConfig(**changes)
 
 

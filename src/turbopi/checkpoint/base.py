@@ -19,6 +19,7 @@ from turbopi.checkpoint import known_hashes
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, WeightSource, check_finite
 from turbopi.config import PolicyConfig
+from turbopi.errors import CheckpointError
 from turbopi.model.reference import Precision, parameter_dtype
 
 PARTS = ("vision", "projector", "vlm", "expert")  # the rest: action, state and time projections
@@ -44,6 +45,7 @@ class Checkpoint:
     source: WeightSource
     asset_id: str | None = None
     tokenizer_candidates: tuple[Path, ...] = ()
+    expected_sha256: str | None = None  # what the configuration says the weights' hash is
 
     @property
     def format(self) -> str:
@@ -54,8 +56,9 @@ class Checkpoint:
         """Read all weights straight into their final dtype and device, a piece at a time.
 
         Host memory besides the result stays small: safetensors are mapped, Orbax arrays decoded one chunk at a time.
-        Raises CheckpointError if a value is NaN or infinite, as it is stored or in that precision.
+        Raises CheckpointError if a value is NaN or infinite, as it is stored or in that precision, and as `check_hash`.
         """
+        self.check_hash()
         device = torch.device(device)
         began = time.perf_counter()
         shapes = self.source.shapes
@@ -76,6 +79,14 @@ class Checkpoint:
             torch.cuda.synchronize(device)
         total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
         return Loaded(state, time.perf_counter() - began, total)
+
+    def check_hash(self) -> None:
+        """CheckpointError if the configuration says which weights these are, and they are others: reads them all."""
+        if self.expected_sha256 is not None and self.fingerprint() != self.expected_sha256:
+            raise CheckpointError(
+                f"{self.path}: {self.config_source} says that the weights' SHA-256 is {self.expected_sha256}, but it "
+                f"is {self.fingerprint()}: they are damaged, or others. Copy them anew, or correct weights_sha256"
+            )
 
     def fingerprint(self, *, trust_files: bool = False) -> str:
         """SHA-256 of the weights: of every parameter's canonical name, shape and float32 bytes (little endian).

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from turbopi.checkpoint.lerobot import is_lerobot
-from turbopi.checkpoint.openpi_jax import MANIFEST
+from turbopi.checkpoint.orbax import MANIFEST
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import is_adapter
 from turbopi.checkpoint.source import listing

@@ -56,6 +56,7 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
         norm_stats=stats,
         source=source,
         asset_id=asset_id,
+        expected_sha256=settings.weights_sha256,
         tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
     )
 
@@ -127,6 +128,7 @@ def _open_lerobot(location: Location, settings: Settings, source: WeightSource) 
         config=policy,
         config_source="LeRobot's config.json and processors" if settings.source == "auto" else settings.source,
         norm_stats=folder.norm_stats(policy.normalization),
+        expected_sha256=settings.weights_sha256,
         source=source,
         tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
     )

@@ -24,6 +24,7 @@ itself.
     lora_alpha            number, or {"vlm": number, "expert": number}: see lora.py
     lora_rslora           true if adapters were trained rank-stabilised
     base_model            folder of the weights that a peft adapter is for, relative to this file
+    weights_sha256        what `turbopi inspect --hash` shows of these weights: others are refused at loading
 
 Unknown keys, wrong types and numbers beyond turbopi.config.LIMITS are errors. `config=` replaces a turbopi.json beside
 the weights as a whole.
@@ -32,6 +33,7 @@ The horizon: the .json's, else config.json's `action_horizon`, else the preset's
 except for sizes, which always come from the tensors.
 """
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -57,6 +59,11 @@ class Settings:
     @property
     def lora(self) -> LoraScale:
         return LoraScale(self.values.get("lora_alpha"), bool(self.values.get("lora_rslora", False)))
+
+    @property
+    def weights_sha256(self) -> str | None:
+        expected: str | None = self.values.get("weights_sha256")
+        return expected
 
     @property
     def vision_heads(self) -> int | None:
@@ -224,6 +231,11 @@ def _count_or_null(limit: int) -> tuple[str, Callable[[Any], int | None]]:
     return f"{expected}, or null", lambda value: None if value is None else parse(value)
 
 
+def _sha256(value: Any) -> str:
+    _require(isinstance(value, str) and re.fullmatch(r"[0-9a-f]{64}", value) is not None)
+    return str(value)
+
+
 def _object(value: Any) -> dict[str, Any]:
     _require(isinstance(value, dict))
     return dict(value)
@@ -283,4 +295,5 @@ _SCHEMA: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "lora_alpha": ("a number from 1e-6 to 1e6, or an object with vlm and expert", _lora_alpha),
     "lora_rslora": ("true or false", _flag),
     "base_model": ("a folder", _text),
+    "weights_sha256": ("64 digits, 0 to 9 and a to f, as `turbopi inspect --hash` shows them", _sha256),
 }

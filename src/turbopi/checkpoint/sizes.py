@@ -5,8 +5,9 @@ from dataclasses import replace
 from math import isqrt
 
 from turbopi.checkpoint.source import Shape, WeightSource, listing
-from turbopi.config import GemmaConfig, Kind, ModelConfig, VisionConfig
+from turbopi.config import LIMITS, GemmaConfig, Kind, ModelConfig, VisionConfig
 from turbopi.errors import CheckpointError, ConfigError
+from turbopi.reading import shown
 
 _STANDARD_VISION = VisionConfig()  # So400m: 1152 wide, 16 heads
 
@@ -104,8 +105,15 @@ def _gemma_sizes(shapes: Mapping[str, Shape], stack: str, depth: int) -> GemmaCo
 
 
 def _depth(shapes: Mapping[str, Shape], prefix: str) -> int:
-    indices = (name[len(prefix) :].split(".", 1)[0] for name in shapes if name.startswith(prefix))
-    return 1 + max((int(index) for index in indices if index.isdigit()), default=-1)
+    """1 + the last layer's number. ValueError for numbers that no model has: what a name says costs no memory."""
+    last = -1
+    for name in shapes:
+        index = name[len(prefix) :].split(".", 1)[0] if name.startswith(prefix) else ""
+        if index.isdecimal():
+            if len(index) > 6 or int(index) >= LIMITS["depth"]:
+                raise ValueError(f"{shown(name)} is of layer {index[:40]}; at most {LIMITS['depth']} layers are read")
+            last = max(last, int(index))
+    return 1 + last
 
 
 def _vision_heads(source: WeightSource, width: int, base: VisionConfig, explicit: int | None, where: object) -> int:

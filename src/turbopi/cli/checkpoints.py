@@ -53,7 +53,9 @@ def inspect(
     else:
         info = inspect_checkpoint(checkpoint, "auto" if options.config is None else options.config)
     if hash:
-        info["sha256"] = options.open(checkpoint).fingerprint()
+        opened = options.open(checkpoint)
+        opened.check_hash()
+        info["sha256"] = opened.fingerprint()
     _show(info, output)
     output.document(info)
 
