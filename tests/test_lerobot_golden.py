@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from checkpoint_helpers import edit_json
 from lerobot_golden import GOLDEN, GoldenCase
 from safetensors.torch import load_file
 
@@ -31,3 +32,22 @@ def test_the_trained_embedding_is_not_the_head(tmp_path: Path) -> None:
         weights[paligemma + name + ".weight"] for name in ("model.language_model.embed_tokens", "lm_head")
     )
     assert (head != embedding).any(1).all()
+
+
+def test_another_versions_semantics_compute_something_else(tmp_path: Path) -> None:
+    """LeRobot 0.4.4 computed this case, and wrote zeros up to 32 behind the state."""
+    case = GoldenCase(GOLDEN / "square_lerobot0.4.4")
+    checkpoint = case.assemble(tmp_path)
+    edit_json(checkpoint / "turbopi.json", lambda content: content.update(lerobot_semantics="0.6"))
+    assert {"tokens", "token_mask", "v_1", "actions"} <= case.wrong(checkpoint).keys()
+    edit_json(checkpoint / "turbopi.json", lambda content: content.update(lerobot_semantics="0.4"))
+    assert case.wrong(checkpoint) == {}
+
+
+def test_actions_that_stay_relative_are_noticed(tmp_path: Path) -> None:
+    case = GoldenCase(GOLDEN / "relative_excluded")
+    checkpoint = case.assemble(tmp_path)
+    edit_json(
+        checkpoint / "policy_postprocessor.json", lambda content: content["steps"][1]["config"].update(enabled=False)
+    )
+    assert case.wrong(checkpoint).keys() == {"actions"}

@@ -44,6 +44,7 @@ class Case:
     runs: list[dict[str, Any]] | None = None
     cameras: tuple[str, ...] = ("top", "wrist")
     state_dim: int = 8
+    config_state_dim: int | None = None  # what config.json says of it, where that is something else
     action_dim: int = 7
     rename_map: dict[str, str] | None = None
     adapter: dict[str, Any] | None = None  # of peft.LoraConfig
@@ -148,14 +149,30 @@ CASES: dict[str, Case] = {
         observations=(
             Seen({"camera1": PORTRAIT, "top": LANDSCAPE}),
             Seen({"camera2": LANDSCAPE, "camera3": PORTRAIT, "side": SQUARE}),
+            Seen({"top": LANDSCAPE, "camera2": PORTRAIT}),
+            Seen({"camera2": PORTRAIT, "top": LANDSCAPE}),
         ),
         seed=9,
     ),
     "two_observations_empty_camera": Case(
         "pi05",
         {"n_obs_steps": 2, "empty_cameras": 1},
-        observations=(Seen({"top": (224, 100), "wrist": (1, 1)}),),
+        observations=(Seen({"top": (224, 100), "wrist": (1, 1)}), Seen({"wrist": PORTRAIT, "empty_camera_0": SQUARE})),
         seed=10,
+    ),
+    # a fine-tune by --policy.path: the base's cameras and state in config.json, the data set's statistics
+    "fine_tune": Case(
+        "pi05",
+        cameras=("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb"),
+        rename_map={
+            "observation.images.top": "observation.images.base_0_rgb",
+            "observation.images.wrist": "observation.images.left_wrist_0_rgb",
+        },
+        observations=(Seen(TOP_WRIST, state_dim=6),),
+        state_dim=6,
+        config_state_dim=32,
+        action_dim=6,
+        seed=15,
     ),
     "peft": Case(
         "pi05",
