@@ -1,6 +1,7 @@
 """`turbopi eval` and `turbopi compare`, as they are typed."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,23 @@ def test_crashes_give_exit_code_1(tmp_path: Path) -> None:
     result = turbopi(command, "--out", tmp_path)
     assert result.exit_code == 1, result.output
     assert "the physics exploded" in result.stdout and "1 episodes crashed and count as nothing" in result.stdout
+
+
+@pytest.mark.usefixtures("seeking")
+def test_a_simulator_in_the_current_folder_is_found_by_the_installed_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whose path begins with its own folder, not with the current one."""
+    (tmp_path / "my_module.py").write_text(
+        "from turbopi.sim.reacher import ReacherSimulator\n\n\nclass Sim(ReacherSimulator):\n    pass\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    here = [path for path in sys.path if path not in ("", str(tmp_path))]
+    monkeypatch.setattr(sys, "path", here)
+    result = turbopi(f"eval my_module:Sim {QUICK} --tasks 0 --trials 1 --max-steps 5 --out out")
+    monkeypatch.delitem(sys.modules, "my_module", raising=False)
+    assert result.exit_code == 0, result.output
+    assert "task 0, initial state 0: failure after 5 steps" in result.stdout
 
 
 def test_compare_runs_each_way_with_the_same_noise(tmp_path: Path) -> None:

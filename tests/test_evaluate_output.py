@@ -3,6 +3,7 @@
 import html
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from turbopi.errors import ConfigError
 from turbopi.evaluate.compare import HEADS, cells, compare, write_comparison
 from turbopi.evaluate.episode import Frame
 from turbopi.evaluate.plan import VideoPlan, parse_numbers
+from turbopi.evaluate.report import write_report
+from turbopi.evaluate.results import load_results
 from turbopi.evaluate.sources import LocalPolicy
 from turbopi.evaluate.video import chunk_groups, draw_frame, write_video
 from turbopi.evaluate.visited import Visited, action_error
@@ -85,11 +88,50 @@ def test_the_report_opens_from_disk_and_loads_nothing_else(tmp_path: Path) -> No
     assert results.tasks[1].instruction in shown
 
 
-def test_what_comes_from_outside_is_escaped_in_the_report(tmp_path: Path) -> None:
-    policy = SeekingPolicy()
-    policy.metadata["config"] = "<img src=x onerror=alert(1)>"
-    run(tmp_path, policy, states=(0,))
-    assert "<img src=x" not in (tmp_path / "report.html").read_text()
+EVIL = '"><script>alert(1)</script>'
+
+
+def with_evil_text(value: Any, name: str = "") -> Any:
+    """A document with script in every text that may come from elsewhere, keys included, where a reader accepts it."""
+    if isinstance(value, dict):
+        free = name in ("about", "identity", "versions", "options")
+        found = {key: with_evil_text(item, "about" if free else key) for key, item in value.items()}
+        return found | ({EVIL: EVIL} if free else {})
+    if isinstance(value, list):
+        return [with_evil_text(item, name) for item in value]
+    return value if name in ("format", "complete", "status") or isinstance(value, int | float) else EVIL
+
+
+def test_foreign_text_is_escaped_wherever_a_page_shows_it(tmp_path: Path) -> None:
+    for name, policy in (("a", SeekingPolicy()), ("b", SeekingPolicy({0: "nan"}))):
+        run(tmp_path / name, policy, states=(0, 1))
+        file = tmp_path / name / "results.json"
+        document = with_evil_text(json.loads(file.read_text()))
+        file.write_text(json.dumps(document))
+    runs = [load_results(tmp_path / name) for name in "ab"]
+    assert runs[0].label == runs[0].episodes[0, 0].video == runs[0].tasks[0].instruction == EVIL
+    pages = [write_report(runs[1]), write_comparison(tmp_path, compare(runs))[2]]
+    for page, least in zip(pages, (12, 5), strict=True):
+        text = page.read_text()
+        assert "<script" not in text and '="">' not in text
+        assert text.count("&lt;script&gt;") >= least
+
+
+def test_pages_are_escaped_whatever_a_results_object_holds(tmp_path: Path) -> None:
+    """Also where `load_results` would have refused it."""
+    results = run(tmp_path, SeekingPolicy(), states=(0,))
+    (episode,) = results.in_order()
+    results.episodes[0, 0] = replace(episode, status=EVIL, message=EVIL, seed=EVIL)  # type: ignore[arg-type]
+    results.started = results.protocol["suite"] = EVIL  # type: ignore[index]
+    assert "<script" not in write_report(results).read_text()
+
+
+def test_dollars_in_a_label_are_no_formula(tmp_path: Path) -> None:
+    policies = SeekingPolicy(), SeekingPolicy()
+    for policy in policies:
+        policy.metadata["backend"] = r"$\nothing{$"
+    runs = [run(tmp_path / name, policy, states=(0,)) for name, policy in zip("ab", policies, strict=True)]
+    assert all(path.is_file() for path in write_comparison(tmp_path, compare(runs)))
 
 
 def test_comparing_pairs_the_common_episodes(tmp_path: Path) -> None:

@@ -17,11 +17,38 @@ def test_an_unknown_simulator_or_suite_is_refused_with_what_there_is() -> None:
         create("metaworld")
     with pytest.raises(ConfigError, match="the simulator 'no_such_module:Sim' can't be imported"):
         create("no_such_module:Sim")
+    for name in (":Sim", "no_such_module:", "..up:Sim", "json:a.b"):
+        with pytest.raises(ConfigError, match="simulator"):
+            create(name)
     with pytest.raises(
         ConfigError, match="unknown suite 'spatal' of libero; choose one of libero_spatial, libero_object"
     ):
         full_suite_name(create("libero"), "spatal")
     assert full_suite_name(create("libero"), "90") == full_suite_name(create("libero"), "libero_90") == "libero_90"
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        ("class Sim(:", "can't be imported: SyntaxError: "),
+        ("import no_such_library", "can't be imported: ModuleNotFoundError: No module named 'no_such_library'"),
+        ("raise OSError('no display')", "can't be imported: OSError: no display"),
+        ("class Other: pass", "can't be imported: AttributeError: "),
+        ("class Sim:\n    def __init__(self, scene): pass", "can't be imported: TypeError: .*scene"),
+        (
+            "class Sim:\n    name = 'mine'",
+            "is no simulator: it has no robot, action_dim, control_hz, image_keys, suites, ",
+        ),
+    ],
+)
+def test_a_simulator_of_ones_own_that_fails_is_refused_with_the_reason(
+    code: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_simulator.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "broken_simulator", raising=False)
+    with pytest.raises(ConfigError, match=why):
+        create("broken_simulator:Sim")
 
 
 def test_without_the_extra_the_one_command_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

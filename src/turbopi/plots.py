@@ -86,9 +86,9 @@ def plot_chunks(file: Path, rows: Sequence[Row], *, robot: str, title: str, rand
     figure = Figure(figsize=(0.8 + 2.45 * sum(widths), 0.9 + 2.75 * len(rows)), dpi=_DPI, layout="constrained")
     if random_weights:
         title += "\nrandom weights: the actions mean nothing"
-    figure.suptitle(title, fontsize=14, fontweight="bold", color=_WARNING if random_weights else "black")
+    figure.suptitle(as_text(title), fontsize=14, fontweight="bold", color=_WARNING if random_weights else "black")
     for row, panel in zip(rows, np.atleast_1d(np.array(figure.subfigures(len(rows), 1))), strict=True):
-        panel.suptitle(row.heading, fontsize=10.5, x=0.01, ha="left")
+        panel.suptitle(as_text(row.heading), fontsize=10.5, x=0.01, ha="left")
         axes = np.atleast_1d(panel.subplots(1, num_pictures + len(groups), width_ratios=widths))
         _draw_pictures(axes[:num_pictures], row.pictures)
         for ax, group in zip(axes[num_pictures:], groups, strict=True):
@@ -107,12 +107,17 @@ def write_figure(file: Path, figure: Figure, dpi: int = _DPI) -> None:
         raise ConfigError(f"can't write the plot {file}: {error}") from error
 
 
+def as_text(text: str) -> str:
+    """`text` for a figure, where a pair of dollar signs would begin a formula: a prompt's or a label's don't."""
+    return text.replace("$", r"\$")
+
+
 def _draw_pictures(axes: Any, pictures: dict[str, np.ndarray]) -> None:
     for ax in axes:
         ax.set_axis_off()
     for ax, (camera, picture) in zip(axes, pictures.items(), strict=False):
         ax.imshow(picture)
-        ax.set_title(camera, fontsize=9)
+        ax.set_title(as_text(camera), fontsize=9)
 
 
 def _draw_group(ax: Axes, group: ActionGroup, row: Row) -> None:

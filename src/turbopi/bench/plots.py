@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from turbopi.plots import write_figure
+from turbopi.plots import as_text, write_figure
 
 SHAPE = ("cameras", "prompt_tokens", "horizon")
 STAGES = {"vision": "#4c72b0", "prefix": "#dd8452", "denoise": "#55a868"}
@@ -59,7 +59,7 @@ def _stages(document: dict[str, Any], path: Path) -> Path:
             names.append(name)
     axes.invert_yaxis()
     axes.set_xlabel("milliseconds on the device, medians; number and whiskers: the whole call, p5 to p95")
-    axes.set_title(f"{document['model']}: {job_label(job)}", fontsize=10)
+    axes.set_title(f"{as_text(document['model'])}: {job_label(job)}", fontsize=10)
     axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
     axes.margins(x=0.08)
     write_figure(path, figure)
@@ -90,7 +90,9 @@ def _steps(document: dict[str, Any], path: Path) -> Path:
     axes.set_xlabel("denoising steps")
     axes.set_ylabel("whole call, median [ms]")
     axes.set_ylim(bottom=0)
-    axes.set_title(f"{document['model']}: {main['cameras']} cameras, {main['prompt_tokens']} tokens", fontsize=10)
+    axes.set_title(
+        f"{as_text(document['model'])}: {main['cameras']} cameras, {main['prompt_tokens']} tokens", fontsize=10
+    )
     axes.legend()
     write_figure(path, figure)
     return path
@@ -124,7 +126,7 @@ def _roofline(document: dict[str, Any], path: Path) -> Path:
         axes.loglog([], [], "s", color=color, label=stage)
     axes.set_xlabel("least operations / least bytes [FLOP/byte]")
     axes.set_ylabel("least operations / median time [TFLOP/s]")
-    axes.set_title(f"{document['model']}: {job_label(document['main_job'])}", fontsize=10)
+    axes.set_title(f"{as_text(document['model'])}: {job_label(document['main_job'])}", fontsize=10)
     axes.legend(fontsize=8)
     write_figure(path, figure)
     return path

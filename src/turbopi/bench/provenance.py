@@ -1,4 +1,4 @@
-"""Where a figure comes from: hardware, clocks, versions, commit."""
+"""Where a figure comes from: hardware, clocks, Turbo-Pi's version and commit, versions of the rest."""
 
 import os
 import platform
@@ -17,6 +17,7 @@ def provenance(device: torch.device) -> dict[str, Any]:
     """Plain values for a result file; the clocks are those of the moment of the call."""
     about: dict[str, Any] = {
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
+        "turbopi": turbopi_version(),
         "python": platform.python_version(),
         "torch": torch.__version__,
         **{name: _version(name) for name in ("triton", "numpy", "sentencepiece")},
@@ -55,16 +56,29 @@ def _version(package: str) -> str | None:
         return None
 
 
+def turbopi_version() -> str:
+    """The installed version, or "from source" where Turbo-Pi runs without having been installed."""
+    return _version("turbopi") or "from source"
+
+
 def _commit() -> str:
     """This checkout's commit, with "+" behind it where files differ from it.
 
-    Outside a checkout: TURBOPI_COMMIT, which whoever copied the files sets, else "unknown".
+    Outside a checkout of Turbo-Pi's own, as in an environment that lies in somebody's repository: TURBOPI_COMMIT, which
+    whoever copied the files sets, else "unknown".
     """
-    here = str(Path(__file__).parent)
-    commit = _output(["git", "-C", here, "rev-parse", "--short=12", "HEAD"])
-    if not commit:
+    here = Path(__file__)
+    root = str(here.parents[3])
+    if _git(root, "ls-files", "--full-name", "--error-unmatch", str(here)) != "src/turbopi/bench/provenance.py":
         return os.environ.get("TURBOPI_COMMIT", "unknown")
-    return commit + ("+" if _output(["git", "-C", here, "status", "--porcelain", "--untracked-files=no"]) else "")
+    commit = _git(root, "rev-parse", "--short=12", "HEAD")
+    return commit + ("+" if _git(root, "status", "--porcelain", "--untracked-files=no") else "")
+
+
+def _git(folder: str, *arguments: str) -> str:
+    """What git says of the repository that a folder is in, whichever one the environment names; "" if nothing."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    return _output(["git", "-C", folder, *arguments], environment)
 
 
 def _cpu_name() -> str:
@@ -75,8 +89,11 @@ def _cpu_name() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
 
 
-def _output(command: list[str]) -> str:
+def _output(command: list[str], environment: dict[str, str] | None = None) -> str:
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=10, check=True, env=environment
+        )
+        return done.stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return ""

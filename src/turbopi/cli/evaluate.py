@@ -10,7 +10,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from turbopi.cli.files import check_folder
+from turbopi.cli.files import check_folder, let_import_from_here
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.errors import ConfigError
@@ -128,6 +128,8 @@ class EvalOptions(PolicyOptions):
         """Checked, with its warnings printed."""
         from turbopi.sim import create
 
+        if ":" in name:
+            let_import_from_here()
         simulator = create(name)
         for warning in simulator.check():
             output.line(f"warning: {warning}", "yellow")

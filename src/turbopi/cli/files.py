@@ -1,6 +1,7 @@
 """Files that commands write and read."""
 
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,12 @@ def check_writable(file: Path) -> None:
     for path in (file.absolute().parent, file):
         if path.exists() and not os.access(path, os.W_OK):
             raise ConfigError(f"can't write {file}: {path} isn't writable")
+
+
+def let_import_from_here() -> None:
+    """Have "module:Class" find modules of the current folder: a console script's path lacks it, `python -m` has it."""
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
 
 
 def load_noise(file: Path) -> "np.ndarray":

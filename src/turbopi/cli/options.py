@@ -1,7 +1,5 @@
 """Options that several commands share: which weights, and how to run them."""
 
-import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from turbopi.cli.files import let_import_from_here
 from turbopi.cli.framework import Output
 from turbopi.cli.process import interrupts_end_at_once
 from turbopi.config import PRESETS
@@ -241,6 +240,5 @@ class PolicyOptions(WeightOptions):
             return self.robot
         from turbopi.robots import import_robot
 
-        if os.getcwd() not in sys.path:  # a console script's path lacks it, `python -m` has it
-            sys.path.insert(0, os.getcwd())
+        let_import_from_here()
         return import_robot(self.robot)

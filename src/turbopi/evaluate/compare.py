@@ -1,6 +1,5 @@
 """Several runs of the same episodes, beside each other: paired with the first of them."""
 
-import html
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +8,9 @@ from typing import Any
 
 from turbopi.calibrate.artifact import RANDOM_NOISE
 from turbopi.errors import ConfigError
+from turbopi.evaluate.pages import render
 from turbopi.evaluate.plots import write_comparison_plot
-from turbopi.evaluate.report import page, table
-from turbopi.evaluate.results import Episode, Results
+from turbopi.evaluate.results import Results
 from turbopi.evaluate.statistics import Paired, Rate, percentiles
 from turbopi.files import write_whole
 
@@ -204,25 +203,27 @@ def write_comparison(folder: Path, compared: Sequence[Compared]) -> list[Path]:
     plot = write_comparison_plot(folder / "compare.png", [(run.label, run.rate) for run in compared])
     shown = folder / "compare.html"
     suite = str(compared[0].results.protocol["suite"])
-    rows = [[html.escape(cell) for cell in cells(run)] for run in compared]
-    body = (
-        f"<h1>{html.escape(suite)}: {len(compared)} runs of {compared[0].rate.trials} episodes</h1>"
-        f"{table(HEADS, rows)}<p class=sub>{html.escape(LEGEND)}</p>"
-        f'<div class=plots><img src="{plot.name}" alt="success of each run"></div>'
-        f"<h2>Episodes that not all runs agree on</h2>{_disagreements(compared)}"
+    page = render(
+        "comparison.html",
+        title=f"{suite}: comparison",
+        suite=suite,
+        runs=[run.label for run in compared],
+        trials=compared[0].rate.trials,
+        heads=HEADS,
+        rows=[cells(run) for run in compared],
+        legend=LEGEND,
+        plot=plot.name,
+        disagreements=_disagreements([run.results for run in compared]),
     )
-    write_whole(shown, page(f"{suite}: comparison", body))
+    write_whole(shown, page)
     return [told, plot, shown]
 
 
-def _disagreements(compared: Sequence[Compared]) -> str:
-    runs = [run.results for run in compared]
-    rows = []
+def _disagreements(runs: Sequence[Results]) -> list[tuple[tuple[int, int], list[str | None]]]:
+    """The episodes, by task and initial state, that some runs solved and others didn't; every run's status."""
+    found: list[tuple[tuple[int, int], list[str | None]]] = []
     for key in sorted(runs[0].episodes):
-        found: list[Episode | None] = [run.episodes.get(key) for run in runs]
-        if len({episode.success for episode in found if episode is not None and episode.judged}) > 1:
-            outcomes = [f"<span class={e.status}>{e.status}</span>" if e else "-" for e in found]
-            rows.append([str(key[0]), str(key[1]), *outcomes])
-    if not rows:
-        return "<p>None.</p>"
-    return table(("task", "initial state", *(run.label for run in compared)), rows, numbers_from=9)
+        episodes = [run.episodes.get(key) for run in runs]
+        if len({episode.success for episode in episodes if episode is not None and episode.judged}) > 1:
+            found.append((key, [episode.status if episode else None for episode in episodes]))
+    return found

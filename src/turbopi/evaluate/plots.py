@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from turbopi.evaluate.results import Results, rate
 from turbopi.evaluate.statistics import Rate
-from turbopi.plots import write_figure
+from turbopi.plots import as_text, write_figure
 
 _DPI = 120
 BLUE, GREEN, RED, GRAY = "#3b6fb6", "#2f8f5b", "#c0504d", "#9aa0a6"
@@ -98,7 +98,7 @@ def write_comparison_plot(path: Path, rows: Sequence[tuple[str, Rate]]) -> Path:
     axes = figure.subplots()
     for place, (_, one) in enumerate(rows):
         _rate_bar(axes, place, one, BLUE)
-    axes.set_yticks(range(len(rows)), [_short(name, 60) for name, _ in rows], fontsize=9)
+    axes.set_yticks(range(len(rows)), [as_text(_short(name, 60)) for name, _ in rows], fontsize=9)
     axes.invert_yaxis()
     axes.set_xlim(0, 100)
     axes.set_xlabel("success on the common episodes [%], with Wilson's 95 % interval")

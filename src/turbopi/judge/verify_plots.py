@@ -6,7 +6,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from turbopi.plots import write_figure
+from turbopi.plots import as_text, write_figure
 
 _BY_LAYER = {"kv_k": "K", "kv_v": "V"}
 _BY_STEP = {"v_t": "velocity v_t", "x_t": "actions so far x_t"}
@@ -39,7 +39,7 @@ def _plot(document: dict[str, Any], names: dict[str, str], axis: str, path: Path
     axes.set_ylabel("relative rms of the difference from float32")
     verdict = "PASS" if document["ok"] else "FAIL"
     title = f"{document['model']}, {document['backend']} {document['precision']}: {verdict}"
-    axes.set_title(f"{title}\ncontrol: {document['control']}", fontsize=10)
+    axes.set_title(f"{as_text(title)}\ncontrol: {document['control']}", fontsize=10)
     write_figure(path, figure)
     return path
 

@@ -13,11 +13,14 @@ SIMULATORS: dict[str, str] = {
     "reacher": "turbopi.sim.reacher:ReacherSimulator",
 }
 
+_PARTS = (*Simulator.__annotations__, "check", "tasks", "open", "example", "versions")
+
 
 def create(name: str) -> Simulator:
     """The simulator called `name`, one of SIMULATORS, or "module:Class" for one of your own, whose code is run.
 
-    Raises ConfigError for an unknown name. Nothing of the simulator itself is imported yet: see `Simulator.check`.
+    Raises ConfigError for an unknown name, and for a class that can't be imported or made, or isn't a simulator.
+    Nothing of one of ours is imported yet: see `Simulator.check`.
     """
     target = SIMULATORS.get(name, name)
     module, _, cls = target.partition(":")
@@ -25,7 +28,10 @@ def create(name: str) -> Simulator:
         raise ConfigError(f"unknown simulator {name!r}; choose one of {', '.join(SIMULATORS)}")
     try:
         made: Any = getattr(importlib.import_module(module), cls)()
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"the simulator {name!r} can't be imported: {error}") from error
+    except Exception as error:  # whatever code of the user's own raises
+        raise ConfigError(f"the simulator {name!r} can't be imported: {type(error).__name__}: {error}") from error
+    missing = [part for part in _PARTS if not hasattr(made, part)]
+    if missing:
+        raise ConfigError(f"{name!r} is no simulator: it has no {', '.join(missing)}; see turbopi.sim.base.Simulator")
     simulator: Simulator = made
     return simulator
