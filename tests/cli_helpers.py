@@ -16,10 +16,18 @@ def text_of(output: str) -> str:
     return " ".join(re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]", " ", output).split())
 
 
-def refusal(result: Result) -> str:
-    """The one line of an error, which must be all there is on stderr, with nothing on stdout."""
+def refusal(result: Result, *, whole: bool = True) -> str:
+    """The one line of an error, which must be all there is on stderr, with nothing on stdout.
+
+    Unless `whole`, it may come after other lines on stderr, of a command with --json.
+    """
     assert result.exit_code == 2, (result.exit_code, result.output, result.exception)
     assert result.stdout == ""
+    if not whole:
+        assert "Traceback" not in result.stderr
+        *_, last = result.stderr.splitlines()
+        assert last.startswith("error: ")
+        return last.removeprefix("error: ")
     assert result.stderr.startswith("error: ")
     assert "Traceback" not in result.stderr
     return result.stderr.removeprefix("error: ").rstrip("\n")

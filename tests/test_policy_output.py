@@ -162,7 +162,9 @@ def test_what_turns_finite_numbers_into_others_is_named(
     if what == "statistics":
         monkeypatch.setattr(whole.pipeline.action_scale, "unnormalize", spoil)
     else:
-        monkeypatch.setattr(whole.pipeline, "robot", SimpleNamespace(name="broken", delta_mask=None, outputs=spoil))
+        monkeypatch.setattr(
+            whole.pipeline, "robot", SimpleNamespace(name="broken", delta_mask=None, outputs=lambda a: spoil(a)[:, :7])
+        )
     with pytest.raises(ActionError) as refused:
         whole.pipeline.after(np.zeros((H, D), np.float32), np.zeros(D))
     message = str(refused.value)

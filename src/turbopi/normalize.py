@@ -76,6 +76,10 @@ class Normalizer:
                 case _:  # lerobot_quantile, lerobot_min_max
                     return np.asarray(2.0 * (x.astype(np.float32) - a) / _nonzero(b - a) - 1.0, np.float64)
 
+    def says_something_past(self, width: int) -> bool:
+        """Whether the statistics past the first `width` values are more than padding: not all 0."""
+        return self.width is not None and bool(np.any(self._a[width:]) or np.any(self._b[width:]))
+
     def fitted(self, x: np.ndarray) -> np.ndarray:
         """float[d] made as wide as `normalize` takes it: cut, or for LeRobot's modes repeated."""
         if self.width is None or (len(x) <= self.width and not self.is_lerobot):

@@ -93,6 +93,8 @@ class UnifiedPolicy:
             vocab_size=checkpoint.config.model.vocab_size,
         )
         self._pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, prompt_tokenizer, default_prompt, robot)
+        for note in self._pipeline.notes:
+            logger.warning("%s", note)
         self._loading: dict[str, Any] = {}
 
         def load(to: torch.device, in_precision: Precision) -> dict[str, torch.Tensor]:

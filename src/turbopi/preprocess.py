@@ -21,6 +21,7 @@ from turbopi.normalize import Normalizer, absolute_actions, pad_last
 from turbopi.observation import ModelInputs
 from turbopi.robots import Robot, RobotInputs, create_robot
 from turbopi.robots.base import read_prompt, read_state
+from turbopi.robots.checks import check_shape, notes_on_statistics, width_of_outputs
 from turbopi.robots.plain import Plain
 from turbopi.tokenizer import PromptTokenizer
 
@@ -72,7 +73,8 @@ class Pipeline:
     robot           instead of the config's: a name, a description's path, or an object. The config's options are for
                     the robot that it names alone
 
-    Raises ConfigError if these don't fit each other. Calls change nothing in it but which long prompt was warned about.
+    `notes` says what the user had better look at. Raises ConfigError if these don't fit each other. Calls change
+    nothing in it but which long prompt was warned about.
     """
 
     def __init__(
@@ -91,6 +93,8 @@ class Pipeline:
         self.state_scale = Normalizer(config.normalization.state, stats.state, "state")
         self.action_scale = Normalizer(config.normalization.actions, stats.actions, "actions")
         self._check()
+        self._action_width = self._dry_run()
+        self.notes = notes_on_statistics(self.robot, self.state_scale, self.action_scale)
         self.before_vision: tuple[Callable[[Incoming], None], ...] = (
             self._read_observation,
             self._choose_prompt,
@@ -145,7 +149,7 @@ class Pipeline:
         state          as `before` returned it
 
         Raises ActionError if any of the model's numbers, also of dimensions that the robot doesn't have, or any of the
-        robot's is NaN or infinite.
+        robot's is NaN or infinite, and if the robot's `outputs` gives another shape.
         """
         assert model_actions.shape[1:] == (self.config.model.action_dim,), model_actions.shape
         if not np.isfinite(model_actions).all():
@@ -180,7 +184,7 @@ class Pipeline:
         described: dict[str, Any] = {
             "robot": self.robot.name,
             "robot_state_dim": self.robot.state_dim,
-            "robot_action_dim": self.robot.action_dim or self.config.model.action_dim,
+            "robot_action_dim": self._action_width,
             "default_prompt": self.default_prompt,
         }
         if self.robot.reset_pose is not None:
@@ -267,7 +271,15 @@ class Pipeline:
             result.actions = absolute_actions(result.actions, state, self.robot.delta_mask)
 
     def _write_actions(self, result: _Result) -> None:
+        expected = (len(result.actions), self._action_width)
         result.actions = self.robot.outputs(result.actions)
+        check_shape(self.robot, result.actions, expected)
+
+    def _dry_run(self) -> int:
+        """How many actions a step the robot gets. Raises ConfigError if `outputs` isn't what it should be."""
+        model = self.config.model
+        middle = self.action_scale.unnormalize(np.zeros((model.action_horizon, model.action_dim)))
+        return width_of_outputs(self.robot, middle)
 
     def _check(self) -> None:
         """Refuse now what would otherwise fail, or go wrong in silence, at the first observation."""

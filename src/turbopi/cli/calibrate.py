@@ -8,7 +8,7 @@ from rich.table import Table
 
 from turbopi.cli.files import check_writable
 from turbopi.cli.framework import JsonFlag, Output, command
-from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.cli.options import CheckpointArgument, RobotOptions
 from turbopi.cli.progress import with_stages
 from turbopi.errors import ConfigError
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @command(
     "calibrate",
-    shared=WeightOptions,
+    shared=RobotOptions,
     examples=(
         "turbopi calibrate checkpoints/pi05_droid --config pi05_droid --observations recordings/20260101T120000Z",
         "turbopi calibrate checkpoints/pi05_libero --config pi05_libero --out libero_fp8.json",
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     ),
 )
 def calibrate(
-    options: WeightOptions,
+    options: RobotOptions,
     checkpoint: CheckpointArgument = None,
     observations: Annotated[
         str | None,
@@ -85,7 +85,12 @@ def calibrate(
     from turbopi.calibrate.run import Progress, Settings
     from turbopi.calibrate.run import calibrate as run
 
-    arguments = {"num_denoising_steps": steps, "device": device, "tokenizer": tokenizer}
+    arguments = {
+        "num_denoising_steps": steps,
+        "device": device,
+        "tokenizer": tokenizer,
+        "robot": options.make_robot(),
+    }
     settings = Settings(arguments, observations, count, noises, seed, target, batch)
     result = with_stages(lambda progress: run(opened, settings, progress), Progress, output)
     result.save(out)

@@ -3,16 +3,22 @@
 import json
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
-from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.cli.options import CheckpointArgument, RobotOptions
+from turbopi.errors import ConfigError
 from turbopi.files import write_whole
+
+if TYPE_CHECKING:
+    from turbopi.checkpoint import Checkpoint
+    from turbopi.preprocess import Pipeline
 
 PART_NAMES = {
     "vision": "vision tower (SigLIP)",
@@ -25,15 +31,16 @@ PART_NAMES = {
 
 @command(
     "inspect",
-    shared=WeightOptions,
+    shared=RobotOptions,
     examples=(
         "turbopi inspect checkpoints/pi05_libero",
         "turbopi inspect checkpoints/pi05_droid --config pi05_droid --json",
+        "turbopi inspect checkpoints/my_arm --config pi05_base --robot my_arm.json",
         "turbopi inspect --random-weights pi05_base --hash",
     ),
 )
 def inspect(
-    options: WeightOptions,
+    options: RobotOptions,
     checkpoint: CheckpointArgument = None,
     hash: Annotated[
         bool, typer.Option("--hash", help="Also the SHA-256 of the weights, the same in any format: reads them all.")
@@ -42,7 +49,8 @@ def inspect(
 ) -> None:
     """Show what a checkpoint holds, without loading it: format, sizes, statistics, robot, horizon.
 
-    If its robot can't be known without --config, the rest is shown.
+    If its robot can't be known without --config, the rest is shown. --robot holds a robot against the checkpoint and
+    shows the keys that its observations have.
     """
     output = Output(as_json)
     options.check(checkpoint)
@@ -52,12 +60,35 @@ def inspect(
         info = options.open(None).info()
     else:
         info = inspect_checkpoint(checkpoint, "auto" if options.config is None else options.config)
+    if options.robot is not None:
+        info |= _with_robot(options, checkpoint, info["notes"])
     if hash:
         opened = options.open(checkpoint)
         opened.check_hash()
         info["sha256"] = opened.fingerprint()
     _show(info, output)
     output.document(info)
+
+
+def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str]) -> dict[str, Any]:
+    """What is shown of the robot that --robot names. Raises ConfigError if it doesn't fit the checkpoint."""
+    from turbopi.robots.base import described
+
+    pipeline = robot_pipeline(options.open(checkpoint), options.make_robot())
+    about = pipeline.metadata
+    return {
+        **{key: about[key] for key in ("robot", "robot_state_dim", "robot_action_dim", "default_prompt")},
+        "observation": described(pipeline.example()),
+        "notes": [*notes, *pipeline.notes],
+    }
+
+
+def robot_pipeline(checkpoint: "Checkpoint", robot: Any) -> "Pipeline":
+    """A robot held against a checkpoint, without its weights and its tokenizer."""
+    from turbopi.preprocess import Pipeline
+
+    no_tokenizer: Any = None  # nothing is tokenised
+    return Pipeline(checkpoint.config, checkpoint.norm_stats, no_tokenizer, robot=robot)
 
 
 def _show(info: dict[str, Any], output: Output) -> None:
@@ -89,6 +120,7 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
         facts += [
             ("configuration", f"{info['name']}, from {info['config_source']}"),
             ("robot", info["robot"]),
+            *((f"  its {key}", value) for key, value in info.get("observation", {}).items()),
             ("action horizon", f"{info['action_horizon']}, {info['num_denoising_steps']} denoising steps"),
             ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
             ("statistics", _statistics_source(info)),
@@ -140,15 +172,16 @@ class _ConvertCommand(CheckpointThen):
 @command(
     "convert",
     cls=_ConvertCommand,
-    shared=WeightOptions,
+    shared=RobotOptions,
     examples=(
         "turbopi convert checkpoints/pi05_droid_jax checkpoints/pi05_droid --config pi05_droid",
         "turbopi convert my_lerobot_policy converted --precision f32",
+        "turbopi convert checkpoints/my_arm_jax checkpoints/my_arm --config pi05_base --robot my_arm.json",
         "turbopi convert --random-weights pi05_tiny tiny_checkpoint",
     ),
 )
 def convert(
-    options: WeightOptions,
+    options: RobotOptions,
     paths: Annotated[
         list[str],
         typer.Argument(
@@ -164,13 +197,16 @@ def convert(
 ) -> None:
     """Write a checkpoint in openpi's PyTorch layout, with its statistics and a turbopi.json that describes it.
 
-    Any format that Turbo-Pi reads goes in; --random-weights makes a checkpoint to try things with.
+    Any format that Turbo-Pi reads goes in; --random-weights makes a checkpoint to try things with. --robot is recorded
+    in the turbopi.json, a description beside it.
     """
     output = Output(as_json)
     from turbopi.checkpoint import convert as write
 
     source, target = options.split("convert", paths, "new folder")
     opened = options.open(source)
+    if options.robot is not None:
+        opened = _for_robot(opened, options.robot)
     options.tell_if_random(opened, output)
     started = time.perf_counter()
     folder = write(opened, Path(target), precision=precision, progress=output.shows_progress)  # type: ignore[arg-type]
@@ -182,6 +218,20 @@ def convert(
     output.document(
         {"folder": folder, "precision": precision, "bytes": size, "seconds": seconds, "tokenizer": tokenizer}
     )
+
+
+def _for_robot(checkpoint: "Checkpoint", robot: str) -> "Checkpoint":
+    """The checkpoint with another robot in its configuration. Raises ConfigError for one that no file can record."""
+    if ":" in robot:
+        raise ConfigError(
+            f"--robot {robot} is a class, and no turbopi.json can name one: its code would run for whoever opens the "
+            "folder. Convert without it and give --robot to the commands that run the policy"
+        )
+    path = str(Path(robot).resolve()) if robot.endswith(".json") else robot
+    if path != checkpoint.config.robot:  # the options were the other robot's
+        checkpoint = replace(checkpoint, config=replace(checkpoint.config, robot=path, robot_options={}))
+    robot_pipeline(checkpoint, None)
+    return checkpoint
 
 
 def _complete_random(folder: Path, seed: int) -> Path:

@@ -122,7 +122,32 @@ class WeightOptions:
 
 
 @dataclass(frozen=True)
-class PolicyOptions(WeightOptions):
+class RobotOptions(WeightOptions):
+    """Which weights, and for which robot."""
+
+    robot: Annotated[
+        str | None,
+        _option(
+            "--robot",
+            panel=_WEIGHTS,
+            metavar="NAME|FILE|CLASS",
+            help="Instead of the configuration's robot: a built-in one, a description (.json), or your own class as "
+            "module:Class, whose code is run.",
+        ),
+    ] = None
+
+    def make_robot(self) -> Any:
+        """What UnifiedPolicy takes as `robot`; "module:Class" runs that module's code, as was asked for."""
+        if self.robot is None or ":" not in self.robot:
+            return self.robot
+        from turbopi.robots import import_robot
+
+        let_import_from_here()
+        return import_robot(self.robot)
+
+
+@dataclass(frozen=True)
+class PolicyOptions(RobotOptions):
     """Which weights, and everything else that UnifiedPolicy is made of."""
 
     backend: Annotated[
@@ -183,17 +208,6 @@ class PolicyOptions(WeightOptions):
         _option("--default-prompt", panel=_RUNNING, metavar="TEXT", help="Instruction for observations without one."),
     ] = None
 
-    robot: Annotated[
-        str | None,
-        _option(
-            "--robot",
-            panel=_RUNNING,
-            metavar="NAME|FILE|CLASS",
-            help="Instead of the configuration's robot: a built-in one, a description (.json), or your own class as "
-            "module:Class, whose code is run.",
-        ),
-    ] = None
-
     def policy_arguments(self) -> dict[str, Any]:
         """UnifiedPolicy's arguments besides the checkpoint."""
         return {
@@ -204,7 +218,7 @@ class PolicyOptions(WeightOptions):
             "device": self.device,
             "tokenizer": self.tokenizer,
             "default_prompt": self.default_prompt,
-            "robot": self._robot(),
+            "robot": self.make_robot(),
         }
 
     def make_policy(self, checkpoint: "Checkpoint", output: Output) -> "UnifiedPolicy":
@@ -233,12 +247,3 @@ class PolicyOptions(WeightOptions):
         from turbopi.calibrate.artifact import Quantization
 
         return Quantization.load(self.quantization).only([part.strip() for part in self.fp8_parts.split(",")])
-
-    def _robot(self) -> Any:
-        """What UnifiedPolicy takes as `robot`; "module:Class" runs that module's code, as was asked for."""
-        if self.robot is None or ":" not in self.robot:
-            return self.robot
-        from turbopi.robots import import_robot
-
-        let_import_from_here()
-        return import_robot(self.robot)

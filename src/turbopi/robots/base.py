@@ -115,6 +115,18 @@ def keys_of(observation: Mapping[str, Any], depth: int = 3) -> Iterator[str]:
             yield str(key)
 
 
+def described(observation: Mapping[str, Any]) -> dict[str, str]:
+    """Each key of an observation, nested ones joined with "/", and what is there: "uint8[224, 224, 3]", "text"."""
+
+    def what(value: Any) -> str:
+        array = np.asarray(value)
+        if array.dtype.kind in "USO":
+            return "text" if array.ndim == 0 else "list of text"
+        return f"{array.dtype}{list(array.shape) if array.ndim else ''}"
+
+    return {key: what(find(observation, key)) for key in keys_of(observation)}
+
+
 def listed(names: Iterable[str]) -> str:
     """Names for a message, which must stay short whatever a client sends."""
     shown = [name if len(name) <= 60 else name[:60] + "…" for name in itertools.islice(names, 21)]
