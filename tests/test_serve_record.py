@@ -255,7 +255,7 @@ def test_an_observation_is_read_from_a_folder_of_pictures(tmp_path: Path) -> Non
     ("description", "message"),
     [
         ("{", "isn't JSON"),
-        ("[]", "must hold an object, not a list"),
+        ("[]", r"observation\.json is a list; expected an object"),
         ('{"a": {"file": "none.png"}}', "'a' names the file 'none.png', which isn't in"),
         ('{"a": {"file": "../secret.npy"}}', "which isn't in"),
         ('{"a": {"file": "text.png"}}', "is neither a readable picture nor .npy"),

@@ -25,11 +25,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 
 from turbopi.backends import Tier
 from turbopi.checkpoint import Checkpoint, load_norm_stats
 from turbopi.errors import BackendError, TurboPiError
+from turbopi.images import read_picture
 from turbopi.model.reference import Pi0Model, parameter_dtype
 from turbopi.policy import UnifiedPolicy
 
@@ -73,19 +73,14 @@ def load_frames(folder: Path = FRAMES) -> list[Frame]:
     return [
         Frame(
             prompt=entry["prompt"],
-            base=_picture(folder / entry["image"]),
-            wrist=_picture(folder / entry["wrist_image"]),
+            base=read_picture(folder / entry["image"]),
+            wrist=read_picture(folder / entry["wrist_image"]),
             state=np.array(entry["state"], np.float64),
             step=entry.get("step"),
             expert=np.array(entry["expert"], np.float64) if "expert" in entry else None,
         )
         for entry in listed
     ]
-
-
-def _picture(file: Path) -> np.ndarray:
-    with Image.open(file) as image:
-        return np.asarray(image.convert("RGB"))
 
 
 def with_libero_stats(checkpoint: Checkpoint) -> Checkpoint:

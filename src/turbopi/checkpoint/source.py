@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from turbopi.errors import CheckpointError
-from turbopi.reading import shown
+from turbopi.reading import listing
 
 PIECE_BYTES = (
     8 * 2**20
@@ -95,11 +95,3 @@ def adapter_hint(names: Sequence[str]) -> str:
     if any("lora" in name.lower() or "base_layer" in name for name in names):
         return ". These look like a training library's LoRA adapters: merge them there (merge_and_unload), save again"
     return ""
-
-
-def listing(names: Sequence[str], limit: int = 5) -> str:
-    """`a, b, c and 7 more (10 in all)`; a name that can't be printed on a line as it is in quotes."""
-    told = ", ".join(name if name.isprintable() and len(name) < 200 else shown(name) for name in names[:limit])
-    if len(names) > limit:
-        told += f" and {len(names) - limit} more ({len(names)} in all)"
-    return told

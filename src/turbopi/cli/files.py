@@ -37,20 +37,21 @@ def let_import_from_here() -> None:
         sys.path.insert(0, os.getcwd())
 
 
+MAX_NOISE_BYTES = 16 * 2**20  # of float64[1000, 1024], twice
+
+
 def load_noise(file: Path) -> "np.ndarray":
     """The noise in an .npy file, or under `noise` in an .npz. Raises ObservationError if there is none."""
-    import numpy as np
+    from turbopi.reading import Npz, listing, open_file, read_npy
 
     try:
-        content = np.load(file, allow_pickle=False)
-    except OSError as error:
-        raise ObservationError(f"the noise {file} can't be read: {error.strerror or error}") from error
-    except (ValueError, EOFError) as error:
-        raise ObservationError(f"the noise {file} is neither .npy nor .npz: {error}") from error
-    if isinstance(content, np.ndarray):
-        return content
-    with content:
-        if "noise" not in content.files:
-            raise ObservationError(f"{file} has no array named noise, only {', '.join(content.files) or 'nothing'}")
-        noise: np.ndarray = content["noise"]
-        return noise
+        with open_file(file, ObservationError) as stream:
+            begin = stream.read(4)
+        if begin == b"\x93NUM":
+            return read_npy(file, limit=MAX_NOISE_BYTES)
+        with Npz(file, limit=MAX_NOISE_BYTES) as archive:
+            if "noise" not in archive:
+                raise ObservationError(f"{file} has no array named noise, only {listing(list(archive)) or 'nothing'}")
+            return archive["noise"]
+    except ObservationError as error:
+        raise ObservationError(f"the noise {error}") from error

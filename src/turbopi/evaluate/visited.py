@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Job
 from turbopi.evaluate.sources import Answer, PolicySource
 from turbopi.files import write_whole
+from turbopi.reading import listing, read_npz
 from turbopi.serve.record import Recorder
 
 FILE = "visited.npz"
@@ -28,10 +30,7 @@ class Visited:
         self.seen = 0
         self.entries: list[dict[str, Any]] = []
         if self._path.exists():
-            with np.load(self._path) as stored:
-                self.seen, count = int(stored["seen"]), int(stored["count"])
-                names = {name.split("|", 1)[1] for name in stored.files if "|" in name}
-                self.entries = [{name: stored[f"{row}|{name}"] for name in names} for row in range(count)]
+            self.seen, self.entries = _read(self._path)
             self._rng = np.random.default_rng(self.seen)
 
     def __call__(self, job: Job, step: int, observation: dict[str, Any], seed: int, answer: Answer) -> None:
@@ -95,3 +94,20 @@ def action_error(entries: Sequence[dict[str, Any]], reference: PolicySource) -> 
         "max": float(np.abs(error).max()),
         "observations": len(entries),
     }
+
+
+def _read(path: Path) -> tuple[int, list[dict[str, np.ndarray]]]:
+    """How many requests were seen, and the entries kept of them. ConfigError for a file that `save` didn't write."""
+    stored = read_npz(path, ConfigError)
+    whole = [name for name in ("seen", "count") if name in stored and stored[name].ndim == 0]
+    kinds = [stored[name].dtype.kind for name in whole]
+    if kinds != ["i", "i"] or not 0 <= stored["count"] <= stored["seen"]:
+        raise ConfigError(
+            f"{path} isn't a sample of requests that `turbopi eval` wrote; give another --out, or delete it"
+        )
+    names = {name.split("|", 1)[1] for name in stored if "|" in name}
+    rows = range(min(int(stored["count"]), len(stored)))
+    absent = [f"{row}|{name}" for row in rows for name in names if f"{row}|{name}" not in stored]
+    if absent or len(rows) < stored["count"] or (rows and not {"seed", "actions"} <= names):
+        raise ConfigError(f"{path} lacks {listing(absent) or 'entries'}; give another --out, or delete it")
+    return int(stored["seen"]), [{name: stored[f"{row}|{name}"] for name in names} for row in rows]

@@ -33,7 +33,10 @@ class Npz(Mapping[str, np.ndarray]):
         self._stream = open_file(file, error)
         self._members: dict[str, zipfile.ZipInfo] = {}
         try:
-            if self._stream.read(4) not in (b"PK\3\4", b"PK\5\6"):
+            begin = self._stream.read(4)
+            if begin == b"\x93NUM":
+                raise error(f"{file} isn't an .npz file, but an .npy")
+            if begin not in (b"PK\3\4", b"PK\5\6"):
                 raise error(f"{file} isn't a readable .npz file: it is no zip archive")
             self._archive = zipfile.ZipFile(self._stream)
             for member in self._archive.infolist():

@@ -4,6 +4,7 @@ import os
 import re
 import reprlib
 import stat
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any
@@ -34,6 +35,14 @@ class _Short(reprlib.Repr):
 
 
 shown = _Short().repr
+
+
+def listing(names: Sequence[str], limit: int = 5) -> str:
+    """`a, b, c and 7 more (10 in all)`; a name that can't be printed on a line as it is in quotes."""
+    told = ", ".join(name if name.isprintable() and len(name) < 200 else shown(name) for name in names[:limit])
+    if len(names) > limit:
+        told += f" and {len(names) - limit} more ({len(names)} in all)"
+    return told
 
 
 def read_bytes(file: str | Path, error: Error = CheckpointError, *, limit: int, hint: str = "") -> bytes:
@@ -71,5 +80,5 @@ def file_inside(folder: Path, name: Any, where: object, error: Error = Checkpoin
         raise error(f"{where} names the file {shown(name)}; expected the name of a file in {folder}")
     path = Path(name)
     if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:|\\", name):
-        raise error(f"{where} names the file {shown(name)}, which leads out of {folder}; expected one in that folder")
+        raise error(f"{where} names the file {shown(name)}, which isn't in {folder}")
     return folder / path

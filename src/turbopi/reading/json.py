@@ -37,8 +37,13 @@ def read_json(
     return value
 
 
-def parse_json(data: bytes, where: object, error: Error = CheckpointError, *, depth: int = MAX_JSON_DEPTH) -> Any:
-    """The value of a JSON text in UTF-8, under the rules of `read_json`; `where` begins the messages."""
+def parse_json(
+    data: bytes, where: object, error: Error = CheckpointError, *, depth: int = MAX_JSON_DEPTH, nan: bool = False
+) -> Any:
+    """The value of a JSON text in UTF-8, under the rules of `read_json`; `where` begins the messages.
+
+    nan   take NaN and the infinities too, as Python writes them: of what somebody measured
+    """
     try:
         value = json.loads(
             data.decode("utf-8"),
@@ -51,7 +56,7 @@ def parse_json(data: bytes, where: object, error: Error = CheckpointError, *, de
         raise error(f"{where} holds objects and lists more than {depth} deep") from reason
     except ValueError as reason:  # not UTF-8, not JSON, or refused by a hook below
         raise error(f"{where} isn't JSON: {reason if data.strip() else 'it is empty'}") from reason
-    if b"NaN" in data or b"Infinity" in data:
+    if not nan and (b"NaN" in data or b"Infinity" in data):
         _check_constants(value, where, error)
     if rb"\u" in data:
         _check_text(value, where, error)

@@ -11,14 +11,13 @@ keys alone can't be split again, since openpi's own keys contain "/".
     node = {"dict": [[key, node], ...]} | {"list": [node, ...]} | {"array": member} | {"scalar": member}
          | {"bytes": base64} | {"value": string, number, boolean or null}
 
-A folder with an `observation.json` is an observation written by hand: see `load_observation`.
+A folder with an `observation.json` is an observation written by hand: see observation_folder.py.
 """
 
 import base64
 import json
 import re
-import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,8 @@ import numpy as np
 
 from turbopi.errors import ObservationError
 from turbopi.files import write_whole
+from turbopi.reading import Npz, is_finite, listing, parse_json, shown
+from turbopi.serve.observation_folder import load_folder
 
 FORMAT = "turbopi-recording"
 VERSION = 1
@@ -60,39 +61,34 @@ def save_call(path: Path, call: Call) -> None:
 
 
 def load_call(path: str | Path) -> Call:
-    """Read one recorded call. Raises ObservationError if `path` isn't one, OSError if it can't be read."""
-    members = _read_npz(Path(path))
-    if "index" not in members:
-        raise ObservationError(f"{path} is an .npz without an index, so not a recorded call")
-    return _to_call(members, path)
+    """Read one recorded call. Raises ObservationError if `path` isn't one, or can't be read."""
+    with Npz(path) as members:
+        if "index" not in members:
+            raise ObservationError(f"{path} is an .npz without an index, so not a recorded call")
+        return _to_call(members, path)
 
 
-def _to_call(members: dict[str, np.ndarray], path: str | Path) -> Call:
+def _to_call(members: Npz, path: str | Path, *, result: bool = True) -> Call:
+    """The call; without `result`, its arrays aren't read, and it is empty."""
+    index = parse_json(
+        members["index"].tobytes(), f"{path} has a damaged index: it", ObservationError, depth=200, nan=True
+    )
     try:
-        index = json.loads(members["index"].tobytes())
         if index["format"] != FORMAT or index["version"] != VERSION:
             raise ObservationError(
-                f"{path} is a {index['format']} of version {index['version']}; this reads {FORMAT} of version {VERSION}"
+                f"{path} is a {shown(index['format'])} of version {shown(index['version'])}; this reads {FORMAT} of "
+                f"version {VERSION}"
             )
         observation = _from_node(index["observation"], members)
-        return Call(observation, _from_node(index["result"], members), float(index["time"]))
+        answer = _from_node(index["result"], members) if result else {}
+        if not isinstance(observation, dict) or not isinstance(answer, dict) or not is_finite(index["time"]):
+            raise ValueError("the observation and the result should be dicts, the time a number")
+        return Call(observation, answer, float(index["time"]))
     except ObservationError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise ObservationError(f"{path} has a damaged index: {error!r}") from error
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    try:
-        archive = np.load(path, allow_pickle=False)
-        if isinstance(archive, np.lib.npyio.NpzFile):
-            with archive:
-                return {name: archive[name] for name in archive.files}
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        # of what is neither, NumPy says that it holds pickles
-        reason = error if zipfile.is_zipfile(path) else "it is no zip archive"
-        raise ObservationError(f"{path} isn't a readable .npz file: {reason}") from error
-    raise ObservationError(f"{path} isn't an .npz file")
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = shown(error) if isinstance(error, KeyError) else str(error)
+        raise ObservationError(f"{path} has a damaged index: {type(error).__name__} {reason}") from error
 
 
 def _to_node(value: Any, name: str, members: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -125,21 +121,33 @@ def _member_name(name: str, taken: dict[str, np.ndarray]) -> str:
     return member
 
 
-def _from_node(node: dict[str, Any], members: dict[str, np.ndarray]) -> Any:
+def _from_node(node: Any, members: Mapping[str, np.ndarray]) -> Any:
+    """What `_to_node` was given. Only the arrays that are named are read. ValueError, ... for what it didn't make."""
+    if not isinstance(node, dict) or len(node) != 1:
+        raise ValueError(f"{shown(node)} should have one kind and its content")
     ((kind, content),) = node.items()
-    if kind == "dict":
-        return {key: _from_node(item, members) for key, item in content}
-    if kind == "list":
-        return [_from_node(item, members) for item in content]
-    if kind == "bytes":
-        return base64.b64decode(content)
-    if kind == "array":
-        return members[content]
-    if kind == "scalar":
-        return members[content][()]
-    if kind == "value":
-        return content
-    raise ValueError(f"unknown kind of value {kind!r}")
+    match kind, content:
+        case "dict", list():
+            if not all(isinstance(pair, list) and len(pair) == 2 and isinstance(pair[0], str) for pair in content):
+                raise ValueError(f"{shown(content)} should be pairs of a key and a value")
+            found = {key: _from_node(item, members) for key, item in content}
+            if len(found) < len(content):
+                raise ValueError(f"a key of {shown(list(found))} is there twice")
+            return found
+        case "list", list():
+            return [_from_node(item, members) for item in content]
+        case "bytes", str():
+            return base64.b64decode(content, validate=True)
+        case "array", str():
+            return members[content]
+        case "scalar", str():
+            scalar = members[content]
+            if scalar.ndim:
+                raise ValueError(f"{shown(content)} has shape {list(scalar.shape)}; expected a single value")
+            return scalar[()]
+        case "value", str() | int() | float() | None:
+            return content
+    raise ValueError(f"{shown(node)} is no value of a recording")
 
 
 # --- folders ----------------------------------------------------------------------------------------------------------
@@ -167,8 +175,11 @@ def iter_recording(path: str | Path) -> Iterator[tuple[dict[str, Any], np.ndarra
     for file in recorded_files(path):
         call = load_call(file)
         if "actions" not in call.result:
-            raise ObservationError(f"{file} holds no actions, only {list(call.result)}")
-        yield call.observation, call.result["actions"]
+            raise ObservationError(f"{file} holds no actions, only {listing(list(call.result)) or 'nothing'}")
+        actions = call.result["actions"]
+        if not isinstance(actions, np.ndarray) or actions.ndim != 2 or actions.dtype.kind != "f":
+            raise ObservationError(f"{file}: its actions are {shown(actions)}; expected an array of numbers [H, d]")
+        yield call.observation, actions
 
 
 def load_observation(path: str | Path) -> dict[str, Any]:
@@ -176,66 +187,16 @@ def load_observation(path: str | Path) -> dict[str, Any]:
 
     - a recorded call (.npz), or a folder of them: the first one's observation;
     - any other .npz: each array under its own name as key, 0-dimensional strings as str;
-    - a folder with `observation.json`: a JSON object like the observation, in which {"file": "wrist.png"} stands for
-      the picture (RGB uint8 [h, w, 3]; [3, h, w] with "layout": "chw") or the .npy array in that folder, and a list
-      of numbers for a float64 array.
+    - a folder with `observation.json`: see observation_folder.py.
 
-    Raises ObservationError if `path` is none of these.
+    Raises ObservationError if `path` is none of these, or damaged. At most 512 MB of arrays are read.
     """
     path = Path(path)
     if not path.exists():
         raise ObservationError(f"{path} doesn't exist")
     if path.is_dir() and (path / "observation.json").is_file():
-        return _load_by_hand(path)
-    members = _read_npz(recorded_files(path)[0])
-    if "index" in members:
-        return _to_call(members, path).observation
-    return {name: str(a) if a.ndim == 0 and a.dtype.kind == "U" else a for name, a in members.items()}
-
-
-def _load_by_hand(folder: Path) -> dict[str, Any]:
-    try:
-        value = json.loads((folder / "observation.json").read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ObservationError(f"{folder / 'observation.json'} isn't JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise ObservationError(f"{folder / 'observation.json'} must hold an object, not a {type(value).__name__}")
-    return {key: _from_json(item, key, folder) for key, item in value.items()}
-
-
-def _from_json(value: Any, name: str, folder: Path) -> Any:
-    if isinstance(value, dict) and "file" in value:
-        return _load_file(value, name, folder)
-    if isinstance(value, dict):
-        return {key: _from_json(item, f"{name}/{key}", folder) for key, item in value.items()}
-    if isinstance(value, list):
-        try:
-            return np.array(value, np.float64)
-        except (TypeError, ValueError) as error:
-            raise ObservationError(f"{name!r} must be a list of numbers: {error}") from error
-    return value
-
-
-def _load_file(value: dict[str, Any], name: str, folder: Path) -> np.ndarray:
-    unknown = set(value) - {"file", "layout"}
-    layout, file = value.get("layout", "hwc"), folder / str(value["file"])
-    if unknown or layout not in ("hwc", "chw"):
-        raise ObservationError(f'{name!r} must be {{"file": ..., "layout": "hwc" or "chw"}}, not {value}')
-    if not file.resolve().is_relative_to(folder.resolve()) or not file.is_file():
-        raise ObservationError(f"{name!r} names the file {value['file']!r}, which isn't in {folder}")
-    if file.suffix == ".npy":
-        try:
-            return np.asarray(np.load(file, allow_pickle=False))
-        except (ValueError, EOFError) as error:
-            with file.open("rb") as stream:
-                is_array = stream.read(6) == b"\x93NUMPY"
-            reason = error if is_array else "it doesn't begin as one"
-            raise ObservationError(f"{file} isn't a readable .npy file: {reason}") from error
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(file) as image:
-            pixels = np.asarray(image.convert("RGB"))  # uint8 [h, w, 3]
-    except (UnidentifiedImageError, OSError) as error:
-        raise ObservationError(f"{file} is neither a readable picture nor .npy: {error}") from error
-    return np.ascontiguousarray(pixels.transpose(2, 0, 1)) if layout == "chw" else pixels
+        return load_folder(path)
+    with Npz(recorded_files(path)[0]) as members:
+        if "index" in members:
+            return _to_call(members, path, result=False).observation
+        return {name: str(a) if a.ndim == 0 and a.dtype.kind == "U" else a for name, a in members.items()}
