@@ -23,7 +23,7 @@ FLOAT32 = {"keys": 4e-6, "values": 4e-6, "v_1": 4e-6, "normalized_actions": 2e-6
 BFLOAT16 = {
     "keys": 4e-2,
     "values": 1e-2,
-    "v_1": 1e-2,
+    "v_1": 2e-2,
     "normalized_actions": 5e-3,
     "actions": 5e-3,
 }  # LeRobot's; seen: half

@@ -65,6 +65,12 @@ def test_prompts_are_cleaned_but_keep_their_case() -> None:
     assert prompt_texts(" a_b ", None) == [("a b", True), ("\n", False)]
 
 
+def test_a_prompt_as_it_is_gets_a_newline_unless_it_has_one() -> None:
+    assert prompt_texts(" a_b\nc ", None, as_is=True) == [(" a_b\nc \n", True)]
+    assert prompt_texts("a_b\n", None, as_is=True) == [("a_b\n", True)]
+    assert prompt_texts(" a_b ", np.zeros(1), as_is=True) == prompt_texts("a b", np.zeros(1))
+
+
 def test_a_truncated_prompt_is_warned_about_once(caplog: pytest.LogCaptureFixture) -> None:
     prompts = PromptTokenizer(ByteTokenizer(), vocab_size=512)
     with caplog.at_level(logging.WARNING):

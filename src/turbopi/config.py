@@ -134,6 +134,7 @@ class PolicyConfig:
     default_prompt: str | None = None
     image_resize: Literal["openpi", "lerobot", "lerobot_0.4"] = "openpi"
     prompt_state_dim: int | None = None  # zeros fill the state up to it in the prompt, as in LeRobot 0.4; None: nothing
+    prompt_as_is: bool = False  # without a state, blanks, underscores and newlines stay in the prompt: LeRobot's Pi0
     num_denoising_steps: int = 10  # unless whoever runs the policy says otherwise
 
     def with_model(self, **changes: Any) -> "PolicyConfig":

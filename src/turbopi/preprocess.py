@@ -234,7 +234,10 @@ class Pipeline:
         if self.config.discrete_state_input:
             state = pad_last(sample.state, self.config.prompt_state_dim or 0)
         sample.tokens, sample.token_mask = self.tokenizer.tokenize(
-            sample.prompt, state, max_tokens=self.config.model.max_prompt_tokens
+            sample.prompt,
+            state,
+            max_tokens=self.config.model.max_prompt_tokens,
+            as_is=self.config.prompt_as_is,
         )
 
     def _pad_state(self, sample: Incoming) -> None:

@@ -1,7 +1,8 @@
 """Prompts to token ids: clean-up, the state as integers in the text, SentencePiece, padding.
 
 Pi0.5 writes the normalised state into the prompt, one integer per dimension; Pi0 (and Pi0.5 trained without it) has the
-task alone, followed by a newline that is encoded by itself. Source: openpi's `tokenizer.py`.
+task alone, followed by a newline that is encoded by itself. Source: openpi's `tokenizer.py`. LeRobot cleans nothing of
+Pi0's: the newline only goes behind a task that has none (its `Pi0NewLineProcessor`).
 """
 
 import logging
@@ -43,8 +44,10 @@ def state_bins(state: np.ndarray) -> np.ndarray:
     return np.asarray(np.digitize(state, _STATE_EDGES) - 1)
 
 
-def prompt_texts(prompt: str, state: np.ndarray | None) -> list[tuple[str, bool]]:
-    """What is encoded, in order: (text, whether BOS goes before it)."""
+def prompt_texts(prompt: str, state: np.ndarray | None, *, as_is: bool = False) -> list[tuple[str, bool]]:
+    """What is encoded, in order: (text, whether BOS goes before it). `as_is`: a prompt without state isn't cleaned."""
+    if as_is and state is None:
+        return [(prompt if prompt.endswith("\n") else prompt + "\n", True)]
     cleaned = clean_prompt(prompt)
     if state is None:
         return [(cleaned, True), ("\n", False)]
@@ -65,8 +68,10 @@ class PromptTokenizer:
         self._truncated_prompt: str | None = None  # warned about last
         self._newline: list[int] | None = None  # Pi0's, which is encoded by itself: always the same
 
-    def encode(self, prompt: str, state: np.ndarray | None = None) -> list[int]:
+    def encode(self, prompt: str, state: np.ndarray | None = None, *, as_is: bool = False) -> list[int]:
         """All ids of `prompt`, neither padded nor truncated. `state` [d], normalised, goes into the text.
+
+        as_is   a prompt without state keeps its blanks, underscores and newlines, as in LeRobot's Pi0
 
         Raises ObservationError for a prompt that can't be encoded, TokenizerError for ids past the vocabulary.
         """
@@ -76,7 +81,7 @@ class PromptTokenizer:
             prompt.encode()
         except UnicodeEncodeError as error:
             raise ObservationError(f"the prompt isn't valid Unicode text: {error}") from error
-        (text, bos), *newline = prompt_texts(prompt, state)
+        (text, bos), *newline = prompt_texts(prompt, state, as_is=as_is)
         ids = self._ids(text, bos)
         if newline:
             self._newline = self._newline or self._ids(*newline[0])
@@ -93,13 +98,13 @@ class PromptTokenizer:
         return list(map(int, self.encoder.encode(text, add_bos=add_bos)))
 
     def tokenize(
-        self, prompt: str, state: np.ndarray | None = None, *, max_tokens: int
+        self, prompt: str, state: np.ndarray | None = None, *, max_tokens: int, as_is: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
         """Ids int64[max_tokens], padded on the right with 0, and their mask bool[max_tokens].
 
-        A longer prompt loses its end, as in openpi; a warning is logged once for each such prompt.
+        `as_is`: see `encode`. A longer prompt loses its end, as in openpi; a warning is logged, once for each.
         """
-        ids = self.encode(prompt, state)
+        ids = self.encode(prompt, state, as_is=as_is)
         count = min(len(ids), max_tokens)
         if count < len(ids):
             self._warn_truncated(prompt, len(ids), max_tokens, state is not None)

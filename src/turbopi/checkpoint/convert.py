@@ -179,6 +179,7 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, Any], Path
         "default_prompt": config.default_prompt,
         "image_resize": config.image_resize,
         "prompt_state_dim": config.prompt_state_dim,
+        "prompt_as_is": config.prompt_as_is,
         "time_grid": config.model.time_grid,
         "num_denoising_steps": config.num_denoising_steps,
         "vision_heads": config.model.vision.num_heads,

@@ -1,4 +1,4 @@
-"""LeRobot's `pi05` checkpoints: `config.json` and the two processor pipelines, which describe a policy fully.
+"""LeRobot's `pi05` and `pi0` checkpoints: `config.json` and the two processor pipelines, which describe a policy fully.
 
 Facts from LeRobot 0.6: the processors' files decide over config.json; their tensors are found by `state_file`;
 QUANTILES and MIN_MAX replace a zero range by 1e-8, MEAN_STD adds 1e-8; the normalised state is always written into the
@@ -9,7 +9,7 @@ the processors' steps may be in lerobot_pipeline.py.
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
@@ -26,7 +26,7 @@ from turbopi.checkpoint.lerobot_pipeline import (
 )
 from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, feature_stats
 from turbopi.checkpoint.settings import Settings, with_values
-from turbopi.config import LIMITS, ModelConfig, Normalization, NormMode, PolicyConfig
+from turbopi.config import LIMITS, Kind, ModelConfig, Normalization, NormMode, PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
 from turbopi.reading import Fields, file_inside, read_json, shown
 
@@ -46,7 +46,7 @@ _FIXED = {
     "min_period": (4e-3, "the time embedding's shortest period 0.004"),
     "max_period": (4.0, "the time embedding's longest period 4.0"),
 }
-# what LeRobot writes: read here, in no use for Pi0.5 (n_obs_steps), or about training and the hub
+# what LeRobot writes: read here, in no use for Pi0.5 and Pi0 (n_obs_steps), or about training and the hub
 _KNOWN = versions.FIRST_KEYS | versions.LATER_KEYS
 
 
@@ -56,14 +56,14 @@ class LeRobotFolder:
     settings  what a turbopi.json puts over it
     untied    whether the weights hold lm_head beside the embedding, see lerobot_versions.py
 
-    Raises CheckpointError for what isn't Pi0.5, is incomplete, or asks for what Turbo-Pi doesn't compute.
+    Raises CheckpointError for what is neither Pi0.5 nor Pi0, is incomplete, or asks for what Turbo-Pi doesn't compute.
     """
 
     def __init__(self, folder: Path, settings: Settings, *, untied: bool = False) -> None:
         self.folder, self.settings, self.file = folder, settings, folder / CONFIG
         self.config = Fields(_read_config(folder), self.file)
-        self._check_config()
-        self.pipelines = Pipelines(folder)
+        self.kind = self._check_config()
+        self.pipelines = Pipelines(folder, self.kind)
         self.stats, self._stats_files = self._read_stats()
         self.action_dim = self._width("output_features", ACTION, "max_action_dim")
         self.described_state_dim = self._width("input_features", STATE, "max_state_dim")
@@ -86,8 +86,9 @@ class LeRobotFolder:
         old = self.semantics == "0.4"
         summed = old and versions.sums_up_time(self.config.values)
         described = PolicyConfig(
-            name="lerobot_pi05",
+            name=f"lerobot_{self.kind}",
             model=ModelConfig(
+                kind=self.kind,
                 action_horizon=self.config.integer("chunk_size", 1, LIMITS["action_horizon"], default=50),
                 max_prompt_tokens=self.pipelines.max_tokens,
                 time_grid="accumulated" if summed else "multiplied",
@@ -95,8 +96,10 @@ class LeRobotFolder:
             robot="lerobot",
             normalization=Normalization("identity", "identity"),  # until the next line
             robot_options=self._robot_options(),
+            discrete_state_input=self.kind == "pi05",
             image_resize="lerobot_0.4" if old else "lerobot",
-            prompt_state_dim=self.pipelines.prompt_width if old else None,
+            prompt_state_dim=self.pipelines.prompt_width or None if old else None,
+            prompt_as_is=self.kind == "pi0",
             num_denoising_steps=self.config.integer(
                 "num_inference_steps", 1, LIMITS["num_denoising_steps"], default=10
             ),
@@ -114,8 +117,8 @@ class LeRobotFolder:
         return self.stats
 
     def notes(self) -> list[str]:
-        """Where the files say two things or what isn't done, and what is done then; keys that LeRobot's Pi0.5 doesn't
-        have, from which another program may compute something.
+        """Where the files say two things or what isn't done, and what is done then; keys that LeRobot doesn't have,
+        from which another program may compute something.
         """
         notes = []
         unknown = sorted(self.config.values.keys() - _KNOWN)
@@ -133,7 +136,9 @@ class LeRobotFolder:
                 f"{CONFIG} says {self.described_state_dim} values of state, but the statistics have {self.state_dim}: "
                 f"observations have {self.state_dim}, as LeRobot runs it"
             )
-        tokens = self.config.integer("tokenizer_max_length", 1, LIMITS["max_prompt_tokens"], default=200)
+        tokens = self.config.integer(
+            "tokenizer_max_length", 1, LIMITS["max_prompt_tokens"], default=200 if self.kind == "pi05" else 48
+        )
         if tokens != self.pipelines.max_tokens:
             notes.append(
                 f"{CONFIG} says {tokens} tokens of prompt, but {PREPROCESSOR} {self.pipelines.max_tokens}: so many "
@@ -149,12 +154,25 @@ class LeRobotFolder:
             )
         return notes
 
-    def _check_config(self) -> None:
+    def _check_config(self) -> Kind:
         kind = self.config.values.get("type")
-        if kind != "pi05":
+        if kind not in ("pi05", "pi0"):
             raise CheckpointError(
-                f"{self.folder} is a LeRobot checkpoint of type {shown(kind)}; Turbo-Pi reads LeRobot's 'pi05' "
-                "(and openpi's own checkpoints of Pi0 and Pi0.5)"
+                f"{self.folder} is a LeRobot checkpoint of type {shown(kind)}; Turbo-Pi reads LeRobot's 'pi05' and "
+                "'pi0' (and openpi's own checkpoints of Pi0 and Pi0.5)"
+            )
+        if "resize_imgs_with_padding" in self.config.values:
+            raise CheckpointError(
+                f"{self.file} is of a LeRobot before 0.4, whose Pi0 had other tensors and no processors; Turbo-Pi "
+                "reads what 0.4 and later ones save"
+            )
+        state, action = (
+            self.config.integer(f"max_{name}_dim", 1, LIMITS["action_dim"], 32) for name in ("state", "action")
+        )
+        if kind == "pi0" and state != action:
+            raise CheckpointError(
+                f"{self.file} has max_state_dim = {state} and max_action_dim = {action}; Turbo-Pi's Pi0 has one width "
+                "for both"
             )
         for key, (expected, meaning) in _FIXED.items():
             value = self.config.values.get(key, expected)
@@ -162,6 +180,7 @@ class LeRobotFolder:
                 raise CheckpointError(
                     f"{self.file} has {key} = {shown(value)}, which Turbo-Pi doesn't compute; it does {meaning}"
                 )
+        return cast(Kind, kind)
 
     # -- scaling -------------------------------------------------------------------------------------------------------
 

@@ -4,13 +4,19 @@ LeRobot runs whatever steps the files list, in their order. Turbo-Pi runs an edg
 steps below compute in the order below. Everything else is refused by its name: a step, an order, a value or a key that
 asks for something that isn't done never passes unnoticed.
 
-Preprocessor. The state's step and the tokenizer must be there; without a normalizer the state stays as it is:
+Preprocessor of Pi0.5. The state's step and the tokenizer must be there; without a normalizer the state stays as it is:
 
     rename_observations_processor                   names of observations to names of the policy
     relative_actions_processor                      keeps the raw state (0.5.1: delta_actions_processor)
     normalizer_processor                            scales the state
     pi05_prepare_state_tokenizer_processor_step     writes the state into the prompt
     tokenizer_processor                             prompt to tokens
+
+Preprocessor of Pi0, whose prompt has no state; what is about the prompt may stand before or behind the rest:
+
+    rename_observations_processor, relative_actions_processor, normalizer_processor
+    pi0_new_line_processor                          puts a newline behind the prompt, unless there is one
+    tokenizer_processor                             prompt to tokens, as it is
 
 Postprocessor; both may be missing:
 
@@ -21,14 +27,14 @@ These change no number of a single observation, and may stand anywhere and often
 parts; device_processor without a float_dtype, or with float32. So may the two new-line steps before the state's, which
 strips the prompt.
 
-Sources: LeRobot 0.4.0 to 0.6.1, `processor/` and `policies/pi05/processor_pi05.py`.
+Sources: LeRobot 0.4.0 to 0.6.1, `processor/`, `policies/pi0/processor_pi0.py` and `policies/pi05/processor_pi05.py`.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from turbopi.config import LIMITS
+from turbopi.config import LIMITS, Kind
 from turbopi.errors import CheckpointError
 from turbopi.reading import Fields, read_json, shown
 
@@ -37,12 +43,13 @@ STATE, ACTION, OBSERVATION = "observation.state", "action", "observation."
 
 RENAME, RELATIVE, NORMALIZER = "rename_observations_processor", "relative_actions_processor", "normalizer_processor"
 STATE_STEP, TOKENIZER = "pi05_prepare_state_tokenizer_processor_step", "tokenizer_processor"
+NEW_LINE = "pi0_new_line_processor"
 UNNORMALIZER, ABSOLUTE, DEVICE = "unnormalizer_processor", "absolute_actions_processor", "device_processor"
 PALIGEMMA = "google/paligemma-3b-pt-224"
 
 _OTHER_NAMES = {"delta_actions_processor": RELATIVE}
+_NEW_LINES = (NEW_LINE, "smolvla_new_line_processor")  # the same step twice
 _BATCH = ("", "_action", "_observation", "_complementary_data")
-_NEW_LINES = ("smolvla_new_line_processor", "pi0_new_line_processor")
 _SCALING = ("eps", "features", "norm_map", "normalize_observation_keys")
 # name: the keys that its config may have
 _HARMLESS: dict[str, tuple[str, ...]] = {DEVICE: ("device", "float_dtype")} | {
@@ -61,8 +68,9 @@ _STEPS: dict[str, dict[str, tuple[str, ...]]] = {
     POSTPROCESSOR: {UNNORMALIZER: _SCALING, ABSOLUTE: ("enabled",), **_HARMLESS},
 }
 _OFTEN = {*_HARMLESS, *_NEW_LINES}
-_NEEDED = {PREPROCESSOR: (STATE_STEP, TOKENIZER), POSTPROCESSOR: ()}
+_NEEDED: dict[Kind, tuple[str, ...]] = {"pi05": (STATE_STEP, TOKENIZER), "pi0": (NEW_LINE, TOKENIZER)}
 _ORDER = (RENAME, RELATIVE, NORMALIZER, *_NEW_LINES, STATE_STEP, TOKENIZER, UNNORMALIZER, ABSOLUTE)
+_PROMPT = (*_NEW_LINES, STATE_STEP, TOKENIZER)
 _BEFORE = {(first, then) for i, first in enumerate(_ORDER) for then in _ORDER[i + 1 :] if then not in _NEW_LINES}
 _SAME_NUMBERS = (None, "float32", "float")  # a device step's float_dtype: everything is float32 already
 
@@ -80,18 +88,22 @@ class Step:
 class Pipelines:
     """What the two files of a folder ask for. Raises CheckpointError for all that Turbo-Pi doesn't compute.
 
+    kind            of the policy that they are for
     steps           the steps that compute something, by name
     rename_map      observations' names -> the policy's
     max_tokens      of a prompt
-    prompt_width    numbers of state that LeRobot 0.4 wrote into the prompt at least; newer ones don't read it
+    prompt_width    numbers of state that LeRobot 0.4 wrote into the prompt at least; newer ones don't read it.
+                    0 for Pi0, which writes none
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.steps = {step.name: step for name in _STEPS for step in _read(folder / name)}
+    def __init__(self, folder: Path, kind: Kind = "pi05") -> None:
+        self.steps = {step.name: step for name in _STEPS for step in _read(folder / name, kind)}
         self.rename_map = self._rename_map()
         self._check_task_keys()
         self.max_tokens = self._tokenizer()
-        self.prompt_width = self.steps[STATE_STEP].config.integer("max_state_dim", 1, LIMITS["action_dim"], default=32)
+        self.prompt_width = 0
+        if kind == "pi05":
+            self.prompt_width = self.steps[STATE_STEP].config.integer("max_state_dim", 1, LIMITS["action_dim"], 32)
 
     def relative_mask(self, action_dim: int) -> list[bool] | None:
         """Which of the actions are relative to the state when they leave the model, and absolute in the answer.
@@ -141,8 +153,7 @@ class Pipelines:
         return dict(renames)
 
     def _check_task_keys(self) -> None:
-        for name in (STATE_STEP, TOKENIZER):
-            step = self.steps[name]
+        for step in (self.steps[name] for name in (STATE_STEP, TOKENIZER) if name in self.steps):
             if step.config.text("task_key", "task") != "task":
                 step.config.refuse("task_key", "task, where Turbo-Pi looks for the prompt")
 
@@ -162,28 +173,38 @@ class Pipelines:
         return step.config.integer("max_length", 1, LIMITS["max_prompt_tokens"], default=512)  # LeRobot's own default
 
 
-def _read(file: Path) -> list[Step]:
+def _read(file: Path, kind: Kind) -> list[Step]:
     """The steps of one pipeline that compute something, each once and in the one order that Turbo-Pi has."""
     entries = read_json(file, hint="; is the download complete?").get("steps")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise CheckpointError(f"{file} has no list of steps; is it a LeRobot processor?")
-    steps = [_step(entry, file) for entry in entries]
+    steps = [_step(entry, file, kind) for entry in entries]
     names = [step.name for step in steps]
     for i, name in enumerate(names):
         if name in names[:i] and name not in _OFTEN:
             raise CheckpointError(f"{file} has the step {name} twice; Turbo-Pi does it once")
-        late = next((earlier for earlier in names[:i] if (name, earlier) in _BEFORE), None)
+        late = next((earlier for earlier in names[:i] if _must_precede(name, earlier, kind)), None)
         if late is not None:
-            order = ", ".join(step for step in _ORDER if step in _STEPS[file.name] and step not in _NEW_LINES)
+            order = ", ".join(step for step in _ORDER if step in _known(file, kind) and step not in _NEW_LINES)
             raise CheckpointError(f"{file} has {late} before {name}, which computes something else than {order}")
-    for name in _NEEDED[file.name]:
-        if name not in names:
-            raise CheckpointError(f"{file} has no step {name}, which every policy of Pi0.5 is trained with")
+    for name in _NEEDED[kind] if file.name == PREPROCESSOR else ():
+        if name not in names and not (name == NEW_LINE and set(names) & set(_NEW_LINES)):
+            raise CheckpointError(f"{file} has no step {name}, which every policy of type {kind} is trained with")
     return [step for step in steps if step.name not in _OFTEN]
 
 
-def _step(entry: dict[str, Any], file: Path) -> Step:
-    known = _STEPS[file.name]
+def _must_precede(first: str, then: str, kind: Kind) -> bool:
+    """Whether another order would compute something else: nothing in a prompt of Pi0 comes from the state."""
+    apart = kind == "pi0" and (first in _PROMPT) != (then in _PROMPT)
+    return (first, then) in _BEFORE and not apart
+
+
+def _known(file: Path, kind: Kind) -> dict[str, tuple[str, ...]]:
+    return {name: keys for name, keys in _STEPS[file.name].items() if name != STATE_STEP or kind == "pi05"}
+
+
+def _step(entry: dict[str, Any], file: Path, kind: Kind) -> Step:
+    known = _known(file, kind)
     given = entry.get("registry_name", entry.get("class"))
     name = _OTHER_NAMES.get(given, given) if isinstance(given, str) else None
     if name not in known:

@@ -1,13 +1,15 @@
-"""Which LeRobot wrote a checkpoint of Pi0.5: 0.4 computed other things than 0.5 and 0.6 do, from the same files.
+"""Which LeRobot wrote a checkpoint of Pi0.5 or Pi0: 0.4 computed other things than 0.5 and 0.6 do, from the same files.
 
     version         prompt                              letterbox    t
     0.4.0 - 0.4.2   the state, and zeros up to 32       -3           summed up in float32
     0.4.3, 0.4.4    the state, and zeros up to 32       -3           1 + step * dt
     0.5.0 - 0.6.1   the state as wide as it is          -1           1 + step * dt
 
+The prompt of Pi0 has no state in any of them, the rest is as Pi0.5's.
+
 No file holds a version. But LeRobot writes every field of its config, and has added some: `freeze_vision_encoder` in
 0.4.3, `use_relative_actions` in 0.5.1. The config of 0.5.0 is that of 0.4.4, but 0.4 ties lm_head to the embedding and
-stores one of them, 0.5 stores both. Sources: LeRobot's `policies/pi05` of each version.
+stores one of them, 0.5 stores both. Sources: LeRobot's `policies/pi0` and `policies/pi05` of each version.
 """
 
 from collections.abc import Collection
@@ -55,10 +57,10 @@ def sums_up_time(keys: Collection[str]) -> bool:
 
 def note(done: Semantics, written_by: Semantics | None, prompt_width: int) -> str:
     """What `inspect` should say where LeRobot's versions differ about a checkpoint, and nobody has chosen."""
-    computes = {
-        "0.4": f"at least {prompt_width} numbers of state in the prompt, pictures padded with -3",
-        "0.6": "the robot's own numbers of state in the prompt, pictures padded with -1",
-    }
+    computes = {"0.4": "pictures padded with -3", "0.6": "pictures padded with -1"}
+    if prompt_width:
+        computes["0.4"] = f"at least {prompt_width} numbers of state in the prompt, {computes['0.4']}"
+        computes["0.6"] = f"the robot's own numbers of state in the prompt, {computes['0.6']}"
     other: Semantics = "0.6" if done == "0.4" else "0.4"
     who = f"LeRobot {written_by} wrote this checkpoint" if written_by else "no file tells which LeRobot wrote this"
     return (

@@ -120,8 +120,10 @@ def _open_adapter(location: Location, settings: Settings) -> WeightSource:
 def _open_lerobot(location: Location, settings: Settings, source: WeightSource) -> Checkpoint:
     folder = LeRobotFolder(location.folder, settings, untied=getattr(source, "untied", False))
     policy = _with_sizes(folder.policy_config(), source, settings, location)
-    if policy.model.kind != "pi05":
-        raise CheckpointError(f"{location.folder}: config.json says pi05, but these are {policy.model.kind} weights")
+    if policy.model.kind != folder.kind:
+        raise CheckpointError(
+            f"{location.folder}: config.json says {folder.kind}, but these are {policy.model.kind} weights"
+        )
     source.notes.extend(folder.notes())
     return Checkpoint(
         path=location.folder,
