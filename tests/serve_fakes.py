@@ -57,7 +57,7 @@ class FakePolicy:
         self.observations[prompt] = dict(obs)
         if prompt.startswith("hold"):
             self.started.set()
-            assert self.release.wait(30)
+            assert self.release.wait(120)
         if prompt == "crash":
             raise RuntimeError("CUDA error: an illegal memory access was encountered")
         if prompt == "nan actions":
@@ -68,6 +68,8 @@ class FakePolicy:
             next(iter(()))
         if prompt == "exit":
             raise SystemExit(3)
+        if prompt == "large actions":  # more than sockets hold
+            return {"actions": np.zeros((1_000_000, 8))}
         if prompt == "no actions":
             return {"policy_timing": {}}
         if prompt == "unpackable":
@@ -112,7 +114,7 @@ async def http_get(port: int, path: str, *headers: str) -> tuple[int, dict[str, 
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     lines = [f"GET {path} HTTP/1.1", f"Host: 127.0.0.1:{port}", *headers, "", ""]
     writer.write("\r\n".join(lines).encode())
-    answer = (await asyncio.wait_for(reader.read(), 5)).decode()
+    answer = (await asyncio.wait_for(reader.read(), 60)).decode()
     writer.close()
     head, _, body = answer.partition("\r\n\r\n")
     status, *fields = head.split("\r\n")

@@ -66,6 +66,9 @@ def serve(
     queue_limit: Annotated[
         int, typer.Option("--queue-limit", min=0, metavar="N", help="Requests that may wait while one runs.")
     ] = 16,
+    max_clients: Annotated[
+        int, typer.Option("--max-clients", min=1, metavar="N", help="Connected at once; more are refused (HTTP 503).")
+    ] = 256,
     record: Annotated[
         Path | None, typer.Option("--record", metavar="DIR", help="Write every observation and its actions below DIR.")
     ] = None,
@@ -86,7 +89,13 @@ def serve(
     from turbopi.serve.hosts import AllowedHosts
     from turbopi.serve.server import check_options
 
-    check_options(port=port, api_key=api_key, max_message_mb=max_message_mb, queue_limit=queue_limit)
+    check_options(
+        port=port,
+        api_key=api_key,
+        max_message_mb=max_message_mb,
+        queue_limit=queue_limit,
+        max_clients=max_clients,
+    )
     AllowedHosts(host, hosts)
     if record is not None:
         check_folder(record)
@@ -114,6 +123,7 @@ def serve(
         queue_limit=queue_limit,
         record_dir=record,
         allowed_hosts=hosts,
+        max_clients=max_clients,
         console=output.console,
     )
 

@@ -7,13 +7,16 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 
-# Kinds of `turbopi_errors_total`. The first six are the client's; "policy", "actions" and "lost" are ours; the last two
-# are nobody's.
+# Kinds of `turbopi_errors_total`. Those to "origin" are the client's; "policy", "actions" and "lost" are ours; the last
+# two are nobody's.
 ERROR_KINDS = (
     "malformed",
     "observation",
     "busy",
     "too_large",
+    "slow",
+    "flood",
+    "full",
     "unauthorized",
     "origin",
     "policy",

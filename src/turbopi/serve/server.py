@@ -9,7 +9,8 @@
       ◀─── traceback, close 1011 ──   or, when the policy failed
 
 The event loop only moves and decodes bytes; the policy runs on the worker's thread, so health checks, pings and other
-clients are served while it does. See docs/serving.md for what differs from openpi's own server.
+clients are served while it does. listener.py lets clients in, connection.py reads what they send no faster than they
+may send it. See docs/serving.md for the limits, and for what differs from openpi's own server.
 """
 
 import asyncio
@@ -20,18 +21,21 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
 from turbopi.errors import ConfigError, DeviceLost
 from turbopi.serve.calls import Outcome, Policy, PolicyCalls
+from turbopi.serve.connection import GuardedConnection, Shared
 from turbopi.serve.gate import Gate, check_key
 from turbopi.serve.hosts import AllowedHosts
+from turbopi.serve.limited_log import LimitedLog
+from turbopi.serve.limits import Limits, limits_for
+from turbopi.serve.listener import Listener
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.record import Recorder
 from turbopi.serve.signals import stop_signals
@@ -39,19 +43,22 @@ from turbopi.serve.wire import WireError, pack, unpack
 from turbopi.serve.worker import Busy, Stopping, Worker
 
 logger = logging.getLogger(__name__)
-# The websockets library reports each port scan and health check as a failed handshake; what matters is logged here.
-_protocol_logger = logging.getLogger(f"{__name__}.protocol")
-_protocol_logger.setLevel(logging.CRITICAL)
 
 _REFUSALS = {
     "observation": "bad observation: {}",
     "actions": "bad actions: {}",
     "lost": "the device is lost: {}",
 }
-LOST_NOTICE = (
-    5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers look now and then
-)
+LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers look seldom
+LARGE = 2**20  # bytes of a message that is decoded beside the event loop
 MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
+
+
+class _Refusal(NamedTuple):
+    """Why a request gets no actions: `kind` for the metrics, `text` for the client."""
+
+    kind: str
+    text: str
 
 
 class _ClientGone(Exception):
@@ -62,7 +69,9 @@ class _PolicyFailed(Exception):
     """The policy raised something that isn't the client's fault; holds the traceback's text."""
 
 
-def check_options(*, port: int, api_key: str | None, max_message_mb: float, queue_limit: int) -> None:
+def check_options(
+    *, port: int, api_key: str | None, max_message_mb: float, queue_limit: int, max_clients: int
+) -> None:
     """Raise ConfigError for options of a server that can't be right."""
     if not 0 <= port <= 65535:
         raise ConfigError(f"port must be between 0 and 65535, not {port}")
@@ -70,6 +79,8 @@ def check_options(*, port: int, api_key: str | None, max_message_mb: float, queu
         raise ConfigError(f"max_message_mb must be more than 0 and finite, not {max_message_mb}")
     if queue_limit < 0:
         raise ConfigError(f"queue_limit must be 0 or more, not {queue_limit}")
+    if max_clients < 1:
+        raise ConfigError(f"max_clients must be 1 or more, not {max_clients}")
     check_key(api_key)
 
 
@@ -82,6 +93,8 @@ class PolicyServer:
     queue_limit     requests that may wait while another one runs; more get a text frame "busy: ..."
     record_dir      if given, every observation and its actions are written below this folder
     allowed_hosts   names, besides its own, by which web pages may address this server (`hosts.AllowedHosts`)
+    max_clients     connected at once; more are refused with HTTP 503
+    limits          what else a client may cost; its `clients` and `message_bytes` are those given above
 
     Raises ConfigError for options that can't be right.
     """
@@ -97,21 +110,32 @@ class PolicyServer:
         queue_limit: int = 16,
         record_dir: str | Path | None = None,
         allowed_hosts: Sequence[str] = (),
+        max_clients: int = Limits.clients,
+        limits: Limits | None = None,
     ) -> None:
-        check_options(port=port, api_key=api_key, max_message_mb=max_message_mb, queue_limit=queue_limit)
+        check_options(
+            port=port,
+            api_key=api_key,
+            max_message_mb=max_message_mb,
+            queue_limit=queue_limit,
+            max_clients=max_clients,
+        )
         self.host, self.port = host, port
         self.metrics = Metrics()
         self._policy = policy
-        self._gate = Gate(api_key, self.metrics, AllowedHosts(host, allowed_hosts), lambda: self.lost)
-        self._max_bytes = int(max_message_mb * 2**20)
+        self._limits = limits_for(max_message_mb, max_clients, limits)
+        self._log = LimitedLog(logger)
+        gate = Gate(api_key, self.metrics, AllowedHosts(host, allowed_hosts), lambda: self.lost)
+        self._listener = Listener(gate, self._handle, Shared(self._limits, self.metrics, self._log))
+        self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
         self._record_dir = None if record_dir is None else Path(record_dir)
         self._recorder: Recorder | None = None
         self._worker = Worker(queue_limit)
         self._calls = PolicyCalls(policy, self._worker, self.metrics, on_lost=self._lose)
         self._lost: Future[str] = Future()  # set from the worker's thread
         self.metrics.watch(lambda: self._worker.waiting, lambda: self._worker.running)
-        self._server: Server | None = None
-        self._idle: set[ServerConnection] = set()  # connections that wait for a request
+        self._started = False
+        self._idle: set[GuardedConnection] = set()  # connections that wait for a request
         self._stopping = False
         self._greeting = b""
 
@@ -142,46 +166,41 @@ class PolicyServer:
 
         Raises ConfigError if the port or the recording's folder can't be had, and whatever the warm-up raises.
         """
-        if self._server is not None:
+        if self._started:
             raise RuntimeError("a PolicyServer starts once: make a new one")
-        server = serve(
-            self._handle,
-            self.host,
-            self.port,
-            process_request=self._gate,
-            compression=None,  # pictures don't get smaller, only later
-            max_size=self._max_bytes,
-            max_queue=1,  # a client that sends ahead is read no further than one message
-            logger=_protocol_logger,
-            start_serving=False,
-        )
+        self._started = True
         try:
-            self._server = await server
+            self.port = await self._listener.bind(self.host, self.port)
         except OSError as error:
             raise ConfigError(f"can't listen on {self.url}: {error}. Choose another --host or --port.") from error
         try:
-            self.port = self._server.sockets[0].getsockname()[1]
             await self._calls.warm_up()
             metadata = self._policy.metadata
             self._greeting = pack(metadata)
             if self._record_dir is not None:
                 self._recorder = Recorder(self._record_dir, metadata, count=self.metrics.recorded)
-            await self._server.start_serving()
+            self._listener.start()
         except BaseException:
-            self._server.close()
+            self._listener.close()
             self._worker.close()
             raise
 
     async def stop(self) -> None:
-        """Stop gracefully: refuse new clients, finish the running inference and send its actions, close with 1001."""
-        assert self._server is not None, "start() first"
+        """Stop gracefully: refuse new clients, finish the running inference and send its actions, close with 1001.
+
+        Takes as long as that inference and a few seconds, whatever the clients do.
+        """
+        assert self._started, "start() first"
         self._stopping = True
         self._worker.stop()
-        self._server.close(close_connections=False)
-        await asyncio.gather(*(self._say_goodbye(connection) for connection in tuple(self._idle)))
-        await self._server.wait_closed()
+        self._listener.close()
+        goodbyes = [asyncio.create_task(self._say_goodbye(connection)) for connection in tuple(self._idle)]
         await self._worker.drain()
+        await self._listener.ended(self._limits.close_seconds)
+        await asyncio.gather(*goodbyes)
         self._worker.close()
+        self._decoder.shutdown(wait=False)
+        self._log.flush()
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
 
@@ -233,20 +252,20 @@ class PolicyServer:
 
     # --- the protocol -------------------------------------------------------------------------------------------------
 
-    async def _handle(self, connection: ServerConnection) -> None:
+    async def _handle(self, connection: GuardedConnection) -> None:
         """One client, from its metadata to its close."""
         self.metrics.clients.inc()
-        logger.info("%s connected", connection.remote_address)
+        self._log.info(f"{connection.remote_address} connected", "connections")
         try:
             await connection.send(self._greeting)
             await self._converse(connection)
         except _ClientGone:
             self.metrics.error("disconnected")
-            logger.info("%s left during its request", connection.remote_address)
+            self._log.info(f"{connection.remote_address} left during its request", "connections")
         except ConnectionClosed as closed:
             if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
                 self.metrics.error("too_large")
-            logger.info("%s disconnected: %s", connection.remote_address, closed)
+            self._log.info(f"{connection.remote_address} disconnected: {closed}", "connections")
         except _PolicyFailed as failure:
             await self._fail(connection, str(failure))
         except Exception:  # a fault of this server must cost one client, not all
@@ -256,17 +275,17 @@ class PolicyServer:
             self._idle.discard(connection)
             self.metrics.clients.dec()
 
-    async def _fail(self, connection: ServerConnection, text: str) -> None:
+    async def _fail(self, connection: GuardedConnection, text: str) -> None:
         """Send a traceback and close, as openpi does."""
         self.metrics.error("policy")
         with contextlib.suppress(ConnectionClosed):
             await connection.send(text)
             await connection.close(CloseCode.INTERNAL_ERROR, "internal server error: the last frame has the traceback")
 
-    async def _say_goodbye(self, connection: ServerConnection) -> None:
+    async def _say_goodbye(self, connection: GuardedConnection) -> None:
         await connection.close(CloseCode.GOING_AWAY, "the server is shutting down")
 
-    async def _converse(self, connection: ServerConnection) -> None:
+    async def _converse(self, connection: GuardedConnection) -> None:
         """One response for every request, until the client leaves or the server stops."""
         previous_total: float | None = None
         while not self._stopping:
@@ -277,8 +296,9 @@ class PolicyServer:
             received = time.perf_counter()
             self.metrics.requests.inc()
             reply = await self._reply(connection, message, previous_total)
-            if isinstance(reply, str):
-                await connection.send(reply)
+            if isinstance(reply, _Refusal):
+                await connection.send(reply.text)
+                await self._refused(connection, reply)
                 continue
             await connection.send(pack(reply))
             finished = time.perf_counter()
@@ -286,20 +306,30 @@ class PolicyServer:
             previous_total = finished - started  # with the wait for the request, as openpi counts it
             if self._recorder is not None:  # decoded anew: the policy may have changed the dict it was given
                 assert isinstance(message, bytes)
-                self._recorder.put(unpack(message, max_bytes=self._max_bytes), reply, size=len(message))
+                size = len(message)
+                self._recorder.put(unpack(message, max_bytes=self._limits.message_bytes), reply, size=size)
+            del message, reply  # a connection that waits holds nothing
+            connection.answered("good")
         await self._say_goodbye(connection)
 
-    async def _reply(
-        self, connection: ServerConnection, message: str | bytes, previous_total: float | None
-    ) -> dict[str, Any] | str:
-        """The result to send for `message`, or the text that tells the client why there is none.
+    async def _refused(self, connection: GuardedConnection, refusal: _Refusal) -> None:
+        """Close with 1008 if the client has sent nothing but bad requests for long: it doesn't look at the answers."""
+        connection.answered("bad" if refusal.kind in ("malformed", "observation") else "neither")
+        if connection.bad_in_a_row >= self._limits.bad_messages:
+            self.metrics.error("flood")
+            reason = f"{connection.bad_in_a_row} bad requests in a row"
+            self._log.warning(f"{connection.remote_address}: {reason}, the last one: {refusal.text}", "flood")
+            await connection.close(CloseCode.POLICY_VIOLATION, f"{reason}: the text frames say what is wrong")
 
-        Raises _PolicyFailed and _ClientGone.
-        """
+    async def _reply(
+        self, connection: GuardedConnection, message: str | bytes, previous_total: float | None
+    ) -> dict[str, Any] | _Refusal:
+        """The result to send, or what to tell the client instead. Raises _PolicyFailed and _ClientGone."""
         if self.lost is not None:
             return self._refuse("lost", _REFUSALS["lost"].format(self.lost))
         try:
-            outcome = await self._infer(connection, _decode(message, self._max_bytes))
+            observation = await self._decode(message)
+            outcome = await self._infer(connection, observation)
         except WireError as error:
             return self._refuse("malformed", f"bad request: {error}")
         except Busy:
@@ -317,13 +347,20 @@ class PolicyServer:
             timing["prev_total_ms"] = previous_total * 1e3
         return {**outcome.result, "server_timing": timing}
 
-    def _refuse(self, kind: str, text: str) -> str:
+    def _refuse(self, kind: str, text: str) -> _Refusal:
         self.metrics.error(kind)
         text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
-        logger.warning("%s", "".join(c if c.isprintable() else repr(c)[1:-1] for c in text))  # it may quote a client
-        return text
+        self._log.warning(text, kind)
+        return _Refusal(kind, text)
 
-    async def _infer(self, connection: ServerConnection, observation: dict[str, Any]) -> Outcome:
+    async def _decode(self, message: str | bytes) -> dict[str, Any]:
+        """One request as the policy gets it. Raises WireError."""
+        limit = self._limits.message_bytes
+        if len(message) < LARGE:
+            return _decode(message, limit)
+        return await asyncio.get_running_loop().run_in_executor(self._decoder, _decode, message, limit)
+
+    async def _infer(self, connection: GuardedConnection, observation: dict[str, Any]) -> Outcome:
         """Run the policy when it is this request's turn, unless the client leaves first."""
         work = asyncio.ensure_future(self._calls.run(observation))
         gone = asyncio.ensure_future(connection.wait_closed())

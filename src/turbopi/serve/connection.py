@@ -1,0 +1,311 @@
+"""A websocket connection that costs the server no more than its share, whatever its client does.
+
+The websockets library reads all that comes, as fast as it comes. This connection stands between the socket and the
+library: it looks at the frames' headers alone, hands over what may be handled now, holds the rest (at most one read of
+the socket, 256 KiB) and stops reading. TCP then stops the client.
+"""
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, Protocol
+
+from websockets.asyncio.server import ServerConnection
+from websockets.frames import CloseCode
+from websockets.protocol import State
+from websockets.server import ServerProtocol
+
+from turbopi.serve.limited_log import LimitedLog
+from turbopi.serve.limits import Credit, Limits, MemoryBudget, WorkPool
+from turbopi.serve.metrics import Metrics
+
+AHEAD = 2  # messages of one client: one that is computed, one that waits
+BYTES_OF_ONE_WORK = 65536
+
+
+@dataclass
+class Shared:
+    """What the connections of a server share."""
+
+    limits: Limits
+    metrics: Metrics
+    log: LimitedLog
+    clock: Callable[[], float] = time.monotonic
+    memory: MemoryBudget = field(init=False)
+    pool: WorkPool = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.memory = MemoryBudget(max(self.limits.memory_bytes, self.limits.message_bytes))
+        self.pool = WorkPool(self.limits.work_total_rate)
+
+
+class Owner(Protocol):
+    """What a connection needs of its listener."""
+
+    def is_serving(self) -> bool: ...
+
+    def connected(self, connection: "GuardedConnection") -> None: ...
+
+
+class FrameHead(NamedTuple):
+    """The header of a websocket frame (RFC 6455, 5.2)."""
+
+    size: int  # bytes of the header itself
+    length: int  # bytes of the payload
+    opcode: int
+    final: bool
+
+
+def frame_head(data: bytes, at: int) -> FrameHead | None:
+    """The header that begins at `data[at]`; None if its end hasn't come yet. What is wrong in it isn't looked at."""
+    if len(data) < at + 2:
+        return None
+    first, second = data[at], data[at + 1]
+    short = second & 0x7F
+    extended = 0 if short < 126 else 2 if short == 126 else 8
+    size = 2 + extended + (4 if second & 0x80 else 0)
+    if len(data) < at + size:
+        return None
+    length = int.from_bytes(data[at + 2 : at + 2 + extended], "big") if extended else short
+    return FrameHead(size, length, first & 0x0F, bool(first & 0x80))
+
+
+@dataclass
+class _Message:
+    """What a message has cost so far."""
+
+    size: int = 0
+    work: float = 0.0
+    memory: int = 0
+
+
+class GuardedConnection(ServerConnection):
+    """One client. `answered` must be called for each message that `recv` gave, once it is dealt with."""
+
+    def __init__(self, protocol: ServerProtocol, owner: Owner, shared: Shared) -> None:
+        limits = shared.limits
+        super().__init__(protocol, owner, close_timeout=limits.close_seconds, max_queue=None)  # type: ignore[arg-type]
+        self.bad_in_a_row = 0
+        self._owner, self._shared, self._limits = owner, shared, limits
+        self._credit = Credit(limits, shared.pool, shared.clock)
+        self._head: bytes | None = b""  # the last bytes of the HTTP request as long as that goes on
+        self._held = b""  # received and not handed over
+        self._left = 0  # bytes of the current frame's payload that are still to come
+        self._ends_message = False  # the current frame is the last one of a message
+        self._message: _Message | None = None  # begun and not complete
+        self._unanswered: deque[_Message] = deque()
+        self._handed_over = 0  # bytes of messages
+        self._timers: dict[str, asyncio.TimerHandle] = {}
+
+    # --- what the server calls ----------------------------------------------------------------------------------------
+
+    def opened(self) -> None:
+        """The handshake is done."""
+        self.start_keepalive()
+        self._feed()
+
+    def answered(self, how: Literal["good", "bad", "neither"]) -> None:
+        """The oldest message is done with: it got actions, it was wrong, or there were none and it wasn't wrong."""
+        if self._unanswered:  # not after the connection was lost
+            message = self._unanswered.popleft()
+            self._shared.memory.give_back(message.memory)
+            if how == "good":
+                self._credit.give_back(message.work)
+        if how != "neither":
+            self.bad_in_a_row = self.bad_in_a_row + 1 if how == "bad" else 0
+        self._feed()
+
+    # --- what asyncio calls -------------------------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super(ServerConnection, self).connection_made(transport)  # its own would start the library's server's handler
+        self._owner.connected(self)
+
+    def data_received(self, data: bytes) -> None:
+        if self._head is not None:
+            data = self._http(data)
+        if self.protocol.state is State.CLOSING:
+            super().data_received(data)  # which throws it away
+        elif data:
+            self._held = self._held + data if self._held else data
+            self._feed()
+
+    def eof_received(self) -> None:
+        super().eof_received()
+        self._once("close", self._limits.close_seconds, self.transport.abort)
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._once("write", self._limits.write_seconds, self._never_reads)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._cancel("write")
+        self._feed()
+
+    def send_data(self) -> None:
+        super().send_data()
+        if self.protocol.close_expected():
+            self._once("close", self._limits.close_seconds, self.transport.abort)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        for timer in self._timers.values():
+            timer.cancel()
+        self._timers.clear()
+        self._credit.close()
+        self._shared.memory.forget(self._feed)
+        for message in (*self._unanswered, *([self._message] if self._message else ())):
+            self._shared.memory.give_back(message.memory)
+        self._unanswered.clear()
+        self._message, self._held = None, b""
+        # This object is part of reference cycles, which may live long: what is large in it must not.
+        self.protocol.reader.buffer.clear()
+        self.recv_messages.frames.queue.clear()
+
+    # --- what comes in ------------------------------------------------------------------------------------------------
+
+    def _http(self, data: bytes) -> bytes:
+        """Hand the HTTP request over, at whose end frames begin; those are returned."""
+        assert self._head is not None
+        joined = self._head + data
+        end = joined.find(b"\r\n\r\n")
+        if end < 0:
+            self._head = joined[-3:]
+            super().data_received(data)
+            return b""
+        end += 4 - len(self._head)
+        self._head = None
+        super().data_received(data[:end])
+        return data[end:]
+
+    def _feed(self) -> None:
+        """Hand over what may be handled now, and read on if nothing is held."""
+        if self.protocol.state is not State.OPEN or not self._held:
+            holding = self.protocol.state is State.CONNECTING and bool(self._held)
+        elif self.paused:
+            holding = True  # it doesn't read what it is sent: what it sends would only lead to more
+        else:
+            self._cancel("retry")
+            self._credit.refill()
+            end, holding = self._scan(self._held)
+            data, self._held = self._held[:end], self._held[end:]
+            if data:
+                super().data_received(data)
+        self._read_on(not holding)
+        self._watch_progress(holding)
+
+    def _scan(self, data: bytes) -> tuple[int, bool]:
+        """How much of `data` to hand over, and whether what follows must wait (if not, it is half a header)."""
+        at = 0
+        while at < len(data):
+            if not self._left:
+                head = frame_head(data, at)
+                if head is None:
+                    return at, False
+                if not self._admit(head):
+                    return at, True
+                at += head.size
+                self._left = head.length
+            part = min(self._left, len(data) - at)
+            at += part
+            self._left -= part
+            if self._message is not None:
+                self._handed_over += part
+                if self._ends_message and not self._left:
+                    self._unanswered.append(self._message)
+                    self._message = None
+        return at, False
+
+    def _admit(self, head: FrameHead) -> bool:
+        """Whether the frame may be handled now; if so, it is paid for."""
+        if self._credit.spent:
+            self._once("retry", self._credit.wait(), self._feed)
+            return False
+        if head.opcode >= 8:  # close, ping, pong
+            self._credit.spend(1.0)
+            return True
+        message = self._message
+        if message is None:
+            if len(self._unanswered) >= AHEAD:
+                return False
+            message = _Message()
+        size = message.size + head.length
+        if size <= self._limits.message_bytes:  # if not, the library refuses it by its header
+            needed = max(0, size - self._limits.free_bytes) - message.memory
+            if needed > 0 and not self._take(needed):
+                return False
+            message.memory += max(0, needed)
+        work = (0.1 if self._message else 1.0) + head.length / BYTES_OF_ONE_WORK
+        self._credit.spend(work)
+        message.size, message.work = size, message.work + work
+        self._message, self._ends_message = message, head.final
+        return True
+
+    def _take(self, size: int) -> bool:
+        """Take memory for a large message, or be called again when some is free, and give up at last."""
+        self._shared.memory.forget(self._feed)
+        if self._shared.memory.take(size, self._feed):
+            self._cancel("memory")
+            return True
+        reason = "the server holds too many large messages already: send smaller ones, or try again later"
+        self._once("memory", self._limits.memory_seconds, lambda: self._give_up(CloseCode.TRY_AGAIN_LATER, reason))
+        return False
+
+    def _read_on(self, on: bool) -> None:
+        if on:
+            self.transport.resume_reading()
+        else:
+            self.transport.pause_reading()
+
+    # --- deadlines ----------------------------------------------------------------------------------------------------
+
+    def _once(self, name: str, seconds: float, call: Callable[[], Any]) -> None:
+        """Call after `seconds`, unless a timer of that name runs already or it is cancelled."""
+
+        def due() -> None:
+            del self._timers[name]
+            call()
+
+        if name not in self._timers:
+            self._timers[name] = self.loop.call_later(seconds, due)
+
+    def _cancel(self, name: str) -> None:
+        if timer := self._timers.pop(name, None):
+            timer.cancel()
+
+    def _watch_progress(self, holding: bool) -> None:
+        """Half a message or frame must go on, unless it is this server that doesn't read on."""
+        half = bool(self._left or self._message or self._held) and self.protocol.state is State.OPEN
+        if not half or (holding and "retry" not in self._timers):  # who is slowed must still end what it began
+            self._cancel("progress")
+        elif "progress" not in self._timers:
+            begun = self._handed_over
+            self._once("progress", self._limits.message_seconds, lambda: self._check_progress(begun))
+
+    def _check_progress(self, before: int) -> None:
+        seconds, rate = self._limits.message_seconds, self._limits.bytes_per_second
+        if self._handed_over - before < rate * seconds:
+            reason = f"half a message, and less than {rate / 1e3:g} kB/s for {seconds:g} s: send it whole"
+            self._give_up(CloseCode.POLICY_VIOLATION, reason)
+        else:
+            self._watch_progress(holding=False)
+
+    def _never_reads(self) -> None:
+        self._complain(f"took nothing of what it was sent for {self._limits.write_seconds:g} s: the connection is cut")
+        self.transport.abort()
+
+    def _give_up(self, code: CloseCode, reason: str) -> None:
+        """Close without waiting for anything."""
+        self._complain(f"{reason}: the connection is closed")
+        if self.protocol.state is State.OPEN:
+            self.protocol.fail(code, reason)
+            self.send_data()
+        self._held = b""
+        self._read_on(True)  # to see the client leave
+
+    def _complain(self, text: str) -> None:
+        self._shared.metrics.error("slow")
+        self._shared.log.warning(f"{self.remote_address}: {text}", "slow")

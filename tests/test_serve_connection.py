@@ -1,0 +1,543 @@
+"""What one connection may cost, frame by frame: with a transport and a clock of the test's own, so nothing depends on
+how fast the machine is."""
+
+import asyncio
+import itertools
+import logging
+import random
+import struct
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.server import ServerProtocol
+
+from turbopi.serve.connection import GuardedConnection, Shared
+from turbopi.serve.limited_log import LimitedLog
+from turbopi.serve.limits import Limits
+from turbopi.serve.metrics import Metrics
+
+REQUEST = (
+    b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+BINARY, CONTINUED, PING, PONG = 2, 0, 9, 10
+MIB = 2**20
+
+
+def frame(payload: bytes = b"", opcode: int = BINARY, *, final: bool = True) -> bytes:
+    """A client's frame, masked with zeros."""
+    size = len(payload)
+    if size < 126:
+        length = bytes([0x80 | size])
+    elif size < 2**16:
+        length = b"\xfe" + struct.pack(">H", size)
+    else:
+        length = b"\xff" + struct.pack(">Q", size)
+    return bytes([(0x80 if final else 0) | opcode]) + length + bytes(4) + payload
+
+
+class Clock:
+    """Stands in for the event loop's `call_later`: time passes when the test says so."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.now = 0.0
+        self._loop = loop
+        self._calls: list[tuple[float, int, Any, asyncio.Handle]] = []
+        self._numbers = itertools.count()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loop, name)
+
+    def call_later(self, seconds: float, call: Callable[..., Any], *args: Any) -> asyncio.Handle:
+        handle = asyncio.Handle(call, args, self._loop)
+        self._calls.append((self.now + seconds, next(self._numbers), call, handle))
+        return handle
+
+    async def sleep(self, seconds: float) -> None:
+        """Let `seconds` pass, and all that is due meanwhile happen."""
+        end = self.now + seconds
+        while due := [call for call in self._calls if call[0] <= end]:
+            first = min(due)
+            self._calls.remove(first)
+            self.now = max(self.now, first[0])
+            handle = first[-1]
+            if not handle.cancelled():
+                handle._run()
+            await asyncio.sleep(0)
+        self.now = end
+        await asyncio.sleep(0)
+
+
+class Transport(asyncio.Transport):
+    """Keeps what is written; `full` is a client that doesn't read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.connection: GuardedConnection
+        self.reading, self.closed, self.written, self.unsent = True, False, b"", 0
+
+    def write(self, data: Any) -> None:
+        if not self.closed:
+            self.written += bytes(data)
+
+    def pause_reading(self) -> None:
+        self.reading = False
+
+    def resume_reading(self) -> None:
+        self.reading = True
+
+    def abort(self) -> None:
+        if not self.closed:
+            self.closed = True
+            asyncio.get_running_loop().call_soon(self.connection.connection_lost, None)
+
+    close = abort
+
+    def is_closing(self) -> bool:
+        return self.closed
+
+    def can_write_eof(self) -> bool:
+        return True
+
+    def write_eof(self) -> None:
+        pass
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        pass
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        return ("client", 1) if name == "peername" else default
+
+
+class Server:
+    """The listener of the connections under test, and what they share."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.clock = Clock(asyncio.get_running_loop())
+        self.metrics = Metrics()
+        log = LimitedLog(logging.getLogger("test"))
+        self.shared = Shared(limits, self.metrics, log, clock=lambda: self.clock.now)
+
+    def is_serving(self) -> bool:
+        return True
+
+    def connected(self, connection: GuardedConnection) -> None:
+        pass
+
+    def accept(self) -> "Client":
+        return Client(self)
+
+    async def client(self) -> "Client":
+        client = self.accept()
+        client.send(REQUEST)
+        await client.shake()
+        return client
+
+    def errors(self, kind: str) -> float:
+        return self.metrics.registry.get_sample_value("turbopi_errors_total", {"kind": kind}) or 0.0
+
+
+class Client:
+    """One connection, seen from both ends."""
+
+    def __init__(self, server: Server) -> None:
+        protocol = ServerProtocol(max_size=server.shared.limits.message_bytes)
+        self.connection = GuardedConnection(protocol, server, server.shared)
+        self.connection.loop = server.clock  # type: ignore[assignment]
+        self.connection.ping_interval = None
+        self.transport = Transport()
+        self.transport.connection = self.connection
+        self.connection.connection_made(self.transport)
+
+    def send(self, data: bytes) -> None:
+        self.connection.data_received(data)
+
+    async def shake(self) -> None:
+        await self.connection.handshake()
+        assert self.transport.written.startswith(b"HTTP/1.1 101")
+        self.transport.written = b""
+        self.connection.opened()
+
+    def waiting(self) -> int:
+        """Messages that could be received at once."""
+        return len([None for frame in self.connection.recv_messages.frames.queue if frame.fin])
+
+    async def receive(self) -> bytes | str:
+        return await asyncio.wait_for(self.connection.recv(), 30)
+
+    @property
+    def closed_with(self) -> tuple[int, str] | None:
+        """Code and reason of the close frame that the client got."""
+        sent = self.connection.protocol.close_sent
+        return None if sent is None else (int(sent.code), sent.reason)
+
+
+def run(test: Callable[[Server], Awaitable[None]], **limits: Any) -> None:
+    async def main() -> None:
+        await test(Server(Limits(**limits)))
+
+    asyncio.run(main())
+
+
+# --- frames -----------------------------------------------------------------------------------------------------------
+
+
+def test_messages_arrive_whole_however_their_bytes_are_cut() -> None:
+    messages = [b"", b"x", b"y" * 125, b"z" * 126, b"a" * 70_000, b"parts", b"last"]
+    parts = frame(b"pa", final=False) + frame(b"", PING) + frame(b"rt", CONTINUED, final=False) + frame(b"s", CONTINUED)
+    stream = b"".join(parts if message == b"parts" else frame(message) for message in messages)
+    generator = random.Random(0)
+
+    async def test(server: Server) -> None:
+        for round_ in range(30):
+            client = server.accept()
+            data, received = REQUEST + stream, []
+            cuts = sorted(generator.choices(range(len(data)), k=30 if round_ else 0))
+            shaken = False
+            for begin, end in itertools.pairwise((0, *cuts, len(data))):
+                client.send(data[begin:end])
+                if not shaken and end >= len(REQUEST):
+                    await client.shake()
+                    shaken = True
+                while client.waiting():
+                    received.append(await client.receive())
+                    client.connection.answered("good")
+            assert received == messages
+            assert client.transport.reading
+            assert client.closed_with is None
+
+    run(test)
+
+
+def test_a_frame_that_is_wrong_is_refused_as_ever() -> None:
+    async def test(server: Server) -> None:
+        for data, code in ((b"\x82\x01x", 1002), (b"\xf2\x80" + bytes(4), 1002), (frame(b"x", CONTINUED), 1002)):
+            client = await server.client()
+            client.send(data)
+            assert client.closed_with is not None
+            assert client.closed_with[0] == code
+        client = await server.client()
+        client.send(frame(bytes(101))[:10])  # its header is enough
+        assert client.closed_with is not None
+        assert client.closed_with[0] == 1009
+
+    run(test, message_bytes=100)
+
+
+def test_no_more_than_two_messages_of_a_client_are_read() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.send(frame(b"1") + frame(b"2") + frame(b"3") + frame(b"", PING) + frame(b"4"))
+        assert client.waiting() == 2
+        assert not client.transport.reading
+        assert await client.receive() == b"1"
+        client.connection.answered("good")
+        assert client.waiting() == 2
+        assert client.transport.written  # the ping, which came before the fourth
+        for expected in (b"2", b"3"):
+            assert await client.receive() == expected
+            client.connection.answered("good")
+        assert client.transport.reading
+        assert await client.receive() == b"4"
+
+    run(test)
+
+
+def test_pings_are_answered_while_a_message_is_computed() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.send(frame(b"request") + frame(b"hello", PING))
+        assert client.transport.written == b"\x8a\x05hello"
+
+    run(test)
+
+
+# --- work -------------------------------------------------------------------------------------------------------------
+
+
+async def served(client: Client, how: Any) -> int:
+    """Take and answer all messages that are there; how many."""
+    count = 0
+    while client.waiting():
+        await client.receive()
+        client.connection.answered(how)
+        count += 1
+    return count
+
+
+@pytest.mark.parametrize("how", ["bad", "neither"])
+def test_a_flood_is_served_at_the_rate_that_is_allowed_and_the_rest_is_not_read(how: str) -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.send(frame(b"\xc1") * 5000)
+        first = await served(client, how)
+        assert first == 20  # a fifth of the burst, for a new connection
+        assert not client.transport.reading
+        for _ in range(10):
+            before = await served(client, how)
+            await server.clock.sleep(1.0)
+            more = before + await served(client, how)
+            assert 40 <= more <= 60
+
+    run(test, work_burst=100, work_rate=50)
+
+
+def test_pings_and_parts_are_work_too_and_large_messages_are_more() -> None:
+    async def test(server: Server) -> None:
+        pings, parts, large = [await server.client() for _ in range(3)]
+        pings.send(frame(b"", PING) * 1000)
+        assert pings.transport.written.count(b"\x8a\x00") == 20
+        parts.send(frame(b"", final=False) + frame(b"", CONTINUED, final=False) * 1000)
+        assert 100 < len(parts.connection.recv_messages.frames.queue) < 300
+        for _ in range(10):
+            large.send(frame(bytes(MIB)))
+        assert await served(large, "bad") == 2  # 17 each
+        assert not any(client.transport.reading for client in (pings, parts, large))
+
+    run(test, work_burst=100, work_rate=1)
+
+
+def test_work_that_led_to_actions_costs_nothing() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        for _ in range(1000):
+            client.send(frame(b"x" * 1000))
+            assert await served(client, "good") == 1
+        assert client.transport.reading
+
+    run(test, work_burst=10, work_rate=0.001)
+
+
+def test_connections_that_are_slowed_share_one_rate() -> None:
+    async def test(server: Server) -> None:
+        clients = [await server.client() for _ in range(10)]
+        for client in clients:
+            client.send(frame(b"\xc1") * 5000)
+            await served(client, "bad")
+        total = 0
+        for _ in range(40):
+            await server.clock.sleep(0.25)
+            for client in clients:
+                total += await served(client, "bad")
+        assert 700 <= total <= 1100  # not 10 * 50 * 10
+        for client in clients[1:]:
+            client.transport.abort()
+        await server.clock.sleep(1.0)
+        assert server.shared.pool.slowed <= 1
+        assert 0 < await served(clients[0], "bad") <= 80
+
+    run(test, work_burst=100, work_rate=50, work_total_rate=100)
+
+
+def test_bad_messages_in_a_row_are_counted_and_a_good_one_forgives() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        for how, expected in (("bad", 1), ("bad", 2), ("neither", 2), ("bad", 3), ("good", 0), ("bad", 1)):
+            client.send(frame(b"x"))
+            await served(client, how)
+            assert client.connection.bad_in_a_row == expected
+
+    run(test)
+
+
+# --- deadlines --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "begun",
+    [
+        frame(b"x" * 1000)[:-1],
+        frame(b"x" * 1000)[:3],
+        b"\x82",
+        frame(b"", final=False),
+        frame(b"abc", PING)[:-1],
+        frame(b"x", final=False) + frame(b"", PING),
+    ],
+)
+def test_what_was_begun_must_end(begun: bytes) -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.send(begun)
+        await server.clock.sleep(9.9)
+        assert client.closed_with is None
+        await server.clock.sleep(0.2)
+        reason = "half a message, and less than 100 kB/s for 10 s: send it whole"
+        assert client.closed_with == (1008, reason)
+        assert server.errors("slow") == 1
+        await server.clock.sleep(5.1)  # it doesn't answer the close frame either
+        assert client.transport.closed
+
+    run(test)
+
+
+def test_a_large_message_may_take_long_as_long_as_it_goes_on() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        data = frame(bytes(12_000_000))
+        for begin in range(0, len(data), 200_000):
+            client.send(data[begin : begin + 200_000])
+            await server.clock.sleep(1.5)
+        assert client.closed_with is None
+        assert await served(client, "good") == 1
+        await server.clock.sleep(1000)
+        assert client.closed_with is None
+
+    run(test)
+
+
+def test_a_message_that_trickles_is_not_waited_for() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.send(frame(bytes(12_000_000))[:11_000_000])
+        for _ in range(25):
+            client.send(b"x")
+            await server.clock.sleep(1.0)
+        assert client.closed_with is not None
+
+    run(test)
+
+
+def test_parts_without_end_do_not_keep_a_message_alive() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.send(frame(b"", final=False))
+        for _ in range(40):
+            client.send(frame(b"", CONTINUED, final=False) * 10_000)
+            await server.clock.sleep(0.5)
+        assert client.closed_with is not None
+
+    run(test)
+
+
+def test_an_idle_client_and_one_whose_request_takes_long_have_no_deadline() -> None:
+    async def test(server: Server) -> None:
+        idle, busy = await server.client(), await server.client()
+        busy.send(frame(b"1") + frame(b"2") + frame(b"3" * 1000)[:-1])
+        await server.clock.sleep(10_000)
+        assert idle.closed_with is None
+        assert busy.closed_with is None
+        await busy.receive()
+        busy.connection.answered("good")  # from here on the third is read, and is only half there
+        await server.clock.sleep(10.1)
+        assert busy.closed_with is not None
+
+    run(test)
+
+
+def test_a_client_that_does_not_read_is_cut_and_its_pings_are_not_piled_up() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.connection.pause_writing()
+        client.send(frame(bytes(125), PING) * 1000)
+        assert not client.transport.reading
+        assert client.transport.written == b""
+        await server.clock.sleep(29.9)
+        assert not client.transport.closed
+        await server.clock.sleep(0.2)
+        assert client.transport.closed
+        assert server.errors("slow") == 1
+
+    run(test)
+
+
+def test_a_client_that_reads_late_is_served_on() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.connection.pause_writing()
+        client.send(frame(b"late", PING))
+        await server.clock.sleep(20)
+        client.connection.resume_writing()
+        assert client.transport.written == b"\x8a\x04late"
+        assert client.transport.reading
+        await server.clock.sleep(100)
+        assert not client.transport.closed
+
+    run(test)
+
+
+def test_a_connection_that_is_being_closed_ends_whatever_the_client_does() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.connection.pause_writing()  # the close frame can't leave
+        closing = asyncio.create_task(client.connection.close(1001, "the server is shutting down"))
+        await asyncio.sleep(0)
+        await server.clock.sleep(5.1)
+        assert client.transport.closed
+        await asyncio.wait_for(closing, 30)
+        half_closed = await server.client()
+        half_closed.connection.eof_received()
+        await server.clock.sleep(5.1)
+        assert half_closed.transport.closed
+
+    run(test)
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+MEMORY = {"message_bytes": 8 * MIB, "memory_bytes": 10 * MIB, "free_bytes": MIB}
+
+
+def test_large_messages_wait_for_memory_and_small_ones_do_not() -> None:
+    async def test(server: Server) -> None:
+        first, second, small = [await server.client() for _ in range(3)]
+        first.send(frame(bytes(8 * MIB)))
+        second.send(frame(bytes(8 * MIB))[: 256 * 1024])
+        assert server.shared.memory.used == 7 * MIB
+        assert not second.transport.reading
+        small.send(frame(bytes(MIB)))
+        assert await served(small, "good") == 1
+        assert await served(first, "good") == 1
+        assert second.transport.reading  # there is room now
+        second.send(frame(bytes(8 * MIB))[256 * 1024 :])
+        assert await served(second, "good") == 1
+        assert server.shared.memory.used == 0
+        await server.clock.sleep(100)
+        assert second.closed_with is None
+
+    run(test, **MEMORY)
+
+
+def test_a_message_in_parts_counts_with_all_of_them() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.send(frame(bytes(MIB), final=False))
+        assert server.shared.memory.used == 0
+        client.send(frame(bytes(MIB), CONTINUED, final=False) + frame(bytes(MIB), CONTINUED))
+        assert server.shared.memory.used == 2 * MIB
+        assert await served(client, "bad") == 1
+        assert server.shared.memory.used == 0
+
+    run(test, **MEMORY)
+
+
+def test_who_waits_for_memory_for_long_is_sent_away() -> None:
+    async def test(server: Server) -> None:
+        holding, waiting = await server.client(), await server.client()
+        holding.send(frame(bytes(8 * MIB)))
+        waiting.send(frame(bytes(8 * MIB))[: 256 * 1024])
+        await server.clock.sleep(30.1)
+        assert waiting.closed_with is not None
+        assert waiting.closed_with[0] == 1013
+        assert "too many large messages" in waiting.closed_with[1]
+
+    run(test, **MEMORY)
+
+
+def test_a_connection_that_is_lost_holds_nothing() -> None:
+    async def test(server: Server) -> None:
+        clients = [await server.client() for _ in range(2)]
+        clients[0].send(frame(bytes(8 * MIB)) + frame(b"x"))
+        clients[1].send(frame(bytes(8 * MIB))[: 256 * 1024])
+        half = await server.client()
+        half.send(frame(bytes(2 * MIB))[:MIB])
+        for client in (*clients, half):
+            client.transport.abort()
+            with pytest.raises(ConnectionClosed):
+                await client.receive()
+            assert not client.connection.recv_messages.frames.queue
+            assert len(client.connection.protocol.reader.buffer) == 0
+        assert server.shared.memory.used == 0
+
+    run(test, **MEMORY)
