@@ -295,7 +295,7 @@ def test_a_state_file_never_leads_out_of_the_folder(tmp_path: Path) -> None:
     folder = lerobot_copy(tmp_path / "c")
     (folder / "pre_stats.safetensors").rename(tmp_path / "pre_stats.safetensors")
     edit_json(folder / PRE, lambda c: step(c, "normalizer_processor").update(state_file="../pre_stats.safetensors"))
-    with pytest.raises(CheckpointError, match=r"names the file '\.\./pre_stats.safetensors', which leads out of"):
+    with pytest.raises(CheckpointError, match=r"names the file '\.\./pre_stats.safetensors', which isn't in"):
         open_checkpoint(folder)
 
 
