@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 import torch
 from checkpoint_helpers import edit_json, write_json
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from lerobot_golden import GOLDEN, GoldenCase
 from safetensors.torch import load_file, save_file
 
@@ -160,6 +162,8 @@ def test_whole_weights_are_read_where_lerobot_reads_them(folder: Path) -> None:
     edit_json(folder / "config.json", lambda content: content.update(use_peft=False))
     settings_without_base(folder)
     assert torch.equal(weights(folder)["action_out_proj.weight"], load_file(base)["model.action_out_proj.weight"])
+    notes = open_checkpoint(folder).info()["notes"]
+    assert any("adapter_config.json isn't followed" in note for note in notes)
 
 
 # -- what is refused ---------------------------------------------------------------------------------------------------
@@ -184,6 +188,10 @@ def test_whole_weights_are_read_where_lerobot_reads_them(folder: Path) -> None:
         ({"rank_pattern": [2]}, r"rank_pattern is \[2\]; expected an object"),
         ({"rank_pattern": {"q_proj": "2"}}, "q_proj is '2'; expected a finite number"),
         ({"alpha_pattern": {"(": 2}}, r"alpha_pattern has '\('"),
+        ({"alpha_pattern": {r"((\w+)+)+!": 2}}, "alpha_pattern has .*, which may take for ever to match"),
+        ({"rank_pattern": {".*.*.*.*x": 2}}, "rank_pattern has .*, which may take for ever to match"),
+        ({"rank_pattern": {"a?" * 40: 2}}, "rank_pattern has .*, which may take for ever to match"),
+        ({"rank_pattern": {"a" * 301: 2}}, "rank_pattern has .*, which may take for ever to match"),
         ({"rank_pattern": {"q_proj": 3}}, r"q_proj has rank 2, but .*adapter_config\.json says 3"),
         ({"r": 8}, r"has rank 4, but .* says 8; one of the files belongs to another adapter"),
     ],
@@ -270,3 +278,22 @@ def test_an_adapter_that_blows_up_is_found_at_loading(folder: Path) -> None:
 def test_the_golden_adapter_is_as_lerobot_saves_it(folder: Path) -> None:
     assert json.loads((folder / "config.json").read_text())["use_peft"] is True
     assert json.loads((folder / CONFIG).read_text())["base_model_name_or_path"] == "lerobot/base"
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_value_in_the_adapters_config_is_followed_or_refused(folder: Path, data: st.DataObject) -> None:
+    plain = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text()
+    value = data.draw(
+        st.recursive(plain, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=4)
+    )
+    original = (folder / CONFIG).read_text()
+    content = json.loads(original)
+    write_json(folder / CONFIG, content | {data.draw(st.sampled_from(sorted(content))): data.draw(nested)})
+    message = ""
+    try:
+        open_checkpoint(folder)
+    except CheckpointError as error:
+        message = str(error)
+    (folder / CONFIG).write_text(original)
+    assert "\n" not in message

@@ -15,7 +15,7 @@ class Seen:
     pictures: dict[str, tuple[int, int]]
     task: str = TASK
     state_dim: int = 8
-    unit: bool = False  # pictures are float32 in [0, 1], not uint8
+    unit: bool = False  # pictures are float32 in [0, 1], not uint8; LeRobot before 0.6 divides these by 255, too
 
     def made(self, seed: int) -> dict[str, np.ndarray]:
         """LeRobot's keys: [h, w, 3] pictures of a few colours, float32 state, the task as an array of one text."""

@@ -9,6 +9,7 @@ from turbopi.checkpoint.lerobot import LeRobotFolder
 from turbopi.checkpoint.locate import Location, locate, recorded_config, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.openpi_jax import JaxSource
+from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import PeftSource, base_model
 from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
 from turbopi.checkpoint.sizes import detect_kind, model_sizes
@@ -104,7 +105,10 @@ def open_weights(location: Location, settings: Settings) -> WeightSource:
     if "base_model" in settings.values:
         raise ConfigError(f"{settings.source}: base_model only applies to adapters, and {location.weights} has weights")
     prefix = "model." if location.format == "lerobot" else ""
-    return TorchSource(location.weights, format=location.format, prefix=prefix)
+    source = TorchSource(location.weights, format=location.format, prefix=prefix)
+    if (location.weights / ADAPTER).is_file():
+        source.notes.append(f"{ADAPTER} isn't followed: there are whole weights, and no use_peft = true in config.json")
+    return source
 
 
 def _open_adapter(location: Location, settings: Settings) -> WeightSource:

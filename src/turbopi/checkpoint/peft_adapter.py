@@ -48,6 +48,7 @@ _PLAIN_STARTS = (
     "gaussian",
     "eva",
 )  # of A and B; others (PiSSA, LoftQ, ...) change the base's weights, too
+_REPEATS, _REPEATED_GROUP = re.compile(r"[*+?{]"), re.compile(r"\)[*+?{]")  # a hostile one matches for hours
 _ADVICE = "Merge it in LeRobot's environment (peft's merge_and_unload), save the whole policy, and give that folder"
 
 
@@ -209,6 +210,11 @@ class _Scales:
             return {}
         values, found = self._config.object(key), {}
         for pattern in values.values:
+            if len(pattern) > 300 or len(_REPEATS.findall(pattern)) > 3 or _REPEATED_GROUP.search(pattern):
+                raise CheckpointError(
+                    f"{self._config.where}: {key} has {shown(pattern)}, which may take for ever to match. At most "
+                    f"three repetitions (* + ? {{}}), and none of a group, are read. {_ADVICE}"
+                )
             try:
                 found[re.compile(rf"(.*\.)?({pattern})$")] = values.number(pattern, 0.0)
             except re.error as error:
