@@ -284,9 +284,7 @@ def test_the_golden_adapter_is_as_lerobot_saves_it(folder: Path) -> None:
 @given(data=st.data())
 def test_any_value_in_the_adapters_config_is_followed_or_refused(folder: Path, data: st.DataObject) -> None:
     plain = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text()
-    value = data.draw(
-        st.recursive(plain, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=4)
-    )
+    nested = st.recursive(plain, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=4)
     original = (folder / CONFIG).read_text()
     content = json.loads(original)
     write_json(folder / CONFIG, content | {data.draw(st.sampled_from(sorted(content))): data.draw(nested)})

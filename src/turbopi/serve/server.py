@@ -69,9 +69,7 @@ class _PolicyFailed(Exception):
     """The policy raised something that isn't the client's fault; holds the traceback's text."""
 
 
-def check_options(
-    *, port: int, api_key: str | None, max_message_mb: float, queue_limit: int, max_clients: int
-) -> None:
+def check_options(*, port: int, api_key: str | None, max_message_mb: float, queue_limit: int, max_clients: int) -> None:
     """Raise ConfigError for options of a server that can't be right."""
     if not 0 <= port <= 65535:
         raise ConfigError(f"port must be between 0 and 65535, not {port}")
