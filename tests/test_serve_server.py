@@ -23,6 +23,7 @@ from websockets.exceptions import ConnectionClosed, ConnectionClosedError, Inval
 
 from turbopi.errors import ConfigError, DeviceLost
 from turbopi.serve import PolicyServer, running
+from turbopi.serve.limits import Limits
 from turbopi.serve.record import iter_recording
 from turbopi.serve.wire import pack, unpack
 
@@ -234,7 +235,7 @@ def test_hundreds_of_random_messages_are_answered_on_one_connection() -> None:
                 await asyncio.wait_for(connection.recv(), 60)
             assert (await infer(connection, observation("after")))["prompt"] == "after"
 
-    served(test)
+    served(test, limits=Limits(work_rate=1e6))
 
 
 def test_a_long_error_is_cut() -> None:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from turbopi.serve.calls import Policy
-    from turbopi.serve.launch import run
-    from turbopi.serve.server import PolicyServer, running
+    from turbopi.serve.launch import run, running
+    from turbopi.serve.server import PolicyServer
 
 __all__ = ["Policy", "PolicyServer", "run", "running"]
 
-_MODULES = {"run": "launch", "Policy": "calls", "PolicyServer": "server", "running": "server"}
+_MODULES = {"run": "launch", "Policy": "calls", "PolicyServer": "server", "running": "launch"}
 
 
 def __getattr__(name: str) -> Any:

@@ -23,6 +23,7 @@ from turbopi.serve.metrics import Metrics
 
 AHEAD = 2  # messages of one client: one that is computed, one that waits
 BYTES_OF_ONE_WORK = 65536
+WORK_OF_A_REFUSAL = 3.0  # to find out what is wrong, say and log it
 
 
 @dataclass
@@ -113,6 +114,8 @@ class GuardedConnection(ServerConnection):
             self._shared.memory.give_back(message.memory)
             if how == "good":
                 self._credit.give_back(message.work)
+        if how == "bad":
+            self._credit.spend(WORK_OF_A_REFUSAL)
         if how != "neither":
             self.bad_in_a_row = self.bad_in_a_row + 1 if how == "bad" else 0
         self._feed()

@@ -1,5 +1,10 @@
-"""What `turbopi serve` does once it has a policy."""
+"""Ways to run a server: `turbopi serve` once it has a policy, and a `with` block."""
 
+import asyncio
+import contextlib
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future
 from typing import Any
 
 from rich.console import Console
@@ -43,3 +48,33 @@ def run(policy: Policy, *, console: Console | None = None, **options: Any) -> No
 
     server.serve_forever(ready, stopping)
     tell("Stopped.")
+
+
+@contextlib.contextmanager
+def running(policy: Policy, *, port: int = 0, **options: Any) -> Iterator[PolicyServer]:
+    """A server in a background thread for the length of a `with` block. For tests, notebooks and demos.
+
+    Takes PolicyServer's options; port 0 picks a free one. Raises what `start` raises.
+    """
+    server = PolicyServer(policy, port=port, **options)
+    ready: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        try:
+            await server.start()
+        except BaseException as error:
+            ready.set_exception(error)
+            return
+        ready.set_result((asyncio.get_running_loop(), stop))
+        await stop.wait()
+        await server.stop()
+
+    thread = threading.Thread(target=lambda: asyncio.run(main()), name="turbopi-server", daemon=True)
+    thread.start()
+    loop, stop = ready.result()
+    try:
+        yield server
+    finally:
+        loop.call_soon_threadsafe(stop.set)
+        thread.join()

@@ -29,7 +29,8 @@ class Limits:
     write_seconds      in which a client must take what is sent to it
     close_seconds      from the end of a conversation to the end of the connection, whatever the client does
     work_burst         work that a connection may cause at once without getting actions for it. A message is 1, and 1
-                       more for each 64 KiB; a ping is 1, a continued frame 0.1; work that led to actions is given back
+                       more for each 64 KiB, and 3 more if it is bad; a ping is 1, a continued frame 0.1; a request that
+                       gets actions is free
     work_rate          such work a second that is allowed on and on
     work_total_rate    the same for all connections that are slowed, together
     bad_messages       in a row, after which a connection is closed
@@ -50,7 +51,7 @@ class Limits:
     work_rate: float = 200.0
     work_total_rate: float = 800.0
     bad_messages: int = 1000
-    connections_rate: float = 200.0
+    connections_rate: float = 100.0
 
 
 def limits_for(max_message_mb: float, max_clients: int, others: Limits | None) -> Limits:

@@ -17,10 +17,9 @@ import asyncio
 import contextlib
 import logging
 import math
-import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -382,33 +381,3 @@ def _decode(message: str | bytes, max_bytes: int) -> dict[str, Any]:
     if not all(isinstance(key, str) for key in observation):
         raise WireError("the keys of an observation are strings (msgpack str), not bytes (msgpack bin)")
     return observation
-
-
-@contextlib.contextmanager
-def running(policy: Policy, *, port: int = 0, **options: Any) -> Iterator[PolicyServer]:
-    """A server in a background thread for the length of a `with` block. For tests, notebooks and demos.
-
-    Takes PolicyServer's options; port 0 picks a free one. Raises what `start` raises.
-    """
-    server = PolicyServer(policy, port=port, **options)
-    ready: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
-
-    async def main() -> None:
-        stop = asyncio.Event()
-        try:
-            await server.start()
-        except BaseException as error:
-            ready.set_exception(error)
-            return
-        ready.set_result((asyncio.get_running_loop(), stop))
-        await stop.wait()
-        await server.stop()
-
-    thread = threading.Thread(target=lambda: asyncio.run(main()), name="turbopi-server", daemon=True)
-    thread.start()
-    loop, stop = ready.result()
-    try:
-        yield server
-    finally:
-        loop.call_soon_threadsafe(stop.set)
-        thread.join()
