@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from PIL import Image
 
-from turbopi.errors import ConfigError, ObservationError
+from turbopi.errors import ConfigError, ObservationError, OutputError
+from turbopi.files import append_line
 from turbopi.serve import record
 from turbopi.serve.record import Call, Recorder, iter_recording, load_call, load_observation, save_call
 
@@ -311,3 +312,62 @@ def test_a_damaged_index_is_refused(tmp_path: Path, index: bytes, message: str) 
     np.savez(tmp_path / "x.npz", index=np.frombuffer(index, np.uint8))
     with pytest.raises(ObservationError, match=message):
         load_call(tmp_path / "x.npz")
+
+
+def test_an_index_that_a_full_disk_did_not_take_is_whole_in_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    full, tried = threading.Event(), threading.Event()
+    full.set()
+
+    def append(file: Path, line: str) -> None:
+        if full.is_set():
+            tried.set()
+            raise OutputError(f"can't write {file}: the disk is full")
+        append_line(file, line)
+
+    monkeypatch.setattr(record, "append_line", append)
+    recorder = Recorder(tmp_path, {})
+    recorder.put({"n": 0}, RESULT, size=1)
+    assert tried.wait(30)
+    full.clear()
+    recorder.put({"n": 1}, RESULT, size=1)
+    recorder.close()
+    assert (recorder.written, recorder.failed) == (2, 0)
+    lines = (recorder.folder / "index.jsonl").read_text().splitlines()
+    assert [json.loads(line)["file"] for line in lines] == ["000000.npz", "000001.npz"]
+    assert "1 calls are recorded and not in the index yet: can't write" in caplog.text
+
+
+def test_an_index_catches_up_when_recording_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    failures = iter([OutputError("the disk is full")])
+
+    def append(file: Path, line: str) -> None:
+        if failure := next(failures, None):
+            raise failure
+        append_line(file, line)
+
+    monkeypatch.setattr(record, "append_line", append)
+    recorder = Recorder(tmp_path, {})
+    recorder.put({"n": 0}, RESULT, size=1)
+    recorder.close()
+    (line,) = (recorder.folder / "index.jsonl").read_text().splitlines()
+    assert json.loads(line)["file"] == "000000.npz"
+
+
+def test_a_call_that_cannot_be_recorded_is_named_by_its_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    recorder = Recorder(tmp_path, {})
+    (recorder.folder / "000000.npz").mkdir()
+    recorder.put({"n": 0}, RESULT, size=1)
+    recorder.close()
+    assert recorder.failed == 1
+    assert "000000.npz" in caplog.text
+
+
+def test_a_manifest_that_cannot_be_written_ends_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("turbopi.files.os.replace", full)
+    with pytest.raises(ConfigError, match=r"manifest\.json"):
+        Recorder(tmp_path, {})

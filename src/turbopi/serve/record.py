@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from turbopi.errors import ConfigError
+from turbopi.errors import ConfigError, OutputError
 from turbopi.files import append_line, write_whole
 from turbopi.serve.record_format import (
     FORMAT,
@@ -33,7 +33,8 @@ class Recorder:
 
     At most `queue_calls` calls or `queue_bytes` bytes wait for the disk; what comes beyond is dropped, and counted in
     `dropped`. A call that can't be written (disk full, folder gone) is counted in `failed` and leaves a gap in the
-    numbers; the next one is tried again. `count` is called with "written", "dropped" or "failed", from any thread.
+    numbers; the next one is tried again. A line of the index that can't be written comes with a later one.
+    `count` is called with "written", "dropped" or "failed", from any thread.
 
     Raises ConfigError if the folder can't be made now.
     """
@@ -53,10 +54,11 @@ class Recorder:
         self._waiting_bytes = 0
         self._lock = threading.Lock()
         self._queue: queue.Queue[tuple[Call, int] | None] = queue.Queue(queue_calls)
+        self._owed: list[str] = []  # lines of the index
         try:
             self.folder = _new_folder(Path(record_dir))
             manifest = {"format": FORMAT, "version": VERSION, "started": time.time(), "metadata": metadata}
-            write_whole(self.folder / "manifest.json", json.dumps(manifest, indent=1, default=_plain))
+            write_whole(self.folder / "manifest.json", json.dumps(manifest, indent=1, default=_plain), ConfigError)
         except OSError as error:
             raise ConfigError(f"can't record into {record_dir}: {error}") from error
         self._thread = threading.Thread(target=self._write_all, name="turbopi-recorder", daemon=True)
@@ -98,6 +100,7 @@ class Recorder:
     def _write_all(self) -> None:
         for number in itertools.count():
             if (item := self._queue.get()) is None:
+                self._write_index()
                 return
             call, size = item
             failure: Exception | None = None
@@ -119,7 +122,20 @@ class Recorder:
         save_call(self.folder / name, call)
         timing = call.result.get("server_timing", {})
         line = {"file": name, "time": call.time, "infer_ms": timing.get("infer_ms")}
-        append_line(self.folder / "index.jsonl", json.dumps(line))
+        self._owed.append(json.dumps(line))
+        self._write_index()
+
+    def _write_index(self) -> None:
+        """Add the lines that are owed. What the disk doesn't take now is tried again with the next call."""
+        if not self._owed:
+            return
+        try:
+            append_line(self.folder / "index.jsonl", "\n".join(self._owed))
+        except OutputError as error:
+            if _is_power_of_two(len(self._owed)):
+                logger.warning("%d calls are recorded and not in the index yet: %s", len(self._owed), error)
+        else:
+            self._owed.clear()
 
     def _release(self, size: int) -> None:
         with self._lock:

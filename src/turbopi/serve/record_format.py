@@ -46,7 +46,7 @@ class Call:
 
 
 def save_call(path: Path, call: Call) -> None:
-    """Write `call` to `path`, whole or not at all. Raises OSError, and ObservationError for what can't be stored."""
+    """Write `call`, whole or not at all. Raises OutputError, and ObservationError for what can't be stored."""
     members: dict[str, np.ndarray] = {}
     index = {
         "format": FORMAT,
