@@ -146,6 +146,19 @@ def test_a_backend_that_hides_what_is_demanded_is_refused(monkeypatch: pytest.Mo
     assert "'faulty' doesn't expose v_t" in refusal_of("--backend", "faulty")
 
 
+def test_a_certificate_says_that_the_oracle_was_float32_whatever_the_program_had_set() -> None:
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        document = verify(random_checkpoint("pi05_tiny"), quick_plan())
+    finally:
+        torch.set_float32_matmul_precision(before)
+    said = document["oracle_float32"]
+    assert said["exact"] is True and said["within"]["products"]["all"] == "highest"
+    assert said["callers"]["products"]["all"] == "high"
+    json.dumps(said)
+
+
 def test_weights_whose_reference_is_not_finite_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def overflowing(model: Pi0Model, *args: Any) -> tuple[torch.Tensor, torch.Tensor]:
         k, v = original(model, *args)

@@ -6,7 +6,7 @@ Each part's inputs travel in one copy out of one pinned buffer, actions come bac
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,11 +17,10 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine import forward
+from turbopi.engine.graph import Mark
 from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
-
-Mark = Callable[[str], None]
 
 
 class Denoiser(Protocol):

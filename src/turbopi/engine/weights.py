@@ -13,6 +13,7 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.fp8 import Matrix
+from turbopi.engine.graph import empty_cache
 from turbopi.model.denoise import time_embedding, time_grid
 
 State = dict[str, Tensor]
@@ -138,8 +139,7 @@ def _gemma_layers(
             norm2=_scale(state, f"{prefix}.post_attention_layernorm"),
         )
         # gate and up leave two holes that the packed matrix, twice their size, can't fill: 2.4 GB at full size
-        if torch.cuda.is_available():
-            torch.cuda.empty_cache()
+        empty_cache()
 
 
 def _scale(state: State, name: str) -> Tensor | None:

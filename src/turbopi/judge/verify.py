@@ -20,10 +20,12 @@ from turbopi.bench.provenance import provenance
 from turbopi.calibrate.artifact import Quantization, calibration_of
 from turbopi.calibrate.observations import inputs_bytes
 from turbopi.checkpoint import Checkpoint
+from turbopi.engine.graph import empty_cache
 from turbopi.errors import BackendError, CheckpointError
 from turbopi.judge.intermediates import Tensors, in_order, tensors_of
 from turbopi.judge.verdict import ACTIONS, Compared, Repetition, Rule, judge
 from turbopi.judge.verify_inputs import Call, Plan, check_observations, make_calls, read_samples
+from turbopi.model import exact
 from turbopi.model.reference import Pi0Model
 from turbopi.policy import UnifiedPolicy
 
@@ -85,6 +87,7 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
         "precision": precision,
         "steps": steps,
         "oracle": "pytorch f32",
+        "oracle_float32": exact.certificate(),
         "control": rule.control_says,
         "not_exposed": sorted(reference.names - exposed),
         "latency_ms": {"backend": _latency(repetition.milliseconds), "oracle": _latency(reference.milliseconds)},
@@ -247,4 +250,4 @@ def _latency(milliseconds: Sequence[float]) -> dict[str, float]:
 def _free(device: torch.device) -> None:
     gc.collect()
     if device.type == "cuda":
-        torch.cuda.empty_cache()
+        empty_cache()

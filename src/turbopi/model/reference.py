@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from turbopi.config import ModelConfig
 from turbopi.errors import ObservationError
 from turbopi.model.denoise import euler_step, run_expert, suffix_mask, suffix_rope, time_embedding, time_grid
+from turbopi.model.exact import exact_float32
 from turbopi.model.gemma import Gemma
 from turbopi.model.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
 from turbopi.model.layers import rope_tables
@@ -86,6 +87,7 @@ class Pi0Model(nn.Module):
     # -- the two halves ----------------------------------------------------------------------------------------------
 
     @torch.no_grad()
+    @exact_float32()
     def sample(
         self,
         observation: Observation,
@@ -100,6 +102,7 @@ class Pi0Model(nn.Module):
         return self.denoise(cache, noise, num_steps, trace=trace)
 
     @torch.no_grad()
+    @exact_float32()
     def prefix(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> KVCache:
         """Keys and values of an observation: `embed`, then `keys_values`.
 
@@ -111,6 +114,7 @@ class Pi0Model(nn.Module):
         return self.keys_values(self.embed(observation, compact=compact, trace=trace), trace=trace)
 
     @torch.no_grad()
+    @exact_float32()
     def denoise(self, cache: KVCache, noise: Tensor, num_steps: int, *, trace: Trace | None = None) -> Tensor:
         """Integrate from noise float32[B, H, action_dim] to actions of the same shape in `num_steps` Euler steps."""
         config = self.config
@@ -146,6 +150,7 @@ class Pi0Model(nn.Module):
     # -- their parts: each one is a stage that a backend may time, compile or replace ----------------------------------
 
     @torch.no_grad()
+    @exact_float32()
     def embed(self, observation: Observation, *, compact: bool = True, trace: Trace | None = None) -> EmbeddedPrefix:
         """Pictures and prompt to the embeddings that enter the language model (the vision tower is most of it)."""
         per_image = self.config.vision.num_tokens
@@ -171,6 +176,7 @@ class Pi0Model(nn.Module):
         return EmbeddedPrefix(embs, layout, lengths, observation.state)
 
     @torch.no_grad()
+    @exact_float32()
     def keys_values(self, embedded: EmbeddedPrefix, *, trace: Trace | None = None) -> KVCache:
         """Run the language model over embedded tokens and keep every layer's keys and values."""
         layout = embedded.layout

@@ -6,7 +6,7 @@ float32 projections of actions and the Euler update; positions and masks. The se
 `parts` may be engines or, in tests, their twins.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ModelConfig
+from turbopi.engine.graph import Mark
 from turbopi.engine.ops import embed_patches
 from turbopi.engine.weights import Weights
 from turbopi.errors import BackendError
@@ -23,8 +24,6 @@ from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.model.layers import apply_rope, rope_tables
 from turbopi.tensorrt.networks import HIDDEN, matrix
 from turbopi.tensorrt.parts import EngineShape
-
-Mark = Callable[[str], None]
 
 
 class Part(Protocol):

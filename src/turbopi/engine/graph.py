@@ -1,0 +1,91 @@
+"""CUDA graphs, and what their capture shares with the rest of the process.
+
+A capture is thread-local: other threads may allocate, launch and wait for their own streams meanwhile. What they may
+not do is to wait for the whole device or to empty the allocator's cache; PyTorch does both when a capture begins. So
+this project's code captures, waits for a device and empties the cache under `CAPTURING`, one thread at a time. A
+program around it should do so in other threads when warm-up has ended; it should also not come close to the end of the
+GPU's memory before, where PyTorch empties the cache by itself.
+"""
+
+import itertools
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from typing import Any
+
+import torch
+
+from turbopi.model.exact import exact_float32
+
+Mark = Callable[[str], None]  # is told the end of each stage
+
+CAPTURING = threading.RLock()  # of the process: policies on other devices, too
+
+
+@contextmanager
+def preparing(device: torch.device) -> Iterator[None]:
+    """Around whatever loads, packs or compiles for a device: it is the thread's current one, on which kernels are
+    loaded, and float32 is exact whatever the caller has set.
+    """
+    with exact_float32(), torch.cuda.device(device) if device.type == "cuda" else nullcontext():
+        yield
+
+
+@contextmanager
+def building(device: torch.device) -> Iterator[None]:
+    """`preparing` around whatever captures, too: one thread at a time."""
+    with CAPTURING, preparing(device):
+        yield
+
+
+def empty_cache() -> None:
+    """Give the allocator's free memory back to the device, when nobody captures."""
+    if torch.cuda.is_available():
+        with CAPTURING:
+            torch.cuda.empty_cache()
+
+
+class Graph:
+    """A sequence of kernels captured once, with timing events at its start and at every mark.
+
+    after   the graph that is launched before each time this one is: its stages are this one's first, and the next one
+            begins where they end, so that it has in it whatever time the device waits in between for this launch
+
+    Replays go to the current stream that the calling thread has on the graph's device, whichever its current device is.
+    """
+
+    def __init__(
+        self, run: Callable[[Mark], None], pool: Any, stream: torch.cuda.Stream, after: "Graph | None" = None
+    ) -> None:
+        self._device = stream.device
+        self._events: dict[str, torch.cuda.Event] = {} if after is None else dict(after._events)
+        self._graph = torch.cuda.CUDAGraph()
+        with building(stream.device):
+            stream.wait_stream(torch.cuda.current_stream(stream.device))
+            with torch.cuda.stream(stream):
+                for _ in range(2):  # compiles and allocates whatever the kernels need, outside the capture
+                    run(lambda stage: None)
+            stream.synchronize()
+            with torch.cuda.graph(self._graph, pool=pool, stream=stream, capture_error_mode="thread_local"):
+                if after is None:
+                    self._mark("start")
+                run(self._mark)
+
+    def launch(self) -> None:
+        """Run the kernels again on what their input buffers hold now, on the current stream, without waiting."""
+        self._graph.replay()
+
+    def replay(self) -> None:
+        """`launch`, and wait for whatever the current stream has to do."""
+        self.launch()
+        torch.cuda.current_stream(self._device).synchronize()
+
+    def stage_ms(self) -> dict[str, float]:
+        """Device time of the last replay: each mark's milliseconds since the one before. Their sum leaves none out."""
+        pairs = itertools.pairwise(self._events.items())
+        return {name: start.elapsed_time(end) for (_, start), (name, end) in pairs}
+
+    def _mark(self, stage: str) -> None:
+        event = torch.cuda.Event(enable_timing=True, external=True)  # type: ignore[no-untyped-call]
+        event.record(torch.cuda.current_stream(self._device))
+        self._events[stage] = event
