@@ -24,11 +24,14 @@ CPU = torch.device("cpu")
 class Ran:
     """A graph's interface around a function that runs anew in every launch, and tells its name."""
 
-    def __init__(self, run: Callable[[Any], None], after: "Ran | None", tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, run: Callable[[Any], None], after: "Ran | None", tell: Callable[[str], None], at_once: bool = True
+    ) -> None:
         self._run, self._tell, self._name = run, tell, run.__name__
         self._stages: list[str] = []
         self._before = after
-        run(lambda stage: None)  # as a capture does
+        if at_once:  # as a capture does
+            run(lambda stage: None)
 
     def launch(self) -> None:
         self._stages.clear()
@@ -51,6 +54,13 @@ class OnCpu(CudaGraphBackend):
 
     def _capture(self, run: Any, after: Any) -> Any:
         return Ran(run, after, self.told.append)
+
+
+class Unrun(OnCpu):
+    """Whose captures don't run what they capture, for tests of which there are."""
+
+    def _capture(self, run: Any, after: Any) -> Any:
+        return Ran(run, after, self.told.append, at_once=False)
 
 
 def on_cpu(kind: Kind = "pi05", cls: type[OnCpu] = OnCpu) -> OnCpu:

@@ -44,7 +44,7 @@ class Failing:
         sample: Sample = self._backend.sample(*arguments)
         return sample
 
-    def warmup(self, *arguments: Any) -> None:
+    def warmup(self, *arguments: Any, **options: Any) -> None:
         self.sample(*arguments[:1], torch.zeros(1, 10, 32), 1)
 
 

@@ -17,6 +17,7 @@ from turbopi.calibrate.statistics import collect
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.fp8 import Fp8Matrix, Matrix
 from turbopi.engine.ops import PLAIN
+from turbopi.engine.recent import RecentLoops
 from turbopi.engine.weights import modulation, pack
 from turbopi.errors import BackendUnavailable
 from turbopi.judge.check_golden import golden_calibration
@@ -123,6 +124,7 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     calibration = dataclasses.replace(calibration, sites=everything)
     backend._quantization, backend._plan = calibration, calibration.plan(golden_model("pi05").config, "fp8")
     backend._calls, backend._ops, backend._denoisers = {}, PLAIN, {}
+    backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
     backend._refused = {(5, 60, 968): "too many", (10, 60, 968): "too many", (10, 60, 1224): "too many"}
     told = backend.describe()
     assert told["denoising"] == {"operations, as too many": ["H=60, 5 steps", "H=60, 10 steps"]}

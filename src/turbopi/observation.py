@@ -1,5 +1,6 @@
 """What goes into the model: the contract between the policy's edges and every backend."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -70,3 +71,10 @@ class Observation:
             self.token_mask.to(device),
             self.state.to(device),
         )
+
+
+def with_cameras(inputs: ModelInputs, count: int) -> ModelInputs:
+    """The same inputs with `count` valid cameras, the first ones; pictures that aren't there are black."""
+    images, slots = inputs.images, max(count, len(inputs.image_mask))
+    padded = np.concatenate((images, np.zeros((slots - len(images), *images.shape[1:]), images.dtype)))
+    return dataclasses.replace(inputs, images=padded, image_mask=np.arange(slots) < count)

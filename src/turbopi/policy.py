@@ -12,21 +12,29 @@ import numpy as np
 import torch
 
 from turbopi import backends
+from turbopi.arguments import (
+    Numbers,
+    checked_cameras,
+    checked_horizon,
+    checked_steps,
+    noise_for,
+    several,
+    warm_loops,
+)
 from turbopi.backends import Tier
 from turbopi.backends.lost import Guard
 from turbopi.calibrate.artifact import Quantization, for_policy
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.config import PolicyConfig
+from turbopi.engine.recent import Loop
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.model.reference import Precision
-from turbopi.observation import ModelInputs, Observation
+from turbopi.observation import ModelInputs, Observation, with_cameras
 from turbopi.preprocess import Pipeline
 from turbopi.robots import Robot
 from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
 
 logger = logging.getLogger(__name__)
-
-MAX_STEPS = 1000  # far beyond any use; a larger number is a mistake, not a wish
 
 
 class UnifiedPolicy:
@@ -51,6 +59,8 @@ class UnifiedPolicy:
         default_prompt: the instruction for observations that bring none.
         robot: instead of the config's: a name, the path of a robot's .json, or your own `Robot` (docs/robots.md).
         progress: show a bar while the weights load.
+        strict: refuse, with an ObservationError, a call that warm-up didn't cover and the backend would capture or
+            compile for, which takes from a second to a minute in the middle of a robot's motion. See `warmup`.
 
     Raises ConfigError, CheckpointError, CalibrationError, TokenizerError or BackendUnavailable, each with what to do
     about it.
@@ -71,6 +81,7 @@ class UnifiedPolicy:
         default_prompt: str | None = None,
         robot: str | Robot | None = None,
         progress: bool = False,
+        strict: bool = False,
     ) -> None:
         if num_denoising_steps is not None:
             checked_steps(num_denoising_steps, ConfigError)  # before anything is opened
@@ -103,12 +114,14 @@ class UnifiedPolicy:
             return loaded.state
 
         fp8 = for_policy(quantization, precision, checkpoint)
-        self.backend = backends.create(
-            name, self.config.model, load, device=self._device, precision=precision, quantization=fp8
-        )
+        self._guard = Guard(self._device)
+        with self._guard:
+            self.backend = backends.create(
+                name, self.config.model, load, device=self._device, precision=precision, quantization=fp8
+            )
+        self.backend.strict = self._strict = strict
         self._generator = np.random.default_rng()
         self._lock = threading.Lock()
-        self._guard = Guard(self._device)
         self._backend_reason = why
         self._checkpoint = checkpoint
 
@@ -119,6 +132,7 @@ class UnifiedPolicy:
         noise: np.ndarray | None = None,
         seed: int | None = None,
         num_steps: int | None = None,
+        horizon: int | None = None,
     ) -> dict[str, Any]:
         """One observation to one action chunk.
 
@@ -128,6 +142,9 @@ class UnifiedPolicy:
                 deterministic.
             seed: draws the noise from `numpy.random.default_rng(seed)`; neither: fresh noise every call.
             num_steps: denoising steps for this call alone.
+            horizon: actions of the chunk, H, for this call alone. None: the config's, which the weights were trained
+                for and openpi has no other than. All actions of a chunk attend to each other, so a shorter chunk isn't
+                the beginning of a longer one. Backends with engines for one horizon refuse another.
 
         Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
 
@@ -144,7 +161,8 @@ class UnifiedPolicy:
         Raises ObservationError for anything wrong with the arguments, naming it; ActionError if an action is NaN or
         infinite; DeviceLost once the GPU has failed for good (`lost`).
         """
-        return self.infer_batch([obs], noise=None if noise is None else [noise], seed=seed, num_steps=num_steps)[0]
+        noises = None if noise is None else [noise]
+        return self.infer_batch([obs], noise=noises, seed=seed, num_steps=num_steps, horizon=horizon)[0]
 
     def infer_batch(
         self,
@@ -153,6 +171,7 @@ class UnifiedPolicy:
         noise: Sequence[np.ndarray] | np.ndarray | None = None,
         seed: int | Sequence[int] | None = None,
         num_steps: int | None = None,
+        horizon: int | None = None,
     ) -> list[dict[str, Any]]:
         """Several observations in one run of the model: `infer` for each, with the times of the whole batch.
 
@@ -163,7 +182,7 @@ class UnifiedPolicy:
         self._guard.refuse_if_lost()
         if not observations:
             raise ObservationError("infer_batch was given no observation")
-        steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
+        steps, actions = self._loop(num_steps, horizon)
         if len(observations) == 1 and hasattr(self.backend, "begin"):
             seen = self._pipeline.see(observations[0])
             asked = time.perf_counter()
@@ -171,7 +190,7 @@ class UnifiedPolicy:
                 infer_start = time.perf_counter()
                 begun: backends.Begun = self.backend.begin(seen.pictures)
                 self._pipeline.read(seen)  # while the device is at the pictures
-                x_1 = self._noise(1, noise, seed)[0]
+                x_1 = self._noise(1, actions, noise, seed)[0]
                 sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps)
                 infer_end = time.perf_counter()
             states = [seen.state]
@@ -179,7 +198,7 @@ class UnifiedPolicy:
             prepared = [self._pipeline.before(obs) for obs in observations]
             inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
             states = [state for _, state in prepared]
-            noises = torch.from_numpy(self._noise(len(observations), noise, seed))
+            noises = torch.from_numpy(self._noise(len(observations), actions, noise, seed))
             asked = time.perf_counter()
             with self._lock, self._guard:
                 infer_start = time.perf_counter()
@@ -197,6 +216,7 @@ class UnifiedPolicy:
         noise: np.ndarray | None = None,
         seed: int | None = None,
         num_steps: int | None = None,
+        horizon: int | None = None,
         serially: bool = False,
     ) -> "Future[dict[str, Any]]":
         """`infer` that returns at once, with a Future of what `infer` returns; several may be in flight.
@@ -211,13 +231,13 @@ class UnifiedPolicy:
                     "or submit(…, serially=True) to run it before submit returns"
                 )
             done: Future[dict[str, Any]] = Future()
-            done.set_result(self.infer(obs, noise=noise, seed=seed, num_steps=num_steps))
+            done.set_result(self.infer(obs, noise=noise, seed=seed, num_steps=num_steps, horizon=horizon))
             return done
         start = time.perf_counter()
         self._guard.refuse_if_lost()
-        steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
+        steps, actions = self._loop(num_steps, horizon)
         inputs, state = self._pipeline.before(obs)
-        x_1 = torch.from_numpy(self._noise(1, None if noise is None else [noise], seed))
+        x_1 = torch.from_numpy(self._noise(1, actions, None if noise is None else [noise], seed))
         asked = time.perf_counter()
         with self._guard:
             running: Future[backends.Sample] = self.backend.submit(Observation.stack([inputs]), x_1, steps)
@@ -241,18 +261,52 @@ class UnifiedPolicy:
         running.add_done_callback(finish)
         return answer
 
-    def warmup(self, num_steps: int | None = None) -> float:
-        """Make the first real call as fast as later ones: compile, allocate, capture. Returns the seconds it took."""
+    def warmup(self, *, cameras: Numbers = None, horizons: Numbers = None, steps: Numbers = None) -> float:
+        """Make the first real call as fast as later ones: compile, allocate, capture. Returns the seconds it took.
+
+        Every prompt length is covered, for all combinations of:
+
+            cameras     numbers of cameras that observations have. None: all that the robot may send
+                        (`Robot.camera_counts`); backends whose engines take minutes to build skip those that aren't
+                        built yet, but for the example observation's
+            horizons    action horizons, see `infer`. None: the config's
+            steps       numbers of denoising steps. None: the policy's
+
+        each a number or several. What earlier warm-ups covered stays covered, as far as backends keep it: loops of
+        engine/recent.py's number, the least recently used ones go. Raises ConfigError for what can't be, and for more
+        loops than are kept.
+        """
         start = time.perf_counter()
+        self._guard.refuse_if_lost()
         example = self.example_observation()
-        steps = self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError)
+        inputs = self._pipeline.before(example)[0]
+        own = int(inputs.image_mask.sum())
+        sent = [own, *(getattr(self._pipeline.robot, "camera_counts", None) or ())]  # the example's first
+        counts = several("cameras", cameras, sent, lambda n, error: n if n == own else checked_cameras(n, error))
+        loops = warm_loops(
+            several("steps", steps, [self._num_steps], checked_steps),
+            several("horizons", horizons, [self.config.model.action_horizon], self._checked_horizon),
+        )
+        plan = [(count, *loop) for count in counts for loop in loops]
         with self._lock, self._guard:
-            self.backend.warmup(Observation.stack([self._pipeline.before(example)[0]]), steps)
+            for i, (count, num_steps, horizon) in enumerate(plan):
+                seen = inputs if count == own else with_cameras(inputs, count)
+                self.backend.warmup(
+                    Observation.stack([seen]),
+                    num_steps,
+                    horizon,
+                    required=cameras is not None or count == own,
+                    last=i + 1 == len(plan),
+                )
+        if own in counts:
+            self._whole_call(example, *loops[0])
+        return time.perf_counter() - start
+
+    def _whole_call(self, example: Mapping[str, Any], num_steps: int, horizon: int) -> None:
         try:
-            self.infer(example, seed=0, num_steps=steps)
+            self.infer(example, seed=0, num_steps=num_steps, horizon=horizon)
         except ActionError as error:  # of a random observation: whether the weights are at fault, real ones show
             logger.warning("warm-up: %s", error)
-        return time.perf_counter() - start
 
     def prepare(self, obs: Mapping[str, Any]) -> ModelInputs:
         """What the model is given for an observation. Raises ObservationError if it can't be used."""
@@ -294,6 +348,7 @@ class UnifiedPolicy:
             "backend_reason": self._backend_reason,
             "backend_details": self.backend.describe(),
             "precision": self.backend.precision,
+            "strict": self._strict,
             "device": str(self._device),
             "device_name": torch.cuda.get_device_name(self._device) if self._device.type == "cuda" else "CPU",
             "checkpoint_format": self._checkpoint.format,
@@ -316,22 +371,31 @@ class UnifiedPolicy:
                 raise ActionError(f"observation {row} of {len(states)} (from 0): {error}") from None
         return results
 
+    def _loop(self, num_steps: int | None, horizon: int | None) -> Loop:
+        """A call's number of steps and horizon. Raises ObservationError."""
+        return (
+            self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError),
+            self.config.model.action_horizon if horizon is None else self._checked_horizon(horizon, ObservationError),
+        )
+
+    def _checked_horizon(self, horizon: int, error: type[ConfigError] | type[ObservationError]) -> int:
+        own = self.config.model.action_horizon
+        if checked_horizon(horizon, error) != own and not self.backend.any_horizon:
+            raise error(
+                f"backend {self.backend.name!r} has engines for the config's action horizon of {own}, not for "
+                f"{horizon}; leave the horizon out, or take backend 'fused', 'cuda_graph' or 'pytorch'"
+            )
+        return int(horizon)
+
     def _noise(
-        self, batch: int, noise: Sequence[np.ndarray] | np.ndarray | None, seed: int | Sequence[int] | None
+        self,
+        batch: int,
+        horizon: int,
+        noise: Sequence[np.ndarray] | np.ndarray | None,
+        seed: int | Sequence[int] | None,
     ) -> np.ndarray:
         """float32[B, H, action_dim], given or drawn."""
-        shape = (self.config.model.action_horizon, self.config.model.action_dim)
-        if noise is not None:
-            if seed is not None:
-                raise ObservationError("noise and seed were both given; give one of them")
-            return checked_noise(noise, (batch, *shape))
-        if seed is None:
-            return self._generator.standard_normal((batch, *shape), dtype=np.float32)
-        seeds = [seed + row for row in range(batch)] if isinstance(seed, int | np.integer) else seed
-        whole = isinstance(seeds, Sequence) and all(isinstance(one, int | np.integer) and one >= 0 for one in seeds)
-        if not whole or len(seeds) != batch:
-            raise ObservationError(f"seed {seed!r} should be a whole number from 0, or one for each of {batch} rows")
-        return np.stack([np.random.default_rng(one).standard_normal(shape, dtype=np.float32) for one in seeds])
+        return noise_for((batch, horizon, self.config.model.action_dim), noise, seed, self._generator)
 
 
 def _timing(
@@ -346,31 +410,3 @@ def _timing(
         "postprocess_ms": (end - infer_end) * 1e3,
         "total_ms": (end - start) * 1e3,
     }
-
-
-def checked_noise(noise: Sequence[np.ndarray] | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        array = np.asarray(noise)
-    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a torch tensor that wants gradients
-        raise ObservationError(f"noise isn't an array of numbers: {error}") from None
-    if array.dtype.kind not in "fiu":
-        raise ObservationError(f"noise isn't an array of numbers: its dtype is {array.dtype}")
-    if array.ndim == 4 and array.shape[:2] == (1, 1):  # one row that brought its batch axis
-        array = array[0]
-    with np.errstate(over="ignore"):  # refused below
-        array = array.astype(np.float32, copy=False)
-    if array.shape != shape:
-        given, expected = (array.shape[1:], shape[1:]) if array.shape[:1] == shape[:1] else (array.shape, shape)
-        raise ObservationError(f"noise has shape {list(given)}, but this policy needs {list(expected)}")
-    if not np.isfinite(array).all():
-        raise ObservationError("noise has values that aren't finite")
-    return np.ascontiguousarray(array)
-
-
-def checked_steps(num_steps: int, error: type[ConfigError] | type[ObservationError]) -> int:
-    whole = isinstance(num_steps, int | np.integer) and not isinstance(num_steps, bool)
-    if not whole or not 1 <= num_steps <= MAX_STEPS:
-        raise error(
-            f"the number of denoising steps is {num_steps!r}; it should be a whole number from 1 to {MAX_STEPS}"
-        )
-    return int(num_steps)

@@ -12,6 +12,7 @@ import torch
 from turbopi.backends.base import Backend, Begun, LoadState, Sample, Tier
 from turbopi.calibrate.artifact import TIERS, Quantization
 from turbopi.config import ModelConfig
+from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
 
 __all__ = [
@@ -182,7 +183,8 @@ def create(
     """
     check(name, device, precision)
     more = {} if quantization is None else {"quantization": quantization}
-    return _backend_class(name)(config, load, device=device, precision=precision, **more)
+    with preparing(device):
+        return _backend_class(name)(config, load, device=device, precision=precision, **more)
 
 
 def precisions(name: str) -> tuple[Tier, ...]:

@@ -1,6 +1,6 @@
 """The protocol that every backend implements. The policy knows nothing else about the one it holds."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
+from turbopi.errors import ObservationError
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import Precision, Trace
 from turbopi.observation import Observation
@@ -55,13 +56,19 @@ class Backend(Protocol):
 
     Observations and noise may be on the host or on the device; both are moved where they are needed. Two methods are
     optional: `begin`, see `Begun`, and `submit`, see `turbopi.backends.tensorrt_pipelined`.
+
+    any_horizon     whether noise may have another action horizon than the config's
+    strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
+                    `not_warm`. Set by the policy; a backend that does nothing of the kind needn't look
     """
 
     name: ClassVar[str]
     precisions: ClassVar[tuple[Tier, ...]]
+    any_horizon: ClassVar[bool]
     config: ModelConfig
     device: torch.device
     precision: Tier
+    strict: bool
 
     def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Tier) -> None:
         """Load the weights; whatever can be prepared without an observation is prepared here."""
@@ -70,8 +77,21 @@ class Backend(Protocol):
     def unavailable(cls, device: torch.device) -> str | None:
         """None if the backend can run on the device, else why it can't and what to do."""
 
-    def warmup(self, observation: Observation, num_steps: int) -> None:
-        """Compile, allocate or capture whatever later observations with these cameras may need."""
+    def warmup(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None = None,
+        *,
+        required: bool = True,
+        last: bool = True,
+    ) -> None:
+        """Compile, allocate or capture whatever later observations with so many cameras may need, and so many steps.
+
+        horizon     None: the config's
+        required    False: not if that takes the minutes of building engines, or can't be at all
+        last        whether no other cameras, steps or horizon will be warmed up, so that what that needs may be let go
+        """
 
     def prefix(self, observation: Observation) -> KVCache:
         """Keys and values of an observation."""
@@ -87,3 +107,18 @@ class Backend(Protocol):
 
     def describe(self) -> dict[str, Any]:
         """What a user may want to know of this instance, as plain values: goes into the policy's metadata."""
+
+
+def not_warm(name: str, needs: str, warm: Iterable[str], **arguments: int) -> ObservationError:
+    """Why a strict backend refuses a call.
+
+    needs       the call's shape
+    warm        the shapes that are covered
+    arguments   what `UnifiedPolicy.warmup` is to be given
+    """
+    covered = "; ".join(sorted({*warm})) or "nothing yet"
+    given = ", ".join(f"{argument}={value}" for argument, value in arguments.items())
+    return ObservationError(
+        f"strict: this call needs {needs}, which backend {name!r} would have to prepare within the call. Warm is: "
+        f"{covered}. Call policy.warmup({given}) before the robot moves"
+    )

@@ -3,11 +3,11 @@
 The first, vision, is for a number of valid cameras; it can start before the prompt is known. The second, prefix and all
 denoising steps, is for a bucket, which rounds the prompt's length up to a multiple of 16, too; inside it nothing is
 captured anew when pictures, prompt, state or noise change. A bucket that warm-up didn't capture is captured when first
-needed, with a log line. Batches run one observation after the other.
+needed, with a log line, or refused if the backend is `strict`. Graphs of the denoising loops (steps, horizon) used last
+are kept, see `engine.recent`. Batches run one observation after the other.
 """
 
 import dataclasses
-import itertools
 import logging
 import time
 from collections.abc import Callable, Sequence
@@ -18,12 +18,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample, Tier
+from turbopi.backends.base import LoadState, Sample, Tier, not_warm
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.config import ModelConfig
 from turbopi.engine import without_compiler
-from turbopi.engine.call import Cache, CallShape, Denoiser, Mark, Pictures, StaticCall
+from turbopi.engine.call import Cache, CallShape, Denoiser, Pictures, StaticCall
+from turbopi.engine.graph import Graph, Mark, building
 from turbopi.engine.ops import Ops, compiled
+from turbopi.engine.recent import Loop, RecentLoops
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError
 from turbopi.model.kv_cache import KVCache
@@ -34,49 +36,6 @@ logger = logging.getLogger(__name__)
 
 BUCKET = 16  # prompt tokens: at most 15 padded rows beside 256 a camera
 MAX_CAMERAS = 4  # the cache is allocated for them
-
-
-class Graph:
-    """A sequence of kernels captured once, with timing events at its start and at every mark.
-
-    after   the graph that is launched before each time this one is: its stages are this one's first, and the next one
-            begins where they end, so that it has in it whatever time the device waits in between for this launch
-    """
-
-    def __init__(
-        self, run: Callable[[Mark], None], pool: Any, stream: torch.cuda.Stream, after: "Graph | None" = None
-    ) -> None:
-        self._device = stream.device
-        self._events: dict[str, torch.cuda.Event] = {} if after is None else dict(after._events)
-        self._graph = torch.cuda.CUDAGraph()
-        stream.wait_stream(torch.cuda.current_stream(stream.device))
-        with torch.cuda.stream(stream):
-            for _ in range(2):  # compiles and allocates whatever the kernels need, outside the capture
-                run(lambda stage: None)
-        stream.synchronize()
-        with torch.cuda.graph(self._graph, pool=pool, stream=stream):
-            if after is None:
-                self._mark("start")
-            run(self._mark)
-
-    def launch(self) -> None:
-        """Run the kernels again on what their input buffers hold now, on the current stream, without waiting."""
-        self._graph.replay()
-
-    def replay(self) -> None:
-        """`launch`, and wait for whatever the current stream has to do."""
-        self.launch()
-        torch.cuda.current_stream(self._device).synchronize()
-
-    def stage_ms(self) -> dict[str, float]:
-        """Device time of the last replay: each mark's milliseconds since the one before. Their sum leaves none out."""
-        pairs = itertools.pairwise(self._events.items())
-        return {name: start.elapsed_time(end) for (_, start), (name, end) in pairs}
-
-    def _mark(self, stage: str) -> None:
-        event = torch.cuda.Event(enable_timing=True, external=True)  # type: ignore[no-untyped-call]
-        event.record(torch.cuda.current_stream())
-        self._events[stage] = event
 
 
 @dataclass(frozen=True)
@@ -114,6 +73,8 @@ class CudaGraphBackend:
 
     name: ClassVar[str] = "cuda_graph"
     precisions: ClassVar[tuple[Tier, ...]] = ("bf16", "f32")
+    any_horizon: ClassVar[bool] = True
+    strict = False
 
     def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Tier) -> None:
         if config.vlm.num_kv_heads != 1:
@@ -124,6 +85,7 @@ class CudaGraphBackend:
         rows = MAX_CAMERAS * config.vision.num_tokens + _bucket(config.max_prompt_tokens) + config.action_horizon + 64
         dtype, joint = self._weights.embed_tokens.dtype, self._ops is without_compiler.OPS
         self._cache = Cache.allocate(config, rows, device, dtype, joint)
+        self._recent = RecentLoops(self._forget)
         self._tables: dict[int, Tensor | None] = {}  # by number of steps, as the next
         self._loops: dict[int, without_compiler.Denoiser] = {}
         self._calls: dict[CallShape, StaticCall] = {}
@@ -132,6 +94,7 @@ class CudaGraphBackend:
         self._begun: Begun | None = None  # what may be finished
         self._pool: Any = None
         self._stream: torch.cuda.Stream | None = None  # that graphs are captured on
+        self._warming = False
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
@@ -142,11 +105,27 @@ class CudaGraphBackend:
             return f"it needs compute capability 8.0 or newer for bfloat16, this GPU has {major}.{minor}"
         return None
 
-    def warmup(self, observation: Observation, num_steps: int) -> None:
+    def warmup(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None = None,
+        *,
+        required: bool = True,
+        last: bool = True,
+    ) -> None:
         """Capture the whole call for every prompt length, with this observation's number of cameras."""
         cameras, floats = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
-        for slots in range(BUCKET, _bucket(self.config.max_prompt_tokens) + 1, BUCKET):
-            self._graph(CallShape(cameras, slots, self.config.action_horizon, num_steps, floats), "answer")
+        actions = self.config.action_horizon if horizon is None else horizon
+        if not required and cameras > MAX_CAMERAS:
+            return
+        self._warming = True
+        try:
+            self._check_cameras(cameras)
+            for slots in range(BUCKET, _bucket(self.config.max_prompt_tokens) + 1, BUCKET):
+                self._graph(CallShape(cameras, slots, actions, num_steps, floats), "answer")
+        finally:
+            self._warming = False
 
     def prefix(self, observation: Observation) -> KVCache:
         if observation.batch_size != 1:
@@ -175,14 +154,13 @@ class CudaGraphBackend:
         call.inputs.length.fill_(length)
         call.inputs.noise.copy_(noise[0])
         call.inputs.state.copy_(cache.state[0])
-        torch.cuda.synchronize(self.device)
+        torch.cuda.current_stream(self.device).synchronize()
         graph.replay()
         return call.x_t[-1:].clone()
 
     def begin(self, pictures: Sequence[np.ndarray]) -> Begun:
         """See `turbopi.backends.base.Begun`. One observation at a time: this ends the turn of the one before."""
-        if len(pictures) > MAX_CAMERAS:
-            raise BackendError(f"{self.name} takes up to {MAX_CAMERAS} cameras, this observation has {len(pictures)}")
+        self._check_cameras(len(pictures))
         begun = Begun(self, len(pictures), bool(pictures) and pictures[0].dtype == np.float32)
         buffers = self._pictures_of(begun.cameras, begun.float_images)
         self._begun = None  # one given up may still be read from the buffers, but nobody gets what becomes of it
@@ -209,8 +187,13 @@ class CudaGraphBackend:
         captured = sorted({(s.cameras, s.prompt_slots, s.horizon, s.num_steps) for s in self._calls})
         return {
             "captured": [f"{c} cameras + {p} tokens, H={h}, {n} steps" for c, p, h, n in captured],
+            "graphs": {"kept": len(self._graphs), **self._recent.describe()},
             "operations": dict(self._ops.origin),
         }
+
+    def _check_cameras(self, count: int) -> None:
+        if count > MAX_CAMERAS:
+            raise BackendError(f"{self.name} takes up to {MAX_CAMERAS} cameras, this observation has {count}")
 
     def _pack(self, load: LoadState) -> Weights:
         return pack(self.config, load(self.device, "f32" if self.precision == "f32" else "bf16"))
@@ -259,22 +242,64 @@ class CudaGraphBackend:
     def _graph(self, of: CallShape | Pictures, part: str) -> Graph:
         """The "vision" of pictures; of a shape the "answer" behind it, or its "prefix" or "denoise" alone.
 
-        Captured on first use.
+        Captured on first use; ObservationError if that isn't allowed.
         """
-        if (of, part) not in self._graphs:
-            start, after = time.perf_counter(), None
-            if isinstance(of, Pictures):
-                run = of.run
-            else:
-                call = self._call(of)
-                if part != "prefix" and call.denoiser is None:
-                    call.denoiser = self._make_denoiser(of, call.table)
-                run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
-                after = None if part == "denoise" else self._graph(call.pictures, "vision")
-            self._graphs[of, part] = self._capture(run, after)
+        graph = self._graphs.get((of, part))
+        if isinstance(of, CallShape):
+            if graph is None:
+                self._check_rows(of)
+            if graph is None and part == "answer":
+                self._refuse_if_cold(of)
+            self._recent.use((of.num_steps, of.horizon))
+        if graph is None:
+            start = time.perf_counter()
+            with building(self.device):
+                graph = self._graphs[of, part] = self._captured(of, part)
             what = f"{of.cameras} cameras" if isinstance(of, Pictures) else of
             logger.info("captured %s of %s in %.2f s", part, what, time.perf_counter() - start)
-        return self._graphs[of, part]
+        return graph
+
+    def _captured(self, of: CallShape | Pictures, part: str) -> Graph:
+        if isinstance(of, Pictures):
+            return self._capture(of.run, None)
+        call = self._call(of)
+        if part != "prefix" and call.denoiser is None:
+            call.denoiser = self._make_denoiser(of, call.table)
+        run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
+        return self._capture(run, None if part == "denoise" else self._graph(call.pictures, "vision"))
+
+    def _check_rows(self, shape: CallShape) -> None:
+        needs, has = shape.cache_rows(self.config), self._cache.k.shape[1]
+        if needs > has:
+            raise BackendError(
+                f"{self.name} has {has} cache rows, but {shape.cameras} cameras, {shape.prompt_slots} prompt tokens "
+                f"and an action horizon of {shape.horizon} need {needs}; the config's horizon is "
+                f"{self.config.action_horizon}"
+            )
+
+    def _refuse_if_cold(self, shape: CallShape) -> None:
+        """Raise ObservationError for a shape that isn't captured, if that isn't allowed now."""
+        if self.strict and not self._warming:
+            warm = [s for s, part in self._graphs if isinstance(s, CallShape) and part == "answer"]
+            raise not_warm(
+                self.name,
+                f"{shape.cameras} cameras, H={shape.horizon}, {shape.num_steps} steps",
+                (f"{s.cameras} cameras, H={s.horizon}, {s.num_steps} steps" for s in warm),
+                cameras=shape.cameras,
+                horizons=shape.horizon,
+                steps=shape.num_steps,
+            )
+
+    def _forget(self, loop: Loop) -> None:
+        """Let go of all that is a denoising loop's alone; nothing of it runs. Vision's graphs are every loop's."""
+        gone = {shape for shape in self._calls if (shape.num_steps, shape.horizon) == loop}
+        for kept in [key for key in self._graphs if key[0] in gone]:
+            del self._graphs[kept]
+        for shape in gone:
+            del self._calls[shape]
+        if loop[0] not in {steps for steps, _ in self._recent}:
+            self._tables.pop(loop[0], None)
+            self._loops.pop(loop[0], None)
 
     def _capture(self, run: Callable[[Mark], None], after: Graph | None) -> Graph:
         """All graphs share memory, as they run one after the other."""
@@ -286,6 +311,9 @@ class CudaGraphBackend:
     def _pictures_of(self, cameras: int, float_images: bool) -> Pictures:
         key, slots = (cameras, float_images), _bucket(self.config.max_prompt_tokens)
         if key not in self._pictures:
+            if self.strict and not self._warming:
+                warm = (f"{count} cameras" for count, _ in self._pictures)
+                raise not_warm(self.name, f"{cameras} cameras", warm, cameras=cameras)
             self._pictures[key] = Pictures(self.config, self._weights, self._ops, cameras, float_images, slots)
         return self._pictures[key]
 
@@ -294,9 +322,6 @@ class CudaGraphBackend:
             table = modulation(self.config, self._weights.conditioning, shape.num_steps)
             self._tables[shape.num_steps] = None if table is None else table.to(self.device)
         if shape not in self._calls:
-            rows = shape.cache_rows(self.config)
-            if rows > self._cache.k.shape[1]:
-                raise BackendError(f"{self.name} has {self._cache.k.shape[1]} cache rows, {shape} needs {rows}")
             pictures, table = self._pictures_of(shape.cameras, shape.float_images), self._tables[shape.num_steps]
             self._calls[shape] = StaticCall(self.config, self._weights, self._ops, shape, pictures, self._cache, table)
         return self._calls[shape]

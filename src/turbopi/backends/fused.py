@@ -22,6 +22,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape, Denoiser
 from turbopi.engine.fp8 import Directions, Fp8Matrix, Matrix
 from turbopi.engine.ops import Ops
+from turbopi.engine.recent import Loop
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
 
@@ -159,8 +160,17 @@ class FusedBackend(CudaGraphBackend):
             return self._denoisers[key]
         if not self._denoisers:
             self._packed_expert = None
-        self._keep_expert_on(self.device)  # for good: a graph of these operations will point to it
+        self._keep_expert_on(self.device)  # while such a graph is kept, as it points to it
         return None
+
+    def _forget(self, loop: Loop) -> None:
+        super()._forget(loop)
+        kept: dict[tuple[int, int, int], Any]
+        for kept in (self._denoisers, self._refused):
+            for key in [key for key in kept if key[:2] == loop]:
+                del kept[key]
+        if self._denoisers:  # if no graph of operations is left, none points to the matrices on the device
+            self._put_expert_away()
 
     def _denoising_kernel(self, horizon: int, rows: int, table: Tensor | None) -> "DenoiseKernel":
         """Raises BackendUnavailable for what it doesn't cover."""

@@ -6,6 +6,7 @@ again. All others leave the GPU as it was. Nothing here is called unless a backe
 
 import torch
 
+from turbopi.engine.graph import CAPTURING
 from turbopi.errors import BackendUnavailable, DeviceLost
 
 # By number, which the runtime (cudaError_t) and the driver (CUresult) share. Source: "Data types used by CUDA Runtime",
@@ -126,7 +127,8 @@ def _may_be_the_devices(error: BaseException) -> bool:
 def _probe(device: torch.device) -> RuntimeError | None:
     """What the device answers to a synchronise; None: it works, or a graph is being captured, which forbids to ask."""
     try:
-        torch.cuda.synchronize(device)
+        with CAPTURING:  # our own threads don't
+            torch.cuda.synchronize(device)
     except RuntimeError as error:
         if getattr(error, "error_code", None) in _CAPTURING or "captur" in str(error):
             return None

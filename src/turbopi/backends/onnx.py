@@ -60,6 +60,8 @@ class OnnxBackend:
 
     name: ClassVar[str] = "onnx"
     precisions: ClassVar[tuple[Tier, ...]] = ("f32",)
+    any_horizon: ClassVar[bool] = True
+    strict = False  # nothing here depends on shapes
 
     def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
         model = Pi0Model.from_state(config, load(device, precision))
@@ -84,9 +86,17 @@ class OnnxBackend:
             return "it runs ONNX Runtime's CPU provider; use device 'cpu'"
         return missing_library((*EXPORT_NEEDS, "onnxruntime"))
 
-    def warmup(self, observation: Observation, num_steps: int) -> None:
-        noise = torch.zeros(observation.batch_size, self.config.action_horizon, self.config.action_dim)
-        self.sample(observation, noise, num_steps)
+    def warmup(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None = None,
+        *,
+        required: bool = True,
+        last: bool = True,
+    ) -> None:
+        actions = self.config.action_horizon if horizon is None else horizon
+        self.sample(observation, torch.zeros(observation.batch_size, actions, self.config.action_dim), num_steps)
 
     def prefix(self, observation: Observation) -> KVCache:
         caches = [self._keys_values(self._embed(row)) for row in _rows(observation.to(self.device))]

@@ -18,21 +18,38 @@ class PyTorchBackend:
 
     name: ClassVar[str] = "pytorch"
     precisions: ClassVar[tuple[Tier, ...]] = ("bf16", "f32")
+    any_horizon: ClassVar[bool] = True
     model_class: ClassVar[type[Pi0Model]] = Pi0Model
+    strict = False  # nothing here depends on shapes
 
     def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
         self.config = config
         self.device = device
         self.precision: Tier = precision
+        self._warm = False
         self.model = self.model_class.from_state(config, load(device, precision))
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
         return None
 
-    def warmup(self, observation: Observation, num_steps: int) -> None:
-        noise = torch.zeros(observation.batch_size, self.config.action_horizon, self.config.action_dim)
-        self.sample(observation, noise, num_steps)
+    def warmup(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None = None,
+        *,
+        required: bool = True,
+        last: bool = True,
+    ) -> None:
+        """One call: it loads libraries and fills allocators; other shapes need nothing more."""
+        if not self._warm:
+            self._one_call(observation, num_steps, horizon)
+        self._warm = True
+
+    def _one_call(self, observation: Observation, num_steps: int, horizon: int | None) -> None:
+        actions = self.config.action_horizon if horizon is None else horizon
+        self.sample(observation, torch.zeros(observation.batch_size, actions, self.config.action_dim), num_steps)
 
     def prefix(self, observation: Observation) -> KVCache:
         return self.model.prefix(observation.to(self.device))

@@ -6,14 +6,18 @@ cameras, another batch size or a mask (batches with unequal prompts) do, once ea
 
 import importlib.util
 import shutil
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from turbopi.backends.base import LoadState, Sample, not_warm
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
-from turbopi.model.reference import Pi0Model
+from turbopi.errors import ObservationError
+from turbopi.model.reference import Pi0Model, Precision
+from turbopi.observation import Observation
 
 
 class CompiledModel(Pi0Model):
@@ -46,11 +50,69 @@ class CompiledModel(Pi0Model):
         return self._velocity(x_t, state, time, cache_k, cache_v, rope, mask)
 
 
+@dataclass(frozen=True)
+class Compiled:
+    """What the compiled code depends on."""
+
+    batch: int
+    cameras: int  # that some row needs
+    masked: bool  # whether the rows' valid slots differ
+    horizon: int
+
+    @classmethod
+    def of(cls, observation: Observation, horizon: int) -> "Compiled":
+        cameras, tokens = observation.image_mask, observation.token_mask
+        masked = bool((cameras != cameras[:1]).any()) or bool((tokens != tokens[:1]).any())
+        return cls(observation.batch_size, int(cameras.any(0).sum()), masked, horizon)
+
+    def __str__(self) -> str:
+        rows = "" if self.batch == 1 else f"batch {self.batch}{' of unequal lengths' if self.masked else ''}, "
+        return f"{rows}{self.cameras} cameras, H={self.horizon}"
+
+
 class PyTorchCompileBackend(PyTorchBackend):
-    """The first calls compile, for a minute or so at full size: `UnifiedPolicy.warmup()` before the robot moves."""
+    """The first calls compile, for a minute or so at full size: `UnifiedPolicy.warmup()` before the robot moves.
+
+    What is compiled is kept by PyTorch, which bounds it itself; it doesn't depend on the number of steps.
+    """
 
     name: ClassVar[str] = "pytorch_compile"
     model_class: ClassVar[type[Pi0Model]] = CompiledModel
+
+    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+        super().__init__(config, load, device=device, precision=precision)
+        self._compiled: set[Compiled] = set()
+        self._warming = False
+
+    def warmup(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None = None,
+        *,
+        required: bool = True,
+        last: bool = True,
+    ) -> None:
+        """One call with as many cameras, which compiles for them."""
+        self._warming = True
+        try:
+            self._one_call(observation, num_steps, horizon)
+        finally:
+            self._warming = False
+
+    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+        shape = Compiled.of(observation, noise.shape[1])
+        if self.strict and not self._warming and shape not in self._compiled:
+            warm = map(str, self._compiled)
+            if shape.batch > 1:
+                raise ObservationError(
+                    f"strict: this call needs {shape}, which backend {self.name!r} would have to compile within the "
+                    "call, and warm-up covers one observation at a time: ask for them one by one"
+                )
+            raise not_warm(self.name, str(shape), warm, cameras=shape.cameras, horizons=shape.horizon)
+        sample = super().sample(observation, noise, num_steps)
+        self._compiled.add(shape)
+        return sample
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
@@ -64,4 +126,7 @@ class PyTorchCompileBackend(PyTorchBackend):
         return None
 
     def describe(self) -> dict[str, Any]:
-        return super().describe() | {"compiled": ["vision", "prefix", "denoising step"]}
+        return super().describe() | {
+            "compiled": ["vision", "prefix", "denoising step"],
+            "compiled_for": sorted(map(str, self._compiled)),
+        }

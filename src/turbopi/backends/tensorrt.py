@@ -19,16 +19,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample
-from turbopi.backends.cuda_graph import Graph, golden_trace
+from turbopi.backends.base import LoadState, Sample, not_warm
+from turbopi.backends.cuda_graph import golden_trace
 from turbopi.config import ModelConfig
+from turbopi.engine.graph import Graph, Mark, building
+from turbopi.engine.recent import Loop, RecentLoops
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import Precision, Trace
 from turbopi.observation import Observation
 from turbopi.tensorrt import library, missing
-from turbopi.tensorrt.call import EngineCall, Mark
+from turbopi.tensorrt.call import EngineCall
 from turbopi.tensorrt.engines import ModelEngines, for_this_gpu, without_engine_weights
 from turbopi.tensorrt.networks import Fp8Scales
 from turbopi.tensorrt.parts import SLOTS, EngineShape, fingerprint
@@ -69,6 +71,8 @@ class TensorRTBackend:
 
     name: ClassVar[str] = "tensorrt"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16",)
+    any_horizon: ClassVar[bool] = False  # engines are built for one
+    strict = False
 
     def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
         if config.vlm.num_kv_heads != 1:
@@ -80,6 +84,7 @@ class TensorRTBackend:
         self._engines = self._make_engines(self._weights)
         self._sealed, self._missed = False, 0
         self._shapes: list[EngineShape] = []  # whose engines are loaded
+        self._recent, self._warming = RecentLoops(self._forget), False
         self._tables: dict[int, Tensor | None] = {}
         self._calls: dict[CallKey, EngineCall] = {}
         self._graphs: dict[tuple[CallKey, str], Graph] = {}
@@ -99,21 +104,43 @@ class TensorRTBackend:
 
     # -- the protocol --------------------------------------------------------------------------------------------------
 
-    def warmup(self, observation: Observation, num_steps: int) -> None:
-        """Load every cached set of engines for this observation's cameras, and capture; allow no other shape after.
+    def warmup(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None = None,
+        *,
+        required: bool = True,
+        last: bool = True,
+    ) -> None:
+        """Load every cached set of engines for this observation's cameras, and capture; allow no other shape after the
+        last one.
 
-        Builds a set for the model's longest prompt where none is cached that holds this observation's prompt.
+        Builds a set for the model's longest prompt where none is cached that holds this observation's prompt, unless it
+        isn't required.
         """
-        row, horizon = self._row(observation, 0), self.config.action_horizon
-        self._shape(len(row.images), len(row.tokens), horizon, building=True)
-        cached = self._engines.cached_shapes(len(row.images), horizon)
+        row, actions = self._row(observation, 0), self.config.action_horizon if horizon is None else horizon
+        cameras = len(row.images)
+        self._warming = True
+        try:
+            if required or self._engines.cached_shapes(cameras, actions):
+                self._warm(cameras, len(row.tokens), actions, num_steps, row.images.dtype == np.float32)
+            else:
+                logger.info("there are no engines for %d cameras: `turbopi build --cameras %d`", cameras, cameras)
+        finally:
+            self._warming = False
+        if last:
+            self._sealed = True
+            self._engines.release()
+            self._weights = without_engine_weights(self._weights)
+
+    def _warm(self, cameras: int, tokens: int, horizon: int, num_steps: int, float_images: bool) -> None:
+        self._shape(cameras, tokens, horizon)
+        cached = self._engines.cached_shapes(cameras, horizon)
         self._shapes += [shape for shape in cached if shape not in self._shapes]
         for shape in self._shapes:
-            if (shape.cameras, shape.horizon) == (len(row.images), horizon):
-                self._prepare(CallKey(shape, num_steps, row.images.dtype == np.float32))
-        self._sealed = True
-        self._engines.release()
-        self._weights = without_engine_weights(self._weights)
+            if (shape.cameras, shape.horizon) == (cameras, horizon):
+                self._prepare(CallKey(shape, num_steps, float_images))
 
     def prefix(self, observation: Observation) -> KVCache:
         if observation.batch_size != 1:
@@ -168,6 +195,7 @@ class TensorRTBackend:
             "engine_runs_while_capturing": self._engines.calls(),
             "observations_without_engine": self._missed,
             "engine_cache": str(self._engines.cache.folder),
+            "graphs": {"kept": len(self._graphs), **self._recent.describe()},
         }
 
     # -- shapes and graphs ---------------------------------------------------------------------------------------------
@@ -184,12 +212,13 @@ class TensorRTBackend:
     def _row(self, observation: Observation, b: int) -> Row:
         return Row.of(observation, b, self.config.vision.num_tokens)
 
-    def _shape(self, cameras: int, tokens: int, horizon: int, *, building: bool = False) -> EngineShape:
+    def _shape(self, cameras: int, tokens: int, horizon: int) -> EngineShape:
         """The smallest engines that an observation fits: loaded ones, else cached ones, else, before warm-up, new ones.
 
         Raises BackendError, naming both shapes, if there are none.
         """
-        if cameras > MAX_CAMERAS or tokens > self.config.max_prompt_tokens or (cameras + tokens == 0 and not building):
+        empty = cameras + tokens == 0 and not self._warming
+        if cameras > MAX_CAMERAS or tokens > self.config.max_prompt_tokens or empty:
             raise BackendError(
                 f"{self.name} takes up to {MAX_CAMERAS} cameras and {self.config.max_prompt_tokens} prompt tokens, "
                 f"this observation has {cameras} and {tokens}"
@@ -197,13 +226,15 @@ class TensorRTBackend:
         fits = [s for s in self._shapes if (s.cameras, s.horizon) == (cameras, horizon) and s.prompt_slots >= tokens]
         if fits:
             return min(fits, key=lambda shape: shape.prompt_slots)
-        if self._sealed and not building:
+        if self._sealed and not self._warming:
             self._missed += 1
             loaded = "; ".join(str(shape) for shape in self._shapes)
             raise BackendError(
                 f"{self.name} has engines for {loaded}, and none for {cameras} cameras, {tokens} prompt tokens, "
                 f"H={horizon}. Build them (`turbopi build --cameras {cameras} --prompt-tokens {tokens}`) and start anew"
             )
+        if self.strict and not self._warming:
+            raise not_warm(self.name, f"engines for {cameras} cameras", map(str, self._shapes), cameras=cameras)
         cached = [s for s in self._engines.cached_shapes(cameras, horizon) if s.prompt_slots >= tokens]
         longest = -(-self.config.max_prompt_tokens // SLOTS) * SLOTS
         shape = cached[0] if cached else EngineShape(cameras, longest, horizon)
@@ -221,14 +252,31 @@ class TensorRTBackend:
     def _graph(self, key: CallKey, part: str) -> Graph:
         """The graph of a call or of one of its halves, "encode" and "denoise"; captured when first needed."""
         if (key, part) not in self._graphs:
+            if self.strict and not self._warming:
+                warm = (f"{k.shape}, {k.num_steps} steps" for k, _ in self._graphs)
+                raise not_warm(self.name, f"{key.shape}, {key.num_steps} steps", warm, steps=key.num_steps)
             start = time.perf_counter()
-            call = self._call(key)
-            run = {"call": call.run, "encode": call.encode, "denoise": call.denoise}[part]
-            before = call.parts.calls()
-            self._graphs[key, part] = self._capture(run, part)
+            with building(self.device):
+                self._recent.use((key.num_steps, key.shape.horizon))
+                call = self._call(key)
+                run = {"call": call.run, "encode": call.encode, "denoise": call.denoise}[part]
+                before = call.parts.calls()
+                self._graphs[key, part] = self._capture(run, part)
             self._check_coverage(call, part, before)
             logger.info("captured %s of %s in %.2f s", part, key, time.perf_counter() - start)
+        else:
+            self._recent.use((key.num_steps, key.shape.horizon))
         return self._graphs[key, part]
+
+    def _forget(self, loop: Loop) -> None:
+        """Let go of all that is a denoising loop's alone; nothing of it runs."""
+        gone = {key for key in self._calls if (key.num_steps, key.shape.horizon) == loop}
+        for kept in [key for key in self._graphs if key[0] in gone]:
+            del self._graphs[kept]
+        for key in gone:
+            del self._calls[key]
+        if loop[0] not in {steps for steps, _ in self._recent}:
+            self._tables.pop(loop[0], None)
 
     def _check_coverage(self, call: EngineCall, part: str, before: list[int]) -> None:
         """Every engine of a part ran while it was captured, as often as it should: nothing was computed elsewhere."""
@@ -274,4 +322,4 @@ class TensorRTBackend:
 
     def _synchronize(self) -> None:
         if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
+            torch.cuda.current_stream(self.device).synchronize()

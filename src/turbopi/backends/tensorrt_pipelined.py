@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Sample
-from turbopi.backends.cuda_graph import Graph
 from turbopi.backends.tensorrt import CallKey, TensorRTBackend
 from turbopi.config import ModelConfig
+from turbopi.engine.graph import Graph
 from turbopi.errors import BackendError
 from turbopi.model.reference import Precision, Trace
 from turbopi.observation import Observation
@@ -97,6 +97,10 @@ class TensorRTPipelinedBackend(TensorRTBackend):
         stages = {name: sum(one.stage_ms[name] for one in samples) for name in samples[0].stage_ms}
         return Sample(torch.cat([one.actions for one in samples]), stages)
 
+    def warmup(self, *arguments: Any, **options: Any) -> None:
+        with self._submitting, _all_free(self._slots):  # graphs may be captured, and others forgotten
+            super().warmup(*arguments, **options)
+
     def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
         with self._submitting, _all_free(self._slots):
             return super().intermediates(observation, noise, num_steps)
@@ -148,7 +152,7 @@ def _all_free(slots: Sequence[_InFlight]) -> Iterator[None]:
 
 def _queue(graph: Graph, stream: torch.cuda.Stream) -> None:
     with torch.cuda.stream(stream):
-        graph._graph.replay()  # `Graph.replay` would wait for it
+        graph.launch()
 
 
 def _collect_all(jobs: "SimpleQueue[_Job]") -> None:

@@ -22,8 +22,8 @@ class StageTimer:
 
     def milliseconds(self) -> dict[str, float]:
         """Stage -> milliseconds since the mark before it."""
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
+        if not isinstance(last := self._marks[-1], float):
+            last.synchronize()  # not the device: another thread may be capturing a graph
         return {
             name: _elapsed_ms(start, end)
             for name, start, end in zip(self._names, self._marks, self._marks[1:], strict=False)

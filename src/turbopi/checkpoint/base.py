@@ -76,7 +76,7 @@ class Checkpoint:
             for name, tensor in state.items():
                 check_finite(tensor, self.source.native_name(name), self.path)
         if device.type == "cuda":
-            torch.cuda.synchronize(device)
+            torch.cuda.current_stream(device).synchronize()  # not the device: others may be capturing
         total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
         return Loaded(state, time.perf_counter() - began, total)
 

@@ -141,8 +141,8 @@ def _options_of(variant: "Variant", options: EvalOptions) -> EvalOptions:
 def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint: "Checkpoint") -> None:
     """Refuse what can't run before hours of what can."""
     from turbopi import backends
+    from turbopi.arguments import checked_steps
     from turbopi.calibrate.artifact import TIERS, calibration_of
-    from turbopi.policy import checked_steps
 
     device = backends.resolve_device(options.device)
     tiers = [variant.precision for variant in variants if variant.precision in TIERS]

@@ -175,7 +175,7 @@ def _noise(
     """Call i -> float32[H, action_dim]: the given noise for all, or what UnifiedPolicy draws for seed + i."""
     import numpy as np
 
-    from turbopi.policy import checked_noise
+    from turbopi.arguments import checked_noise
 
     shape = (policy.config.model.action_horizon, policy.config.model.action_dim)
     if given is not None:

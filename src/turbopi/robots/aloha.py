@@ -62,6 +62,7 @@ class Aloha(Robot):
     name = "aloha"
     state_dim = 14
     action_dim = 14
+    camera_counts = (1, 2, 3)
 
     @property
     def delta_mask(self) -> tuple[bool, ...] | None:  # type: ignore[override]

@@ -47,6 +47,7 @@ class Robot(Protocol):
     delta_mask      per action dimension: True where the model's action is relative to the state; None: nowhere
     reset_pose      joint positions to start from, for clients that ask for them; part of the policy's metadata
     default_prompt  for observations without one
+    camera_counts   how many cameras an observation may have, for warm-up; None: as many as `example` has
     """
 
     name: str = "custom"
@@ -55,6 +56,7 @@ class Robot(Protocol):
     delta_mask: tuple[bool, ...] | None = None
     reset_pose: list[float] | None = None
     default_prompt: str | None = None
+    camera_counts: tuple[int, ...] | None = None
 
     @abstractmethod
     def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:

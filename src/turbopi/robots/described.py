@@ -50,6 +50,10 @@ class Described(Robot):
         return sum(self.state.values())
 
     @property
+    def camera_counts(self) -> tuple[int, ...]:  # type: ignore[override]
+        return (len(self.cameras),)
+
+    @property
     def _keys(self) -> tuple[str, ...]:
         return (*self.cameras, *self.state, self.prompt_key)
 

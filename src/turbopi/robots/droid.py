@@ -39,6 +39,7 @@ class Droid(Robot):
     name = "droid"
     state_dim = 8
     action_dim = 8
+    camera_counts = (2,)
 
     def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
         base, wrist = (parse_image(require(observation, key, KEYS), key) for key in KEYS[:2])

@@ -82,6 +82,10 @@ class LeRobot(Robot):
     def delta_mask(self) -> tuple[bool, ...] | None:  # type: ignore[override]
         return None if self.relative_dims is None else tuple(self.relative_dims)
 
+    @property
+    def camera_counts(self) -> tuple[int, ...]:  # type: ignore[override]
+        return tuple(range(1, len(self.image_keys) + 1))
+
     def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
         named = self._renamed(observation)
         spare = [f"{IMAGES}empty_camera_{i}" for i in range(self.num_missing_cameras)]

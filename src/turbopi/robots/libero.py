@@ -41,6 +41,7 @@ class Libero(Robot):
     name = "libero"
     state_dim = 8
     action_dim = 7
+    camera_counts = (2,)
 
     @property
     def delta_mask(self) -> tuple[bool, ...] | None:  # type: ignore[override]

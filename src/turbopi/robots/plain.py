@@ -36,6 +36,7 @@ class Plain(Robot):
     """
 
     name = "plain"
+    camera_counts = tuple(range(1, len(CAMERAS) + 1))
 
     def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
         folder, sent = self._sent(observation)

@@ -149,11 +149,16 @@ def for_this_gpu(
     )
     cache = EngineCache(folder or default_folder(), environment)
     kernels = Kernels(library, cache.folder / f"kernels-{properties.name.replace(' ', '_')}-{library.version}.bin")
+
+    def build_here(specification: Specification) -> bytes:  # by threads of a pool, whose current device is the first
+        with torch.cuda.device(device):
+            return build(library, specification)
+
     return ModelEngines(
         config,
         weights,
         cache,
-        build=lambda specification: build(library, specification),
+        build=build_here,
         load=lambda specification, plan: Engine(library, specification.name, plan, kernels=kernels),
         loaded=kernels.keep,
         **options,

@@ -1,0 +1,98 @@
+"""What a call of a policy is asked for, checked: noise and seeds, numbers of steps, cameras and actions."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from turbopi.config import LIMITS
+from turbopi.engine.recent import MOST_LOOPS, MOST_STEPS, Loop, fit
+from turbopi.errors import ConfigError, ObservationError
+
+MAX_STEPS = LIMITS["num_denoising_steps"]  # far beyond any use; a larger number is a mistake, not a wish
+MAX_HORIZON = LIMITS["action_horizon"]
+MAX_CAMERAS = 16
+
+Error = type[ConfigError] | type[ObservationError]
+Numbers = int | Sequence[int] | None  # None: as the policy is made
+
+
+def checked_steps(num_steps: int, error: Error) -> int:
+    return _checked("the number of denoising steps", num_steps, MAX_STEPS, error)
+
+
+def checked_horizon(horizon: int, error: Error) -> int:
+    return _checked("the action horizon", horizon, MAX_HORIZON, error)
+
+
+def checked_cameras(cameras: int, error: Error) -> int:
+    return _checked("the number of cameras", cameras, MAX_CAMERAS, error)
+
+
+def _checked(what: str, number: int, most: int, error: Error) -> int:
+    whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
+    if not whole or not 1 <= number <= most:
+        raise error(f"{what} is {number!r}; it should be a whole number from 1 to {most}")
+    return int(number)
+
+
+def several(what: str, given: Numbers, default: Sequence[int], check: Callable[[int, Error], int]) -> list[int]:
+    """One number or several, checked, as a list without repetitions; `default` for None. Raises ConfigError."""
+    if given is None:
+        given = default
+    one_by_one = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    numbers = list(dict.fromkeys(check(number, ConfigError) for number in one_by_one))
+    if not numbers:
+        raise ConfigError(f"{what} is an empty list; give one number or several, or leave it out")
+    return numbers
+
+
+def warm_loops(steps: Sequence[int], horizons: Sequence[int]) -> list[Loop]:
+    """All pairs of steps and horizon, for a warm-up. Raises ConfigError if there are more than are kept."""
+    loops = [(n, horizon) for n in steps for horizon in horizons]
+    if not fit(loops):
+        raise ConfigError(
+            f"warm-up was given {len(loops)} pairs of steps and horizon, {sum(n for n, _ in loops)} steps together; "
+            f"backends keep graphs of {MOST_LOOPS} pairs and {MOST_STEPS} steps, so leave some out"
+        )
+    return loops
+
+
+def checked_noise(noise: Sequence[np.ndarray] | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Noise as float32[B, H, action_dim], which is `shape`. Raises ObservationError."""
+    try:
+        array = np.asarray(noise)
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a torch tensor that wants gradients
+        raise ObservationError(f"noise isn't an array of numbers: {error}") from None
+    if array.dtype.kind not in "fiu":
+        raise ObservationError(f"noise isn't an array of numbers: its dtype is {array.dtype}")
+    if array.ndim == 4 and array.shape[:2] == (1, 1):  # one row that brought its batch axis
+        array = array[0]
+    with np.errstate(over="ignore"):  # refused below
+        array = array.astype(np.float32, copy=False)
+    if array.shape != shape:
+        given, expected = (array.shape[1:], shape[1:]) if array.shape[:1] == shape[:1] else (array.shape, shape)
+        raise ObservationError(f"noise has shape {list(given)}, but this policy needs {list(expected)}")
+    if not np.isfinite(array).all():
+        raise ObservationError("noise has values that aren't finite")
+    return np.ascontiguousarray(array)
+
+
+def noise_for(
+    shape: tuple[int, int, int],
+    noise: Sequence[np.ndarray] | np.ndarray | None,
+    seed: int | Sequence[int] | None,
+    generator: np.random.Generator,
+) -> np.ndarray:
+    """float32[B, H, action_dim], given, or drawn from a seed for each row or from `generator`; or ObservationError."""
+    batch = shape[0]
+    if noise is not None:
+        if seed is not None:
+            raise ObservationError("noise and seed were both given; give one of them")
+        return checked_noise(noise, shape)
+    if seed is None:
+        return generator.standard_normal(shape, dtype=np.float32)
+    seeds = [seed + row for row in range(batch)] if isinstance(seed, int | np.integer) else seed
+    whole = isinstance(seeds, Sequence) and all(isinstance(one, int | np.integer) and one >= 0 for one in seeds)
+    if not whole or len(seeds) != batch:
+        raise ObservationError(f"seed {seed!r} should be a whole number from 0, or one for each of {batch} rows")
+    return np.stack([np.random.default_rng(one).standard_normal(shape[1:], dtype=np.float32) for one in seeds])

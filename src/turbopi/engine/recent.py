@@ -1,0 +1,58 @@
+"""Which denoising loops a backend keeps graphs, tables and kernels of: those used last."""
+
+import logging
+from collections.abc import Callable, Iterable
+from typing import Any
+
+logger = logging.getLogger(__name__)
+
+Loop = tuple[int, int]  # number of denoising steps, action horizon
+
+# A policy has one loop, a study a handful. What is kept of each step is up to 1.27 MB: Pi0.5's modulation (0.45 MB) and
+# what the denoising kernel makes of it. So all loops together keep 1.3 GB at most, and eight of ten steps 0.1 GB.
+MOST_LOOPS = 8
+MOST_STEPS = 1024  # of all loops together; one loop may always have as many as the policy takes
+
+
+class RecentLoops:
+    """The loops in use, least recently used first; `forget` is told of each that must make room for another.
+
+    It is told within `use`: a backend calls that while no graph of another loop runs.
+    """
+
+    def __init__(self, forget: Callable[[Loop], None]) -> None:
+        self._forget = forget
+        self._loops: dict[Loop, None] = {}
+        self._last: Loop | None = None
+        self.forgotten = 0
+
+    def __iter__(self) -> Any:
+        return iter(self._loops)
+
+    def use(self, loop: Loop) -> None:
+        """This loop is about to be used: make it the most recent one, and room for it if it is new."""
+        if loop == self._last:
+            return
+        self._loops.pop(loop, None)
+        while self._loops and not fit((*self._loops, loop)):
+            oldest = next(iter(self._loops))
+            del self._loops[oldest]
+            self.forgotten += 1
+            logger.info("denoising in %d steps, H=%d, makes room for other loops: its graphs are forgotten", *oldest)
+            self._forget(oldest)
+        self._loops[loop] = None
+        self._last = loop
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "denoising_loops": [f"{steps} steps, H={horizon}" for steps, horizon in self._loops],
+            "most_loops": MOST_LOOPS,
+            "most_steps_together": MOST_STEPS,
+            "forgotten": self.forgotten,
+        }
+
+
+def fit(loops: Iterable[Loop]) -> bool:
+    """Whether so many loops are kept at once."""
+    loops = list(loops)
+    return len(loops) <= MOST_LOOPS and sum(steps for steps, _ in loops) <= MOST_STEPS

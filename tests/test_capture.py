@@ -1,0 +1,113 @@
+"""How graphs are captured: thread-locally, one at a time in the process, in exact float32."""
+
+import threading
+from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from turbopi.engine import graph
+from turbopi.engine.graph import CAPTURING, Graph
+from turbopi.model import exact
+
+
+class FakeStream(SimpleNamespace):
+    def wait_stream(self, other: Any) -> None: ...
+
+    def synchronize(self) -> None: ...
+
+
+class FakeCuda:
+    """PyTorch's graphs on a machine without a GPU; `captures` has what each was told."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.captures: list[dict[str, Any]] = []
+        event = SimpleNamespace(record=lambda stream: None)
+        monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: SimpleNamespace(replay=lambda: None))
+        monkeypatch.setattr(torch.cuda, "current_stream", lambda device: FakeStream(device=device))
+        monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
+        monkeypatch.setattr(torch.cuda, "Event", lambda **options: event)
+        monkeypatch.setattr(torch.cuda, "graph", self._graph)
+
+    @contextmanager
+    def _graph(self, captured: Any, **options: Any) -> Any:
+        self.captures.append(options)
+        yield
+
+
+def capture(run: Any) -> Graph:
+    return Graph(run, None, FakeStream(device=torch.device("cpu")))  # type: ignore[arg-type]
+
+
+def test_a_capture_is_thread_local(monkeypatch: pytest.MonkeyPatch) -> None:
+    cuda = FakeCuda(monkeypatch)
+    capture(lambda mark: mark("vision"))
+    (options,) = cuda.captures
+    assert options["capture_error_mode"] == "thread_local"
+
+
+def test_captures_of_several_threads_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second one neither runs nor empties a cache nor probes the device while the first one captures."""
+    FakeCuda(monkeypatch)
+    within, done, order = threading.Event(), threading.Event(), list[str]()
+
+    def first(mark: Any) -> None:
+        within.set()
+        assert done.wait(30)
+        order.append("first")
+
+    def second(mark: Any) -> None:
+        order.append("second")
+
+    def cache() -> None:
+        graph.empty_cache()
+        order.append("cache")
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
+    threads = [threading.Thread(target=capture, args=(first,))]
+    threads[0].start()
+    assert within.wait(30)
+    threads += [threading.Thread(target=capture, args=(second,)), threading.Thread(target=cache)]
+    for thread in threads[1:]:
+        thread.start()
+    for thread in threads[1:]:
+        thread.join(0.2)
+    assert order == [] and all(thread.is_alive() for thread in threads)
+    done.set()
+    for thread in threads:
+        thread.join(30)
+    assert order[:3] == ["first"] * 3 and order.count("second") == 3 and order.count("cache") == 1
+    assert CAPTURING.acquire(timeout=10)
+    CAPTURING.release()
+
+
+def test_what_is_captured_is_exact_whatever_the_caller_has_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeCuda(monkeypatch)
+    seen: list[bool] = []
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            capture(lambda mark: seen.append(exact._is_exact(exact.products()) and not exact.autocast()))
+            assert exact.autocast() == ["cpu"]
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision(before)
+    assert seen == [True] * 3
+
+
+def test_a_capture_that_fails_lets_the_next_one_have_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeCuda(monkeypatch)
+
+    def fail(mark: Any) -> None:
+        raise RuntimeError("no kernel")
+
+    with pytest.raises(RuntimeError, match="no kernel"):
+        capture(fail)
+    thread = threading.Thread(target=capture, args=(lambda mark: None,))
+    thread.start()
+    thread.join(30)
+    assert not thread.is_alive()

@@ -1,0 +1,169 @@
+"""What is kept for numbers of steps and horizons is bounded, and what is let go is let go whole."""
+
+import weakref
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from conftest import golden_cases, golden_model
+from tensorrt_fakes import golden_backend
+from test_begin import Unrun, on_cpu
+from test_engine import made_up
+from torch import Tensor
+
+from turbopi.backends.cuda_graph import HostRow
+from turbopi.backends.fused import FusedBackend
+from turbopi.backends.tensorrt import TensorRTBackend
+from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
+from turbopi.engine.call import CallShape
+from turbopi.engine.recent import MOST_LOOPS, MOST_STEPS, RecentLoops, fit
+from turbopi.engine.without_compiler import OPS
+from turbopi.errors import BackendUnavailable
+
+STEPS = range(1, 41)
+
+
+def test_the_least_recently_used_loop_goes() -> None:
+    gone: list[tuple[int, int]] = []
+    recent = RecentLoops(gone.append)
+    for steps in range(1, MOST_LOOPS + 1):
+        recent.use((steps, 10))
+    recent.use((1, 10))
+    assert gone == []
+    recent.use((MOST_LOOPS + 1, 10))
+    recent.use((2, 50))
+    assert gone == [(2, 10), (3, 10)]
+    assert list(recent)[-2:] == [(MOST_LOOPS + 1, 10), (2, 50)] and (1, 10) in list(recent)
+    assert recent.describe()["forgotten"] == 2 and recent.describe()["denoising_loops"][-1] == "2 steps, H=50"
+
+
+def test_many_steps_leave_room_for_few_loops() -> None:
+    """1.27 MB a step: all together stay at some 1.3 GB."""
+    gone: list[tuple[int, int]] = []
+    recent = RecentLoops(gone.append)
+    for steps in (10, 5, 1000, 20, 500):
+        recent.use((steps, 10))
+    assert gone == [(10, 10), (5, 10), (1000, 10)]
+    assert fit(recent) and sum(steps for steps, _ in recent) <= MOST_STEPS
+    recent.use((1000, 10))
+    assert (1000, 10) in list(recent)
+
+
+def test_forty_numbers_of_steps_leave_few_graphs_and_every_answer_is_right() -> None:
+    backend = on_cpu(cls=Unrun)
+    observation, noise = made_up("pi05", 2, 5)
+    first = {steps: backend.sample(observation, noise, steps).actions for steps in STEPS}
+    details = backend.describe()["graphs"]
+    assert details["kept"] == MOST_LOOPS + 1 == len(backend._graphs)  # and vision's, which is every loop's
+    assert details["forgotten"] == len(STEPS) - MOST_LOOPS and details["most_loops"] == MOST_LOOPS
+    assert details["denoising_loops"] == [f"{steps} steps, H=7" for steps in STEPS[-MOST_LOOPS:]]
+    assert len(backend._calls) == len(backend._tables) == MOST_LOOPS
+    for steps in (1, 20, 40, 39):
+        assert torch.equal(backend.sample(observation, noise, steps).actions, first[steps])
+
+
+def test_horizons_are_bounded_too_and_steps_they_share_stay() -> None:
+    backend = on_cpu(cls=Unrun)
+    observation, _ = made_up("pi05", 2, 5)
+    for horizon in range(1, 21):
+        backend.sample(observation, torch.zeros(1, horizon, 32), 2)
+    assert len(backend._calls) == MOST_LOOPS and list(backend._tables) == [2]
+
+
+def test_a_loop_without_a_compiler_is_let_go_as_well() -> None:
+    backend = on_cpu(cls=Unrun)
+    backend._ops = OPS
+    backend._cache = type(backend._cache).allocate(
+        backend.config, backend._cache.k.shape[1], backend.device, torch.float32, True
+    )
+    observation, noise = made_up("pi05", 1, 5)
+    for steps in STEPS[:12]:
+        backend.sample(observation, noise, steps)
+    assert len(backend._loops) == MOST_LOOPS
+
+
+def test_what_is_begun_is_finished_though_its_loop_makes_others_go() -> None:
+    backend = on_cpu(cls=Unrun)
+    observation, noise = made_up("pi05", 2, 5)
+    row = HostRow.of(observation, 0)
+    rest = (row.tokens, row.state, noise[0].numpy())
+    expected = {steps: on_cpu(cls=Unrun).sample(observation, noise, steps).actions for steps in (9, 1)}
+    for steps in STEPS[:MOST_LOOPS]:
+        backend.sample(observation, noise, steps)
+    begun = backend.begin(row.images)
+    assert torch.equal(begun.finish(*rest, MOST_LOOPS + 1).actions, expected[9])
+    begun = backend.begin(row.images)
+    assert torch.equal(begun.finish(*rest, 1).actions, expected[1])
+
+
+def test_what_is_forgotten_is_freed() -> None:
+    backend = on_cpu(cls=Unrun)
+    observation, noise = made_up("pi05", 2, 5)
+    backend.sample(observation, noise, 1)
+    (call,) = backend._calls.values()
+    buffer = weakref.ref(call)
+    del call
+    for steps in STEPS[1 : MOST_LOOPS + 1]:
+        backend.sample(observation, noise, steps)
+    assert buffer() is None
+
+
+class Fused(FusedBackend):
+    """Without a GPU: its kernels are fakes, and refuse horizons from 50 on."""
+
+    def __init__(self) -> None:
+        self.config, self.device = golden_model("pi05").config, torch.device("cpu")
+        self._graphs, self._calls, self._tables, self._loops = {}, {}, {}, {}
+        self._denoisers, self._refused, self._packed_expert = {}, {}, None
+        self._recent = RecentLoops(self._forget)
+        self.expert_on = "device"
+
+    def _denoising_kernel(self, horizon: int, rows: int, table: Tensor | None) -> Any:
+        if horizon >= 50:
+            raise BackendUnavailable("too many")
+        self._put_expert_away()
+        return SimpleNamespace()
+
+    def _keep_expert_on(self, device: torch.device) -> None:
+        self.expert_on = "host" if self._away else "device"
+
+    def _put_expert_away(self) -> None:
+        self._away = True
+        super()._put_expert_away()
+        self._away = False
+
+    _away = False
+
+    def call(self, steps: int, horizon: int) -> Any:
+        self._recent.use((steps, horizon))
+        return self._make_denoiser(CallShape(2, 16, horizon, steps), None)
+
+
+def test_fuseds_kernels_go_with_their_loops_and_the_expert_goes_away_with_the_last_graph_that_reads_it() -> None:
+    backend = Fused()
+    assert backend.call(10, 50) is None and backend.expert_on == "device"
+    for steps in range(1, MOST_LOOPS):
+        assert backend.call(steps, 10) is not None
+    assert backend.expert_on == "device" and len(backend._refused) == 1  # a graph of operations points to it
+    backend.call(MOST_LOOPS, 10)
+    assert not backend._refused and backend.expert_on == "host"
+    assert backend.call(10, 50) is None and backend.expert_on == "device"
+    for steps in STEPS:
+        backend.call(steps, 10)
+    assert len(backend._denoisers) == MOST_LOOPS and backend.expert_on == "host"
+
+
+@pytest.mark.parametrize("cls", [TensorRTBackend, TensorRTPipelinedBackend])
+def test_graphs_around_engines_are_bounded(cls: type[TensorRTBackend], tmp_path: Path) -> None:
+    case, backend = golden_cases()["b_third_masked"], golden_backend(cls, "pi05", tmp_path)
+    expected = backend.sample(case.observation, case.noise, 1).actions
+    for steps in range(2, 13):
+        backend.sample(case.observation, case.noise, steps)
+    parts = 1 if cls is TensorRTBackend else 2
+    details = backend.describe()["graphs"]
+    assert details["denoising_loops"] == [f"{steps} steps, H={case.noise.shape[1]}" for steps in range(5, 13)]
+    assert len({key.num_steps for key in backend._calls}) == len(backend._tables) == MOST_LOOPS
+    assert details["kept"] == parts * len(backend._calls)
+    assert torch.equal(backend.sample(case.observation, case.noise, 1).actions, expected)
