@@ -129,8 +129,8 @@ def test_a_pipelined_backends_served_actions_are_its_own(tmp_path: Path) -> None
     assert policy.pipelined
     steady = policy._noise
 
-    def noise(batch: int, given: Any, seed: Any) -> np.ndarray:
-        return steady(batch, None, 0)
+    def noise(batch: int, horizon: int, given: Any, seed: Any) -> np.ndarray:
+        return steady(batch, horizon, None, 0)
 
     policy._noise = noise  # all calls get the noise of one seed
     observations = [policy.example_observation(seed) for seed in range(3)]
