@@ -83,6 +83,21 @@ def test_a_server_is_evaluated(tmp_path: Path) -> None:
     assert "task 1, initial state 0: success" in result.stdout and "100.0 % [20.7, 100.0]" in result.stdout
 
 
+def test_a_foreign_label_is_printed_as_it_is(tmp_path: Path) -> None:
+    """And isn't taken for the terminal's markup, which would end the command after the run."""
+    policy = SeekingPolicy()
+    policy.metadata["backend"] = "[/red]"
+    with serve.running(policy) as server:
+        for name in "ab":
+            command = f"eval reacher --port {server.port} --tasks 1 --trials 1 --videos none --max-steps 5"
+            result = turbopi(command, "--out", tmp_path / name)
+            assert result.exit_code == 0, result.output
+            assert "[/red]" in result.stdout
+    result = turbopi("compare", tmp_path / "a", tmp_path / "b", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert "[/red]" in result.stdout
+
+
 @pytest.mark.usefixtures("seeking")
 def test_crashes_give_exit_code_1(tmp_path: Path) -> None:
     command = f"eval evaluate_fakes:TroubledSimulator {QUICK} --tasks 0 --initial-states 0,3 --max-steps 5"

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluate_fakes import SeekingPolicy, run
+from file_helpers import no_room
 
-from turbopi.errors import ConfigError
+from turbopi.errors import ConfigError, OutputError
 from turbopi.evaluate.compare import HEADS, cells, compare, write_comparison
 from turbopi.evaluate.episode import Frame
 from turbopi.evaluate.plan import VideoPlan, parse_numbers
+from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.report import write_report
-from turbopi.evaluate.results import load_results
-from turbopi.evaluate.sources import LocalPolicy
+from turbopi.evaluate.sources import Answer, LocalPolicy
 from turbopi.evaluate.video import chunk_groups, draw_frame, write_video
 from turbopi.evaluate.visited import Visited, action_error
 
@@ -231,9 +232,56 @@ def test_visited_observations_give_the_action_error(tmp_path: Path) -> None:
     assert action_error([], source) is None
 
 
+def visit(visited: Visited, number: int) -> None:
+    observation = {"observation/image": np.full((8, 8, 3), number, np.uint8), "prompt": "x"}
+    visited(None, 0, observation, number, Answer(np.zeros((2, 7)), None))  # type: ignore[arg-type]
+
+
+def test_a_run_that_never_began_leaves_the_earlier_sample(tmp_path: Path) -> None:
+    first = Visited(tmp_path)
+    visit(first, 1)
+    first.save()
+    before = (tmp_path / "visited.npz").read_bytes()
+    for restart in (False, True):
+        Visited(tmp_path, restart=restart).save()
+        assert (tmp_path / "visited.npz").read_bytes() == before
+    again = Visited(tmp_path, restart=True)
+    visit(again, 2)
+    again.save()
+    assert [int(entry["seed"]) for entry in Visited(tmp_path).entries] == [2]
+
+
+def test_a_damaged_sample_is_refused_by_file(tmp_path: Path) -> None:
+    file = tmp_path / "visited.npz"
+    sample = Visited(tmp_path)
+    visit(sample, 1)
+    sample.save()
+    whole = file.read_bytes()
+    for content in (b"", b"text", whole[:-40], whole.replace(b"0|seed", b"2|seed")):
+        file.write_bytes(content)
+        with pytest.raises(ConfigError, match=f"^{file}"):
+            Visited(tmp_path)
+    np.savez(file, seen=3, count=2)
+    with pytest.raises(ConfigError, match="lacks entries; give another --out, or --restart"):
+        Visited(tmp_path)
+
+
+def test_a_film_that_cant_be_written_leaves_the_earlier_one(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="pip install 'imageio[ffmpeg]'")
+    file = tmp_path / "a.mp4"
+    write_video(file, [frame()], "x", "success", "libero", 4.0)
+    before = file.read_bytes()
+    with (
+        no_room(1000),
+        pytest.raises(OutputError, match=f"can't write {file}: ffmpeg could not finish it; is there room?"),
+    ):
+        write_video(file, [frame(step) for step in range(20)], "x", "success", "libero", 4.0)
+    assert file.read_bytes() == before and [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+
+
 def test_numbers_and_ranges_are_read() -> None:
     assert parse_numbers("--tasks", "0,2,5-7") == [0, 2, 5, 6, 7]
-    for text in ("", "a", "3-", "-3", "1,,2"):
+    for text in ("", "a", "3-", "-3", "1,,2", "¹", "0-9999999999", "1" * 5000):
         with pytest.raises(ConfigError, match=r"--tasks is .*expected whole numbers and ranges"):
             parse_numbers("--tasks", text)
     with pytest.raises(ConfigError, match="nothing in that range"):

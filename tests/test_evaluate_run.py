@@ -1,20 +1,27 @@
 """Whole runs in the built-in simulator: scheduling, batching, resuming, crashes, and what is written."""
 
+import errno
 import html
 import json
+import multiprocessing
+import os
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
+import evaluate_fakes
 import numpy as np
 import pytest
 from evaluate_fakes import NO_VIDEOS, SeekingPolicy, TroubledSimulator, jobs_for, run
 
-from turbopi.errors import ConfigError, TurboPiError
+from turbopi.errors import ActionError, ConfigError, OutputError, TurboPiError
 from turbopi.evaluate.plan import VideoPlan, noise_seed
-from turbopi.evaluate.results import Results, load_results
+from turbopi.evaluate.reading import load_results
+from turbopi.evaluate.results import Results
 from turbopi.evaluate.schedule import TooManyCrashes
+from turbopi.evaluate.sources import PolicyRefused
+from turbopi.files import alone_in
 from turbopi.sim import SimulatorUnavailable
 
 TROUBLED = "evaluate_fakes:TroubledSimulator"
@@ -192,19 +199,96 @@ def test_results_are_replaced_as_a_whole(tmp_path: Path) -> None:
     assert not broken and not (tmp_path / "results.json.tmp").exists()
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("", "is neither"),
-        ("{", "can't be read"),
-        ('{"format": 99}', "isn't a result of this version"),
-        ('{"format": 1}', "isn't a complete result: KeyError"),
-    ],
-)
-def test_files_that_are_no_results_are_refused(tmp_path: Path, text: str, why: str) -> None:
-    (tmp_path / "results.json").write_text(text)
-    with pytest.raises(ConfigError, match=why if text else "can't be read"):
-        load_results(tmp_path)
+def hold(folder: Path, ready: Any, done: Any) -> None:
+    """What another `turbopi eval` does as long as it runs."""
+    with alone_in(folder, "another evaluation"):
+        ready.set()
+        done.wait(120)
+
+
+def test_two_runs_in_one_folder_dont_lose_each_others_results(tmp_path: Path) -> None:
+    run(tmp_path, SeekingPolicy(), states=(0,))
+    before = (tmp_path / "results.json").read_bytes()
+    spawn = multiprocessing.get_context("spawn")
+    ready, done = spawn.Event(), spawn.Event()
+    other = spawn.Process(target=hold, args=(tmp_path, ready, done))
+    other.start()
+    assert ready.wait(120)
+    for restart in (False, True):
+        with pytest.raises(
+            ConfigError, match=f"{tmp_path} is being written by another evaluation, process {other.pid}"
+        ):
+            run(tmp_path, SeekingPolicy(), states=(0, 1), restart=restart)
+    assert (tmp_path / "results.json").read_bytes() == before
+    done.set()
+    other.join(120)
+    assert run(tmp_path, SeekingPolicy(), states=(0, 1)).complete
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_what_another_run_finished_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the reading of the folder and the first episode."""
+    real, others = evaluate_fakes.prepare, []
+
+    def prepare_and_be_overtaken(*args: Any, **options: Any) -> Results:
+        prepared = real(*args, **options)
+        monkeypatch.setattr(evaluate_fakes, "prepare", real)
+        others.append(run(tmp_path, SeekingPolicy(), states=(1,)))
+        return prepared
+
+    monkeypatch.setattr(evaluate_fakes, "prepare", prepare_and_be_overtaken)
+    results = run(tmp_path, SeekingPolicy(), states=(0,))
+    assert len(others) == 1 and set(results.episodes) == set(load_results(tmp_path).episodes) == {(0, 0), (0, 1)}
+
+
+def test_a_full_disk_leaves_the_earlier_results_and_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(tmp_path, SeekingPolicy(), states=(0, 1))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.name != "workers.log"}
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(
+            OutputError, match=rf"can't write {tmp_path}/results\.json: No space left on device; make room"
+        ):
+            run(tmp_path, SeekingPolicy(), states=(0, 1, 2))
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.name != "workers.log"} == before
+    assert run(tmp_path, SeekingPolicy(), states=(0, 1, 2)).complete
+
+
+def test_a_policy_that_refuses_its_own_actions_aborts_that_episode_alone(tmp_path: Path) -> None:
+    """As Turbo-Pi's policies do with actions that aren't finite; the batch's other observations are asked again."""
+
+    class Finding(SeekingPolicy):
+        def infer_batch(self, observations: Any, seed: Any) -> Any:
+            if any(self.is_bad(one) for one in seed):
+                raise ActionError("the model computed nan at [2, 1]")
+            return super().infer_batch(observations, seed)
+
+        def is_bad(self, seed: int) -> bool:
+            return seed == noise_seed(7, 0, 1, 0)
+
+    results = run(tmp_path, Finding(), states=(0, 1, 2), workers=3, max_batch=3, videos=VideoPlan("sample"))
+    assert [episode.status for episode in results.in_order()] == ["success", "aborted", "success"]
+    message = str(results.episodes[0, 1].message)
+    assert message == "step 0: the model computed nan at [2, 1]; the episode was aborted"
+
+
+@pytest.mark.parametrize("shape", [(0, 7), (4, 7), (10, 6), (10, 8)])
+def test_a_policy_whose_later_chunks_dont_fit_ends_the_run_with_the_shape(tmp_path: Path, shape: Any) -> None:
+    class Changing(SeekingPolicy):
+        def infer_batch(self, observations: Any, seed: Any) -> Any:
+            results = super().infer_batch(observations, seed)
+            return [{"actions": np.zeros(shape)}] if len(self.batches) > 1 else results
+
+    said = rf"actions of shape \[{shape[0]}, {shape[1]}\]; expected at least 5 actions of 7 numbers"
+    with pytest.raises(PolicyRefused, match=said):
+        run(tmp_path, Changing(), states=(0,))
+    assert load_results(tmp_path).episodes == {}
 
 
 def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:

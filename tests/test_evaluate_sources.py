@@ -1,16 +1,25 @@
 """Policies behind the websocket, policies that don't fit, and servers that go away."""
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
+import websockets.sync.server
 from evaluate_fakes import SeekingPolicy, run
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from websockets.exceptions import ConnectionClosed
 
 from turbopi import serve
-from turbopi.errors import ConfigError, ObservationError
-from turbopi.evaluate.results import load_results
-from turbopi.evaluate.sources import LocalPolicy, PolicyLost, PolicyRefused, RemotePolicy, check_fit
+from turbopi.errors import ActionError, ConfigError, ObservationError
+from turbopi.evaluate.reading import load_results
+from turbopi.evaluate.sources import Answer, LocalPolicy, PolicyLost, PolicyRefused, RemotePolicy, check_fit
+from turbopi.serve.wire import MAX_BYTES, pack
 from turbopi.sim import SimSettings, create
 
 SETTINGS = SimSettings(camera_px=64)
@@ -113,3 +122,163 @@ def test_answers_that_hold_no_chunk_are_refused(result: Any, why: str) -> None:
 
     with pytest.raises((PolicyRefused, ConfigError), match=why):
         fit(Odd())
+
+
+# -- servers of any kind -----------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def foreign(greeting: Any, *replies: Any) -> Iterator[RemotePolicy]:
+    """A policy behind a server that sends these messages whatever it is asked; bytes and text as they are."""
+
+    def handle(connection: Any) -> None:
+        with suppress(ConnectionClosed):
+            for number, message in enumerate((greeting, *replies)):
+                if number:
+                    connection.recv()
+                connection.send(message if isinstance(message, bytes | str) else msgpack.packb(message))
+            connection.close()
+
+    with websockets.sync.server.serve(handle, "127.0.0.1", 0, compression=None) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        source = None
+        try:
+            source = RemotePolicy("127.0.0.1", server.socket.getsockname()[1])
+            yield source
+        finally:
+            if source is not None:
+                source.close()
+            server.shutdown()
+            thread.join()
+
+
+def ask(source: RemotePolicy) -> Answer:
+    return source.infer([{"prompt": "x"}], [0])[0]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "why"),
+    [
+        ("hello", "sent text where a message should be: hello"),
+        (b"\xc1", "doesn't speak openpi's protocol: "),
+        ([1, 2], "sent a list where a map should be"),
+        (None, "sent a NoneType where a map should be"),
+        (
+            {"config": float("inf")},
+            "tells metadata.config = inf; expected text, finite numbers, lists and maps of them",
+        ),
+        ({"reset_pose": [0.0, float("nan")]}, "tells metadata.reset_pose = nan"),
+        ({"a": {"b": b"bytes"}}, r"tells metadata\.a\.b = b'bytes'"),
+        ({1: "one"}, "doesn't speak openpi's protocol: the keys of a map must be str"),
+        ({b"one": 1}, "tells metadata = {b'one': 1}"),
+    ],
+)
+def test_a_server_that_tells_nonsense_of_itself_is_refused_by_the_key(metadata: Any, why: str) -> None:
+    with pytest.raises(PolicyRefused, match=why), foreign(metadata):
+        pass
+
+
+def test_what_a_server_tells_of_itself_fits_into_the_results(tmp_path: Path) -> None:
+    pose = pack(
+        {"reset_pose": np.array([0.5, 1.0]), "robot": None, "precision": np.float32(2), "config": "\x1b[2J[/red]"}
+    )
+    with foreign(pose) as source:
+        assert source.about["metadata"] | {"config": 0} == {
+            "reset_pose": [0.5, 1.0],
+            "robot": None,
+            "precision": 2.0,
+            "config": 0,
+        }
+        assert source.label.isprintable() and source.label.endswith(" [2J[/red] 2.0")
+
+
+CHUNK = {b"__ndarray__": True, b"data": b"\0" * 4, b"dtype": "<f4", b"shape": [1, 1]}
+
+
+@pytest.mark.parametrize(
+    ("reply", "why"),
+    [
+        ("Traceback\n  File\nValueError: no such camera", "sent no actions but: ValueError: no such camera"),
+        ("", "sent no actions but: nothing"),
+        (b"", "doesn't speak openpi's protocol"),
+        (b"\xc1" * 100, "doesn't speak openpi's protocol"),
+        ({}, r"has no actions but the keys \[\]"),
+        ([1], "sent a list where a map should be"),
+        ({"actions": None}, "actions aren't numbers but object: None"),
+        ({"actions": "left"}, "actions aren't numbers but <U4: 'left'"),
+        ({"actions": [["1", "2"]]}, "actions aren't numbers but <U1"),
+        ({"actions": [[True]]}, "actions aren't numbers but bool"),
+        ({"actions": [[1.0], [1.0, 2.0]]}, "actions aren't numbers"),
+        ({"actions": [1.0]}, r"shape \[1\]; expected \[horizon, width\]"),
+        ({"actions": 3}, r"shape \[\]; expected \[horizon, width\]"),
+        ({"actions": [[1.0]], "policy_timing": {"infer_ms": "fast"}}, "policy_timing says infer_ms = 'fast'; expected"),
+        ({"actions": [[1.0]], "policy_timing": {"infer_ms": float("nan")}}, "infer_ms = nan"),
+        ({"actions": [[1.0]], "server_timing": {"infer_ms": -1}}, "infer_ms = -1"),
+        ({"actions": [[1.0]], "server_timing": {"infer_ms": [1]}}, r"infer_ms = \[1\]"),
+        ({"actions": {**CHUNK, b"dtype": "<c8"}}, "doesn't speak openpi's protocol"),
+        ({"actions": {**CHUNK, b"shape": [9, 9]}}, "doesn't speak openpi's protocol"),
+    ],
+)
+def test_an_answer_without_usable_actions_is_one_line(reply: Any, why: str) -> None:
+    with foreign({}, reply) as source, pytest.raises(PolicyRefused, match=why) as told:
+        ask(source)
+    assert "\n" not in str(told.value) and len(str(told.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    "extra", [{}, {"server_timing": None}, {"policy_timing": 3}, {"server_timing": {"infer_ms": None}}]
+)
+def test_times_are_optional(extra: Any) -> None:
+    with foreign({}, {"actions": [[1, 2.5]]} | extra) as source:
+        answer = ask(source)
+    assert answer.actions.tolist() == [[1.0, 2.5]] and answer.infer_ms is None
+
+
+def test_a_server_that_leaves_or_says_too_much_is_lost() -> None:
+    with foreign({}) as source, pytest.raises(PolicyLost, match=r"went away: .*give the same command to continue"):
+        ask(source)
+    with foreign({}, b"x" * (MAX_BYTES + 1)) as source, pytest.raises(PolicyLost, match=r"went away: .*too big"):
+        ask(source)
+
+
+def test_actions_that_the_server_found_not_finite_are_told_as_such() -> None:
+    with foreign({}, "bad actions: the model computed nan at [2, 1]") as source:
+        answer = ask(source)
+    assert answer.problem == "the model computed nan at [2, 1]"
+
+    class Refusing(SeekingPolicy):
+        def infer(self, observation: dict[str, Any]) -> dict[str, Any]:
+            raise ActionError("the model computed inf at [0, 0]")
+
+    with serve.running(Refusing()) as server:
+        remote = RemotePolicy("127.0.0.1", server.port)
+        assert ask(remote).problem == "the model computed inf at [0, 0]"
+        remote.close()
+
+
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=5)
+    | st.binary(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.dictionaries(st.sampled_from(["actions", "policy_timing", "server_timing", "infer_ms"]), VALUES) | VALUES)
+def test_any_answer_is_actions_or_refused(result: Any) -> None:
+    class Odd(SeekingPolicy):
+        def infer_batch(self, observations: Any, seed: Any) -> Any:
+            return [result]
+
+    try:
+        answer = LocalPolicy(Odd()).infer([{}], [0])[0]
+    except PolicyRefused:
+        return
+    assert answer.actions.dtype == np.float64 and answer.actions.ndim == 2
+    assert answer.infer_ms is None or 0 <= answer.infer_ms < float("inf")

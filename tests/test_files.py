@@ -1,14 +1,17 @@
 """Files appear whole or not at all, whatever happens while they are written."""
 
 import errno
+import fcntl
 import json
 import multiprocessing
 import os
+import platform
 import stat
+import sys
 import threading
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -16,7 +19,7 @@ from file_helpers import no_room
 from matplotlib.figure import Figure
 
 from turbopi.errors import CheckpointError, ConfigError, OutputError
-from turbopi.files import append_line, new_file, new_folder, whole_lines, write_whole
+from turbopi.files import alone_in, append_line, new_file, new_folder, whole_lines, write_whole
 from turbopi.plots import write_figure
 
 
@@ -208,9 +211,10 @@ def test_of_many_writers_at_once_none_fails_and_readers_find_a_whole_file(tmp_pa
 
 
 def test_a_path_that_another_writer_fills_becomes_the_file(tmp_path: Path) -> None:
-    with new_file(tmp_path / "film.mp4") as temporary:
+    with new_file(tmp_path / "film.mp4", ending=".mp4") as temporary:
         temporary.write_text("frames")
         assert names(tmp_path) == [temporary.name] and temporary.name.startswith(".film.mp4.")
+        assert temporary.suffix == ".mp4"
     assert names(tmp_path) == ["film.mp4"]
 
 
@@ -269,6 +273,101 @@ def test_an_empty_folder_that_cant_be_replaced_is_filled(tmp_path: Path, monkeyp
         (folder / "below").mkdir()
         (folder / "below" / "file").write_text("whole")
     assert target.stat().st_ino == before and names(target) == ["below"] and names(tmp_path) == ["mounted"]
+
+
+# -- one writer of several files ---------------------------------------------------------------------------------------
+
+
+def hold(folder: Path, ready: Any, done: Any) -> None:
+    with alone_in(folder, "a test"):
+        ready.set()
+        done.wait(120)
+
+
+@pytest.fixture(params=["locks", "no locks"])
+def disk(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A disk with locks, and one that knows none."""
+
+    def unsupported(descriptor: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    if request.param == "no locks":
+        monkeypatch.setattr(fcntl, "flock", unsupported)
+    return str(request.param)
+
+
+def test_a_second_writer_is_refused_with_the_first_ones_process(tmp_path: Path, disk: str) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    ready, done = spawn.Event(), spawn.Event()
+    first = spawn.Process(target=hold, args=(tmp_path, ready, done))
+    first.start()
+    assert ready.wait(120)
+    said = f"^{tmp_path} is being written by a test, process {first.pid} on {platform.node()}: wait until it is done"
+    with pytest.raises(ConfigError, match=said), alone_in(tmp_path, "a test", ConfigError):
+        pass
+    done.set()
+    first.join(120)
+    with alone_in(tmp_path, "a test"):
+        assert names(tmp_path) == [".turbopi.lock"]
+    assert names(tmp_path) == []
+
+
+def test_a_killed_writer_leaves_no_lock(tmp_path: Path, disk: str) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    ready, done = spawn.Event(), spawn.Event()
+    killed = spawn.Process(target=hold, args=(tmp_path, ready, done))
+    killed.start()
+    assert ready.wait(120)
+    killed.kill()
+    killed.join(120)
+    assert names(tmp_path) == [".turbopi.lock"]
+    with alone_in(tmp_path, "a test"):
+        assert str(os.getpid()) in (tmp_path / ".turbopi.lock").read_text()
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("left", ["", "process 0x7 on", "process 99999999999999999999 on here", "\0\xff"])
+def test_a_damaged_lock_is_no_lock(left: str, tmp_path: Path, disk: str) -> None:
+    (tmp_path / ".turbopi.lock").write_text(left)
+    with alone_in(tmp_path, "a test"):
+        pass
+
+
+def test_without_locks_another_hosts_is_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fcntl", None)  # as on systems that have none
+    (tmp_path / ".turbopi.lock").write_text("process 7 on elsewhere\n")
+    with (
+        pytest.raises(OutputError, match=r"process 7 on elsewhere: .* gone, delete .*\.turbopi\.lock"),
+        alone_in(tmp_path, "a test"),
+    ):
+        pass
+
+
+def test_one_of_many_gets_the_lock(tmp_path: Path) -> None:
+    """Locking and removing the lock's file don't come between each other: never two at once."""
+    inside, most, refused = 0, 0, 0
+    counting = threading.Lock()
+
+    def often() -> None:
+        nonlocal inside, most, refused
+        for _ in range(200):
+            try:
+                with alone_in(tmp_path, "a test"):
+                    with counting:
+                        inside += 1
+                        most = max(most, inside)
+                    with counting:
+                        inside -= 1
+            except OutputError:
+                with counting:
+                    refused += 1
+
+    threads = [threading.Thread(target=often) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == 1 and refused < 800
 
 
 # -- lines -------------------------------------------------------------------------------------------------------------

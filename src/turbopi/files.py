@@ -5,6 +5,7 @@
     with new_file(file) as temporary: ...                       or to a path
     with new_folder(folder) as temporary: ...
     append_line(file, line)                                     one more line of a .jsonl
+    with alone_in(folder, "another run"): ...                   one writer of several files
 
 The content goes to a temporary file of a name of its own in the same folder, hidden; it is on the disk before it takes
 the file's name. So a reader, a full disk or a kill at any moment finds the old file or the new one, and of several
@@ -15,6 +16,8 @@ reason.
 import errno
 import json
 import os
+import platform
+import re
 import secrets
 import shutil
 import stat
@@ -28,6 +31,7 @@ from turbopi.errors import OutputError, TurboPiError
 Error = type[TurboPiError]
 Content = str | bytes | Callable[[IO[bytes]], object]
 
+_LOCK = ".turbopi.lock"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -50,19 +54,19 @@ def write_whole(file: Path, content: Content, error: Error = OutputError, *, syn
 
 
 @contextmanager
-def new_file(file: Path, error: Error = OutputError, *, sync: bool = True) -> Iterator[Path]:
+def new_file(file: Path, error: Error = OutputError, *, sync: bool = True, ending: str = "") -> Iterator[Path]:
     """An empty temporary file that becomes `file` if all goes well, and disappears otherwise.
 
-    Whoever fills it goes by another name's ending than `file`'s: name the format. A file that is replaced leaves its
-    permissions to the new one; a link to a file stays a link. What can't be replaced, /dev/null or a pipe, is written
-    to as it is. Raises `error` for an OSError about this file, also from what fills it.
+    `ending` is the temporary name's, for what goes by it. A file that is replaced leaves its permissions to the new
+    one; a link to a file stays a link. What can't be replaced, /dev/null or a pipe, is written to as it is. Raises
+    `error` for an OSError about this file, also from what fills it.
     """
     with _errors_named(file, error):
         target = Path(os.path.realpath(file))
         if target.exists() and not target.is_file():
             yield target
             return
-        temporary = _temporary(target)
+        temporary = _temporary(target, ending)
         try:
             os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
             if target.exists():
@@ -112,6 +116,31 @@ def new_folder(dst: Path, error: Error = OutputError) -> Iterator[Path]:
         _sync_folder(target.parent)
 
 
+@contextmanager
+def alone_in(folder: Path, what: str, error: Error = OutputError) -> Iterator[None]:
+    """Be the only one who writes into a folder, which is made if it isn't there; `what` this is, others are told.
+
+    Raises `error`, with the other's process and host, if somebody is in there already. The system ends a lock with its
+    process, however that ends, so none is ever stale. On a disk without locks a file with the process and host stands
+    for it: it is stale if that process is gone; whether one of another host is, only a person can tell.
+    """
+    with _errors_named(folder / _LOCK, error):
+        folder.mkdir(parents=True, exist_ok=True)
+        file = folder / _LOCK
+        descriptor = _lock(file)
+    if descriptor is None:
+        raise error(
+            f"{folder} is being written by {what}, {_owner(file) or 'of another process'}: wait until it is done, or "
+            f"write to another folder. If that process is gone, delete {file}"
+        )
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            file.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
 def append_line(file: Path, line: str, error: Error = OutputError) -> None:
     """Append a line to a .jsonl, whole or not at all. Raises `error` if it can't be written.
 
@@ -149,8 +178,8 @@ def whole_lines(file: Path) -> list[str]:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-def _temporary(target: Path) -> Path:
-    return Path(f"{_temporary_prefix(target)}.{os.getpid()}-{secrets.token_hex(6)}.part")
+def _temporary(target: Path, ending: str = "") -> Path:
+    return Path(f"{_temporary_prefix(target)}.{os.getpid()}-{secrets.token_hex(6)}.part{ending}")
 
 
 def _temporary_prefix(target: Path) -> str:
@@ -220,6 +249,67 @@ def _end_of_lines(stream: IO[bytes]) -> tuple[int, bytes]:
     except (ValueError, RecursionError):
         whole = False
     return end, tail if whole else b""
+
+
+def _lock(file: Path) -> int | None:
+    """A descriptor that holds the lock of a file, which names this process; None if another one has it."""
+    while True:
+        descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if not _try_lock(descriptor, file):
+                os.close(descriptor)
+                return None
+            if _is_the_same(descriptor, file):  # the one before may have removed it between our opening and locking
+                os.ftruncate(descriptor, 0)
+                os.write(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode())
+                return descriptor
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+
+
+def _try_lock(descriptor: int, file: Path) -> bool:
+    try:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):  # no locks on this system or disk
+        return not _is_running(_owner(file))
+    return True
+
+
+def _is_the_same(descriptor: int, file: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(file))
+    except FileNotFoundError:
+        return False
+
+
+def _owner(file: Path) -> str:
+    """ "process 123 on host", as a lock's file tells it, or nothing."""
+    try:
+        text = file.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""
+    return text if re.fullmatch(r"process \d{1,19} on [\w.-]{0,255}", text) else ""
+
+
+def _is_running(owner: str) -> bool:
+    if not owner:
+        return False
+    process, host = int(owner.split()[1]), owner.split(" on ")[1]
+    if host != platform.node():
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
 
 
 @contextmanager

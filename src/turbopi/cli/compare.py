@@ -1,10 +1,12 @@
 """`turbopi compare`."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from turbopi.cli.evaluate import EvalOptions, run_with_progress
@@ -57,7 +59,8 @@ def compare_command(
     steps, on observations that each of them met. Folders are compared as they are.
     """
     from turbopi.evaluate.compare import HEADS, LEGEND, cells, compare, document, write_comparison
-    from turbopi.evaluate.results import FILE, load_results
+    from turbopi.evaluate.reading import load_results
+    from turbopi.evaluate.results import FILE
 
     output = Output(as_json)
     if len(runs) < 2:
@@ -75,12 +78,13 @@ def compare_command(
         results, errors = _run_variants(options, runs, checkpoint, simulator, out, output)
         compared = compare(results, errors, across_calibrations=across_calibrations)
     table = Table(
-        title=f"{compared[0].results.protocol['suite']}: {compared[0].rate.trials} episodes", title_justify="left"
+        title=escape(f"{compared[0].results.protocol['suite']}: {compared[0].rate.trials} episodes"),
+        title_justify="left",
     )
     for number, name in enumerate(HEADS):
         table.add_column(name, justify="right" if number else "left", no_wrap=True)
     for run in compared:
-        table.add_row(*cells(run))
+        table.add_row(*map(escape, cells(run)))
     output.table(table)
     output.line(LEGEND)
     if out is not None:
@@ -111,9 +115,7 @@ def _run_variants(
         own = _options_of(variant, options)
         source = own.local_policy(checkpoint, output)
         folder = out / variant.folder
-        if options.restart and (folder / "visited.npz").exists():
-            (folder / "visited.npz").unlink()
-        visited = Visited(folder)
+        visited = Visited(folder, restart=options.restart)
         try:
             results.append(
                 run_with_progress(
@@ -167,7 +169,7 @@ def parse_variant(text: str, options: EvalOptions) -> tuple[str, str, int | None
     backend = parts[0]
     precision = parts[1] if len(parts) > 1 else options.precision
     known = backend in BACKENDS and precision in backends.PRECISIONS
-    if not known or len(parts) > 3 or not all(steps.isdigit() for steps in parts[2:]):
+    if not known or len(parts) > 3 or not all(re.fullmatch("[0-9]{1,9}", steps) for steps in parts[2:]):
         raise ConfigError(
             f"{text!r} is neither the folder of an evaluation nor a way to run: BACKEND[:PRECISION[:STEPS]], "
             f"with a backend of {', '.join(BACKENDS)}, and {' or '.join(backends.PRECISIONS)}"

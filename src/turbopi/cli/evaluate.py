@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -346,7 +347,7 @@ def _show(results: "Results", output: Output) -> None:
     from turbopi.evaluate.results import rate
 
     episodes = results.in_order()
-    table = Table(title=f"{results.protocol['suite']}: {results.label}", title_justify="left")
+    table = Table(title=escape(f"{results.protocol['suite']}: {results.label}"), title_justify="left")
     table.add_column("task", justify="right")
     table.add_column("instruction", overflow="fold")
     for name in ("solved", "success [95 % interval]", "steps", "crashed"):
@@ -361,7 +362,7 @@ def _show(results: "Results", output: Output) -> None:
         crashes = sum(not e.judged for e in own)
         if own:
             table.add_row(
-                index, instruction, f"{found.successes}/{found.trials}", str(found), steps, str(crashes or "-")
+                index, escape(instruction), f"{found.successes}/{found.trials}", str(found), steps, str(crashes or "-")
             )
     output.table(table)
     summary = results.summary()
@@ -382,4 +383,4 @@ def _show(results: "Results", output: Output) -> None:
 
 def _folder_name(suite: str, label: str, about: dict[str, Any]) -> str:
     text = "-".join(str(part) for part in (suite, about.get("config"), label) if part)
-    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in text)
+    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in text)[:80]

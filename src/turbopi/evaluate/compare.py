@@ -1,7 +1,7 @@
 """Several runs of the same episodes, beside each other: paired with the first of them."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,9 +49,9 @@ class Compared:
     @property
     def precision(self) -> str:
         """What the policy ran in, where it told; FP8 that was calibrated on noise says so."""
-        precision = str(self.results.policy.get("identity", {}).get("precision") or "-")
-        details = self.results.policy.get("about", {}).get("backend_details") or {}
-        noisy = isinstance(details, dict) and details.get("fp8", {}).get("observations") == RANDOM_NOISE
+        policy = self.results.policy
+        precision = str(_at(policy, "identity", "precision") or "-")
+        noisy = _at(policy, "about", "backend_details", "fp8", "observations") == RANDOM_NOISE
         calibration = _calibration(self.results)
         told = [precision, *([] if calibration is None else [calibration[:8]]), *(["random noise"] if noisy else [])]
         return ", ".join(told)
@@ -131,8 +131,7 @@ def check_same_calibration(runs: Sequence[Results]) -> None:
         if calibration is None:
             continue
         # a server doesn't tell its weights: what it tells besides stands for them
-        identity = run.policy.get("identity", {})
-        told = identity.get("weights") or identity.get("server", {}).get("config")
+        told = _at(run.policy, "identity", "weights") or _at(run.policy, "identity", "server", "config")
         other = first.setdefault(str(told), run)
         if _calibration(other) != calibration:
             raise ConfigError(
@@ -143,8 +142,15 @@ def check_same_calibration(runs: Sequence[Results]) -> None:
 
 
 def _calibration(run: Results) -> str | None:
-    found = run.policy.get("identity", {}).get("calibration")
+    found = _at(run.policy, "identity", "calibration")
     return None if found is None else str(found)
+
+
+def _at(value: Any, *keys: str) -> Any:
+    """What is at these keys inside each other; None if there is nothing, as in results that tell something else."""
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
 
 
 def document(compared: Sequence[Compared]) -> dict[str, Any]:

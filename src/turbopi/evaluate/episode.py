@@ -11,7 +11,7 @@ import numpy as np
 from turbopi.evaluate.plan import Job
 from turbopi.sim import Environment
 
-# Asks the policy at a step: observation -> actions float64[H, d]
+# Asks the policy at a step: observation -> actions float64[H, d]. Raises NoActions if it has none that can be used
 Ask = Callable[[int, dict[str, Any]], np.ndarray]
 
 
@@ -55,7 +55,10 @@ def run_episode(
     step, chunk, count = 0, np.zeros((1, 1)), 0
     while step < max_steps:
         observation = environment.observation()
-        chunk = ask(step, observation)
+        try:
+            chunk = ask(step, observation)
+        except NoActions as none:
+            return Ending("aborted", step, f"step {step}: {none}; the episode was aborted")
         count = min(replan, max_steps - step)
         if film is not None:
             film(Frame(step, [observation[key] for key in image_keys], chunk, count, 0))
@@ -90,7 +93,7 @@ def _problem(chunk: np.ndarray) -> str | None:
 class Worker:
     """Runs jobs that come through a connection, holding the environment of the last task.
 
-    Messages out   ("observation", step, observation)   answered with ("actions", chunk) or ("stop",)
+    Messages out   ("observation", step, observation)   answered with ("actions", chunk), ("problem", text) or ("stop",)
                    ("finished", status, steps, message, seconds, video)
                    ("crashed", traceback, seconds)
                    ("unavailable", text)   nothing can be simulated here at all
@@ -119,7 +122,7 @@ class Worker:
         )
         seconds = time.perf_counter() - start
         message, video = ending.message, None
-        if job.video and (ending.status != "success" or job.keep_success):
+        if frames and (ending.status != "success" or job.keep_success):
             try:
                 video = self._write_video(job, frames, ending.status)
             except OSError as error:  # a full disk, no ffmpeg: the verdict stands
@@ -155,7 +158,13 @@ class Worker:
         answer = self.connection.recv()
         if answer[0] == "stop":
             raise Stopped
+        if answer[0] == "problem":
+            raise NoActions(answer[1])
         return np.asarray(answer[1])
+
+
+class NoActions(Exception):
+    """The policy found itself that its actions can't be used."""
 
 
 class Stopped(Exception):

@@ -1,5 +1,6 @@
 """What is evaluated: which episodes, by which protocol."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
@@ -117,10 +118,10 @@ def parse_numbers(option: str, text: str) -> list[int]:
     """ "0,2,5-7" as [0, 2, 5, 6, 7]. Raises ConfigError, naming the option."""
     numbers: list[int] = []
     for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        if not first.isdigit() or (dash and not last.isdigit()):
+        found = re.fullmatch(r"\s*([0-9]{1,6})(?:-([0-9]{1,6}))?\s*", part)
+        if found is None:
             raise ConfigError(f"{option} is {text!r}; expected whole numbers and ranges, such as 0,2,5-7")
-        numbers += range(int(first), int(last or first) + 1)
+        numbers += range(int(found[1]), int(found[2] or found[1]) + 1)
     if not numbers:
         raise ConfigError(f"{option} is {text!r}: there is nothing in that range")
     return numbers

@@ -1,12 +1,15 @@
 """results.json: every episode of a run, written so that an interruption at any moment leaves a valid file."""
 
 import json
+import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
+
+import numpy as np
 
 from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Protocol
@@ -19,6 +22,7 @@ FILE = "results.json"
 _SAVE_EVERY_S = 3.0  # episodes of the last seconds are lost by a kill, and run again
 
 Status = Literal["success", "failure", "aborted", "crash"]
+STATUSES: tuple[str, ...] = get_args(Status)
 
 
 @dataclass(frozen=True)
@@ -106,7 +110,7 @@ class Results:
 
     def continue_from(self, earlier: "Results") -> None:
         """Take over the episodes of an interrupted run. Raises ConfigError if they were run in another way."""
-        mine, theirs = _flat(self._decisive()), _flat(earlier._decisive())
+        mine, theirs = _flat(plain(self._decisive())), _flat(plain(earlier._decisive()))
         for name in sorted({*mine, *theirs}):
             if mine.get(name) != theirs.get(name):
                 raise ConfigError(
@@ -126,7 +130,7 @@ class Results:
     def save(self) -> None:
         """Write the file as a whole: a reader, or a crash, sees the old one or the new one."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_whole(self.path, json.dumps(self.as_json(), ensure_ascii=False))
+        write_whole(self.path, json.dumps(self.as_json(), ensure_ascii=False, allow_nan=False))
         self._saved_at = time.monotonic()
 
     def summary(self) -> dict[str, Any]:
@@ -154,10 +158,10 @@ class Results:
         return {
             "format": FORMAT,
             "complete": self.complete,
-            "protocol": self.protocol,
-            "policy": self.policy,
-            "versions": self.versions,
-            "options": self.options,
+            "protocol": plain(self.protocol),
+            "policy": plain(self.policy),
+            "versions": plain(self.versions),
+            "options": plain(self.options),
             "started": self.started,
             "updated": _now(),
             "wall_seconds": round(self.wall_seconds, 1),
@@ -172,34 +176,28 @@ class Results:
         return {"protocol": self.protocol, "policy": self.policy.get("identity", {}), "versions": simulator}
 
 
-def load_results(folder: Path) -> Results:
-    """The run in a folder. Raises ConfigError if there is none, or none that can be read."""
-    path = folder / FILE if folder.is_dir() else folder
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"{folder} holds no {FILE}: it isn't the folder of an evaluation") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ConfigError(f"{path} can't be read: {error}") from error
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise ConfigError(f"{path} isn't a result of this version's `turbopi eval` (format {FORMAT})")
-    try:
-        tasks = [Task(**task) for task in document["tasks"]]
-        results = Results(
-            path.parent, document["protocol"], document["policy"], tasks, document["versions"], document["options"]
-        )
-        results.episodes = {(e["task"], e["initial_state"]): Episode(**e) for e in document["episodes"]}
-        results.planned = {(task, state) for task, state in document["planned"]}
-        results.started, results.wall_seconds = document["started"], document["wall_seconds"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise ConfigError(f"{path} isn't a complete result: {type(error).__name__}: {error}") from error
-    return results
-
-
 def protocol_json(protocol: Protocol) -> dict[str, Any]:
     """As it looks after a round trip through JSON, so that it compares equal."""
-    value: dict[str, Any] = json.loads(json.dumps(protocol.as_json()))
+    value: dict[str, Any] = plain(protocol.as_json())
     return value
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON has it: arrays as lists, numbers that aren't finite as null, anything else as its text."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int) else writable(str(value))
+
+
+def writable(text: str) -> str:
+    """`text` without what UTF-8 can't write: halves of characters, from a file's name that isn't UTF-8."""
+    return text.encode(errors="replace").decode()
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:

@@ -4,20 +4,24 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 
 import torch
 
 from turbopi.bench.provenance import provenance
+from turbopi.errors import ConfigError
 from turbopi.evaluate.episode import WorkerSetup
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan
+from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.report import write_report
-from turbopi.evaluate.results import FILE, Episode, Results, load_results, protocol_json
+from turbopi.evaluate.results import FILE, Episode, Results, protocol_json
 from turbopi.evaluate.schedule import OnAnswer, Scheduler
 from turbopi.evaluate.sources import PolicySource
 from turbopi.evaluate.video import check_can_write
 from turbopi.evaluate.workers import LOG
+from turbopi.files import alone_in
 from turbopi.sim import Simulator
 
 # Is told of every episode as it ends, with the results so far
@@ -35,8 +39,11 @@ def prepare(
     """Results for these jobs, with the episodes that the folder holds already unless `restart`: then `evaluate` removes
     them, once it can begin.
 
-    Raises ConfigError if those were run in another way, or by another policy.
+    Raises ConfigError if those were run in another way, by another policy, or are being written by another process.
     """
+    if folder.is_dir():
+        with _alone(folder):  # `evaluate` needs to be; who can't be should know before it is prepared
+            pass
     policy = {"label": source.label, "identity": source.identity, "about": source.about}
     versions = {"simulator": simulator.versions(), **provenance(torch.device("cpu"))}
     results = Results(folder, protocol_json(protocol), policy, [job.task for job in jobs], versions, {})
@@ -68,14 +75,11 @@ def evaluate(
 ) -> Results:
     """Run the jobs that have no verdict yet; add them to `results`, in whose folder everything is written.
 
-    Whatever ends it, Ctrl-C or a lost server, results.json and report.html then hold what was finished.
+    Whatever ends it, Ctrl-C or a lost server, results.json and report.html then hold what was finished. Raises
+    ConfigError while another process evaluates into that folder.
     """
     if videos.which != "none":
         check_can_write()
-    if results.replaces:
-        _clear(results.folder)
-    results.folder.mkdir(parents=True, exist_ok=True)
-    results.options = {"workers": num_workers, "max_batch": max_batch, "videos": asdict(videos)}
 
     def ended(episode: Episode, job: Job) -> None:
         results.add(episode)
@@ -94,20 +98,30 @@ def evaluate(
         protocol,
         setup,
         source,
-        simulator.image_keys,
+        simulator,
         num_workers=num_workers,
         max_batch=max_batch,
         on_episode=ended,
         on_answer=on_answer,
     )
-    start = time.monotonic()
-    try:
-        scheduler.run(pending(results, jobs))
-    finally:
-        results.wall_seconds += time.monotonic() - start
-        results.save()
-        write_report(results)
+    with _alone(results.folder):
+        if results.replaces:
+            _clear(results.folder)
+        elif (results.folder / FILE).exists():  # another process may have added to it since `prepare`
+            results.continue_from(load_results(results.folder))
+        results.options = {"workers": num_workers, "max_batch": max_batch, "videos": asdict(videos)}
+        start = time.monotonic()
+        try:
+            scheduler.run(pending(results, jobs))
+        finally:
+            results.wall_seconds += time.monotonic() - start
+            results.save()
+            write_report(results)
     return results
+
+
+def _alone(folder: Path) -> AbstractContextManager[None]:
+    return alone_in(folder, "another evaluation", ConfigError)
 
 
 def _clear(folder: Path) -> None:

@@ -18,10 +18,11 @@ import numpy as np
 from turbopi.errors import TurboPiError
 from turbopi.evaluate.episode import WorkerSetup
 from turbopi.evaluate.plan import Job, Protocol, noise_seed
-from turbopi.evaluate.results import Episode, Status
-from turbopi.evaluate.sources import Answer, PolicySource
+from turbopi.evaluate.results import Episode, Status, writable
+from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
 from turbopi.evaluate.workers import LOG, WorkerHandle
 from turbopi.images import resize_with_pad
+from turbopi.sim import Simulator
 
 MAX_CRASHES_IN_A_ROW = 5
 SILENCE_S = 600.0  # a worker that says nothing for so long hangs
@@ -65,7 +66,7 @@ class Scheduler:
         protocol: Protocol,
         setup: WorkerSetup,
         source: PolicySource,
-        image_keys: Sequence[str],
+        simulator: Simulator,
         *,
         num_workers: int,
         max_batch: int,
@@ -73,7 +74,8 @@ class Scheduler:
         on_answer: OnAnswer | None = None,
     ) -> None:
         assert num_workers >= 1 and max_batch >= 1
-        self._protocol, self._setup, self._source, self._image_keys = protocol, setup, source, image_keys
+        self._protocol, self._setup, self._source = protocol, setup, source
+        self._image_keys, self._action_dim = simulator.image_keys, simulator.action_dim
         self._num_workers = num_workers
         self._max_batch = min(max_batch, source.max_batch or max_batch)
         self._on_episode, self._on_answer = on_episode, on_answer
@@ -187,8 +189,9 @@ class Scheduler:
         told = self._running[worker]
         seed = self._protocol.sim.episode_seed(job.task.index, job.initial_state)
         lists = ([round(ms, 3) for ms in told.call_ms], [round(ms, 3) for ms in told.infer_ms], told.batch)
+        text = None if message is None else writable(message)
         episode = Episode(
-            job.task.index, job.initial_state, status, steps, seed, round(seconds, 2), *lists, message, video
+            job.task.index, job.initial_state, status, steps, seed, round(seconds, 2), *lists, text, video
         )
         self._on_episode(episode, job)
         if status != "crash":
@@ -221,8 +224,22 @@ class Scheduler:
             told.batch.append(len(batch))
             if answer.infer_ms is not None:
                 told.infer_ms.append(answer.infer_ms)
-            if self._on_answer is not None:
-                self._on_answer(request.job, request.step, request.observation, request.seed, answer)
             request.worker.heard = time.monotonic()
+            if answer.problem is not None:
+                reply: tuple[str, Any] = ("problem", answer.problem)
+            else:
+                self._check_shape(answer.actions)
+                reply = ("actions", answer.actions)
+                if self._on_answer is not None:
+                    self._on_answer(request.job, request.step, request.observation, request.seed, answer)
             with contextlib.suppress(OSError):  # it died meanwhile; the next message from it is its end
-                request.worker.connection.send(("actions", answer.actions))
+                request.worker.connection.send(reply)
+
+    def _check_shape(self, actions: np.ndarray) -> None:
+        """A policy that fitted at the beginning may answer otherwise later."""
+        horizon, width = actions.shape
+        if width != self._action_dim or horizon < self._protocol.replan:
+            raise PolicyRefused(
+                f"the policy answered with actions of shape {list(actions.shape)}; expected at least "
+                f"{self._protocol.replan} actions of {self._action_dim} numbers. What was finished is kept"
+            )

@@ -7,12 +7,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from turbopi.errors import ConfigError, ObservationError, TurboPiError
-from turbopi.serve.wire import WireError, pack, unpack
+from turbopi.errors import ActionError, ConfigError, ObservationError, TurboPiError
+from turbopi.reading import is_finite, shown
+from turbopi.serve.wire import MAX_BYTES, WireError, pack, unpack
 from turbopi.sim import SimSettings, Simulator
 
 CONNECT_S = 10.0
 ANSWER_S = 600.0  # a server's first call may compile
+BAD_ACTIONS = "bad actions: "  # begins a Turbo-Pi server's answer where the model computed NaN or infinity
+MAX_MS = 1e12
+MAX_TOLD = 10_000  # numbers of an array in a server's metadata
 
 
 class PolicyLost(TurboPiError):
@@ -20,15 +24,23 @@ class PolicyLost(TurboPiError):
 
 
 class PolicyRefused(TurboPiError):
-    """The policy server answered with an error instead of actions."""
+    """The policy answered with something else than actions: an error, or what isn't openpi's protocol."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """actions float64[H, d]; infer_ms: the model alone, as the policy itself measured it, if it did."""
+    """actions float64[H, d]; infer_ms: the model alone, as the policy itself measured it, if it did.
+
+    problem   why the actions can't be used, if the policy found that itself: they weren't finite, and aren't given
+    """
 
     actions: np.ndarray
     infer_ms: float | None
+    problem: str | None = None
+
+    @classmethod
+    def unusable(cls, problem: str) -> "Answer":
+        return cls(np.zeros((0, 0)), None, problem)
 
 
 class PolicySource(Protocol):
@@ -67,7 +79,13 @@ class LocalPolicy:
         self.label = label or default
 
     def infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Answer]:
-        results = self._policy.infer_batch(list(observations), seed=list(seeds))
+        try:
+            results = self._policy.infer_batch(list(observations), seed=list(seeds))
+        except ActionError as error:
+            if len(observations) == 1:
+                return [Answer.unusable(str(error))]
+            pairs = zip(observations, seeds, strict=True)  # the others' actions are good
+            return [self.infer([observation], [seed])[0] for observation, seed in pairs]
         return [_answer(result, "policy_timing") for result in results]
 
     def close(self) -> None:
@@ -107,7 +125,7 @@ class RemotePolicy:
                     url,
                     additional_headers=headers,
                     compression=None,
-                    max_size=None,
+                    max_size=MAX_BYTES,
                     open_timeout=CONNECT_S,
                     ping_interval=None,  # openpi's server answers no ping while it computes
                 )
@@ -123,12 +141,17 @@ class RemotePolicy:
                 f"no policy server at {url}: {_reason(error)}. Start one (turbopi serve CHECKPOINT{chosen}), "
                 "then give the same command again: finished episodes are kept"
             ) from error
-        metadata = _unpacked(greeting, self._where)
+        try:
+            metadata = _told(_unpacked(greeting, self._where), self._where)
+        except PolicyRefused:
+            self.close()
+            raise
         volatile = ("load_seconds", "backend_details", "backend_reason")
         self.about = {"server": self._where, "metadata": metadata}
         server = {name: value for name, value in metadata.items() if name not in volatile}
         self.identity = {"server": server, "calibration": calibration_of(metadata)}
-        described = " ".join(str(metadata[name]) for name in ("config", "backend", "precision") if name in metadata)
+        names = [name for name in ("config", "backend", "precision") if name in metadata]
+        described = " ".join(_printable(str(metadata[name])[:80]) for name in names)
         self.label = f"{self._where} {described}".strip()
 
     def infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Answer]:
@@ -150,8 +173,10 @@ class RemotePolicy:
                 "server again and give the same command to continue"
             ) from error
         if isinstance(reply, str):
-            last = reply.strip().splitlines()[-1] if reply.strip() else "nothing"
-            raise PolicyRefused(f"the policy server at {self._where} sent no actions but: {last}")
+            if reply.startswith(BAD_ACTIONS):
+                return Answer.unusable(_printable(reply.removeprefix(BAD_ACTIONS)))
+            lines = reply.strip().splitlines() or ["nothing"]
+            raise PolicyRefused(f"the policy server at {self._where} sent no actions but: {_printable(lines[-1])}")
         return _answer(_unpacked(reply, self._where), "policy_timing", "server_timing")
 
 
@@ -166,6 +191,8 @@ def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings,
         answer = source.infer([example], [0])[0]
     except (ObservationError, PolicyRefused) as error:
         raise ConfigError(f"the policy doesn't take the observations of {simulator.name}: {error}; {robot}") from error
+    if answer.problem is not None:
+        return answer  # of an example that no robot ever sees: episodes will show it
     horizon, width = answer.actions.shape
     if width != simulator.action_dim:
         raise ConfigError(
@@ -180,23 +207,51 @@ def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings,
 
 
 def _answer(result: Any, *timings: str) -> Answer:
+    """The actions, which may still be NaN, and the time. Raises PolicyRefused for whatever else this is."""
     if not isinstance(result, Mapping) or "actions" not in result:
-        found = f"the keys {sorted(map(str, result))}" if isinstance(result, Mapping) else f"a {type(result).__name__}"
+        found = f"the keys {shown(list(result))}" if isinstance(result, Mapping) else f"a {type(result).__name__}"
         raise PolicyRefused(f"the policy's answer has no actions but {found}")
     try:
-        actions = np.asarray(result["actions"], np.float64)
-    except (TypeError, ValueError) as error:
+        actions = np.asarray(result["actions"])
+    except (TypeError, ValueError, OverflowError) as error:  # lists of different lengths
         raise PolicyRefused(f"the policy's actions aren't numbers: {error}") from error
+    if actions.dtype.kind not in "fiu":
+        raise PolicyRefused(f"the policy's actions aren't numbers but {actions.dtype}: {shown(result['actions'])}")
     if actions.ndim != 2:
         raise PolicyRefused(f"the policy's actions have shape {list(actions.shape)}; expected [horizon, width]")
-    found_ms = [result[timing].get("infer_ms") for timing in timings if isinstance(result.get(timing), Mapping)]
-    infer_ms = next((float(ms) for ms in found_ms if ms is not None), None)
-    return Answer(actions, infer_ms)
+    infer_ms = next((ms for ms in (_milliseconds(result, timing) for timing in timings) if ms is not None), None)
+    return Answer(actions.astype(np.float64), infer_ms)
+
+
+def _milliseconds(result: Mapping[str, Any], timing: str) -> float | None:
+    """How long the model took, as a part of the answer tells it; None if it doesn't."""
+    told = result.get(timing)
+    if told is None or not isinstance(told, Mapping) or told.get("infer_ms") is None:
+        return None
+    value = told["infer_ms"].item() if isinstance(told["infer_ms"], np.generic) else told["infer_ms"]
+    if not is_finite(value) or not 0 <= value <= MAX_MS:
+        raise PolicyRefused(f"the policy's {timing} says infer_ms = {shown(value)}; expected milliseconds")
+    return float(value)
+
+
+def _told(value: Any, where: str, key: str = "metadata") -> Any:
+    """What a server tells of itself, as JSON has it. Raises PolicyRefused, with the key, for what JSON hasn't."""
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "fiubU" and value.size <= MAX_TOLD:
+        value = value.tolist()
+    if isinstance(value, Mapping) and all(isinstance(name, str) for name in value):
+        return {name: _told(item, where, f"{key}.{name}") for name, item in value.items()}
+    if isinstance(value, list):
+        return [_told(item, where, key) for item in value]
+    if value is None or isinstance(value, str | bool) or is_finite(value):
+        return value
+    raise PolicyRefused(
+        f"the server at {where} tells {key} = {shown(value)}; expected text, finite numbers, lists and maps of them"
+    )
 
 
 def _unpacked(data: Any, where: str) -> dict[str, Any]:
     if isinstance(data, str):
-        raise PolicyRefused(f"the server at {where} sent text where a message should be: {data.strip()[-300:]}")
+        raise PolicyRefused(f"the server at {where} sent text where a message should be: {_printable(data.strip())}")
     try:
         message = unpack(data)
     except WireError as error:
@@ -204,6 +259,11 @@ def _unpacked(data: Any, where: str) -> dict[str, Any]:
     if not isinstance(message, dict):
         raise PolicyRefused(f"the server at {where} sent a {type(message).__name__} where a map should be")
     return message
+
+
+def _printable(text: str) -> str:
+    """The end of a text on one line, without what would move a terminal's cursor."""
+    return "".join(c if c.isprintable() else " " for c in text[-500:])
 
 
 def _reason(error: BaseException) -> str:

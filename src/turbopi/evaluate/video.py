@@ -4,6 +4,7 @@ A frame is drawn with Pillow, which is a hundred times faster than a plot of its
 """
 
 import importlib.util
+import struct
 import textwrap
 from collections.abc import Sequence
 from functools import lru_cache
@@ -13,8 +14,9 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from turbopi.errors import TurboPiError
+from turbopi.errors import OutputError, TurboPiError
 from turbopi.evaluate.episode import Frame
+from turbopi.files import new_file
 
 VIEW = 320  # pixels of each camera's square
 PANEL = 150  # height of the chunk's plots
@@ -47,12 +49,31 @@ def write_video(
     groups = chunk_groups(robot, frames[0].chunk.shape[1])
     options: dict[str, Any] = {"fps": fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
     writer: Any  # imageio's own types lack the methods of its writers
-    with imageio.get_writer(path, **options) as writer:
-        for number, frame in enumerate(frames):
-            last = number == len(frames) - 1
-            picture = draw_frame(frame, caption, groups, ending if last else None)
-            for _ in range(repeats + (round(END_S * fps) if last else 0)):
-                writer.append_data(picture)
+    with new_file(path, ending=path.suffix) as temporary:
+        with imageio.get_writer(temporary, **options) as writer:
+            for number, frame in enumerate(frames):
+                last = number == len(frames) - 1
+                picture = draw_frame(frame, caption, groups, ending if last else None)
+                for _ in range(repeats + (round(END_S * fps) if last else 0)):
+                    writer.append_data(picture)
+        if not _is_finished(temporary):  # imageio doesn't tell that ffmpeg has failed
+            raise OutputError(f"can't write {path}: ffmpeg could not finish it; is there room?")
+
+
+def _is_finished(film: Path) -> bool:
+    """Whether an MP4 has all of its boxes, among them the index, which comes last. (ISO/IEC 14496-12, 4.2)"""
+    size, at, kinds = film.stat().st_size, 0, set()
+    with film.open("rb") as stream:
+        while at + 8 <= size:
+            stream.seek(at)
+            length, kind = struct.unpack(">I4s", stream.read(8))
+            if length == 1:
+                (length,) = struct.unpack(">Q", stream.read(8).ljust(8, b"\0"))
+            if length < 8:
+                return False
+            at += length
+            kinds.add(kind)
+    return at == size and b"moov" in kinds
 
 
 def chunk_groups(robot: str, width: int) -> list[tuple[str, dict[int, str]]]:

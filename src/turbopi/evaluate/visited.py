@@ -23,15 +23,12 @@ class Visited:
     Each entry: the observation as the policy got it, the noise's seed, and the actions it gave.
     """
 
-    def __init__(self, folder: Path, kept: int = KEPT) -> None:
-        """Continues the sample that the folder holds."""
+    def __init__(self, folder: Path, kept: int = KEPT, *, restart: bool = False) -> None:
+        """Continues the sample that the folder holds, unless `restart`. Raises ConfigError if that is damaged."""
         self._path, self._kept = folder / FILE, kept
-        self._rng = np.random.default_rng(0)
-        self.seen = 0
-        self.entries: list[dict[str, Any]] = []
-        if self._path.exists():
-            self.seen, self.entries = _read(self._path)
-            self._rng = np.random.default_rng(self.seen)
+        self.seen, self.entries = (0, []) if restart or not self._path.exists() else _read(self._path)
+        self._found = self.seen
+        self._rng = np.random.default_rng(self.seen)
 
     def __call__(self, job: Job, step: int, observation: dict[str, Any], seed: int, answer: Answer) -> None:
         self.seen += 1
@@ -45,6 +42,9 @@ class Visited:
             self.entries[place] = entry
 
     def save(self) -> None:
+        """Write the sample; if nothing was added to it, what the folder holds stays as it is."""
+        if self.seen == self._found:
+            return
         stored: dict[str, Any] = {"seen": self.seen, "count": len(self.entries)}
         for row, entry in enumerate(self.entries):
             stored |= {f"{row}|{name}": value for name, value in entry.items()}
@@ -103,11 +103,11 @@ def _read(path: Path) -> tuple[int, list[dict[str, np.ndarray]]]:
     kinds = [stored[name].dtype.kind for name in whole]
     if kinds != ["i", "i"] or not 0 <= stored["count"] <= stored["seen"]:
         raise ConfigError(
-            f"{path} isn't a sample of requests that `turbopi eval` wrote; give another --out, or delete it"
+            f"{path} isn't a sample of requests that `turbopi eval` wrote; give another --out, or --restart"
         )
     names = {name.split("|", 1)[1] for name in stored if "|" in name}
     rows = range(min(int(stored["count"]), len(stored)))
     absent = [f"{row}|{name}" for row in rows for name in names if f"{row}|{name}" not in stored]
     if absent or len(rows) < stored["count"] or (rows and not {"seed", "actions"} <= names):
-        raise ConfigError(f"{path} lacks {listing(absent) or 'entries'}; give another --out, or delete it")
+        raise ConfigError(f"{path} lacks {listing(absent) or 'entries'}; give another --out, or --restart")
     return int(stored["seen"]), [{name: stored[f"{row}|{name}"] for name in names} for row in rows]
