@@ -422,7 +422,7 @@ def test_every_presets_robot_can_be_made() -> None:
         ("droid", {"delta": True}, "robot droid has no option delta; it has none"),
         ("aloha", {"adapt": True}, "robot aloha has no option adapt; it has adapt_to_pi, delta_actions"),
         ("lerobot", {"state_dim": 3}, "robot lerobot needs the option image_keys, action_dim"),
-        ("absent.json", {}, r"can't read the robot's description absent\.json"),
+        ("absent.json", {}, r"absent\.json can't be read: No such file"),
         ("arm.json", {"a": 1}, "a robot described by a file takes no robot_options, got a"),
         (CREATED["libero"], {"a": 1}, "a robot given as an object takes no robot_options"),
         (ROBOTS["libero"], {}, "is a class; pass an instance"),
@@ -490,9 +490,9 @@ def test_a_description_may_name_its_prompt_key_and_reset_pose() -> None:
         ({"cameras": {"a": "base_0_rgb", "b": "base_0_rgb"}}, "gives one of the model's cameras to two keys"),
         ({"cameras": {"a": ["base_0_rgb"]}}, r"cameras\['a'\] must be one of"),
         ({"state": {}}, "state must be an object: key -> width"),
-        ({"state": {"a": 0}}, r"state\['a'\] must be a positive integer, got 0"),
-        ({"state": {"a": True}}, r"state\['a'\] must be a positive integer, got True"),
-        ({"action_dim": 7.0}, "action_dim must be a positive integer, got 7.0"),
+        ({"state": {"a": 0}}, r"state\['a'\] must be a whole number from 1 to 1024, got 0"),
+        ({"state": {"a": True}}, r"state\['a'\] must be a whole number from 1 to 1024, got True"),
+        ({"action_dim": 7.0}, "action_dim must be a whole number from 1 to 1024, got 7.0"),
         ({"delta_action_dims": 6}, "delta_action_dims must be a list such as"),
         ({"delta_action_dims": [6, 0]}, "delta_action_dims must be a list such as"),
         ({"delta_action_dims": [6, -2]}, r"delta_action_dims \[6, -2\] covers 8 dimensions, but action_dim is 7"),
@@ -517,7 +517,7 @@ def test_a_description_without_a_needed_field_is_refused(field: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [("{", "isn't JSON"), ("[]", "must be an object"), ("\xff", "isn't JSON")]
+    ("content", "message"), [("{", "isn't JSON"), ("[]", "is a list; expected an object"), ("\xff", "isn't JSON")]
 )
 def test_files_that_arent_descriptions_are_refused_by_name(tmp_path: Path, content: str, message: str) -> None:
     path = tmp_path / "arm.json"

@@ -81,7 +81,7 @@ def test_the_file_holds_what_was_measured(tmp_path: Path) -> None:
 
 def test_a_broken_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / calibrating.FILE).write_text(json.dumps({"scales": [{}]}))
-    with pytest.raises(ConfigError, match=r"isn't a calibration .*; delete it and build again"):
+    with pytest.raises(ConfigError, match=r"isn't a calibration of .*; delete it and build again"):
         Calibration.find(tmp_path)
 
 

@@ -10,7 +10,7 @@ Every size has a limit, LIMITS: a number beyond it is damage or a slip, and beli
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from turbopi.errors import ConfigError
 from turbopi.reading import is_finite, is_integer, shown
@@ -89,6 +89,10 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for sizes beyond LIMITS, and for sizes that don't fit each other."""
+        if self.kind not in get_args(Kind):
+            raise ConfigError(f"kind is {shown(self.kind)}; expected one of {', '.join(get_args(Kind))}")
+        if self.time_grid not in ("accumulated", "multiplied"):
+            raise ConfigError(f"time_grid is {shown(self.time_grid)}; expected 'accumulated' or 'multiplied'")
         for name, part in (("", self), ("vision ", self.vision), ("vlm ", self.vlm), ("expert ", self.expert)):
             _check_sizes(name, part)
         for attribute in ("depth", "num_heads", "num_kv_heads", "head_dim"):

@@ -15,12 +15,14 @@ import numpy as np
 import sentencepiece
 
 from turbopi.errors import ObservationError, TokenizerError
+from turbopi.reading import read_bytes, shown
 
 logger = logging.getLogger(__name__)
 
 TINY_TOKENIZER = Path(__file__).parent / "data" / "small_policy" / "tokenizer.model"  # 1024 pieces; ours
 FILE_NAMES = ("tokenizer.model", "paligemma_tokenizer.model")
 MAX_PROMPT_CHARACTERS = 20_000  # far past any model's tokens; keeps a hostile prompt from stalling the robot
+_MAX_BYTES = 64 * 2**20  # of a SentencePiece model; PaliGemma's has 4 MB
 _STATE_EDGES = np.linspace(-1, 1, 257)[:-1]
 _DOWNLOAD = "https://storage.googleapis.com/big_vision/paligemma_tokenizer.model"
 
@@ -200,10 +202,11 @@ def _not_found(places: Sequence[Path]) -> str:
 
 def _open(path: Path, vocab_size: int) -> PromptTokenizer:
     try:
-        processor = sentencepiece.SentencePieceProcessor(model_proto=path.read_bytes())
+        content = read_bytes(path, TokenizerError, limit=_MAX_BYTES)
+        processor = sentencepiece.SentencePieceProcessor(model_proto=content)
         pieces, bos = processor.vocab_size(), processor.bos_id()
-    except (OSError, RuntimeError) as error:
-        raise TokenizerError(f"{path} isn't a readable SentencePiece model: {error}") from error
+    except (RuntimeError, UnicodeDecodeError) as error:  # the second: a message that quotes a damaged piece
+        raise TokenizerError(f"{path} isn't a readable SentencePiece model: {shown(str(error))}") from error
     if pieces == 0:  # an empty file parses as an empty model
         raise TokenizerError(f"{path} isn't a SentencePiece model: it has no pieces")
     if pieces > vocab_size:

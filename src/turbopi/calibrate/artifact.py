@@ -22,6 +22,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.fp8 import E4M3, Directions
 from turbopi.errors import CalibrationError, ConfigError
 from turbopi.files import write_whole
+from turbopi.reading import is_finite, is_integer, read_json, shown
 
 logger = logging.getLogger(__name__)
 
@@ -81,6 +82,8 @@ class SiteScale:
         given = content.get("directions")
         if given is None:
             return cls(**content)
+        if not all(map(is_finite, (*given["scale"], given["rest"]))):
+            raise ValueError("directions that aren't finite numbers")
         codes = torch.frombuffer(bytearray(base64.b64decode(given["e4m3"], validate=True)), dtype=torch.uint8)
         scale = torch.tensor(given["scale"], dtype=torch.float32)
         found = Directions(codes.view(E4M3).view(-1, len(scale)), scale, float(given["rest"]))
@@ -219,12 +222,15 @@ class Quantization:
         if not path.is_file():
             raise CalibrationError(f"there is no file {path}; make it with `turbopi calibrate CKPT --out {path}`")
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = read_json(path, CalibrationError, limit=_MAX_BYTES, nan=True)
+        except CalibrationError as error:
+            raise CalibrationError(f"{error}, so it isn't a calibration that `turbopi calibrate` wrote") from error
+        try:
             if content["format"] != FORMAT:
-                raise CalibrationError(f"{path} is {content['format']!r}, not {FORMAT}")
-            if content["version"] not in range(1, VERSION + 1):
+                raise CalibrationError(f"{path} is {shown(content['format'])}, not {FORMAT}")
+            if not is_integer(content["version"]) or content["version"] not in range(1, VERSION + 1):
                 raise CalibrationError(
-                    f"{path} has version {content['version']} of {FORMAT}, this Turbo-Pi reads versions 1 to "
+                    f"{path} has version {shown(content['version'])} of {FORMAT}, this Turbo-Pi reads versions 1 to "
                     f"{VERSION}. Run `turbopi calibrate` again"
                 )
             for name in ("sites", "shapes", "report"):
@@ -233,6 +239,9 @@ class Quantization:
             _expect(isinstance(content["weights_sha256"], str), "weights_sha256", "text", content["weights_sha256"])
             source, warnings = report["observations"]["source"], report.get("warnings", [])
             _expect(isinstance(source, str), "the source of observations", "text", source)
+            for name, kind in (("calibration", dict), ("count", int)):
+                value = report["observations"].get(name, kind())
+                _expect(isinstance(value, kind), f"{name} of the observations", f"of type {kind.__name__}", value)
             listed = isinstance(warnings, list) and all(isinstance(one, str) for one in warnings)
             _expect(listed, "warnings", "a list of texts", warnings)
             found = {name: SiteScale.from_json(values) for name, values in content["sites"].items()}
@@ -240,7 +249,9 @@ class Quantization:
         except CalibrationError:
             raise
         except _UNSOUND as error:
-            raise CalibrationError(f"{path} isn't a calibration that `turbopi calibrate` wrote: {error!r}") from error
+            raise CalibrationError(
+                f"{path} isn't a calibration that `turbopi calibrate` wrote: {_unsound(error)}"
+            ) from error
 
 
 @dataclass(frozen=True)
@@ -284,7 +295,12 @@ def _reason(site: Site, entry: SiteScale, tier: str, parts: Sequence[str]) -> st
 
 
 _UNSOUND = (KeyError, TypeError, ValueError, OverflowError, RuntimeError)  # the last: tensors, or nested too deeply
+_MAX_BYTES = 512 * 2**20  # the directions of a full-size model are most of it
 _SCALES = (1e-30, 1e30)  # of an activation; further out float32 has no room for products
+
+
+def _unsound(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__} {error}".split())[:300]
 
 
 def _is_number(value: Any) -> bool:

@@ -10,6 +10,7 @@ import hashlib
 import importlib.util
 import json
 import logging
+import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from turbopi.export.graphs import Graph, graphs
 from turbopi.export.quantized import quantize_mlps
 from turbopi.files import new_folder
 from turbopi.model.reference import Pi0Model
+from turbopi.reading import Fields, file_inside, is_integer, read_json
 from turbopi.tensorrt.calibrate import Calibration
 from turbopi.tensorrt.networks import Fp8Scales
 
@@ -34,6 +36,7 @@ MANIFEST = "turbopi_onnx.json"
 GRAPHS = ("vision", "prompt", "prefix", "denoise_step")
 OPSET = 20  # the first with Gelu as one node
 FORMAT_VERSION = 1
+_AXIS = re.compile(r"\w+( \+ \d{1,6})?")  # a free axis: "prompt", "horizon + 1"
 INSTALL = "pip install 'turbopi[onnx]'"
 EXPORT_NEEDS = ("onnx", "onnxscript")
 
@@ -119,24 +122,45 @@ def open_export(folder: str | Path) -> Export:
     if not file.is_file():
         raise CheckpointError(f"{folder} has no {MANIFEST}: it isn't a folder that `turbopi export onnx` wrote")
     try:
-        manifest = json.loads(file.read_text())
-        version, files = manifest["format_version"], dict(manifest["files"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{file} can't be read ({error!r}); export again") from error
-    if version != FORMAT_VERSION:
-        raise CheckpointError(f"{file} has format version {version}, not {FORMAT_VERSION}; export again")
+        manifest, config = _read_manifest(file)
+    except (CheckpointError, ConfigError) as error:
+        raise CheckpointError(f"{error}; export again") from error
+    files = manifest["files"]
     for name in (*(f"{graph}.onnx" for graph in GRAPHS), *files):
         size = (folder / name).stat().st_size if (folder / name).is_file() else None
         if size is None or size != files.get(name):
             found = "is missing" if size is None else f"has {size} bytes instead of {files.get(name)}"
             raise CheckpointError(f"{folder / name} {found}; copy the whole folder or export again")
+    return Export(folder, config, manifest)
+
+
+def _read_manifest(file: Path) -> tuple[dict[str, Any], ModelConfig]:
+    """The manifest, in which everything is there that is used of it, and the model that it describes."""
+    manifest = read_json(file)
+    fields = Fields(manifest, file)
+    version = fields.integer("format_version", 0, 2**31)
+    if version != FORMAT_VERSION:
+        raise CheckpointError(f"{file} has format version {version}, not {FORMAT_VERSION}")
+    for name in fields.object("files").values:
+        file_inside(file.parent, name, file)
+    fields.integer("opset", 1, 1000)
+    fields.text("weights_sha256")
+    fields.object("versions")
+    for graph in GRAPHS:
+        for end in ("inputs", "outputs"):
+            signature = fields.object("graphs").object(graph).object(end)
+            for name in signature.values:
+                one = signature.object(name)
+                one.text("dtype")
+                if not all(is_integer(axis) or _AXIS.fullmatch(str(axis)) for axis in one.list("shape")):
+                    one.refuse("shape", "whole numbers and names of axes")
     try:
-        sizes = dict(manifest["sizes"])
+        sizes = dict(fields.object("sizes").values)
         vision, vlm = VisionConfig(**sizes.pop("vision")), GemmaConfig(**sizes.pop("vlm"))
         config = ModelConfig(vision=vision, vlm=vlm, expert=GemmaConfig(**sizes.pop("expert")), **sizes)
-    except (KeyError, TypeError) as error:
-        raise CheckpointError(f"{file}: its sizes aren't those of a model ({error!r}); export again") from error
-    return Export(folder, config, manifest)
+    except (KeyError, TypeError, ConfigError) as error:
+        raise CheckpointError(f"{file}: its sizes aren't those of a model ({error})") from error
+    return manifest, config
 
 
 def weights_sha256(state: Mapping[str, Tensor]) -> str:

@@ -20,18 +20,20 @@ def read_json(
     *,
     limit: int = MAX_JSON_BYTES,
     depth: int = MAX_JSON_DEPTH,
+    nan: bool = False,
     hint: str = "",
 ) -> dict[str, Any]:
     """The object that a JSON file holds. Raises `error`, naming the file, for everything else.
 
     limit   bytes of the file
     depth   of objects and lists inside each other
+    nan     take NaN and the infinities too, as Python writes them: of what was measured
     hint    put behind the reason for which a file can't be read: "; is the download complete?"
 
     Refused are: what is missing, no regular file, too large, not UTF-8, or not JSON; NaN, Infinity and numbers beyond
     float64, which no JSON has; whole numbers beyond 64 bits; a key that is given twice; text that isn't Unicode.
     """
-    value = parse_json(read_bytes(file, error, limit=limit, hint=hint), file, error, depth=depth)
+    value = parse_json(read_bytes(file, error, limit=limit, hint=hint), file, error, depth=depth, nan=nan)
     if not isinstance(value, dict):
         raise error(f"{file} is a {type(value).__name__}; expected an object")
     return value
@@ -40,10 +42,7 @@ def read_json(
 def parse_json(
     data: bytes, where: object, error: Error = CheckpointError, *, depth: int = MAX_JSON_DEPTH, nan: bool = False
 ) -> Any:
-    """The value of a JSON text in UTF-8, under the rules of `read_json`; `where` begins the messages.
-
-    nan   take NaN and the infinities too, as Python writes them: of what somebody measured
-    """
+    """The value of a JSON text in UTF-8, under the rules of `read_json`; `where` begins the messages."""
     try:
         value = json.loads(
             data.decode("utf-8"),

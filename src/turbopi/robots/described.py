@@ -1,7 +1,5 @@
 """A robot described by a small JSON file; docs/robots.md has an example and says what each field means."""
 
-import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.config import CAMERAS
+from turbopi.config import CAMERAS, LIMITS
 from turbopi.errors import ConfigError
 from turbopi.images import parse_image
 from turbopi.normalize import action_mask
+from turbopi.reading import is_finite, is_integer, listing, read_json, shown
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
@@ -24,6 +23,7 @@ from turbopi.robots.base import (
 )
 
 REQUIRED = ("name", "cameras", "state", "action_dim")
+_MOST = LIMITS["action_dim"]  # numbers in a state or an action: no model takes more
 OPTIONAL = ("delta_action_dims", "prompt_key", "default_prompt", "reset_pose")
 
 
@@ -81,12 +81,7 @@ def load_robot(path: str | Path) -> Described:
     not what it should be.
     """
     path = Path(path).expanduser()
-    try:
-        described = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"can't read the robot's description {path}: {error.strerror}") from error
-    except ValueError as error:  # not JSON, or not UTF-8
-        raise ConfigError(f"{path} isn't JSON: {error}") from error
+    described = read_json(path, ConfigError)
     try:
         return robot_from_dict(described)
     except ConfigError as error:
@@ -99,7 +94,7 @@ def robot_from_dict(described: Any) -> Described:
     unknown = sorted(set(described) - {*REQUIRED, *OPTIONAL})
     missing = [name for name in REQUIRED if name not in described]
     if unknown:
-        raise ConfigError(f"unknown field {', '.join(unknown)}; a robot has {', '.join((*REQUIRED, *OPTIONAL))}")
+        raise ConfigError(f"unknown field {listing(unknown)}; a robot has {', '.join((*REQUIRED, *OPTIONAL))}")
     if missing:
         raise ConfigError(f"{', '.join(missing)} missing; a robot needs {', '.join(REQUIRED)}")
     for name in ("name", "prompt_key"):
@@ -108,10 +103,10 @@ def robot_from_dict(described: Any) -> Described:
     _check_cameras(described["cameras"])
     _check_state(described["state"])
     action_dim = described["action_dim"]
-    _expect(_is_count(action_dim), "action_dim", "a positive integer", action_dim)
+    _expect(_is_count(action_dim), "action_dim", f"a whole number from 1 to {_MOST}", action_dim)
     prompt, pose = described.get("default_prompt"), described.get("reset_pose")
     _expect(prompt is None or isinstance(prompt, str), "default_prompt", "text", prompt)
-    pose_is_right = isinstance(pose, list) and all(_is_number(value) for value in pose)
+    pose_is_right = isinstance(pose, list) and all(map(is_finite, pose))
     _expect(pose is None or pose_is_right, "reset_pose", "a list of numbers", pose)
     fields = {name: value for name, value in described.items() if name != "delta_action_dims"}
     return Described(**fields, delta_mask=_delta_mask(described.get("delta_action_dims"), described))
@@ -122,39 +117,32 @@ def _check_cameras(cameras: Any) -> None:
     for key, camera in cameras.items():
         _expect(camera in CAMERAS, f"cameras[{key!r}]", f"one of {', '.join(CAMERAS)}", camera)
     if len(set(cameras.values())) < len(cameras):
-        raise ConfigError(f"cameras gives one of the model's cameras to two keys: {cameras}")
+        raise ConfigError(f"cameras gives one of the model's cameras to two keys: {shown(cameras)}")
 
 
 def _check_state(state: Any) -> None:
     _expect(isinstance(state, dict) and len(state) > 0, "state", "an object: key -> width", state)
     for key, width in state.items():
-        _expect(_is_count(width), f"state[{key!r}]", "a positive integer", width)
+        _expect(_is_count(width), f"state[{key!r}]", f"a whole number from 1 to {_MOST}", width)
 
 
 def _delta_mask(dims: Any, described: dict[str, Any]) -> tuple[bool, ...] | None:
     if dims is None:
         return None
-    is_dims = isinstance(dims, list) and all(isinstance(n, int) and not isinstance(n, bool) and n != 0 for n in dims)
+    is_dims = isinstance(dims, list) and all(is_integer(n) and n for n in dims)
     _expect(is_dims, "delta_action_dims", "a list such as [6, -1]: six relative, one absolute", dims)
     covered = sum(map(abs, dims))
     widths = {"action_dim": described["action_dim"], "the state's width": sum(described["state"].values())}
     for name, width in widths.items():
         if covered > width:
-            raise ConfigError(f"delta_action_dims {dims} covers {covered} dimensions, but {name} is {width}")
+            raise ConfigError(f"delta_action_dims {shown(dims)} covers {covered} dimensions, but {name} is {width}")
     return action_mask(dims)
 
 
 def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-
-def _is_number(value: Any) -> bool:
-    try:
-        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # a whole number beyond float64
-        return False
+    return is_integer(value) and 1 <= value <= _MOST
 
 
 def _expect(right: bool, name: str, expected: str, got: Any) -> None:
     if not right:
-        raise ConfigError(f"{name} must be {expected}, got {got!r}")
+        raise ConfigError(f"{name} must be {expected}, got {shown(got)}")

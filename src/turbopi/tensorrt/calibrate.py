@@ -21,6 +21,7 @@ from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.files import write_whole
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
+from turbopi.reading import Fields, read_json
 from turbopi.tensorrt.networks import Fp8Scales
 from turbopi.tensorrt.ops import FP8_MAX
 
@@ -54,15 +55,20 @@ class Calibration:
         if not file.is_file():
             return None
         try:
-            content = json.loads(file.read_text())
-            scales = [
-                None if layer is None else Fp8Scales(*(torch.tensor(layer[name]) for name in _NAMES))
-                for layer in content["scales"]
-            ]
-            found = cls(scales, content["method"], content["observations"], content["source"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"{file} isn't a calibration ({error!r}); delete it and build again") from error
-        return found
+            content = Fields(read_json(file, ConfigError), file, ConfigError)
+            layers = content.list("scales")
+            by_number = Fields({str(i): layer for i, layer in enumerate(layers)}, f"{file}: scales", ConfigError)
+            scales = [None if layer is None else _scales(by_number.object(str(i))) for i, layer in enumerate(layers)]
+            observations = content.integer("observations", 0, 2**31)
+            return cls(scales, content.text("method"), observations, content.text("source"))
+        except ConfigError as error:
+            raise ConfigError(
+                f"{error}, so it isn't a calibration of this version; delete it and build again"
+            ) from error
+
+
+def _scales(layer: Fields) -> Fp8Scales:
+    return Fp8Scales(*(torch.tensor(layer.number(name, 1e-30, 1e30)) for name in _NAMES))
 
 
 def unavailable(method: str) -> str | None:
