@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_helpers import refusal, turbopi
+from file_helpers import no_room
 from PIL import Image
 from typer.testing import Result
 
@@ -206,3 +207,16 @@ def test_noise_of_another_shape_is_refused(npz: Path, tmp_path: Path) -> None:
     result = turbopi("infer", *TINY, npz, "--noise", tmp_path / "noise.npy", "-o", tmp_path / "actions.npz")
     assert result.exit_code == 2
     assert "noise has shape [9, 32], but this policy needs [10, 32]" in result.stderr
+
+
+def test_a_full_disk_keeps_the_earlier_actions_and_names_the_file(npz: Path, tmp_path: Path) -> None:
+    infer(tmp_path, npz, "--seed", 1, "--no-plot")
+    earlier = (tmp_path / "actions.npz").read_bytes()
+    with no_room(1000):
+        result = turbopi("infer", *TINY, npz, "--seed", 2, "--no-plot", "-o", tmp_path / "actions.npz")
+    assert result.exit_code == 2
+    assert f"can't write {tmp_path / 'actions.npz'}: " in result.stderr
+    assert "full" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert (tmp_path / "actions.npz").read_bytes() == earlier
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["actions.npz", "observation.npz"]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 from cli_helpers import refusal, text_of, turbopi
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
-from turbopi.errors import ActionError, ConfigError
+from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.policy import UnifiedPolicy
 from turbopi.preprocess import Pipeline
 from turbopi.robots import Robot, RobotInputs
@@ -106,6 +107,41 @@ def test_outputs_that_change_their_shape_later_never_reach_the_robot() -> None:
 
 def test_a_dry_run_does_not_warn_of_what_middling_actions_do() -> None:
     pipeline(robot_giving(lambda a: (a / (a - a))[:, :6]))  # 0 / 0; warnings are errors here
+
+
+@pytest.mark.parametrize(
+    ("code", "name", "message"),
+    [
+        ("1 / 0", "Arm", "broken_arm failed: ZeroDivisionError: division by zero (broken_arm.py, line 1)"),
+        ("import sys\nsys.exit(3)", "Arm", "broken_arm failed: SystemExit: 3"),
+        ("def", "Arm", "broken_arm failed: SyntaxError"),
+        ("class Arm:\n  def __init__(self):\n    {}['joints']", "Arm", "KeyError: 'joints' (broken_arm.py, line 3)"),
+        ("arm = 3", "arm", "robot 3 has no inputs, outputs, example"),
+        ("", "Arm", "has no attribute 'Arm'"),
+    ],
+)
+def test_a_robots_own_code_that_fails_is_one_line(
+    code: str, name: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_arm.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "broken_arm", raising=False)
+    assert message in refusal(turbopi("inspect", *TINY, "--robot", f"broken_arm:{name}"))
+
+
+def test_inputs_that_fail_on_an_observation_refuse_it_by_the_robots_name() -> None:
+    edges = pipeline(Arm())
+    with pytest.raises(ObservationError, match="robot arm: `inputs` failed on this observation: KeyError: 'camera'"):
+        edges.see({"state": np.zeros(8)})
+
+    class Loose(Arm):
+        name = "loose"
+
+        def inputs(self, observation: Mapping[str, Any]) -> Any:
+            return {"images": {}}
+
+    with pytest.raises(ObservationError, match="robot loose: `inputs` gives a dict, expected RobotInputs"):
+        pipeline(Loose()).see({})
 
 
 # --- narrower than the statistics -------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from turbopi.normalize import Normalizer, absolute_actions, pad_last
 from turbopi.observation import ModelInputs
 from turbopi.robots import Robot, RobotInputs, create_robot
 from turbopi.robots.base import read_prompt, read_state
-from turbopi.robots.checks import check_shape, notes_on_statistics, width_of_outputs
+from turbopi.robots.checks import check_shape, notes_on_statistics, read_observation, width_of_outputs
 from turbopi.robots.plain import Plain
 from turbopi.tokenizer import PromptTokenizer
 
@@ -194,7 +194,7 @@ class Pipeline:
     # Before the model
 
     def _read_observation(self, sample: Incoming) -> None:
-        sample.robot = self.robot.inputs(sample.observation)
+        sample.robot = read_observation(self.robot, sample.observation)
 
     def _choose_prompt(self, sample: Incoming) -> None:
         prompt = sample.robot.prompt if sample.robot.prompt is not None else self.default_prompt

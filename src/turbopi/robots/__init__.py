@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -75,12 +76,25 @@ def import_robot(path: str) -> Robot:
         raise ConfigError(f"a robot's path is module:Class, got {path!r}")
     try:
         found = getattr(importlib.import_module(module_name), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise ConfigError(f"can't import the robot {path!r}: {error}") from error
+    except (Exception, SystemExit) as error:  # whatever the module's own code does
+        raise ConfigError(f"can't import the robot {path!r}: {module_name} failed: {_what(error)}") from error
     try:
         return _checked(found() if isinstance(found, type) else found)
+    except ConfigError:
+        raise
     except TypeError as error:  # abstract methods, or arguments that it needs
         raise ConfigError(f"can't make the robot {path!r}: {error}") from error
+    except (Exception, SystemExit) as error:
+        raise ConfigError(f"can't make the robot {path!r}: {_what(error)}") from error
+
+
+def _what(error: BaseException) -> str:
+    """An error of the user's own code, and where in it; --debug shows the rest."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {error}{where}"
 
 
 def _refuse_options(options: Mapping[str, Any], what: str) -> None:

@@ -1,13 +1,32 @@
 """A robot held against its policy: what its `outputs` gives, and which statistics it leaves out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from turbopi.errors import ActionError, ConfigError
+from turbopi.errors import ActionError, ConfigError, ObservationError, TurboPiError
 from turbopi.normalize import Normalizer
-from turbopi.robots.base import Robot
+from turbopi.robots.base import Robot, RobotInputs
+
+
+def read_observation(robot: Robot, observation: Mapping[str, Any]) -> RobotInputs:
+    """The robot's `inputs`. Raises ObservationError also for errors of a robot's own code, which are no fault of ours:
+    most often a key that its client doesn't send.
+    """
+    try:
+        given: Any = robot.inputs(observation)
+    except TurboPiError:
+        raise
+    except Exception as error:
+        if type(robot).__module__.startswith("turbopi."):
+            raise
+        raise ObservationError(
+            f"robot {robot.name}: `inputs` failed on this observation: {type(error).__name__}: {error}"
+        ) from error
+    if not isinstance(given, RobotInputs):
+        raise ObservationError(f"robot {robot.name}: `inputs` gives a {type(given).__name__}, expected RobotInputs")
+    return given
 
 
 def width_of_outputs(robot: Robot, actions: np.ndarray) -> int:
