@@ -48,6 +48,8 @@ class Gate:
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a plain HTTP request, or None to go on with the websocket handshake."""
         path, lost = request.path.partition("?")[0], self._why_lost()
+        if len(request.headers.get_all("Host")) > 1:  # which of them a proxy has checked, nobody knows
+            return connection.respond(HTTPStatus.BAD_REQUEST, "A request has one Host header.\n")
         if path == "/healthz":
             if lost is None:
                 return connection.respond(HTTPStatus.OK, "OK\n")
