@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
+import gpu_evidence
 import numpy as np
 import pytest
 import torch
@@ -74,3 +75,11 @@ def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
 @pytest.fixture(scope="session")
 def golden() -> Path:
     return GOLDEN
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say at the end of every run that the GPU tests weren't run on this code, if that is so."""
+    waiting = gpu_evidence.pending()
+    if waiting is not None:
+        terminalreporter.section("THE GPU TESTS WERE NOT RUN ON THIS CODE", red=True, bold=True)
+        terminalreporter.line(f"since {waiting['date']}: {waiting['reason']}. Run scripts/gpu_check on a Hopper GPU.")

@@ -1,0 +1,63 @@
+"""The checked-in result of the GPU tests belongs to the code as it is."""
+
+import json
+from pathlib import Path
+
+import gpu_evidence
+import pytest
+
+SOURCE = '''"""A module."""
+# why
+def scale(x: float) -> float:
+    """Twice as much."""
+    return 2 * x  # "twice"
+'''
+KERNEL = 'asm("// not a comment");  // a comment\n/* long\n   one */ int n = 2;\n'
+
+
+def code(tmp_path: Path, name: str, text: str) -> str:
+    (tmp_path / name).write_text(text)
+    return gpu_evidence.code_of(tmp_path / name)
+
+
+def test_the_checked_in_gpu_result_is_of_this_code() -> None:
+    result = json.loads(gpu_evidence.RESULT.read_text())
+    assert result["ok"] and result["tests"]["parts_to_go"] == 0
+    changed = gpu_evidence.changed_since(result["fingerprint"])
+    waiting = gpu_evidence.pending()
+    if waiting is not None and changed:  # conftest.py says so at the end of every run
+        changed = gpu_evidence.changed_since(waiting["fingerprint"])
+    assert not changed, (
+        f"{len(changed)} files differ from those that scripts/gpu_check saw: {', '.join(changed)}. Run it on a Hopper "
+        "GPU and check its result in; where none can be had, scripts/gpu_check --pending REASON says so"
+    )
+    assert waiting is None or gpu_evidence.changed_since(result["fingerprint"]), "nothing is pending: remove that file"
+
+
+def test_comments_and_docstrings_do_not_count_and_all_else_does(tmp_path: Path) -> None:
+    plain = "def scale(x: float) -> float:\n    return 2 * x"
+    assert code(tmp_path, "a.py", SOURCE) == plain
+    assert code(tmp_path, "a.py", SOURCE.replace("2 * x", "3 * x")) != plain
+    assert code(tmp_path, "a.py", SOURCE.replace("why", "how").replace("Twice", "Two times")) == plain
+
+
+def test_kernels_comments_do_not_count_and_their_strings_do(tmp_path: Path) -> None:
+    lean = code(tmp_path, "a.cu", KERNEL)
+    assert "not a comment" in lean and "long" not in lean and "a comment\n" not in lean
+    assert code(tmp_path, "a.cu", KERNEL.replace("int n = 2", "int n = 3")) != lean
+    assert code(tmp_path, "a.cu", KERNEL.replace("long", "longer")) == lean
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        *("kernels/gemm_fp8.py", "kernels/denoise.py", "kernels/denoise_loop.cu", "kernels/denoise_primitives.cu"),
+        *("kernels/gemm.py", "backends/fused.py", "backends/cuda_graph.py", "engine/call.py", "model/reference.py"),
+    ],
+)
+def test_what_runs_on_the_gpu_is_in_the_fingerprint(file: str) -> None:
+    assert f"src/turbopi/{file}" in gpu_evidence.fingerprint()
+
+
+def test_whatever_those_files_import_is_in_the_fingerprint_or_runs_on_the_host_alone() -> None:
+    assert gpu_evidence.uncovered_imports() == {}

@@ -1,0 +1,122 @@
+"""Whether the checked-in result of scripts/gpu_check belongs to the code as it is.
+
+CI has no GPU, so all that it knows of the GPU tests is a result file. That file carries a hash of each source file that
+runs on the GPU, decides what does, or judges it. A CPU test compares them with the tree. Comments, docstrings and blank
+lines don't count.
+"""
+
+import ast
+import hashlib
+import io
+import json
+import re
+import tokenize
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULT = ROOT / "benchmarks/results/gpu_check.json"
+PENDING = ROOT / "benchmarks/results/gpu_check_pending.json"
+
+# Files whose code runs on the GPU, or decides what does.
+PRODUCT = (
+    *("src/turbopi/kernels/*", "src/turbopi/engine/*", "src/turbopi/model/*", "src/turbopi/backends/*"),
+    *("src/turbopi/calibrate/*", "src/turbopi/config.py", "src/turbopi/observation.py", "src/turbopi/policy.py"),
+    "src/turbopi/judge/check_golden.py",
+)
+# Modules that those import and that only read files or format text on the host: CPU tests see all of what they do.
+HOST_ONLY = (
+    *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.tokenizer", "turbopi.images"),
+    *("turbopi.normalize", "turbopi.serve", "turbopi.demo", "turbopi.export", "turbopi.tensorrt", "turbopi.errors"),
+    *("turbopi.files", "turbopi.folders", "turbopi.reading", "turbopi.judge.golden", "turbopi.bench.provenance"),
+)
+MARKED = re.compile(r"mark\.gpu|on_hopper|gpu_or_interpreter")
+
+
+def gpu_test_files() -> list[Path]:
+    """The test files with tests that need a GPU."""
+    return [path for path in sorted((ROOT / "tests").glob("test_*.py")) if MARKED.search(path.read_text())]
+
+
+def product_files() -> list[Path]:
+    return sorted(path for glob in PRODUCT for path in ROOT.glob(glob) if path.suffix in (".py", ".cu"))
+
+
+def fingerprint() -> dict[str, str]:
+    """{file, relative to the repository: hash of its code} for the product's files and the GPU tests."""
+    files = [*product_files(), *gpu_test_files(), ROOT / "tests/conftest.py", ROOT / "tests/denoise_helpers.py"]
+    code = {str(path.relative_to(ROOT)): code_of(path) for path in files}
+    return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in code.items()}
+
+
+def code_of(path: Path) -> str:
+    """A file's text without comments, docstrings, blank lines and spaces at the ends of lines.
+
+    Cut out of the text, since the tokens and syntax trees of one file differ between Python versions.
+    """
+    text = path.read_text(encoding="utf-8")
+    text = _without_cuda_comments(text) if path.suffix == ".cu" else _without_python_comments(text)
+    return "\n".join(line.rstrip() for line in text.splitlines() if line.strip())
+
+
+def _without_cuda_comments(text: str) -> str:
+    strings_or_comments = r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/'
+    return re.sub(strings_or_comments, lambda m: m[0] if m[0][0] == '"' else " ", text, flags=re.DOTALL)
+
+
+def _without_python_comments(text: str) -> str:
+    lines = text.splitlines(keepends=True)
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            row, column = token.start
+            lines[row - 1] = lines[row - 1][:column] + "\n"
+    for node in ast.walk(ast.parse(text)):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) or not node.body:
+            continue
+        first = node.body[0]
+        if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str):
+            assert first.end_lineno is not None
+            for row in range(first.lineno, first.end_lineno + 1):
+                lines[row - 1] = "\n"
+    return "".join(lines)
+
+
+def imported_by(path: Path) -> set[str]:
+    """The modules of ours that a file imports, also inside functions, or names in a string, as lazy imports do."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found.add(node.value)
+    return {name for name in found if re.fullmatch(r"turbopi(\.\w+)*", name) and _file_of(name) is not None}
+
+
+def _file_of(module: str) -> Path | None:
+    place = ROOT / "src" / module.replace(".", "/")
+    return next((file for file in (place.with_suffix(".py"), place / "__init__.py") if file.is_file()), None)
+
+
+def uncovered_imports() -> dict[str, list[str]]:
+    """{module: the product's files that import it} for modules that are neither in the fingerprint nor HOST_ONLY."""
+    covered = {*product_files()}
+    missing: dict[str, list[str]] = {}
+    for path in sorted(covered):
+        for module in imported_by(path) if path.suffix == ".py" else ():
+            if _file_of(module) not in covered and not any(f"{module}.".startswith(f"{one}.") for one in HOST_ONLY[1:]):
+                missing.setdefault(module, []).append(str(path.relative_to(ROOT)))
+    missing.pop("turbopi", None)
+    return missing
+
+
+def changed_since(recorded: dict[str, str]) -> list[str]:
+    """The files whose code isn't what `recorded` (a fingerprint) says, new and removed ones too."""
+    now = fingerprint()
+    return sorted(name for name in {*now, *recorded} if now.get(name) != recorded.get(name))
+
+
+def pending() -> dict[str, Any] | None:
+    """What `scripts/gpu_check --pending` wrote, if anything: reason, date, fingerprint."""
+    return json.loads(PENDING.read_text()) if PENDING.is_file() else None
