@@ -13,6 +13,7 @@ import torch
 from turbopi.bench import barrier
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import hopper, nvrtc
+from turbopi.kernels.arguments import Parameter, Parameters
 
 
 class Status(enum.IntEnum):
@@ -81,11 +82,16 @@ class Args(ctypes.Structure):
 NOTHING = Args(0)
 
 
+def cluster_of_two(shared_bytes: int = 0) -> hopper.DependentKernel:
+    takes = Parameters((Parameter("int", "count"),))
+    return hopper.DependentKernel(b"", "attention", takes, shared_bytes=shared_bytes, threads=128, cluster=2)
+
+
 def test_a_launch_that_fails_names_the_call_and_its_status(driver: Any) -> None:
     driver(cuLaunchKernel=ILLEGAL, cuLaunchKernelEx=ILLEGAL, cuLaunchCooperativeKernel=ILLEGAL)
-    kernel = hopper.DependentKernel(b"", "attention", 0, 128, 2)
+    kernel = cluster_of_two()
     with pytest.raises(BackendError, match=r"cuLaunchKernelEx failed: CUDA_ERROR_ILLEGAL_ADDRESS"):
-        kernel.launch_dependent(8, (ctypes.c_int(1),))
+        kernel.launch_dependent(8, {"count": 1})
     with pytest.raises(BackendError, match=r"cuLaunchKernel failed: CUDA_ERROR_ILLEGAL_ADDRESS"):
         kernel.launch(8, 128, NOTHING)
     with pytest.raises(BackendError, match=r"cuLaunchCooperativeKernel failed: CUDA_ERROR_ILLEGAL_ADDRESS"):
@@ -102,7 +108,7 @@ def test_blocks_that_do_not_fit_together_are_refused_with_what_limits_them(drive
 def test_a_gpu_without_room_for_one_cluster_is_refused(driver: Any) -> None:
     driver(cuOccupancyMaxActiveClusters=(Status(0), 0))
     with pytest.raises(BackendUnavailable, match=r"'attention' needs a cluster of 2 blocks of 128 threads with 77 b"):
-        hopper.DependentKernel(b"", "attention", 77, 128, 2)
+        cluster_of_two(shared_bytes=77)
 
 
 def test_a_tensor_map_that_cannot_be_made_names_its_sizes(driver: Any) -> None:

@@ -33,7 +33,8 @@ constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : 232, PRODUCER_REGISTERS = 40
 // which warpgroup ends up with a block of 8 columns; blocks go in fours, as that many leave together
 __device__ constexpr int owner(int block) { return block / 4 * WGS / FOURS; }
 
-TP_MMA  // mma_logits(float (&)[KEYS / 2], u64, u64, int keep), mma_values(float (&)[DIM / 2], u32 * 4, u64, int keep)
+// Generated: mma_logits(float (&)[KEYS / 2], u64, u64, int keep), mma_values(float (&)[DIM / 2], u32 * 4, u64, int keep),
+// and the kernel's parameters.
 
 // 64 columns of 64 or KEYS rows of one head
 __device__ __forceinline__ void load(u32 to, const TensorMap* map, int column, int head, int row, u32 bar) {
@@ -67,9 +68,7 @@ __device__ __forceinline__ void sync_consumers(int barrier, int threads) {
 }
 
 extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), 1)
-attention(const __grid_constant__ TensorMap map_q, const __grid_constant__ TensorMap map_k,
-          const __grid_constant__ TensorMap map_v, Element* out, const long long* length, int rows, int keys, int heads,
-          int k_first, int v_first, int tiles, float scale, float inverse) {
+attention(ATTENTION_PARAMETERS) {
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024, ring = base + Q_BYTES;
     const u32 q_full = ring + STAGES * STAGE_BYTES, full = q_full + 8, empty = full + 8 * STAGES;

@@ -4,7 +4,6 @@ Twins: `engine.ops.vision_attention`, and `engine.ops.attention` without a suffi
 for heads that this one doesn't take, are in attention.py.
 """
 
-import ctypes
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -12,10 +11,22 @@ import torch
 from torch import Tensor
 
 from turbopi.kernels import hopper
+from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
 from turbopi.kernels.attention import LOG2_E
 from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
 from turbopi.kernels.launch import result_dtype
 from turbopi.kernels.nvrtc import compile_cubin
+
+PARAMETERS = Parameters(
+    (
+        *(Parameter(TENSOR_MAP, f"map_{name}") for name in "qkv"),
+        Parameter("Element*", "out"),  # bfloat16 or E4M3: attention.cu
+        Parameter("const long long*", "length"),
+        *(Parameter("int", name) for name in ("rows", "keys", "heads", "k_first", "v_first", "tiles")),
+        Parameter("float", "scale"),
+        Parameter("float", "inverse"),
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -112,15 +123,20 @@ def _launch(
     assert tile.sharing == 1 or (tiles % tile.sharing == 0 and tile.holds(keys)), "who shares never waits for a slot"
     whole = length is None and keys == tile.keys * tile.warpgroups
     kernel = _kernel(tile, inverse is not None, whole, out.device)
-    arguments = (
-        *maps,
-        ctypes.c_void_p(out.data_ptr()),
-        ctypes.c_void_p(None if length is None else length.data_ptr()),
-        *(ctypes.c_int(value) for value in (rows, keys, count, first[1], first[2], tiles)),
-        ctypes.c_float(tile.dim**-0.5 * LOG2_E),
-        ctypes.c_float(1.0 if inverse is None else inverse),
-    )
-    kernel.launch_dependent(tiles * groups, arguments)
+    given = {
+        **dict(zip(("map_q", "map_k", "map_v"), maps, strict=True)),
+        "out": out.data_ptr(),
+        "length": None if length is None else length.data_ptr(),
+        "rows": rows,
+        "keys": keys,
+        "heads": count,
+        "k_first": first[1],
+        "v_first": first[2],
+        "tiles": tiles,
+        "scale": tile.dim**-0.5 * LOG2_E,
+        "inverse": 1.0 if inverse is None else inverse,
+    }
+    kernel.launch_dependent(tiles * groups, given)
 
 
 def constants(tile: Tile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
@@ -140,11 +156,15 @@ def source(tile: Tile) -> str:
     """attention.cu with the instructions for a tile."""
     logits = hopper.wgmma("mma_logits", tile.keys)
     values = hopper.wgmma("mma_values", tile.dim, from_registers=True, across=True)
-    return hopper.source("attention.cu", instructions=f"{logits}\n{values}")
+    parameters = f"#define ATTENTION_PARAMETERS {PARAMETERS.declarations}"
+    return hopper.source("attention.cu", generated=f"{logits}\n{values}\n{parameters}\n")
 
 
 @cache
 def _kernel(tile: Tile, out_fp8: bool, whole: bool, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8, whole))
-        return DependentKernel(cubin, "attention", SHARED_BYTES, 128 * (tile.warpgroups + 1), tile.sharing)
+        threads = 128 * (tile.warpgroups + 1)
+        return DependentKernel(
+            cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=threads, cluster=tile.sharing
+        )

@@ -8,7 +8,6 @@ units cross clusters. How, and why it is safe, is said in denoise_base.cu.
 Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns, A action_dim.
 """
 
-import ctypes
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.weights import State
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import hopper
+from turbopi.kernels.arguments import Parameter, Struct, enumeration
 from turbopi.kernels.denoise_packing import (
     BLOCK,
     RANKS,
@@ -40,11 +40,20 @@ PARTS = tuple(
     )
 )
 THREADS = (WARPS + 4) * 32
-# `What` of denoise_primitives.cu
-WAITS = (
-    *("nothing", "the stream", "queries", "largest logits", "outputs", "attention", "attention's sums", "hidden units"),
-    *("feed-forward sums", "v_t", "the next step", "its end"),
-)
+WAITS = {  # what a CTA waits for: the kernel's enum, and what users are told
+    "WAIT_NONE": "nothing",
+    "WAIT_X": "the stream",
+    "WAIT_Q": "queries",
+    "WAIT_TOPS": "largest logits",
+    "WAIT_COMB": "outputs",
+    "WAIT_ATT": "attention",
+    "WAIT_X2": "attention's sums",
+    "WAIT_HID": "hidden units",
+    "WAIT_X1": "feed-forward sums",
+    "WAIT_V": "v_t",
+    "WAIT_GO": "the next step",
+    "FINISHED": "its end",
+}
 FEW = 16  # tokens: `FEW` of denoise_base.cu
 MAX_SUFFIX = 56  # beyond it too little shared memory is left for weights on their way
 
@@ -59,22 +68,39 @@ def unavailable(device: torch.device) -> str | None:
     return None
 
 
-class _Args(ctypes.Structure):
-    """`Args` of denoise_base.cu."""
-
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("weights", "starts", "table", "shifted", "out_w", "out_shift", "in_w")),
-        *((name, ctypes.c_void_p) for name in ("in_b", "inv_freq", "cache_k", "cache_v", "keys", "length", "noise")),
-        *((name, ctypes.c_void_p) for name in ("x_t", "v_t", "scratch", "hang", "clock", "trace")),
-        ("layer_stride", ctypes.c_longlong),
-        ("layer_bytes", ctypes.c_longlong),
-        ("steps", ctypes.c_int),
-        ("dt", ctypes.c_float),
-        ("eps", ctypes.c_float),
-        ("zero", ctypes.c_uint32),
-        ("row_scales", ctypes.c_void_p),
-        ("values_times", ctypes.c_void_p),
-    )
+ARGS = Struct(
+    "Args",
+    (
+        Parameter("const unsigned char*", "weights", "fragments [L][layer_bytes], a CTA's in the order of their use"),
+        Parameter("const long long*", "starts", "[NC * S]: where a CTA's begin in a layer, bytes"),
+        Parameter("const float*", "table", "[N][2L+1][3][D]: scale, shift, gate"),
+        Parameter("const float*", "shifted", "[N][L][NC * S][TILES][16]: W shift"),
+        Parameter("const float*", "out_w", "[D][A]"),
+        Parameter("const float*", "out_shift", "[N][A]: action_out_proj of the final norm's shift, and its bias"),
+        Parameter("const float*", "in_w", "[D][A]"),
+        Parameter("const float*", "in_b", "[D]"),
+        Parameter("const float*", "inv_freq", "[HD/2]"),
+        Parameter("const unsigned char*", "cache_k", "bf16 [L][rows][HD], layer_stride bytes from layer to layer"),
+        Parameter("const unsigned char*", "cache_v"),
+        Parameter("unsigned char*", "keys", "bf16 [L][2][KEY_TILES][QT] fragments: the cache as tensor cores take it"),
+        Parameter("const long long*", "length", "valid rows of the cache"),
+        Parameter("const float*", "noise", "[T][A]"),
+        Parameter("float*", "x_t", "[N+1][T][A]"),
+        Parameter("float*", "v_t", "[N][T][A]"),
+        Parameter("uint4*", "scratch", "zero at the start"),
+        Parameter("u32*", "hang", "[NC * S] host memory: see `watch`"),
+        Parameter("long long*", "clock", "[2] host memory: cycles and nanoseconds of a launch, of CTA 0"),
+        Parameter("u32*", "trace", "[NC * S][64] cycles up to each mark, with TP_TRACE"),
+        Parameter("long long", "layer_stride"),
+        Parameter("long long", "layer_bytes"),
+        Parameter("int", "steps"),
+        Parameter("float", "dt"),
+        Parameter("float", "eps"),
+        Parameter("u32", "zero", "0, which the compiler doesn't know"),
+        Parameter("const float*", "row_scales", "[L][NC * S][TILES][16]: FP8; those of out and down are in the gates"),
+        Parameter("const float*", "values_times", "[L]: FP8, makes attention's outputs fit E4M3; a power of two"),
+    ),
+)
 
 
 def kernel_sizes(
@@ -118,7 +144,8 @@ def source(suffix: int, fp8: bool) -> str:
         hopper.wgmma("add_rows", columns, from_registers=True),
         hopper.wgmma("add_keys", 2 * 8),
     )
-    return hopper.source(*PARTS, instructions="\n".join(products), folder=FOLDER)
+    generated = (*products, enumeration("What", tuple(WAITS)), ARGS.source)
+    return hopper.source(*PARTS, generated="\n".join(generated) + "\n", folder=FOLDER)
 
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
@@ -143,7 +170,8 @@ def megahertz(cycles: int, nanoseconds: int) -> float | None:
 def stuck(words: list[int]) -> str | None:
     """What the blocks' words of `watch` (denoise_primitives.cu) say, or None: none has said anything."""
     waits = sorted({(word & 0xFFFFF, word >> 20 & 0x7FF) for word in words if word})
-    where = ", ".join(f"layer {layer} for {WAITS[what]}" for layer, what in waits[:8])
+    told = tuple(WAITS.values())
+    where = ", ".join(f"layer {layer} for {told[what]}" for layer, what in waits[:8])
     return f"blocks of the denoising kernel waited for seconds (counted over all steps): {where}" if waits else None
 
 
@@ -232,15 +260,15 @@ class DenoiseKernel:
         assert all(t.is_contiguous() and t.dtype == torch.float32 for t in (noise, x_t, v_t))
         named = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "length": length, "noise": noise}
         pointers = {name: t.data_ptr() for name, t in {**named, "x_t": x_t, "v_t": v_t}.items()}
-        args = _Args(
-            **pointers,
-            layer_stride=cache_k.stride(0) * 2,
-            layer_bytes=self._packed.layer_bytes,
-            steps=steps,
-            dt=float(np.float32(-1.0 / steps)),
-            eps=self._config.rms_norm_eps,
-            zero=0,
-        )
+        numbers = {
+            "layer_stride": cache_k.stride(0) * 2,
+            "layer_bytes": self._packed.layer_bytes,
+            "steps": steps,
+            "dt": float(np.float32(-1.0 / steps)),
+            "eps": self._config.rms_norm_eps,
+            "zero": 0,
+        }
+        args = ARGS.value(pointers | numbers)
         self._prepare.launch(self._tiles, 256, args)
         self._kernel.launch_cooperative(self._blocks, THREADS, args)  # clusters wait for one another
 

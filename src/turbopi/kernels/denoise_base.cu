@@ -263,35 +263,6 @@ __device__ __forceinline__ bool word_exists(int i) {
   return T % 8 == 0 || i / (OPERAND / 16) % NT * 8 + i % 8 < T;
 }
 
-struct Args {
-  const byte* weights;      // fragments [L][layer_bytes], a CTA's in the order in which it uses them
-  const long long* starts;  // [NC * S]: where a CTA's begin in a layer, bytes
-  const float* table;       // [N][2L+1][3][D]: scale, shift, gate
-  const float* shifted;     // [N][L][NC * S][TILES][16]: W shift
-  const float* out_w;       // [D][A]
-  const float* out_shift;   // [N][A]: action_out_proj of the final norm's shift, and its bias
-  const float* in_w;        // [D][A]
-  const float* in_b;        // [D]
-  const float* inv_freq;    // [HD/2]
-  const byte* cache_k;      // bf16 [L][rows][HD], layer_stride bytes from layer to layer
-  const byte* cache_v;
-  byte* keys;               // bf16 [L][2][KEY_TILES][QT] fragments: the same, as the tensor cores take it
-  const long long* length;  // valid rows
-  const float* noise;       // [T][A]
-  float* x_t;               // [N+1][T][A]
-  float* v_t;               // [N][T][A]
-  uint4* scratch;           // zero at the start
-  u32* hang;                // [NC * S] host memory: see `watch`
-  long long* clock;         // [2] host memory: cycles and nanoseconds of a launch, of CTA 0
-  u32* trace;
-  long long layer_stride, layer_bytes;
-  int steps;
-  float dt, eps;
-  u32 zero;                 // 0, which the compiler doesn't know
-  const float* row_scales;  // [L][NC * S][TILES][16]: of FP8 products; those of out and down are in the table's gates
-  const float* values_times;  // [L]: FP8, what makes attention's outputs fit E4M3; a power of two
-};
-
 // ---- a CTA's view
 
 // What is the same in all lanes of a warp, so that the compiler knows it. wgmma takes its operands' places from

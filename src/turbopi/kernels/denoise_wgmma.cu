@@ -19,8 +19,7 @@ __device__ __forceinline__ u32 behind(u32 place, u32 bytes) { return place + (by
 __device__ __forceinline__ void keep_until_here(uint4 v) { asm volatile("" ::"r"(v.x), "r"(v.y), "r"(v.z), "r"(v.w)); }
 // What threads wrote to shared memory (or peers, whose barrier was waited for) before may now be read by products.
 __device__ __forceinline__ void show_to_products() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
-// add_product(float (&sums)[NT * 4], u64 a, u64 b, int keep), add_from_registers(.., u32 * 4, ..): weights, in bfloat16
+// Generated: add_product(float (&sums)[NT * 4], u64 a, u64 b, int keep), add_from_registers(.., u32 * 4, ..): weights, in bfloat16
 // or (32 columns) E4M3; add_rows: as the second, always bfloat16; add_keys(float (&sums)[8], u64 a, u64 b, int keep):
 // 64 tokens' queries times 16 keys, bfloat16, from shared memory. The compiler makes all of them wait for each other if
 // one stands in a branch of its own.
-TP_MMA

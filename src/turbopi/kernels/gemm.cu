@@ -1,23 +1,7 @@
 // The kernel; what it does, sizes and helpers are in gemm_base.cu, which comes before it.
 
 extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), 1)
-gemm(const __grid_constant__ TensorMap map_a, const __grid_constant__ TensorMap map_w, void* out, const u32* bias,
-#if TP_FP8
-     const float* scale, float inverse,
-#endif
-#if TP_RESIDUAL
-     const u32* residual, float2* sums_out,
-#endif
-#if TP_ROW_PARTS
-     const float2* sums_in, float inverse_width, float eps,
-#endif
-#if TP_NORMED
-     const float* sums_of_w, const float* offset,
-#endif
-#if TP_COPY
-     const float2* norm_scale, const float2* norm_shift, unsigned char* copy, float2* plain_sums,
-#endif
-     int M, int N, int k_blocks, int m_groups, int n_groups, const char* ahead, u32 ahead_bytes) {
+gemm(GEMM_PARAMETERS) {
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
     const u32 full = base + STAGES * STAGE_BYTES + RECEIVED_BYTES, empty = full + 8 * STAGES;

@@ -4,7 +4,6 @@ Twins: `engine.ops.linear`, `linear_gelu`, `linear_geglu`; "partial" and "parts"
 up, which the norms in `norms.py` do.
 """
 
-import ctypes
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
@@ -13,6 +12,7 @@ import torch
 from torch import Tensor
 
 from turbopi.kernels import hopper
+from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
 from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
 from turbopi.kernels.nvrtc import compile_cubin
 
@@ -162,17 +162,15 @@ def matmul(
     kernel = _kernel(
         tile, epilogue, residual is not None, 0 if sums is None else sums.count, copied_parts(copy, m, n), a.device
     )
-    arguments = (
-        matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
-        matrix_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
-        ctypes.c_void_p(out.data_ptr()),
-        ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
-        *residual_arguments(residual, sums_out),
-        *(() if folded is None else norm_arguments(sums, k, eps, folded.sums, folded.offset)),
-        *copy_arguments(copy, n),
-        *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), *groups)),
-    )
-    launch(kernel, tile, groups, arguments, ahead)
+    given = {
+        "map_a": matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
+        "map_w": matrix_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
+        **product_arguments(out, bias, residual, sums_out),
+        **({} if folded is None else norm_arguments(sums, k, eps, folded.sums, folded.offset)),
+        **copy_arguments(copy, n),
+        **size_arguments(m, n, -(-k // DEPTH), groups),
+    }
+    launch(kernel, tile, groups, given, ahead)
     return out
 
 
@@ -191,25 +189,61 @@ def layout(
 
 
 def launch(
-    kernel: DependentKernel, tile: Tile, groups: tuple[int, int], arguments: tuple[Any, ...], ahead: Tensor | None
+    kernel: DependentKernel, tile: Tile, groups: tuple[int, int], given: dict[str, Any], ahead: Tensor | None
 ) -> None:
-    """`ahead` is the matrix that is to be in L2 for the next product; each block fetches a share of it."""
+    """`given` has all parameters but the last two. `ahead` is the matrix that is to be in L2 for the next product; each
+    block fetches a share of it.
+    """
     assert groups[0] * groups[1] * tile.splits < 1 << 20, "gemm.cu divides no larger numbers"
     blocks = clusters(tile, groups[0] * groups[1], kernel.max_clusters) * tile.cluster
     share = 0 if ahead is None else ahead.numel() * ahead.element_size() // blocks // 16 * 16
-    place = ctypes.c_void_p(ahead.data_ptr() if ahead is not None and share else None)
-    kernel.launch_dependent(blocks, (*arguments, place, ctypes.c_uint(share)))
+    place = ahead.data_ptr() if ahead is not None and share else None
+    kernel.launch_dependent(blocks, given | {"ahead": place, "ahead_bytes": share})
 
 
-def residual_arguments(residual: Tensor | None, sums_out: Sums | None) -> tuple[Any, ...]:
-    if residual is None or sums_out is None:
-        return ()
-    return ctypes.c_void_p(residual.data_ptr()), ctypes.c_void_p(sums_out.parts.data_ptr())
+def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool) -> Parameters:
+    """What gemm.cu's kernel takes in these forms."""
+    rows = (
+        Parameter("const float2*", "sums_in", "[parts][M]: the sum and the sum of squares of a row"),
+        Parameter("float", "inverse_width"),
+        Parameter("float", "eps"),
+    )
+    return Parameters(
+        (
+            Parameter(TENSOR_MAP, "map_a"),
+            Parameter(TENSOR_MAP, "map_w"),
+            Parameter("void*", "out"),
+            Parameter("const u32*", "bias"),
+            *((Parameter("const float*", "scale"), Parameter("float", "inverse")) if fp8 else ()),
+            *((Parameter("const u32*", "residual"), Parameter("float2*", "sums_out")) if residual else ()),
+            *(rows if normed or copied else ()),
+            *((Parameter("const float*", "sums_of_w"), Parameter("const float*", "offset")) if normed else ()),
+            *((Parameter("const float2*", "norm_scale"), Parameter("const float2*", "norm_shift")) if copied else ()),
+            *((Parameter("unsigned char*", "copy"), Parameter("float2*", "plain_sums")) if copied else ()),
+            *(Parameter("int", name) for name in ("M", "N", "k_blocks", "m_groups", "n_groups")),
+            Parameter("const char*", "ahead"),
+            Parameter("u32", "ahead_bytes"),
+        )
+    )
 
 
-def norm_arguments(sums: Sums | None, width: int, eps: float, of_weight: Tensor, offset: Tensor) -> tuple[Any, ...]:
+def product_arguments(
+    out: Tensor, bias: Tensor | None, residual: Tensor | None, sums_out: Sums | None
+) -> dict[str, Any]:
+    given: dict[str, Any] = {"out": out.data_ptr(), "bias": None if bias is None else bias.data_ptr()}
+    if residual is not None and sums_out is not None:
+        given |= {"residual": residual.data_ptr(), "sums_out": sums_out.parts.data_ptr()}
+    return given
+
+
+def size_arguments(m: int, n: int, k_blocks: int, groups: tuple[int, int]) -> dict[str, int]:
+    """Rows and columns of the result, steps along the inner axis, groups of tiles along M and N."""
+    return {"M": m, "N": n, "k_blocks": k_blocks, "m_groups": groups[0], "n_groups": groups[1]}
+
+
+def norm_arguments(sums: Sums | None, width: int, eps: float, of_weight: Tensor, offset: Tensor) -> dict[str, Any]:
     assert sums is not None
-    return (*_row_arguments(sums, width, eps), *(ctypes.c_void_p(t.data_ptr()) for t in (of_weight, offset)))
+    return _row_arguments(sums, width, eps) | {"sums_of_w": of_weight.data_ptr(), "offset": offset.data_ptr()}
 
 
 def copied_parts(copy: Copy | None, m: int, n: int) -> int:
@@ -222,20 +256,19 @@ def copied_parts(copy: Copy | None, m: int, n: int) -> int:
     return copy.sums.count
 
 
-def copy_arguments(copy: Copy | None, width: int) -> tuple[Any, ...]:
+def copy_arguments(copy: Copy | None, width: int) -> dict[str, Any]:
     if copy is None:
-        return ()
-    return (
-        *_row_arguments(copy.sums, width, copy.eps),
-        ctypes.c_void_p(copy.scale.data_ptr()),
-        ctypes.c_void_p(copy.shift.data_ptr()),
-        ctypes.c_void_p(copy.out.data_ptr()),
-        ctypes.c_void_p(copy.plain.parts.data_ptr()),
-    )
+        return {}
+    return _row_arguments(copy.sums, width, copy.eps) | {
+        "norm_scale": copy.scale.data_ptr(),
+        "norm_shift": copy.shift.data_ptr(),
+        "copy": copy.out.data_ptr(),
+        "plain_sums": copy.plain.parts.data_ptr(),
+    }
 
 
-def _row_arguments(sums: Sums, width: int, eps: float) -> tuple[Any, ...]:
-    return ctypes.c_void_p(sums.parts.data_ptr()), ctypes.c_float(1 / width), ctypes.c_float(eps)
+def _row_arguments(sums: Sums, width: int, eps: float) -> dict[str, Any]:
+    return {"sums_in": sums.parts.data_ptr(), "inverse_width": 1 / width, "eps": eps}
 
 
 def clusters(tile: Tile, groups: int, at_once: int) -> int:
@@ -276,19 +309,22 @@ def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: i
 def _kernel(
     tile: Tile, epilogue: Epilogue, residual: bool, normed: int, copied: int, device: torch.device
 ) -> DependentKernel:
-    return build(source(tile.columns), constants(tile, epilogue, residual, normed, copied), tile, device)
+    takes = parameters(fp8=False, residual=residual, normed=normed > 0, copied=copied > 0)
+    return build(takes, constants(tile, epilogue, residual, normed, copied), tile, device)
 
 
-def build(source: str, sizes: dict[str, int], tile: Tile, device: torch.device) -> DependentKernel:
+def build(takes: Parameters, sizes: dict[str, int], tile: Tile, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
-        cubin = compile_cubin(source, "sm_90a", sizes)
-        return DependentKernel(cubin, "gemm", SHARED_BYTES, 128 * (tile.warpgroups + 1), tile.cluster)
+        cubin = compile_cubin(source(tile.columns, takes, fp8=bool(sizes["TP_FP8"])), "sm_90a", sizes)
+        threads = 128 * (tile.warpgroups + 1)
+        return DependentKernel(cubin, "gemm", takes, shared_bytes=SHARED_BYTES, threads=threads, cluster=tile.cluster)
 
 
-def source(columns: int, fp8: bool = False) -> str:
+def source(columns: int, takes: Parameters, *, fp8: bool) -> str:
     """gemm_base.cu, gemm_geglu.cu and gemm.cu with the instruction for tiles of that many columns."""
     mma = hopper.wgmma("mma", columns, numbers="e4m3" if fp8 else "bf16")
-    return hopper.source("gemm_base.cu", "gemm_geglu.cu", "gemm.cu", instructions=mma)
+    generated = f"{mma}\n#define GEMM_PARAMETERS {takes.declarations}\n"
+    return hopper.source("gemm_base.cu", "gemm_geglu.cu", "gemm.cu", generated=generated)
 
 
 def matrix_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> Any:

@@ -71,7 +71,7 @@ __device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int ro
             "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3}], [%4];"
             ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar) : "memory");
 }
-TP_MMA  // mma(float (&sums)[BN / 2], u64 a, u64 b, int keep)
+// Generated: mma(float (&sums)[BN / 2], u64 a, u64 b, int keep), and the kernel's parameters.
 
 __device__ __forceinline__ float tanh_of_gelu(float x) {  // off by 2^-11 at most: less than rounding is
     float t;

@@ -4,7 +4,6 @@ Twins: `engine.ops`' products with an `Fp8Matrix`. The results are bfloat16, E4M
 (`inverse`), or parts of the sums ("partial", "parts") for the norms of `norms.py` to add up.
 """
 
-import ctypes
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -25,8 +24,9 @@ from turbopi.kernels.gemm import (
     layout,
     matrix_map,
     norm_arguments,
-    residual_arguments,
-    source,
+    parameters,
+    product_arguments,
+    size_arguments,
     tile_constants,
 )
 from turbopi.kernels.hopper import DependentKernel
@@ -109,19 +109,17 @@ def matmul_fp8(
     normed = 0 if sums is None else sums.count
     copied = copied_parts(copy, m, n)
     kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, copied, a.device)
-    arguments = (
-        matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
-        matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
-        ctypes.c_void_p(out.data_ptr()),
-        ctypes.c_void_p(bias.data_ptr() if bias is not None else None),
-        ctypes.c_void_p((weight if folded is None else folded).scale.data_ptr()),
-        ctypes.c_float(1.0 if inverse is None else inverse),
-        *residual_arguments(residual, sums_out),
-        *(() if folded is None else norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),
-        *copy_arguments(copy, n),
-        *(ctypes.c_int(value) for value in (m, n, -(-k // DEPTH), *groups)),
-    )
-    launch(kernel, tile, groups, arguments, ahead)
+    given = {
+        "map_a": matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
+        "map_w": matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
+        **product_arguments(out, bias, residual, sums_out),
+        "scale": (weight if folded is None else folded).scale.data_ptr(),
+        "inverse": 1.0 if inverse is None else inverse,
+        **({} if folded is None else norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),
+        **copy_arguments(copy, n),
+        **size_arguments(m, n, -(-k // DEPTH), groups),
+    }
+    launch(kernel, tile, groups, given, ahead)
     return out
 
 
@@ -156,8 +154,8 @@ def _kernel(
     copied: int,
     device: torch.device,
 ) -> DependentKernel:
-    sizes = constants(tile, epilogue, out_fp8, promote, residual, normed, copied)
-    return build(source(tile.columns, fp8=True), sizes, tile, device)
+    takes = parameters(fp8=True, residual=residual, normed=normed > 0, copied=copied > 0)
+    return build(takes, constants(tile, epilogue, out_fp8, promote, residual, normed, copied), tile, device)
 
 
 # -- which tile --------------------------------------------------------------------------------------------------------

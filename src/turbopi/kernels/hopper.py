@@ -4,7 +4,7 @@ Their sources begin with hopper.cu.
 """
 
 import ctypes
-import re
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any, Literal
 import torch
 
 from turbopi.errors import BackendUnavailable
+from turbopi.kernels.arguments import Parameters
 from turbopi.kernels.nvrtc import Kernel, bindings, checked
 
 SHARED_BYTES = 227 * 1024
@@ -21,8 +22,11 @@ SHARED_BYTES = 227 * 1024
 class DependentKernel(Kernel):
     """A kernel whose blocks may start before the kernel ahead of it ends (it waits for its results itself)."""
 
-    def __init__(self, cubin: bytes, name: str, shared_bytes: int, threads: int, cluster: int) -> None:
+    def __init__(
+        self, cubin: bytes, name: str, parameters: Parameters, *, shared_bytes: int, threads: int, cluster: int
+    ) -> None:
         super().__init__(cubin, name, shared_bytes)
+        self._parameters = parameters
         d = self._driver
         dependent, clusters = d.CUlaunchAttribute(), d.CUlaunchAttribute()
         dependent.id = d.CUlaunchAttributeID.CU_LAUNCH_ATTRIBUTE_PROGRAMMATIC_STREAM_SERIALIZATION
@@ -38,8 +42,9 @@ class DependentKernel(Kernel):
                 "of shared memory each, and the GPU has no room for one; does MPS or MIG limit this process?"
             )
 
-    def launch_dependent(self, blocks: int, arguments: tuple[Any, ...]) -> None:
-        """Launch on PyTorch's current stream; `arguments` are ctypes values."""
+    def launch_dependent(self, blocks: int, given: Mapping[str, Any]) -> None:
+        """Launch on PyTorch's current stream; `given` has each parameter's value by its name."""
+        arguments = self._parameters.values(given)
         pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(value) for value in arguments))
         config = self._config(blocks)
         launched = self._driver.cuLaunchKernelEx(config, self._function, ctypes.addressof(pointers), 0)
@@ -55,11 +60,10 @@ class DependentKernel(Kernel):
         return config
 
 
-def source(*names: str, instructions: str, folder: Path | None = None) -> str:
-    """A kernel's source, of those files, with the instructions that its line TP_MMA stands for."""
+def source(*names: str, generated: str, folder: Path | None = None) -> str:
+    """A kernel's source: hopper.cu, what is `generated` (instructions, parameters), and those files."""
     here = folder or files("turbopi.kernels")
-    text = "\n".join((here / name).read_text() for name in ("hopper.cu", *names))
-    return re.sub(r"^TP_MMA.*$", lambda _: instructions, text, flags=re.MULTILINE)
+    return "\n".join(((here / "hopper.cu").read_text(), generated, *((here / name).read_text() for name in names)))
 
 
 Numbers = Literal["bf16", "e4m3"]
