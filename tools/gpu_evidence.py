@@ -28,9 +28,16 @@ PRODUCT = (
 HOST_ONLY = (
     *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.tokenizer", "turbopi.images"),
     *("turbopi.normalize", "turbopi.serve", "turbopi.demo", "turbopi.export", "turbopi.tensorrt", "turbopi.errors"),
-    *("turbopi.files", "turbopi.folders", "turbopi.reading", "turbopi.judge.golden", "turbopi.bench.provenance"),
+    *(
+        "turbopi.files",
+        "turbopi.folders",
+        "turbopi.reading",
+        "turbopi.judge.golden",
+        "turbopi.bench.provenance",
+        "turbopi.arguments",
+    ),
 )
-MARKED = re.compile(r"mark\.gpu|on_hopper|gpu_or_interpreter")
+MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
 
 
 def gpu_test_files() -> list[Path]:
