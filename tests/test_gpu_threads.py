@@ -76,10 +76,11 @@ def busy_allocating(device: torch.device, until: threading.Event) -> int:
     """Allocate from the device and from the host, copy, launch and wait, on a stream of one's own, as another program
     part does. Returns how many rounds it made."""
     rounds, stream, kept = 0, torch.cuda.Stream(device), list[torch.Tensor]()  # type: ignore[no-untyped-call]
+    generator = torch.Generator(device)  # PyTorch's own belongs to whoever captures: see engine/graph.py
     with torch.cuda.stream(stream):
         while not until.is_set():
             size = (1 + rounds % 13) << 18
-            x = torch.randn(size, device=device)
+            x = torch.randn(size, device=device, generator=generator)
             pinned = torch.empty(1000 + rounds % 7, pin_memory=True)
             pinned.copy_((x[:1000] * 2).sum() + pinned.new_zeros(len(pinned)).to(device), non_blocking=True)
             stream.synchronize()

@@ -4,7 +4,9 @@ A capture is thread-local: other threads may allocate, launch and wait for their
 not do is to wait for the whole device or to empty the allocator's cache; PyTorch does both when a capture begins. So
 this project's code captures, waits for a device and empties the cache under `CAPTURING`, one thread at a time. A
 program around it should do so in other threads when warm-up has ended; it should also not come close to the end of the
-GPU's memory before, where PyTorch empties the cache by itself.
+GPU's memory before, where PyTorch empties the cache by itself. Nor may another thread draw random numbers from the
+default CUDA generator of PyTorch while a graph is captured: every capture takes that one, and the draw fails ("Offset
+increment outside graph capture"). A generator of its own works.
 """
 
 import itertools
