@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from file_helpers import no_room
 from typer.testing import CliRunner
 
 from turbopi.bench import barrier, profile
@@ -30,7 +31,7 @@ from turbopi.bench.work import Job, Work, floor_ms, stage_work
 from turbopi.checkpoint import random_checkpoint
 from turbopi.cli import app
 from turbopi.config import ModelConfig
-from turbopi.errors import BackendError, BackendUnavailable, ConfigError
+from turbopi.errors import BackendError, BackendUnavailable, ConfigError, OutputError
 from turbopi.kernels.nvrtc import bindings, compile_cubin
 from turbopi.policy import UnifiedPolicy
 
@@ -217,6 +218,27 @@ def test_a_start_that_fails_says_why() -> None:
     start = Start(None, "pi05_tiny", 0, None, "warp", "bf16", "cpu", 1, None)
     with pytest.raises(BackendError, match="unknown backend 'warp'"):
         measure_ready(start)
+
+
+def test_anothers_results_arent_replaced_and_what_cant_be_written_is_told_first(tmp_path: Path) -> None:
+    (tmp_path / "results.json").write_text('{"format": 1, "episodes": []}')
+    for folder, why in (
+        (tmp_path, "results.json is there and isn't a benchmark's results, so it isn't replaced"),
+        (tmp_path / "results.json" / "below", "is a file"),
+    ):
+        result = CliRunner().invoke(app, ["bench", "--random-weights", "pi05_tiny", "--report", str(folder)])
+        assert result.exit_code == 2 and why in " ".join(result.stderr.split())
+    assert (tmp_path / "results.json").read_text() == '{"format": 1, "episodes": []}'
+
+
+def test_a_full_disk_keeps_the_earlier_benchmark(tmp_path: Path) -> None:
+    from turbopi.cli.bench import _write_results
+
+    file = _write_results({"floors": {}}, tmp_path)
+    before = file.read_text()
+    with no_room(10), pytest.raises(OutputError, match=rf"can't write {file}: File too large"):
+        _write_results({"floors": {}, "results": [1, 2, 3]}, tmp_path)
+    assert file.read_text() == before and list(tmp_path.iterdir()) == [file]
 
 
 def test_the_command_writes_a_complete_document(tmp_path: Path) -> None:

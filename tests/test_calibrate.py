@@ -11,6 +11,7 @@ import pytest
 import torch
 from cli_helpers import refusal, turbopi
 from conftest import golden_cases, golden_folder, golden_model
+from file_helpers import no_room
 from torch import nn
 
 from turbopi import backends, demo
@@ -34,7 +35,7 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.cli.options import PolicyOptions
 from turbopi.config import preset
 from turbopi.engine.fp8 import E4M3, E4M3_MAX, Directions, to_e4m3
-from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, ObservationError
+from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, ObservationError, OutputError
 from turbopi.judge.check_golden import check_case, golden_calibration, golden_calls
 from turbopi.judge.verdict import ACTIONS, Compared, Repetition, Rule, judge
 from turbopi.judge.verify import verify
@@ -288,6 +289,15 @@ def test_a_recording_is_read_and_what_cannot_be_used_is_named(tmp_path: Path) ->
 
 
 # The file
+
+
+def test_a_full_disk_keeps_the_earlier_calibration(tmp_path: Path) -> None:
+    file = tmp_path / "q.json"
+    made_up().save(file)
+    before = file.read_bytes()
+    with no_room(100), pytest.raises(OutputError, match=f"can't write {file}: File too large; make room"):
+        made_up().save(file)
+    assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]
 
 
 def test_a_file_comes_back_as_it_was(tmp_path: Path) -> None:

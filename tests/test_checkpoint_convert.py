@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 import torch
 from checkpoint_helpers import GOLDEN, LIBERO, lerobot_copy, torch_copy, write_json
+from file_helpers import no_room
 from safetensors import safe_open
 from safetensors.torch import load_file
 
 from turbopi.checkpoint import convert, open_checkpoint, random_checkpoint, write_random
 from turbopi.checkpoint.norm_stats import load_norm_stats
 from turbopi.config import PRESETS, VisionConfig
-from turbopi.errors import CheckpointError, ConfigError
+from turbopi.errors import CheckpointError, ConfigError, OutputError
 
 UNUSED = "paligemma_with_expert.gemma_expert.lm_head.weight"  # read by nothing, and zeros in what is written here
 
@@ -133,6 +134,14 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(OSError, match="disk on fire"):
         convert(source, tmp_path / "below" / "out", precision="bf16")
     assert list((tmp_path / "below").iterdir()) == []
+
+
+@pytest.mark.parametrize("room", [0, 5000])
+def test_a_full_disk_leaves_nothing_behind_and_is_named(room: int, tmp_path: Path) -> None:
+    target, checkpoint = tmp_path / "out", open_checkpoint(GOLDEN / "pi05" / "jax", "pi05_libero")
+    with no_room(room), pytest.raises(OutputError, match=f"can't write {target}: File too large; make room"):
+        convert(checkpoint, target, precision="bf16")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_config_that_turbopi_json_cannot_hold_is_refused(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """`turbopi infer`: every form of observation in, actions and a plot out."""
 
+import errno
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -57,6 +59,28 @@ def actions_in(tmp_path: Path) -> np.ndarray:
         assert set(archive.files) == {"actions", "noise"}
         actions: np.ndarray = archive["actions"]
         return actions
+
+
+def test_a_full_disk_keeps_the_earlier_actions_and_plot(
+    npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    infer(tmp_path, npz, "--seed", 5)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    replace = os.replace
+    for name in ("actions.npz", "actions.png"):
+
+        def full(source: Path, target: Path, name: str = name) -> None:
+            if Path(target).name == name:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            replace(source, target)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "replace", full)
+            result = turbopi("infer", *TINY, npz, "--seed", 5, "-o", tmp_path / "actions.npz")
+        assert result.exit_code == 2
+        assert f"error: can't write {tmp_path / name}: No space left on device; make room" in result.stderr
+        assert {path.name for path in tmp_path.iterdir()} == before.keys()
+        assert (tmp_path / name).read_bytes() == before[name]
 
 
 def test_an_npz_becomes_actions_and_a_plot(npz: Path, tmp_path: Path) -> None:

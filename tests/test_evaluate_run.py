@@ -166,6 +166,16 @@ def test_a_restart_that_cannot_begin_leaves_the_earlier_run(tmp_path: Path, monk
     assert load_results(tmp_path).planned == {(0, 0)}
 
 
+def test_a_restart_replaces_damaged_results_but_no_other_commands(tmp_path: Path) -> None:
+    file = tmp_path / "results.json"
+    file.write_text('{"floors": {}, "results": []}')
+    with pytest.raises(ConfigError, match="isn't the result of an evaluation, so it isn't replaced"):
+        run(tmp_path, SeekingPolicy(), states=(0,), restart=True)
+    assert file.read_text() == '{"floors": {}, "results": []}'
+    file.write_text('{"format": 1, "epis')
+    assert run(tmp_path, SeekingPolicy(), states=(0,), restart=True).complete
+
+
 def test_more_episodes_can_be_added_to_a_run(tmp_path: Path) -> None:
     run(tmp_path, SeekingPolicy(), tasks=(0,), states=(0,))
     results = run(tmp_path, SeekingPolicy(), tasks=(1,), states=(0,))

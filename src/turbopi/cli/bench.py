@@ -11,7 +11,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from turbopi.cli.files import check_folder
+from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, WeightOptions
 from turbopi.errors import ConfigError
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from turbopi.bench.run import Plan
 
+RESULTS = "results.json"
 _ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps": "10"}
 _TABLE = {"--cameras": "1,2,3", "--prompt-tokens": "48,200", "--horizons": "10,50", "--steps": "1,2,3,5,10"}
 
@@ -142,6 +143,7 @@ def bench(
         plan.check(resolved)
         if report is not None:
             check_folder(report)
+            check_replaces(report / RESULTS, "floors", "a benchmark's results")
         starts = _starts(checkpoint, options, plan, str(resolved)) if ready else []
         document = _run_with_bar(lambda progress: run(opened, plan, resolved, progress), plan, report, output)
     document["provenance"]["command"] = ["turbopi", *sys.argv[1:]]
@@ -198,7 +200,7 @@ def _write(document: dict[str, Any], folder: Path) -> list[Path]:
 
 def _write_results(document: dict[str, Any], folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
-    results = folder / "results.json"
+    results = folder / RESULTS
     write_whole(results, json.dumps(document, indent=1) + "\n")
     return results
 

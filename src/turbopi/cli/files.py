@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 from turbopi.errors import ConfigError, ObservationError
 
+MAX_RESULTS_BYTES = 512 * 2**20
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -29,6 +31,16 @@ def check_writable(file: Path) -> None:
     for path in (file.absolute().parent, file):
         if path.exists() and not os.access(path, os.W_OK):
             raise ConfigError(f"can't write {file}: {path} isn't writable")
+
+
+def check_replaces(file: Path, key: str, what: str) -> None:
+    """Raise ConfigError if a file is there that isn't `what` a command writes, a JSON object with this key: another
+    command's results would be lost.
+    """
+    from turbopi.reading import read_json
+
+    if file.exists() and key not in read_json(file, ConfigError, limit=MAX_RESULTS_BYTES):
+        raise ConfigError(f"{file} is there and isn't {what}, so it isn't replaced; name another folder")
 
 
 def let_import_from_here() -> None:

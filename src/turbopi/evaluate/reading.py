@@ -42,6 +42,19 @@ def load_results(folder: Path) -> Results:
     return results
 
 
+def check_is_run(folder: Path) -> None:
+    """Raise ConfigError if a folder's results.json isn't an evaluation's, damaged or not: it would be lost."""
+    path = folder / FILE
+    if not path.exists():
+        return
+    try:
+        content = read_json(path, ConfigError, limit=MAX_BYTES)
+    except ConfigError:
+        return  # what nobody can read is no loss
+    if "episodes" not in content:
+        raise ConfigError(f"{path} isn't the result of an evaluation, so it isn't replaced; give another --out")
+
+
 def _objects(fields: Fields, key: str) -> list[Fields]:
     """The objects of a list; messages name each by its place."""
     values = fields.list(key)

@@ -14,7 +14,7 @@ from turbopi.bench.provenance import provenance
 from turbopi.errors import ConfigError
 from turbopi.evaluate.episode import WorkerSetup
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan
-from turbopi.evaluate.reading import load_results
+from turbopi.evaluate.reading import check_is_run, load_results
 from turbopi.evaluate.report import write_report
 from turbopi.evaluate.results import FILE, Episode, Results, protocol_json
 from turbopi.evaluate.schedule import OnAnswer, Scheduler
@@ -39,7 +39,8 @@ def prepare(
     """Results for these jobs, with the episodes that the folder holds already unless `restart`: then `evaluate` removes
     them, once it can begin.
 
-    Raises ConfigError if those were run in another way, by another policy, or are being written by another process.
+    Raises ConfigError if those were run in another way or by another policy, if it is no evaluation that the folder
+    holds, or if another process evaluates into it.
     """
     if folder.is_dir():
         with _alone(folder):  # `evaluate` needs to be; who can't be should know before it is prepared
@@ -48,6 +49,7 @@ def prepare(
     versions = {"simulator": simulator.versions(), **provenance(torch.device("cpu"))}
     results = Results(folder, protocol_json(protocol), policy, [job.task for job in jobs], versions, {})
     if restart:
+        check_is_run(folder)
         results.replaces = True
     elif (folder / FILE).exists():
         results.continue_from(load_results(folder))
