@@ -203,7 +203,7 @@ def read_calibration(folder: str) -> None:
 
 
 def read_result(folder: str) -> None:
-    from turbopi.evaluate.results import load_results
+    from turbopi.evaluate.reading import load_results
 
     def read() -> Any:
         results = load_results(Path(folder))
