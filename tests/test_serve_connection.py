@@ -473,6 +473,21 @@ def test_a_connection_that_is_being_closed_ends_whatever_the_client_does() -> No
     run(test)
 
 
+@pytest.mark.parametrize("state", ["closing", "its HTTP request has no end"])
+def test_what_has_no_use_is_read_slowly(state: str) -> None:
+    async def test(server: Server) -> None:
+        client = await server.client() if state == "closing" else server.accept()
+        if state == "closing":
+            client.send(b"\x82\x00")  # not masked: the server closes
+        for _ in range(10):
+            client.send(b"x" * 100_000)
+            assert not client.transport.reading
+            await server.clock.sleep(0.021)
+            assert client.transport.reading
+
+    run(test)
+
+
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 MEMORY = {"message_bytes": 8 * MIB, "memory_bytes": 10 * MIB, "free_bytes": MIB}

@@ -188,6 +188,26 @@ def test_nothing_of_large_messages_stays_when_their_clients_have_left() -> None:
     served(test)
 
 
+def test_memory_goes_back_to_the_system_when_the_last_client_has_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits.trim_memory()  # whatever the C library is
+    trimmed: list[int] = []
+    monkeypatch.setattr(listener, "TRIM_SECONDS", 0.0)
+
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        monkeypatch.setattr(listener, "trim_memory", lambda: trimmed.append(len(policy.seen)))
+        async with client(server) as first:
+            async with client(server) as second:
+                await infer(second, observation("1"))
+            await eventually(lambda: metric(server, "turbopi_clients") == 1)
+            await infer(first, observation("2"))
+        for _ in range(3):
+            await http_get(server.port, "/healthz")
+        await eventually(lambda: bool(trimmed))
+
+    served(test)
+    assert trimmed == [2]
+
+
 # --- how many ---------------------------------------------------------------------------------------------------------
 
 

@@ -258,7 +258,7 @@ def test_a_message_over_the_limit_is_refused_with_1009_and_the_server_goes_on() 
             assert "524288" in closed.value.rcvd.reason  # the limit
         async with client(server) as connection:
             await infer(connection, observation())
-        assert metric(server, "turbopi_errors_total", kind="too_large") == 1
+        await eventually(lambda: metric(server, "turbopi_errors_total", kind="too_large") == 1)
 
     served(test, max_message_mb=0.5)
 

@@ -23,6 +23,7 @@ from turbopi.serve.metrics import Metrics
 
 AHEAD = 2  # messages of one client: one that is computed, one that waits
 BYTES_OF_ONE_WORK = 65536
+BREATH_SECONDS = 0.002  # 128 MB a second and more: who sent too much shall come to read why it is closed
 WORK_OF_A_REFUSAL = 3.0  # to find out what is wrong, say and log it
 
 
@@ -131,6 +132,7 @@ class GuardedConnection(ServerConnection):
             data = self._http(data)
         if self.protocol.state is State.CLOSING:
             super().data_received(data)  # which throws it away
+            self._breathe()
         elif data:
             self._held = self._held + data if self._held else data
             self._feed()
@@ -178,6 +180,7 @@ class GuardedConnection(ServerConnection):
         if end < 0:
             self._head = joined[-3:]
             super().data_received(data)
+            self._breathe()
             return b""
         end += 4 - len(self._head)
         self._head = None
@@ -256,6 +259,11 @@ class GuardedConnection(ServerConnection):
         reason = "the server holds too many large messages already: send smaller ones, or try again later"
         self._once("memory", self._limits.memory_seconds, lambda: self._give_up(CloseCode.TRY_AGAIN_LATER, reason))
         return False
+
+    def _breathe(self) -> None:
+        """Read on in a moment: what has no use may come without end until its deadline."""
+        self._read_on(False)
+        self._once("breathe", BREATH_SECONDS, lambda: self._read_on(True))
 
     def _read_on(self, on: bool) -> None:
         if on:

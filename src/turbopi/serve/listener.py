@@ -22,6 +22,7 @@ _protocol_logger = logging.getLogger(f"{__name__}.protocol")
 _protocol_logger.setLevel(logging.CRITICAL)
 
 RETRY_SECONDS = 1.0  # after a connection couldn't be taken
+TRIM_SECONDS = 1.0  # after the last client has left
 _BACKLOG = 256
 _NO_RESOURCES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _FULL_LINE = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: %d\r\nConnection: close\r\n\r\n%s"
@@ -46,6 +47,7 @@ class Listener:
         self._opening: dict[GuardedConnection, None] = {}  # in the order in which they came
         self._clients: set[GuardedConnection] = set()
         self._connected: set[GuardedConnection] = set()
+        self._trimming: asyncio.TimerHandle | None = None
         self._pace = AtMost(shared.limits.connections_rate)
 
     # --- lifecycle ----------------------------------------------------------------------------------------------------
@@ -185,9 +187,10 @@ class Listener:
             connection.transport.abort()
             await connection.wait_closed()
             self._connected.discard(connection)
-            self._clients.discard(connection)
-            if not self._clients:
-                asyncio.get_running_loop().call_later(1.0, self._trim)
+            if connection in self._clients:
+                self._clients.remove(connection)
+                if not self._clients and self._trimming is None:
+                    self._trimming = asyncio.get_running_loop().call_later(TRIM_SECONDS, self._trim)
 
     def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
         assert isinstance(connection, GuardedConnection)
@@ -200,5 +203,6 @@ class Listener:
         return None
 
     def _trim(self) -> None:
+        self._trimming = None
         if not self._clients:
             trim_memory()

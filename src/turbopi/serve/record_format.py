@@ -27,7 +27,6 @@ import numpy as np
 from turbopi.errors import ObservationError
 from turbopi.files import write_whole
 from turbopi.reading import Npz, is_finite, listing, parse_json, shown
-from turbopi.serve.observation_folder import load_folder
 
 FORMAT = "turbopi-recording"
 VERSION = 1
@@ -195,6 +194,8 @@ def load_observation(path: str | Path) -> dict[str, Any]:
     if not path.exists():
         raise ObservationError(f"{path} doesn't exist")
     if path.is_dir() and (path / "observation.json").is_file():
+        from turbopi.serve.observation_folder import load_folder  # pictures need torch, recordings don't
+
         return load_folder(path)
     with Npz(recorded_files(path)[0]) as members:
         if "index" in members:
