@@ -1,8 +1,10 @@
 """Everything around the engines: shapes, buffers, coverage, the pipeline. The engines are their PyTorch twins."""
 
 import dataclasses
+import threading
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -167,6 +169,21 @@ def test_a_failing_observation_frees_its_buffers(tmp_path: Path) -> None:
         with pytest.raises(BackendError, match="none for 1 cameras"):
             backend.submit(none, torch.zeros(1, H, 32), 2)
     assert backend.submit(observation, torch.zeros(1, H, 32), 2).result(timeout=60).actions.isfinite().all()
+
+
+def test_waiting_for_free_buffers_is_told_apart_from_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, backend = golden_cases()["a_three_cams"], golden_backend(TensorRTPipelinedBackend, "pi05", tmp_path)
+    now = [10.0]
+    monkeypatch.setattr("turbopi.backends.tensorrt_pipelined.time", SimpleNamespace(perf_counter=lambda: now[0]))
+
+    class Busy(threading.Semaphore):
+        def acquire(self, *arguments: Any) -> bool:
+            now[0] += 1.5
+            return super().acquire(*arguments)
+
+    backend._slots[1].free = Busy(1)
+    submitted = [backend.submit(first(one.observation), torch.zeros(1, H, 32), 2) for _ in range(3)]
+    assert [future.result(timeout=60).queue_ms for future in submitted] == [0, 1500, 0]
 
 
 def test_submit_takes_one_observation() -> None:

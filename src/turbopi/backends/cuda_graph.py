@@ -184,7 +184,9 @@ class CudaGraphBackend:
         return {name: torch.cat([row[name] for row in rows], dim=int(name != "actions")) for name in rows[0]}
 
     def describe(self) -> dict[str, Any]:
-        captured = sorted({(s.cameras, s.prompt_slots, s.horizon, s.num_steps) for s in self._calls})
+        captured = sorted(
+            {(s.cameras, s.prompt_slots, s.horizon, s.num_steps) for s in list(self._calls)}
+        )  # a call of another thread may add some
         return {
             "captured": [f"{c} cameras + {p} tokens, H={h}, {n} steps" for c, p, h, n in captured],
             "graphs": {"kept": len(self._graphs), **self._recent.describe()},

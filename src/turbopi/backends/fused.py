@@ -94,16 +94,16 @@ class FusedBackend(CudaGraphBackend):
         def call_of(steps: int, horizon: int, _: int) -> str:
             return f"H={horizon}, {steps} steps"
 
-        by_kernel = sorted({call_of(*key) for key in self._denoisers})
+        by_kernel = sorted({call_of(*key) for key in list(self._denoisers)})
         by_operations: dict[str, list[str]] = {}
-        for key, why in self._refused.items():
+        for key, why in list(self._refused.items()):
             calls = by_operations.setdefault(f"operations, as {why}", [])
             if (call := call_of(*key)) not in calls:
                 calls.append(call)
         described["denoising"] = ({"one CUDA kernel": by_kernel} if by_kernel else {}) | by_operations
         clocks = {
             call_of(*key): round(clock)
-            for key, kernel in self._denoisers.items()
+            for key, kernel in list(self._denoisers.items())
             if (clock := kernel.clock_mhz()) is not None
         }
         if clocks:

@@ -128,5 +128,5 @@ class PyTorchCompileBackend(PyTorchBackend):
     def describe(self) -> dict[str, Any]:
         return super().describe() | {
             "compiled": ["vision", "prefix", "denoising step"],
-            "compiled_for": sorted(map(str, self._compiled)),
+            "compiled_for": sorted(map(str, list(self._compiled))),
         }

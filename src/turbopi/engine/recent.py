@@ -45,7 +45,7 @@ class RecentLoops:
 
     def describe(self) -> dict[str, Any]:
         return {
-            "denoising_loops": [f"{steps} steps, H={horizon}" for steps, horizon in self._loops],
+            "denoising_loops": [f"{steps} steps, H={horizon}" for steps, horizon in list(self._loops)],
             "most_loops": MOST_LOOPS,
             "most_steps_together": MOST_STEPS,
             "forgotten": self.forgotten,
