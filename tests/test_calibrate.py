@@ -341,7 +341,7 @@ def test_other_weights_shapes_and_versions_are_refused(tmp_path: Path) -> None:
         ({"report": None}, "report None should be an object"),
         (
             {"report": {"observations": {"source": "x"}, "warnings": "hello"}},
-            "warnings hello should be a list of texts",
+            "warnings 'hello' should be a list of texts",
         ),
         ({"weights_sha256": 5}, "weights_sha256 5 should be text"),
         *(({"sites": {"vision.0.qkv": site | change}}, message) for change, message in WRONG_SITES),

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from attack.mutators import NASTY, changed, places, said, value_at
+
 Damage = Callable[[random.Random, Path], str]  # damages the file, says how
 
 
@@ -123,35 +125,28 @@ _BYTES: dict[str, Damage] = {
 
 # --- JSON -------------------------------------------------------------------------------------------------------------
 
-# fmt: off
-_VALUES: tuple[Any, ...] = (
-    None, True, -1, 0, 0.5, 10**18, 10**400, 1.7e308, -1.7e308, 1e-320, float("nan"), float("inf"), "", "text",
-    "1.5", "\0", "x" * 5000, "\ud800", "../other", [], {}, [None], [[]], {"a": 1}, [0] * 5000,
-)
-# fmt: on
-
 
 def _another_value(draw: random.Random, file: Path) -> str:
     content = _parsed(file)
-    place = draw.choice(_places(content))
-    value = draw.choice(_VALUES)
-    return _write(file, _with(content, place, lambda _: value), f"{_said(place)} = {str(value)[:30]}")
+    place = draw.choice(places(content))
+    value = draw.choice(NASTY)
+    return _write(file, changed(content, place, lambda _: value), f"{said(place)} = {str(value)[:30]}")
 
 
 def _without(draw: random.Random, file: Path) -> str:
     content = _parsed(file)
-    place = draw.choice(_places(content))
-    return _write(file, _with(content, place, None), f"{_said(place)} taken out")
+    place = draw.choice(places(content))
+    return _write(file, changed(content, place, None), f"{said(place)} taken out")
 
 
 def _negated(draw: random.Random, file: Path) -> str:
     content = _parsed(file)
-    places = [p for p in _places(content) if type(_at(content, p)) in (int, float)]
-    if not places:
+    numbers = [place for place in places(content) if type(value_at(content, place)) in (int, float)]
+    if not numbers:
         return _another_value(draw, file)
-    place = draw.choice(places)
+    place = draw.choice(numbers)
     change = draw.choice((lambda number: -number, lambda number: number * 10**6, str))
-    return _write(file, _with(content, place, change), f"{_said(place)} changed")
+    return _write(file, changed(content, place, change), f"{said(place)} changed")
 
 
 def _deep(draw: random.Random, file: Path) -> str:
@@ -192,36 +187,6 @@ def _parsed(file: Path) -> Any:
     return [json.loads(line) for line in text.splitlines()] if file.suffix == ".jsonl" else json.loads(text)
 
 
-def _places(content: Any) -> list[tuple[Any, ...]]:
-    """The way to every value, the whole among them; of long lists only the first three."""
-    found: list[tuple[Any, ...]] = [()]
-    if isinstance(content, dict):
-        for key, value in content.items():
-            found += [(key, *rest) for rest in _places(value)]
-    elif isinstance(content, list):
-        for index, value in enumerate(content[:3]):
-            found += [(index, *rest) for rest in _places(value)]
-    return found
-
-
-def _at(content: Any, place: tuple[Any, ...]) -> Any:
-    for key in place:
-        content = content[key]
-    return content
-
-
-def _with(content: Any, place: tuple[Any, ...], change: Callable[[Any], Any] | None) -> Any:
-    """A changed copy; `change` None takes the value out."""
-    if not place:
-        return None if change is None else change(content)
-    copy = dict(content) if isinstance(content, dict) else list(content)
-    if change is None and len(place) == 1:
-        del copy[place[0]]
-    else:
-        copy[place[0]] = _with(content[place[0]], place[1:], change)
-    return copy
-
-
 def _write(file: Path, content: Any, how: str) -> str:
     lines = (
         [json.dumps(item) for item in content]
@@ -230,7 +195,3 @@ def _write(file: Path, content: Any, how: str) -> str:
     )
     file.write_text("\n".join(lines), encoding="utf-8")
     return how
-
-
-def _said(place: tuple[Any, ...]) -> str:
-    return "/".join(map(str, place))[:80] or "the whole"

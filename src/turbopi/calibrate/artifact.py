@@ -22,7 +22,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.fp8 import E4M3, Directions
 from turbopi.errors import CalibrationError, ConfigError
 from turbopi.files import write_whole
-from turbopi.reading import is_finite, is_integer, read_json, shown
+from turbopi.reading import is_finite, is_integer, one_line, read_json, shown
 
 logger = logging.getLogger(__name__)
 
@@ -250,7 +250,7 @@ class Quantization:
             raise
         except _UNSOUND as error:
             raise CalibrationError(
-                f"{path} isn't a calibration that `turbopi calibrate` wrote: {_unsound(error)}"
+                f"{path} isn't a calibration that `turbopi calibrate` wrote: {type(error).__name__} {one_line(error)}"
             ) from error
 
 
@@ -299,17 +299,13 @@ _MAX_BYTES = 512 * 2**20  # the directions of a full-size model are most of it
 _SCALES = (1e-30, 1e30)  # of an activation; further out float32 has no room for products
 
 
-def _unsound(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__} {error}".split())[:300]
-
-
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _expect(right: bool, name: str, expected: str, got: Any) -> None:
     if not right:
-        raise ValueError(f"{name} {str(got)[:80]} should be {expected}")
+        raise ValueError(f"{name} {shown(got)} should be {expected}")
 
 
 def _bytes(codes: torch.Tensor) -> bytes:

@@ -28,7 +28,7 @@ from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, f
 from turbopi.checkpoint.settings import Settings, with_values
 from turbopi.config import LIMITS, Kind, ModelConfig, Normalization, NormMode, PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
-from turbopi.reading import Fields, file_inside, read_json, shown
+from turbopi.reading import Fields, file_inside, one_line, read_json, shown
 
 CONFIG, EMPTY_CAMERA = "config.json", "observation.images.empty_camera_"
 
@@ -226,7 +226,7 @@ class LeRobotFolder:
         try:
             tensors = load_file(file)
         except (SafetensorError, OSError) as error:
-            raise CheckpointError(f"{file} can't be read as safetensors ({error})") from error
+            raise CheckpointError(f"{file} can't be read as safetensors ({one_line(error)})") from error
         selected = step.config.values.get("normalize_observation_keys")
         if not isinstance(selected, list | None):
             step.config.refuse("normalize_observation_keys", "a list of keys or null")

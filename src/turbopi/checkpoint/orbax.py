@@ -21,7 +21,7 @@ from torch import Tensor
 
 from turbopi.checkpoint.source import Shape, listing
 from turbopi.errors import CheckpointError
-from turbopi.reading import Fields, is_integer, parse_json, read_json
+from turbopi.reading import Fields, is_integer, one_line, parse_json, read_json
 
 MANIFEST = "manifest.ocdbt"
 _DTYPES = {"float32": "F32", "<f4": "F32", "bfloat16": "BF16", "float16": "F16", "<f2": "F16"}
@@ -148,10 +148,6 @@ class OrbaxArray:
         if values.dtype.name == "bfloat16":  # NumPy's is foreign to torch
             return torch.from_numpy(values.view("int16")).view(torch.bfloat16)
         return torch.from_numpy(values)
-
-
-def one_line(reason: Exception) -> str:
-    return " ".join(str(reason).split())[:400]
 
 
 def _chunks_of(arrays: Mapping[str, Any], keys: list[str]) -> Counter[str]:

@@ -205,7 +205,7 @@ def _text_or_null(value: Any) -> str | None:
 
 
 def _name(value: Any) -> str:
-    _require(isinstance(value, str) and value.isprintable())
+    _require(isinstance(value, str) and value.isprintable() and len(value) < 1000)
     return _text(value)
 
 

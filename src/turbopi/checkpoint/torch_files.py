@@ -1,11 +1,9 @@
 """openpi's PyTorch layout and LeRobot's: safetensors, memory-mapped, tensor by tensor."""
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -14,6 +12,7 @@ from torch import Tensor
 from turbopi.checkpoint.names import EMBEDDING, TIED_EMBEDDING, TIED_HEAD, UNUSED_HEAD, from_openpi, to_openpi
 from turbopi.checkpoint.source import Piece, Shape, listing, row_ranges
 from turbopi.errors import CheckpointError
+from turbopi.reading import Fields, one_line, read_json
 
 ITEMSIZE = {"F32": 4, "BF16": 2, "F16": 2}
 WEIGHTS, INDEX = "model.safetensors", "model.safetensors.index.json"
@@ -107,16 +106,13 @@ def _weight_files(folder: Path) -> list[Path]:
     index = folder / INDEX
     if not index.exists():
         return [folder / WEIGHTS]
-    try:
-        weight_map: dict[str, Any] = json.loads(index.read_text())["weight_map"]
-        names = sorted(set(weight_map.values()))
-        odd = [name for name in names if not re.fullmatch(r"[^/\\]+\.safetensors", name)]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"{index} isn't a safetensors index: {error!r}") from error
-    if odd:
+    weight_map = Fields(read_json(index), f"{index} isn't a safetensors index").object("weight_map").values
+    odd = [str(name) for name in weight_map.values() if not re.fullmatch(r"[^/\\]{1,200}\.safetensors", str(name))]
+    names = sorted(set(map(str, weight_map.values())))
+    if odd or not names:
         raise CheckpointError(
-            f"{index} names {listing(odd)}; expected plain names of .safetensors files beside it. Weights are read "
-            "from that folder alone"
+            f"{index} names {listing(odd) or 'no file'}; expected plain names of .safetensors files beside it. Weights "
+            "are read from that folder alone"
         )
     absent = [name for name in names if not (folder / name).is_file()]
     if absent:
@@ -134,7 +130,9 @@ def read_header(file: Path) -> list[Stored]:
                 stored.append(Stored(file, key, tuple(tensor.get_shape()), tensor.get_dtype()))
             return stored
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{file} can't be read as safetensors ({error}); is the download complete?") from error
+        raise CheckpointError(
+            f"{file} can't be read as safetensors ({one_line(error)}); is the download complete?"
+        ) from error
 
 
 def read_tensor(stored: Stored) -> Tensor:

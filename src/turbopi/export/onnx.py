@@ -28,7 +28,7 @@ from turbopi.export.graphs import Graph, graphs
 from turbopi.export.quantized import quantize_mlps
 from turbopi.files import new_folder
 from turbopi.model.reference import Pi0Model
-from turbopi.reading import Fields, file_inside, is_integer, read_json
+from turbopi.reading import Fields, file_inside, is_integer, read_json, shown
 from turbopi.tensorrt.calibrate import Calibration
 from turbopi.tensorrt.networks import Fp8Scales
 
@@ -129,7 +129,7 @@ def open_export(folder: str | Path) -> Export:
     for name in (*(f"{graph}.onnx" for graph in GRAPHS), *files):
         size = (folder / name).stat().st_size if (folder / name).is_file() else None
         if size is None or size != files.get(name):
-            found = "is missing" if size is None else f"has {size} bytes instead of {files.get(name)}"
+            found = "is missing" if size is None else f"has {size} bytes instead of {shown(files.get(name))}"
             raise CheckpointError(f"{folder / name} {found}; copy the whole folder or export again")
     return Export(folder, config, manifest)
 

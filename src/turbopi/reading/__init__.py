@@ -16,7 +16,7 @@ flipped digit in one that still reads well stays unnoticed.
 
 from turbopi.reading.arrays import MAX_ARRAY_BYTES, Npz, read_npy, read_npz
 from turbopi.reading.fields import Fields, is_finite, is_integer
-from turbopi.reading.files import file_inside, listing, open_file, read_bytes, shown
+from turbopi.reading.files import file_inside, listing, one_line, open_file, read_bytes, shown
 from turbopi.reading.json import MAX_JSON_BYTES, MAX_JSON_DEPTH, parse_json, read_json
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "is_finite",
     "is_integer",
     "listing",
+    "one_line",
     "open_file",
     "parse_json",
     "read_bytes",

@@ -15,7 +15,7 @@ import numpy as np
 
 from turbopi.errors import ObservationError, TurboPiError
 from turbopi.reading.fields import is_integer
-from turbopi.reading.files import Error, open_file, shown
+from turbopi.reading.files import Error, one_line, open_file, shown
 
 MAX_ARRAY_BYTES = 512 * 2**20  # of all arrays of a file together
 _MAX_NPY_HEADER = 4096
@@ -39,6 +39,8 @@ class Npz(Mapping[str, np.ndarray]):
             if begin not in (b"PK\3\4", b"PK\5\6"):
                 raise error(f"{file} isn't a readable .npz file: it is no zip archive")
             self._archive = zipfile.ZipFile(self._stream)
+            if len(self._archive.infolist()) != _count_at_the_end(self._stream):
+                raise error(f"{file} isn't a readable .npz file: its list of arrays is damaged")
             for member in self._archive.infolist():
                 name = member.filename.removesuffix(".npy")
                 if name in self._members:
@@ -83,6 +85,16 @@ class Npz(Mapping[str, np.ndarray]):
         self.close()
 
 
+def _count_at_the_end(stream: IO[bytes]) -> int | None:
+    """The number of members that a zip archive says it has in its last 22 bytes, which zipfile doesn't look at.
+
+    None where there is no such end: behind a comment, which no .npz has. More than 65,534 are written elsewhere.
+    """
+    stream.seek(-22, os.SEEK_END)
+    end = stream.read(22)
+    return int.from_bytes(end[10:12], "little") if end[:4] == b"PK\5\6" else None
+
+
 def read_npz(
     file: str | Path, error: Error = ObservationError, *, limit: int = MAX_ARRAY_BYTES
 ) -> dict[str, np.ndarray]:
@@ -102,7 +114,7 @@ def read_npy(file: str | Path, error: Error = ObservationError, *, limit: int = 
 
 
 def _reason(error: Exception) -> str:
-    return f"{type(error).__name__} {error}".split("\n", 1)[0][:200].rstrip()
+    return f"{type(error).__name__} {one_line(error)}".rstrip()
 
 
 _DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|[US]\d{1,7}|[mM]8\[\d{0,4}[a-zA-Z]{1,2}\])")

@@ -37,6 +37,11 @@ class _Short(reprlib.Repr):
 shown = _Short().repr
 
 
+def one_line(error: Exception) -> str:
+    """What a library says of damage, which may quote all of it."""
+    return "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(error)[:2000].split())[:400])
+
+
 def listing(names: Sequence[str], limit: int = 5) -> str:
     """`a, b, c and 7 more (10 in all)`; a name that can't be printed on a line as it is in quotes."""
     told = ", ".join(name if name.isprintable() and len(name) < 200 else shown(name) for name in names[:limit])
@@ -76,7 +81,7 @@ def file_inside(folder: Path, name: Any, where: object, error: Error = Checkpoin
     Raises `error` for what is no name, is absolute, or leads out of the folder by "..". Links are followed: whoever
     owns the folder made them.
     """
-    if not isinstance(name, str) or not name or not name.isprintable():
+    if not isinstance(name, str) or not 0 < len(name) < 1000 or not name.isprintable():
         raise error(f"{where} names the file {shown(name)}; expected the name of a file in {folder}")
     path = Path(name)
     if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:|\\", name):
