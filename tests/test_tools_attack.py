@@ -110,7 +110,14 @@ def test_a_bar_that_could_not_be_measured_is_broken() -> None:
     assert not Bar("ratio", None, 1.5).held
     assert latency_ratio([10.0, 10.0], [16.0, 14.0, 15.0]) == 1.5
     assert latency_ratio([10.0], []) is None and latency_ratio([], [1.0]) is None
-    assert percentile([3.0, 1.0, 2.0], 0.5) == 2.0
+
+
+def test_one_long_wait_outweighs_many_short_ones() -> None:
+    assert percentile([20.0] * 9, 0.5) == 20.0
+    assert percentile([20.0] * 9 + [181.0], 0.5) == 181.0
+    assert percentile([20.0] * 10 + [181.0], 0.5) == 20.0
+    assert percentile([20.0] * 10 + [181.0], 0.99) == 181.0
+    assert percentile([], 0.5) is None
 
 
 def test_a_request_that_still_waits_is_a_fault() -> None:

@@ -21,7 +21,7 @@ from attack.arena import Found, Tick
 from attack.specimens import write_observation
 from attack.zygote import Job, Zygote, fault
 
-SECONDS, MEMORY_MB = 60.0, 4000.0
+SECONDS, MEMORY_MB = 120.0, 4000.0
 SERVE_SECONDS = 12.0  # a server that comes up in spite of its options is ended then
 
 _TINY = ("--random-weights", "pi05_tiny")

@@ -27,7 +27,8 @@ def damage(draw: random.Random, folder: Path) -> Done:
     choices = _JSON if file.suffix in (".json", ".jsonl") and draw.random() < 0.7 else _BYTES
     name = draw.choice(tuple(choices))
     how = choices[name](draw, file)
-    return Done(file, how, noticeable=name in _NOTICEABLE or file.suffix in (".npz", ".png", ""))
+    checked = file.suffix in _CHECKED and name in ("flip", "flip at an end", "zeros")
+    return Done(file, how, noticeable=name in _NOTICEABLE or checked)
 
 
 # --- bytes ------------------------------------------------------------------------------------------------------------
@@ -179,6 +180,7 @@ _JSON: dict[str, Damage] = {
     "a key twice": _key_twice,
     "UTF-16": _utf16,
 }
+_CHECKED = (".npz", ".png", "")  # formats with checksums: zip, PNG, and OCDBT's files, which have no suffix
 _NOTICEABLE = ("cut", "replaced", "a folder", "deep")
 
 

@@ -44,10 +44,10 @@ def knocks(port: int) -> Iterator[Knock]:
         "file://",
         "",
         "http://[",
-        "\x7f",
         "é",
     ):
         yield origin(f"Origin: {value!r}", OUT, f"Origin: {value}")
+    yield origin("Origin: a control character", (*OUT, 0), "Origin: \x7f")
     yield origin("long origin", (*OUT, 0), f"Origin: http://{'a' * 7000}")
     yield origin("two origins", OUT, f"Origin: http://{here}", "Origin: http://evil.example")
     for host in ("evil.example", f"evil.example:{port}", "[::1", "127.0.0.1.evil.example"):

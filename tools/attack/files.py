@@ -21,33 +21,27 @@ def files(
     """`count` damages of each format, each read once, in a fork."""
     with Zygote() as zygote:
         for index, specimen in enumerate(specimens):
-            whole = folder / f"whole-{seed}-{index}"
+            whole, place = folder / f"whole-{seed}-{index}", folder / f"read-{seed}-{index}"
             specimen.make(whole)
-            expected = _read(zygote, specimen, whole)
+            shutil.copytree(whole, place)  # all are read at one place: what is read may hold its path
+            expected = _read(zygote, specimen, place)
+            shutil.rmtree(place)
             if expected.code != 0:
-                found.violate(
-                    f"{specimen.name}: the undamaged file is refused: {expected.stderr[-300:]}", specimen.read
-                )
+                said = f"the undamaged file is refused: {expected.stderr[-300:]}"
+                found.violate(f"{specimen.name}: {said}", specimen.read)
             for number in range(count):
                 draw = random.Random(f"{seed} {specimen.name} {number}")
-                _one(zygote, specimen, whole, expected.stdout, draw, found)
+                shutil.copytree(whole, place)
+                done = damage(draw, place)
+                read = _read(zygote, specimen, place)
+                shutil.rmtree(place)
+                outcome, wrong = judge_read(read, expected.stdout, done)
+                found.count += 1
+                found.outcomes[outcome] += 1
+                if wrong is not None:
+                    found.violate(f"{specimen.name}: {wrong}", f"{done.file.relative_to(place)}: {done.how}")
                 tick((index + (number + 1) / count) / len(specimens))
             shutil.rmtree(whole)
-
-
-def _one(zygote: Zygote, specimen: Specimen, whole: Path, expected: str, draw: random.Random, found: Found) -> None:
-    copy = whole.with_name(f"{whole.name}-damaged")
-    shutil.copytree(whole, copy)
-    try:
-        done = damage(draw, copy)
-        read = _read(zygote, specimen, copy)
-    finally:
-        shutil.rmtree(copy)
-    outcome, wrong = judge_read(read, expected, done)
-    found.count += 1
-    found.outcomes[outcome] += 1
-    if wrong is not None:
-        found.violate(f"{specimen.name}: {wrong}", f"{done.file.relative_to(copy)}: {done.how}")
 
 
 def judge_read(read: Done, expected: str, done: Damaged) -> tuple[str, str | None]:

@@ -13,6 +13,8 @@ from attack.websocket import PING, HandshakeRefused, Raw, frame, header, request
 from turbopi.serve.wire import pack
 
 SLOW_WALK = b"\xdd\0\0\x4e\x1e" + b"\xc0" * 19998  # as many values as a message may have: the most work a byte
+# The most headers of different kinds that a message may have, which no run of equal ones makes cheap.
+WORST_WALK = b"\xdd\0\0\x0f\0" + b"\xa1a\x01" * 1920
 GONE = (OSError, HandshakeRefused, asyncio.TimeoutError, asyncio.IncompleteReadError)
 RECONNECT_S = 0.1
 
@@ -78,6 +80,29 @@ async def slow_walk(arena: Arena) -> None:
 
 async def slow_walks(arena: Arena) -> None:
     await _attackers(arena, 8, lambda: _flood(arena, frame(SLOW_WALK) * 4, 4, None))
+
+
+async def worst_walks(arena: Arena) -> None:
+    await _attackers(arena, 8, lambda: _flood(arena, frame(WORST_WALK) * 4, 4, None))
+
+
+async def reconnecting_walks(arena: Arena) -> None:
+    """Clients that leave after forty such frames: whoever is limited by connection must limit those, too."""
+
+    async def come_and_go() -> None:
+        raw = await Raw.open(arena.port)
+        try:
+            raw.writer.write(frame(WORST_WALK) * 40)
+            arena.found.count += 40
+            for _ in range(40):
+                reply = await raw.reply(30)
+                arena.found.outcomes[reply.kind] += 1
+                if reply.kind in ("closed", "silence"):
+                    break
+        finally:
+            raw.abort()
+
+    await _attackers(arena, 8, come_and_go)
 
 
 async def one_byte(arena: Arena) -> None:
