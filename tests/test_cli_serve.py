@@ -20,7 +20,11 @@ import pytest
 from cli_helpers import refusal, turbopi
 from websockets.sync.client import connect
 
+from turbopi.checkpoint import random_checkpoint
 from turbopi.demo import load_frames
+from turbopi.observation import Observation
+from turbopi.policy import UnifiedPolicy
+from turbopi.serve import running
 from turbopi.serve.record import iter_recording
 from turbopi.serve.wire import pack, unpack
 
@@ -106,6 +110,26 @@ def test_no_warmup_hides_the_policys_warmup_from_the_server(monkeypatch: Any) ->
     assert served["policy"].metadata["num_denoising_steps"] == 2
     assert (served["queue_limit"], served["max_message_mb"]) == (3, 1.5)
     assert (served["host"], served["port"], served["api_key"], served["record_dir"]) == ("127.0.0.1", 0, None, None)
+
+
+def test_strict_reaches_the_policy_and_needs_a_warm_up(monkeypatch: Any) -> None:
+    served: dict[str, Any] = {}
+    monkeypatch.setattr("turbopi.serve.run", lambda policy, **options: served.update(policy=policy))
+    assert turbopi("serve", *TINY, "--port", 0, "--strict").exit_code == 0
+    assert served["policy"].metadata["strict"] is True
+    assert "with --no-warmup that would be everything" in refusal(turbopi("serve", *TINY, "--strict", "--no-warmup"))
+
+
+def test_a_port_is_ready_once_every_number_of_cameras_is_warm(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), device="cpu", robot="plain", num_denoising_steps=1)
+    warm: list[int] = []
+
+    def warmup(observation: Observation, *arguments: Any, **options: Any) -> None:
+        warm.append(int(observation.image_mask.sum()))
+
+    monkeypatch.setattr(policy.backend, "warmup", warmup)
+    with running(policy):
+        assert sorted(warm) == [1, 2, 3]
 
 
 def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:

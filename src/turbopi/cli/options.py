@@ -221,14 +221,14 @@ class PolicyOptions(RobotOptions):
             "robot": self.make_robot(),
         }
 
-    def make_policy(self, checkpoint: "Checkpoint", output: Output) -> "UnifiedPolicy":
-        """The policy, with what it is printed."""
+    def make_policy(self, checkpoint: "Checkpoint", output: Output, *, strict: bool = False) -> "UnifiedPolicy":
+        """The policy, with what it is printed. `strict` as UnifiedPolicy's."""
         with interrupts_end_at_once():
             from turbopi.policy import UnifiedPolicy
 
             if checkpoint.stored_bytes > SHOW_LOADING_BYTES:
                 output.line(f"Loading {checkpoint.stored_bytes / 1e9:.1f} GB of weights …")
-            policy = UnifiedPolicy(checkpoint, progress=output.shows_progress, **self.policy_arguments())
+            policy = UnifiedPolicy(checkpoint, progress=output.shows_progress, strict=strict, **self.policy_arguments())
         about = policy.metadata
         output.line(
             f"{about['config']} for {about['robot']}, {about['precision']} on {about['device']} "

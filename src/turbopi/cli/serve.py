@@ -73,8 +73,16 @@ def serve(
         Path | None, typer.Option("--record", metavar="DIR", help="Write every observation and its actions below DIR.")
     ] = None,
     warmup: Annotated[
-        bool, typer.Option("--warmup/--no-warmup", help="Run once before the first client, which compiles.")
+        bool,
+        typer.Option(
+            "--warmup/--no-warmup",
+            help="Compile and capture, before the first client, for every number of cameras that the robot may send.",
+        ),
     ] = True,
+    strict: Annotated[
+        bool,
+        typer.Option("--strict", help="Refuse requests that warm-up didn't cover, which would take a second or more."),
+    ] = False,
 ) -> None:
     """Serve a policy to openpi's clients.
 
@@ -83,6 +91,8 @@ def serve(
     """
     output = Output()
     options.check(checkpoint)
+    if strict and not warmup:
+        raise ConfigError("--strict refuses what warm-up didn't cover: with --no-warmup that would be everything")
     shown = api_key is not None and api_key != os.environ.get("TURBOPI_API_KEY")
     api_key = _key(api_key, api_key_file)
     hosts = [] if allowed_hosts is None else [name.strip() for name in allowed_hosts.split(",")]
@@ -108,7 +118,7 @@ def serve(
         )
     opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
-    policy = options.make_policy(opened, output)
+    policy = options.make_policy(opened, output, strict=strict)
 
     from turbopi import serve as serving
 
