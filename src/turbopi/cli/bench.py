@@ -13,9 +13,11 @@ from rich.table import Table
 
 from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
-from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
+from turbopi.config import CAMERAS, LIMITS
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
+from turbopi.reading import shown
 
 if TYPE_CHECKING:
     import torch
@@ -27,13 +29,24 @@ _ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps"
 _TABLE = {"--cameras": "1,2,3", "--prompt-tokens": "48,200", "--horizons": "10,50", "--steps": "1,2,3,5,10"}
 
 
+_MOST = {
+    "--cameras": len(CAMERAS),
+    "--prompt-tokens": LIMITS["max_prompt_tokens"],
+    "--horizons": LIMITS["action_horizon"],
+    "--steps": LIMITS["num_denoising_steps"],
+}
+
+
 def _numbers(option: str, text: str) -> list[int]:
     try:
         values = [int(part) for part in text.split(",")]
     except ValueError:
-        raise ConfigError(f"{option} is {text!r}; expected whole numbers with commas between, such as 1,5,10") from None
-    if min(values) < 1:
-        raise ConfigError(f"{option} has {min(values)}; expected whole numbers from 1")
+        raise ConfigError(
+            f"{option} is {shown(text)}; expected whole numbers with commas between, such as 1,5,10"
+        ) from None
+    wrong = [value for value in values if not 1 <= value <= _MOST[option]]
+    if wrong:
+        raise ConfigError(f"{option} has {shown(wrong[0])}; expected whole numbers from 1 to {_MOST[option]}")
     return list(dict.fromkeys(values))
 
 
@@ -84,10 +97,16 @@ def bench(
     prompt_tokens: Annotated[str | None, typer.Option(metavar="N,N,…", help="Valid prompt tokens; else 48.")] = None,
     horizons: Annotated[str | None, typer.Option(metavar="N,N,…", help="Actions in a chunk; else 10.")] = None,
     steps: Annotated[str | None, typer.Option(metavar="N,N,…", help="Denoising steps; else 10.")] = None,
-    calls: Annotated[int, typer.Option(min=1, help="Calls of each measurement, after three for warm-up.")] = 100,
+    calls: Annotated[
+        int, typer.Option(min=1, max=MOST_CALLS, help="Calls of each measurement, after three for warm-up.")
+    ] = 100,
     main_calls: Annotated[
         int | None,
-        typer.Option(min=1, help="Calls of the main job (2 cameras, 48 tokens, H = 10, 10 steps, or the nearest)."),
+        typer.Option(
+            min=1,
+            max=MOST_CALLS,
+            help="Calls of the main job (2 cameras, 48 tokens, H = 10, 10 steps, or the nearest).",
+        ),
     ] = None,
     seconds: Annotated[
         float, typer.Option(min=0, help="A measurement ends after them, though not before 20 calls.")

@@ -9,6 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, EngineCalibration, ScaleMethod, WeightOptions
+from turbopi.config import LIMITS
 from turbopi.errors import BackendUnavailable, ConfigError
 
 if TYPE_CHECKING:
@@ -33,9 +34,18 @@ def build(
     checkpoint: CheckpointArgument = None,
     cameras: Annotated[int, typer.Option(min=0, max=4, help="Valid cameras of an observation.")] = 2,
     prompt_tokens: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Longest prompt; the model's own limit unless given.")
+        int | None,
+        typer.Option(
+            min=1,
+            max=LIMITS["max_prompt_tokens"],
+            metavar="N",
+            help="Longest prompt; the model's own limit unless given.",
+        ),
     ] = None,
-    horizon: Annotated[int | None, typer.Option(min=1, metavar="N", help="Actions in a chunk; the model's.")] = None,
+    horizon: Annotated[
+        int | None,
+        typer.Option(min=1, max=LIMITS["action_horizon"], metavar="N", help="Actions in a chunk; the model's."),
+    ] = None,
     precision: Annotated[
         str, typer.Option(metavar="bf16|fp8", help="Of the prefix's MLPs: for backend tensorrt, or tensorrt_fp8.")
     ] = "bf16",

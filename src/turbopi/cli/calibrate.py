@@ -8,8 +8,9 @@ from rich.table import Table
 
 from turbopi.cli.files import check_writable
 from turbopi.cli.framework import JsonFlag, Output, command
-from turbopi.cli.options import CheckpointArgument, RobotOptions
+from turbopi.cli.options import MOST_NOISES, MOST_OBSERVATIONS, CheckpointArgument, RobotOptions
 from turbopi.cli.progress import with_stages
+from turbopi.config import LIMITS
 from turbopi.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -43,8 +44,12 @@ def calibrate(
             "--out", "-o", metavar="FILE", help="Where it goes.", show_default="turbopi_fp8.json beside the weights"
         ),
     ] = None,
-    count: Annotated[int, typer.Option("--count", min=2, metavar="N", help="At most so many observations.")] = 64,
-    noises: Annotated[int, typer.Option("--noises", min=1, metavar="M", help="Noises for each of them.")] = 1,
+    count: Annotated[
+        int, typer.Option("--count", min=2, max=MOST_OBSERVATIONS, metavar="N", help="At most so many observations.")
+    ] = 64,
+    noises: Annotated[
+        int, typer.Option("--noises", min=1, max=MOST_NOISES, metavar="M", help="Noises for each of them.")
+    ] = 1,
     seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the first noise.")] = 0,
     target: Annotated[
         float,
@@ -57,10 +62,17 @@ def calibrate(
         ),
     ] = 0.9975,
     steps: Annotated[
-        int | None, typer.Option("--steps", min=1, metavar="N", help="Denoising steps; else the checkpoint's.")
+        int | None,
+        typer.Option(
+            "--steps",
+            min=1,
+            max=LIMITS["num_denoising_steps"],
+            metavar="N",
+            help="Denoising steps; else the checkpoint's.",
+        ),
     ] = None,
     batch: Annotated[
-        int, typer.Option("--batch", min=1, metavar="N", help="Observations at once; fewer take less memory.")
+        int, typer.Option("--batch", min=1, max=1024, metavar="N", help="Observations at once; fewer take less memory.")
     ] = 8,
     device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     tokenizer: Annotated[str | None, typer.Option("--tokenizer", metavar="FILE", help="SentencePiece model.")] = None,

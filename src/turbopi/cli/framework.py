@@ -37,7 +37,7 @@ from turbopi.cli.process import (
     forget_output,
     is_closed_pipe,
 )
-from turbopi.errors import DeviceLost, TurboPiError
+from turbopi.errors import ConfigError, DeviceLost, TurboPiError
 
 CHECK_FAILED, OUR_FAULT = 1, 3
 PLAIN_WIDTH = 140  # columns of tables where there is no terminal
@@ -133,9 +133,15 @@ def command(
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(function)
         def run(*, debug: bool, **values: Any) -> None:
+            given = dict(values)
             if shared is not None:
                 values["options"] = shared(**{field.name: values.pop(field.name) for field in shared_fields})
-            with_errors_told(lambda: function(**values), debug=debug)
+
+            def work() -> None:
+                _refuse_nan(given)
+                function(**values)
+
+            with_errors_told(work, debug=debug)
 
         keyword = inspect.Parameter.KEYWORD_ONLY
         own = [p.replace(kind=keyword) for p in inspect.signature(function).parameters.values() if p.name != "options"]
@@ -151,6 +157,13 @@ def command(
         return run
 
     return decorate
+
+
+def _refuse_nan(values: Mapping[str, Any]) -> None:
+    """NaN passes every min and max, as it compares with nothing."""
+    for name, value in values.items():
+        if isinstance(value, float) and math.isnan(value):
+            raise ConfigError(f"--{name.replace('_', '-')} is nan; expected a number")
 
 
 def _unwrapped(function: Callable[..., None]) -> str:

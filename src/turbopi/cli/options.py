@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
     from turbopi.policy import UnifiedPolicy
 
+MOST_CALLS, MOST_OBSERVATIONS, MOST_NOISES = 1_000_000, 100_000, 1000  # more is a slip, and would never end
 SHOW_LOADING_BYTES = 1e9  # smaller weights load before a line about it is read
 
 _WEIGHTS, _RUNNING = "Weights", "How to run them"

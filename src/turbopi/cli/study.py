@@ -8,7 +8,8 @@ import typer
 from rich.table import Table
 
 from turbopi.cli.framework import JsonFlag, Output, command
-from turbopi.cli.options import CheckpointArgument, WeightOptions
+from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
+from turbopi.config import LIMITS
 from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.files import write_whole
 
@@ -46,8 +47,12 @@ def study(
             help="As for `turbopi infer`; else Turbo-Pi's LIBERO pictures (precision, mask: the first).",
         ),
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Denoising steps; the mask study has its own.")] = 10,
-    calls: Annotated[int, typer.Option(min=1, help="Calls of each measurement of the throughput study.")] = 100,
+    steps: Annotated[
+        int, typer.Option(min=1, max=LIMITS["num_denoising_steps"], help="Denoising steps; the mask study has its own.")
+    ] = 10,
+    calls: Annotated[
+        int, typer.Option(min=1, max=MOST_CALLS, help="Calls of each measurement of the throughput study.")
+    ] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Of the precision and mask studies' noise.")] = 0,
     device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the results there as JSON.")] = None,

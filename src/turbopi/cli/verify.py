@@ -9,7 +9,7 @@ from rich.table import Table
 
 from turbopi.cli.files import check_folder
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, plain
-from turbopi.cli.options import CheckpointArgument, PolicyOptions
+from turbopi.cli.options import MOST_NOISES, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
 from turbopi.files import write_whole
 
@@ -44,7 +44,9 @@ def verify(
             "--count", min=1, metavar="N", help="Observations, evenly spread over PATH.", show_default="8, or all"
         ),
     ] = None,
-    noises: Annotated[int, typer.Option("--noises", min=1, metavar="M", help="Noises for each observation.")] = 2,
+    noises: Annotated[
+        int, typer.Option("--noises", min=1, max=MOST_NOISES, metavar="M", help="Noises for each observation.")
+    ] = 2,
     seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Of the first noise.")] = 0,
     bound: Annotated[
         float | None,

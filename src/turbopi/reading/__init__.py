@@ -14,10 +14,14 @@ An .npz is checked by its CRC-32, so damage to its numbers is found. Neither an 
 flipped digit in one that still reads well stays unnoticed.
 """
 
-from turbopi.reading.arrays import MAX_ARRAY_BYTES, Npz, read_npy, read_npz
+from typing import TYPE_CHECKING, Any
+
 from turbopi.reading.fields import Fields, is_finite, is_integer
 from turbopi.reading.files import file_inside, listing, one_line, open_file, read_bytes, shown
 from turbopi.reading.json import MAX_JSON_BYTES, MAX_JSON_DEPTH, parse_json, read_json
+
+if TYPE_CHECKING:
+    from turbopi.reading.arrays import MAX_ARRAY_BYTES, Npz, read_npy, read_npz
 
 __all__ = [
     "MAX_ARRAY_BYTES",
@@ -38,3 +42,13 @@ __all__ = [
     "read_npz",
     "shown",
 ]
+
+_ARRAYS = ("MAX_ARRAY_BYTES", "Npz", "read_npy", "read_npz")
+
+
+def __getattr__(name: str) -> Any:
+    if name in _ARRAYS:  # imported when asked for: `turbopi --help` needs no NumPy
+        from turbopi.reading import arrays
+
+        return getattr(arrays, name)
+    raise AttributeError(f"module 'turbopi.reading' has no attribute {name!r}")
