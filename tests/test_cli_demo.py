@@ -163,16 +163,28 @@ def test_the_check_passes_the_oracle_itself_and_refuses_anything_else() -> None:
     assert same.ok
     assert same.worst.rms == 0
     assert 1e-4 < same.control < 2e-2
-    spread = exact[0].std(axis=0)
-    assert not judged(exact[0] + 1.1 * same.bound * spread).ok
-    assert judged(exact[0] + 0.9 * same.bound * spread).ok
+    units = demo.action_units(oracle, observed[0])
+    assert not judged(exact[0] + 1.1 * same.bound * units).ok
+    assert judged(exact[0] + 0.9 * same.bound * units).ok
     assert not judged(np.full_like(exact[0], np.nan)).ok
     last_dimension = exact[0].copy()
-    last_dimension[:, 6] += 3 * same.bound * spread[6]  # alone, and small beside the others' units
+    last_dimension[:, 6] += 3 * same.bound * units[6]  # alone, and small beside the others' units
     assert not judged(last_dimension).ok
     assert judged(exact[0], "f32").bound < 1e-5
     with pytest.raises(BackendError, match=r"the backend's chunk has shape \[9, 7\], the oracle's \[10, 7\]"):
         judged(exact[0][:9])
+
+
+def test_an_error_is_the_same_however_many_frames_are_shown() -> None:
+    oracle = tiny_oracle()
+    observed = demo.observations(oracle, demo.load_frames()[:2])
+    off = [result["actions"] * 1.01 for result in demo.run_frames(oracle, observed, 0, lambda: None)]
+    one, two = (demo.check(off[:n], oracle, observed[:n], precision="bf16", seed=0) for n in (1, 2))
+    assert one.differences[0].rms == pytest.approx(two.differences[0].rms, rel=1e-4)
+    # a whole unit is half of what the statistics span, by which LIBERO's actions are normalised
+    stats = oracle.pipeline.action_scale
+    step = stats.unnormalize(np.ones((1, 32), np.float32)) - stats.unnormalize(np.zeros((1, 32), np.float32))
+    np.testing.assert_allclose(demo.action_units(oracle, observed[0]), np.abs(step[0, :7]), rtol=1e-6)
 
 
 def test_jitter_moves_what_bfloat16_would_round_and_is_undone() -> None:

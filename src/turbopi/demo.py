@@ -159,7 +159,7 @@ def expert_distance(actions: np.ndarray, expert: np.ndarray) -> ExpertDistance:
 
 @dataclass(frozen=True)
 class Difference:
-    """Of one action chunk from the oracle's; each dimension counts in units of its own spread over the frames."""
+    """Of one action chunk from the oracle's, in units of the model's normalised actions (`action_units`)."""
 
     rms: float
     max: float
@@ -221,16 +221,15 @@ def check(
     """Compare a backend's chunks with those of `oracle`, a `pytorch` policy in f32; same observations and seed."""
     assert (oracle.backend.name, oracle.backend.precision) == ("pytorch", "f32")
     exact = _chunks(run_frames(oracle, observed, seed, tick))
-    spread = exact.std(axis=(0, 1))
-    spread[spread == 0] = 1
+    units = action_units(oracle, observed[0])
     model: Pi0Model = oracle.backend.model  # type: ignore[attr-defined]
     moved = []
     for control_seed in CONTROL_SEEDS:
         with jittered(model, control_seed):
             chunks = _chunks(run_frames(oracle, observed, seed, tick))
-        moved += [difference(chunk, truth, spread).rms for chunk, truth in zip(chunks, exact, strict=True)]
+        moved += [difference(chunk, truth, units).rms for chunk, truth in zip(chunks, exact, strict=True)]
     return OracleCheck(
-        differences=[difference(chunk, truth, spread) for chunk, truth in zip(actions, exact, strict=True)],
+        differences=[difference(chunk, truth, units) for chunk, truth in zip(actions, exact, strict=True)],
         control=float(np.sqrt(np.mean(np.square(moved)))) * ROUNDING[precision],
         factor=(BOUND_FACTORS if oracle.metadata["random_weights"] else TRAINED_FACTORS)[precision],
         oracle_actions=exact,
@@ -246,13 +245,29 @@ def num_oracle_runs(num_frames: int) -> int:
     return num_frames * (1 + len(CONTROL_SEEDS))
 
 
-def difference(chunk: np.ndarray, truth: np.ndarray, spread: np.ndarray) -> Difference:
-    """Between chunks [H, d], in units of spread [d]. Infinite if anything in `chunk` isn't finite."""
+def action_units(policy: UnifiedPolicy, observation: Mapping[str, Any]) -> np.ndarray:
+    """float64[d]: how far each of the robot's numbers moves with one unit of the model's normalised actions.
+
+    Known from the statistics alone, so that an error means the same however many frames are shown.
+    """
+    model = policy.config.model
+    _, state = policy.pipeline.before(observation)
+    low, high = (
+        policy.pipeline.after(np.full((model.action_horizon, model.action_dim), at, np.float32), state)["actions"][0]
+        for at in (-0.5, 0.5)
+    )
+    units: np.ndarray = np.abs(high - low)
+    units[units == 0] = 1
+    return units
+
+
+def difference(chunk: np.ndarray, truth: np.ndarray, units: np.ndarray) -> Difference:
+    """Between chunks [H, d], in `units` [d]. Infinite if anything in `chunk` isn't finite."""
     if chunk.shape != truth.shape:
         raise BackendError(f"the backend's chunk has shape {list(chunk.shape)}, the oracle's {list(truth.shape)}")
     if not np.isfinite(chunk).all():
         return Difference(float("inf"), float("inf"))
-    error = (chunk - truth) / spread
+    error = (chunk - truth) / units
     return Difference(float(np.sqrt(np.mean(error**2))), float(np.abs(error).max()))
 
 

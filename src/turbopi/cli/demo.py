@@ -188,7 +188,7 @@ class _Run:
         precision = self.metadata["precision"]
         step = "half a bfloat16 step" if precision == "bf16" else "half a float32 step (scaled from bfloat16's)"
         self.output.line(
-            "Errors are in units of each action dimension's own spread. "
+            "Errors are in units of the model's normalised actions. "
             f"The bound is {check.factor:g} times the control, {check.control:.1e}: how far the oracle itself moves "
             f"when every weight moves by up to {step}.",
             "dim",
