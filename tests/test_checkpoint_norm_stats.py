@@ -137,6 +137,12 @@ def test_tensors_that_hold_no_numbers_are_no_statistics(dtype: Any) -> None:
         feature_stats({"std": np.ones(2).astype(dtype)}, "here")
 
 
+def test_a_signalling_nan_is_refused_like_any_other() -> None:
+    values = np.array([0x7F800001, 0], np.uint32).view(np.float32)
+    with pytest.raises(CheckpointError, match=r"^here: mean must be a list of finite numbers"):
+        feature_stats({"mean": values}, "here")
+
+
 def test_constant_dimensions_are_sound() -> None:
     stats = feature_stats(SOUND, "here")
     assert stats.available == ("mean", "std", "q01", "q99", "min", "max") and stats.dim == 2

@@ -257,6 +257,22 @@ def test_pickles_are_never_opened(tmp_path: Path) -> None:
     assert "'|O' isn't read" in _refused(lambda: read_npy(tmp_path / "a.npy"), ObservationError)
 
 
+def test_an_npz_whose_list_of_arrays_is_damaged_is_refused(tmp_path: Path) -> None:
+    """zipfile believes in fewer members, or none."""
+    file = tmp_path / "a.npz"
+    np.savez(file)
+    assert read_npz(file) == {}
+    np.savez(file, a=np.zeros(1), b=np.zeros(1))
+    good = file.read_bytes()
+    second = good.rindex(b"PK\1\2")
+    first = good.rindex(b"PK\1\2", 0, second)
+    comment = first + 32  # of the first entry: made as long as the second entry
+    swallowed = good[:comment] + struct.pack("<H", len(good) - 22 - second) + good[comment + 2 :]
+    for damaged in (good[:-17] + bytes(17), swallowed, good + b"\0"):
+        file.write_bytes(damaged)
+        assert "its list of arrays is damaged" in _refused(lambda: read_npz(file), ObservationError)
+
+
 def test_every_single_byte_of_an_npz_is_checked(tmp_path: Path) -> None:
     """Each byte damaged in turn: the arrays come back unchanged, or one line says that they can't."""
     for save in SAVES:

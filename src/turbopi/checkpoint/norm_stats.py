@@ -122,7 +122,8 @@ def feature_stats(values: Mapping[str, Any], where: str) -> FeatureStats:
             is_numbers = isinstance(value, list) and all(map(is_finite, value))
         if not is_numbers:
             raise CheckpointError(f"{where}: {name} must be a list of finite numbers, not {shown(value)}")
-        arrays[name] = np.asarray(value, dtype=np.float64)
+        with np.errstate(invalid="ignore"):  # NaN, refused below
+            arrays[name] = np.asarray(value, dtype=np.float64)
     stats = FeatureStats(**arrays)
     stats.check(where)
     return stats

@@ -39,7 +39,8 @@ class Npz(Mapping[str, np.ndarray]):
             if begin not in (b"PK\3\4", b"PK\5\6"):
                 raise error(f"{file} isn't a readable .npz file: it is no zip archive")
             self._archive = zipfile.ZipFile(self._stream)
-            if len(self._archive.infolist()) != _count_at_the_end(self._stream):
+            count = len(self._archive.infolist())
+            if count != _count_at_the_end(self._stream) or (count == 0) != (begin == b"PK\5\6"):
                 raise error(f"{file} isn't a readable .npz file: its list of arrays is damaged")
             for member in self._archive.infolist():
                 name = member.filename.removesuffix(".npy")
