@@ -293,7 +293,9 @@ class CudaGraphBackend:
             )
 
     def _forget(self, loop: Loop) -> None:
-        """Let go of all that is a denoising loop's alone; nothing of it runs. Vision's graphs are every loop's."""
+        """Let go of all that is a denoising loop's alone. Vision's graphs are every loop's."""
+        if self.device.type == "cuda":  # one may still run whose call was interrupted
+            torch.cuda.current_stream(self.device).synchronize()
         gone = {shape for shape in self._calls if (shape.num_steps, shape.horizon) == loop}
         for kept in [key for key in self._graphs if key[0] in gone]:
             del self._graphs[kept]

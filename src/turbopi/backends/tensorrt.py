@@ -269,7 +269,8 @@ class TensorRTBackend:
         return self._graphs[key, part]
 
     def _forget(self, loop: Loop) -> None:
-        """Let go of all that is a denoising loop's alone; nothing of it runs."""
+        """Let go of all that is a denoising loop's alone."""
+        self._synchronize()  # one may still run whose call was interrupted
         gone = {key for key in self._calls if (key.num_steps, key.shape.horizon) == loop}
         for kept in [key for key in self._graphs if key[0] in gone]:
             del self._graphs[kept]

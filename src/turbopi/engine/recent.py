@@ -17,7 +17,7 @@ MOST_STEPS = 1024  # of all loops together; one loop may always have as many as 
 class RecentLoops:
     """The loops in use, least recently used first; `forget` is told of each that must make room for another.
 
-    It is told within `use`: a backend calls that while no graph of another loop runs.
+    It is told within `use`, and must wait for what may still run.
     """
 
     def __init__(self, forget: Callable[[Loop], None]) -> None:
