@@ -132,6 +132,12 @@ def test_an_error_on_purpose_is_one_line_and_code_2(capsys: Any) -> None:
     assert errors_of(raising(ObservationError("no [base] camera")), capsys) == (2, "error: no [base] camera\n")
 
 
+def test_an_error_that_quotes_a_very_long_argument_is_short_and_keeps_its_end(capsys: Any) -> None:
+    code, text = errors_of(raising(ObservationError(f"unknown {'x' * 10**5!r}; choose a, b")), capsys)
+    assert (code, len(text) < 2100) == (2, True)
+    assert text.startswith("error: unknown 'xxx") and text.endswith("xxx'; choose a, b\n")
+
+
 def test_debug_adds_the_traceback(capsys: Any) -> None:
     code, text = errors_of(raising(ObservationError("no camera")), capsys, debug=True)
     assert code == 2

@@ -40,6 +40,7 @@ from turbopi.cli.process import (
 from turbopi.errors import ConfigError, DeviceLost, TurboPiError
 
 CHECK_FAILED, OUR_FAULT = 1, 3
+MAX_MESSAGE = 2000  # characters of an error
 PLAIN_WIDTH = 140  # columns of tables where there is no terminal
 
 app = typer.Typer(
@@ -197,8 +198,13 @@ def with_errors_told(work: Callable[[], None], *, debug: bool) -> None:
         if message is None:
             message = f"this is a fault of Turbo-Pi's own ({type(error).__name__}); please report it with the traceback"
         console = new_console(stderr=True)
-        console.print(f"[bold red]error:[/] {escape(message)}", highlight=False, soft_wrap=True)
+        console.print(f"[bold red]error:[/] {escape(_shortened(message))}", highlight=False, soft_wrap=True)
         raise typer.Exit(_exit_code(error)) from None
+
+
+def _shortened(message: str) -> str:
+    """A message that quotes a very long argument, without its middle."""
+    return message if len(message) <= MAX_MESSAGE else f"{message[: MAX_MESSAGE // 2]} … {message[-MAX_MESSAGE // 2 :]}"
 
 
 def _exit_code(error: Exception) -> int:
