@@ -69,7 +69,7 @@ def _loud(limits: Limits, **changes: Any) -> Limits:
 
 
 _FLOOD = Limits()
-_QUICK = Siege(policy="fake:0", limits=Limits(ratio=None, log_kb_s=None), quiet_seconds=1.0)
+_QUICK = Siege(policy="fake:0", limits=Limits(ratio=None, mean_ratio=None, log_kb_s=None), quiet_seconds=1.0)
 
 ATTACKS: dict[str, Attack] = {
     attack.name: attack
@@ -116,7 +116,7 @@ ATTACKS: dict[str, Attack] = {
         ),
         Attack(
             "reconnecting_walks",
-            "the same frames, forty at a time, each time over a new connection",
+            "the same frames, always over new connections",
             "a new connection brings no new budget worth having: within 1.5 ×",
             Size(),
             0.5,
@@ -160,7 +160,7 @@ ATTACKS: dict[str, Attack] = {
             "a few answers wait for each such client, no more; the queue is shared, so no bar for latency",
             Size(),
             0.5,
-            _on_a_server(Siege(limits=_loud(_FLOOD, ratio=None)), floods.answers_unread),
+            _on_a_server(Siege(limits=_loud(_FLOOD, ratio=None, mean_ratio=None)), floods.answers_unread),
         ),
         Attack(
             "big_messages",
@@ -168,15 +168,17 @@ ATTACKS: dict[str, Attack] = {
             "a small multiple of one message at the peak, nothing afterwards",
             Size(60, few=3),
             1.5,
-            _on_a_server(Siege(limits=Limits(ratio=None, growth_mb=6 * 60, kept_mb=100)), floods.big_messages),
+            _on_a_server(
+                Siege(limits=Limits(ratio=None, mean_ratio=None, growth_mb=6 * 60, kept_mb=100)), floods.big_messages
+            ),
         ),
         Attack(
             "half_messages",
             "thirty clients that send half of 40 MB and stop",
             "a limit on what all messages that are under way may hold: far below 600 MB",
             Size(seconds=30),
-            1.0,
-            _on_a_server(Siege(limits=_loud(_FLOOD, growth_mb=400)), floods.half_messages),
+            2.2,
+            _on_a_server(Siege(limits=_loud(_FLOOD, growth_mb=400), quiet_seconds=40), floods.half_messages),
         ),
         Attack(
             "trickles",

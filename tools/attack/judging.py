@@ -208,21 +208,18 @@ class Bar:
         return self.value is not None and self.value <= self.limit
 
 
-def percentile(milliseconds: Sequence[float], share: float) -> float | None:
-    """What a request that is asked at any moment waits for, at this share of the time; None of no values.
-
-    Each value counts for as long as it took: a client that asks again after each answer asks less often while it
-    waits, and one answer in ten seconds must not count as little as one in ten milliseconds.
-    """
-    total, passed = sum(milliseconds), 0.0
-    for value in sorted(milliseconds):
-        passed += value
-        if passed >= share * total:
-            return value
-    return None
+def percentile(values: Sequence[float], share: float) -> float | None:
+    """The nearest-rank percentile; None of no values."""
+    if not values:
+        return None
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, max(0, math.ceil(share * len(ordered)) - 1))]
 
 
-def latency_ratio(undisturbed: Sequence[float], attacked: Sequence[float]) -> float | None:
-    """Median under attack by undisturbed median; None if either has no values."""
-    before, under = percentile(undisturbed, 0.5), percentile(attacked, 0.5)
-    return None if not before or under is None else under / before
+def mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def ratio(undisturbed: float | None, attacked: float | None) -> float | None:
+    """How many times as much `attacked` is; None if either is unknown."""
+    return None if not undisturbed or attacked is None else round(attacked / undisturbed, 3)
