@@ -272,7 +272,7 @@ def test_a_flood_is_served_at_the_rate_that_is_allowed_and_the_rest_is_not_read(
     async def test(server: Server) -> None:
         client = await server.client()
         client.send(frame(b"\xc1") * 5000)
-        assert abs(await served(client, how) - 20 / cost) <= 2  # a fifth of the burst, for a new connection
+        assert abs(await served(client, how) - 20 / cost) <= 2  # what a new connection begins with
         assert not client.transport.reading
         total = 0
         for _ in range(100):
@@ -280,7 +280,28 @@ def test_a_flood_is_served_at_the_rate_that_is_allowed_and_the_rest_is_not_read(
             total += await served(client, how)
         assert abs(total - 500 / cost) <= 50 / cost
 
-    run(test, work_burst=100, work_rate=50)
+    run(test, work_burst=500, work_rate=50)
+
+
+def test_what_takes_long_to_decode_is_more_work_unless_it_led_to_actions() -> None:
+    async def flood(server: Server, how: Any, seconds: float) -> int:
+        await server.clock.sleep(0.1)  # what the flood before wasted is forgotten
+        client, count = await server.client(), 0
+        client.send(frame(b"x") * 5000)
+        while client.waiting():
+            await client.receive()
+            client.connection.took(seconds)
+            client.connection.answered(how)
+            count += 1
+        return count
+
+    async def test(server: Server) -> None:
+        assert await flood(server, "neither", 0.0) == 20
+        assert await flood(server, "neither", 0.001) == 5  # 1 each, and 4 for the millisecond of those that are decoded
+        assert await flood(server, "bad", 0.25) == 2  # the second one was read ahead
+        assert await flood(server, "good", 0.25) == 5000
+
+    run(test, work_burst=500, work_rate=0.001, work_total_rate=1e9)
 
 
 def test_pings_and_parts_are_work_too_and_large_messages_are_more() -> None:
@@ -295,7 +316,7 @@ def test_pings_and_parts_are_work_too_and_large_messages_are_more() -> None:
         assert await served(large, "bad") == 2  # 17 each
         assert not any(client.transport.reading for client in (pings, parts, large))
 
-    run(test, work_burst=100, work_rate=1)
+    run(test, work_burst=500, work_rate=1)
 
 
 def test_work_that_led_to_actions_costs_nothing() -> None:
@@ -307,6 +328,28 @@ def test_work_that_led_to_actions_costs_nothing() -> None:
         assert client.transport.reading
 
     run(test, work_burst=10, work_rate=0.001)
+
+
+def test_who_comes_while_work_is_wasted_waits_in_line_and_who_is_there_does_not() -> None:
+    async def test(server: Server) -> None:
+        good, bad = await server.client(), await server.client()
+        bad.send(frame(b"x"))
+        await bad.receive()
+        bad.connection.took(0.02)  # 80, and 4
+        bad.connection.answered("bad")
+        bad.transport.abort()
+        good.send(frame(b"x"))
+        assert await served(good, "good") == 1
+        late, later = await server.client(), await server.client()
+        later.send(frame(b"x"))
+        late.send(frame(b"x"))
+        for client, seconds in ((late, 0.84), (later, 0.25)):  # 84 of 100 a second; 30 for the one before
+            await server.clock.sleep(seconds - 0.05)
+            assert not client.waiting()
+            await server.clock.sleep(0.1)
+            assert await served(client, "good") == 1
+
+    run(test, work_total_rate=100)
 
 
 def test_connections_that_are_slowed_share_one_rate() -> None:
@@ -338,7 +381,7 @@ def test_bad_messages_in_a_row_are_counted_and_a_good_one_forgives() -> None:
             await served(client, how)
             assert client.connection.bad_in_a_row == expected
 
-    run(test)
+    run(test, work_burst=1000)
 
 
 # --- deadlines --------------------------------------------------------------------------------------------------------
@@ -490,7 +533,7 @@ def test_what_has_no_use_is_read_slowly(state: str) -> None:
 
 # --- memory -----------------------------------------------------------------------------------------------------------
 
-MEMORY = {"message_bytes": 8 * MIB, "memory_bytes": 10 * MIB, "free_bytes": MIB}
+MEMORY = {"work_burst": 10_000, "message_bytes": 8 * MIB, "memory_bytes": 10 * MIB, "free_bytes": MIB}
 
 
 def test_large_messages_wait_for_memory_and_small_ones_do_not() -> None:

@@ -24,6 +24,7 @@ from turbopi.serve.metrics import Metrics
 AHEAD = 2  # messages of one client: one that is computed, one that waits
 BYTES_OF_ONE_WORK = 65536
 BREATH_SECONDS = 0.002  # 128 MB a second and more: who sent too much shall come to read why it is closed
+WORK_OF_A_SECOND = 4000.0  # that a message keeps the event loop busy: all who are slowed get a fifth of its time
 WORK_OF_A_REFUSAL = 3.0  # to find out what is wrong, say and log it
 
 
@@ -40,7 +41,7 @@ class Shared:
 
     def __post_init__(self) -> None:
         self.memory = MemoryBudget(max(self.limits.memory_bytes, self.limits.message_bytes))
-        self.pool = WorkPool(self.limits.work_total_rate)
+        self.pool = WorkPool(self.limits.work_total_rate, self.clock)
 
 
 class Owner(Protocol):
@@ -108,6 +109,13 @@ class GuardedConnection(ServerConnection):
         self.start_keepalive()
         self._feed()
 
+    def took(self, seconds: float) -> None:
+        """Decoding the oldest message took so long: a few bytes can be much work. Call it before `answered`."""
+        work = seconds * WORK_OF_A_SECOND
+        self._credit.spend(work)
+        if self._unanswered:  # not after the connection was lost
+            self._unanswered[0].work += work
+
     def answered(self, how: Literal["good", "bad", "neither"]) -> None:
         """The oldest message is done with: it got actions, it was wrong, or there were none and it wasn't wrong."""
         if self._unanswered:  # not after the connection was lost
@@ -115,8 +123,11 @@ class GuardedConnection(ServerConnection):
             self._shared.memory.give_back(message.memory)
             if how == "good":
                 self._credit.give_back(message.work)
+            else:
+                self._shared.pool.waste(message.work)
         if how == "bad":
             self._credit.spend(WORK_OF_A_REFUSAL)
+            self._shared.pool.waste(WORK_OF_A_REFUSAL)
         if how != "neither":
             self.bad_in_a_row = self.bad_in_a_row + 1 if how == "bad" else 0
         self._feed()
@@ -164,6 +175,7 @@ class GuardedConnection(ServerConnection):
         self._shared.memory.forget(self._feed)
         for message in (*self._unanswered, *([self._message] if self._message else ())):
             self._shared.memory.give_back(message.memory)
+            self._shared.pool.waste(message.work)
         self._unanswered.clear()
         self._message, self._held = None, b""
         # This object is part of reference cycles, which may live long: what is large in it must not.

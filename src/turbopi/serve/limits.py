@@ -29,8 +29,8 @@ class Limits:
     write_seconds      in which a client must take what is sent to it
     close_seconds      from the end of a conversation to the end of the connection, whatever the client does
     work_burst         work that a connection may cause at once without getting actions for it. A message is 1, and 1
-                       more for each 64 KiB, and 3 more if it is bad; a ping is 1, a continued frame 0.1; a request that
-                       gets actions is free
+                       more for each 64 KiB and each 0.25 ms of decoding, and 3 more if it is bad; a ping is 1, a
+                       continued frame 0.1; a request that gets actions is free
     work_rate          such work a second that is allowed on and on
     work_total_rate    the same for all connections that are slowed, together
     bad_messages       in a row, after which a connection is closed
@@ -51,7 +51,7 @@ class Limits:
     work_rate: float = 200.0
     work_total_rate: float = 800.0
     bad_messages: int = 1000
-    connections_rate: float = 100.0
+    connections_rate: float = 50.0
 
 
 def limits_for(max_message_mb: float, max_clients: int, others: Limits | None) -> Limits:
@@ -62,11 +62,36 @@ def limits_for(max_message_mb: float, max_clients: int, others: Limits | None) -
 
 
 class WorkPool:
-    """How many connections are slowed at the moment: they share `total_rate`."""
+    """How many connections are slowed at the moment: they share `total_rate`. And what newcomers wait for.
 
-    def __init__(self, total_rate: float) -> None:
-        self.total_rate = total_rate
+    Who leaves when it is slowed and comes back would never be slowed. So work that led to nothing, beyond `total_rate`,
+    makes all who come then wait until it has leaked away, one after the other. Who is there already notices nothing.
+    """
+
+    LONGEST_WAIT = 5.0  # seconds. Who waits so long holds a place among the clients, which are counted
+    NEWCOMER = 30.0  # work that a newcomer is expected to waste while others do
+
+    def __init__(self, total_rate: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self.total_rate, self._clock = total_rate, clock
         self.slowed = 0
+        self._wasted, self._at = 0.0, clock()
+
+    def waste(self, work: float) -> None:
+        """Count work that led to no actions."""
+        self._leak()
+        self._wasted = min(self._wasted + work, self.LONGEST_WAIT * self.total_rate)
+
+    def newcomers_wait(self) -> float:
+        """Seconds until the first message of a connection that begins now is read. Call it once for each."""
+        self._leak()
+        wait = self._wasted / self.total_rate
+        if wait > 0:
+            self.waste(self.NEWCOMER)
+        return wait
+
+    def _leak(self) -> None:
+        now = self._clock()
+        self._wasted, self._at = max(0.0, self._wasted - (now - self._at) * self.total_rate), now
 
     def share(self) -> float:
         return self.total_rate / max(self.slowed, 1)
@@ -78,16 +103,18 @@ class Credit:
     Spending may lead below zero: then it is `spent`, and `wait` says for how long nothing more should be read.
     """
 
+    FIRST = 1 / 25  # of the burst: who reconnects again and again gains nothing. Enough to take a robot's first request
     BATCH = 4.0  # work to wait for at least, so that a slowed connection doesn't wake the loop for each frame
 
     def __init__(self, limits: Limits, pool: WorkPool, clock: Callable[[], float] = time.monotonic) -> None:
         self._burst, self._rate, self._pool, self._clock = limits.work_burst, limits.work_rate, pool, clock
-        self._level, self._at = limits.work_burst / 5, clock()  # who reconnects again and again gains nothing
+        self._level, self._at = limits.work_burst * self.FIRST, clock()
+        self._opens = self._at + pool.newcomers_wait()
         self._slowed = False
 
     @property
     def spent(self) -> bool:
-        return self._level <= 0
+        return self._level <= 0 or self._clock() < self._opens
 
     def spend(self, work: float) -> None:
         self._level -= work
@@ -105,6 +132,8 @@ class Credit:
 
     def wait(self) -> float:
         """Seconds until there is credit again, if it is all spent."""
+        if (opens_in := self._opens - self._clock()) > 0:
+            return opens_in
         self._set_slowed(True)
         return (self.BATCH - self._level) / self._current_rate()
 

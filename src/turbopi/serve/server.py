@@ -325,7 +325,7 @@ class PolicyServer:
         if self.lost is not None:
             return self._refuse("lost", _REFUSALS["lost"].format(self.lost))
         try:
-            observation = await self._decode(message)
+            observation = await self._decode(connection, message)
             outcome = await self._infer(connection, observation)
         except WireError as error:
             return self._refuse("malformed", f"bad request: {error}")
@@ -350,12 +350,15 @@ class PolicyServer:
         self._log.warning(text, kind)
         return _Refusal(kind, text)
 
-    async def _decode(self, message: str | bytes) -> dict[str, Any]:
+    async def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, Any]:
         """One request as the policy gets it. Raises WireError."""
-        limit = self._limits.message_bytes
-        if len(message) < LARGE:
-            return _decode(message, limit)
-        return await asyncio.get_running_loop().run_in_executor(self._decoder, _decode, message, limit)
+        limit, started = self._limits.message_bytes, time.perf_counter()
+        try:
+            if len(message) < LARGE:
+                return _decode(message, limit)
+            return await asyncio.get_running_loop().run_in_executor(self._decoder, _decode, message, limit)
+        finally:
+            connection.took(time.perf_counter() - started)
 
     async def _infer(self, connection: GuardedConnection, observation: dict[str, Any]) -> Outcome:
         """Run the policy when it is this request's turn, unless the client leaves first."""
