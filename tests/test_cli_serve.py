@@ -141,7 +141,7 @@ def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
                 assert line
             time.sleep(0.5)  # it is said just before it begins
             process.send_signal(signal.SIGINT)
-            rest, errors = process.communicate(timeout=60)
+            rest, errors = process.communicate(timeout=250)
         finally:
             process.kill()
     assert process.returncode == 0, errors
