@@ -259,7 +259,7 @@ PROGRAM = """
 import sys
 from serve_fakes import FakePolicy
 from turbopi.cli.options import PolicyOptions
-PolicyOptions.make_policy = lambda self, opened, output: FakePolicy()
+PolicyOptions.make_policy = lambda *_, **options: FakePolicy()
 from turbopi.__main__ import main
 sys.argv = ["turbopi", "serve", "--random-weights", "pi05_tiny", "--port", "0", "--no-warmup"]
 main()
