@@ -22,7 +22,7 @@ ENCODINGS = [
 
 
 def turbopi(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[bytes]":
-    return subprocess.run([*TURBOPI, *arguments], capture_output=True, timeout=120, env=os.environ | environment)
+    return subprocess.run([*TURBOPI, *arguments], capture_output=True, timeout=200, env=os.environ | environment)
 
 
 @pytest.mark.parametrize("environment", ENCODINGS, ids=str)
@@ -44,7 +44,9 @@ def test_text_beyond_the_encoding_is_replaced_in_lines_and_escaped_in_json(envir
         "    Output(True).document({'a': '\\u5199\\xe9'})\n"
         "run(work)"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, env=os.environ | environment, timeout=60)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, env=os.environ | environment, timeout=200
+    )
     assert (result.returncode, result.stderr) == (0, b"")
     assert b"ok" in result.stdout
     assert b'"a": "\\u5199\\u00e9"' in result.stdout
@@ -56,7 +58,7 @@ def test_a_name_that_is_no_text_can_be_written() -> None:
         "from turbopi.cli.framework import Output\n"
         "run(lambda: Output().line('written to \\udcff.npz'))"
     )
-    result = subprocess.run([sys.executable, "-X", "utf8", "-c", code], capture_output=True, timeout=60)
+    result = subprocess.run([sys.executable, "-X", "utf8", "-c", code], capture_output=True, timeout=200)
     assert (result.returncode, result.stderr) == (0, b"")
     assert result.stdout == b"written to \\udcff.npz\n"
 
@@ -66,7 +68,7 @@ def until_closed(*arguments: str) -> tuple[int, bytes]:
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "wb") as stream:
-        result = subprocess.run([*TURBOPI, *arguments], stdout=stream, stderr=subprocess.PIPE, timeout=120)
+        result = subprocess.run([*TURBOPI, *arguments], stdout=stream, stderr=subprocess.PIPE, timeout=200)
     return result.returncode, result.stderr
 
 
@@ -99,7 +101,7 @@ def test_a_broken_pipe_that_is_not_the_output_is_no_quiet_end() -> None:
         "    try: work()\n"
         "    except typer.Exit as end: sys.exit(end.exit_code)\n"
     )
-    result = subprocess.run([sys.executable, "-c", helper + code], capture_output=True, timeout=60)
+    result = subprocess.run([sys.executable, "-c", helper + code], capture_output=True, timeout=200)
     assert result.returncode == 3
     assert b"BrokenPipeError" in result.stderr
 
@@ -108,7 +110,7 @@ def test_a_broken_pipe_that_is_not_the_output_is_no_quiet_end() -> None:
 @pytest.mark.parametrize("arguments", [["--version"], ["inspect", "--random-weights", "pi05_tiny"]], ids=" ".join)
 def test_a_full_disk_behind_the_output_is_one_line(arguments: list[str]) -> None:
     with open("/dev/full", "wb") as full:
-        result = subprocess.run([*TURBOPI, *arguments], stdout=full, stderr=subprocess.PIPE, timeout=120)
+        result = subprocess.run([*TURBOPI, *arguments], stdout=full, stderr=subprocess.PIPE, timeout=200)
     assert result.returncode == 2
     assert result.stderr.startswith(b"error: can't write")
     assert result.stderr.count(b"\n") == 1
@@ -162,7 +164,7 @@ def test_ctrl_c_ends_the_process_with_130(moment: str) -> None:
             assert process.stdout is not None
             assert process.stdout.readline() == b"READY\n"
             process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=30)
+            _, errors = process.communicate(timeout=200)
         finally:
             process.kill()
     assert process.returncode == 130
@@ -191,7 +193,7 @@ def test_ctrl_c_while_a_full_size_model_is_loaded_is_130(after: bytes) -> None:
             with contextlib.suppress(OSError):  # raised once the other end is closed
                 while True:
                     printed += os.read(terminal, 4096)
-            process.wait(timeout=60)
+            process.wait(timeout=200)
         finally:
             process.kill()
             os.close(terminal)
