@@ -15,7 +15,7 @@ from small_policy.scenes import INSTRUCTIONS
 from turbopi.demo import SMALL_POLICY
 from turbopi.evaluate.plan import Protocol, VideoPlan, choose_tasks, make_jobs
 from turbopi.evaluate.run import evaluate, prepare
-from turbopi.evaluate.sources import LocalPolicy
+from turbopi.evaluate.sources import LocalPolicy, PolicyRefused
 from turbopi.policy import UnifiedPolicy
 from turbopi.sim import SimSettings, SimulatorUnavailable, create
 from turbopi.sim.libero import LiberoEnvironment, openpi_state
@@ -148,25 +148,26 @@ def test_success_is_the_simulators_own_verdict(environment: LiberoEnvironment) -
     assert verdicts[-1]
 
 
-def test_a_run_in_libero_counts_a_crash_apart(tmp_path: Path) -> None:
+def test_actions_of_another_width_end_a_run_in_libero_and_what_was_finished_stays(tmp_path: Path) -> None:
     simulator = create("libero")
     protocol = Protocol("libero", SUITE, SimSettings(camera_px=64), image_px=64, max_steps=6)
     videos = VideoPlan("none")
     jobs = make_jobs(choose_tasks(simulator, SUITE, [0]), [0, 1], None, videos)
 
-    class Dying(SeekingPolicy):
-        """Its second episode gets an action that the controller can't take."""
+    class Widening(SeekingPolicy):
+        """Its second episode gets actions that the controller can't take."""
 
         def infer_batch(self, observations: Any, seed: Any) -> Any:
             results = super().infer_batch(observations, seed)
             wide = len(self.batches) == 3
             return [{"actions": np.zeros((10, 9))} if wide else result for result in results]
 
-    source = LocalPolicy(Dying())
+    source = LocalPolicy(Widening())
     results = prepare(tmp_path, protocol, source, simulator, jobs, restart=False)
-    evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=videos)
-    first, second = results.in_order()
-    assert (first.status, first.steps, second.status) == ("failure", 6, "crash")
+    with pytest.raises(PolicyRefused, match=r"\[10, 9\]; expected at least 5 actions of 7"):
+        evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=videos)
+    (first,) = results.in_order()
+    assert (first.status, first.steps) == ("failure", 6)
     assert results.versions["simulator"]["mujoco"] == "3.2.3"
 
 
