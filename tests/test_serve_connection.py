@@ -598,3 +598,19 @@ def test_a_connection_that_is_lost_holds_nothing() -> None:
         assert server.shared.memory.used == 0
 
     run(test, **MEMORY)
+
+
+def test_a_message_that_comes_with_the_connections_end_is_still_received() -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        receiving = asyncio.ensure_future(client.receive())
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)  # `recv` waits now
+        client.send(frame(b"first") + frame(b"second"))
+        client.connection.connection_lost(None)  # before `recv` could go on
+        assert await receiving == b"first"
+        assert not client.connection.recv_messages.frames.queue
+        with pytest.raises(ConnectionClosed):
+            await client.receive()
+
+    run(test)

@@ -180,7 +180,11 @@ class GuardedConnection(ServerConnection):
         self._message, self._held = None, b""
         # This object is part of reference cycles, which may live long: what is large in it must not.
         self.protocol.reader.buffer.clear()
-        self.recv_messages.frames.queue.clear()
+        frames = self.recv_messages.frames
+        if frames.get_waiter is None:
+            frames.queue.clear()
+        else:  # a message that came a moment ago has woken `recv`, which counts on it
+            self.loop.call_soon(frames.queue.clear)
 
     # --- what comes in ------------------------------------------------------------------------------------------------
 
