@@ -4,8 +4,11 @@ import asyncio
 import io
 import itertools
 import json
+import os
 import random
+import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -370,3 +373,18 @@ def test_a_tiny_run_leaves_its_result(tmp_path: Path, capsys: pytest.CaptureFixt
     assert one["server"]["health"]["failed"] == 0
     assert one["server"]["good"]["attacked_ms"]["n"] >= 0
     assert main(["show", str(file)]) == 0
+
+
+def test_pieces_run_side_by_side_and_what_there_is_no_time_for_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = replace(ATTACKS["frames"], size=Size(20, pieces=2, few=20), minutes=0.1)
+    long = replace(ATTACKS["slow_walk"], minutes=1e6)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    monkeypatch.setattr("attack.__main__.ATTACKS", {"frames": few, "slow_walk": long})
+    file = tmp_path / "a.json"
+    assert main(["all", "--jobs", "2", "--small", "--minutes", "1000", "--out", str(file)]) == 3
+    assert [(one["attack"], one["seed"]) for one in results.load(file)] == [("frames", 0)]
+    assert "next: slow_walk, seed 0" in capsys.readouterr().out
+    assert main(["all", "--jobs", "0", "--out", str(file)]) == 2
+    assert "--jobs must be 1 or more, not 0" in capsys.readouterr().err

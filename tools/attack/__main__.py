@@ -6,6 +6,7 @@
     python -m attack run frames --count 100000 --seed 3 --out work/a.json
     python -m attack all --small --out work/small.json           all of them, tiny: a few minutes
     python -m attack all --minutes 9 --out work/a.json           the whole run in pieces: again until it says it is done
+    python -m attack all --jobs 7 --out work/a.json              the same, untimed pieces side by side, two cores each
     python -m attack show work/a.json                            the table, and each violation with what repeats it
     python -m attack frame 3 71                                  frame 71 of seed 3: its bytes, and the answer to them
 
@@ -15,10 +16,13 @@ held, 1 one was broken, 2 bad usage, 3 the minutes are over and there is more to
 
 import argparse
 import asyncio
+import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument("--seconds", type=float, help="of a timed attack")
     whole = kinds.add_parser("all", help="every attack, each in its pieces")
     whole.add_argument("--minutes", type=float, default=float("inf"), help="begin no piece that would take longer")
+    whole.add_argument("--jobs", type=int, default=1, help="pieces without a bar of time that run side by side")
     for one in (run, whole):
         one.add_argument("--out", type=Path, required=True, help="the result file")
         one.add_argument("--small", action="store_true", help="tiny counts, to try it")
@@ -86,19 +91,58 @@ def _run(given: argparse.Namespace) -> int:
 
 
 def _all(given: argparse.Namespace) -> int:
-    """The pieces that the file lacks, one after the other, while there is time."""
-    started, done = time.monotonic(), {(one["attack"], one["seed"]) for one in results.load(given.out)}
-    for attack in ATTACKS.values():
-        size = attack.size.small if given.small else attack.size
-        for seed in range(size.pieces):
-            if (attack.name, seed) in done:
-                continue
-            left = given.minutes - (time.monotonic() - started) / 60
-            if attack.minutes * (0.1 if given.small else 1) > left:
-                print(f"next: {attack.name}, seed {seed}. Give the same command again.")
-                return MORE
-            _one(attack, seed, size, given.out)
+    """The pieces that the file lacks while there is time: first those that may run side by side, then the others."""
+    if given.jobs < 1:
+        raise ValueError(f"--jobs must be 1 or more, not {given.jobs}")
+    end = time.monotonic() + given.minutes * 60
+    done = {(one["attack"], one["seed"]) for one in results.load(given.out)}
+    missing = [
+        (attack, seed)
+        for attack in ATTACKS.values()
+        for seed in range((attack.size.small if given.small else attack.size).pieces)
+        if (attack.name, seed) not in done
+    ]
+    beside = [piece for piece in missing if given.jobs > 1 and not piece[0].timed]
+    left = _side_by_side(beside, given, end)
+    for attack, seed in missing:
+        if (attack, seed) in beside:
+            continue
+        if _too_long(attack, given.small, end):
+            left.append((attack, seed))
+            break
+        _one(attack, seed, attack.size.small if given.small else attack.size, given.out)
+    if left:
+        print(f"next: {left[0][0].name}, seed {left[0][1]}. Give the same command again.")
+        return MORE
     return _end(given.out, results.load(given.out))
+
+
+def _too_long(attack: Attack, small: bool, end: float) -> bool:
+    return attack.minutes * (0.1 if small else 1) * 60 > end - time.monotonic()
+
+
+def _side_by_side(pieces: list[tuple[Attack, int]], given: argparse.Namespace, end: float) -> list[tuple[Attack, int]]:
+    """Run each piece in a process of its own, so many at a time; returns those for which there was no time."""
+
+    def run(piece: tuple[Attack, int]) -> bool:
+        attack, seed = piece
+        if _too_long(attack, given.small, end):
+            return False
+        out = folder / f"{attack.name}-{seed}.json"
+        words = [sys.executable, "-m", "attack", "run", attack.name, "--seed", str(seed), "--out", str(out)]
+        ended = subprocess.run(words + ["--small"] * given.small, capture_output=True, text=True, check=False)
+        if ended.returncode not in (0, BROKEN) or not out.exists():
+            raise RuntimeError(f"{' '.join(words)} ended with {ended.returncode}: {ended.stderr[-2000:]}")
+        (made,) = results.load(out)
+        with writing:
+            results.add(given.out, made)
+        print(ended.stdout.splitlines()[0], flush=True)
+        return True
+
+    writing = threading.Lock()
+    with tempfile.TemporaryDirectory(prefix="turbopi-attack-") as name, ThreadPoolExecutor(given.jobs) as executor:
+        folder = Path(name)
+        return [piece for piece, ran in zip(pieces, executor.map(run, pieces), strict=True) if not ran]
 
 
 def _one(attack: Attack, seed: int, size: Size, out: Path) -> dict[str, Any]:

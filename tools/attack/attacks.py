@@ -36,6 +36,7 @@ class Attack:
     size: Size
     minutes: float  # that a piece takes, about
     run: Callable[[int, Size, Path, Tick], tuple[Found, dict[str, Any]]]
+    timed: bool = True  # has a bar of time, so nothing may run beside it
 
 
 def _on_a_server(siege: Siege, assault: Assault) -> Any:
@@ -69,7 +70,9 @@ def _loud(limits: Limits, **changes: Any) -> Limits:
 
 
 _FLOOD = Limits()
-_QUICK = Siege(policy="fake:0", limits=Limits(ratio=None, mean_ratio=None, log_kb_s=None), quiet_seconds=1.0)
+_QUICK = Siege(
+    policy="fake:0", limits=Limits(ratio=None, mean_ratio=None, log_kb_s=None), quiet_seconds=1.0, settle_seconds=1.0
+)
 
 ATTACKS: dict[str, Attack] = {
     attack.name: attack
@@ -81,6 +84,7 @@ ATTACKS: dict[str, Attack] = {
             Size(FRAMES_A_PIECE, pieces=20, few=500),
             3.0,
             _frames(_QUICK),
+            timed=False,
         ),
         Attack(
             "frames_model",
@@ -89,6 +93,7 @@ ATTACKS: dict[str, Attack] = {
             Size(5_000, pieces=2, few=100),
             3.0,
             _frames(replace(_QUICK, policy="pi05_tiny")),
+            timed=False,
         ),
         Attack(
             "slow_walk",
@@ -120,7 +125,7 @@ ATTACKS: dict[str, Attack] = {
             "a new connection brings no new budget worth having: within 1.5 ×",
             Size(),
             0.5,
-            _on_a_server(Siege(), floods.reconnecting_walks),
+            _on_a_server(Siege(settle_seconds=20), floods.reconnecting_walks),
         ),
         Attack(
             "one_byte",
@@ -178,7 +183,7 @@ ATTACKS: dict[str, Attack] = {
             "a limit on what all messages that are under way may hold: far below 600 MB",
             Size(seconds=30),
             2.2,
-            _on_a_server(Siege(limits=_loud(_FLOOD, growth_mb=400), quiet_seconds=40), floods.half_messages),
+            _on_a_server(Siege(limits=_loud(_FLOOD, growth_mb=400), settle_seconds=40), floods.half_messages),
         ),
         Attack(
             "trickles",
@@ -226,7 +231,10 @@ ATTACKS: dict[str, Attack] = {
             "401, 403 or 400; never 500, never silence",
             Size(3),
             0.5,
-            _on_a_server(Siege(options=("--api-key", doors.KEY), good_client=False, quiet_seconds=0.5), doors.doors),
+            _on_a_server(
+                Siege(options=("--api-key", doors.KEY), good_client=False, quiet_seconds=0.5, settle_seconds=0.5),
+                doors.doors,
+            ),
         ),
         Attack(
             "never_readers",
@@ -275,6 +283,7 @@ ATTACKS: dict[str, Attack] = {
             Size(150, pieces=4, few=3),
             5.0,
             _alone(files.files),
+            timed=False,
         ),
         Attack(
             "commands",
@@ -283,6 +292,7 @@ ATTACKS: dict[str, Attack] = {
             Size(100, pieces=5, few=20),
             5.0,
             _alone(commands.commands),
+            timed=False,
         ),
     )
 }
