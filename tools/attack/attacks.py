@@ -250,7 +250,7 @@ ATTACKS: dict[str, Attack] = {
             "nobody notices",
             Size(200, few=40),
             0.5,
-            _on_a_server(Siege(), endings.killed_clients),
+            _on_a_server(Siege(settle_seconds=20), endings.killed_clients),
         ),
         Attack(
             "killed_servers",
