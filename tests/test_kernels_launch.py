@@ -34,7 +34,11 @@ class Anything:
 
 
 def fake_driver(**answers: tuple[Any, ...]) -> SimpleNamespace:
-    """The driver's functions that launches call: each succeeds, unless `answers` has another result for it."""
+    """The driver's functions that launches call: each succeeds, unless `answers` has another result for it.
+
+    `calls` has the name and the arguments of each call, in order.
+    """
+    calls: list[tuple[str, tuple[Any, ...]]] = []
     results: dict[str, tuple[Any, ...]] = {
         "cuModuleLoadData": (Status(0), 1),
         "cuModuleGetFunction": (Status(0), 2),
@@ -47,7 +51,11 @@ def fake_driver(**answers: tuple[Any, ...]) -> SimpleNamespace:
     } | answers
 
     def answer(name: str) -> Any:
-        return lambda *args: results[name]
+        def function(*args: Any) -> tuple[Any, ...]:
+            calls.append((name, args))
+            return results[name]
+
+        return function
 
     functions = {name: answer(name) for name in results}
     structs = dict.fromkeys(("CUlaunchAttribute", "CUlaunchConfig"), Anything)
@@ -56,22 +64,26 @@ def fake_driver(**answers: tuple[Any, ...]) -> SimpleNamespace:
         *("CUtensorMapSwizzle", "CUtensorMapL2promotion", "CUtensorMapFloatOOBfill"),
     )
     numbers = {"cuuint32_t": int, "cuuint64_t": int}
-    return SimpleNamespace(**functions, **structs, **{name: Anything() for name in enums}, **numbers, CUresult=Status)
+    return SimpleNamespace(
+        **functions, **structs, **{name: Anything() for name in enums}, **numbers, CUresult=Status, calls=calls
+    )
 
 
 @pytest.fixture
 def driver(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """`driver(name=(status, value), …)`: from then on the launches meet that driver."""
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(cuda_stream=0))
+    """`driver(name=(status, value), …)`: from then on the launches meet that driver, which it returns."""
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(cuda_stream=STREAM))
 
-    def install(**answers: tuple[Any, ...]) -> None:
+    def install(**answers: tuple[Any, ...]) -> SimpleNamespace:
         driver = fake_driver(**answers)
         monkeypatch.setattr(nvrtc, "bindings", lambda name: driver)
         monkeypatch.setattr(hopper, "bindings", lambda name: driver)
+        return driver
 
     return install
 
 
+STREAM = 77
 ILLEGAL = (Status.CUDA_ERROR_ILLEGAL_ADDRESS,)
 
 
@@ -96,6 +108,38 @@ def test_a_launch_that_fails_names_the_call_and_its_status(driver: Any) -> None:
         kernel.launch(8, 128, NOTHING)
     with pytest.raises(BackendError, match=r"cuLaunchCooperativeKernel failed: CUDA_ERROR_ILLEGAL_ADDRESS"):
         kernel.launch_cooperative(8, 128, NOTHING)
+
+
+def test_a_dependent_launch_has_the_kernels_grid_block_cluster_and_shared_memory(driver: Any) -> None:
+    installed = driver()
+    kernel = cluster_of_two(shared_bytes=5000)
+    kernel.launch_dependent(8, {"count": 12})
+    (name, (config, function, parameters, _)) = installed.calls[-1]
+    assert (name, function) == ("cuLaunchKernelEx", 2)
+    assert (config.gridDimX, config.gridDimY, config.gridDimZ) == (8, 1, 1)
+    assert (config.blockDimX, config.blockDimY, config.blockDimZ) == (128, 1, 1)
+    assert (config.sharedMemBytes, config.hStream, config.numAttrs) == (5000, STREAM, 2)
+    dependent, cluster = config.attrs
+    assert dependent.value.programmaticStreamSerializationAllowed == 1
+    dims = cluster.value.clusterDim
+    assert (dims.x, dims.y, dims.z) == (2, 1, 1)
+    assert parameters != 0
+    (asked,) = [args for name, args in installed.calls if name == "cuOccupancyMaxActiveClusters"]
+    assert (asked[1].gridDimX, asked[1].blockDimX, asked[1].sharedMemBytes) == (2, 128, 5000)
+    (allowed,) = [args for name, args in installed.calls if name == "cuFuncSetAttribute"]
+    assert allowed[0] == 2 and allowed[2] == 5000, "more than 48 KB must be allowed before a launch"
+
+
+@pytest.mark.parametrize("call", ["launch", "launch_cooperative"])
+def test_a_launch_says_grid_block_shared_memory_stream_and_where_the_struct_is(driver: Any, call: str) -> None:
+    installed, args = driver(), Args(41)
+    getattr(nvrtc.Kernel(b"", "turbopi_denoise", 1234), call)(64, 640, args)
+    function, *sizes, stream, pointers = installed.calls[-1][1][:10]
+    assert (function, sizes, stream) == (2, [64, 1, 1, 640, 1, 1, 1234], STREAM)
+    assert (
+        installed.calls[-1][0] == {"launch": "cuLaunchKernel", "launch_cooperative": "cuLaunchCooperativeKernel"}[call]
+    )
+    assert pointers != 0
 
 
 def test_blocks_that_do_not_fit_together_are_refused_with_what_limits_them(driver: Any) -> None:

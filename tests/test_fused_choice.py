@@ -1,0 +1,254 @@
+"""How `fused` chooses between its denoising kernel and operations, and where it keeps the expert: fakes, on a CPU."""
+
+from typing import Any
+
+import pytest
+import torch
+from conftest import golden_cases, golden_model
+from test_begin import CPU, Ran
+from torch import Tensor
+
+from turbopi.backends.fused import FusedBackend
+from turbopi.config import Kind, ModelConfig
+from turbopi.engine.call import CallShape
+from turbopi.engine.ops import PLAIN, Ops
+from turbopi.engine.weights import GemmaLayer
+from turbopi.errors import BackendUnavailable, DeviceLost
+from turbopi.kernels import denoise, denoise_packing
+from turbopi.kernels.denoise_packing import PackedExpert
+from turbopi.kernels.denoise_plain import denoise_plain
+
+GPU = torch.device("cuda", 0)
+MATRICES = ("qkv", "out", "gate_up", "down")
+
+
+class TwinKernel:
+    """Stands for `DenoiseKernel`: the same arguments and results, computed from the packed matrices in PyTorch."""
+
+    made: list["TwinKernel"]
+    refuse: str | None
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        packed: PackedExpert,
+        small: dict[str, Tensor],
+        table: Tensor,
+        *,
+        cache_rows: int,
+        suffix: int,
+        device: torch.device,
+    ) -> None:
+        if self.refuse is not None:
+            raise BackendUnavailable(self.refuse)
+        self.config, self.packed, self.small, self.table = config, packed, small, table
+        self.cache_rows, self.suffix, self.device = cache_rows, suffix, device
+        self.launches = 0
+        self.trapped: str | None = None
+        self.made.append(self)
+
+    def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
+        assert noise.shape[0] == self.suffix and int(length) <= self.cache_rows
+        self.launches += 1
+        layers: Any = [
+            GemmaLayer(**dict(zip(MATRICES, self.packed.matrices(i), strict=True)), norm1=None, norm2=None)
+            for i in range(self.config.expert.depth)
+        ]
+        made = denoise_plain(self.config, layers, self.small, self.table, noise, cache_k, cache_v, int(length))
+        x_t[:], v_t[:] = made
+
+    def clock_mhz(self) -> float | None:
+        return 1800.4 if self.launches else None
+
+    def why_it_trapped(self) -> str | None:
+        return self.trapped
+
+
+class OnCpu(FusedBackend):
+    """`fused` with plain operations, and without graphs."""
+
+    def _make_ops(self) -> Ops:
+        return PLAIN
+
+    def _capture(self, run: Any, after: Any) -> Any:
+        return Ran(run, after, lambda name: None)
+
+
+@pytest.fixture
+def kernels(monkeypatch: pytest.MonkeyPatch) -> type[TwinKernel]:
+    """The class of kernels that the backend makes; `made` and `refuse` are this test's own."""
+    cls = type("Kernel", (TwinKernel,), {"made": [], "refuse": None})
+    monkeypatch.setattr(denoise, "DenoiseKernel", cls)
+    monkeypatch.setattr(denoise, "unavailable", lambda device: None)
+    return cls
+
+
+def fused(kind: Kind = "pi05") -> OnCpu:
+    model = golden_model(kind)
+    load = lambda device, precision: dict(model.state_dict())  # noqa: E731
+    return OnCpu(model.config, load, device=CPU, precision="bf16")
+
+
+def actions(backend: FusedBackend, steps: int = 3, horizon: int = 10) -> Tensor:
+    case = golden_cases()["b_third_masked" if backend.config.kind == "pi05" else "p0_pi0_state"]
+    return backend.sample(case.observation, case.noise[:, :horizon], steps).actions
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_the_kernel_and_the_operations_give_the_references_actions(kernels: type[TwinKernel], refused: bool) -> None:
+    kernels.refuse = "the GPU is too small" if refused else None
+    backend, case = fused(), golden_cases()["b_third_masked"]
+    expected = golden_model("pi05").sample(case.observation, case.noise, 3)
+    torch.testing.assert_close(actions(backend), expected, rtol=0, atol=1e-4)  # its weights are bfloat16 numbers
+    chosen = "operations, as the GPU is too small" if refused else "one CUDA kernel"
+    assert backend.describe()["denoising"] == {chosen: ["H=10, 3 steps"]}
+    assert [kernel.launches > 0 for kernel in kernels.made] == ([] if refused else [True])
+
+
+def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[TwinKernel]) -> None:
+    backend = fused()
+    for steps, horizon in ((3, 10), (3, 6), (2, 10), (3, 10)):
+        actions(backend, steps, horizon)
+    assert [(kernel.table.shape[0], kernel.suffix) for kernel in kernels.made] == [(3, 10), (3, 6), (2, 10)]
+    assert len({id(kernel.packed) for kernel in kernels.made}) == 1, "one packed expert serves them all"
+    config = backend.config  # a kernel serves every prompt, with up to three cameras
+    needed = 3 * config.vision.num_tokens + config.max_prompt_tokens
+    assert all(needed <= kernel.cache_rows < needed + 16 for kernel in kernels.made)
+    assert backend.describe()["denoising_clock_mhz"] == dict.fromkeys(
+        ("H=10, 3 steps", "H=6, 3 steps", "H=10, 2 steps"), 1800
+    )
+
+
+def test_four_cameras_have_a_kernel_with_room_for_them(kernels: type[TwinKernel]) -> None:
+    backend = fused()
+    table = backend._call(CallShape(3, 16, 10, 2)).table
+    for cameras in (1, 2, 3, 4):
+        assert backend._make_denoiser(CallShape(cameras, 16, 10, 2), table) is not None
+    tokens, most = backend.config.vision.num_tokens, -(-backend.config.max_prompt_tokens // 16) * 16
+    assert [kernel.cache_rows for kernel in kernels.made] == [3 * tokens + most, 4 * tokens + most]
+
+
+def test_a_model_horizon_or_gpu_that_the_kernel_does_not_cover_takes_operations_and_says_why(
+    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pi0 = fused("pi0")
+    actions(pi0)
+    assert list(pi0.describe()["denoising"]) == ["operations, as it covers Pi0.5, this model is pi0"]
+    backend = fused()
+    table = backend._call(CallShape(3, 16, 10, 2)).table
+    assert backend._make_denoiser(CallShape(3, 16, denoise.MAX_SUFFIX, 2), table) is not None
+    assert backend._make_denoiser(CallShape(3, 16, denoise.MAX_SUFFIX + 1, 2), table) is None
+    monkeypatch.setattr(denoise, "unavailable", lambda device: "this GPU has 12.0")
+    assert backend._make_denoiser(CallShape(3, 16, 9, 2), table) is None
+    told = backend.describe()["denoising"]
+    assert told["one CUDA kernel"] == ["H=56, 2 steps"]
+    assert told["operations, as the denoising kernel takes up to 56 actions"] == ["H=57, 2 steps"]
+    assert told["operations, as this GPU has 12.0"] == ["H=9, 2 steps"]
+
+
+def test_an_error_of_the_kernel_that_is_no_refusal_is_no_reason_for_operations(
+    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*args: Any, **options: Any) -> None:
+        raise RuntimeError("CUDA error: unspecified launch failure")
+
+    monkeypatch.setattr(denoise, "DenoiseKernel", broken)
+    with pytest.raises(RuntimeError, match="unspecified launch failure"):
+        actions(fused())
+
+
+def test_a_trapped_kernel_is_asked_why_and_the_advice_is_given(
+    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = fused()
+    actions(backend)
+    (kernel,) = kernels.made
+    kernel.trapped = "blocks waited for seconds"
+
+    def fail(*args: Any) -> None:
+        raise RuntimeError("CUDA error: unspecified launch failure")
+
+    monkeypatch.setattr(kernel, "launch", fail)
+    with pytest.raises(DeviceLost, match=r"blocks waited for seconds; .*use backend 'cuda_graph'"):
+        actions(backend)
+
+
+# ---- where the expert's matrices are: a GPU that isn't there, by matrices that only know their place
+
+
+class Placed:
+    """A matrix that knows where it is."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+
+    def to(self, device: torch.device) -> "Placed":
+        return Placed(device)
+
+
+class OnFakeGpu:
+    """A backend whose device is a GPU, and its loops; `places` are those of all matrices of the expert."""
+
+    def __init__(self, kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> None:
+        self.backend, self.kernels = fused(), kernels
+        self.table = self.backend._call(CallShape(3, 16, 10, 2)).table
+        self.backend.device = GPU
+        layer: Any = GemmaLayer(**{name: Placed(GPU) for name in MATRICES}, norm1=None, norm2=None)
+        self.backend._weights.expert[:] = [layer] * 3
+        self.packed_from: list[set[torch.device]] = []
+
+        def pack(config: ModelConfig, layers: Any, **options: Any) -> str:
+            self.packed_from.append(self.places)
+            return "packed"
+
+        monkeypatch.setattr(denoise_packing.PackedExpert, "pack", pack)
+        stream = type("Stream", (), {"synchronize": lambda self: None})
+        monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream())
+
+    @property
+    def places(self) -> set[torch.device]:
+        return {getattr(layer, name).device for layer in self.backend._weights.expert for name in MATRICES}
+
+    def denoise(self, steps: int, refuse: str | None = None) -> bool:
+        """Whether a loop of so many steps has a kernel."""
+        self.kernels.refuse = refuse
+        shape = CallShape(3, 16, 10, steps)
+        self.backend._recent.use((steps, 10))
+        return self.backend._make_denoiser(shape, self.table) is not None
+
+
+@pytest.fixture
+def gpu(kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> OnFakeGpu:
+    return OnFakeGpu(kernels, monkeypatch)
+
+
+def test_the_expert_waits_on_the_host_while_only_kernels_denoise(gpu: OnFakeGpu) -> None:
+    assert gpu.denoise(2) and gpu.places == {CPU}
+    assert gpu.denoise(3) and gpu.places == {CPU}
+    assert gpu.packed_from == [{GPU}], "packed once, from the device"
+
+
+def test_operations_find_the_expert_on_the_device_whatever_was_there_before(gpu: OnFakeGpu) -> None:
+    assert not gpu.denoise(2, refuse="too small") and gpu.places == {GPU}
+    assert gpu.denoise(3) and gpu.places == {GPU}, "a graph of operations points to it"
+    assert not gpu.denoise(4, refuse="too small") and gpu.places == {GPU}
+
+
+def test_the_expert_comes_back_from_the_host_for_operations(gpu: OnFakeGpu) -> None:
+    assert gpu.denoise(2) and gpu.places == {CPU}
+    assert not gpu.denoise(3, refuse="too small") and gpu.places == {GPU}
+    assert gpu.denoise(2) and gpu.places == {GPU}
+
+
+def test_the_expert_leaves_the_device_when_the_last_loop_of_operations_is_forgotten(gpu: OnFakeGpu) -> None:
+    assert gpu.denoise(2) and not gpu.denoise(3, refuse="too small") and not gpu.denoise(4, refuse="too small")
+    gpu.backend._forget((3, 10))
+    assert gpu.places == {GPU}, "the loop of 4 steps still takes operations"
+    gpu.backend._forget((4, 10))
+    assert gpu.places == {CPU}
+
+
+def test_a_refused_first_kernel_leaves_no_packed_expert_behind(gpu: OnFakeGpu) -> None:
+    assert not gpu.denoise(2, refuse="too small")
+    assert gpu.backend._packed_expert is None
+    assert gpu.denoise(3) and gpu.packed_from == [{GPU}, {GPU}]

@@ -1,0 +1,304 @@
+"""How work is cut into blocks and clusters, and what a launch is given: on a CPU, for every tile that is chosen."""
+
+import ctypes
+from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from denoise_helpers import Problem, problem
+from torch import Tensor
+
+pytest.importorskip("triton", reason="Triton isn't installed")
+
+from turbopi.engine.fp8 import E4M3, Fp8Matrix
+from turbopi.kernels import attention_hopper, denoise, gemm, gemm_fp8, hopper, products, vision_tower
+from turbopi.kernels.denoise_packing import RANKS, PackedExpert, Tables
+from turbopi.kernels.gemm import Epilogue, Tile
+
+GPU = torch.device("cuda", 0)
+CPU = torch.device("cpu")
+H200_SMS = 132
+
+
+# ---- products
+
+
+def chosen() -> Iterator[tuple[Tile, int, int, int, Epilogue, bool]]:
+    """(tile, rows, columns, inner, epilogue, FP8) of every product that has a tile of its own, and of odd sizes."""
+    tables: list[tuple[Mapping[tuple[int, int, int], Any], bool]] = [
+        (products.VISION_TILES, False),
+        (products.PARTS, False),
+        (vision_tower.RESIDUAL_TILES, False),
+        (vision_tower.RESIDUAL_TILES_FP8, True),
+        (gemm_fp8.MEASURED, True),
+    ]
+    for table, fp8 in tables:
+        for (m, n, k), tile in table.items():
+            if isinstance(tile, Tile):
+                geglu = tile.overlap
+                epilogue: Epilogue = "geglu" if geglu else "parts" if tile.splits > 1 and not tile.gather else "bias"
+                yield tile, m, n, k, epilogue, fp8
+    for tile in products.GEGLU_TILES:
+        yield tile, 560, 16384, 2048, "geglu", False
+    for m in (1, 11, 203, 816, 976):
+        yield gemm_fp8.best_tile(m, 2048, 16384, "parts", H200_SMS), m, 2048, 16384, "parts", True
+        yield gemm_fp8.best_tile(m, 4304, 1152, "gelu", H200_SMS), m, 4304, 1152, "gelu", True
+        yield gemm_fp8.best_tile(m, 16384, 2048, "geglu", H200_SMS), m, 16384, 2048, "geglu", True
+
+
+CHOSEN = sorted(set(chosen()), key=str)
+PRODUCTS = pytest.mark.parametrize(("tile", "m", "n", "k", "epilogue", "fp8"), CHOSEN)
+
+
+class Launched:
+    """Stands for a compiled kernel on an H200; keeps what it was launched with."""
+
+    def __init__(self, cluster: int) -> None:
+        self.max_clusters = {1: 132, 2: 66, 4: 30, 8: 15}[cluster]
+        self.blocks = 0
+        self.given: dict[str, Any] = {}
+
+    def launch_dependent(self, blocks: int, given: dict[str, Any]) -> None:
+        self.blocks, self.given = blocks, given
+
+
+def on_meta(*shape: int, dtype: torch.dtype = torch.bfloat16) -> Tensor:
+    return torch.empty(*shape, dtype=dtype, device="meta")
+
+
+@pytest.fixture
+def maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """TMA's maps as what they were made of."""
+    monkeypatch.setattr(
+        hopper, "tensor_map", lambda address, sizes, strides, box, fp8=False: SimpleNamespace(**vars_of(locals()))
+    )
+
+
+def vars_of(names: dict[str, Any]) -> dict[str, Any]:
+    return {name: names[name] for name in ("sizes", "strides", "box", "fp8")}
+
+
+def launched(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, fp8: bool, monkeypatch: Any) -> Launched:
+    """The launch of that product. Its operands have no memory: sizes alone count."""
+    kernel = Launched(tile.cluster)
+    rows = 2 * n if epilogue == "geglu" else n
+    bias = on_meta(n) if epilogue in ("bias", "gelu") else None
+    for module in (gemm, gemm_fp8):
+        monkeypatch.setattr(module, "_kernel", lambda *args: kernel)
+    if fp8:
+        weight = Fp8Matrix(on_meta(rows, k, dtype=E4M3), on_meta(rows, dtype=torch.float32), 1.0, torch.bfloat16)
+        gemm_fp8.matmul_fp8(on_meta(m, k, dtype=E4M3), weight, tile, epilogue, bias)
+    else:
+        gemm.matmul(on_meta(m, k), on_meta(rows, k), tile, epilogue, bias)
+    return kernel
+
+
+@PRODUCTS
+def test_tiles_cover_the_result_and_none_lies_outside(
+    tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, fp8: bool, maps: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = launched(tile, m, n, k, epilogue, fp8, monkeypatch).given
+    columns = tile.columns // 2 if epilogue == "geglu" else tile.columns  # of the result: the others are its gate
+    for size, groups, of_group in (
+        (m, given["m_groups"], tile.rows * tile.cluster_m),
+        (n, given["n_groups"], columns * tile.cluster_n),
+    ):
+        assert (groups - 1) * of_group < size <= groups * of_group
+    assert (given["M"], given["N"]) == (m, n)
+    step = 128 if fp8 else 64
+    assert (given["k_blocks"] - 1) * step < k <= given["k_blocks"] * step
+
+
+@PRODUCTS
+def test_blocks_are_whole_clusters_that_the_gpu_holds_and_each_has_work(
+    tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, fp8: bool, maps: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel = launched(tile, m, n, k, epilogue, fp8, monkeypatch)
+    clusters, rest = divmod(kernel.blocks, tile.cluster)
+    units = kernel.given["m_groups"] * kernel.given["n_groups"] * (1 if tile.gather else tile.splits)
+    assert rest == 0 and 1 <= clusters == min(units, kernel.max_clusters)
+    if tile.gather:
+        assert clusters == units, "who gathers has no second tile"
+
+
+@PRODUCTS
+def test_loads_fill_a_tile_and_its_stages_fit_into_shared_memory(
+    tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, fp8: bool, maps: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = launched(tile, m, n, k, epilogue, fp8, monkeypatch).given
+    inner = 128 if fp8 else 64  # numbers of a row of 128 bytes
+    a, w = given["map_a"], given["map_w"]
+    halves = 2 if epilogue == "geglu" else 1
+    assert (a.sizes, w.sizes) == ((k, m), (k, halves * n)) and a.fp8 == w.fp8 == fp8
+    assert a.strides == w.strides == (k,)
+    assert a.box == (inner, tile.rows // tile.cluster_n), "the CTAs of a row share its loads"
+    assert w.box == (inner, tile.columns // halves // tile.cluster_m), "gate and up come apart"
+    sizes = gemm_fp8.constants(tile, epilogue, False, 0) if fp8 else gemm.constants(tile, epilogue)
+    stages = sizes["TP_STAGES"] * (tile.rows + tile.columns) * 128
+    barriers = 16 * sizes["TP_STAGES"] + 16
+    factors = 8 * tile.warpgroups * tile.columns if fp8 else 0
+    lines = tile.warpgroups * 4 * 16 * 128 if epilogue == "parts" else 0
+    assert sizes["TP_STAGES"] >= 3
+    assert 1024 + stages + barriers + factors + lines <= hopper.SHARED_BYTES == 227 * 1024
+
+
+def test_what_is_fetched_ahead_is_shared_out_and_never_reaches_beyond_the_matrix(
+    maps: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel = Launched(1)
+    monkeypatch.setattr(gemm, "_kernel", lambda *args: kernel)
+    ahead = torch.zeros(1000, 7, dtype=torch.bfloat16)
+    gemm.matmul(on_meta(256, 64), on_meta(1152, 64), Tile(1, 96), "plain", ahead=ahead)
+    share = kernel.given["ahead_bytes"]
+    assert kernel.given["ahead"] == ahead.data_ptr() and share % 16 == 0
+    assert 0 <= ahead.numel() * 2 - share * kernel.blocks < 16 * kernel.blocks
+    gemm.matmul(on_meta(256, 64), on_meta(1152, 64), Tile(1, 96), "plain", ahead=ahead[:1, :1])
+    assert (kernel.given["ahead"], kernel.given["ahead_bytes"]) == (None, 0), "less than 16 bytes a block"
+
+
+# ---- attention
+
+
+@pytest.mark.parametrize(("images", "tokens", "heads", "dim"), [(3, 256, 16, 72), (2, 50, 2, 24), (1, 128, 8, 256)])
+def test_visions_attention_has_a_block_for_each_64_queries_of_a_head_of_a_picture(
+    images: int, tokens: int, heads: int, dim: int, maps: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel, tiles = Launched(1), list[attention_hopper.Tile]()
+
+    def compiled(tile: attention_hopper.Tile, *rest: Any) -> Launched:
+        tiles.append(tile)
+        return kernel
+
+    monkeypatch.setattr(attention_hopper, "_kernel", compiled)
+    attention_hopper.vision_attention(on_meta(images * tokens, 3 * heads * dim), images, heads)
+    given, (tile,) = kernel.given, tiles
+    assert kernel.blocks == images * heads * given["tiles"] and kernel.blocks % tile.sharing == 0
+    assert (given["tiles"] - 1) * 64 < tokens <= given["tiles"] * 64
+    assert (given["rows"], given["keys"], given["heads"], given["length"]) == (tokens, tokens, heads, None)
+    assert (given["k_first"], given["v_first"]) == (heads, 2 * heads), "q, k and v lie side by side"
+    for name, rows in (("map_q", 64), ("map_k", tile.keys // tile.sharing), ("map_v", tile.keys // tile.sharing)):
+        assert given[name].sizes == (dim, 3 * heads, images * tokens)
+        assert given[name].strides == (dim, 3 * heads * dim) and given[name].box == (64, 1, rows)
+    assert given["scale"] == pytest.approx(dim**-0.5 / np.log(2))
+
+
+# ---- the denoising kernel: what its launch is given, read back as the GPU reads it
+
+
+class FakeKernel:
+    """Stands for a loaded function; `launches` has (name, blocks, threads, the struct) of all of them."""
+
+    launches: list[tuple[str, int, int, Any]]
+    clusters = 16
+
+    def __init__(self, cubin: bytes, name: str, shared_bytes: int) -> None:
+        self.name, self.shared_bytes = name, shared_bytes
+
+    def max_active_clusters(self, ranks: int, threads: int) -> int:
+        return self.clusters
+
+    def launch(self, blocks: int, threads: int, args: Any) -> None:
+        self.launches.append((self.name, blocks, threads, args))
+
+    launch_cooperative = launch
+
+
+@pytest.fixture
+def loaded(monkeypatch: pytest.MonkeyPatch) -> type[FakeKernel]:
+    """A GPU that isn't there: kernels load and launch, their structs' memory is the host's."""
+    cls = type("Kernel", (FakeKernel,), {"launches": []})
+    properties = SimpleNamespace(major=9, minor=0, shared_memory_per_block_optin=232448)
+    zeros = torch.zeros
+    monkeypatch.setattr(denoise, "unavailable", lambda device: None)
+    monkeypatch.setattr(denoise, "compiled", lambda arch, sizes: b"")
+    monkeypatch.setattr(denoise, "Kernel", cls)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
+    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+    monkeypatch.setattr(torch, "zeros", lambda *args, pin_memory=False, **options: zeros(*args, **options))
+    return cls
+
+
+def made(p: Problem, packed: PackedExpert) -> denoise.DenoiseKernel:
+    rows, suffix = p.cache_k.shape[1], p.noise.shape[0]
+    return denoise.DenoiseKernel(p.config, packed, p.small, p.table, cache_rows=rows, suffix=suffix, device=CPU)
+
+
+def memory(address: int, *shape: int, kind: Any = np.float32) -> np.ndarray:
+    count = int(np.prod(shape)) * np.dtype(kind).itemsize
+    return np.frombuffer((ctypes.c_char * count).from_address(address), kind).reshape(shape)
+
+
+@pytest.mark.parametrize("fp8", [False, True])
+def test_the_denoising_kernels_struct_points_to_what_its_fields_say(loaded: type[FakeKernel], fp8: bool) -> None:
+    p = problem("golden", 3, 10, 37, 0, CPU)
+    scales = {f"expert.{i}.{kind}": 0.5 + i for i in range(3) for kind in ("qkv", "out", "gate_up", "down")}
+    packed = PackedExpert.pack(p.config, p.layers, None, scales if fp8 else None)
+    kernel, length = made(p, packed), torch.tensor([p.length])
+    x_t, v_t = torch.zeros(4, 10, 32), torch.zeros(3, 10, 32)
+    kernel.launch(p.noise, p.cache_k, p.cache_v, length, x_t, v_t)
+    (_, _, _, a), (_, _, _, again) = loaded.launches
+    assert bytes(a) == bytes(again)
+    given = {"noise": p.noise, "cache_k": p.cache_k, "cache_v": p.cache_v, "length": length, "x_t": x_t, "v_t": v_t}
+    assert {name: getattr(a, name) for name in given} == {name: tensor.data_ptr() for name, tensor in given.items()}
+    assert (a.weights, a.starts) == (packed.weights.data_ptr(), packed.starts.data_ptr())
+    assert a.layer_bytes == packed.weights[1].data_ptr() - packed.weights[0].data_ptr()
+    assert a.layer_stride == p.cache_k[1].data_ptr() - p.cache_k[0].data_ptr()
+    assert (a.steps, a.dt, a.eps, a.zero) == (3, np.float32(-1 / 3), np.float32(p.config.rms_norm_eps), 0)
+    width, actions, depth = p.config.expert.width, p.config.action_dim, p.config.expert.depth
+    tables, small = Tables.make(packed, p.table), p.small
+
+    def same(address: int, expected: Tensor) -> None:
+        np.testing.assert_array_equal(memory(address, *expected.shape), expected.float().numpy())
+
+    same(a.table, tables.modulation)
+    same(a.shifted, tables.shifted)
+    if fp8:
+        same(a.row_scales, tables.row_scales)
+        same(a.values_times, tables.values_times)
+    same(a.in_w, small["action_in_proj.weight"])  # [D][A]
+    same(a.in_b, small["action_in_proj.bias"])
+    same(a.out_w, small["action_out_proj.weight"].T)  # [D][A]
+    assert small["action_in_proj.weight"].shape == (width, actions)
+    shift = p.table[:, 2 * depth, 1] @ small["action_out_proj.weight"].T + small["action_out_proj.bias"]
+    np.testing.assert_allclose(memory(a.out_shift, 3, actions), shift.numpy(), rtol=1e-5, atol=1e-5)
+    half = p.config.expert.head_dim // 2
+    frequencies = p.config.rope_base ** -(np.arange(half) / half)
+    np.testing.assert_allclose(memory(a.inv_freq, half), frequencies, rtol=1e-5)
+
+
+def test_the_host_reads_back_what_the_kernel_writes_for_it(loaded: type[FakeKernel]) -> None:
+    p = problem("golden", 1, 4, 3, 0, CPU)
+    kernel = made(p, PackedExpert.pack(p.config, p.layers))
+    kernel.launch(p.noise, p.cache_k, p.cache_v, torch.tensor([3]), torch.zeros(2, 4, 32), torch.zeros(1, 4, 32))
+    args = loaded.launches[-1][3]
+    assert kernel.clock_mhz() is None and kernel.why_it_trapped() is None
+    memory(args.clock, 2, kind=np.int64)[:] = (4_500_000, 2_500_000)
+    blocks = p.config.expert.num_heads * RANKS
+    memory(args.hang, blocks, kind=np.uint32)[blocks - 1] = 1 << 31 | 4 << 20 | 2
+    assert kernel.clock_mhz() == 1800
+    assert str(kernel.why_it_trapped()).endswith("layer 2 for outputs")
+
+
+@pytest.mark.parametrize(("name", "clusters"), [("golden", 8), ("odd", 9)])
+def test_the_denoising_kernel_is_launched_behind_what_prepares_its_keys(
+    loaded: type[FakeKernel], name: str, clusters: int
+) -> None:
+    p = problem(name, 1, 4, 40, 0, CPU)
+    kernel = made(p, PackedExpert.pack(p.config, p.layers, clusters))
+    kernel.launch(p.noise, p.cache_k, p.cache_v, torch.tensor([40]), torch.zeros(2, 4, 32), torch.zeros(1, 4, 32))
+    tiles = -(-p.cache_k.shape[1] // 16) * p.config.expert.depth  # 16 keys of a layer
+    # 16 warps that multiply, and four beside them
+    expected = [("turbopi_denoise_prepare", tiles, 256), ("turbopi_denoise", clusters * 8, 640)]
+    assert [launch[:3] for launch in loaded.launches] == expected
+
+
+def test_a_gpu_that_holds_too_few_clusters_says_so(loaded: type[FakeKernel], monkeypatch: pytest.MonkeyPatch) -> None:
+    p = problem("golden", 1, 4, 3, 0, CPU)
+    monkeypatch.setattr(loaded, "clusters", 7)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "half a GPU")
+    with pytest.raises(denoise.BackendUnavailable, match=r"needs 8 clusters of 8 .*half a GPU holds 7"):
+        made(p, PackedExpert.pack(p.config, p.layers))
