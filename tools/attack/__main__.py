@@ -16,6 +16,7 @@ held, 1 one was broken, 2 bad usage, 3 the minutes are over and there is more to
 
 import argparse
 import asyncio
+import signal
 import subprocess
 import sys
 import tempfile
@@ -62,6 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     frame.add_argument("seed", type=int)
     frame.add_argument("number", type=int)
     given = parser.parse_args(arguments)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job; its children would ignore it, too
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return {"list": _list, "run": _run, "all": _all, "show": _show, "frame": _frame}[given.command](given)
     except ValueError as error:
