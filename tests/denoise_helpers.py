@@ -12,8 +12,8 @@ from turbopi.engine.fp8 import E4M3_MAX
 from turbopi.engine.weights import GemmaLayer
 from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
-from turbopi.kernels.denoise_packing import KINDS
-from turbopi.kernels.denoise_plain import Operand, denoise_plain
+from turbopi.kernels.sm90.denoise.packing import KINDS
+from turbopi.kernels.sm90.denoise.plain import Operand, denoise_plain
 from turbopi.model.denoise import euler_step
 from turbopi.model.layers import apply_rope, rms_normalize, rope_tables
 

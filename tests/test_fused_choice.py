@@ -14,9 +14,10 @@ from turbopi.engine.call import CallShape
 from turbopi.engine.ops import PLAIN, Ops
 from turbopi.engine.weights import GemmaLayer
 from turbopi.errors import BackendUnavailable, DeviceLost
-from turbopi.kernels import denoise, denoise_packing
-from turbopi.kernels.denoise_packing import PackedExpert
-from turbopi.kernels.denoise_plain import denoise_plain
+from turbopi.kernels.sm90.denoise import kernel as denoise
+from turbopi.kernels.sm90.denoise import packing as denoise_packing
+from turbopi.kernels.sm90.denoise.packing import PackedExpert
+from turbopi.kernels.sm90.denoise.plain import denoise_plain
 
 GPU = torch.device("cuda", 0)
 MATRICES = ("qkv", "out", "gate_up", "down")

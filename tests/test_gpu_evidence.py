@@ -51,8 +51,9 @@ def test_kernels_comments_do_not_count_and_their_strings_do(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "file",
     [
-        *("kernels/gemm_fp8.py", "kernels/denoise.py", "kernels/denoise_loop.cu", "kernels/denoise_primitives.cu"),
-        *("kernels/gemm.py", "backends/fused.py", "backends/cuda_graph.py", "engine/call.py", "model/reference.py"),
+        *("kernels/norms.py", "kernels/sm90/instructions.cu", "kernels/sm90/denoise/kernel.py"),
+        *("kernels/sm90/denoise/loop.cu", "kernels/sm90/gemm/fp8.py", "kernels/sm90/gemm/kernel.cu"),
+        *("backends/fused.py", "backends/cuda_graph.py", "engine/call.py", "model/reference.py"),
     ],
 )
 def test_what_runs_on_the_gpu_is_in_the_fingerprint(file: str) -> None:

@@ -17,8 +17,8 @@ from turbopi.calibrate.sites import sites
 from turbopi.config import Kind
 from turbopi.judge.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
 from turbopi.judge.golden import Case
-from turbopi.kernels.denoise import MAX_SUFFIX
-from turbopi.kernels.denoise_packing import refusal
+from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX
+from turbopi.kernels.sm90.denoise.packing import refusal
 from turbopi.model.reference import Pi0Model
 
 pytestmark = [

@@ -2,7 +2,6 @@
 
 import ctypes
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,8 +9,12 @@ import torch
 from torch import Tensor
 
 from turbopi.engine.fp8 import E4M3, Fp8Matrix
-from turbopi.kernels import attention_hopper, denoise, gemm, gemm_fp8, hopper
 from turbopi.kernels.arguments import Parameter, Parameters, Struct, enumeration
+from turbopi.kernels.sm90 import instructions
+from turbopi.kernels.sm90.attention import kernel as attention_hopper
+from turbopi.kernels.sm90.denoise import kernel as denoise
+from turbopi.kernels.sm90.gemm import bf16 as gemm
+from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8
 
 PAIR = (Parameter("const float*", "values"), Parameter("int", "count", "of them"))
 
@@ -45,14 +48,14 @@ def test_a_struct_is_written_with_its_sizes_checked() -> None:
 
 
 def test_the_denoising_kernel_names_no_wait_that_is_not_declared_and_declares_none_twice() -> None:
-    text = "\n".join((Path(denoise.__file__).parent / part).read_text() for part in denoise.PARTS)
+    text = "\n".join((denoise.FOLDER / part).read_text() for part in denoise.PARTS)
     named = set(re.findall(r"\bWAIT_[A-Z0-9]+\b", text)) | {"FINISHED"}
     assert named == set(denoise.WAITS)
     assert len(set(denoise.WAITS.values())) == len(denoise.WAITS)
 
 
 def test_the_denoising_kernels_struct_has_what_its_source_reads() -> None:
-    text = "\n".join((Path(denoise.__file__).parent / part).read_text() for part in denoise.PARTS)
+    text = "\n".join((denoise.FOLDER / part).read_text() for part in denoise.PARTS)
     read = set(re.findall(r"\ba(?:rgs)?\.([a-z_]\w+)", text))
     declared = {one.name for one in denoise.ARGS.fields}
     assert read <= declared, read - declared
@@ -79,7 +82,7 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> Launched:
     kernel = Launched()
     for module in (gemm, gemm_fp8, attention_hopper):
         monkeypatch.setattr(module, "_kernel", lambda *args: kernel)
-    monkeypatch.setattr(hopper, "tensor_map", lambda address, sizes, *rest: (address, sizes))
+    monkeypatch.setattr(instructions, "tensor_map", lambda address, sizes, *rest: (address, sizes))
     return kernel
 
 

@@ -26,10 +26,11 @@ from torch import Tensor
 from turbopi.calibrate.directions import directions
 from turbopi.engine.fp8 import E4M3, Fp8Matrix
 from turbopi.errors import BackendError, BackendUnavailable
-from turbopi.kernels import denoise, nvrtc
-from turbopi.kernels import denoise_packing as packing
-from turbopi.kernels.denoise_packing import KINDS, PackedExpert
-from turbopi.kernels.denoise_plain import in_e4m3
+from turbopi.kernels import nvrtc
+from turbopi.kernels.sm90.denoise import kernel as denoise
+from turbopi.kernels.sm90.denoise import packing
+from turbopi.kernels.sm90.denoise.packing import KINDS, PackedExpert
+from turbopi.kernels.sm90.denoise.plain import in_e4m3
 from turbopi.model.denoise import euler_step
 
 CPU = torch.device("cpu")
@@ -118,7 +119,7 @@ def test_a_fragment_of_fp8_has_two_blocks() -> None:
 
 
 def multiply(stream: Tensor, x: Tensor, tiles: int, max_tiles: int) -> tuple[Tensor, int]:
-    """What a CTA makes of its next product: ([tiles, 16] sums, elements read). Reads as denoise_product.cu does."""
+    """What a CTA makes of its next product: ([tiles, 16] sums, elements read). Reads as denoise/product.cu does."""
     per = 2 if stream.dtype == E4M3 else 1  # blocks of a fragment
     units = -(-len(x) // (16 * per))
     sums, at = torch.zeros(max_tiles, 16, dtype=torch.float64), 0

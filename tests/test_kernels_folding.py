@@ -10,10 +10,11 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine import ops as plain
 from turbopi.engine.fp8 import E4M3, E4M3_MAX, Fp8Matrix, to_e4m3
-from turbopi.kernels import attention_hopper, norms
+from turbopi.kernels import norms
 from turbopi.kernels import ops as fused
-from turbopi.kernels.gemm import Copy, Folded, Sums, Tile, clusters, matmul
-from turbopi.kernels.gemm_fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
+from turbopi.kernels.sm90.attention import kernel as attention_hopper
+from turbopi.kernels.sm90.gemm.bf16 import Copy, Folded, Sums, Tile, clusters, matmul
+from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 EPS = 1e-6

@@ -17,9 +17,11 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine import ops as plain  # noqa: E402
 from turbopi.engine.fp8 import E4M3, E4M3_MAX, Fp8Matrix, input_of, to_e4m3  # noqa: E402
-from turbopi.kernels import attention, attention_hopper, gemm_fp8, norms  # noqa: E402
-from turbopi.kernels.gemm import Epilogue, Tile, matmul  # noqa: E402
-from turbopi.kernels.hopper import SHARED_BYTES  # noqa: E402
+from turbopi.kernels import attention, norms  # noqa: E402
+from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
+from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8  # noqa: E402
+from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402
+from turbopi.kernels.sm90.instructions import SHARED_BYTES  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32

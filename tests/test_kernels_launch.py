@@ -12,8 +12,9 @@ import torch
 
 from turbopi.bench import barrier
 from turbopi.errors import BackendError, BackendUnavailable
-from turbopi.kernels import hopper, nvrtc
+from turbopi.kernels import nvrtc
 from turbopi.kernels.arguments import Parameter, Parameters
+from turbopi.kernels.sm90 import instructions
 
 
 class Status(enum.IntEnum):
@@ -77,7 +78,7 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Any:
     def install(**answers: tuple[Any, ...]) -> SimpleNamespace:
         driver = fake_driver(**answers)
         monkeypatch.setattr(nvrtc, "bindings", lambda name: driver)
-        monkeypatch.setattr(hopper, "bindings", lambda name: driver)
+        monkeypatch.setattr(instructions, "bindings", lambda name: driver)
         return driver
 
     return install
@@ -94,9 +95,9 @@ class Args(ctypes.Structure):
 NOTHING = Args(0)
 
 
-def cluster_of_two(shared_bytes: int = 0) -> hopper.DependentKernel:
+def cluster_of_two(shared_bytes: int = 0) -> instructions.DependentKernel:
     takes = Parameters((Parameter("int", "count"),))
-    return hopper.DependentKernel(b"", "attention", takes, shared_bytes=shared_bytes, threads=128, cluster=2)
+    return instructions.DependentKernel(b"", "attention", takes, shared_bytes=shared_bytes, threads=128, cluster=2)
 
 
 def test_a_launch_that_fails_names_the_call_and_its_status(driver: Any) -> None:
@@ -158,7 +159,7 @@ def test_a_gpu_without_room_for_one_cluster_is_refused(driver: Any) -> None:
 def test_a_tensor_map_that_cannot_be_made_names_its_sizes(driver: Any) -> None:
     driver(cuTensorMapEncodeTiled=(*ILLEGAL, None))
     with pytest.raises(BackendError, match=r"cuTensorMapEncodeTiled for \(64, 3\) at 0xabc0 failed: CUDA"):
-        hopper.tensor_map(0xABC0, (64, 3), (64,), (64, 1))
+        instructions.tensor_map(0xABC0, (64, 3), (64,), (64, 1))
 
 
 def test_failed_launches_are_heeded_without_asserts_too() -> None:

@@ -18,14 +18,14 @@ from turbopi.engine import ops as plain  # noqa: E402
 from turbopi.kernels import (  # noqa: E402
     activations,
     attention,
-    attention_hopper,
     embedding,
     norms,
-    products,
     rope,
 )
 from turbopi.kernels import ops as fused  # noqa: E402
-from turbopi.kernels.gemm import Epilogue, Tile, matmul  # noqa: E402
+from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
+from turbopi.kernels.sm90.gemm import products  # noqa: E402
+from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402
 from turbopi.model.layers import rope_tables  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")

@@ -15,9 +15,14 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine.fp8 import E4M3, Fp8Matrix
-from turbopi.kernels import attention_hopper, denoise, gemm, gemm_fp8, hopper, products, vision_tower
-from turbopi.kernels.denoise_packing import RANKS, PackedExpert, Tables
-from turbopi.kernels.gemm import Epilogue, Tile
+from turbopi.kernels.sm90 import instructions
+from turbopi.kernels.sm90.attention import kernel as attention_hopper
+from turbopi.kernels.sm90.denoise import kernel as denoise
+from turbopi.kernels.sm90.denoise.packing import RANKS, PackedExpert, Tables
+from turbopi.kernels.sm90.gemm import bf16 as gemm
+from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8
+from turbopi.kernels.sm90.gemm import products, vision_tower
+from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
 
 GPU = torch.device("cuda", 0)
 CPU = torch.device("cpu")
@@ -74,7 +79,7 @@ def on_meta(*shape: int, dtype: torch.dtype = torch.bfloat16) -> Tensor:
 def maps(monkeypatch: pytest.MonkeyPatch) -> None:
     """TMA's maps as what they were made of."""
     monkeypatch.setattr(
-        hopper, "tensor_map", lambda address, sizes, strides, box, fp8=False: SimpleNamespace(**vars_of(locals()))
+        instructions, "tensor_map", lambda address, sizes, strides, box, fp8=False: SimpleNamespace(**vars_of(locals()))
     )
 
 
@@ -143,7 +148,7 @@ def test_loads_fill_a_tile_and_its_stages_fit_into_shared_memory(
     factors = 8 * tile.warpgroups * tile.columns if fp8 else 0
     lines = tile.warpgroups * 4 * 16 * 128 if epilogue == "parts" else 0
     assert sizes["TP_STAGES"] >= 3
-    assert 1024 + stages + barriers + factors + lines <= hopper.SHARED_BYTES == 227 * 1024
+    assert 1024 + stages + barriers + factors + lines <= instructions.SHARED_BYTES == 227 * 1024
 
 
 def test_what_is_fetched_ahead_is_shared_out_and_never_reaches_beyond_the_matrix(

@@ -12,8 +12,8 @@ from kernel_turns.stalls import Instruction, by_function, compiled, disassembled
 from kernel_turns.turns import Job, marks_by_rank, time_in_turns
 from kernel_turns.variants import Variant
 
-from turbopi.kernels import denoise
-from turbopi.kernels.denoise_packing import Arrangement
+from turbopi.kernels.sm90.denoise import kernel as denoise
+from turbopi.kernels.sm90.denoise.packing import Arrangement
 
 SIZES: dict[str, Any] = {"cache_rows": 976, "suffix": 50, "shared_bytes": 232448}
 
@@ -21,11 +21,11 @@ SIZES: dict[str, Any] = {"cache_rows": 976, "suffix": 50, "shared_bytes": 232448
 @pytest.fixture
 def patch(tmp_path: Path) -> Path:
     """Of this tree's kernels: five staged streams, not four."""
-    text = (denoise.FOLDER / "denoise_base.cu").read_text()
+    text = (denoise.FOLDER / "denoise/base.cu").read_text()
     assert text.count("STAGED = 4;") == 1
     for name, version in (("a", text), ("b", text.replace("STAGED = 4;", "STAGED = 5;"))):
-        (tmp_path / name / "src/turbopi/kernels").mkdir(parents=True)
-        (tmp_path / name / "src/turbopi/kernels/denoise_base.cu").write_text(version)
+        (tmp_path / name / "src/turbopi/kernels/sm90/denoise").mkdir(parents=True)
+        (tmp_path / name / "src/turbopi/kernels/sm90/denoise/base.cu").write_text(version)
     command = ["git", "diff", "--no-index", "--no-prefix", "a", "b"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
     file = tmp_path / "five.patch"
@@ -64,15 +64,16 @@ def test_what_is_no_job_is_refused_by_name(precision: str, length: int) -> None:
 
 
 def test_a_folder_that_would_read_this_trees_sources_is_refused(tmp_path: Path) -> None:
-    text = (denoise.FOLDER / "denoise.py").read_text()
-    (tmp_path / "denoise.py").write_text(text.replace("FOLDER", "ELSEWHERE"))
+    text = (denoise.FOLDER / "denoise/kernel.py").read_text()
+    (tmp_path / "denoise").mkdir()
+    (tmp_path / "denoise/kernel.py").write_text(text.replace("FOLDER", "ELSEWHERE"))
     with pytest.raises(ValueError, match="would read this tree's sources"):
         Variant(str(tmp_path))
 
 
 def test_a_patch_of_other_sources_is_refused(patch: Path) -> None:
     patch.write_text(patch.read_text().replace("STAGED = 4;", "STAGED = 3;"))
-    with pytest.raises(ValueError, match=r"five\.patch doesn't fit these kernels: .*denoise_base\.cu"):
+    with pytest.raises(ValueError, match=r"five\.patch doesn't fit these kernels: .*denoise/base\.cu"):
         Variant(str(patch))
 
 

@@ -20,7 +20,7 @@ PENDING = ROOT / "benchmarks/results/gpu_check_pending.json"
 
 # Files whose code runs on the GPU, or decides what does.
 PRODUCT = (
-    *("src/turbopi/kernels/*", "src/turbopi/engine/*", "src/turbopi/model/*", "src/turbopi/backends/*"),
+    *("src/turbopi/kernels/**/*", "src/turbopi/engine/*", "src/turbopi/model/*", "src/turbopi/backends/*"),
     *("src/turbopi/calibrate/*", "src/turbopi/config.py", "src/turbopi/observation.py", "src/turbopi/policy.py"),
     "src/turbopi/judge/check_golden.py",
 )

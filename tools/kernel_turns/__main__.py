@@ -8,7 +8,7 @@
     ncu -i samples.ncu-rep --page source --csv > samples.csv
     python -m kernel_turns stalls other.patch --tokens 50 --samples samples.csv     (needs no GPU, but NVRTC and Triton)
 
-A variant is "here", a folder with denoise.py and its sources, or a patch of this tree, and constants: +NAME=VALUE.
+A variant is "here", a folder as kernels/sm90 is, or a patch of this tree, and constants: +NAME=VALUE.
 """
 
 import argparse

@@ -16,8 +16,8 @@ from kernel_turns.variants import Variant
 from turbopi.config import preset
 from turbopi.errors import BackendUnavailable
 from turbopi.kernels import nvrtc
-from turbopi.kernels.denoise_packing import Arrangement
-from turbopi.kernels.hopper import SHARED_BYTES
+from turbopi.kernels.sm90.denoise.packing import Arrangement
+from turbopi.kernels.sm90.instructions import SHARED_BYTES
 
 KERNEL = "turbopi_denoise"
 _INSTRUCTION = re.compile(r"/\*[0-9a-f]{4,5}\*/\s+(.*?);")

@@ -14,11 +14,11 @@ from torch import Tensor
 from kernel_turns.variants import Variant
 from turbopi.backends import resolve_device
 from turbopi.errors import BackendUnavailable
-from turbopi.kernels.denoise import unavailable
-from turbopi.kernels.denoise_packing import RANKS, PackedExpert
+from turbopi.kernels.sm90.denoise.kernel import unavailable
+from turbopi.kernels.sm90.denoise.packing import RANKS, PackedExpert
 
 STEPS, CACHE_ROWS, SEED = 10, 976, 1
-# `MARK`s of denoise_base.cu in the order in which a layer comes to them
+# `MARK`s of denoise/base.cu in the order in which a layer comes to them
 MARKS = (0, 1, 2, 3, 4, 23, 24, 25, 5, 6, 7, 8, 9, 10, 11, 21, 12, 13, 15, 16, 17, 18, 22, 14, 19, 20)
 
 

@@ -11,14 +11,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from turbopi.kernels import denoise
+from turbopi.kernels.sm90.denoise import kernel as denoise
 
-KERNELS = Path("src/turbopi/kernels")
+KERNELS = Path("src/turbopi/kernels/sm90")
 
 
 class Variant:
-    """What `SPEC` says: "here", a folder that holds denoise.py and its sources, or a patch of this tree (.patch, or
-    .patch.xz); behind it +NAME=VALUE for constants, as in "rows.patch+TP_RPS=4".
+    """What `SPEC` says: "here", a folder as kernels/sm90 is, or a patch of this tree (.patch, or .patch.xz); behind
+    it +NAME=VALUE for constants, as in "rows.patch+TP_RPS=4".
 
     Raises ValueError for a place that doesn't exist, a constant without a whole number, a patch that doesn't fit.
     """
@@ -34,13 +34,13 @@ class Variant:
         if place == "here":
             return denoise.FOLDER.resolve()
         path = Path(place)
-        if path.is_dir() and (path / "denoise.py").is_file():
+        if path.is_dir() and (path / "denoise/kernel.py").is_file():
             return path
         if path.is_file() and ".patch" in path.suffixes:
             folder = Path(tempfile.mkdtemp())
             weakref.finalize(self, shutil.rmtree, folder)  # it lives as long as the variant
             return _patched(path, folder)
-        raise ValueError(f"{place!r}: expected 'here', a folder with denoise.py, or a .patch or .patch.xz file")
+        raise ValueError(f"{place!r}: expected 'here', a folder with denoise/kernel.py, or a .patch or .patch.xz file")
 
     def sizes(self, *args: Any, trace: int | None = None, **options: Any) -> dict[str, int]:
         """`kernel_sizes` with the variant's constants; `trace`: a warp whose cycles between marks are kept."""
@@ -71,11 +71,11 @@ def _patched(patch: Path, to: Path) -> Path:
 
 
 def _load(folder: Path) -> ModuleType:
-    """denoise.py of a folder, beside the tree's own."""
-    spec = importlib.util.spec_from_file_location("kernel_turns_denoise", folder.resolve() / "denoise.py")
+    """denoise/kernel.py of a folder, beside the tree's own."""
+    spec = importlib.util.spec_from_file_location("kernel_turns_denoise", folder.resolve() / "denoise/kernel.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     if getattr(module, "FOLDER", None) != folder.resolve():
-        raise ValueError(f"{folder}/denoise.py would read this tree's sources: it must give FOLDER to hopper.source")
+        raise ValueError(f"{folder}/denoise/kernel.py would read this tree's sources: they must come from its FOLDER")
     return module

@@ -27,8 +27,8 @@ from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
 
 if TYPE_CHECKING:
-    from turbopi.kernels.denoise import DenoiseKernel
-    from turbopi.kernels.denoise_packing import PackedExpert
+    from turbopi.kernels.sm90.denoise.kernel import DenoiseKernel
+    from turbopi.kernels.sm90.denoise.packing import PackedExpert
 
 
 class FusedBackend(CudaGraphBackend):
@@ -174,8 +174,8 @@ class FusedBackend(CudaGraphBackend):
 
     def _denoising_kernel(self, horizon: int, rows: int, table: Tensor | None) -> "DenoiseKernel":
         """Raises BackendUnavailable for what it doesn't cover."""
-        from turbopi.kernels.denoise import MAX_SUFFIX, DenoiseKernel, unavailable
-        from turbopi.kernels.denoise_packing import PackedExpert, refusal
+        from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, DenoiseKernel, unavailable
+        from turbopi.kernels.sm90.denoise.packing import PackedExpert, refusal
 
         reason = unavailable(self.device) or refusal(self.config)
         if reason is None and horizon > MAX_SUFFIX:

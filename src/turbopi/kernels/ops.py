@@ -13,11 +13,13 @@ from torch import Tensor
 
 from turbopi.engine import ops as plain
 from turbopi.engine.ops import Ops
-from turbopi.kernels import attention, attention_hopper, embedding, norms, products, rope
-from turbopi.kernels.gemm import Tile
-from turbopi.kernels.gemm_fp8 import GATHERING_SMS
+from turbopi.kernels import attention, embedding, norms, rope
 from turbopi.kernels.launch import capability
-from turbopi.kernels.vision_tower import RESIDUAL_TILES, VisionTower
+from turbopi.kernels.sm90.attention import kernel as attention_hopper
+from turbopi.kernels.sm90.gemm import products
+from turbopi.kernels.sm90.gemm.bf16 import Tile
+from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
+from turbopi.kernels.sm90.gemm.vision_tower import RESIDUAL_TILES, VisionTower
 
 
 def fused_ops(device: torch.device) -> Ops:

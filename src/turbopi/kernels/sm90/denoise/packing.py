@@ -1,4 +1,4 @@
-"""The action expert's weights in the order in which the denoising kernel reads them: see denoise_base.cu.
+"""The action expert's weights in the order in which the denoising kernel reads them: see base.cu.
 
 Shapes: N steps, L layers, D width, F feed-forward width, n query heads of K columns.
 """
@@ -52,7 +52,7 @@ def most(count: int, parts: int) -> int:
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Who does what: see denoise_base.cu."""
+    """Who does what: see base.cu."""
 
     config: ModelConfig
     clusters: int

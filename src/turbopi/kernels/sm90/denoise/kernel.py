@@ -3,7 +3,7 @@
 Ten steps read the action expert's 311 M weights ten times and do little else, so the loop is a race between memory and
 the delay of some thousand dependent operations. One kernel keeps its clusters resident, streams the weights through
 shared memory without pause, and passes activations through distributed shared memory; only sums over heads or hidden
-units cross clusters. How, and why it is safe, is said in denoise_base.cu.
+units cross clusters. How, and why it is safe, is said in base.cu.
 
 Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns, A action_dim.
 """
@@ -17,9 +17,10 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.engine.weights import State
 from turbopi.errors import BackendError, BackendUnavailable
-from turbopi.kernels import hopper
 from turbopi.kernels.arguments import Parameter, Struct, enumeration
-from turbopi.kernels.denoise_packing import (
+from turbopi.kernels.nvrtc import Kernel, compile_cubin
+from turbopi.kernels.sm90 import instructions
+from turbopi.kernels.sm90.denoise.packing import (
     BLOCK,
     RANKS,
     WARPS,
@@ -28,12 +29,11 @@ from turbopi.kernels.denoise_packing import (
     Tables,
     most,
 )
-from turbopi.kernels.denoise_plain import affine, inverse_frequencies
-from turbopi.kernels.nvrtc import Kernel, compile_cubin
+from turbopi.kernels.sm90.denoise.plain import affine, inverse_frequencies
 
-FOLDER = Path(__file__).parent
+FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
 PARTS = tuple(
-    f"denoise_{part}.cu"
+    f"denoise/{part}.cu"
     for part in (
         *("base", "primitives", "wgmma", "producer", "product", "spread", "stream"),
         *("project", "score", "attention_many", "attention", "step", "loop"),
@@ -54,7 +54,7 @@ WAITS = {  # what a CTA waits for: the kernel's enum, and what users are told
     "WAIT_GO": "the next step",
     "FINISHED": "its end",
 }
-FEW = 16  # tokens: `FEW` of denoise_base.cu
+FEW = 16  # tokens: `FEW` of base.cu
 MAX_SUFFIX = 56  # beyond it too little shared memory is left for weights on their way
 
 
@@ -137,15 +137,15 @@ def kernel_sizes(
 
 def source(suffix: int, fp8: bool) -> str:
     columns = most(suffix, 8) * 8
-    numbers: hopper.Numbers = "e4m3" if fp8 else "bf16"
+    numbers: instructions.Numbers = "e4m3" if fp8 else "bf16"
     products = (
-        hopper.wgmma("add_product", columns, numbers=numbers),
-        hopper.wgmma("add_from_registers", columns, numbers=numbers, from_registers=True),
-        hopper.wgmma("add_rows", columns, from_registers=True),
-        hopper.wgmma("add_keys", 2 * 8),
+        instructions.wgmma("add_product", columns, numbers=numbers),
+        instructions.wgmma("add_from_registers", columns, numbers=numbers, from_registers=True),
+        instructions.wgmma("add_rows", columns, from_registers=True),
+        instructions.wgmma("add_keys", 2 * 8),
     )
     generated = (*products, enumeration("What", tuple(WAITS)), ARGS.source)
-    return hopper.source(*PARTS, generated="\n".join(generated) + "\n", folder=FOLDER)
+    return instructions.source(*PARTS, generated="\n".join(generated) + "\n", folder=FOLDER)
 
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
@@ -168,7 +168,7 @@ def megahertz(cycles: int, nanoseconds: int) -> float | None:
 
 
 def stuck(words: list[int]) -> str | None:
-    """What the blocks' words of `watch` (denoise_primitives.cu) say, or None: none has said anything."""
+    """What the blocks' words of `watch` (primitives.cu) say, or None: none has said anything."""
     waits = sorted({(word & 0xFFFFF, word >> 20 & 0x7FF) for word in words if word})
     told = tuple(WAITS.values())
     where = ", ".join(f"layer {layer} for {told[what]}" for layer, what in waits[:8])

@@ -1,4 +1,4 @@
-"""Matrix products of E4M3 numbers, for compute capability 9.0: gemm.cu compiled for them.
+"""Matrix products of E4M3 numbers, for compute capability 9.0: kernel.cu compiled for them.
 
 Twins: `engine.ops`' products with an `Fp8Matrix`. The results are bfloat16, E4M3 for a product that reads them next
 (`inverse`), or parts of the sums ("partial", "parts") for the norms of `norms.py` to add up.
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from turbopi.engine.fp8 import ALIGNMENT, E4M3, Fp8Matrix
-from turbopi.kernels.gemm import (
+from turbopi.kernels.sm90.gemm.bf16 import (
     SPLIT,
     Copy,
     Epilogue,
@@ -29,7 +29,7 @@ from turbopi.kernels.gemm import (
     size_arguments,
     tile_constants,
 )
-from turbopi.kernels.hopper import DependentKernel
+from turbopi.kernels.sm90.instructions import DependentKernel
 
 DEPTH = 128  # of a step along the inner axis
 PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are added up in float32
@@ -136,7 +136,7 @@ def constants(
     normed: int = 0,
     copied: int = 0,
 ) -> dict[str, int]:
-    """What gemm.cu is compiled with."""
+    """What kernel.cu is compiled with."""
     own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": copied}
     if out_fp8:
         own["TP_APART"] = 0  # such blocks go in fours, which may need more room than `Tile.apart` counts

@@ -1,4 +1,4 @@
-// The kernel; what it does, sizes and helpers are in gemm_base.cu, which comes before it.
+// The kernel; what it does, sizes and helpers are in base.cu, which comes before it.
 
 extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), 1)
 gemm(GEMM_PARAMETERS) {

@@ -1,7 +1,7 @@
-"""Attention without materialised logits through wgmma and TMA, for compute capability 9.0: see attention.cu.
+"""Attention without materialised logits through wgmma and TMA, for compute capability 9.0: see kernel.cu.
 
 Twins: `engine.ops.vision_attention`, and `engine.ops.attention` without a suffix. The kernels for all other GPUs, and
-for heads that this one doesn't take, are in attention.py.
+for heads that this one doesn't take, are in kernels/attention.py.
 """
 
 from dataclasses import dataclass, replace
@@ -10,17 +10,17 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from turbopi.kernels import hopper
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
 from turbopi.kernels.attention import LOG2_E
-from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
 from turbopi.kernels.launch import result_dtype
 from turbopi.kernels.nvrtc import compile_cubin
+from turbopi.kernels.sm90 import instructions
+from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
 
 PARAMETERS = Parameters(
     (
         *(Parameter(TENSOR_MAP, f"map_{name}") for name in "qkv"),
-        Parameter("Element*", "out"),  # bfloat16 or E4M3: attention.cu
+        Parameter("Element*", "out"),  # bfloat16 or E4M3: kernel.cu
         Parameter("const long long*", "length"),
         *(Parameter("int", name) for name in ("rows", "keys", "heads", "k_first", "v_first", "tiles")),
         Parameter("float", "scale"),
@@ -111,7 +111,7 @@ def _launch(
     count = out.shape[-1] // tile.dim if length is None else 1  # query heads beside each other
     boxes = (64, tile.keys // tile.sharing, tile.keys // tile.sharing)
     maps = [
-        hopper.tensor_map(
+        instructions.tensor_map(
             matrix.data_ptr(),
             (tile.dim, width, matrix.numel() // (width * tile.dim)),
             (tile.dim, width * tile.dim),
@@ -140,7 +140,7 @@ def _launch(
 
 
 def constants(tile: Tile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
-    """What attention.cu is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
+    """What kernel.cu is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
     return {
         "TP_DIM": tile.dim,
         "TP_WGS": tile.warpgroups,
@@ -153,11 +153,11 @@ def constants(tile: Tile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
 
 
 def source(tile: Tile) -> str:
-    """attention.cu with the instructions for a tile."""
-    logits = hopper.wgmma("mma_logits", tile.keys)
-    values = hopper.wgmma("mma_values", tile.dim, from_registers=True, across=True)
+    """kernel.cu with the instructions for a tile."""
+    logits = instructions.wgmma("mma_logits", tile.keys)
+    values = instructions.wgmma("mma_values", tile.dim, from_registers=True, across=True)
     parameters = f"#define ATTENTION_PARAMETERS {PARAMETERS.declarations}"
-    return hopper.source("attention.cu", generated=f"{logits}\n{values}\n{parameters}\n")
+    return instructions.source("attention/kernel.cu", generated=f"{logits}\n{values}\n{parameters}\n")
 
 
 @cache

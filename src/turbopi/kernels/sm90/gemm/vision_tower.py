@@ -7,9 +7,9 @@ from torch import Tensor
 
 from turbopi.engine.fp8 import E4M3, Fp8Matrix, Matrix
 from turbopi.kernels import norms
-from turbopi.kernels.gemm import Copy, Epilogue, Folded, Sums, Tile, matmul
-from turbopi.kernels.gemm_fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
-from turbopi.kernels.products import (
+from turbopi.kernels.sm90.gemm.bf16 import Copy, Epilogue, Folded, Sums, Tile, matmul
+from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
+from turbopi.kernels.sm90.gemm.products import (
     as_input,
     num_sms,
     tuned_linear,

@@ -1,10 +1,10 @@
-// Part 9 of 13: attention's steps, of which denoise_attention_many.cu and denoise_attention.cu make the whole.
+// Part 9 of 13: attention's steps, of which attention_many.cu and attention.cu make the whole.
 
 // Who does what: the first SCORERS warps score a tile of prefix keys each, and the next if there are more; the last
 // four score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries.
 // If tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries
 // and weights; else all warps weigh, and the third warpgroup fetches the suffix's values. Queries of many tokens are
-// more than shared memory can bring to each warp by itself (ASYNC): see denoise_attention_many.cu.
+// more than shared memory can bring to each warp by itself (ASYNC): see attention_many.cu.
 constexpr int LEADER = SCORERS - 1, SUFFIX_WARP = 12;
 constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
 // Blocks of its keys that a scoring warp holds, tiles of values that a weighing warp does: more would spill.

@@ -1,5 +1,5 @@
 // out = softmax(scale * q @ k^T) @ v in bfloat16 with float32 logits and sums, over the first `length` keys: TMA feeds
-// shared memory, wgmma multiplies. For compute capability 9.0. attention_hopper.py sets the TP_ constants and writes
+// shared memory, wgmma multiplies. For compute capability 9.0. kernel.py sets the TP_ constants and writes
 // `mma_logits` and `mma_values` for the tile's widths.
 //
 // q, k and v are columns of matrices [rows, heads, TP_DIM] (possibly of one and the same): heads of q begin at column

@@ -1,4 +1,4 @@
-"""Matrix products in bfloat16 with float32 sums and a fused epilogue, for compute capability 9.0: see gemm.cu.
+"""Matrix products in bfloat16 with float32 sums and a fused epilogue, for compute capability 9.0: see kernel.cu.
 
 Twins: `engine.ops.linear`, `linear_gelu`, `linear_geglu`; "partial" and "parts" are `linear` before its sums are added
 up, which the norms in `norms.py` do.
@@ -11,17 +11,17 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from turbopi.kernels import hopper
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
-from turbopi.kernels.hopper import SHARED_BYTES, DependentKernel
 from turbopi.kernels.nvrtc import compile_cubin
+from turbopi.kernels.sm90 import instructions
+from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
 
 Epilogue = Literal["plain", "bias", "gelu", "geglu", "partial", "parts"]
 EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, "partial": 4, "parts": 5}
 SPLIT = ("partial", "parts")
 DEPTH = 64  # of a step along the inner axis
 STEP_BYTES = 128  # the same, in either precision
-BF16 = {"TP_FP8": 0, "TP_OUT_FP8": 0, "TP_PROMOTE": 0}  # gemm_fp8.py has the others
+BF16 = {"TP_FP8": 0, "TP_OUT_FP8": 0, "TP_PROMOTE": 0}  # fp8.py has the others
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Tile:
         return (self.rows + self.columns) * STEP_BYTES
 
     @property
-    def _received(self) -> int:  # see gemm_base.cu
+    def _received(self) -> int:  # see base.cu
         return (self.splits - 1) * -(-self.columns // 16 // self.splits) * 32 * 128 * self.warpgroups
 
     def _room(self, factors: int) -> int:
@@ -194,7 +194,7 @@ def launch(
     """`given` has all parameters but the last two. `ahead` is the matrix that is to be in L2 for the next product; each
     block fetches a share of it.
     """
-    assert groups[0] * groups[1] * tile.splits < 1 << 20, "gemm.cu divides no larger numbers"
+    assert groups[0] * groups[1] * tile.splits < 1 << 20, "kernel.cu divides no larger numbers"
     blocks = clusters(tile, groups[0] * groups[1], kernel.max_clusters) * tile.cluster
     share = 0 if ahead is None else ahead.numel() * ahead.element_size() // blocks // 16 * 16
     place = ahead.data_ptr() if ahead is not None and share else None
@@ -202,7 +202,7 @@ def launch(
 
 
 def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool) -> Parameters:
-    """What gemm.cu's kernel takes in these forms."""
+    """What kernel.cu's kernel takes in these forms."""
     rows = (
         Parameter("const float2*", "sums_in", "[parts][M]: the sum and the sum of squares of a row"),
         Parameter("float", "inverse_width"),
@@ -247,7 +247,7 @@ def norm_arguments(sums: Sums | None, width: int, eps: float, of_weight: Tensor,
 
 
 def copied_parts(copy: Copy | None, m: int, n: int) -> int:
-    """TP_COPY of gemm.cu."""
+    """TP_COPY of kernel.cu."""
     if copy is None:
         return 0
     assert (
@@ -280,7 +280,7 @@ def clusters(tile: Tile, groups: int, at_once: int) -> int:
 def constants(
     tile: Tile, epilogue: Epilogue, residual: bool = False, normed: int = 0, copied: int = 0
 ) -> dict[str, int]:
-    """What gemm.cu is compiled with."""
+    """What kernel.cu is compiled with."""
     return tile_constants(tile, epilogue, residual, factors=normed > 0) | {
         "TP_NORMED": normed,
         "TP_COPY": copied,
@@ -321,12 +321,12 @@ def build(takes: Parameters, sizes: dict[str, int], tile: Tile, device: torch.de
 
 
 def source(columns: int, takes: Parameters, *, fp8: bool) -> str:
-    """gemm_base.cu, gemm_geglu.cu and gemm.cu with the instruction for tiles of that many columns."""
-    mma = hopper.wgmma("mma", columns, numbers="e4m3" if fp8 else "bf16")
+    """base.cu, geglu.cu and kernel.cu with the instruction for tiles of that many columns."""
+    mma = instructions.wgmma("mma", columns, numbers="e4m3" if fp8 else "bf16")
     generated = f"{mma}\n#define GEMM_PARAMETERS {takes.declarations}\n"
-    return hopper.source("gemm_base.cu", "gemm_geglu.cu", "gemm.cu", generated=generated)
+    return instructions.source("gemm/base.cu", "gemm/geglu.cu", "gemm/kernel.cu", generated=generated)
 
 
 def matrix_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> Any:
     """TMA's map of blocks of box_rows x 128 bytes of a bfloat16 or E4M3 matrix [rows, width]."""
-    return hopper.tensor_map(address, (width, rows), (width,), (128 if fp8 else 64, box_rows), fp8)
+    return instructions.tensor_map(address, (width, rows), (width,), (128 if fp8 else 64, box_rows), fp8)

@@ -1,5 +1,5 @@
 // GeGLU where a CTA has several tiles: what follows a tile's sums is done in pieces between the steps of the next tile,
-// whose sums have registers of their own. Comes behind gemm_base.cu.
+// whose sums have registers of their own. Comes behind base.cu.
 // step(sums, is it the first, keep) multiplies, and all but this step is done then; end() waits for that one.
 #if TP_OVERLAP
 static_assert(EPILOGUE == 3 && !TP_PROMOTE && !GATHER && SPLITS == 1);

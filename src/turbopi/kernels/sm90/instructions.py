@@ -1,6 +1,6 @@
 """What the CUDA kernels for compute capability 9.0 share on the host: their launch, TMA's maps, wgmma's instructions.
 
-Their sources begin with hopper.cu.
+Their sources begin with instructions.cu.
 """
 
 import ctypes
@@ -61,9 +61,11 @@ class DependentKernel(Kernel):
 
 
 def source(*names: str, generated: str, folder: Path | None = None) -> str:
-    """A kernel's source: hopper.cu, what is `generated` (instructions, parameters), and those files."""
-    here = folder or files("turbopi.kernels")
-    return "\n".join(((here / "hopper.cu").read_text(), generated, *((here / name).read_text() for name in names)))
+    """A kernel's source: instructions.cu, what is `generated` (instructions, parameters), and those files."""
+    here = folder or files("turbopi.kernels.sm90")
+    return "\n".join(
+        ((here / "instructions.cu").read_text(), generated, *((here / name).read_text() for name in names))
+    )
 
 
 Numbers = Literal["bf16", "e4m3"]

@@ -5,7 +5,7 @@
 // Waits are short loops without an end of their own; a spare warp watches instead. Where the first thread waits is a
 // word in shared memory, and if that stays the same for seconds the kernel says where (in memory of the host, which
 // outlives the trap; [NC * S] words: 1 << 31 | what << 20 | layer) and traps.
-// `What` they wait for is generated: WAITS of denoise.py.
+// `What` they wait for is generated: WAITS of kernel.py.
 __device__ __forceinline__ void note(const Block& b, int what) {
   if (b.thread == 0) *(volatile u32*)(b.smem + M_PROGRESS) = u32(what) << 20 | u32(b.n);
 }

@@ -1,11 +1,11 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
-// Part 1 of 13, which denoise.py puts together: sizes, shared memory, a CTA's view.
+// Part 1 of 13, which kernel.py puts together: sizes, shared memory, a CTA's view.
 //
 // NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
 // feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
 // cluster owns the r-th slice of the residual stream's columns; all NC clusters keep the same stream, in float32
 // registers. (Of more than 16 tokens each cluster keeps some, and the stream comes together in another way: see
-// denoise_spread.cu. What follows holds for the rest.)
+// spread.cu. What follows holds for the rest.)
 //
 // What a cluster's CTAs tell each other goes through distributed shared memory (st.async, counted in by an mbarrier of
 // the receiver: no cluster barriers). What crosses clusters are sums over heads or over hidden units, two exchanges a
@@ -48,7 +48,7 @@ constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in
 constexpr bool FEW = NT <= 2;              // tokens: registers and shared memory to spare
 // Clock cycles before sums are asked for: polls slow down what they wait for.
 constexpr u32 PATIENCE = FEW ? 500 : FP8 ? 300 : 400;
-constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see denoise_spread.cu
+constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see spread.cu
 constexpr int OWN_N = most(NT, NC);        // if so: 8 tokens of the slice at a time, which a CTA looks after
 constexpr int ITEMS_X = most(SPREAD ? DX * OWN_N : DX * NT, W);  // (tile, 8 tokens) that one warp looks after
 static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NC >= NH && A <= CONSUMERS,
@@ -210,7 +210,7 @@ constexpr int X_OWN_HIDDEN = X_OWN_V;  // of a rank, before they are sent
 static_assert(!COPY_HIDDEN || X_OWN_HIDDEN + GTL / 2 * NT * OPERAND <= X_SIZE, "room for a rank's hidden units");
 static_assert(STAGES >= 2 && (!MMA_QKV || QKV_ROUNDS <= STAGES), "too little shared memory");
 
-// Who scores prefix keys, a tile a warp and round. ASYNC: by wgmma, see denoise_attention_many.cu.
+// Who scores prefix keys, a tile a warp and round. ASYNC: by wgmma, see attention_many.cu.
 constexpr int SCORERS = 8, ROUNDS = most(KT, SCORERS);
 constexpr bool ASYNC = SPREAD && ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES;
 // Prefix keys that rank i has: tiles from `first` on, with `keys` keys in all. Ranks with one more would let the others
@@ -255,7 +255,7 @@ constexpr size_t N_HEAD = size_t(NC) * QT * NT, N_HIDDEN = size_t(NC) * HC * NT 
 constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_SQUARES = B_STAGE + STAGED * N_STAGE;
 constexpr size_t B_ORDER = B_SQUARES + 2 * N_SQUARES, B_HIDDEN = B_ORDER + NC * S, B_QUERIES = B_HIDDEN + N_HIDDEN,
                  B_ATT = B_QUERIES + N_HEAD * 16, SCRATCH = SPREAD ? B_ATT + N_HEAD * (OPERAND / 16) : B_STAGE;
-static_assert(SCRATCH == TP_SCRATCH, "denoise.py disagrees on the scratch memory");
+static_assert(SCRATCH == TP_SCRATCH, "kernel.py disagrees on the scratch memory");
 // Stands where a word of the staged stream is still to come. Nothing is rounded to it: the NaN made then is another.
 constexpr u32 ABSENT = ~0u;
 // Whether there is the token whose 8 columns (E4M3: 16) word i of a staged slice has.

@@ -1,5 +1,5 @@
 // out[M, N] = epilogue(a[M, K] @ w[N, K]^T) in bfloat16 with float32 sums: TMA feeds shared memory, wgmma multiplies.
-// For compute capability 9.0. gemm.py sets the TP_ constants and writes `mma` for the tile's width.
+// For compute capability 9.0. bf16.py sets the TP_ constants and writes `mma` for the tile's width.
 //
 // TP_FP8: a and w are E4M3; `scale` (of each output channel, times the input's) multiplies the sums before bias and
 // nonlinearity. The tensor cores keep only some 14 bits of sums of E4M3 products: after every TP_PROMOTE blocks of K
@@ -31,7 +31,7 @@
 // in the copy already, and the bias goes apart.
 //
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
-// TP_OVERLAP: see gemm_geglu.cu.
+// TP_OVERLAP: see geglu.cu.
 
 constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
 constexpr bool GATHER = TP_GATHER;
@@ -80,7 +80,7 @@ __device__ __forceinline__ float tanh_of_gelu(float x) {  // off by 2^-11 at mos
 }
 __device__ __forceinline__ float gelu(float x) { return fmaf(0.5f * x, tanh_of_gelu(x), 0.5f * x); }
 __device__ __forceinline__ float twice_gelu(float x) { return fmaf(x, tanh_of_gelu(x), x); }
-// The descriptor of hopper.cu's `operand`, of its lower half, which counts in 16 bytes.
+// The descriptor of instructions.cu's `operand`, of its lower half, which counts in 16 bytes.
 __device__ __forceinline__ u32 lower_half(u32 address) { return (u32)operand(address); }
 __device__ __forceinline__ u64 operand_of(u32 lower) { return lower | (operand(0) & 0xffffffff00000000ull); }
 

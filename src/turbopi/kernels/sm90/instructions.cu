@@ -1,5 +1,5 @@
 // What kernels for compute capability 9.0 share: TMA and its barriers, operands of wgmma, results on their way out.
-// Put in front of a kernel's source by hopper.py.
+// Put in front of a kernel's source by instructions.py.
 
 typedef unsigned int u32;
 typedef unsigned long long u64;
