@@ -313,14 +313,6 @@ def test_the_table_fits_eighty_columns() -> None:
     assert "1,234,567" in out.getvalue()
 
 
-@pytest.mark.parametrize("name", ["cpu_2026-11-23_attack_control.json"])
-def test_the_document_quotes_the_result(name: str) -> None:
-    root = Path(__file__).parents[1]
-    written = (root / "docs" / "dev" / "attack.md").read_text(encoding="utf-8")
-    pieces = results.load(root / "benchmarks" / "results" / name)
-    assert results.markdown(pieces) in written, f"python -m attack show {name} --markdown"
-
-
 def test_a_file_of_another_kind_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "a.json"
     file.write_text('{"format": "other"}')

@@ -96,13 +96,14 @@ def plot_chunks(file: Path, rows: Sequence[Row], *, robot: str, title: str, rand
     write_figure(file, figure)
 
 
-def write_figure(file: Path, figure: Figure, dpi: int = _DPI) -> None:
-    """Write a figure in the format that the file's ending names, whole or not at all.
+def write_figure(file: Path, figure: Figure, dpi: int = _DPI, *, about: Mapping[str, str] | None = None) -> None:
+    """Write a figure in the format that the file's ending names, whole or not at all. A PNG holds the texts `about`.
 
     Raises ConfigError for an unknown ending, OutputError if the file can't be written.
     """
     try:
-        write_whole(file, lambda stream: figure.savefig(stream, dpi=dpi, format=file.suffix.removeprefix(".") or "png"))
+        kind = file.suffix.removeprefix(".") or "png"
+        write_whole(file, lambda stream: figure.savefig(stream, dpi=dpi, format=kind, metadata=about))
     except ValueError as error:
         raise ConfigError(f"can't write the plot {file}: {error}") from error
 

@@ -1,5 +1,7 @@
 """Plots of a benchmark document: stages beside their floors, latency by the number of steps, the roofline."""
 
+import hashlib
+import json
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,7 @@ from matplotlib.figure import Figure
 
 from turbopi.plots import as_text, write_figure
 
+DRAWN_OF = "Drawn of"  # the PNG text in which a plot names its document
 SHAPE = ("cameras", "prompt_tokens", "horizon")
 STAGES = {"vision": "#4c72b0", "prefix": "#dd8452", "denoise": "#55a868"}
 
@@ -20,12 +23,19 @@ def job_label(job: dict[str, int]) -> str:
     return f"{job['cameras']} cameras, {job['prompt_tokens']} tokens, H={job['horizon']}, {job['steps']} steps"
 
 
+def fingerprint(document: dict[str, Any]) -> str:
+    """What tells this document from another one: a SHA-256 of its values, whatever their order in the file."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+
 def write_plots(document: dict[str, Any], folder: Path) -> list[Path]:
     """stages.png and roofline.png of the main job, steps.png where several numbers of steps were measured."""
-    written = [_stages(document, folder / "stages.png"), _roofline(document, folder / "roofline.png")]
+    plots = {"stages.png": _stages, "roofline.png": _roofline}
     if len({result["job"]["steps"] for result in document["results"]}) > 1:
-        written.append(_steps(document, folder / "steps.png"))
-    return written
+        plots["steps.png"] = _steps
+    for name, draw in plots.items():
+        write_figure(folder / name, draw(document), about={DRAWN_OF: fingerprint(document)})
+    return [folder / name for name in plots]
 
 
 def main_results(document: dict[str, Any]) -> list[dict[str, Any]]:
@@ -33,12 +43,13 @@ def main_results(document: dict[str, Any]) -> list[dict[str, Any]]:
     return [result for result in document["results"] if result["job"] == document["main_job"]]
 
 
-def _stages(document: dict[str, Any], path: Path) -> Path:
+def _stages(document: dict[str, Any]) -> Figure:
     """One bar a backend, stacked by stage; the floor as a bar of its own."""
     job, results = document["main_job"], main_results(document)
     figure = Figure(figsize=(9, 1.6 + 0.5 * 2 * len(results)), layout="constrained")
     axes = figure.subplots()
     names: list[str] = []
+    cut = _axis_end([result["milliseconds"]["total"] for result in results])
     for result in results:
         rows = ((label(result), _medians(result)), (f"floor, {result['precision']}", result["floor_ms"]))
         for name, milliseconds in rows:
@@ -55,22 +66,33 @@ def _stages(document: dict[str, Any], path: Path) -> Path:
                 sides = [[max(end - total["p5"], 0)], [max(total["p95"] - end, 0)]]
                 axes.errorbar(end, len(names), xerr=sides, fmt="|", color="black", capsize=3)
                 end = max(end, total["p95"])
-            axes.text(end, len(names), f"  {milliseconds['total']:.1f}", va="center")
+            if end < cut:
+                axes.text(end, len(names), f"  {milliseconds['total']:.1f}", va="center")
+            else:
+                axes.text(cut, len(names), f"{milliseconds['total']:.1f} →  ", va="center", ha="right", color="white")
             names.append(name)
     axes.invert_yaxis()
+    axes.set_xlim(0, cut)
     axes.set_xlabel("milliseconds on the device, medians; number and whiskers: the whole call, p5 to p95")
     axes.set_title(f"{as_text(document['model'])}: {job_label(job)}", fontsize=10)
     axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
-    axes.margins(x=0.08)
-    write_figure(path, figure)
-    return path
+    return figure
+
+
+def _axis_end(totals: list[dict[str, float]]) -> float:
+    """Where the axis ends: behind all bars, or, if one is many times as long as all others, behind those."""
+    by_median = sorted(totals, key=lambda total: total["p50"])
+    longest = by_median[-1]
+    if len(by_median) > 1 and longest["p50"] > 4 * by_median[-2]["p50"]:
+        longest = by_median[-2]
+    return 1.12 * max(longest["p50"], longest["p95"])
 
 
 def _medians(result: dict[str, Any]) -> dict[str, float]:
     return {stage: values["p50"] for stage, values in result["milliseconds"].items()}
 
 
-def _steps(document: dict[str, Any], path: Path) -> Path:
+def _steps(document: dict[str, Any]) -> Figure:
     """Median of the whole call by steps (bars: 5th to 95th percentile), with the line a + b * steps through it."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
@@ -94,8 +116,7 @@ def _steps(document: dict[str, Any], path: Path) -> Path:
         f"{as_text(document['model'])}: {main['cameras']} cameras, {main['prompt_tokens']} tokens", fontsize=10
     )
     axes.legend()
-    write_figure(path, figure)
-    return path
+    return figure
 
 
 def _is_of(result: dict[str, Any], policy: dict[str, str], shape: dict[str, int]) -> bool:
@@ -104,7 +125,7 @@ def _is_of(result: dict[str, Any], policy: dict[str, str], shape: dict[str, int]
     )
 
 
-def _roofline(document: dict[str, Any], path: Path) -> Path:
+def _roofline(document: dict[str, Any]) -> Figure:
     """Each stage's rate over its operations a byte, below what bandwidth and matrix rate allow."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
@@ -128,5 +149,4 @@ def _roofline(document: dict[str, Any], path: Path) -> Path:
     axes.set_ylabel("least operations / median time [TFLOP/s]")
     axes.set_title(f"{as_text(document['model'])}: {job_label(document['main_job'])}", fontsize=10)
     axes.legend(fontsize=8)
-    write_figure(path, figure)
-    return path
+    return figure

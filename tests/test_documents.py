@@ -1,0 +1,113 @@
+"""What the documents say: their tables and plots are the result files', their links lead somewhere."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from doc_tables import blocks, drawn
+from doc_tables.__main__ import main
+from doc_tables.tables import TABLES, headline, whole_calls
+
+ROOT = Path(__file__).parents[1]
+RESULT = ROOT / "benchmarks" / "results" / "h200_2026-11-23_pi05_libero" / "results.json"
+_LINK = re.compile(r"\]\(([^()\s]+(?:\([^()\s]*\)[^()\s]*)*)\)")
+
+
+def test_every_table_and_plot_is_what_the_result_files_say(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--check"]) == 0, capsys.readouterr().err
+
+
+def test_every_table_stands_in_a_document() -> None:
+    used = {
+        found["what"].split()[0]
+        for document in blocks.documents(ROOT)
+        for found in blocks._BLOCK.finditer(document.read_text(encoding="utf-8"))
+    }
+    assert used == set(TABLES)
+
+
+@pytest.mark.parametrize("document", blocks.documents(ROOT), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_links_lead_to_files_and_headings(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    for link in _LINK.findall(text):
+        if re.match(r"[a-z]+:", link):
+            continue  # the web's links aren't followed: tests need no network
+        path, _, anchor = link.partition("#")
+        target = (document.parent / path).resolve() if path else document
+        assert target.exists(), f"{link} leads nowhere"
+        if anchor:
+            assert anchor in headings(target), f"{link}: {target.name} has no such heading"
+
+
+def headings(document: Path) -> set[str]:
+    """The anchors that GitHub makes of a document's headings."""
+    text = re.sub(r"```.*?```", "", document.read_text(encoding="utf-8"), flags=re.DOTALL)
+    titles = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+# --- the tool itself --------------------------------------------------------------------------------------------------
+
+
+def project(folder: Path, table: str) -> Path:
+    """A project with one document and one result file."""
+    results = folder / "benchmarks" / "results" / "a"
+    results.mkdir(parents=True)
+    (results / "results.json").write_text(RESULT.read_text(encoding="utf-8"))
+    (folder / "README.md").write_text(f"before\n<!-- table: {table} -->\n<!-- end of table -->\nbehind\n")
+    return folder
+
+
+def test_a_figure_that_was_changed_by_hand_is_found(tmp_path: Path) -> None:
+    root = project(tmp_path, "headline a/results.json")
+    assert blocks.fill(root) == [root / "README.md"]
+    assert blocks.differences(root) == [] and blocks.fill(root) == []
+    text = (root / "README.md").read_text()
+    assert text.startswith("before\n") and text.endswith("behind\n")
+    number = re.search(r"\d+\.\d", text)
+    assert number is not None
+    (root / "README.md").write_text(text.replace(number[0], "0.1"))
+    (found,) = blocks.differences(root)
+    assert "README.md" in found and "0.1" in found and "scripts/tables" in found
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [("nonsense a/results.json", "no table is named 'nonsense'"), ("headline b.json", "no result file b.json")],
+)
+def test_a_place_that_names_nothing_is_refused(tmp_path: Path, table: str, said: str) -> None:
+    with pytest.raises(blocks.TableError, match=said):
+        blocks.fill(project(tmp_path, table))
+
+
+def test_a_table_without_an_end_is_refused(tmp_path: Path) -> None:
+    root = project(tmp_path, "headline a/results.json")
+    (root / "README.md").write_text("<!-- table: headline a/results.json -->\n")
+    with pytest.raises(blocks.TableError, match="end of table"):
+        blocks.fill(root)
+
+
+def test_plots_of_another_document_are_drawn_anew(tmp_path: Path) -> None:
+    root = project(tmp_path, "headline a/results.json")
+    assert len(drawn.stale_plots(root)) == 3
+    assert {path.name for path in drawn.draw(root)} == set(drawn.PLOTS)
+    assert drawn.stale_plots(root) == []
+    file = root / "benchmarks" / "results" / "a" / "results.json"
+    document = json.loads(file.read_text())
+    document["results"][0]["milliseconds"]["total"]["p50"] += 1
+    file.write_text(json.dumps(document))
+    assert len(drawn.stale_plots(root)) == 3
+
+
+def test_tables_hold_the_numbers_of_their_job() -> None:
+    document = json.loads(RESULT.read_text(encoding="utf-8"))
+    (measured,) = [
+        result
+        for result in document["results"]
+        if result["backend"] == "fused" and result["precision"] == "fp8" and result["job"] == document["main_job"]
+    ]
+    median = measured["milliseconds"]["total"]["p50"]
+    assert f"**{median:.1f} ms**" in headline(document)[2]
+    (row,) = [line for line in whole_calls(document)[-6:] if line.startswith("| 2, 48 |")]
+    assert f"/ {median:.2f} |" in row

@@ -1,0 +1,1 @@
+"""Tables and plots of the documents, written from the checked-in result files."""

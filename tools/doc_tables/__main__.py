@@ -1,0 +1,43 @@
+"""Write the documents' tables and plots from the result files below benchmarks/results/, or check that they agree.
+
+    scripts/tables           fill them in
+    scripts/tables --check   change nothing; exit code 1 and a list if one differs
+
+A table stands between two lines of a document, which name what it shows and of which files:
+
+    <!-- table: main_job h200_2026-11-23_pi05_libero/results.json -->
+    <!-- end of table -->
+
+`tables.py` has one function for each name. The plots are those that `turbopi bench --report` draws: every folder below
+benchmarks/results/ with a benchmark's results.json has them, and each names the document it was drawn of.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from doc_tables.blocks import differences, fill
+from doc_tables.drawn import draw, stale_plots
+
+ROOT = Path(__file__).parents[2]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="scripts/tables", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 if a table or plot differs")
+    given = parser.parse_args(arguments)
+    if given.check:
+        found = differences(ROOT) + stale_plots(ROOT)
+        for line in found:
+            print(line, file=sys.stderr)
+        return 1 if found else 0
+    for changed in (*fill(ROOT), *draw(ROOT)):
+        print(f"wrote {changed.relative_to(ROOT)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,76 @@
+"""The marked places in documents, and what belongs there."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from doc_tables.tables import TABLES
+
+RESULTS = Path("benchmarks") / "results"
+_BLOCK = re.compile(r"<!-- table: (?P<what>[^\n]*?) -->\n(?P<text>.*?)<!-- end of table -->", re.DOTALL)
+
+
+class TableError(ValueError):
+    """A marked place that names no table or no file."""
+
+
+def documents(root: Path) -> list[Path]:
+    """Every document of the project."""
+    return sorted([*root.glob("*.md"), *root.glob("docs/**/*.md"), *root.glob("benchmarks/**/*.md")])
+
+
+def filled(text: str, root: Path) -> str:
+    """A document's text with its tables written anew. Raises TableError."""
+
+    def table(found: re.Match[str]) -> str:
+        name, *files = found["what"].split()
+        if name not in TABLES:
+            raise TableError(f"no table is named {name!r}: there are {', '.join(sorted(TABLES))}")
+        contents = [_load(root / RESULTS / file) for file in files]
+        lines = TABLES[name](*contents)
+        return f"<!-- table: {found['what']} -->\n" + "".join(f"{line}\n" for line in lines) + "<!-- end of table -->"
+
+    if text.count("<!-- table:") != len(_BLOCK.findall(text)):
+        raise TableError('a line "<!-- table: … -->" has no "<!-- end of table -->" behind it')
+    return _BLOCK.sub(table, text)
+
+
+def _load(file: Path) -> Any:
+    if not file.is_file():
+        raise TableError(f"there is no result file {file.name} in {file.parent}")
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def _wanted(root: Path) -> Iterator[tuple[Path, str, str]]:
+    """(document, its text, what it should be) of every document with tables."""
+    for document in documents(root):
+        text = document.read_text(encoding="utf-8")
+        if "<!-- table:" in text:
+            try:
+                yield document, text, filled(text, root)
+            except TableError as error:
+                raise TableError(f"{document.relative_to(root)}: {error}") from None
+
+
+def fill(root: Path) -> list[Path]:
+    """Write every table anew; returns the documents that changed."""
+    changed = []
+    for document, text, wanted in _wanted(root):
+        if text != wanted:
+            document.write_text(wanted, encoding="utf-8")
+            changed.append(document)
+    return changed
+
+
+def differences(root: Path) -> list[str]:
+    """One line for each line of a document that isn't what the result files say."""
+    found = []
+    for document, text, wanted in _wanted(root):
+        if text == wanted:
+            continue
+        pairs = zip(text.splitlines(), wanted.splitlines(), strict=False)
+        first = next((pair for pair in pairs if pair[0] != pair[1]), ("(the end)", "(the end)"))
+        found.append(f"{document.relative_to(root)}: {first[0]!r} should be {first[1]!r}; run scripts/tables")
+    return found
