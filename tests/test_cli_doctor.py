@@ -113,7 +113,7 @@ def test_missing_and_old_packages_fail_by_name(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(metadata, "version", lambda name: "0.1.0" if name == "turbopi" else version(name))
     row = checkups.check_packages()
     assert row.level == "FAIL"
-    assert row.found == f"rich is {version('rich')}, older than 99.1; no-such-package is missing"
+    assert row.found == f"rich is {version('rich')}, not >=99.1; no-such-package is missing"
 
 
 GPU_CASES = [
@@ -188,11 +188,31 @@ def test_busy_cpus_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "1000.0 want to run" in row.found
 
 
+INSTALL = "on Debian and Ubuntu: apt-get install g++ python3-dev"
+
+
 def test_no_compiler_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     assert checkups.check_compiler() == Row(
-        "WARN", "C compiler", "no C compiler", "apt install gcc g++: pytorch_compile and Triton kernels need them"
+        "WARN", "C compiler", "no C++ compiler", f"{INSTALL}: pytorch_compile and Triton kernels need it"
     )
+
+
+@pytest.mark.parametrize(("device", "who"), [("cpu", "torch.compile can't build its code"), ("cuda", "Triton can't")])
+def test_an_environment_without_pythons_headers_is_told_before_anything_compiles(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, device: str, who: str
+) -> None:
+    monkeypatch.setattr("sysconfig.get_paths", lambda: {"include": str(tmp_path)})
+    monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+    row = checkups.check_compiler()
+    assert (row.level, row.found) == ("WARN", f"no {tmp_path}/Python.h, Python's headers")
+    reason = PyTorchCompileBackend.unavailable(torch.device(device))
+    assert reason is not None
+    assert reason.startswith(who) and "Python.h" in reason and INSTALL in reason
+    (tmp_path / "Python.h").write_text("")
+    assert checkups.check_compiler().level == "OK"
+    assert PyTorchCompileBackend.unavailable(torch.device(device)) is None
 
 
 def test_backends_are_listed_with_reasons_and_what_auto_takes(monkeypatch: Any) -> None:

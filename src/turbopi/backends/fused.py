@@ -6,7 +6,6 @@ takes the engine's operations one by one, and `describe()` says so.
 """
 
 import importlib.util
-import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -25,6 +24,7 @@ from turbopi.engine.ops import Ops
 from turbopi.engine.recent import Loop
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
+from turbopi.toolchain import missing_for_c
 
 if TYPE_CHECKING:
     from turbopi.kernels.sm90.denoise.kernel import DenoiseKernel
@@ -61,8 +61,8 @@ class FusedBackend(CudaGraphBackend):
             return reason
         if importlib.util.find_spec("triton") is None:
             return "its kernels are written in Triton, which isn't installed; `pip install triton`"
-        if shutil.which("gcc") is None and shutil.which("clang") is None:
-            return "Triton needs a C compiler for its launcher; install gcc"
+        if (missing := missing_for_c()) is not None:
+            return f"Triton can't build its launcher here: {missing}"
         if importlib.util.find_spec("cuda") is None or importlib.util.find_spec("cuda.bindings") is None:
             return (
                 "its CUDA kernels are compiled through cuda.bindings, which isn't installed; `pip install cuda-python`"

@@ -5,7 +5,6 @@ cameras, another batch size or a mask (batches with unequal prompts) do, once ea
 """
 
 import importlib.util
-import shutil
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -18,6 +17,7 @@ from turbopi.config import ModelConfig
 from turbopi.errors import ObservationError
 from turbopi.model.reference import Pi0Model, Precision
 from turbopi.observation import Observation
+from turbopi.toolchain import missing_for_c, missing_for_cpp
 
 
 class CompiledModel(Pi0Model):
@@ -116,13 +116,13 @@ class PyTorchCompileBackend(PyTorchBackend):
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
-        if device.type == "cpu" and shutil.which("g++") is None and shutil.which("clang++") is None:
-            return "torch.compile needs a C++ compiler on a CPU; install g++"
+        if device.type == "cpu" and (missing := missing_for_cpp()) is not None:
+            return f"torch.compile can't build its code here: {missing}"
         if device.type == "cuda":
             if importlib.util.find_spec("triton") is None:
                 return "torch.compile needs Triton on a GPU; `pip install triton`"
-            if shutil.which("gcc") is None and shutil.which("clang") is None:
-                return "Triton needs a C compiler for its launcher; install gcc"
+            if (missing := missing_for_c()) is not None:
+                return f"Triton can't build its launcher here: {missing}"
         return None
 
     def describe(self) -> dict[str, Any]:

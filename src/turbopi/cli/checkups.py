@@ -14,12 +14,16 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
+from packaging.requirements import Requirement
+from packaging.version import Version
+
 from turbopi.cli.ports import why_not_free
 from turbopi.errors import TurboPiError
+from turbopi.toolchain import missing_for_c, missing_for_cpp
 
 Level = Literal["OK", "WARN", "FAIL"]
 
-MIN_PYTHON, MIN_TORCH = (3, 10), (2, 8)
+MIN_PYTHON, MIN_TORCH = (3, 10), "2.8"
 # Weights of the full-size model (docs: 3.617 B parameters), and room for what runs beside them
 FULL_SIZE_GB = {"bf16": 7.2, "f32": 14.5}
 ACTIVATIONS_GB = 1.5
@@ -72,27 +76,19 @@ def check_packages() -> Row:
     except metadata.PackageNotFoundError:
         return Row("WARN", "packages", "turbopi itself isn't installed", "pip install -e . in its folder")
     problems = []
-    for requirement in required:
-        match = re.match(r"([A-Za-z0-9_.-]+)\s*(?:>=\s*([\d.]+))?", requirement)
-        if match is None or "extra ==" in requirement:
+    for requirement in map(Requirement, required):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
-        name, minimum = match.groups()
         try:
-            installed = metadata.version(name)
+            installed = metadata.version(requirement.name)
         except metadata.PackageNotFoundError:
-            problems.append(f"{name} is missing")
+            problems.append(f"{requirement.name} is missing")
             continue
-        if minimum and version_tuple(installed) < version_tuple(minimum):
-            problems.append(f"{name} is {installed}, older than {minimum}")
+        if not requirement.specifier.contains(installed, prereleases=True):
+            problems.append(f"{requirement.name} is {installed}, not {requirement.specifier}")
     if problems:
         return Row("FAIL", "packages", "; ".join(problems), "pip install --upgrade turbopi")
     return Row("OK", "packages", f"turbopi {version} and all that it requires")
-
-
-def version_tuple(version: str) -> tuple[int, ...]:
-    """The leading numbers: "2.13.0+cpu" is (2, 13, 0)."""
-    leading = re.match(r"\d+(\.\d+)*", version)
-    return tuple(int(part) for part in leading[0].split(".")) if leading else ()
 
 
 def check_torch() -> Row:
@@ -102,7 +98,7 @@ def check_torch() -> Row:
         return Row("FAIL", "PyTorch", f"can't be imported: {error}", "pip install --force-reinstall 'torch>=2.8'")
     build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "ROCm" if torch.version.hip else "CPU only"
     found = f"{torch.__version__} ({build})"
-    if version_tuple(torch.__version__) < MIN_TORCH:
+    if Version(torch.__version__) < Version(MIN_TORCH):
         return Row("FAIL", "PyTorch", found, "pip install --upgrade 'torch>=2.8'")
     return Row("OK", "PyTorch", found)
 
@@ -117,7 +113,8 @@ def check_gpu() -> Iterator[Row]:
         yield _no_gpu(torch, driver, names)
         return
     if driver is not None:
-        old = version_tuple(driver)[:1] < (MIN_DRIVER,)
+        major = driver.split(".", 1)[0]
+        old = major.isdigit() and int(major) < MIN_DRIVER
         fix = f"update the NVIDIA driver to {MIN_DRIVER} or newer" if old else ""
         yield Row("WARN" if old else "OK", "NVIDIA driver", driver, fix)
     supported = torch.cuda.get_arch_list()
@@ -200,11 +197,11 @@ def check_triton() -> Row:
 def check_compiler() -> Row:
     """Triton builds its launcher with a C compiler, torch.compile its CPU code with a C++ one."""
     found = [path for name in ("gcc", "g++", "clang", "clang++") if (path := shutil.which(name))]
-    c, cpp = (any(Path(path).name in names for path in found) for names in (("gcc", "clang"), ("g++", "clang++")))
-    if c and cpp:
+    missing = missing_for_cpp() or missing_for_c()
+    if missing is None:
         return Row("OK", "C compiler", ", ".join(found))
-    lacks = "no C++ compiler" if c else "no C compiler"
-    return Row("WARN", "C compiler", lacks, "apt install gcc g++: pytorch_compile and Triton kernels need them")
+    what, _, mend = missing.removesuffix(")").partition(" (")
+    return Row("WARN", "C compiler", what, f"{mend}: pytorch_compile and Triton kernels need it")
 
 
 def check_cpu() -> Row:
@@ -218,9 +215,9 @@ def check_cpu() -> Row:
     if threads is not None and threads > usable:
         return Row("WARN", "CPU", found, f"set OMP_NUM_THREADS={usable}: more threads than CPUs are slow")
     load = psutil.getloadavg()[0]
-    if load > usable:  # threads that wait for each other spin: measured 5 times slower on busy CPUs
+    if load > usable:
         busy = f"{found}, but {load:.1f} want to run"
-        return Row("WARN", "CPU", busy, "stop other programs, or set OMP_WAIT_POLICY=PASSIVE: steady, a bit slower")
+        return Row("WARN", "CPU", busy, "stop other programs: they make every call on the CPU slower")
     return Row("OK", "CPU", found)
 
 
