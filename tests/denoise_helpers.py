@@ -32,6 +32,8 @@ CONFIGS = {
     "golden": sized(32, 64, 3, 16),
     "tiny": sized(128, 256, 6, 32),
     "odd": sized(160, 224, 2, 48, 4),
+    "uneven": sized(160, 224, 2, 48, 10),  # ten clusters divide nothing
+    "crowd": sized(64, 128, 1, 16, 32),  # more clusters than a GPU holds
     "shallow": sized(1024, 4096, 3, 256),
     "full": FULL,
 }

@@ -241,7 +241,7 @@ def memory(address: int, *shape: int, kind: Any = np.float32) -> np.ndarray:
 def test_the_denoising_kernels_struct_points_to_what_its_fields_say(loaded: type[FakeKernel], fp8: bool) -> None:
     p = problem("golden", 3, 10, 37, 0, CPU)
     scales = {f"expert.{i}.{kind}": 0.5 + i for i in range(3) for kind in ("qkv", "out", "gate_up", "down")}
-    packed = PackedExpert.pack(p.config, p.layers, None, scales if fp8 else None)
+    packed = PackedExpert.pack(p.config, p.layers, scales if fp8 else None)
     kernel, length = made(p, packed), torch.tensor([p.length])
     x_t, v_t = torch.zeros(4, 10, 32), torch.zeros(3, 10, 32)
     kernel.launch(p.noise, p.cache_k, p.cache_v, length, x_t, v_t)
@@ -288,12 +288,12 @@ def test_the_host_reads_back_what_the_kernel_writes_for_it(loaded: type[FakeKern
     assert str(kernel.why_it_trapped()).endswith("layer 2 for outputs")
 
 
-@pytest.mark.parametrize(("name", "clusters"), [("golden", 8), ("odd", 9)])
+@pytest.mark.parametrize(("name", "clusters"), [("golden", 8), ("uneven", 10)])
 def test_the_denoising_kernel_is_launched_behind_what_prepares_its_keys(
     loaded: type[FakeKernel], name: str, clusters: int
 ) -> None:
     p = problem(name, 1, 4, 40, 0, CPU)
-    kernel = made(p, PackedExpert.pack(p.config, p.layers, clusters))
+    kernel = made(p, PackedExpert.pack(p.config, p.layers))
     kernel.launch(p.noise, p.cache_k, p.cache_v, torch.tensor([40]), torch.zeros(2, 4, 32), torch.zeros(1, 4, 32))
     tiles = -(-p.cache_k.shape[1] // 16) * p.config.expert.depth  # 16 keys of a layer
     # 16 warps that multiply, and four beside them

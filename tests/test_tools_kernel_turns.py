@@ -42,15 +42,18 @@ def test_a_patch_changes_its_variants_source_alone(patch: Path) -> None:
 
 
 def test_constants_replace_or_join_the_kernels_own() -> None:
-    arrangement = Arrangement(CONFIGS["full"], 8)
+    arrangement = Arrangement(CONFIGS["full"])
     own = denoise.kernel_sizes(arrangement, **SIZES)
-    sizes = Variant("here+TP_RPS=4+MORE=-1").sizes(arrangement, trace=12, **SIZES)
-    assert sizes == {**own, "TP_RPS": 4, "MORE": -1, "TP_TRACE": 13} != own
+    sizes = Variant("here+TP_ROUND_FRAGMENTS=4+MORE=-1").sizes(arrangement, trace=12, **SIZES)
+    assert sizes == {**own, "TP_ROUND_FRAGMENTS": 4, "MORE": -1, "TP_TRACED_WARP": 13} != own
 
 
 @pytest.mark.parametrize(
     ("spec", "message"),
-    [("nowhere", "'nowhere': expected 'here', a folder"), ("here+TP_RPS=few", r"\+TP_RPS=few: expected \+NAME=VALUE")],
+    [
+        ("nowhere", "'nowhere': expected 'here', a folder"),
+        ("here+TP_ROUND_FRAGMENTS=few", r"\+TP_ROUND_FRAGMENTS=few: expected \+NAME=VALUE"),
+    ],
 )
 def test_what_is_no_variant_is_refused_by_name(spec: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):

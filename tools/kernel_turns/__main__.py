@@ -1,7 +1,7 @@
 """Time variants of the denoising kernel, and see where they wait. Run from the repository, on a Hopper GPU:
 
     export PYTHONPATH=src:tools:tests
-    python -m kernel_turns time here other.patch here+TP_RPS=4 --tokens 10,50 --marks
+    python -m kernel_turns time here other.patch here+TP_ROUND_FRAGMENTS=4 --tokens 10,50 --marks
     ncu --clock-control none --kernel-name turbopi_denoise --launch-skip 1 --launch-count 1 \\
         --section SourceCounters --warp-sampling-interval 4 -o samples -f \\
         python -m kernel_turns launch other.patch --tokens 50
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def _time(arguments: argparse.Namespace) -> None:
-    from kernel_turns.turns import GPU, MARKS, Job, marks_by_rank, time_in_turns
+    from kernel_turns.turns import GPU, MARKS, RANKS, Job, marks_by_rank, time_in_turns
     from turbopi.bench.provenance import provenance
 
     variants, console, rows = [Variant(spec) for spec in arguments.variants], Console(), []
@@ -76,9 +76,13 @@ def _time(arguments: argparse.Namespace) -> None:
             console.print(table)
             for variant in variants if arguments.marks else ():
                 title = f"cycles a layer up to each mark, warp {arguments.warp}, {variant.spec}"
-                table = Table("rank", *map(str, MARKS), title=title)
-                for rank, cycles in enumerate(marks_by_rank(job, variant, arguments.warp)):
-                    table.add_row(str(rank), *(f"{cycles[mark]:.0f}" for mark in MARKS))
+                table = Table("mark", *(f"rank {rank}" for rank in range(RANKS)), title=title)
+                for (mark, about), cycles in zip(
+                    MARKS.items(), marks_by_rank(job, variant, arguments.warp).T, strict=True
+                ):
+                    table.add_row(
+                        f"{mark.removeprefix('MARK_').lower()}: {about}", *(f"{count:.0f}" for count in cycles)
+                    )
                 console.print(table)
     if arguments.json is not None:
         arguments.json.write_text(json.dumps({"provenance": provenance(GPU), "rows": rows}, indent=1))

@@ -14,12 +14,10 @@ from torch import Tensor
 from kernel_turns.variants import Variant
 from turbopi.backends import resolve_device
 from turbopi.errors import BackendUnavailable
-from turbopi.kernels.sm90.denoise.kernel import unavailable
+from turbopi.kernels.sm90.denoise.kernel import MARKS, unavailable
 from turbopi.kernels.sm90.denoise.packing import RANKS, PackedExpert
 
 STEPS, CACHE_ROWS, SEED = 10, 976, 1
-# `MARK`s of denoise/base.cu in the order in which a layer comes to them
-MARKS = (0, 1, 2, 3, 4, 23, 24, 25, 5, 6, 7, 8, 9, 10, 11, 21, 12, 13, 15, 16, 17, 18, 22, 14, 19, 20)
 
 
 @dataclass
@@ -42,14 +40,14 @@ class Job:
     Raises ValueError for another precision or length, or without a GPU, BackendUnavailable for one that isn't Hopper.
     """
 
-    def __init__(self, tokens: int, precision: str, length: int, clusters: int = 8) -> None:
+    def __init__(self, tokens: int, precision: str, length: int) -> None:
         if precision not in ("bf16", "fp8") or not 1 <= length <= CACHE_ROWS:
             raise ValueError(f"{precision!r}, {length}: expected bf16 or fp8, 1 to {CACHE_ROWS} prefix tokens")
         if (reason := unavailable(resolve_device(GPU))) is not None:
             raise BackendUnavailable(reason)
         p = problem("full", STEPS, tokens, length, SEED, GPU)
         self.problem = p
-        self.packed = PackedExpert.pack(p.config, p.layers, clusters, input_scales(p) if precision == "fp8" else None)
+        self.packed = PackedExpert.pack(p.config, p.layers, input_scales(p) if precision == "fp8" else None)
         self.exact = plain(p, torch.float32)[0][-1]
         self.tokens, self.length = tokens, torch.tensor([length], device=GPU)
 
@@ -113,10 +111,10 @@ def time_in_turns(job: Job, variants: list[Variant], rounds: int, calls: int = 1
 
 
 def marks_by_rank(job: Job, variant: Variant, warp: int = 0) -> Tensor:
-    """A warp's cycles of a layer between marks, the mean over steps, layers and clusters: float64[RANKS, marks]."""
+    """A warp's cycles of a layer between marks, the mean over steps, layers and clusters: float64[RANKS, MARKS]."""
     kernel, (x_t, v_t) = job.kernel(variant, warp), job.outputs()
     job.launch(kernel, x_t, v_t)
     torch.cuda.synchronize()
     layers = STEPS * job.problem.config.expert.depth
-    cycles = kernel._tensors["trace"][:, 1:32].double().cpu() / layers
+    cycles = kernel._tensors["trace"][:, 1 : 1 + len(MARKS)].double().cpu() / layers
     return cycles.view(-1, RANKS, cycles.shape[1]).mean(0)

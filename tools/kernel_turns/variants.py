@@ -18,7 +18,7 @@ KERNELS = Path("src/turbopi/kernels/sm90")
 
 class Variant:
     """What `SPEC` says: "here", a folder as kernels/sm90 is, or a patch of this tree (.patch, or .patch.xz); behind
-    it +NAME=VALUE for constants, as in "rows.patch+TP_RPS=4".
+    it +NAME=VALUE for constants, as in "rows.patch+TP_ROUND_FRAGMENTS=4".
 
     Raises ValueError for a place that doesn't exist, a constant without a whole number, a patch that doesn't fit.
     """
@@ -44,7 +44,7 @@ class Variant:
 
     def sizes(self, *args: Any, trace: int | None = None, **options: Any) -> dict[str, int]:
         """`kernel_sizes` with the variant's constants; `trace`: a warp whose cycles between marks are kept."""
-        traced = {} if trace is None else {"TP_TRACE": trace + 1}
+        traced = {} if trace is None else {"TP_TRACED_WARP": trace + 1}
         return {**self._sizes(*args, **options), **self.constants, **traced}
 
     def kernel(self, *args: Any, trace: int | None = None, **options: Any) -> denoise.DenoiseKernel:
@@ -56,7 +56,7 @@ class Variant:
 def _constant(text: str) -> tuple[str, int]:
     name, _, value = text.partition("=")
     if not name.isidentifier() or not value.lstrip("-").isdigit():
-        raise ValueError(f"+{text}: expected +NAME=VALUE with a whole number, such as +TP_RPS=4")
+        raise ValueError(f"+{text}: expected +NAME=VALUE with a whole number, such as +TP_ROUND_FRAGMENTS=4")
     return name, int(value)
 
 

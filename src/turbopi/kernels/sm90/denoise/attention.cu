@@ -98,7 +98,7 @@ __device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 b
       pass();
       receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
       b.forget();
-      MARK(3)
+      MARK(MARK_QUERIES_HERE)
       float c[1][NT][4];
       clear(c[0]);
       if (b.warp() < tiles) {
@@ -114,7 +114,7 @@ __device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 b
           for (int i = 0; i < 4; ++i) c[0][n][i] += rest[n][i];
         give_slot(b, mine, seen);
       }
-      MARK(4)
+      MARK(MARK_PREFIX_SCORED)
       weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16);
       arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
       if (b.warp() == LEADER) {
@@ -185,7 +185,7 @@ __device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 b
     }
   } else {
     receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
-    MARK(3)
+    MARK(MARK_QUERIES_HERE)
     float c[ROUNDS][NT][4];
 #pragma unroll
     for (int r = 0; r < ROUNDS; ++r) clear(c[r]);
@@ -204,7 +204,7 @@ __device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 b
         }
         give_slot(b, slot, seen);
       }
-    MARK(4)
+    MARK(MARK_PREFIX_SCORED)
     if (scorer) {
       weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16);
       arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
@@ -214,7 +214,7 @@ __device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 b
     if (for_suffix) of_suffix();
     consumers_sync();
   }
-  MARK(5)
+  MARK(MARK_WEIGHTS_STORED)
   if constexpr (!HOLD) {
     float out[CT][NT][4];
     clear_out(out);
@@ -259,9 +259,9 @@ __device__ __forceinline__ void combine(Block& b) {
 #pragma unroll
   for (int s = 0; s < S; ++s)
     w[s] = make_float2(exp2_approx(w[s].x - highest.x), exp2_approx(w[s].y - highest.y));
-  MARK(7)
+  MARK(MARK_TOPS_HERE)
   receive(b, BAR_COMB, b.n, outputs_expect(b), WAIT_COMB);
-  MARK(8)
+  MARK(MARK_OUTPUTS_HERE)
   if (mine) {
     float4 o = make_float4(0, 0, 0, 0);
     float2 sum = make_float2(0, 0);
@@ -305,7 +305,7 @@ __device__ __forceinline__ void combine(Block& b) {
       __syncwarp();
     }
   }
-  MARK(9)
+  MARK(MARK_COMBINED)
   // A rank without queries has nothing to send now, but what has come may not land over the stream that comes next.
   if (IDLE_Q && b.thread < S) send(at_rank(b.base + M_TOKEN, b.thread), 0, at_rank(b.bar(BAR_ATT), b.thread));
 }
@@ -319,6 +319,6 @@ __device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int p
     attend_together(b, kv, bit, keys);
   else
     attend_by_warps(b, kv, bit, keys);
-  MARK(6)
+  MARK(MARK_OUTPUTS_SENT)
   combine(b);
 }

@@ -118,7 +118,7 @@ struct LooseRows {
 __device__ __forceinline__ void weigh_rows(const Block& b, int n, int count) {
   float c[2][4], own[2] = {no_logit(), no_logit()};
   score_rows(c);
-  MARK(24)
+  MARK(MARK_ROWS_SCORED)
 #pragma unroll
   for (int j = 0; j < 2; ++j)
 #pragma unroll
@@ -192,7 +192,7 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
 #pragma unroll
     for (int k = 0; k < SCORE_CHUNK; ++k) first[k] = fetch(k);
     receive(b, BAR_Q, b.n, Q_EXPECT, WAIT_Q);
-    MARK(3)
+    MARK(MARK_QUERIES_HERE)
     float c[NT][4];
     clear(c);
     if (b.warp() / 4 * 4 < tiles) {
@@ -201,7 +201,7 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
     }
 #pragma unroll 1
     for (int i = 0; i < slots; ++i) give_slot(b, slot_behind(first_keys, i));
-    MARK(4)
+    MARK(MARK_PREFIX_SCORED)
     if (b.warp() < tiles) {
       if (const int exist = keys.keys - b.warp() * 16; exist < 16)
 #pragma unroll
@@ -245,17 +245,17 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
       suffix_values.ask(), loose_values.keep(b), suffix_values.keep(b);
     } else {
       sync<ROWS_HERE, W - SCORERS>();
-      MARK(23)
+      MARK(MARK_ROWS_HERE)
       barrier_wait(b.bar(BAR_Q), b.n & 1);
       __syncwarp();
       show_to_products();
       weigh_rows(b, (b.warp() - SUFFIX_WARP) * 2, rows);
-      MARK(25)
+      MARK(MARK_ROWS_WEIGHED)
     }
   }
   show_to_products();
   consumers_sync();
-  MARK(5)
+  MARK(MARK_WEIGHTS_STORED)
 
   const u32 first_values = b.slot, weights = operand_place(b.start() + M_X + X_P, NT * 128);
   float sums[NT * 4], out[NT][4];

@@ -1,9 +1,8 @@
 // The whole denoising loop of Pi0.5's action expert, all layers and steps, in one kernel of resident clusters.
 // Part 1 of 13, which kernel.py puts together: sizes, shared memory, a CTA's view.
 //
-// NC clusters of S CTAs stay resident. Cluster c owns query head c (the first NH clusters do), 1/NC of the
-// feed-forward's hidden units and, with the other attention clusters, 1/NH of the key and value columns. Rank r of each
-// cluster owns the r-th slice of the residual stream's columns; all NC clusters keep the same stream, in float32
+// NC clusters of S CTAs stay resident, one a query head: cluster c owns head c, 1/NC of the feed-forward's hidden units
+// and 1/NC of the key and value columns. Rank r of each cluster owns the r-th slice of the residual stream's columns; all NC clusters keep the same stream, in float32
 // registers. (Of more than 16 tokens each cluster keeps some, and the stream comes together in another way: see
 // spread.cu. What follows holds for the rest.)
 //
@@ -22,8 +21,8 @@
 
 typedef unsigned char byte;
 
-constexpr int D = TP_D, F = TP_F, L = TP_L, NH = TP_NH, HD = TP_HD, T = TP_T, A = TP_A;
-constexpr int S = TP_S, NC = TP_NC;                                   // CTAs of a cluster, clusters
+constexpr int D = TP_WIDTH, F = TP_MLP_DIM, L = TP_DEPTH, NH = TP_HEADS, HD = TP_HEAD_DIM, T = TP_TOKENS, A = TP_ACTION_DIM;
+constexpr int S = TP_RANKS, NC = NH;                                      // CTAs of a cluster, clusters: one a head
 constexpr int KEY_TILES = TP_KEY_TILES;                               // tiles of prefix keys, at most
 constexpr int W = 16, CONSUMERS = W * 32, THREADS = CONSUMERS + 128;  // registers are dealt out by warpgroup
 constexpr int NT = (T + 7) / 8;
@@ -51,7 +50,7 @@ constexpr u32 PATIENCE = FEW ? 500 : FP8 ? 300 : 400;
 constexpr bool SPREAD = !FEW;              // the stream: each CTA keeps and adds up a part, see spread.cu
 constexpr int OWN_N = most(NT, NC);        // if so: 8 tokens of the slice at a time, which a CTA looks after
 constexpr int ITEMS_X = most(SPREAD ? DX * OWN_N : DX * NT, W);  // (tile, 8 tokens) that one warp looks after
-static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NC >= NH && A <= CONSUMERS,
+static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NH % 2 == 0 && A <= CONSUMERS,
               "sizes");
 
 // A product's tiles are multiplied in groups of up to 8. A warpgroup multiplies 4 tiles at once, a warp one of them;
@@ -75,12 +74,12 @@ constexpr int PARTIAL = (NT - 1) * 512 + TAIL * 128;  // bytes of one tile's par
 // ---- shared memory
 
 constexpr int RS = HD * 2 + 16;  // bytes of a suffix key's or value's row: no bank conflicts for ldmatrix
-constexpr int FRAGMENT = 512, RPS = TP_RPS, SLOT = RPS * W * FRAGMENT;
-// A round: RPS fragments of the reduction for each part of it. Weights of a group of tiles are filled up with zeros to
+constexpr int FRAGMENT = 512, ROUND_FRAGMENTS = TP_ROUND_FRAGMENTS, SLOT = ROUND_FRAGMENTS * W * FRAGMENT;
+// A round: ROUND_FRAGMENTS fragments of the reduction for each part of it. Weights of a group of tiles are filled up with zeros to
 // a multiple of `filled` fragments.
 __host__ __device__ constexpr int filled(int tiles) { return 4 * packed_parts(tiles); }
 __host__ __device__ constexpr int plan_rounds(int tiles, int blocks) {
-  return most(most(blocks, KB), filled(tiles)) * filled(tiles) / (RPS * group_parts(tiles));
+  return most(most(blocks, KB), filled(tiles)) * filled(tiles) / (ROUND_FRAGMENTS * group_parts(tiles));
 }
 __host__ __device__ constexpr int slot_rounds(int parts, int tiles) {  // W / (parts * tiles), for they are few
   int n = W / parts;
@@ -91,12 +90,12 @@ __host__ __device__ constexpr int slot_rounds(int parts, int tiles) {  // W / (p
 // would need more memory than the stream that they lie over.
 constexpr int QKV = QTL + KVL, QKV_ROUNDS = plan_rounds(group_tiles(QKV), D16);
 constexpr bool MMA_QKV = FEW && QKV <= 3 && QKV_ROUNDS * KB <= 4 && (QKV_ROUNDS & (QKV_ROUNDS - 1)) == 0;
-static_assert(!MMA_QKV || RPS * group_parts(QKV) == W, "a fragment of each round for a warp");
+static_assert(!MMA_QKV || ROUND_FRAGMENTS * group_parts(QKV) == W, "a fragment of each round for a warp");
 // Of other products' weights the first rounds wait in registers for activations, if tokens are few: that is room for as
 // many more behind them. A round is a slot then, and all CTAs have as many.
 __host__ __device__ constexpr int rounds_ahead(int tiles, bool all, int blocks, int rounds) {
   const int parts = group_parts(group_tiles(tiles));
-  return FEW && RPS == 4 && all && tiles <= 8 && slot_rounds(parts, tiles) == 1 && blocks % (KB * filled(tiles)) == 0
+  return FEW && ROUND_FRAGMENTS == 4 && all && tiles <= 8 && slot_rounds(parts, tiles) == 1 && blocks % (KB * filled(tiles)) == 0
              ? imin(rounds, plan_rounds(group_tiles(tiles), blocks))
              : 0;
 }
@@ -107,7 +106,7 @@ constexpr int OUT_AHEAD = rounds_ahead(DX, D16 % S == 0, QT, 1),
 constexpr bool QKV_PAIRS = QKV * W * PARTIAL > D16 * NT * 256;
 constexpr int QKV_PARTS = QKV_PAIRS ? W / 2 : W;
 constexpr int KEY_TILE = QT * FRAGMENT;     // bytes of 16 keys, or values
-constexpr int SLOT_TILES = RPS;             // of them in a slot
+constexpr int SLOT_TILES = ROUND_FRAGMENTS;             // of them in a slot
 constexpr int KT = most(KEY_TILES, S);      // tiles of a rank's prefix keys
 constexpr int SUFFIX = most(T, S);          // suffix keys of a rank, at most 8
 static_assert(SLOT_TILES * KEY_TILE <= SLOT, "a slot's keys");
@@ -181,7 +180,7 @@ constexpr int BEYOND = 3 * FRAGMENT;  // of a slot: where the missing ones of 4 
 constexpr int SIZE_SSQ = up128(SQ * NT * 32), SIZE_PART = up128((SPREAD ? imax(DX * OWN_N, NT) : DX * NT) * 32),
               SIZE_BAR = SPREAD ? 384 : 512, SIZE_LIST = up128(MAX_SLOTS * 8);
 constexpr int BEHIND = imax(SIZE_SSQ + SIZE_PART + up128(NT * 32) + SIZE_BAR + SIZE_LIST, BEYOND);
-constexpr int SPREAD_STAGES = imin((TP_SMEM - X_SIZE - BEHIND) / SLOT, 7);
+constexpr int SPREAD_STAGES = imin((TP_SHARED_BYTES - X_SIZE - BEHIND) / SLOT, 7);
 constexpr int M_X = 0, M_H = M_X + X_SIZE, M_SSQ = M_H + (SPREAD ? SPREAD_STAGES * SLOT : H_SIZE);
 constexpr int M_Q = SPREAD ? M_X + X_Q : M_H + H_Q, M_ATT = SPREAD ? M_X + X_ATT : M_H + H_ATT,
               M_HID = SPREAD ? M_X : M_H;  // queries, attention, hidden units
@@ -191,7 +190,7 @@ constexpr int M_ROPE = M_RMS + up128(NT * 32);  // if tokens are few: see `make_
 constexpr int M_XT = M_ROPE + (FEW ? (QTL + KVL) * NT * 512 : 0);  // if tokens are few: x_t
 constexpr int M_BAR = M_XT + (FEW ? up128(T * A * 4) : 0), M_PROGRESS = M_BAR + 248, M_TOKEN = M_BAR + 252,
               M_LIST = M_BAR + SIZE_BAR, M_SUMS = M_LIST + SIZE_LIST;
-__host__ __device__ constexpr int plan_stages(int ring) { return imin((TP_SMEM - ring - BEYOND) / SLOT, 11); }
+__host__ __device__ constexpr int plan_stages(int ring) { return imin((TP_SHARED_BYTES - ring - BEYOND) / SLOT, 11); }
 // Partial sums of gate|up, out and down lie in a place of their own unless that costs a slot.
 constexpr int SUMS_SIZE = up128(imax(plan_others(GTL), plan_others(DX)) * PARTIAL);
 constexpr bool APART = !SPREAD && plan_stages(M_SUMS) == plan_stages(M_SUMS + SUMS_SIZE);
@@ -241,7 +240,7 @@ enum SpreadBarrier { BAR_DONE = BAR_RING + 2 * 7, BAR_FREE, BAR_ROOM, BAR_HERE, 
 // Partial sums of the stream, of all clusters: float16, for half the bytes that polls read. A lane's four of two
 // clusters lie side by side; a word's lowest bit, the flag, is that of every other number. If SPREAD a cluster's lie
 // together, for sectors of L2 that are half written cost as much as whole ones.
-constexpr int PAIRS = most(NC, 2);
+constexpr int PAIRS = NC / 2;
 constexpr size_t N_STREAM = size_t(D16) * NT * PAIRS * 32;
 // Keeps them within float16's range; sums of E4M3 numbers lack their scales yet.
 constexpr float PARTIAL_SCALE = FP8 ? 1.0f / 16384 : 1.0f / 256;
@@ -255,7 +254,7 @@ constexpr size_t N_HEAD = size_t(NC) * QT * NT, N_HIDDEN = size_t(NC) * HC * NT 
 constexpr size_t B_STAGE = B_KV + 2 * N_KV, B_SQUARES = B_STAGE + STAGED * N_STAGE;
 constexpr size_t B_ORDER = B_SQUARES + 2 * N_SQUARES, B_HIDDEN = B_ORDER + NC * S, B_QUERIES = B_HIDDEN + N_HIDDEN,
                  B_ATT = B_QUERIES + N_HEAD * 16, SCRATCH = SPREAD ? B_ATT + N_HEAD * (OPERAND / 16) : B_STAGE;
-static_assert(SCRATCH == TP_SCRATCH, "kernel.py disagrees on the scratch memory");
+static_assert(SCRATCH == TP_SCRATCH_WORDS, "kernel.py disagrees on the scratch memory");
 // Stands where a word of the staged stream is still to come. Nothing is rounded to it: the NaN made then is another.
 constexpr u32 ABSENT = ~0u;
 // Whether there is the token whose 8 columns (E4M3: 16) word i of a staged slice has.
@@ -300,8 +299,6 @@ struct Block {
   __device__ __forceinline__ int rank() const { return int(cta % S); }
   __device__ __forceinline__ int warp() const { return int(warp_); }
   __device__ __forceinline__ int lane() const { return int(thread % 32); }
-  // Which of a barrier's two phases the stream has that comes before attention, or (half 1) the feed-forward.
-  __device__ __forceinline__ u32 x_parity(int half) const { return attends() ? u32(half) : n & 1; }
   // A lane's place in the tensor cores' operands.
   __device__ __forceinline__ int g() const { return int(thread / 4 % 8); }
   __device__ __forceinline__ int t() const { return int(thread % 4); }
@@ -309,7 +306,6 @@ struct Block {
   __device__ __forceinline__ u32 full(u32 s) const { return base + M_BAR + BAR_RING * 8 + s * 16; }
   __device__ __forceinline__ u32 empty(u32 s) const { return full(s) + 8; }
   __device__ __forceinline__ byte* ring(u32 s) const { return smem + M_RING + s * SLOT; }
-  __device__ __forceinline__ bool attends() const { return NC == NH || cluster() < NH; }
   // blocks of the stream's slice, hidden blocks of the cluster, tiles of the CTA
   __device__ __forceinline__ int x0() const { return share(D16, S, rank()); }
   __device__ __forceinline__ int xn() const { return D16 % S == 0 ? DX : share(D16, S, rank() + 1) - x0(); }
@@ -326,14 +322,10 @@ struct Block {
   __device__ __forceinline__ int kvn() const { return share(KVT, NH * S, cluster() * S + rank() + 1) - kv0(); }
 };
 
-// Cycles up to each mark, summed up: 0 stream here, 1 qkv multiplied, 2 sent, 3 queries here, 4 prefix scored, 5 its
-// weights stored (beyond 16 tokens: all weights here), 6 sent what this warp has of outputs, 7 largest logits of all
-// ranks here, 8 outputs here, 9 combined, 10 attention here, 11 out, 12 sent, 13 stream here, 15 gate|up multiplied,
-// 16 sent, 17 hidden here, 18 down, 14 sent, 19 embedded, 20 step done. Before 12 and 14: 21 and 22 partial sums here.
-// Of warps that score rows instead of the prefix: 23 keys here, 24 scored, 25 weights sent. TP_TRACE: warp 0's are 1.
-#ifdef TP_TRACE
-#define MARK(i)                              \
-  if (b.thread == (TP_TRACE - 1) * 32) {     \
+// A warp's cycles up to each mark, summed up over the loop: see MARKS of kernel.py. TP_TRACED_WARP: which warp's, from 1.
+#ifdef TP_TRACED_WARP
+#define MARK(i)                                    \
+  if (b.thread == (TP_TRACED_WARP - 1) * 32) { \
     const u32 now_ = u32(clock64());         \
     u32* m_ = (u32*)(b.smem + M_BAR + 256); \
     m_[1 + (i)] += now_ - m_[0];             \

@@ -54,6 +54,34 @@ WAITS = {  # what a CTA waits for: the kernel's enum, and what users are told
     "WAIT_GO": "the next step",
     "FINISHED": "its end",
 }
+MARKS = {  # up to where the tracer counts cycles, in the order in which a layer comes there: the kernel's enum
+    "MARK_STREAM_FOR_ATTENTION": "the stream is here",
+    "MARK_QKV_MULTIPLIED": "q|k|v multiplied",
+    "MARK_QKV_SENT": "queries sent, keys and values published",
+    "MARK_QUERIES_HERE": "all ranks' queries are here",
+    "MARK_PREFIX_SCORED": "prefix keys scored",
+    "MARK_ROWS_HERE": "of warps that score rows: keys here",
+    "MARK_ROWS_SCORED": "of warps that score rows: scored",
+    "MARK_ROWS_WEIGHED": "of warps that score rows: weights stored, tops sent",
+    "MARK_WEIGHTS_STORED": "weights stored; beyond 16 tokens: of all warps",
+    "MARK_OUTPUTS_SENT": "this warp's part of the outputs sent",
+    "MARK_TOPS_HERE": "largest logits of all ranks here",
+    "MARK_OUTPUTS_HERE": "partial outputs of all ranks here",
+    "MARK_COMBINED": "combined, attention sent",
+    "MARK_ATTENTION_HERE": "all ranks' attention here",
+    "MARK_OUT_PUBLISHED": "out multiplied, its sums published",
+    "MARK_OUT_SUMS_HERE": "all clusters' sums of out here",
+    "MARK_SLICE_AFTER_ATTENTION": "slice of the stream sent",
+    "MARK_STREAM_FOR_FEED_FORWARD": "the stream is here",
+    "MARK_GATE_UP_MULTIPLIED": "gate|up multiplied",
+    "MARK_HIDDEN_SENT": "hidden units sent",
+    "MARK_HIDDEN_HERE": "all ranks' hidden units here",
+    "MARK_DOWN_PUBLISHED": "down multiplied, its sums published",
+    "MARK_DOWN_SUMS_HERE": "all clusters' sums of down here",
+    "MARK_SLICE_AFTER_FEED_FORWARD": "slice of the stream sent",
+    "MARK_EMBEDDED": "x_t embedded",
+    "MARK_STEP_DONE": "the step's Euler step done",
+}
 FEW = 16  # tokens: `FEW` of base.cu
 MAX_SUFFIX = 56  # beyond it too little shared memory is left for weights on their way
 
@@ -90,7 +118,7 @@ ARGS = Struct(
         Parameter("uint4*", "scratch", "zero at the start"),
         Parameter("u32*", "hang", "[NC * S] host memory: see `watch`"),
         Parameter("long long*", "clock", "[2] host memory: cycles and nanoseconds of a launch, of CTA 0"),
-        Parameter("u32*", "trace", "[NC * S][64] cycles up to each mark, with TP_TRACE"),
+        Parameter("u32*", "trace", "[NC * S][64] cycles up to each mark, with TP_TRACED_WARP"),
         Parameter("long long", "layer_stride"),
         Parameter("long long", "layer_bytes"),
         Parameter("int", "steps"),
@@ -109,7 +137,7 @@ def kernel_sizes(
     """The kernel's compile-time constants."""
     config, g = arrangement.config, arrangement.config.expert
     groups = most(suffix, 8)
-    stream = most(arrangement.clusters, 2) * (g.width // BLOCK) * groups * 32
+    stream = arrangement.clusters // 2 * (g.width // BLOCK) * groups * 32
     scratch = 4 * stream + suffix * g.head_dim
     if suffix > FEW:
         words = 8 if fp8 else 16  # of a block's activations of 8 tokens
@@ -117,21 +145,20 @@ def kernel_sizes(
         head, hidden = g.head_dim // BLOCK, most(g.mlp_dim // BLOCK, arrangement.clusters)
         scratch += arrangement.clusters * groups * (head * (16 + words) + hidden * words)
     return {
-        "TP_D": g.width,
-        "TP_F": g.mlp_dim,
-        "TP_L": g.depth,
-        "TP_NH": g.num_heads,
-        "TP_HD": g.head_dim,
-        "TP_T": suffix,
-        "TP_A": config.action_dim,
-        "TP_S": RANKS,
-        "TP_NC": arrangement.clusters,
+        "TP_WIDTH": g.width,
+        "TP_MLP_DIM": g.mlp_dim,
+        "TP_DEPTH": g.depth,
+        "TP_HEADS": g.num_heads,
+        "TP_HEAD_DIM": g.head_dim,
+        "TP_TOKENS": suffix,
+        "TP_ACTION_DIM": config.action_dim,
+        "TP_RANKS": RANKS,
         "TP_KEY_TILES": most(cache_rows, BLOCK),
         "TP_FP8": int(fp8),
         # Larger slots of weights are faster, if enough of them fit.
-        "TP_RPS": 4 if suffix <= (40 if cache_rows <= 1024 else 24) else 2,
-        "TP_SMEM": shared_bytes,
-        "TP_SCRATCH": scratch,
+        "TP_ROUND_FRAGMENTS": 4 if suffix <= (40 if cache_rows <= 1024 else 24) else 2,
+        "TP_SHARED_BYTES": shared_bytes,
+        "TP_SCRATCH_WORDS": scratch,
     }
 
 
@@ -144,21 +171,21 @@ def source(suffix: int, fp8: bool) -> str:
         instructions.wgmma("add_rows", columns, from_registers=True),
         instructions.wgmma("add_keys", 2 * 8),
     )
-    generated = (*products, enumeration("What", tuple(WAITS)), ARGS.source)
+    generated = (*products, enumeration("What", tuple(WAITS)), enumeration("Mark", tuple(MARKS)), ARGS.source)
     return instructions.source(*PARTS, generated="\n".join(generated) + "\n", folder=FOLDER)
 
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
     """The kernel's machine code. Raises BackendUnavailable if a block has too little shared memory for these sizes."""
     try:
-        return compile_cubin(source(sizes["TP_T"], bool(sizes["TP_FP8"])), arch, sizes, folder=folder)
+        return compile_cubin(source(sizes["TP_TOKENS"], bool(sizes["TP_FP8"])), arch, sizes, folder=folder)
     except BackendError as e:
         if "too little shared memory" not in str(e):
             raise
-        tokens, keys = sizes["TP_T"], sizes["TP_KEY_TILES"] * BLOCK
+        tokens, keys = sizes["TP_TOKENS"], sizes["TP_KEY_TILES"] * BLOCK
         raise BackendUnavailable(
             f"{tokens} suffix tokens and {keys} cache rows leave the denoising kernel too little of a "
-            f"block's {sizes['TP_SMEM']} bytes of shared memory"
+            f"block's {sizes['TP_SHARED_BYTES']} bytes of shared memory"
         ) from e
 
 
@@ -214,7 +241,7 @@ class DenoiseKernel:
         with torch.cuda.device(device):
             arch = f"sm_{properties.major}{properties.minor}a"
             cubin = compiled(arch, sizes)
-            self._kernel = Kernel(cubin, "turbopi_denoise", sizes["TP_SMEM"])
+            self._kernel = Kernel(cubin, "turbopi_denoise", sizes["TP_SHARED_BYTES"])
             self._prepare = Kernel(cubin, "turbopi_denoise_prepare", 0)
             self._tiles = g.depth * sizes["TP_KEY_TILES"]
             fitting = self._kernel.max_active_clusters(RANKS, THREADS)
@@ -241,10 +268,10 @@ class DenoiseKernel:
             "keys": torch.empty(
                 g.depth * 2 * sizes["TP_KEY_TILES"] * BLOCK * g.head_dim, dtype=torch.bfloat16, device=device
             ),
-            "scratch": torch.empty(4 * sizes["TP_SCRATCH"], dtype=torch.int32, device=device),
+            "scratch": torch.empty(4 * sizes["TP_SCRATCH_WORDS"], dtype=torch.int32, device=device),
             "hang": torch.zeros(self._blocks, dtype=torch.int32, pin_memory=True),  # see `why_it_trapped`
             "clock": torch.zeros(2, dtype=torch.int64, pin_memory=True),  # see `clock_mhz`
-            "trace": torch.zeros(self._blocks, 64, dtype=torch.int32, device=device),  # cycles by phase, with TP_TRACE
+            "trace": torch.zeros(self._blocks, 64, dtype=torch.int32, device=device),
         }
 
     def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:

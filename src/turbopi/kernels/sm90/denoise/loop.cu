@@ -18,7 +18,7 @@ __device__ __forceinline__ void consume(Block& b) {
   make_rope(b, prefix, rope);
   float4 x[ITEMS_X];
   const u32 expect_hidden = hidden_bytes(b);
-#ifdef TP_TRACE
+#ifdef TP_TRACED_WARP
   if (threadIdx.x < 32) ((u32*)(b.smem + M_BAR + 256))[threadIdx.x] = threadIdx.x ? 0 : u32(clock64());
   consumers_sync();
 #endif
@@ -31,7 +31,7 @@ __device__ __forceinline__ void consume(Block& b) {
   for (int step = 0; step < a.steps; ++step) {
     const float* const table = a.table + size_t(step) * (2 * L + 1) * 3 * D;
     if constexpr (SPREAD) embed_own(b, actions, x, table);
-    MARK(19)
+    MARK(MARK_EMBEDDED)
 #pragma unroll 1
     for (; b.n < u32(step + 1) * L; ++b.n) {
       const bool last = b.n + 1 == u32(step + 1) * L;
@@ -49,26 +49,24 @@ __device__ __forceinline__ void consume(Block& b) {
           load_columns(b, gates, table + (half ? 5 : 2) * D);
           load_columns(b, scales, table + (half ? 6 : 3) * D);  // of the next norm, the final one behind the last layer
         };
-        if (half || b.attends()) {
-          if (half) {
-            gate_up(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L), sent);
-            MARK(16)
-            load_norm();
-          } else {
-            float* const kv = (float*)(a.scratch + B_KV + (b.n & 1) * N_KV);
-            project(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L), kv, bit, rope);
-            MARK(2)
-            attend(b, kv, bit, prefix);
-          }
+        if (half) {
+          gate_up(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L), sent);
+          MARK(MARK_HIDDEN_SENT)
+          load_norm();
+        } else {
+          float* const kv = (float*)(a.scratch + B_KV + (b.n & 1) * N_KV);
+          project(b, of_tiles(a.shifted, b.n), of_tiles(a.row_scales, b.n - step * L), kv, bit, rope);
+          MARK(MARK_QKV_SENT)
+          attend(b, kv, bit, prefix);
         }
         uint4* const buffer = a.scratch + (half ? B_X1 : B_X2) + (settled(b.n) & 1) * N_STREAM;
         auto await = [&] {
           if (half) {
             receive(b, BAR_HID, b.n, expect_hidden, WAIT_HID);
-            MARK(17)
+            MARK(MARK_HIDDEN_HERE)
           } else {
             receive(b, BAR_ATT, b.n, ATT_EXPECT, WAIT_ATT);
-            MARK(10)
+            MARK(MARK_ATTENTION_HERE)
           }
         };
         auto then = [&] {
@@ -78,23 +76,18 @@ __device__ __forceinline__ void consume(Block& b) {
         if constexpr (SPREAD) {
           if (half)
             residual_product<HIDDEN>(b, M_HID, b.hn(), M_X + X_FF_SUMS, buffer, bit, await, then, sent);
-          else if (b.attends())
-            residual_product<QT>(b, M_ATT, QT, M_X, buffer, bit, await, then, sent);
           else
-            load_norm();
-        } else if (half || b.attends()) {  // one piece of code for both
+            residual_product<QT>(b, M_ATT, QT, M_X, buffer, bit, await, then, sent);
+        } else {  // one piece of code for both
           constexpr int EVEN = HIDDEN % 16 == 0 && QT % 16 == 0 ? 16 : HIDDEN % 8 == 0 && QT % 8 == 0 ? 8 : 1;
           residual_product<EVEN>(b, half ? M_HID : M_ATT, half ? b.hn() : QT, M_H, buffer, bit, await, then, sent);
-        } else {
-          load_norm();
         }
         if constexpr (SPREAD)  // behind the last layer `embed_own` says it
-          if (!half || (b.attends() && !last)) done_with_x(b);
-        MARK(half ? 18 : 11)
+          if (!half || !last) done_with_x(b);
+        MARK(half ? MARK_DOWN_PUBLISHED : MARK_OUT_PUBLISHED)
         note(b, half ? WAIT_X1 : WAIT_X2);
-        gather(b, x, buffer, half ? NC : NH, bit, gates, scales,
-               !half || (!last && (SPREAD || b.attends())), half, half && last);
-        MARK(half ? 14 : 12)
+        gather(b, x, buffer, bit, gates, scales, !half || !last, half, half && last);
+        MARK(half ? MARK_SLICE_AFTER_FEED_FORWARD : MARK_SLICE_AFTER_ATTENTION)
       }
     }
     if constexpr (SPREAD)
@@ -103,7 +96,7 @@ __device__ __forceinline__ void consume(Block& b) {
       advance(b, x, step + 1 < a.steps ? table + (2 * L + 1) * 3 * D : table, step);
   }
   note(b, FINISHED);
-#ifdef TP_TRACE
+#ifdef TP_TRACED_WARP
   consumers_sync();
   if (threadIdx.x < 32) a.trace[blockIdx.x * 64 + threadIdx.x] = ((u32*)(b.smem + M_BAR + 256))[threadIdx.x];
 #endif

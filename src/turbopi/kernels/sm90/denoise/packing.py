@@ -32,6 +32,8 @@ def refusal(config: ModelConfig) -> str | None:
         return f"it covers Pi0.5, this model is {config.kind}"
     if g.num_kv_heads != 1:
         return f"it needs one key/value head, this model has {g.num_kv_heads}"
+    if g.num_heads % 2:
+        return f"it needs an even number of heads, this model has {g.num_heads}"
     if g.width % BLOCK or g.mlp_dim % BLOCK:
         return f"widths must be multiples of {BLOCK}: width {g.width}, mlp_dim {g.mlp_dim}"
     if g.head_dim % BLOCK or g.head_dim > 256:
@@ -55,7 +57,11 @@ class Arrangement:
     """Who does what: see base.cu."""
 
     config: ModelConfig
-    clusters: int
+
+    @property
+    def clusters(self) -> int:
+        """One a query head."""
+        return self.config.expert.num_heads
 
     @property
     def blocks(self) -> int:
@@ -71,8 +77,6 @@ class Arrangement:
 
     def query_rows(self, cluster: int, rank: int) -> Tensor:
         """int64[tiles, 16] rows of q|k|v: of a tile 8 columns of the head's first half, then RoPE's partners."""
-        if cluster >= self.config.expert.num_heads:
-            return torch.empty(0, BLOCK, dtype=torch.int64)
         head_dim = self.config.expert.head_dim
         tiles = torch.tensor(share(head_dim // BLOCK, RANKS, rank), dtype=torch.int64)
         return cluster * head_dim + _rope_rows(tiles, head_dim)
@@ -80,8 +84,6 @@ class Arrangement:
     def key_value_rows(self, cluster: int, rank: int) -> Tensor:
         """int64[tiles, 16] rows of q|k|v: keys in RoPE's pairs, values as they are."""
         g = self.config.expert
-        if cluster >= g.num_heads:
-            return torch.empty(0, BLOCK, dtype=torch.int64)
         mine = torch.tensor(share(g.head_dim // 8, g.num_heads * RANKS, cluster * RANKS + rank), dtype=torch.int64)
         keys, values = mine[mine < g.head_dim // BLOCK], mine[mine >= g.head_dim // BLOCK] - g.head_dim // BLOCK
         value_rows = (g.num_heads + 1) * g.head_dim + values[:, None] * BLOCK + torch.arange(BLOCK)
@@ -150,22 +152,18 @@ class PackedExpert:
         cls,
         config: ModelConfig,
         layers: list[GemmaLayer],
-        clusters: int | None = None,
         inputs: Mapping[str, float] | None = None,
         directions: Mapping[str, Directions] | None = None,
     ) -> "PackedExpert":
-        """`clusters`: at least one per head, which is also the default. `inputs`: the activations' scales by site, and
-        weights become E4M3 with a scale for each output channel, rounded for `directions` by site.
+        """`inputs`: the activations' scales by site, and weights become E4M3 with a scale for each output channel,
+        rounded for `directions` by site.
 
         Raises BackendError for sizes that the kernel doesn't cover.
         """
         reason = refusal(config)
         if reason is not None:
             raise BackendError(f"the denoising kernel can't run this model: {reason}")
-        heads = config.expert.num_heads
-        arrangement = Arrangement(config, clusters or heads)
-        if arrangement.clusters < heads:
-            raise BackendError(f"{clusters} clusters are fewer than the model's {heads} heads; give {heads} or more")
+        arrangement = Arrangement(config)
         streams = _streams(arrangement, "bf16" if inputs is None else "fp8")
         device, size = layers[0].qkv.device, 2 if inputs is None else 1
         index = torch.cat(streams).to(device)
@@ -238,15 +236,10 @@ def _streams(a: Arrangement, weights: Precision) -> list[Tensor]:
         hidden = a.hidden(cluster)
         for rank in range(RANKS):
             rows = a.stream_rows(rank)
-            products = []
-            if cluster < a.config.expert.num_heads:
-                columns = a.out_columns(cluster)
-                qkv_rows = torch.cat((a.query_rows(cluster, rank), a.key_value_rows(cluster, rank)))
-                products = [
-                    fragments(qkv[qkv_rows], queries + keys_values, padding, weights),
-                    fragments(out[rows][:, :, columns], slice_tiles, padding, weights),
-                ]
-            products += [
+            qkv_rows = torch.cat((a.query_rows(cluster, rank), a.key_value_rows(cluster, rank)))
+            products = [
+                fragments(qkv[qkv_rows], queries + keys_values, padding, weights),
+                fragments(out[rows][:, :, a.out_columns(cluster)], slice_tiles, padding, weights),
                 fragments(gate_up[a.gate_up_rows(cluster, rank)], gates, padding, weights),
                 fragments(down[rows][:, :, hidden.start : hidden.stop], slice_tiles, padding, weights),
             ]

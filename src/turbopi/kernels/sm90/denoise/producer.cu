@@ -22,7 +22,7 @@ struct Producer {
       constexpr int N = group_tiles(MT - FIRST), PARTS = group_parts(N);
       if (FIRST < tiles) {
         const int n = min(tiles - FIRST, N), rounds = plan_rounds(N, blocks), most_rounds = slot_rounds(PARTS, n);
-        const u32 round = PARTS * RPS * n * FRAGMENT;
+        const u32 round = PARTS * ROUND_FRAGMENTS * n * FRAGMENT;
 #pragma unroll 1
         for (int r = 0; r < rounds; r += most_rounds) {
           const u32 bytes = min(most_rounds, rounds - r) * round;
@@ -40,14 +40,11 @@ struct Producer {
   __device__ void run() {
     const PrefixShare mine(int(*b.a.length), b.rank());
     const int first = mine.first, count = mine.tiles;
-    int last_key = -STAGES;
-    if (b.attends()) {
-      product<QTL + KVL>(D16, b.qn() + b.kvn());
-      keys(0, count);
-      last_key = slots - 1;
-      keys(KEY_TILES * KEY_TILE, count);
-      product<DX>(QT, b.xn());
-    }
+    product<QTL + KVL>(D16, b.qn() + b.kvn());
+    keys(0, count);
+    const int last_key = slots - 1;
+    keys(KEY_TILES * KEY_TILE, count);
+    product<DX>(QT, b.xn());
     // When the keys have been scored, memory has nothing else to do for a while. Asked for earlier, gate|up is in the
     // way of what the scores wait for.
     const int gate_up = slots, scored = min(gate_up, last_key + STAGES), back = scored - last_key;

@@ -45,7 +45,7 @@ __device__ __forceinline__ uint4 load_weights(const Block& b, u32 at) {
 // This warp's share of the first rounds of a group of tiles, read before its activations are there.
 template <int TILES_, int ROUNDS>
 struct Ahead {
-  uint4 weights[imax(ROUNDS * RPS, 1)];
+  uint4 weights[imax(ROUNDS * ROUND_FRAGMENTS, 1)];
 
   __device__ __forceinline__ explicit Ahead(Block& b) {
     constexpr int PARTS = group_parts(TILES_);
@@ -55,9 +55,9 @@ struct Ahead {
       const u32 slot = take_slot(b), at = M_RING + slot * SLOT + (my.part * TILES_ + my.tile) * FRAGMENT;
       u32 seen = 0;
 #pragma unroll
-      for (int i = 0; i < RPS; ++i) {
-        weights[r * RPS + i] = load_weights(b, at + i * PARTS * TILES_ * FRAGMENT);
-        seen ^= fold(weights[r * RPS + i]);
+      for (int i = 0; i < ROUND_FRAGMENTS; ++i) {
+        weights[r * ROUND_FRAGMENTS + i] = load_weights(b, at + i * PARTS * TILES_ * FRAGMENT);
+        seen ^= fold(weights[r * ROUND_FRAGMENTS + i]);
       }
       give_slot(b, slot, seen);
     }
@@ -89,7 +89,7 @@ struct GroupProduct {
   // (that are numbers: of a pair's missing block its other).
   __device__ __forceinline__ u64 activations(int r, int i) const {
     constexpr int NEXT_TOKENS = FP8 ? 128 : 256;
-    const int fragment = (r * RPS + i) * PARTS;
+    const int fragment = (r * ROUND_FRAGMENTS + i) * PARTS;
     if constexpr (EXACT) return operand_at<NEXT_TOKENS>(behind(first, fragment * NT * 256));
     const int here = min(fragment + my.part, most(blocks, KB) - 1);
     const u32 place = behind(first, here * NT * 256);
@@ -98,7 +98,7 @@ struct GroupProduct {
   __device__ __forceinline__ void multiply(const Ahead<TILES_, AHEAD>& ahead) {
     begin_products();
 #pragma unroll
-    for (int i = 0; i < AHEAD * RPS; ++i) {
+    for (int i = 0; i < AHEAD * ROUND_FRAGMENTS; ++i) {
       const uint4 w = ahead.weights[i];
       add_from_registers(sums, w.x, w.y, w.z, w.w, activations(0, i), i);
     }
@@ -122,7 +122,7 @@ struct GroupProduct {
       }
       begin_products();
 #pragma unroll
-      for (int i = 0; i < RPS; ++i) {
+      for (int i = 0; i < ROUND_FRAGMENTS; ++i) {
         const u32 at = behind(from, i * PARTS * tiles * FRAGMENT);
         add_product(sums, operand_at<256>(at), activations(r, i), 1);
         if (i == 0) {
@@ -132,7 +132,7 @@ struct GroupProduct {
         }
       }
       commit_products();
-      --left, from = behind(from, RPS * PARTS * tiles * FRAGMENT);
+      --left, from = behind(from, ROUND_FRAGMENTS * PARTS * tiles * FRAGMENT);
     }
     b.slot = next, b.phase = phase;
     await_products<0>();
@@ -149,7 +149,7 @@ struct GroupProduct {
     }
     if constexpr (AHEAD > 0) {
 #pragma unroll
-      for (int i = 0; i < AHEAD * RPS; ++i) keep_until_here(ahead.weights[i]);
+      for (int i = 0; i < AHEAD * ROUND_FRAGMENTS; ++i) keep_until_here(ahead.weights[i]);
     }
   }
 };

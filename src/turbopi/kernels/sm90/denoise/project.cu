@@ -9,7 +9,7 @@ __device__ __forceinline__ void make_rope(const Block& b, int prefix, float2 (&r
   for (int j = 0; j < ITEMS_Q; ++j) {
     const int i = b.warp() + j * W, qn = b.qn(), kvn = b.kvn(), k = i - qn * NT;
     rope[j][0] = rope[j][1] = make_float2(1, 0);
-    if (!b.attends() || i >= (qn + kvn) * NT) continue;
+    if (i >= (qn + kvn) * NT) continue;
     const int tile = k < 0 ? b.q0() + i % qn : b.kv0() + (KVL == 1 ? 0 : k % kvn), n = k < 0      ? i / qn
                                                                                        : KVL == 1 ? k
                                                                                                   : k / kvn;
@@ -186,14 +186,14 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
   }
   auto await_stream = [&] {
     receive_stream(b, 0);
-    MARK(0)
+    MARK(MARK_STREAM_FOR_ATTENTION)
   };
   if constexpr (MMA_QKV) {
     QkvProduct product(qn + kvn);
     product.load(b);
     await_stream();
     product.multiply(b);
-    MARK(1)
+    MARK(MARK_QKV_MULTIPLIED)
     consumers_sync();
     product.store(b, b.smem + M_X);
   } else {
@@ -202,7 +202,7 @@ __device__ __forceinline__ void project(Block& b, const float* shifted, const fl
     float sums[plan_groups(QKV)][NT * 4];
     if (!SPREAD) show_to_products();
     multiply<QKV, D16>(b, M_X, D16, qn + kvn, sums, ahead);
-    MARK(1)
+    MARK(MARK_QKV_MULTIPLIED)
     consumers_sync();
     if constexpr (SPREAD) give_room(b);
     store_partials<QKV>(b, b.smem + M_X, qn + kvn, sums);

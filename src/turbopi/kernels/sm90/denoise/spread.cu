@@ -170,7 +170,6 @@ __device__ __forceinline__ void fetch_stream(const Block& b) {
   for (int step = 0; step < b.a.steps; ++step)
 #pragma unroll 1
     for (int i = 0; i < 2 * L; ++i, ++turn) {  // embedded, then behind attention, behind the feed-forward, ...
-      if (!b.attends() && i % 2 == 0) continue;
       barrier_wait(b.bar(BAR_DONE), uses & 1);
       __syncwarp();
       if (b.lane() < S) arrive_at(at_rank(b.bar(BAR_FREE), b.lane()));

@@ -60,7 +60,6 @@ struct Embedding {
     }
   }
   __device__ __forceinline__ void send(const Block& b, const float4 (&x)[ITEMS_X]) const {
-    if (!b.attends()) return;
     __syncwarp();
 #pragma unroll
     for (int j = 0; j < ITEMS_X; ++j) {
@@ -156,7 +155,7 @@ __device__ __forceinline__ void advance(Block& b, float4 (&x)[ITEMS_X], const fl
       if (b.cta == 0) put_out(b, step, at, v, next);
     }
   }
-  MARK(20)
+  MARK(MARK_STEP_DONE)
   if (step + 1 == b.a.steps) return;
   consumers_sync();
   if (b.thread < S) arrive_at(at_rank(b.bar(BAR_GO), b.thread));
@@ -225,7 +224,7 @@ __device__ __forceinline__ void embed_own(Block& b, const Actions& actions, floa
   }
   float2 scales[ITEMS_X];
   load_columns(b, scales, scale);
-  if (b.attends()) done_with_x(b);
+  done_with_x(b);
   publish_stream(b, x, scales);
 }
 
@@ -283,5 +282,5 @@ __device__ __forceinline__ void advance_own(Block& b, Actions& actions, const fl
       actions.kept[i] = euler_step(b, actions.kept[i], v);
       if (b.rank() == 0) put_out(b, step, at, v, actions.kept[i]);
     }
-  MARK(20)
+  MARK(MARK_STEP_DONE)
 }

@@ -42,14 +42,14 @@ __device__ __forceinline__ float2 known_rms(const Block& b, int token) {
   return *(const float2*)(b.smem + M_RMS + token * 4);
 }
 __device__ __forceinline__ float2 inverse_rms(const Block& b, int token, int half) {
-  barrier_wait(b.bar(BAR_RMS), b.x_parity(half));
+  barrier_wait(b.bar(BAR_RMS), half);
   return known_rms(b, token);
 }
 __device__ __forceinline__ float rms_from(const Block& b, float squares) {  // 1 / rms
   return rsqrtf(squares * (1.0f / D) + b.a.eps);
 }
 __device__ __forceinline__ void make_inverse_rms(const Block& b) {
-  const int uses = b.a.steps * L * (b.attends() ? 2 : 1);
+  const int uses = b.a.steps * L * 2;
 #pragma unroll 1
   for (int use = 0; use < uses; ++use) {
     barrier_wait(b.bar(SPREAD ? int(BAR_SQUARES) : int(BAR_X)), use & 1);
@@ -73,7 +73,7 @@ constexpr u32 X_EXPECT = D16 * (SPREAD ? NT * 8 : T) * (OPERAND / 8) + (SPREAD ?
 // The stream that comes before attention, or (half 1) the feed-forward.
 __device__ __forceinline__ void receive_stream(const Block& b, int half) {
   if constexpr (SPREAD) note(b, WAIT_X), await_slice(b);
-  receive(b, BAR_X, b.x_parity(half), X_EXPECT, WAIT_X);
+  receive(b, BAR_X, half, X_EXPECT, WAIT_X);
 }
 
 // A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
@@ -84,13 +84,13 @@ __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X
 }
 
 // Partial sums of an item of the stream from all clusters, two in a word (SPREAD: see `take_singly`).
-constexpr int FETCH = most(NH, 2) < 4 ? most(NH, 2) : 4;  // words at a time: no more than there ever are
+constexpr int FETCH = imin(PAIRS, 4);  // words at a time
 __device__ __forceinline__ const uint4* partials(const Block& b, const uint4* buffer, Item item) {
   return buffer + ((b.x0() + item.tile) * NT + item.n) * PAIRS * 32 + b.lane();
 }
-// Asks until what `parts` clusters send is there, in words `first` and on (of `real` tokens: others never come); adds
-// it up, without what comes before `from`.
-__device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int from, int parts, u32 bit, bool real) {
+// Asks until what the clusters send is there, in words `first` and on (of `real` tokens: others never come); adds it up,
+// without what comes before `from`.
+__device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int from, u32 bit, bool real) {
   uint4 v[FETCH];
 #pragma unroll
   for (int i = 0; i < FETCH; ++i) v[i] = peek(p + i * 32);
@@ -99,9 +99,8 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
     u32 missing[FETCH], any = 0;
 #pragma unroll
     for (int i = 0; i < FETCH; ++i) {
-      const bool both = (NC % 2 == 0 && NH % 2 == 0) || 2 * (first + i) + 1 < parts;
-      const u32 second = both ? differing(v[i].z, bit, v[i].w ^ bit) : 0;
-      missing[i] = differing(v[i].x, bit, differing(v[i].y, bit, second)), any |= missing[i];
+      missing[i] = differing(v[i].x, bit, differing(v[i].y, bit, differing(v[i].z, bit, v[i].w ^ bit)));
+      any |= missing[i];
     }
     if (!__any_sync(~0u, real && any & 1)) break;
 #pragma unroll
@@ -110,23 +109,20 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
   }
 #pragma unroll
   for (int i = 0; i < FETCH; ++i) {
-    const bool both = (NC % 2 == 0 && NH % 2 == 0) || 2 * (first + i) + 1 < parts;
     if (PAIRS == FETCH || first + i >= from) {
       const float2 a = unpack_half(v[i].x), c = unpack_half(v[i].y);
       sum.x += a.x, sum.y += a.y, sum.z += c.x, sum.w += c.y;
-      if (both) {
-        const float2 a1 = unpack_half(v[i].z), c1 = unpack_half(v[i].w);
-        sum.x += a1.x, sum.y += a1.y, sum.z += c1.x, sum.w += c1.y;
-      }
+      const float2 a1 = unpack_half(v[i].z), c1 = unpack_half(v[i].w);
+      sum.x += a1.x, sum.y += a1.y, sum.z += c1.x, sum.w += c1.y;
     }
   }
 }
 
-// The same if SPREAD, where a word is of one cluster: `parts` of them, without what comes before `from`.
-constexpr int FETCH_SINGLY = imin(NH, 8);
-__device__ __forceinline__ void take_singly(float4& sum, const uint2* p, int from, int parts, u32 bit, bool real) {
+// The same if SPREAD, where a word is of one cluster.
+constexpr int FETCH_SINGLY = imin(NC, 8);
+__device__ __forceinline__ void take_singly(float4& sum, const uint2* p, int from, u32 bit, bool real) {
   constexpr int N = FETCH_SINGLY;
-  const int first = min(from, max(parts - N, 0));
+  const int first = min(from, max(NC - N, 0));
   uint2 v[N];
   auto ask = [&](int i) { v[i] = peek(p + (first + i) * 32); };
 #pragma unroll
@@ -161,10 +157,10 @@ __device__ __forceinline__ void keep_item(const Block& b, int j, float4 y) {
   *(float2*)to = make_float2(y.x, y.y), *(float2*)(to + 8) = make_float2(y.z, y.w);
 }
 
-// Fetch `parts` clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
+// Fetch the clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
 // slice times the next norm's scale to all ranks (SPREAD: publish it), if `last` keep it. buffer:
-// [D16][NT][PAIRS][32] 16-byte words, or [D16][NT][NC][32] 8-byte words with room for an even number of clusters.
-__device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, int parts, u32 bit,
+// [D16][NT][PAIRS][32] 16-byte words, or [D16][NT][NC][32] 8-byte words.
+__device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
                                        int half, bool last) {
   const u32 since = u32(clock64());
@@ -187,13 +183,13 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
       float4 sum = make_float4(0, 0, 0, 0);
       if constexpr (SPREAD) {
 #pragma unroll 1
-        for (int from = 0; from < parts; from += FETCH_SINGLY)
-          take_singly(sum, (const uint2*)(p - b.lane()) + b.lane(), from, parts, bit, item.real);
+        for (int from = 0; from < NC; from += FETCH_SINGLY)
+          take_singly(sum, (const uint2*)(p - b.lane()) + b.lane(), from, bit, item.real);
       } else {
 #pragma unroll 1
-        for (int from = 0, words = most(parts, 2); from < words; from += FETCH) {
-          const int first = min(from, max(words - FETCH, 0));  // the last round may ask for what the one before had
-          take(sum, p + first * 32, first, from, parts, bit, item.real);
+        for (int from = 0; from < PAIRS; from += FETCH) {
+          const int first = min(from, max(PAIRS - FETCH, 0));  // the last round may ask for what the one before had
+          take(sum, p + first * 32, first, from, bit, item.real);
         }
       }
       const float2 gate = make_float2(gates[j].x / PARTIAL_SCALE, gates[j].y / PARTIAL_SCALE);
@@ -202,7 +198,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
     }
     __syncwarp();
     if (j == 0) {
-      MARK(21 + half)
+      MARK(half ? MARK_DOWN_SUMS_HERE : MARK_OUT_SUMS_HERE)
     }
     if (!SPREAD && (send_on || last)) {
       const float4 y = scaled(x[j], scales[j]);
@@ -304,11 +300,11 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
   }
   Ahead<group_tiles(GTL), GATE_UP_AHEAD> ahead(b);
   receive_stream(b, 1);
-  MARK(13)
+  MARK(MARK_STREAM_FOR_FEED_FORWARD)
   float sums[GROUPS_][NT * 4];
   if (!SPREAD) show_to_products();  // what the copy engine wrote needs none
   multiply<GTL, D16>(b, M_X, D16, gn, sums, ahead);
-  MARK(15)
+  MARK(MARK_GATE_UP_MULTIPLIED)
   if constexpr (SPREAD) consumers_sync(), give_room(b);
   own.add_up(b, SPREAD ? M_X + X_FF_SUMS : M_X, gn, sums);
   constexpr int QUARTER = most(S, 4);
