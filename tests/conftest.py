@@ -18,8 +18,8 @@ if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel's module is imported, by whichever test comes first
 
 from turbopi.config import Kind
-from turbopi.judge.golden import Case, GoldenFolder
 from turbopi.model.reference import Pi0Model, Precision
+from turbopi.verify.golden import Case, GoldenFolder
 
 GOLDEN = Path(__file__).parent / "golden"
 torch.set_num_threads(2)

@@ -14,7 +14,7 @@ from turbopi import UnifiedPolicy
 from turbopi.checkpoint import open_checkpoint
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs, Observation
-from turbopi.tokenizer import TINY_TOKENIZER
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 
 GOLDEN = Path(__file__).parent / "golden_lerobot"
 EXACT = ("tokens", "token_mask", "image_mask")

@@ -12,8 +12,8 @@ from conftest import golden_cases, golden_folder
 from turbopi import backends
 from turbopi.backends.timing import StageTimer
 from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.judge.check_golden import check_case
 from turbopi.model.reference import Precision
+from turbopi.verify.check_golden import check_case
 
 CPU = torch.device("cpu")
 

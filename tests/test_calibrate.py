@@ -36,15 +36,15 @@ from turbopi.cli.options import PolicyOptions
 from turbopi.config import preset
 from turbopi.engine.fp8 import E4M3, E4M3_MAX, Directions, to_e4m3
 from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, ObservationError, OutputError
-from turbopi.judge.check_golden import check_case, golden_calibration, golden_calls
-from turbopi.judge.verdict import ACTIONS, Compared, Repetition, Rule, judge
-from turbopi.judge.verify import verify
-from turbopi.judge.verify_inputs import Call, Plan, Sample
 from turbopi.model.layers import AdaRMSNorm
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
 from turbopi.serve.record import Call as RecordedCall
 from turbopi.serve.record import save_call
+from turbopi.verify.check_golden import check_case, golden_calibration, golden_calls
+from turbopi.verify.inputs import Call, Plan, Sample
+from turbopi.verify.run import verify
+from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
 TINY = preset("pi05_tiny").model
 

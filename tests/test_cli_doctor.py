@@ -15,7 +15,7 @@ from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.checkpoint import write_random
 from turbopi.cli import checkups
 from turbopi.cli.checkups import Row
-from turbopi.tokenizer import TINY_TOKENIZER
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 
 
 def doctor(*arguments: object) -> tuple[int, dict[str, dict[str, str]]]:

@@ -16,8 +16,8 @@ from turbopi.calibrate.sites import sites
 from turbopi.cli import app
 from turbopi.errors import ConfigError
 from turbopi.evaluate.sources import LocalPolicy
-from turbopi.judge.check_golden import check_folder, golden_calibration
 from turbopi.policy import UnifiedPolicy
+from turbopi.verify.check_golden import check_folder, golden_calibration
 
 CPU = torch.device("cpu")
 CASE = "b_third_masked"

@@ -20,8 +20,8 @@ from turbopi.engine.ops import PLAIN
 from turbopi.engine.recent import RecentLoops
 from turbopi.engine.weights import modulation, pack
 from turbopi.errors import BackendUnavailable
-from turbopi.judge.check_golden import golden_calibration
 from turbopi.observation import Observation
+from turbopi.verify.check_golden import golden_calibration
 
 CPU, META = torch.device("cpu"), torch.device("meta")
 STEPS = 2

@@ -35,13 +35,13 @@ from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import Episode, Results
 from turbopi.evaluate.visited import Visited
 from turbopi.export.onnx import GRAPHS, MANIFEST, open_export
-from turbopi.normalize import Normalizer
+from turbopi.preprocess.normalize import Normalizer
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.robots.described import load_robot
 from turbopi.serve.record import Call, load_call, load_observation, save_call
 from turbopi.serve.wire import pack, unpack
 from turbopi.sim import Task
 from turbopi.tensorrt.calibrate import Calibration
-from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
 
 FACTOR = float(os.environ.get("TURBOPI_FUZZ", "1"))
 MAX_GROWTH = 700 * 2**20  # of memory, by a target with all of its damages

@@ -15,9 +15,9 @@ from turbopi import backends
 from turbopi.backends.cuda_graph import Graph, HostRow
 from turbopi.config import Kind
 from turbopi.engine.call import StaticCall
-from turbopi.judge.check_golden import check_case
 from turbopi.model.reference import Precision
 from turbopi.observation import Observation
+from turbopi.verify.check_golden import check_case
 
 pytestmark = [
     pytest.mark.gpu,

@@ -15,11 +15,11 @@ from turbopi.calibrate.artifact import Quantization
 from turbopi.calibrate.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.calibrate.sites import sites
 from turbopi.config import Kind
-from turbopi.judge.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
-from turbopi.judge.golden import Case
 from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX
 from turbopi.kernels.sm90.denoise.packing import refusal
 from turbopi.model.reference import Pi0Model
+from turbopi.verify.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
+from turbopi.verify.golden import Case
 
 pytestmark = [
     pytest.mark.gpu,

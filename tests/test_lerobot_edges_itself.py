@@ -18,8 +18,8 @@ from lerobot_golden import GOLDEN
 from turbopi.checkpoint.lerobot import LeRobotFolder
 from turbopi.checkpoint.settings import Settings
 from turbopi.errors import TurboPiError
-from turbopi.preprocess import Pipeline
-from turbopi.tokenizer import TINY_TOKENIZER, PromptTokenizer, load_tokenizer
+from turbopi.preprocess.pipeline import Pipeline
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER, PromptTokenizer, load_tokenizer
 
 REPOSITORY = Path(__file__).parents[1]
 PYTHON = Path(os.environ.get("TURBOPI_LEROBOT_PYTHON", REPOSITORY / ".venv-lerobot" / "bin" / "python")).absolute()

@@ -11,7 +11,7 @@ from turbopi import UnifiedPolicy
 from turbopi.checkpoint import convert, inspect_checkpoint, open_checkpoint
 from turbopi.config import Normalization
 from turbopi.errors import CheckpointError, ConfigError
-from turbopi.tokenizer import TINY_TOKENIZER
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 
 PRE = "policy_preprocessor.json"
 NEW_LINE, TOKENIZER, RENAME = "pi0_new_line_processor", "tokenizer_processor", "rename_observations_processor"

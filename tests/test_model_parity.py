@@ -13,10 +13,10 @@ from torch import Tensor
 
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.errors import CheckpointError
-from turbopi.judge.check_golden import Comparison, check_case
-from turbopi.judge.golden import GoldenFolder
 from turbopi.model import denoise, reference
 from turbopi.model.reference import Pi0Model, Precision
+from turbopi.verify.check_golden import Comparison, check_case
+from turbopi.verify.golden import GoldenFolder
 
 CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
 

@@ -14,7 +14,7 @@ from PIL import Image
 from turbopi.cli.files import load_noise
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.evaluate.visited import FILE, Visited
-from turbopi.images import read_picture
+from turbopi.reading.pictures import read_picture
 from turbopi.serve.record import Call, iter_recording, load_call, load_observation, save_call
 
 PIXELS = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)

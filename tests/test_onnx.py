@@ -23,7 +23,7 @@ from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError, Obs
 from turbopi.export import onnx as exporting
 from turbopi.export.graphs import graphs
 from turbopi.export.onnx import MANIFEST, export_onnx, open_export
-from turbopi.judge.check_golden import check_case
+from turbopi.verify.check_golden import check_case
 
 for library in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(library)

@@ -15,7 +15,8 @@ from hypothesis.extra.numpy import arrays
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats, load_norm_stats
 from turbopi.config import NormMode
 from turbopi.errors import ConfigError, ObservationError
-from turbopi.normalize import Normalizer, absolute_actions, action_mask, delta_actions, pad_last
+from turbopi.preprocess.normalize import Normalizer, absolute_actions, delta_actions, pad_last
+from turbopi.robots.base import action_mask
 
 FOLDER = Path(__file__).parent / "golden" / "preprocess"
 NORMALIZED = packed_arrays(FOLDER / "normalize.npz")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from turbopi.bench import provenance as module
-from turbopi.bench.provenance import provenance
+from turbopi import provenance as module
+from turbopi.provenance import provenance
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git isn't installed")
 
@@ -46,7 +46,7 @@ def test_the_version_is_always_recorded() -> None:
 def test_a_checkout_of_ours_is_told_by_its_commit_and_by_its_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    name = "src/turbopi/bench/provenance.py"
+    name = "src/turbopi/provenance.py"
     commit = repository(tmp_path, name)
     assert told(monkeypatch, tmp_path / name) == commit
     (tmp_path / "README").write_text("changed")
@@ -59,7 +59,7 @@ def test_a_repository_around_the_installation_isnt_taken_for_ours(
 ) -> None:
     """An environment in somebody's checkout, ignored there or not."""
     monkeypatch.delenv("TURBOPI_COMMIT", raising=False)
-    installed = "venv/lib/python3.12/site-packages/turbopi/bench/provenance.py"
+    installed = "venv/lib/python3.12/site-packages/turbopi/provenance.py"
     repository(tmp_path, *([installed] if tracked else []))
     (tmp_path / installed).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / installed).write_text("installed")
@@ -70,7 +70,7 @@ def test_a_repository_around_the_installation_isnt_taken_for_ours(
 
 def test_a_repository_that_the_environment_names_is_no_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As within a git hook."""
-    name = "src/turbopi/bench/provenance.py"
+    name = "src/turbopi/provenance.py"
     commit = repository(tmp_path / "ours", name)
     repository(tmp_path / "theirs", name)
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "theirs" / ".git"))

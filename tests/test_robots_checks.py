@@ -14,7 +14,7 @@ from cli_helpers import refusal, text_of, turbopi
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.policy import UnifiedPolicy
-from turbopi.preprocess import Pipeline
+from turbopi.preprocess.pipeline import Pipeline
 from turbopi.robots import Robot, RobotInputs
 
 TINY = ("--random-weights", "pi05_tiny")

@@ -15,9 +15,9 @@ from turbopi import backends
 from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
 from turbopi.errors import BackendError
-from turbopi.judge.check_golden import check_case
 from turbopi.observation import Observation
 from turbopi.tensorrt.parts import EngineShape
+from turbopi.verify.check_golden import check_case
 
 H = golden_folder().checkpoint("pi05").config.model.action_horizon
 CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]

@@ -15,13 +15,13 @@ from turbopi import backends, tensorrt
 from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_fp8 import TensorRTFp8Backend
 from turbopi.errors import BackendError
-from turbopi.judge.check_golden import check_case
 from turbopi.model.denoise import time_embedding, time_grid
 from turbopi.model.vision import normalize_images
 from turbopi.observation import Observation
 from turbopi.tensorrt.calibrate import calibrate, unavailable
 from turbopi.tensorrt.engine import Engine, Input, Kernels, Specification, build
 from turbopi.tensorrt.ops import NetworkOps
+from turbopi.verify.check_golden import check_case
 
 if TYPE_CHECKING:
     from turbopi.export.onnx import Export

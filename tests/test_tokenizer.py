@@ -11,10 +11,17 @@ import numpy as np
 import pytest
 import sentencepiece
 
-from turbopi import tokenizer
+import turbopi
 from turbopi.config import preset
 from turbopi.errors import ObservationError, TokenizerError
-from turbopi.tokenizer import TINY_TOKENIZER, PromptTokenizer, clean_prompt, load_tokenizer, prompt_texts, state_bins
+from turbopi.preprocess.tokenizer import (
+    TINY_TOKENIZER,
+    PromptTokenizer,
+    clean_prompt,
+    load_tokenizer,
+    prompt_texts,
+    state_bins,
+)
 
 FOLDER = Path(__file__).parent / "golden" / "preprocess"
 PROMPTS: list[dict[str, Any]] = json.loads((FOLDER / "prompts.json").read_text())
@@ -213,7 +220,7 @@ def test_the_script_makes_the_same_file_each_time() -> None:
 
 
 def test_the_tiny_tokenizer_is_part_of_the_package() -> None:
-    assert TINY_TOKENIZER.is_relative_to(Path(tokenizer.__file__).parent)
+    assert TINY_TOKENIZER.is_relative_to(Path(turbopi.__file__).parent)
 
 
 def test_the_newline_behind_a_prompt_is_encoded_once() -> None:

@@ -14,15 +14,16 @@ from cli_helpers import refusal, turbopi
 from turbopi import backends
 from turbopi.checkpoint import random_checkpoint
 from turbopi.errors import CheckpointError
-from turbopi.judge import certificates, verify_inputs
-from turbopi.judge.intermediates import Errors, Place, first_suspect, in_order, tensors_of
-from turbopi.judge.verdict import ACTIONS, Rule
-from turbopi.judge.verify import verify
-from turbopi.judge.verify_inputs import Plan
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
 from turbopi.serve.record import Call, save_call
+from turbopi.verify import certificates
+from turbopi.verify import inputs as verify_inputs
+from turbopi.verify.inputs import Plan
+from turbopi.verify.intermediates import Errors, Place, first_suspect, in_order, tensors_of
+from turbopi.verify.run import verify
+from turbopi.verify.verdict import ACTIONS, Rule
 
 STEPS = 2
 WEIGHTS = ("--random-weights", "pi05_tiny")
@@ -212,7 +213,7 @@ def test_observations_made_by_hand_are_verified_too_evenly_spread(tmp_path: Path
 def test_calibrations_are_looked_at_before_anything_runs(
     monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
 ) -> None:
-    monkeypatch.delattr("turbopi.judge.verify._Reference")
+    monkeypatch.delattr("turbopi.verify.run._Reference")
     assert message in refusal_of("--device", "cpu", *arguments)
 
 

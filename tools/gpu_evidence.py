@@ -22,20 +22,13 @@ PENDING = ROOT / "benchmarks/results/gpu_check_pending.json"
 PRODUCT = (
     *("src/turbopi/kernels/**/*", "src/turbopi/engine/*", "src/turbopi/model/*", "src/turbopi/backends/*"),
     *("src/turbopi/calibrate/*", "src/turbopi/config.py", "src/turbopi/observation.py", "src/turbopi/policy.py"),
-    "src/turbopi/judge/check_golden.py",
+    "src/turbopi/verify/check_golden.py",
 )
 # Modules that those import and that only read files or format text on the host: CPU tests see all of what they do.
 HOST_ONLY = (
-    *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.tokenizer", "turbopi.images"),
-    *("turbopi.normalize", "turbopi.serve", "turbopi.demo", "turbopi.export", "turbopi.tensorrt", "turbopi.errors"),
-    *(
-        "turbopi.files",
-        "turbopi.folders",
-        "turbopi.reading",
-        "turbopi.judge.golden",
-        "turbopi.bench.provenance",
-        "turbopi.arguments",
-    ),
+    *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.serve", "turbopi.demo"),
+    *("turbopi.export", "turbopi.tensorrt", "turbopi.errors", "turbopi.files", "turbopi.reading", "turbopi.arguments"),
+    *("turbopi.provenance", "turbopi.verify.golden"),
 )
 MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
 

@@ -29,9 +29,9 @@ import torch
 from turbopi.backends import Tier
 from turbopi.checkpoint import Checkpoint, load_norm_stats
 from turbopi.errors import BackendError, TurboPiError
-from turbopi.images import read_picture
 from turbopi.model.reference import Pi0Model, parameter_dtype
 from turbopi.policy import UnifiedPolicy
+from turbopi.reading.pictures import read_picture
 
 CONTROL_SEEDS = (1, 2)
 BOUND_FACTORS: dict[Tier, float] = {"bf16": 5.0, "f32": 30.0, "fp8": 5.0, "fp8-mlp": 5.0}

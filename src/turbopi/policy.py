@@ -30,9 +30,9 @@ from turbopi.engine.recent import Loop
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.model.reference import Precision
 from turbopi.observation import ModelInputs, Observation, with_cameras
-from turbopi.preprocess import Pipeline
+from turbopi.preprocess.pipeline import Pipeline
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.robots import Robot
-from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
 
 logger = logging.getLogger(__name__)
 

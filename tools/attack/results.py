@@ -21,7 +21,7 @@ def piece(attack: Attack, seed: int, size: Size, found: Found, seen: dict[str, A
     """One attack as it is written: plain values."""
     import torch
 
-    from turbopi.bench.provenance import provenance
+    from turbopi.provenance import provenance
 
     held = not found.violations and not found.more_violations and all(bar.held for bar in found.bars)
     return {

@@ -61,7 +61,7 @@ def main() -> None:
 
 def _time(arguments: argparse.Namespace) -> None:
     from kernel_turns.turns import GPU, MARKS, RANKS, Job, marks_by_rank, time_in_turns
-    from turbopi.bench.provenance import provenance
+    from turbopi.provenance import provenance
 
     variants, console, rows = [Variant(spec) for spec in arguments.variants], Console(), []
     for tokens in (int(text) for text in arguments.tokens.split(",")):

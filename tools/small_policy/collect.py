@@ -23,7 +23,7 @@ from small_policy.scenes import (
     PracticeScene,
     Setting,
 )
-from turbopi.images import resize_with_pad
+from turbopi.preprocess.images import resize_with_pad
 from turbopi.sim.libero import CAMERAS
 
 HORIZON, REPLAN = 10, 5

@@ -13,7 +13,7 @@ from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, Shape
 from turbopi.config import PolicyConfig, preset
 from turbopi.model.reference import Precision
-from turbopi.tokenizer import TINY_TOKENIZER
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 
 ASSET_ID = "turbopi/libero_spatial"
 # As openpi's own pi05_libero, it doesn't read the state: where the hand is, the pictures show

@@ -16,7 +16,7 @@ from small_policy.actor import Actor
 from small_policy.collect import IMAGE_PX, Mix, Record, run_worker
 from small_policy.memory import Memory
 from small_policy.scenes import NUM_TASKS
-from turbopi.normalize import Normalizer
+from turbopi.preprocess.normalize import Normalizer
 
 HARDER = (4, 9, 0, 7, 2, 6)  # scenes that get a further worker first
 _GATHER_S = 0.008  # how long a question waits for company

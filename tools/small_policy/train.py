@@ -28,8 +28,8 @@ from small_policy.memory import Batch, Memory
 from small_policy.scenes import INSTRUCTIONS, NUM_TASKS, Setting
 from small_policy.start import fresh_model
 from turbopi.checkpoint.norm_stats import load_norm_stats
-from turbopi.normalize import Normalizer
-from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.preprocess.normalize import Normalizer
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 
 PROMPT_TOKENS = 24  # the longest instruction has 21; a multiple of 8 with the cameras' 512, as attention kernels like
 GUIDE_VALUES = AUX_DIM + 3  # and from the hand to the bowl

@@ -15,13 +15,13 @@ from turbopi.backends import PRECISIONS, Tier
 from turbopi.bench.floors import Floors, measure_floors
 from turbopi.bench.measure import WARMING, Observations, answers, at_horizon, bench_policy, error_against, measure_calls
 from turbopi.bench.profile import stage_kernels, start_profiler
-from turbopi.bench.provenance import provenance
 from turbopi.bench.summary import linear_models
 from turbopi.bench.work import Job, floor_ms, stage_work
 from turbopi.calibrate.artifact import TIERS
 from turbopi.checkpoint import Checkpoint
 from turbopi.errors import ConfigError, TurboPiError
 from turbopi.policy import UnifiedPolicy
+from turbopi.provenance import provenance
 
 Answered = tuple[dict[str, Any], Job, np.ndarray]  # a result, its job, and the policy's `answers`
 

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from turbopi import backends, demo
-from turbopi.bench.provenance import provenance
 from turbopi.calibrate.directions import Rows, directions
 from turbopi.calibrate.emulate import Round, RoundedWeights, delta_cosine, relative_rms, replaced, rounded
 from turbopi.calibrate.formats import attention_in_fp8, round_nvfp4
@@ -27,8 +26,9 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.engine.fp8 import Directions
 from turbopi.files import write_whole
 from turbopi.model.reference import Pi0Model
-from turbopi.preprocess import Pipeline
-from turbopi.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.preprocess.pipeline import Pipeline
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.provenance import provenance
 
 
 def errors(

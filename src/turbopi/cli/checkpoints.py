@@ -18,7 +18,7 @@ from turbopi.files import write_whole
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
-    from turbopi.preprocess import Pipeline
+    from turbopi.preprocess.pipeline import Pipeline
 
 PART_NAMES = {
     "vision": "vision tower (SigLIP)",
@@ -85,7 +85,7 @@ def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str])
 
 def robot_pipeline(checkpoint: "Checkpoint", robot: Any) -> "Pipeline":
     """A robot held against a checkpoint, without its weights and its tokenizer."""
-    from turbopi.preprocess import Pipeline
+    from turbopi.preprocess.pipeline import Pipeline
 
     no_tokenizer: Any = None  # nothing is tokenised
     return Pipeline(checkpoint.config, checkpoint.norm_stats, no_tokenizer, robot=robot)
@@ -237,7 +237,7 @@ def _for_robot(checkpoint: "Checkpoint", robot: str) -> "Checkpoint":
 def _complete_random(folder: Path, seed: int) -> Path:
     """Make random weights' folder complete with the project's small tokenizer, and have it say what it is, always."""
     from turbopi.checkpoint.settings import FILE_NAME
-    from turbopi.tokenizer import FILE_NAMES, TINY_TOKENIZER
+    from turbopi.preprocess.tokenizer import FILE_NAMES, TINY_TOKENIZER
 
     settings = json.loads((folder / FILE_NAME).read_text())
     settings["name"] += f" with random weights, seed {seed}"

@@ -272,7 +272,7 @@ def open_for_check(path: str, config: str | None) -> tuple[Any, Row]:
 def check_tokenizer(given: str | None, checkpoint: Any) -> Row:
     """Where UnifiedPolicy would find its tokenizer. Without a checkpoint, its absence is only a warning."""
     from turbopi.config import ModelConfig
-    from turbopi.tokenizer import load_tokenizer
+    from turbopi.preprocess.tokenizer import load_tokenizer
 
     vocab_size = ModelConfig().vocab_size if checkpoint is None else checkpoint.config.model.vocab_size
     try:

@@ -80,9 +80,9 @@ def study(
             raise BackendUnavailable(f"the {name} study needs TensorRT: {reason}")
     opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
-    from turbopi.bench.provenance import provenance
     from turbopi.cli.build import given_observations
     from turbopi.policy import UnifiedPolicy
+    from turbopi.provenance import provenance
 
     policy = UnifiedPolicy(opened, backend="pytorch", precision="f32", device=resolved, progress=output.shows_progress)
     given, source = given_observations(policy, observation)

@@ -73,9 +73,9 @@ def verify(
         check_folder(report)
     output = Output(as_json)
     opened = options.open(checkpoint)
-    from turbopi.judge.verify import Progress
-    from turbopi.judge.verify import verify as run
-    from turbopi.judge.verify_inputs import Plan
+    from turbopi.verify.inputs import Plan
+    from turbopi.verify.run import Progress
+    from turbopi.verify.run import verify as run
 
     options.tell_if_random(opened, output)
     plan = Plan(
@@ -99,7 +99,7 @@ def verify(
 
 
 def _write(document: dict[str, Any], folder: Path, output: Output) -> None:
-    from turbopi.judge.verify_plots import write_plots
+    from turbopi.verify.plots import write_plots
 
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "verify.json"

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import torch
 
-from turbopi.bench.provenance import provenance
 from turbopi.errors import ConfigError
 from turbopi.evaluate.episode import WorkerSetup
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan
@@ -22,6 +21,7 @@ from turbopi.evaluate.sources import PolicySource
 from turbopi.evaluate.video import check_can_write
 from turbopi.evaluate.workers import LOG
 from turbopi.files import alone_in
+from turbopi.provenance import provenance
 from turbopi.sim import Simulator
 
 # Is told of every episode as it ends, with the results so far

@@ -21,7 +21,7 @@ from turbopi.evaluate.plan import Job, Protocol, noise_seed
 from turbopi.evaluate.results import Episode, Status, writable
 from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
 from turbopi.evaluate.workers import LOG, WorkerHandle
-from turbopi.images import resize_with_pad
+from turbopi.preprocess.images import resize_with_pad
 from turbopi.sim import Simulator
 
 MAX_CRASHES_IN_A_ROW = 5

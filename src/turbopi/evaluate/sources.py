@@ -182,7 +182,7 @@ class RemotePolicy:
 
 def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings, image_px: int, replan: int) -> Answer:
     """Ask once, with an example. Raises ConfigError for a policy that can't act in this simulator."""
-    from turbopi.images import resize_with_pad
+    from turbopi.preprocess.images import resize_with_pad
 
     example = simulator.example(settings)
     example |= {key: resize_with_pad(example[key], image_px, image_px) for key in simulator.image_keys}

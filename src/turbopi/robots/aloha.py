@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from turbopi.errors import ObservationError
-from turbopi.images import parse_chw_image
-from turbopi.normalize import action_mask
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
+    action_mask,
     listed,
     names_in,
     optional_prompt,
@@ -24,6 +23,7 @@ from turbopi.robots.base import (
     require,
     with_missing_cameras,
 )
+from turbopi.robots.pictures import parse_chw_image
 
 CAMERA_OF = {
     "cam_high": "base_0_rgb",

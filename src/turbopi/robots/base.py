@@ -7,7 +7,7 @@ reader raises ObservationError with the key, what was found and what was expecte
 import functools
 import itertools
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -72,6 +72,11 @@ class Robot(Protocol):
     def example(self, rng: np.random.Generator) -> dict[str, Any]:
         """A random valid observation in the robot's own keys, for warm-up and tests."""
         ...
+
+
+def action_mask(dims: Sequence[int]) -> tuple[bool, ...]:
+    """openpi's shorthand for a mask: n times True, or for -n as often False; (2, -1) is (True, True, False)."""
+    return tuple(flag for n in dims for flag in [n > 0] * abs(n))
 
 
 def find(observation: Mapping[str, Any], key: str) -> Any:

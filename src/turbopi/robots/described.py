@@ -9,18 +9,18 @@ import numpy as np
 
 from turbopi.config import CAMERAS, LIMITS
 from turbopi.errors import ConfigError
-from turbopi.images import parse_image
-from turbopi.normalize import action_mask
 from turbopi.reading import is_finite, is_integer, listing, read_json, shown
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
+    action_mask,
     optional_prompt,
     random_image,
     read_state,
     require,
     with_missing_cameras,
 )
+from turbopi.robots.pictures import parse_image
 
 REQUIRED = ("name", "cameras", "state", "action_dim")
 _MOST = LIMITS["action_dim"]  # numbers in a state or an action: no model takes more

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.images import parse_image
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
@@ -16,6 +15,7 @@ from turbopi.robots.base import (
     require,
     with_missing_cameras,
 )
+from turbopi.robots.pictures import parse_image
 
 KEYS = (
     "observation/exterior_image_1_left",

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from turbopi.errors import ConfigError, ObservationError
-from turbopi.images import parse_unit_image
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
@@ -25,6 +24,7 @@ from turbopi.robots.base import (
     read_state,
     require,
 )
+from turbopi.robots.pictures import parse_unit_image
 
 logger = logging.getLogger(__name__)
 

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.images import parse_image
-from turbopi.normalize import action_mask
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
+    action_mask,
     optional_prompt,
     random_image,
     read_state,
     require,
     with_missing_cameras,
 )
+from turbopi.robots.pictures import parse_image
 
 KEYS = ("observation/image", "observation/wrist_image", "observation/state", "prompt")
 

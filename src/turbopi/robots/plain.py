@@ -8,7 +8,6 @@ import numpy as np
 
 from turbopi.config import CAMERAS
 from turbopi.errors import ObservationError
-from turbopi.images import parse_image
 from turbopi.robots.base import (
     Robot,
     RobotInputs,
@@ -21,6 +20,7 @@ from turbopi.robots.base import (
     require,
     with_missing_cameras,
 )
+from turbopi.robots.pictures import parse_image
 
 
 @dataclass(frozen=True)

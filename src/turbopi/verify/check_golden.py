@@ -26,9 +26,9 @@ from turbopi.calibrate.artifact import TIERS, Quantization, shapes_of
 from turbopi.calibrate.observations import Call, Sample
 from turbopi.calibrate.run import Settings, calibrate_model
 from turbopi.config import Kind
-from turbopi.judge.golden import Arrays, Case, GoldenFolder, Run
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
+from turbopi.verify.golden import Arrays, Case, GoldenFolder, Run
 
 # max absolute error against torch_fp32. Masks, positions and times must be equal.
 F32_AGAINST_TORCH = {

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from turbopi.errors import ActionError, ConfigError, ObservationError, TurboPiError
-from turbopi.normalize import Normalizer
+from turbopi.preprocess.normalize import Normalizer
 from turbopi.robots.base import Robot, RobotInputs
 
 

@@ -16,14 +16,20 @@ import numpy as np
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.config import CAMERAS, PolicyConfig
 from turbopi.errors import ActionError, ConfigError, ObservationError
-from turbopi.images import check_hwc, resize_into, resize_unit_into, to_uint8
-from turbopi.normalize import Normalizer, absolute_actions, pad_last
 from turbopi.observation import ModelInputs
+from turbopi.preprocess.images import resize_into, resize_unit_into
+from turbopi.preprocess.normalize import Normalizer, absolute_actions, pad_last
+from turbopi.preprocess.robot_checks import (
+    check_shape,
+    notes_on_statistics,
+    read_observation,
+    width_of_outputs,
+)
+from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.robots import Robot, RobotInputs, create_robot
 from turbopi.robots.base import read_prompt, read_state
-from turbopi.robots.checks import check_shape, notes_on_statistics, read_observation, width_of_outputs
+from turbopi.robots.pictures import check_hwc, to_uint8
 from turbopi.robots.plain import Plain
-from turbopi.tokenizer import PromptTokenizer
 
 # image_resize: what pictures are padded with, the dtype that the model gets, and how
 _RESIZING: dict[str, tuple[int, type, Callable[[np.ndarray, np.ndarray], None]]] = {
@@ -68,7 +74,7 @@ class Pipeline:
 
     config          the model's sizes, the robot, how to normalise and resize
     stats           the checkpoint's statistics
-    tokenizer       see `turbopi.tokenizer.load_tokenizer`
+    tokenizer       see `turbopi.preprocess.tokenizer.load_tokenizer`
     default_prompt  for observations without one; before the config's and the robot's
     robot           instead of the config's: a name, a description's path, or an object. The config's options are for
                     the robot that it names alone

@@ -19,7 +19,7 @@ from turbopi.reading import read_bytes, shown
 
 logger = logging.getLogger(__name__)
 
-TINY_TOKENIZER = Path(__file__).parent / "data" / "small_policy" / "tokenizer.model"  # 1024 pieces; ours
+TINY_TOKENIZER = Path(__file__).parents[1] / "data" / "small_policy" / "tokenizer.model"  # 1024 pieces; ours
 FILE_NAMES = ("tokenizer.model", "paligemma_tokenizer.model")
 MAX_PROMPT_CHARACTERS = 20_000  # far past any model's tokens; keeps a hostile prompt from stalling the robot
 _MAX_BYTES = 64 * 2**20  # of a SentencePiece model; PaliGemma's has 4 MB

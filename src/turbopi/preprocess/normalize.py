@@ -120,11 +120,6 @@ def _nonzero(span: np.ndarray) -> np.ndarray:
     return np.where(span == 0, np.float32(_LEROBOT_EPS), span)
 
 
-def action_mask(dims: Sequence[int]) -> tuple[bool, ...]:
-    """openpi's shorthand for a mask: n times True, or for -n as often False; (2, -1) is (True, True, False)."""
-    return tuple(flag for n in dims for flag in [n > 0] * abs(n))
-
-
 def delta_actions(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool]) -> np.ndarray:
     """Absolute actions [..., H, d] relative to `state` [..., s] where `mask` is True; the dtype is kept."""
     return _shifted(actions, state, mask, -1)

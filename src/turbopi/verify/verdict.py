@@ -8,9 +8,9 @@ import numpy as np
 from turbopi import demo
 from turbopi.calibrate.artifact import TIERS
 from turbopi.errors import BackendError, ConfigError
-from turbopi.judge.intermediates import Errors, ErrorsBy, Place, Suspect, Tensors, first_suspect, in_order
-from turbopi.judge.verify_inputs import Call
 from turbopi.plots import action_groups
+from turbopi.verify.inputs import Call
+from turbopi.verify.intermediates import Errors, ErrorsBy, Place, Suspect, Tensors, first_suspect, in_order
 
 ACTIONS = Place("actions")
 F32_BOUND = 1e-5  # relative rms of the actions

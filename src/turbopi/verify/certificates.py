@@ -1,4 +1,4 @@
-"""FP8's certificates at full size, without a checkpoint: `python -m turbopi.judge.certificates --out DIR`.
+"""FP8's certificates at full size, without a checkpoint: `python -m turbopi.verify.certificates --out DIR`.
 
 For each kind of weights (calibrate/studied.py): a calibration on varied LIBERO pictures, then `verify` in both tiers on
 other ones, each cut down to what fits in a table.
@@ -22,9 +22,9 @@ from turbopi.calibrate.run import Settings, calibrate
 from turbopi.calibrate.studied import WEIGHTS, Weights, studied_checkpoint
 from turbopi.checkpoint import Checkpoint
 from turbopi.files import write_whole
-from turbopi.judge.verify import verify
-from turbopi.judge.verify_inputs import Plan
 from turbopi.serve.record import Call, save_call
+from turbopi.verify.inputs import Plan
+from turbopi.verify.run import verify
 
 _MOST_SHIFT = 20  # pixels
 

@@ -16,18 +16,18 @@ import numpy as np
 import torch
 
 from turbopi import backends, demo
-from turbopi.bench.provenance import provenance
 from turbopi.calibrate.artifact import Quantization, calibration_of
 from turbopi.calibrate.observations import inputs_bytes
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.graph import empty_cache
 from turbopi.errors import BackendError, CheckpointError
-from turbopi.judge.intermediates import Tensors, in_order, tensors_of
-from turbopi.judge.verdict import ACTIONS, Compared, Repetition, Rule, judge
-from turbopi.judge.verify_inputs import Call, Plan, check_observations, make_calls, read_samples
 from turbopi.model import exact
 from turbopi.model.reference import Pi0Model
 from turbopi.policy import UnifiedPolicy
+from turbopi.provenance import provenance
+from turbopi.verify.inputs import Call, Plan, check_observations, make_calls, read_samples
+from turbopi.verify.intermediates import Tensors, in_order, tensors_of
+from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
 _DEMANDED = ("kv_k", "kv_v", "v_t", "actions")  # by the Backend protocol
 

@@ -68,8 +68,8 @@ def _commit() -> str:
     whoever copied the files sets, else "unknown".
     """
     here = Path(__file__)
-    root = str(here.parents[3])
-    if _git(root, "ls-files", "--full-name", "--error-unmatch", str(here)) != "src/turbopi/bench/provenance.py":
+    root = str(here.parents[2])
+    if _git(root, "ls-files", "--full-name", "--error-unmatch", str(here)) != "src/turbopi/provenance.py":
         return os.environ.get("TURBOPI_COMMIT", "unknown")
     commit = _git(root, "rev-parse", "--short=12", "HEAD")
     return commit + ("+" if _git(root, "status", "--porcelain", "--untracked-files=no") else "")
