@@ -14,7 +14,7 @@ from conftest import golden_cases, golden_folder, golden_model
 from file_helpers import no_room
 from torch import nn
 
-from turbopi import backends, demo
+from turbopi import backends, shipped
 from turbopi.calibrate import formats, run
 from turbopi.calibrate.artifact import (
     BESIDE,
@@ -39,8 +39,7 @@ from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, Ob
 from turbopi.model.layers import AdaRMSNorm
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
-from turbopi.serve.record import Call as RecordedCall
-from turbopi.serve.record import save_call
+from turbopi.recordings import RecordedCall, save_call
 from turbopi.verify.check_golden import check_case, golden_calibration, golden_calls
 from turbopi.verify.inputs import Call, Plan, Sample
 from turbopi.verify.run import verify
@@ -663,7 +662,7 @@ def test_the_command_replaces_nothing_but_a_calibration(tmp_path: Path) -> None:
 
 def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Path) -> None:
     checkpoint = random_checkpoint("pi05_tiny")
-    policy = UnifiedPolicy(demo.with_libero_stats(checkpoint), backend="pytorch", device="cpu")
+    policy = UnifiedPolicy(shipped.with_libero_stats(checkpoint), backend="pytorch", device="cpu")
     for number in range(2):
         call = RecordedCall(policy.example_observation(number), {"actions": np.zeros((10, 7))}, 0.0)
         save_call(tmp_path / f"{number}.npz", call)

@@ -10,7 +10,7 @@ from checkpoint_helpers import GOLDEN
 from cli_helpers import refusal, text_of, turbopi
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
-from turbopi.demo import FRAMES, load_frames
+from turbopi.shipped import FRAMES, load_frames
 
 
 @pytest.fixture(scope="module")

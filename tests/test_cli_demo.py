@@ -11,7 +11,7 @@ import torch
 from cli_helpers import turbopi
 from PIL import Image
 
-from turbopi import demo
+from turbopi import demo, shipped
 from turbopi.backends.base import Sample
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.checkpoint import random_checkpoint
@@ -21,6 +21,7 @@ from turbopi.plots import action_groups
 from turbopi.policy import UnifiedPolicy
 from turbopi.sim import SimulatorUnavailable
 from turbopi.sim.libero import LiberoSimulator
+from turbopi.verify import control
 
 
 def tiny_oracle(preset: str = "pi05_tiny") -> UnifiedPolicy:
@@ -28,7 +29,7 @@ def tiny_oracle(preset: str = "pi05_tiny") -> UnifiedPolicy:
 
 
 def test_the_frames_are_real_pictures_with_states_and_prompts() -> None:
-    frames = demo.load_frames()
+    frames = shipped.load_frames()
     assert len(frames) >= 3
     for frame in frames:
         for picture in (frame.base, frame.wrist):
@@ -42,7 +43,7 @@ def test_the_frames_are_real_pictures_with_states_and_prompts() -> None:
 
 def test_missing_pictures_are_said_to_be_missing(tmp_path: Path) -> None:
     with pytest.raises(TurboPiError, match=r"has no frames.json: the installation lacks the demo's pictures"):
-        demo.load_frames(tmp_path)
+        shipped.load_frames(tmp_path)
 
 
 def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_expert(tmp_path: Path) -> None:
@@ -55,7 +56,7 @@ def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_exp
     assert "backend: pytorch (auto: on a CPU" in out
     for heading in ("preprocess", "vision", "prefix", "denoise", "postprocess", "model", "total"):
         assert heading in out
-    for frame in demo.load_frames()[:2]:
+    for frame in shipped.load_frames()[:2]:
         assert frame.prompt.split()[-1] in out
     assert "the chunk, 10 steps of 7" in out
     assert "The bound is 10 times the control" in out
@@ -133,11 +134,11 @@ def test_a_report_folder_that_cannot_be_made_is_refused_before_the_work(tmp_path
 
 @pytest.mark.parametrize("preset", ["pi05_tiny", "pi05_droid", "pi05_aloha", "pi05_base"])
 def test_the_pictures_reach_every_robots_cameras(preset: str) -> None:
-    frame = demo.load_frames()[0]
+    frame = shipped.load_frames()[0]
     checkpoint = random_checkpoint("pi05_tiny")
     robot = random_checkpoint(preset).config.robot
     policy = UnifiedPolicy(checkpoint, backend="pytorch", robot=robot) if robot == "libero" else _for_robot(robot)
-    (observation,) = demo.observations(policy, [frame])
+    (observation,) = shipped.observations(policy, [frame])
     inputs, _ = policy._pipeline.before(observation)
     expected = np.asarray(Image.fromarray(frame.base).resize((224, 224), Image.Resampling.BILINEAR))
     np.testing.assert_array_equal(inputs.images[0], expected)
@@ -153,7 +154,7 @@ def _for_robot(robot: str) -> UnifiedPolicy:
 
 def test_the_check_passes_the_oracle_itself_and_refuses_anything_else() -> None:
     oracle = tiny_oracle()
-    observed = demo.observations(oracle, demo.load_frames()[:1])
+    observed = shipped.observations(oracle, shipped.load_frames()[:1])
     exact = [result["actions"] for result in demo.run_frames(oracle, observed, 0, lambda: None)]
 
     def judged(actions: np.ndarray, precision: Any = "bf16") -> demo.OracleCheck:
@@ -177,7 +178,7 @@ def test_the_check_passes_the_oracle_itself_and_refuses_anything_else() -> None:
 
 def test_an_error_is_the_same_however_many_frames_are_shown() -> None:
     oracle = tiny_oracle()
-    observed = demo.observations(oracle, demo.load_frames()[:2])
+    observed = shipped.observations(oracle, shipped.load_frames()[:2])
     off = [result["actions"] * 1.01 for result in demo.run_frames(oracle, observed, 0, lambda: None)]
     one, two = (demo.check(off[:n], oracle, observed[:n], precision="bf16", seed=0) for n in (1, 2))
     assert one.differences[0].rms == pytest.approx(two.differences[0].rms, rel=1e-4)
@@ -190,7 +191,7 @@ def test_an_error_is_the_same_however_many_frames_are_shown() -> None:
 def test_jitter_moves_what_bfloat16_would_round_and_is_undone() -> None:
     model = tiny_oracle().backend.model  # type: ignore[attr-defined]
     before = {name: parameter.clone() for name, parameter in model.named_parameters()}
-    with demo.jittered(model, 1):
+    with control.jittered(model, 1):
         moved = {name for name, parameter in model.named_parameters() if not torch.equal(parameter, before[name])}
         weight = model.vlm.layers[0].mlp.up_proj.weight
         ratio = weight / before["vlm.layers.0.mlp.up_proj.weight"] - 1
@@ -203,15 +204,15 @@ def test_jitter_moves_what_bfloat16_would_round_and_is_undone() -> None:
 
 def test_random_libero_weights_get_the_statistics_of_real_episodes() -> None:
     random = random_checkpoint("pi05_tiny")
-    real = demo.with_libero_stats(random).norm_stats.state
+    real = shipped.with_libero_stats(random).norm_stats.state
     assert real is not None
     assert real.q01 is not None
     assert real.q99 is not None
-    states = np.stack([frame.state for frame in demo.load_frames()])
+    states = np.stack([frame.state for frame in shipped.load_frames()])
     margin = 0.25 * (real.q99 - real.q01)
     assert ((real.q01 - margin <= states) & (states <= real.q99 + margin)).mean() > 0.9
     droid = replace(random, config=replace(random.config, robot="droid"))
-    assert demo.with_libero_stats(droid) is droid
+    assert shipped.with_libero_stats(droid) is droid
 
 
 @pytest.mark.parametrize(("robot", "dims"), [("libero", 7), ("droid", 8), ("aloha", 14), ("aloha", 7), ("mine", 19)])

@@ -14,9 +14,9 @@ from file_helpers import no_room
 from PIL import Image
 from typer.testing import Result
 
-from turbopi.demo import FRAMES, load_frames
 from turbopi.policy import UnifiedPolicy
-from turbopi.serve.record import Call, save_call
+from turbopi.recordings import RecordedCall, save_call
+from turbopi.shipped import FRAMES, load_frames
 
 TINY = ("--random-weights", "pi05_tiny", "--steps", 2, "--no-warmup")
 
@@ -44,7 +44,7 @@ def recording(tmp_path: Path) -> Path:
     folder.mkdir()
     for number in range(3):
         result = {"actions": np.zeros((10, 7)), "policy_timing": {}}
-        save_call(folder / f"{number:06d}.npz", Call(observation(number), result, 0.0))
+        save_call(folder / f"{number:06d}.npz", RecordedCall(observation(number), result, 0.0))
     return folder
 
 

@@ -21,12 +21,12 @@ from cli_helpers import refusal, turbopi
 from websockets.sync.client import connect
 
 from turbopi.checkpoint import random_checkpoint
-from turbopi.demo import load_frames
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
+from turbopi.recordings import iter_recording
 from turbopi.serve import running
-from turbopi.serve.record import iter_recording
-from turbopi.serve.wire import pack, unpack
+from turbopi.shipped import load_frames
+from turbopi.wire import pack, unpack
 
 TINY = ("--random-weights", "pi05_tiny", "--steps", "2")
 

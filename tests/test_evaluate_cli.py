@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 from turbopi import serve
 from turbopi.cli import app
 from turbopi.cli.options import PolicyOptions
-from turbopi.serve.record import load_call, recorded_files
+from turbopi.recordings import load_call, recorded_files
 from turbopi.sim import libero
 
 QUICK = "--random-weights pi05_tiny --precision f32 --steps 1 --camera-px 64 --image-px 64 --videos none"

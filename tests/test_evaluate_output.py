@@ -14,7 +14,7 @@ from file_helpers import no_room
 
 from turbopi.errors import ConfigError, OutputError
 from turbopi.evaluate.compare import HEADS, cells, compare, write_comparison
-from turbopi.evaluate.episode import Frame
+from turbopi.evaluate.frames import Frame
 from turbopi.evaluate.plan import VideoPlan, parse_numbers
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.report import write_report

@@ -19,8 +19,8 @@ from turbopi import serve
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.sources import Answer, LocalPolicy, PolicyLost, PolicyRefused, RemotePolicy, check_fit
-from turbopi.serve.wire import MAX_BYTES, pack
 from turbopi.sim import SimSettings, create
+from turbopi.wire import MAX_BYTES, pack
 
 SETTINGS = SimSettings(camera_px=64)
 

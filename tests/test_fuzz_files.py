@@ -37,11 +37,11 @@ from turbopi.evaluate.visited import Visited
 from turbopi.export.onnx import GRAPHS, MANIFEST, open_export
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.recordings import RecordedCall, load_call, load_observation, save_call
 from turbopi.robots.described import load_robot
-from turbopi.serve.record import Call, load_call, load_observation, save_call
-from turbopi.serve.wire import pack, unpack
 from turbopi.sim import Task
 from turbopi.tensorrt.calibrate import Calibration
+from turbopi.wire import pack, unpack
 
 FACTOR = float(os.environ.get("TURBOPI_FUZZ", "1"))
 MAX_GROWTH = 700 * 2**20  # of memory, by a target with all of its damages
@@ -304,8 +304,9 @@ TARGETS = (
            lambda f: load_noise(f / "n.npy").shape, _as_bytes, 200),
     Target("noise in an npz", lambda f: np.savez(f / "n.npz", noise=np.ones((10, 32), np.float32)), "n.npz",
            lambda f: _arrays(load_noise(f / "n.npz")), _as_bytes, 300, exact=True),
-    Target("recording", lambda f: save_call(f / "0.npz", Call(_observation(), {"actions": np.ones((2, 7))}, 1.0)),
-           "0.npz", lambda f: _arrays(dataclasses.asdict(load_call(f / "0.npz"))), _as_bytes, 400, exact=True),
+    Target("recording",
+           lambda f: save_call(f / "0.npz", RecordedCall(_observation(), {"actions": np.ones((2, 7))}, 1.0)), "0.npz",
+           lambda f: _arrays(dataclasses.asdict(load_call(f / "0.npz"))), _as_bytes, 400, exact=True),
     Target("visited", lambda f: _visited(f), "visited.npz", lambda f: _arrays(Visited(f).entries),
            _as_bytes, 200, exact=True),
     Target("message", lambda f: (f / "m").write_bytes(pack(_observation())), "m",

@@ -15,7 +15,7 @@ from turbopi.cli.files import load_noise
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.evaluate.visited import FILE, Visited
 from turbopi.reading.pictures import read_picture
-from turbopi.serve.record import Call, iter_recording, load_call, load_observation, save_call
+from turbopi.recordings import RecordedCall, iter_recording, load_call, load_observation, save_call
 
 PIXELS = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
 
@@ -120,7 +120,7 @@ def test_a_link_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
 def test_an_array_of_the_answer_is_not_read_with_the_observation(tmp_path: Path) -> None:
     """Its damage doesn't matter then, and neither does its size."""
     file = tmp_path / "000000.npz"
-    save_call(file, Call({"state": np.ones(3)}, {"actions": np.full((2, 3), 1.25)}, 1.0))
+    save_call(file, RecordedCall({"state": np.ones(3)}, {"actions": np.full((2, 3), 1.25)}, 1.0))
     data = file.read_bytes()
     numbers = np.full((2, 3), 1.25).tobytes()
     assert data.count(numbers) == 1
@@ -148,7 +148,7 @@ def test_an_array_of_the_answer_is_not_read_with_the_observation(tmp_path: Path)
 )
 def test_an_index_that_save_call_did_not_write_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     file = tmp_path / "000000.npz"
-    save_call(file, Call({"state": np.ones(3)}, {"actions": np.ones((2, 3))}, 1.0))
+    save_call(file, RecordedCall({"state": np.ones(3)}, {"actions": np.ones((2, 3))}, 1.0))
     with np.load(file) as stored:
         arrays = dict(stored)
     index = json.loads(arrays["index"].tobytes()) | change
@@ -159,7 +159,7 @@ def test_an_index_that_save_call_did_not_write_is_refused(tmp_path: Path, change
 
 @pytest.mark.parametrize("actions", ["none", None, np.ones(3), np.ones((1, 2), np.int64), [[1.0]]])
 def test_recorded_actions_are_an_array(tmp_path: Path, actions: Any) -> None:
-    save_call(tmp_path / "000000.npz", Call({"state": np.ones(3)}, {"actions": actions}, 1.0))
+    save_call(tmp_path / "000000.npz", RecordedCall({"state": np.ones(3)}, {"actions": actions}, 1.0))
     assert "expected an array of numbers [H, d]" in _refused(lambda: list(iter_recording(tmp_path)))
 
 

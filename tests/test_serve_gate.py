@@ -24,7 +24,7 @@ from turbopi.errors import ConfigError
 from turbopi.serve import PolicyServer
 from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limited_log import LimitedLog
-from turbopi.serve.wire import pack
+from turbopi.wire import pack
 
 REASON = "CUDA error: an illegal memory access was encountered"
 

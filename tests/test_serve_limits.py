@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from turbopi.errors import ConfigError
 from turbopi.serve import PolicyServer, limits, listener
 from turbopi.serve.limits import AtMost, Limits, room_for_connections
-from turbopi.serve.wire import pack
+from turbopi.wire import pack
 
 NIL = b"\xdd\0\0\x4e\x1e" + b"\xc0" * 19_998  # 20 kB, 19 998 values
 

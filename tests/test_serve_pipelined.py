@@ -17,7 +17,7 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.serve import PolicyServer
-from turbopi.serve.wire import pack, unpack
+from turbopi.wire import pack, unpack
 
 Test = Callable[[PolicyServer, PipelinedFakePolicy], Awaitable[None]]
 

@@ -14,8 +14,8 @@ from PIL import Image
 
 from turbopi.errors import ConfigError, ObservationError, OutputError
 from turbopi.files import append_line
-from turbopi.serve import record
-from turbopi.serve.record import Call, Recorder, iter_recording, load_call, load_observation, save_call
+from turbopi.recordings import RecordedCall, Recorder, iter_recording, load_call, load_observation, save_call
+from turbopi.recordings import recorder as record
 
 RESULT = {
     "actions": np.arange(14.0).reshape(2, 7),
@@ -71,7 +71,7 @@ def test_any_observation_comes_back_unchanged(
     tmp_path_factory: pytest.TempPathFactory, observation: dict[str, Any]
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "call.npz"
-    save_call(path, Call(observation, RESULT, 1.5))
+    save_call(path, RecordedCall(observation, RESULT, 1.5))
     call = load_call(path)
     assert_equal(call.observation, observation)
     assert_equal(call.result, RESULT)
@@ -80,12 +80,12 @@ def test_any_observation_comes_back_unchanged(
 
 def test_keys_that_join_to_the_same_name_stay_apart(tmp_path: Path) -> None:
     observation = {"a/b": np.zeros(1), "a": {"b": np.ones(2)}}
-    save_call(tmp_path / "x.npz", Call(observation, RESULT, 0.0))
+    save_call(tmp_path / "x.npz", RecordedCall(observation, RESULT, 0.0))
     assert_equal(load_observation(tmp_path / "x.npz"), observation)
 
 
 def test_plain_numpy_reads_the_arrays_by_their_keys(tmp_path: Path) -> None:
-    save_call(tmp_path / "x.npz", Call({"observation/state": np.arange(8.0)}, RESULT, 0.0))
+    save_call(tmp_path / "x.npz", RecordedCall({"observation/state": np.arange(8.0)}, RESULT, 0.0))
     with np.load(tmp_path / "x.npz", allow_pickle=False) as archive:
         assert set(archive.files) == {"observation/observation/state", "result/actions", "index"}
         np.testing.assert_array_equal(archive["result/actions"], RESULT["actions"])
@@ -94,7 +94,7 @@ def test_plain_numpy_reads_the_arrays_by_their_keys(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", [object(), np.array([None]), {1: 2}])
 def test_what_cannot_be_stored_is_refused_and_leaves_no_file(tmp_path: Path, value: Any) -> None:
     with pytest.raises(ObservationError, match="can't record"):
-        save_call(tmp_path / "x.npz", Call({"x": value}, RESULT, 0.0))
+        save_call(tmp_path / "x.npz", RecordedCall({"x": value}, RESULT, 0.0))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -131,7 +131,7 @@ class SlowDisk:
         self.writing, self.may_write = threading.Event(), threading.Event()
         monkeypatch.setattr(record, "save_call", self)
 
-    def __call__(self, path: Path, call: Call) -> None:
+    def __call__(self, path: Path, call: RecordedCall) -> None:
         self.writing.set()
         assert self.may_write.wait(30)
         save_call(path, call)

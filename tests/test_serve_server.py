@@ -22,10 +22,10 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidStatus
 
 from turbopi.errors import ConfigError, DeviceLost
+from turbopi.recordings import iter_recording
 from turbopi.serve import PolicyServer, running
 from turbopi.serve.limits import Limits
-from turbopi.serve.record import iter_recording
-from turbopi.serve.wire import pack, unpack
+from turbopi.wire import pack, unpack
 
 
 def served(
@@ -321,7 +321,7 @@ def test_a_client_that_leaves_costs_nothing(how: str) -> None:
         ("stop iteration", "StopIteration"),
         ("exit", "SystemExit: 3"),
         ("no actions", 'TypeError: the policy\'s result must be a dict with "actions", not dict'),
-        ("unpackable", "turbopi.serve.wire.WireError: can't send a builtins.object"),
+        ("unpackable", "turbopi.wire.WireError: can't send a builtins.object"),
     ],
 )
 def test_a_failing_policy_sends_its_traceback_closes_1011_and_the_server_goes_on(prompt: str, last_line: str) -> None:

@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from turbopi import wire
 from turbopi.errors import ObservationError
-from turbopi.serve import wire
-from turbopi.serve.wire import MAX_DEPTH, MAX_STEPS, MAX_VALUES, WireError, pack, unpack
+from turbopi.wire import MAX_DEPTH, MAX_STEPS, MAX_VALUES, WireError, pack, unpack
 
 GOLDEN = json.loads((Path(__file__).parent / "golden" / "preprocess" / "msgpack.json").read_text())
 OBJECTS = {item["name"]: item for item in GOLDEN["objects"]}

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from turbopi.checkpoint import open_checkpoint
-from turbopi.demo import SMALL_POLICY, expert_distance, load_frames, observations
+from turbopi.demo import expert_distance
 from turbopi.policy import UnifiedPolicy
+from turbopi.shipped import SMALL_POLICY, load_frames, observations
 
 PICTURES = ("observation/image", "observation/wrist_image")
 FRAMES = load_frames()

@@ -17,11 +17,11 @@ from small_policy.start import fresh_model
 from small_policy.train import Settings, Trainer, prompt_table, toy_memory
 from torch import Tensor
 
-from turbopi.demo import SMALL_POLICY
 from turbopi.model import denoise
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
+from turbopi.shipped import SMALL_POLICY
 
 STATS = SMALL_POLICY / "assets" / "turbopi" / "libero_spatial" / "norm_stats.json"
 

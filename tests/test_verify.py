@@ -17,7 +17,7 @@ from turbopi.errors import CheckpointError
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
-from turbopi.serve.record import Call, save_call
+from turbopi.recordings import RecordedCall, save_call
 from turbopi.verify import certificates
 from turbopi.verify import inputs as verify_inputs
 from turbopi.verify.inputs import Plan
@@ -186,7 +186,7 @@ def test_overridden_bounds_decide_and_are_recorded() -> None:
 def test_a_recording_is_verified_by_its_files(tmp_path: Path) -> None:
     policy = tiny_policy()
     for number in range(3):
-        call = Call(policy.example_observation(number), {"actions": np.zeros((10, 7))}, 0.0)
+        call = RecordedCall(policy.example_observation(number), {"actions": np.zeros((10, 7))}, 0.0)
         save_call(tmp_path / f"{number:06d}.npz", call)
     document = verify(random_checkpoint("pi05_tiny"), quick_plan(observations=tmp_path, count=2))
     assert document["observations"]["names"] == ["000000.npz", "000001.npz"]

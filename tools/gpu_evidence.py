@@ -26,7 +26,7 @@ PRODUCT = (
 )
 # Modules that those import and that only read files or format text on the host: CPU tests see all of what they do.
 HOST_ONLY = (
-    *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.serve", "turbopi.demo"),
+    *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.serve", "turbopi.shipped"),
     *("turbopi.export", "turbopi.tensorrt", "turbopi.errors", "turbopi.files", "turbopi.reading", "turbopi.arguments"),
     *("turbopi.provenance", "turbopi.verify.golden"),
 )

@@ -22,8 +22,8 @@ from attack.messages import observation
 from attack.server import GoodClient, ServerProcess, environment
 from attack.websocket import PING, Raw, frame, header
 from turbopi.errors import TurboPiError
-from turbopi.serve.record import load_call
-from turbopi.serve.wire import pack
+from turbopi.recordings import load_call
+from turbopi.wire import pack
 
 END_S = 20.0  # a SIGTERM is obeyed within, whatever clients do
 WAIT_S = 60.0  # after which a server that doesn't end is killed

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from attack.websocket import BINARY, CLOSE, PING, PONG, TEXT, frame, header
-from turbopi.serve.wire import pack
+from turbopi.wire import pack
 
 
 @dataclass(frozen=True)

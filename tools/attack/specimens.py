@@ -41,7 +41,7 @@ def _helpers() -> Any:
 
 def observation() -> dict[str, Any]:
     """One of LIBERO's, as a robot sends it."""
-    from turbopi.demo import load_frames
+    from turbopi.shipped import load_frames
 
     frame = load_frames()[0]
     return {
@@ -93,7 +93,7 @@ def _by_hand(folder: Path) -> None:
 
 
 def _recording(folder: Path) -> None:
-    from turbopi.serve.record import Recorder
+    from turbopi.recordings import Recorder
 
     recorder = Recorder(folder, {"policy": "fake"})
     for number in range(2):
@@ -185,13 +185,13 @@ def read_observation_npz(folder: str) -> None:
 
 
 def read_observation(path: str) -> None:
-    from turbopi.serve.record import load_observation
+    from turbopi.recordings import load_observation
 
     _told(lambda: load_observation(path))
 
 
 def read_recording(folder: str) -> None:
-    from turbopi.serve.record import iter_recording
+    from turbopi.recordings import iter_recording
 
     _told(lambda: [[observation, actions] for observation, actions in iter_recording(folder)])
 

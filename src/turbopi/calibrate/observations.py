@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi import demo
+from turbopi import shipped
 from turbopi.calibrate.artifact import RANDOM_NOISE
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.observation import ModelInputs, Observation
 from turbopi.policy import UnifiedPolicy
-from turbopi.serve.record import load_observation, recorded_files
+from turbopi.recordings import load_observation, recorded_files
 
 LIBERO = "the LIBERO pictures that come with Turbo-Pi"
 EVERY = 4  # of so many observations one is held out
@@ -86,7 +86,7 @@ def _observations(
                 f"calibration for robot {robot!r} needs observations of it: --observations RECORDING, which "
                 "`turbopi serve --record` writes"
             )
-        listed = demo.observations(policy, demo.load_frames())
+        listed = shipped.observations(policy, shipped.load_frames())
         return LIBERO, ((f"LIBERO frame {i}", listed[i]) for i in spread(len(listed), count))
     path = Path(source)
     files = observation_files(path)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbopi import backends, demo
+from turbopi import backends, shipped
 from turbopi.calibrate.directions import Rows, directions
 from turbopi.calibrate.emulate import Round, RoundedWeights, delta_cosine, relative_rms, replaced, rounded
 from turbopi.calibrate.formats import attention_in_fp8, round_nvfp4
@@ -99,7 +99,7 @@ def in_nvfp4(
         yield
 
 
-def _observation(frame: demo.Frame, prompt: str) -> dict[str, Any]:
+def _observation(frame: shipped.Frame, prompt: str) -> dict[str, Any]:
     return {
         "observation/image": frame.base,
         "observation/wrist_image": frame.wrist,
@@ -122,11 +122,11 @@ def run(
     formats: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """All errors, on LIBERO pictures: by weights and format; written to `out` as they come."""
-    checkpoint = demo.with_libero_stats(random_checkpoint(preset))
+    checkpoint = shipped.with_libero_stats(random_checkpoint(preset))
     sizes = checkpoint.config.model
     tokenizer = load_tokenizer(TINY_TOKENIZER, checkpoint_dir=None, candidates=(), vocab_size=sizes.vocab_size)
     pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, tokenizer)
-    frames = demo.load_frames()
+    frames = shipped.load_frames()
     if not 1 <= count < len(frames):
         raise SystemExit(f"--count is from 1 to {len(frames) - 1}, as other frames give the directions; it is {count}")
     samples = [  # one prompt, so that they are one batch

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbopi import backends, demo
+from turbopi import backends, shipped
 from turbopi.calibrate import observations as observed
 from turbopi.calibrate.artifact import RANDOM_NOISE, Quantization, SiteScale, shapes_of
 from turbopi.calibrate.directions import Rows, directions
@@ -65,7 +65,7 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     """
     progress, started = progress or Progress(), time.perf_counter()
     if settings.arguments.get("robot") is None:
-        checkpoint = demo.with_libero_stats(checkpoint)
+        checkpoint = shipped.with_libero_stats(checkpoint)
     arguments = dict(settings.arguments) | {"backend": "pytorch", "precision": "f32"}
     arguments["device"] = backends.resolve_device(arguments.get("device", "auto"))
     policy = UnifiedPolicy(checkpoint, **arguments)

@@ -164,10 +164,10 @@ def calibration_observations(policy: "UnifiedPolicy", path: Path | None) -> "tup
 def given_observations(policy: "UnifiedPolicy", path: Path | None) -> tuple[list[dict[str, Any]], str]:
     """Observations under the robot's keys, and where they are from; None: the pictures that come with Turbo-Pi."""
     if path is None:
-        from turbopi.demo import load_frames, observations
+        from turbopi.shipped import load_frames, observations
 
         return observations(policy, load_frames()), "LIBERO pictures that come with Turbo-Pi"
     from turbopi.cli.infer import _sources
-    from turbopi.serve.record import load_observation
+    from turbopi.recordings import load_observation
 
     return [load_observation(one) for one in _sources(path, None)], path.name

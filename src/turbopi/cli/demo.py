@@ -17,7 +17,8 @@ from turbopi.files import write_whole
 if TYPE_CHECKING:
     import numpy as np
 
-    from turbopi.demo import Frame, OracleCheck
+    from turbopi.demo import OracleCheck
+    from turbopi.shipped import Frame
 
 
 @command(
@@ -63,7 +64,7 @@ def demo(
     actions.npz, report.json and episodes/. Exit code 1: the check failed.
     """
     if checkpoint is None and options.random_weights is None:
-        from turbopi.demo import SMALL_POLICY
+        from turbopi.shipped import SMALL_POLICY
 
         checkpoint = str(SMALL_POLICY)
     check_folder(report)  # what can't be written is better known before the work
@@ -82,8 +83,9 @@ class _Run:
         self, options: PolicyOptions, checkpoint: str | None, limit: int | None, seed: int, output: Output
     ) -> None:
         opened = options.open(checkpoint)
-        from turbopi.demo import check, load_frames, num_oracle_runs, observations, run_frames, with_libero_stats
+        from turbopi.demo import check, num_oracle_runs, run_frames
         from turbopi.policy import UnifiedPolicy
+        from turbopi.shipped import load_frames, observations, with_libero_stats
 
         self.output, self.seed = output, seed
         self.frames: list[Frame] = load_frames()[:limit]

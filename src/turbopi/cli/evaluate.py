@@ -159,8 +159,8 @@ class EvalOptions(PolicyOptions):
 
     def local_policy(self, checkpoint: str | None, output: Output) -> "PolicySource":
         """The policy in this process, warmed up."""
-        from turbopi.demo import with_libero_stats
         from turbopi.evaluate.sources import LocalPolicy
+        from turbopi.shipped import with_libero_stats
 
         opened = with_libero_stats(self.open(checkpoint))
         self.tell_if_random(opened, output)

@@ -89,7 +89,7 @@ def infer(
         raise ConfigError("--plot and --no-plot were both given; give one of them")
     check_writable(out)
     drawing = None if no_plot else plot or out.with_suffix(".png")
-    from turbopi.serve.record import load_observation
+    from turbopi.recordings import load_observation
 
     _check_targets(Path(source), out, drawing)
     sources = _sources(Path(source), call)
@@ -155,7 +155,7 @@ def _is_of(file: Path, source: Path) -> bool:
 
 def _sources(path: Path, call: int | None) -> list[Path]:
     """The observation at a path, or all those of a recording; `call` picks one of them."""
-    from turbopi.serve.record import recorded_files
+    from turbopi.recordings import recorded_files
 
     if not path.is_dir() or (path / "observation.json").is_file():
         if call is not None:
@@ -191,7 +191,7 @@ def _run(
     policy: "UnifiedPolicy", sources: list[Path], draw: Callable[[int], "np.ndarray"], output: Output
 ) -> list[_Answer]:
     """Every observation through the policy. ObservationError names the file of a recording that is wrong."""
-    from turbopi.serve.record import load_observation
+    from turbopi.recordings import load_observation
 
     answers = []
     hidden = not output.shows_progress or len(sources) == 1

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from turbopi.evaluate.frames import Frame
 from turbopi.evaluate.plan import Job
 from turbopi.sim import Environment
 
@@ -22,21 +23,7 @@ class Ending:
     status: str
     steps: int
     message: str | None = None
-    frames: "list[Frame]" = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One picture of a film: what the cameras see at a step, and the chunk that is being carried out.
-
-    planned, done   how many of its actions will be carried out before the policy is asked again, and have been
-    """
-
-    step: int
-    pictures: list[np.ndarray]
-    chunk: np.ndarray  # [H, d]
-    planned: int
-    done: int
+    frames: list[Frame] = field(default_factory=list)
 
 
 def run_episode(

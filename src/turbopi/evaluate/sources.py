@@ -9,8 +9,8 @@ import numpy as np
 
 from turbopi.errors import ActionError, ConfigError, ObservationError, TurboPiError
 from turbopi.reading import is_finite, shown
-from turbopi.serve.wire import MAX_BYTES, WireError, pack, unpack
 from turbopi.sim import SimSettings, Simulator
+from turbopi.wire import MAX_BYTES, WireError, pack, unpack
 
 CONNECT_S = 10.0
 ANSWER_S = 600.0  # a server's first call may compile

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from turbopi.errors import OutputError, TurboPiError
-from turbopi.evaluate.episode import Frame
+from turbopi.evaluate.frames import Frame
 from turbopi.files import new_file
 
 VIEW = 320  # pixels of each camera's square

@@ -11,7 +11,7 @@ from turbopi.evaluate.plan import Job
 from turbopi.evaluate.sources import Answer, PolicySource
 from turbopi.files import write_whole
 from turbopi.reading import listing, read_npz
-from turbopi.serve.record import Recorder
+from turbopi.recordings import Recorder
 
 FILE = "visited.npz"
 KEPT = 48

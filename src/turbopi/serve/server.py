@@ -28,6 +28,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
 from turbopi.errors import ConfigError, DeviceLost
+from turbopi.recordings import Recorder
 from turbopi.serve.calls import Outcome, Policy, PolicyCalls
 from turbopi.serve.connection import GuardedConnection, Shared
 from turbopi.serve.gate import Gate, check_key
@@ -36,10 +37,9 @@ from turbopi.serve.limited_log import LimitedLog
 from turbopi.serve.limits import Limits, limits_for
 from turbopi.serve.listener import Listener
 from turbopi.serve.metrics import Metrics
-from turbopi.serve.record import Recorder
 from turbopi.serve.signals import stop_signals
-from turbopi.serve.wire import WireError, pack, unpack
 from turbopi.serve.worker import Busy, Stopping, Worker
+from turbopi.wire import WireError, pack, unpack
 
 logger = logging.getLogger(__name__)
 

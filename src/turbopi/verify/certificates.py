@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from turbopi import backends, demo
+from turbopi import backends, shipped
 from turbopi.backends import Tier
 from turbopi.calibrate.artifact import TIERS, Quantization
 from turbopi.calibrate.run import Settings, calibrate
 from turbopi.calibrate.studied import WEIGHTS, Weights, studied_checkpoint
 from turbopi.checkpoint import Checkpoint
 from turbopi.files import write_whole
-from turbopi.serve.record import Call, save_call
+from turbopi.recordings import RecordedCall, save_call
 from turbopi.verify.inputs import Plan
 from turbopi.verify.run import verify
 
@@ -31,7 +31,7 @@ _MOST_SHIFT = 20  # pixels
 
 def varied(seed: int, count: int) -> Iterator[dict[str, Any]]:
     """Observations made of the packaged LIBERO frames: shifted, relit, with another state."""
-    frames, rng = demo.load_frames(), np.random.default_rng(seed)
+    frames, rng = shipped.load_frames(), np.random.default_rng(seed)
     for number in range(count):
         frame = frames[number % len(frames)]
         yield {
@@ -50,7 +50,7 @@ def _varied(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _record(folder: Path, seed: int, count: int) -> Path:
     folder.mkdir()
     for number, observation in enumerate(varied(seed, count)):
-        save_call(folder / f"{number:06d}.npz", Call(observation, {}, 0.0))
+        save_call(folder / f"{number:06d}.npz", RecordedCall(observation, {}, 0.0))
     return folder
 
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from turbopi import demo
+from turbopi import shipped
 from turbopi.calibrate.observations import observation_files, spread
 from turbopi.errors import ObservationError
 from turbopi.observation import ModelInputs, Observation
 from turbopi.policy import UnifiedPolicy
-from turbopi.serve.record import load_observation
+from turbopi.recordings import load_observation
 
 DEFAULT_OBSERVATIONS = 8
 
@@ -88,8 +88,8 @@ def _observations(policy: UnifiedPolicy, plan: Plan) -> Iterator[tuple[str, Mapp
             yield name, load_observation(file)
         return
     wanted = DEFAULT_OBSERVATIONS if plan.count is None else plan.count
-    frames = demo.load_frames()[:wanted] if policy.metadata["robot"] == "libero" else []
-    for number, observation in enumerate(demo.observations(policy, frames)):
+    frames = shipped.load_frames()[:wanted] if policy.metadata["robot"] == "libero" else []
+    for number, observation in enumerate(shipped.observations(policy, frames)):
         yield f"LIBERO frame {number}", observation
     for seed in range(wanted - len(frames)):
         yield f"random example {seed}", policy.example_observation(seed)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from turbopi import backends, demo
+from turbopi import backends, shipped
 from turbopi.calibrate.artifact import Quantization, calibration_of
 from turbopi.calibrate.observations import inputs_bytes
 from turbopi.checkpoint import Checkpoint
@@ -25,6 +25,7 @@ from turbopi.model import exact
 from turbopi.model.reference import Pi0Model
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
+from turbopi.verify import control
 from turbopi.verify.inputs import Call, Plan, check_observations, make_calls, read_samples
 from turbopi.verify.intermediates import Tensors, in_order, tensors_of
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
@@ -59,7 +60,7 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
     check_observations(plan)
     quantization = calibration_of(arguments.get("quantization"), precision, checkpoint)
     if arguments.get("robot") is None:
-        checkpoint = demo.with_libero_stats(checkpoint)
+        checkpoint = shipped.with_libero_stats(checkpoint)
     arguments |= {"backend": name, "device": device, "quantization": None}  # of reference and control
 
     reference = _Reference(checkpoint, arguments, plan, progress)
@@ -153,7 +154,7 @@ class _Reference:
     def control(self, rule: Rule, checkpoint: Checkpoint, arguments: Mapping[str, Any], progress: Progress) -> Compared:
         """What rounding alone does. Changes the reference's weights in their last bit: nothing exact comes after it."""
         assert self._policy is not None
-        runs = len(demo.CONTROL_SEEDS) if rule.control == "jitter" else 1
+        runs = len(control.CONTROL_SEEDS) if rule.control == "jitter" else 1
         progress.begin("control", runs * len(self.calls))
         if rule.control == "bf16":
             self.release()
@@ -164,8 +165,8 @@ class _Reference:
             return compared
         compared = Compared()
         model: Pi0Model = self._policy.backend.model  # type: ignore[attr-defined]
-        for seed in demo.CONTROL_SEEDS:
-            with demo.jittered(model, seed):
+        for seed in control.CONTROL_SEEDS:
+            with control.jittered(model, seed):
                 self.compare(self._policy, progress, compared)
         return compared
 

@@ -5,23 +5,25 @@ from typing import Any, Literal
 
 import numpy as np
 
-from turbopi import demo
 from turbopi.calibrate.artifact import TIERS
 from turbopi.errors import BackendError, ConfigError
 from turbopi.plots import action_groups
+from turbopi.verify.bounds import (
+    BF16_FACTOR,
+    BOUND_FACTORS,
+    F32_BOUND,
+    FLOAT32_ROUNDING,
+    FP8_BOUND,
+    FP8_COSINE,
+    FP8_STEP,
+    JUMP,
+    SUSPECT_FACTOR,
+    TRAINED_FACTORS,
+)
 from turbopi.verify.inputs import Call
 from turbopi.verify.intermediates import Errors, ErrorsBy, Place, Suspect, Tensors, first_suspect, in_order
 
 ACTIONS = Place("actions")
-F32_BOUND = 1e-5  # relative rms of the actions
-BF16_FACTOR = 1.25  # times the bf16 control's
-FP8_BOUND = 0.0707  # relative rms of the actions: a cosine of 0.9975
-FP8_COSINE = 0.9975  # of what denoising did (actions less noise): what calibration aims at
-FP8_STEP = 2.0**5  # E4M3's rounding is so much coarser than bfloat16's, and so may intermediates be
-SUSPECT_FACTOR = 3.0  # times the control's, on an intermediate
-JUMP = 10.0  # times the layer or step before
-FLOAT32_ROUNDING = 1e-6  # relative rms: where the control stays in float32 it may have no error at all
-
 Control = Literal["bf16", "jitter"]
 
 
@@ -61,7 +63,7 @@ class Rule:
             reason = "a cosine of 0.9975 to float32, what calibration aims at"
             return cls(control, FP8_BOUND, None, reason, cosine=FP8_COSINE)
         if control == "jitter":
-            factors, seen = (demo.TRAINED_FACTORS, "5.5") if trained else (demo.BOUND_FACTORS, "3.2")
+            factors, seen = (TRAINED_FACTORS, "5.5") if trained else (BOUND_FACTORS, "3.2")
             reason = f"rounding activations besides weights was seen to cost up to {seen} times rounding weights alone"
             return cls(control, None, factors["bf16"], reason)
         return cls(control, None, BF16_FACTOR, "no worse than PyTorch's own bfloat16, with room for chance")
@@ -80,7 +82,7 @@ class Rule:
 
     @property
     def suspect_factor(self) -> float:
-        return demo.BOUND_FACTORS["bf16"] if self.control == "jitter" else SUSPECT_FACTOR
+        return BOUND_FACTORS["bf16"] if self.control == "jitter" else SUSPECT_FACTOR
 
     @property
     def control_says(self) -> str:

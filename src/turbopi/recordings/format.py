@@ -27,13 +27,14 @@ import numpy as np
 from turbopi.errors import ObservationError
 from turbopi.files import write_whole
 from turbopi.reading import Npz, is_finite, listing, parse_json, shown
+from turbopi.recordings.observation_folder import load_folder
 
 FORMAT = "turbopi-recording"
 VERSION = 1
 
 
 @dataclass(frozen=True)
-class Call:
+class RecordedCall:
     """One recorded call. `time` is the wall clock when it ended, in seconds since 1970."""
 
     observation: dict[str, Any]
@@ -44,7 +45,7 @@ class Call:
 # --- one call ---------------------------------------------------------------------------------------------------------
 
 
-def save_call(path: Path, call: Call) -> None:
+def save_call(path: Path, call: RecordedCall) -> None:
     """Write `call`, whole or not at all. Raises OutputError, and ObservationError for what can't be stored."""
     members: dict[str, np.ndarray] = {}
     index = {
@@ -59,7 +60,7 @@ def save_call(path: Path, call: Call) -> None:
     write_whole(path, lambda stream: np.savez(stream, **members), sync=False)  # type: ignore[arg-type]
 
 
-def load_call(path: str | Path) -> Call:
+def load_call(path: str | Path) -> RecordedCall:
     """Read one recorded call. Raises ObservationError if `path` isn't one, or can't be read."""
     with Npz(path) as members:
         if "index" not in members:
@@ -67,7 +68,7 @@ def load_call(path: str | Path) -> Call:
         return _to_call(members, path)
 
 
-def _to_call(members: Npz, path: str | Path, *, result: bool = True) -> Call:
+def _to_call(members: Npz, path: str | Path, *, result: bool = True) -> RecordedCall:
     """The call; without `result`, its arrays aren't read, and it is empty."""
     index = parse_json(
         members["index"].tobytes(), f"{path} has a damaged index: it", ObservationError, depth=200, nan=True
@@ -82,7 +83,7 @@ def _to_call(members: Npz, path: str | Path, *, result: bool = True) -> Call:
         answer = _from_node(index["result"], members) if result else {}
         if not isinstance(observation, dict) or not isinstance(answer, dict) or not is_finite(index["time"]):
             raise ValueError("the observation and the result should be dicts, the time a number")
-        return Call(observation, answer, float(index["time"]))
+        return RecordedCall(observation, answer, float(index["time"]))
     except ObservationError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -194,8 +195,6 @@ def load_observation(path: str | Path) -> dict[str, Any]:
     if not path.exists():
         raise ObservationError(f"{path} doesn't exist")
     if path.is_dir() and (path / "observation.json").is_file():
-        from turbopi.serve.observation_folder import load_folder  # pictures need torch, recordings don't
-
         return load_folder(path)
     with Npz(recorded_files(path)[0]) as members:
         if "index" in members:

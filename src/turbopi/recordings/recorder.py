@@ -12,24 +12,13 @@ from typing import Any
 
 from turbopi.errors import ConfigError, OutputError
 from turbopi.files import append_line, write_whole
-from turbopi.serve.record_format import (
-    FORMAT,
-    VERSION,
-    Call,
-    iter_recording,
-    load_call,
-    load_observation,
-    recorded_files,
-    save_call,
-)
-
-__all__ = ["Call", "Recorder", "iter_recording", "load_call", "load_observation", "recorded_files", "save_call"]
+from turbopi.recordings.format import FORMAT, VERSION, RecordedCall, save_call
 
 logger = logging.getLogger(__name__)
 
 
 class Recorder:
-    """Writes calls into a new folder below `record_dir` (layout: record_format.py), from a background thread.
+    """Writes calls into a new folder below `record_dir` (layout: format.py), from a background thread.
 
     At most `queue_calls` calls or `queue_bytes` bytes wait for the disk; what comes beyond is dropped, and counted in
     `dropped`. A call that can't be written (disk full, folder gone) is counted in `failed` and leaves a gap in the
@@ -53,7 +42,7 @@ class Recorder:
         self._queue_bytes = queue_bytes
         self._waiting_bytes = 0
         self._lock = threading.Lock()
-        self._queue: queue.Queue[tuple[Call, int] | None] = queue.Queue(queue_calls)
+        self._queue: queue.Queue[tuple[RecordedCall, int] | None] = queue.Queue(queue_calls)
         self._owed: list[str] = []  # lines of the index
         try:
             self.folder = _new_folder(Path(record_dir))
@@ -75,7 +64,7 @@ class Recorder:
                 self._waiting_bytes += size
         if not full:
             try:
-                self._queue.put_nowait((Call(observation, result, time.time()), size))
+                self._queue.put_nowait((RecordedCall(observation, result, time.time()), size))
                 return
             except queue.Full:
                 self._release(size)
@@ -85,7 +74,7 @@ class Recorder:
             logger.warning("%d calls weren't recorded: the disk can't keep up", self.dropped)
 
     def close(self, timeout: float = 30.0) -> None:
-        """Write what waits, for at most `timeout` seconds, and stop. Call `put` no more."""
+        """Write what waits, for at most `timeout` seconds, and stop. RecordedCall `put` no more."""
         deadline = time.monotonic() + timeout
         try:
             self._queue.put(None, timeout=timeout)
@@ -118,7 +107,7 @@ class Recorder:
             if _is_power_of_two(self.failed):
                 logger.warning("%d calls couldn't be recorded in %s: %s", self.failed, self.folder, failure)
 
-    def _write(self, name: str, call: Call) -> None:
+    def _write(self, name: str, call: RecordedCall) -> None:
         save_call(self.folder / name, call)
         timing = call.result.get("server_timing", {})
         line = {"file": name, "time": call.time, "infer_ms": timing.get("infer_ms")}

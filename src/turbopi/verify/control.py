@@ -1,0 +1,32 @@
+"""The control: what rounding the weights alone does to a model's actions, measured on the model itself."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import torch
+
+from turbopi.backends import Tier
+from turbopi.model.reference import Pi0Model, parameter_dtype
+
+CONTROL_SEEDS = (1, 2)
+# how much coarser than bfloat16's a precision's rounding is
+ROUNDING: dict[Tier, float] = {"bf16": 1.0, "f32": 2.0**-16, "fp8": 2.0**5, "fp8-mlp": 2.0**5}
+_HALF_BF16_STEP = 2.0**-9
+
+
+@contextmanager
+def jittered(model: Pi0Model, seed: int) -> Iterator[None]:
+    """For a while, each weight that is bfloat16 in the bf16 mode is moved by up to half a bfloat16 step."""
+    try:
+        _scale_weights(model, seed, torch.Tensor.mul_)
+        yield
+    finally:
+        _scale_weights(model, seed, torch.Tensor.div_)
+
+
+def _scale_weights(model: Pi0Model, seed: int, apply: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> None:
+    generator = torch.Generator(model.device).manual_seed(seed)
+    for name, parameter in model.named_parameters():
+        if parameter_dtype(name, "bf16") == torch.bfloat16:
+            uniform = torch.rand(parameter.shape, generator=generator, device=parameter.device)
+            apply(parameter.data, uniform.mul_(2).sub_(1).mul_(_HALF_BF16_STEP).add_(1))
