@@ -26,7 +26,7 @@ from turbopi.calibrate.artifact import (
     shapes_of,
 )
 from turbopi.calibrate.emulate import Round, RoundedWeights, relative_rms, replaced, through_norm
-from turbopi.calibrate.observations import calls, read_samples, split
+from turbopi.calibrate.observations import read_examples, split
 from turbopi.calibrate.run import Settings, by_harm, calibrate_model
 from turbopi.calibrate.sites import PARTS, linears, sites
 from turbopi.calibrate.statistics import Histogram, collect
@@ -36,12 +36,13 @@ from turbopi.cli.options import PolicyOptions
 from turbopi.config import preset
 from turbopi.engine.fp8 import E4M3, E4M3_MAX, Directions, to_e4m3
 from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, ObservationError, OutputError
+from turbopi.examples import Example, NoisyExample, with_noises
 from turbopi.model.layers import AdaRMSNorm
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.verify.check_golden import check_case, golden_calibration, golden_calls
-from turbopi.verify.inputs import Call, Plan, Sample
+from turbopi.verify.inputs import Plan
 from turbopi.verify.run import verify
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
@@ -248,7 +249,7 @@ def test_saturation_is_told_and_stays(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_random_noise_has_to_be_asked_for_and_is_told() -> None:
-    described, samples = read_samples(tiny_policy(), "random-noise", 3)
+    described, samples = read_examples(tiny_policy(), "random-noise", 3)
     assert described == "random-noise" and len(samples) == 3
     noisy = made_up(report={"observations": {"source": described}, "warnings": []})
     assert "random noise" in noisy.warnings[0]
@@ -256,12 +257,12 @@ def test_random_noise_has_to_be_asked_for_and_is_told() -> None:
 
 
 def test_every_fourth_observation_is_held_out() -> None:
-    _, samples = read_samples(tiny_policy(), None, 6)
+    _, samples = read_examples(tiny_policy(), None, 6)
     chosen, held = split(samples)
     assert [sample.source for sample in held] == ["LIBERO frame 3"]
     assert len(chosen) == 5
     assert [sample.source for sample in split(samples[:2])[1]] == ["LIBERO frame 1"]
-    made = calls(samples, (10, 32), 2, 5)
+    made = with_noises(samples, (10, 32), 2, 5)
     assert [call.seed for call in made] == list(range(5, 17))
     expected = np.random.default_rng(7).standard_normal((1, 10, 32), dtype=np.float32)
     np.testing.assert_array_equal(made[2].noise.numpy(), expected)
@@ -271,20 +272,20 @@ def test_a_recording_is_read_and_what_cannot_be_used_is_named(tmp_path: Path) ->
     for number in range(3):
         observation = tiny_policy().example_observation(number)
         save_call(tmp_path / f"{number:06d}.npz", RecordedCall(observation, {"actions": np.zeros((10, 7))}, 0.0))
-    _, samples = read_samples(tiny_policy(), str(tmp_path), 64)
+    _, samples = read_examples(tiny_policy(), str(tmp_path), 64)
     assert [sample.source for sample in samples] == ["000000.npz", "000001.npz", "000002.npz"]
     assert len({sample.sha256 for sample in samples}) == 3
     observation["observation/state"] = np.full(8, np.nan)
     save_call(tmp_path / "000002.npz", RecordedCall(observation, {"actions": np.zeros((10, 7))}, 0.0))
     with pytest.raises(ObservationError, match=r"^000002\.npz: .*finite"):
-        read_samples(tiny_policy(), str(tmp_path), 64)
+        read_examples(tiny_policy(), str(tmp_path), 64)
     with pytest.raises(ObservationError, match="needs two observations or more"):
-        read_samples(tiny_policy(), str(tmp_path / "000000.npz"), 64)
+        read_examples(tiny_policy(), str(tmp_path / "000000.npz"), 64)
     (tmp_path / "empty").mkdir()
     with pytest.raises(ObservationError, match="holds no recording"):
-        read_samples(tiny_policy(), str(tmp_path / "empty"), 64)
+        read_examples(tiny_policy(), str(tmp_path / "empty"), 64)
     with pytest.raises(ObservationError, match="doesn't exist"):
-        read_samples(tiny_policy(), str(tmp_path / "nowhere"), 64)
+        read_examples(tiny_policy(), str(tmp_path / "nowhere"), 64)
 
 
 # The file
@@ -517,7 +518,7 @@ def test_fp8_is_held_to_what_denoising_did_where_the_noise_hides_it(off: float, 
     noise = rng.standard_normal((1, 10, 32)).astype(np.float32)
     did, wrong = (0.1 * rng.standard_normal((2, 10, 32))).astype(np.float32)
     inputs = ModelInputs(np.zeros(1), np.ones(1, bool), np.zeros(1), np.ones(1, bool), np.zeros(1))
-    call = Call(0, Sample("one", inputs, np.zeros(8)), 0, torch.from_numpy(noise), first=True)
+    call = NoisyExample(0, Example("one", inputs, np.zeros(8)), 0, torch.from_numpy(noise), first=True)
     compared = Compared()
     exact, ours = {ACTIONS: noise[0] + did}, {ACTIONS: noise[0] + did + off * wrong}
     compared.add(call, ours, exact, ours[ACTIONS], exact[ACTIONS])
@@ -666,7 +667,7 @@ def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Pat
     for number in range(2):
         call = RecordedCall(policy.example_observation(number), {"actions": np.zeros((10, 7))}, 0.0)
         save_call(tmp_path / f"{number}.npz", call)
-    seen = [sample.sha256 for sample in read_samples(policy, str(tmp_path), 2)[1]]
+    seen = [sample.sha256 for sample in read_examples(policy, str(tmp_path), 2)[1]]
     report = {"observations": {"source": "x", "calibration": {"1": seen[1], "other": "0" * 64}}, "warnings": []}
     arguments = {"backend": "emulated_fp8", "precision": "fp8", "device": "cpu", "num_denoising_steps": 1}
     plan = Plan(arguments | {"quantization": made_up(report=report)}, tmp_path, noises=1)

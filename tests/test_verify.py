@@ -18,8 +18,8 @@ from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
 from turbopi.recordings import RecordedCall, save_call
+from turbopi.recordings.sources import chosen_files
 from turbopi.verify import certificates
-from turbopi.verify import inputs as verify_inputs
 from turbopi.verify.inputs import Plan
 from turbopi.verify.intermediates import Errors, Place, first_suspect, in_order, tensors_of
 from turbopi.verify.run import verify
@@ -197,8 +197,8 @@ def test_observations_made_by_hand_are_verified_too_evenly_spread(tmp_path: Path
     for number in range(4):
         (tmp_path / str(number)).mkdir()
         (tmp_path / str(number) / "observation.json").write_text("{}")
-    assert [path.name for path in verify_inputs._chosen(tmp_path, 2)] == ["0", "2"]
-    assert len(verify_inputs._chosen(tmp_path, None)) == 4
+    assert [name for name, _ in chosen_files(tmp_path, 2)] == ["0", "2"]
+    assert len(chosen_files(tmp_path)) == 4
 
 
 @pytest.mark.parametrize(

@@ -18,12 +18,13 @@ from turbopi import backends, shipped
 from turbopi.calibrate.directions import Rows, directions
 from turbopi.calibrate.emulate import Round, RoundedWeights, delta_cosine, relative_rms, replaced, rounded
 from turbopi.calibrate.formats import attention_in_fp8, round_nvfp4
-from turbopi.calibrate.observations import Batch, Sample, batches, calls
+from turbopi.calibrate.observations import Batch, batches
 from turbopi.calibrate.sites import MLP_KINDS, PARTS, Site, linears, sites
 from turbopi.calibrate.statistics import collect
 from turbopi.calibrate.studied import WEIGHTS, Weights, studied_checkpoint
 from turbopi.checkpoint import random_checkpoint
 from turbopi.engine.fp8 import Directions
+from turbopi.examples import Example, with_noises
 from turbopi.files import write_whole
 from turbopi.model.reference import Pi0Model
 from turbopi.preprocess.pipeline import Pipeline
@@ -129,17 +130,16 @@ def run(
     frames = shipped.load_frames()
     if not 1 <= count < len(frames):
         raise SystemExit(f"--count is from 1 to {len(frames) - 1}, as other frames give the directions; it is {count}")
-    samples = [  # one prompt, so that they are one batch
-        Sample(f"LIBERO frame {i}", pipeline.before(_observation(frame, frames[0].prompt))[0])
+    examples = [  # one prompt, so that they are one batch
+        Example(f"LIBERO frame {i}", *pipeline.before(_observation(frame, frames[0].prompt)))
         for i, frame in enumerate(frames)
     ]
     shape = (sizes.action_horizon, sizes.action_dim)
     made, seen = (
-        [batch for _, batch in batches(calls(some, shape, 1, seed), 8, device)]
-        for seed, some in enumerate((samples[:count], samples[count:]))
+        [batch for _, batch in batches(with_noises(some, shape, 1, seed), 8, device)]
+        for seed, some in enumerate((examples[:count], examples[count:]))
     )
-    samples = samples[:count]
-    about = {"provenance": provenance(device), "preset": preset, "steps": steps, "observations": len(samples)}
+    about = {"provenance": provenance(device), "preset": preset, "steps": steps, "observations": count}
     results: dict[str, Any] = {}
     for kind in kinds:
         model = Pi0Model.from_state(sizes, studied_checkpoint(kind, preset, device).load(device, "f32").state)

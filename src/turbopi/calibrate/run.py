@@ -20,13 +20,14 @@ from turbopi.calibrate import observations as observed
 from turbopi.calibrate.artifact import RANDOM_NOISE, Quantization, SiteScale, shapes_of
 from turbopi.calibrate.directions import Rows, directions
 from turbopi.calibrate.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
-from turbopi.calibrate.observations import Batch, Call
+from turbopi.calibrate.observations import Batch
 from turbopi.calibrate.product_errors import product_errors
 from turbopi.calibrate.sites import KINDS, MLP_KINDS, PARTS, Site, sites
 from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.fp8 import Directions
 from turbopi.errors import CheckpointError
+from turbopi.examples import NoisyExample, with_noises
 from turbopi.model.reference import Pi0Model, parameter_dtype
 from turbopi.policy import UnifiedPolicy
 
@@ -42,7 +43,7 @@ class Settings:
     """What to calibrate on and for. `arguments` are UnifiedPolicy's besides the checkpoint, backend and precision."""
 
     arguments: Mapping[str, Any]
-    observations: str | None = None  # see observations.read_samples
+    observations: str | None = None  # see observations.read_examples
     count: int = 64
     noises: int = 1
     seed: int = 0
@@ -69,12 +70,12 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     arguments = dict(settings.arguments) | {"backend": "pytorch", "precision": "f32"}
     arguments["device"] = backends.resolve_device(arguments.get("device", "auto"))
     policy = UnifiedPolicy(checkpoint, **arguments)
-    source, samples = observed.read_samples(policy, settings.observations, settings.count)
-    chosen, held = observed.split(samples)
+    source, examples = observed.read_examples(policy, settings.observations, settings.count)
+    chosen, held = observed.split(examples)
     config = policy.config.model
     shape = (config.action_horizon, config.action_dim)
-    calibration = observed.calls(chosen, shape, settings.noises, settings.seed)
-    held_out = observed.calls(held, shape, settings.noises, settings.seed + len(calibration))
+    calibration = with_noises(chosen, shape, settings.noises, settings.seed)
+    held_out = with_noises(held, shape, settings.noises, settings.seed + len(calibration))
     model: Pi0Model = policy.backend.model  # type: ignore[attr-defined]
     steps = int(policy.metadata["num_denoising_steps"])
     loaded = time.perf_counter()
@@ -87,11 +88,11 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
         "device": policy.metadata["device_name"],
         "observations": {
             "source": source,
-            "count": len(samples),
+            "count": len(examples),
             "noises": settings.noises,
             "seed": settings.seed,
-            "calibration": {sample.source: sample.sha256 for sample in chosen},
-            "held_out": {sample.source: sample.sha256 for sample in held},
+            "calibration": {one.source: one.sha256 for one in chosen},
+            "held_out": {one.source: one.sha256 for one in held},
         },
         **result.report,
     }
@@ -122,8 +123,8 @@ class Measured:
 
 def calibrate_model(
     model: Pi0Model,
-    calibration: Sequence[Call],
-    held_out: Sequence[Call],
+    calibration: Sequence[NoisyExample],
+    held_out: Sequence[NoisyExample],
     steps: int,
     settings: Settings,
     progress: Progress | None = None,
@@ -133,7 +134,9 @@ def calibrate_model(
     everywhere = sites(model.config)
     eligible = [site for site in everywhere if site.refusal is None]
 
-    def statistics(text: str, calls: Sequence[Call], rows: dict[str, Rows] | None = None) -> dict[str, Histogram]:
+    def statistics(
+        text: str, calls: Sequence[NoisyExample], rows: dict[str, Rows] | None = None
+    ) -> dict[str, Histogram]:
         made = list(observed.batches(calls, settings.batch, model.device))
         progress.begin(text, len(made))
 
@@ -208,7 +211,7 @@ def calibrate_model(
     return Measured(entries, report)
 
 
-def _apart(calibration: Sequence[Call]) -> tuple[Sequence[Call], Sequence[Call]]:
+def _apart(calibration: Sequence[NoisyExample]) -> tuple[Sequence[NoisyExample], Sequence[NoisyExample]]:
     """(calls to find directions on, calls to choose sites on); of a single call it is both."""
     count = min(SELECTION, len(calibration) // 2)
     if count == 0:
@@ -224,7 +227,7 @@ class _Trials:
     def __init__(
         self,
         model: Pi0Model,
-        calls: Sequence[Call],
+        calls: Sequence[NoisyExample],
         steps: int,
         size: int,
         progress: Progress,
@@ -245,7 +248,7 @@ class _Trials:
         return [batch for _, batch in self._made]
 
     @property
-    def calls(self) -> list[Call]:
+    def calls(self) -> list[NoisyExample]:
         return [call for calls, _ in self._made for call in calls]
 
     def actions(self, scales: Mapping[Site, float], model: Pi0Model | None = None) -> list[Tensor]:
@@ -382,7 +385,7 @@ def _held_out(
     ]
     worst = max(range(len(by_call)), key=by_call.__getitem__)
     call = trials.calls[worst]
-    report["worst"] = {"observation": call.sample.source, "seed": call.seed, "relative_rms": by_call[worst]}
+    report["worst"] = {"observation": call.example.source, "seed": call.seed, "relative_rms": by_call[worst]}
     return report
 
 

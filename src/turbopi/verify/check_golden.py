@@ -23,9 +23,9 @@ import torch
 from turbopi import backends
 from turbopi.backends import Tier
 from turbopi.calibrate.artifact import TIERS, Quantization, shapes_of
-from turbopi.calibrate.observations import Call, Sample
 from turbopi.calibrate.run import Settings, calibrate_model
 from turbopi.config import Kind
+from turbopi.examples import Example, NoisyExample
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
 from turbopi.verify.golden import Arrays, Case, GoldenFolder, Run
@@ -99,15 +99,17 @@ def check_folder(
             yield check_case(case, loaded[case.kind, precision])
 
 
-def golden_calls(case: Case) -> list[Call]:
+def golden_calls(case: Case) -> list[NoisyExample]:
     """A case's rows as calibration takes them."""
     observation = case.observation
     fields = [getattr(observation, name).numpy() for name in ("images", "image_mask", "tokens", "token_mask", "state")]
-    samples = [
-        Sample(f"{case.name} {row}", ModelInputs(*(field[row] for field in fields)))
+    examples = [
+        Example(f"{case.name} {row}", ModelInputs(*(field[row] for field in fields)), fields[-1][row])
         for row in range(observation.batch_size)
     ]
-    return [Call(sample, row, case.noise[row : row + 1]) for row, sample in enumerate(samples)]
+    return [
+        NoisyExample(row, example, row, case.noise[row : row + 1], first=True) for row, example in enumerate(examples)
+    ]
 
 
 def golden_calibration(
@@ -118,7 +120,7 @@ def golden_calibration(
     model = Pi0Model.from_state(checkpoint.config.model, checkpoint.load(device, "f32").state)
     calls = [call for case in folder.cases() if case.kind == kind for call in golden_calls(case)]
     calls = [call for call in calls if call.noise.shape == calls[0].noise.shape]
-    twice = sorted(calls * 2, key=lambda call: call.sample.source)  # one gives directions, the other chooses sites
+    twice = sorted(calls * 2, key=lambda call: call.example.source)  # one gives directions, the other chooses sites
     measured = calibrate_model(model, twice, calls, 3, Settings({}, target=target, batch=1, methods=("headroom",)))
     report = {**measured.report, "observations": {"source": "the golden cases themselves"}}
     return Quantization(checkpoint.fingerprint(), shapes_of(model.config), measured.sites, report)

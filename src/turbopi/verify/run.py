@@ -17,16 +17,16 @@ import torch
 
 from turbopi import backends, shipped
 from turbopi.calibrate.artifact import Quantization, calibration_of
-from turbopi.calibrate.observations import inputs_bytes
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.graph import empty_cache
 from turbopi.errors import BackendError, CheckpointError
+from turbopi.examples import NoisyExample
 from turbopi.model import exact
 from turbopi.model.reference import Pi0Model
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
 from turbopi.verify import control
-from turbopi.verify.inputs import Call, Plan, check_observations, make_calls, read_samples
+from turbopi.verify.inputs import Plan, check_observations, make_calls, read_examples
 from turbopi.verify.intermediates import Tensors, in_order, tensors_of
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
@@ -117,8 +117,8 @@ class _Reference:
         policy, self.device = self._policy, arguments["device"]
         self.steps = int(policy.metadata["num_denoising_steps"])
         self._pipeline = policy.pipeline
-        self.samples = list(read_samples(policy, plan))
-        self.calls = make_calls(policy, self.samples, plan)
+        self.examples = list(read_examples(policy, plan))
+        self.calls = make_calls(policy, self.examples, plan)
         self.milliseconds: list[float] = []
         self._exact: list[Tensors] = []
         self._robot: list[np.ndarray] = []
@@ -131,7 +131,7 @@ class _Reference:
                 if not np.isfinite(tensors[place]).all():
                     raise CheckpointError(
                         f"the float32 reference itself gives values that aren't finite: {place}, on "
-                        f"{call.sample.source}; these weights or statistics are damaged"
+                        f"{call.example.source}; these weights or statistics are damaged"
                     )
             self._exact.append(tensors)
             self._robot.append(self._robot_units(tensors, call))
@@ -175,45 +175,45 @@ class _Reference:
         self._policy = None
         _free(self.device)
 
-    def _robot_units(self, tensors: Tensors, call: Call) -> np.ndarray:
+    def _robot_units(self, tensors: Tensors, call: NoisyExample) -> np.ndarray:
         chunk = tensors[ACTIONS]
         if not np.isfinite(chunk).all():  # the robot's edge needn't cope with these
             shape = self._robot[0].shape if self._robot else chunk.shape
             return np.full(shape, np.nan)
-        return self._pipeline.after(chunk, call.sample.state)["actions"]
+        return self._pipeline.after(chunk, call.example.state)["actions"]
 
     def describe(self, plan: Plan, quantization: Quantization | None) -> dict[str, Any]:
         """What it was run on, with a hash of all of the model's inputs."""
         digest, calibrated = hashlib.sha256(), 0
         known = {} if quantization is None else quantization.report["observations"].get("calibration", {})
-        for sample in self.samples:
-            inputs = b"".join(inputs_bytes(sample.inputs))
+        for example in self.examples:
+            inputs = example.bytes()
             digest.update(inputs)
             calibrated += hashlib.sha256(inputs).hexdigest() in known.values()
         return {
             "calibrated_on": None if quantization is None else calibrated,
             "path": None if plan.observations is None else str(plan.observations),
-            "count": len(self.samples),
-            "names": [sample.source for sample in self.samples],
+            "count": len(self.examples),
+            "names": [example.source for example in self.examples],
             "sha256": digest.hexdigest(),
             "noises": plan.noises,
             "seed": plan.seed,
         }
 
 
-def _run(policy: UnifiedPolicy, call: Call, steps: int) -> Tensors:
+def _run(policy: UnifiedPolicy, call: NoisyExample, steps: int) -> Tensors:
     """One call's intermediates on the host, with the actions that `sample` gives."""
     observation = call.observation
     trace = policy.backend.intermediates(observation, call.noise, steps)
     missing = [name for name in _DEMANDED if name not in trace]
     if missing:
         raise BackendError(f"backend {policy.backend.name!r} doesn't expose {', '.join(missing)}; it can't be verified")
-    tensors = tensors_of(trace, call.sample.inputs, with_prefix=call.first)
+    tensors = tensors_of(trace, call.example.inputs, with_prefix=call.first)
     tensors[ACTIONS] = _sample(policy, call, steps)[0][0]
     return tensors
 
 
-def _sample(policy: UnifiedPolicy, call: Call, steps: int) -> tuple[np.ndarray, float]:
+def _sample(policy: UnifiedPolicy, call: NoisyExample, steps: int) -> tuple[np.ndarray, float]:
     """Actions float32[1, H, action_dim], a copy, and the milliseconds they took from host to host."""
     observation = call.observation
     start = time.perf_counter()
@@ -222,7 +222,7 @@ def _sample(policy: UnifiedPolicy, call: Call, steps: int) -> tuple[np.ndarray, 
     return actions.float().cpu().numpy().copy(), milliseconds
 
 
-def _repeat(policy: UnifiedPolicy, calls: Sequence[Call], steps: int, progress: Progress) -> Repetition:
+def _repeat(policy: UnifiedPolicy, calls: Sequence[NoisyExample], steps: int, progress: Progress) -> Repetition:
     result = Repetition()
     first: dict[int, np.ndarray] = {}
     for call in [*calls, *reversed(calls)]:
@@ -237,7 +237,7 @@ def _repeat(policy: UnifiedPolicy, calls: Sequence[Call], steps: int, progress: 
         if chunk.tobytes() == before.tobytes():
             result.identical += 1
             continue
-        result.differing = result.differing or call.sample.source
+        result.differing = result.differing or call.example.source
         both = np.isfinite(chunk) & np.isfinite(before)
         result.max = max(result.max, float(np.abs(chunk[both] - before[both]).max(initial=0.0)))
     return result

@@ -7,6 +7,7 @@ import numpy as np
 
 from turbopi.calibrate.artifact import TIERS
 from turbopi.errors import BackendError, ConfigError
+from turbopi.examples import NoisyExample
 from turbopi.plots import action_groups
 from turbopi.verify.bounds import (
     BF16_FACTOR,
@@ -20,7 +21,6 @@ from turbopi.verify.bounds import (
     SUSPECT_FACTOR,
     TRAINED_FACTORS,
 )
-from turbopi.verify.inputs import Call
 from turbopi.verify.intermediates import Errors, ErrorsBy, Place, Suspect, Tensors, first_suspect, in_order
 
 ACTIONS = Place("actions")
@@ -97,10 +97,12 @@ class Compared:
 
     by_place: ErrorsBy = field(default_factory=dict)
     by_dimension: list[Errors] = field(default_factory=list)  # robot units
-    by_call: list[tuple[Call, Errors]] = field(default_factory=list)  # actions
+    by_call: list[tuple[NoisyExample, Errors]] = field(default_factory=list)  # actions
     deltas: Errors = field(default_factory=Errors)  # what denoising did: actions less noise
 
-    def add(self, call: Call, tensors: Tensors, exact: Tensors, robot: np.ndarray, exact_robot: np.ndarray) -> None:
+    def add(
+        self, call: NoisyExample, tensors: Tensors, exact: Tensors, robot: np.ndarray, exact_robot: np.ndarray
+    ) -> None:
         """One call's tensors, and its actions [H, d] in the robot's units."""
         for place in tensors.keys() & exact.keys():
             ours, theirs = tensors[place], exact[place]
@@ -123,7 +125,7 @@ class Compared:
         return self.by_place[ACTIONS]
 
     @property
-    def worst(self) -> tuple[Call, Errors]:
+    def worst(self) -> tuple[NoisyExample, Errors]:
         return max(self.by_call, key=lambda one: one[1].relative_rms)
 
 
@@ -240,7 +242,7 @@ def _actions(robot: str, compared: Compared, control: Compared) -> dict[str, Any
         **compared.actions.as_json(),
         "deltas": {"cosine": compared.deltas.cosine, "relative_rms": compared.deltas.relative_rms},
         "control": control.actions.as_json() | {"deltas_cosine": control.deltas.cosine},
-        "worst": {"observation": call.sample.source, "seed": call.seed, **errors.as_json()},
+        "worst": {"observation": call.example.source, "seed": call.seed, **errors.as_json()},
         "dimensions": [
             {
                 "index": index,
