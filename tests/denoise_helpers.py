@@ -8,14 +8,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import GemmaConfig, ModelConfig, preset
-from turbopi.engine.fp8 import E4M3_MAX
-from turbopi.engine.weights import GemmaLayer
 from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
+from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.sm90.denoise.packing import KINDS
 from turbopi.kernels.sm90.denoise.plain import Operand, denoise_plain
 from turbopi.model.denoise import euler_step
 from turbopi.model.layers import apply_rope, rms_normalize, rope_tables
+from turbopi.quantization.fp8 import E4M3_MAX
 
 FULL = preset("pi05_libero").model
 BF16 = torch.bfloat16

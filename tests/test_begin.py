@@ -15,8 +15,9 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.cuda_graph import CudaGraphBackend, HostRow
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import Kind
-from turbopi.engine.ops import PLAIN, Ops
 from turbopi.errors import BackendError, ObservationError
+from turbopi.kernels.interface import Ops
+from turbopi.kernels.plain import PLAIN
 
 CPU = torch.device("cpu")
 

@@ -15,32 +15,27 @@ from file_helpers import no_room
 from torch import nn
 
 from turbopi import backends, shipped
-from turbopi.calibrate import formats, run
-from turbopi.calibrate.artifact import (
-    BESIDE,
-    VERSION,
-    Quantization,
-    SiteScale,
-    calibration_of,
-    for_policy,
-    shapes_of,
-)
-from turbopi.calibrate.emulate import Round, RoundedWeights, relative_rms, replaced, through_norm
+from turbopi.calibrate import run
 from turbopi.calibrate.observations import read_examples, split
 from turbopi.calibrate.run import Settings, by_harm, calibrate_model
-from turbopi.calibrate.sites import PARTS, linears, sites
 from turbopi.calibrate.statistics import Histogram, collect
-from turbopi.calibrate.studied import WEIGHTS, studied_checkpoint
 from turbopi.checkpoint import random_checkpoint
+from turbopi.checkpoint.calibration import BESIDE, calibration_of, for_policy
 from turbopi.cli.options import PolicyOptions
 from turbopi.config import preset
-from turbopi.engine.fp8 import E4M3, E4M3_MAX, Directions, to_e4m3
+from turbopi.engine.emulate import Round, RoundedWeights, relative_rms, replaced, through_norm
 from turbopi.errors import BackendUnavailable, CalibrationError, ConfigError, ObservationError, OutputError
 from turbopi.examples import Example, NoisyExample, with_noises
 from turbopi.model.layers import AdaRMSNorm
+from turbopi.model.sites import linears
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
+from turbopi.quantization.artifact import VERSION, Quantization, SiteScale, shapes_of
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Directions, to_e4m3
+from turbopi.quantization.sites import PARTS, sites
 from turbopi.recordings import RecordedCall, save_call
+from turbopi.studies import formats
+from turbopi.studies.weights import WEIGHTS, studied_checkpoint
 from turbopi.verify.check_golden import check_case, golden_calibration, golden_calls
 from turbopi.verify.inputs import Plan
 from turbopi.verify.run import verify

@@ -15,8 +15,8 @@ from tensorrt_fakes import ENVIRONMENT, Twin
 from turbopi import backends
 from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_fp8 import TensorRTFp8Backend
-from turbopi.calibrate.artifact import RANDOM_NOISE, Quantization, SiteScale
 from turbopi.errors import BackendError, ConfigError
+from turbopi.quantization.artifact import RANDOM_NOISE, Quantization, SiteScale
 from turbopi.tensorrt import Library
 from turbopi.tensorrt.cache import EngineCache
 from turbopi.tensorrt.calibrate import Calibration, from_quantization

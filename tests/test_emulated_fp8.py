@@ -10,13 +10,14 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from turbopi import backends
-from turbopi.calibrate.artifact import TIERS, Quantization, Tier
-from turbopi.calibrate.emulate import RoundedWeights, rounded
-from turbopi.calibrate.sites import sites
 from turbopi.cli import app
+from turbopi.engine.emulate import RoundedWeights, rounded
 from turbopi.errors import ConfigError
 from turbopi.evaluate.sources import LocalPolicy
 from turbopi.policy import UnifiedPolicy
+from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.plan import TIERS, Fp8Tier
+from turbopi.quantization.sites import sites
 from turbopi.verify.check_golden import check_folder, golden_calibration
 
 CPU = torch.device("cpu")
@@ -29,7 +30,7 @@ def calibration() -> Quantization:
     return golden_calibration(golden_folder(), "pi05", CPU)
 
 
-def emulated(quantization: Quantization, tier: Tier) -> backends.Backend:
+def emulated(quantization: Quantization, tier: Fp8Tier) -> backends.Backend:
     checkpoint = golden_folder().checkpoint("pi05")
     return backends.create(
         "emulated_fp8",
@@ -47,7 +48,7 @@ def actions(backend: backends.Backend) -> Tensor:
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_it_rounds_what_the_plan_says_and_nothing_else(calibration: Quantization, tier: Tier) -> None:
+def test_it_rounds_what_the_plan_says_and_nothing_else(calibration: Quantization, tier: Fp8Tier) -> None:
     case, model = golden_cases()[CASE], golden_model("pi05")
     plan = calibration.plan(model.config, tier)
     scales = {site: plan.scales[str(site)] for site in sites(model.config) if str(site) in plan.scales}

@@ -15,9 +15,11 @@ from turbopi import backends
 from turbopi.backends.cuda_graph import CudaGraphBackend, HostRow
 from turbopi.config import Kind
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
-from turbopi.engine.ops import PLAIN, Ops, compiled, geglu, geglu_by_sigmoid, gelu, gelu_by_sigmoid
+from turbopi.engine.compiled import compiled
 from turbopi.engine.weights import modulation, pack
 from turbopi.engine.without_compiler import OPS, Denoiser
+from turbopi.kernels.interface import Ops
+from turbopi.kernels.plain import PLAIN, geglu, geglu_by_sigmoid, gelu, gelu_by_sigmoid
 from turbopi.model.reference import Precision
 from turbopi.observation import Observation
 

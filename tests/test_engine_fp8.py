@@ -11,16 +11,17 @@ from test_engine import answer, shape_of
 from torch import Tensor
 
 from turbopi.backends.fused import FusedBackend
-from turbopi.calibrate.emulate import rounded
-from turbopi.calibrate.sites import Site, sites
 from turbopi.calibrate.statistics import collect
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
-from turbopi.engine.fp8 import Fp8Matrix, Matrix
-from turbopi.engine.ops import PLAIN
+from turbopi.engine.emulate import rounded
 from turbopi.engine.recent import RecentLoops
 from turbopi.engine.weights import modulation, pack
 from turbopi.errors import BackendUnavailable
+from turbopi.kernels.plain import PLAIN
+from turbopi.kernels.quantize import quantize
 from turbopi.observation import Observation
+from turbopi.quantization.fp8 import Matrix
+from turbopi.quantization.sites import Site, sites
 from turbopi.verify.check_golden import golden_calibration
 
 CPU, META = torch.device("cpu"), torch.device("meta")
@@ -43,7 +44,7 @@ def engine_actions(scales: dict[str, float], observation: Observation, noise: Te
         if place not in scales:
             return matrix
         made.append(place)
-        return Fp8Matrix.quantize(matrix, scales[place])
+        return quantize(matrix, scales[place])
 
     weights = pack(model.config, dict(model.state_dict()), make)
     shape = shape_of(observation, noise, STEPS)

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from turbopi.engine.ops import PLAIN
 from turbopi.engine.without_compiler import FEW, OPS, linear_geglu, product
+from turbopi.kernels.plain import PLAIN
 
 NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, NO_GPU])]

@@ -11,9 +11,9 @@ from torch import Tensor
 from turbopi.backends.fused import FusedBackend
 from turbopi.config import Kind, ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.ops import PLAIN, Ops
-from turbopi.engine.weights import GemmaLayer
 from turbopi.errors import BackendUnavailable, DeviceLost
+from turbopi.kernels.interface import GemmaLayer, Ops
+from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise import packing as denoise_packing
 from turbopi.kernels.sm90.denoise.packing import PackedExpert

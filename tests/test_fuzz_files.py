@@ -25,8 +25,6 @@ from lerobot_golden import GOLDEN as LEROBOT_GOLDEN
 from lerobot_golden import GoldenCase
 from PIL import Image
 
-from turbopi.calibrate.artifact import Quantization, SiteScale, shapes_of
-from turbopi.calibrate.sites import sites
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.cli.files import load_noise
 from turbopi.config import LIMITS, preset
@@ -37,6 +35,8 @@ from turbopi.evaluate.visited import Visited
 from turbopi.export.onnx import GRAPHS, MANIFEST, open_export
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.quantization.artifact import Quantization, SiteScale, shapes_of
+from turbopi.quantization.sites import sites
 from turbopi.recordings import RecordedCall, load_call, load_observation, save_call
 from turbopi.robots.described import load_robot
 from turbopi.sim import Task

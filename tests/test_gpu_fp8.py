@@ -11,13 +11,13 @@ from torch import Tensor
 from turbopi import backends
 from turbopi.backends import Tier
 from turbopi.backends.fused import FusedBackend
-from turbopi.calibrate.artifact import Quantization
-from turbopi.calibrate.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
-from turbopi.calibrate.sites import sites
 from turbopi.config import Kind
+from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX
 from turbopi.kernels.sm90.denoise.packing import refusal
 from turbopi.model.reference import Pi0Model
+from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.sites import sites
 from turbopi.verify.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
 from turbopi.verify.golden import Case
 

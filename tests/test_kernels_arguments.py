@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from turbopi.engine.fp8 import E4M3, Fp8Matrix
 from turbopi.kernels.arguments import Parameter, Parameters, Struct, enumeration
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.gemm import bf16 as gemm
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8
+from turbopi.quantization.fp8 import E4M3, Fp8Matrix
 
 PAIR = (Parameter("const float*", "values"), Parameter("int", "count", "of them"))
 

@@ -23,15 +23,16 @@ from denoise_helpers import (
 from kernel_turns.stalls import disassembled
 from torch import Tensor
 
-from turbopi.calibrate.directions import directions
-from turbopi.engine.fp8 import E4M3, Fp8Matrix
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import nvrtc
+from turbopi.kernels.quantize import quantize
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise import packing
 from turbopi.kernels.sm90.denoise.packing import KINDS, PackedExpert
 from turbopi.kernels.sm90.denoise.plain import in_e4m3
 from turbopi.model.denoise import euler_step
+from turbopi.quantization.directions import directions
+from turbopi.quantization.fp8 import E4M3
 
 CPU = torch.device("cpu")
 
@@ -63,7 +64,7 @@ def test_packing_in_fp8_keeps_every_weight_as_e4m3_rounds_it(name: str) -> None:
     packed = PackedExpert.pack(p.config, p.layers, ones(p))
     for i, layer in enumerate(p.layers):
         for found, matrix in zip(packed.matrices(i), (layer.qkv, layer.out, layer.gate_up, layer.down), strict=True):
-            expected = Fp8Matrix.quantize(matrix, 1.0).dequantized()
+            expected = quantize(matrix, 1.0).dequantized()
             torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
             # 4 bits of mantissa: within 2^-4 of each, or of the smallest normal number, 2^-6 / 448 of the largest
             bound = torch.maximum(matrix.abs().float(), matrix.abs().amax(dim=1, keepdim=True).float() / (64 * 448))
@@ -81,9 +82,9 @@ def test_packing_in_fp8_rounds_for_a_sites_directions() -> None:
     for i, layer in enumerate(p.layers):
         for found, kind in zip(packed.matrices(i), KINDS, strict=True):
             matrix, place = getattr(layer, kind), f"expert.{i}.{kind}"
-            expected = Fp8Matrix.quantize(matrix, 1.0, known.get(place)).dequantized()
+            expected = quantize(matrix, 1.0, known.get(place)).dequantized()
             torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
-            assert (place in known) != torch.equal(expected, Fp8Matrix.quantize(matrix, 1.0).dequantized())
+            assert (place in known) != torch.equal(expected, quantize(matrix, 1.0).dequantized())
 
 
 @SMALL

@@ -8,13 +8,13 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.engine import ops as plain
-from turbopi.engine.fp8 import E4M3, E4M3_MAX, Fp8Matrix, to_e4m3
-from turbopi.kernels import norms
+from turbopi.kernels import norms, plain
 from turbopi.kernels import ops as fused
+from turbopi.kernels.quantize import quantize
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Folded, Sums, Tile, clusters, matmul
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Fp8Matrix, to_e4m3
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 EPS = 1e-6
@@ -101,7 +101,7 @@ def test_sums_gathered_in_a_cluster(shape: tuple[int, int, int], tile: Tile) -> 
 def test_sums_of_e4m3_gathered_in_a_cluster(shape: tuple[int, int, int], tile: Tile) -> None:
     _, n, k = shape
     m = at_once(tile, shape[0], n)
-    matrix, bias = Fp8Matrix.quantize(random(n, k), 0.02), random(n)
+    matrix, bias = quantize(random(n, k), 0.02), random(n)
     x = to_e4m3(random(m, k), matrix.inverse)
     out = torch.full((m, n), torch.nan, device=DEVICE, dtype=torch.bfloat16)
     assert error(matmul_fp8(x, matrix, tile, "bias", bias, out), matrix.product(x, bias)) < 0.006
@@ -118,7 +118,7 @@ def test_a_product_adds_the_stream_and_its_rows_sums(fp8: bool, rows: int, inner
     sums, again = (Sums.allocate(tile, rows, WIDTH, DEVICE) for _ in range(2))
     sums.parts.fill_(torch.nan)
     if fp8:
-        matrix = Fp8Matrix.quantize(weight, 0.02)
+        matrix = quantize(weight, 0.02)
         x = to_e4m3(random(rows, inner), matrix.inverse)
         exact = matrix.product(x, bias) + residual.float()
         out = matmul_fp8(x, matrix, tile, "bias", bias, residual=residual, sums_out=sums)
@@ -167,7 +167,7 @@ def test_a_norm_made_of_a_copy_in_other_units_is_the_norm(kind: str, growth: flo
     residual = stream(kind, 7, torch.float64)
     x = residual + growth * random(7, WIDTH, dtype=torch.float64) + growth
     scale, shift = random(WIDTH, dtype=torch.float32), random(WIDTH, dtype=torch.float32)
-    matrix, bias = Fp8Matrix.quantize(random(24, WIDTH, dtype=torch.float32), 0.5), random(24, dtype=torch.float32)
+    matrix, bias = quantize(random(24, WIDTH, dtype=torch.float32), 0.5), random(24, dtype=torch.float32)
     folded = FoldedFp8.fold(matrix, scale, shift)
     mean, factor = deviations(residual)
     units = (x - mean) * factor
@@ -189,7 +189,7 @@ def test_a_product_leaves_a_copy_in_e4m3_in_the_units_of_the_stream_before(
     rows = at_once(tile, rows, WIDTH)
     residual, bias, weight = stream(kind, rows), random(WIDTH), random(WIDTH, WIDTH) / WIDTH**0.5
     scale, shift, x = random(WIDTH), random(WIDTH), random(rows, WIDTH)
-    matrix = Fp8Matrix.quantize(weight, 0.02)
+    matrix = quantize(weight, 0.02)
     given = to_e4m3(x, matrix.inverse)
 
     def product(copied: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -257,7 +257,7 @@ def test_a_norm_of_a_copy_errs_no_more_than_one_before_the_product(
         shift[::200] = -(usual * scale)[::200].bfloat16()
     behind = stream_behind(1.0)
     normed = F.layer_norm(behind.double(), (WIDTH,), scale.double(), shift.double(), EPS)
-    matrix = Fp8Matrix.quantize(random(HIDDEN, WIDTH) / WIDTH**0.5, float(normed.abs().max()) / E4M3_MAX)
+    matrix = quantize(random(HIDDEN, WIDTH) / WIDTH**0.5, float(normed.abs().max()) / E4M3_MAX)
     assert torch.equal(stream_behind(matrix.inverse), behind)
     offset = random(HIDDEN)
     exact = normed @ matrix.dequantized().double().T + offset.double()
@@ -292,7 +292,7 @@ def test_two_layers_and_the_projector_in_fused_operations(fp8: str, rows: int) -
     sizes["projector"] = (2048, WIDTH)
     makers = [
         {
-            name: (Fp8Matrix.quantize(weight, 0.035) if name in fp8.split() else weight, random(size[0]))
+            name: (quantize(weight, 0.035) if name in fp8.split() else weight, random(size[0]))
             for name, size in sizes.items()
             for weight in [random(*size) / size[1] ** 0.5]
         }
@@ -344,7 +344,7 @@ def test_layers_of_the_vision_tower_in_fused_operations(fp8: str, rows: int) -> 
     sizes = {"out": (WIDTH, WIDTH), "fc1": (HIDDEN, WIDTH), "fc2": (WIDTH, HIDDEN), "qkv": (3 * WIDTH, WIDTH)}
     weights = {name: random(*size) / size[1] ** 0.5 for name, size in sizes.items()}
     biases = {name: random(size[0]) for name, size in sizes.items()}
-    matrices = {name: Fp8Matrix.quantize(w, 0.05) if name in fp8.split() else w for name, w in weights.items()}
+    matrices = {name: quantize(w, 0.05) if name in fp8.split() else w for name, w in weights.items()}
     x, attended = stream("outliers", rows), random(rows, WIDTH)
 
     def layer(o: plain.Ops, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

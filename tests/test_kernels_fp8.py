@@ -15,13 +15,17 @@ from torch import Tensor
 ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.engine import ops as plain  # noqa: E402
-from turbopi.engine.fp8 import E4M3, E4M3_MAX, Fp8Matrix, input_of, to_e4m3  # noqa: E402
-from turbopi.kernels import attention, norms  # noqa: E402
+from turbopi.kernels import (  # noqa: E402
+    attention,
+    norms,
+    plain,
+)
+from turbopi.kernels.quantize import quantize  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8  # noqa: E402
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402
 from turbopi.kernels.sm90.instructions import SHARED_BYTES  # noqa: E402
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Fp8Matrix, input_of, to_e4m3  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32
@@ -67,7 +71,7 @@ def test_rounding_is_to_the_nearest_number() -> None:
 def test_a_matrix_has_a_scale_for_each_channel() -> None:
     weight = random(24, 32) * torch.logspace(-6, 3, 24, device=DEVICE)[:, None].to(DTYPE)
     weight[3] = 0
-    matrix = Fp8Matrix.quantize(weight, 0.5)
+    matrix = quantize(weight, 0.5)
     assert matrix.inverse == 2 and matrix.shape == (24, 32)
     largest = matrix.data.float().abs().amax(dim=1)
     assert bool((largest == torch.where(weight.any(1), E4M3_MAX, 0)).all())
@@ -79,7 +83,7 @@ def test_a_matrix_has_a_scale_for_each_channel() -> None:
 
 def test_a_product_is_what_its_numbers_stand_for() -> None:
     weight, x, bias = random(48, 32), random(5, 32), random(48)
-    matrix = Fp8Matrix.quantize(weight, 0.02)
+    matrix = quantize(weight, 0.02)
     given = to_e4m3(x, matrix.inverse)
     expected = (given.float() * 0.02) @ matrix.dequantized().T + bias.float()
     torch.testing.assert_close(plain.linear(given, matrix, bias), expected.to(DTYPE), atol=1e-4, rtol=1e-2)
@@ -169,7 +173,7 @@ TILES = [Tile(2, 112), Tile(3, 192), Tile(2, 256), Tile(1, 80), Tile(3, 96), Til
 
 
 def operands(m: int, n: int, k: int) -> tuple[Tensor, Fp8Matrix]:
-    matrix = Fp8Matrix.quantize(random(n, k) / k**0.5, 0.01)
+    matrix = quantize(random(n, k) / k**0.5, 0.01)
     return to_e4m3(random(m, k), matrix.inverse), matrix
 
 

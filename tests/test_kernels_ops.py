@@ -14,12 +14,12 @@ from torch import Tensor
 ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.engine import ops as plain  # noqa: E402
 from turbopi.kernels import (  # noqa: E402
     activations,
     attention,
     embedding,
     norms,
+    plain,
     rope,
 )
 from turbopi.kernels import ops as fused  # noqa: E402

@@ -12,16 +12,12 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.calibrate.directions import COUNT, ROWS, Rows, directions
-from turbopi.calibrate.formats import round_e2m1, round_nvfp4
-from turbopi.engine.fp8 import Directions, Fp8Matrix, to_e4m3
-from turbopi.engine.rounding import (
-    columns_with_feedback,
-    feedback,
-    round_rows,
-    round_with_feedback_plain,
-)
+from turbopi.kernels.quantize import quantize, round_rows
 from turbopi.kernels.rounding import round_with_feedback
+from turbopi.quantization.directions import COUNT, ROWS, Rows, directions
+from turbopi.quantization.fp8 import Directions, to_e4m3
+from turbopi.quantization.rounding import feedback, round_with_feedback_plain
+from turbopi.studies.formats import round_nvfp4
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 pytestmark = gpu_or_interpreter()
@@ -47,7 +43,7 @@ def test_errors_cancel_where_activations_lie(out: int, width: int, count: int) -
     weight, seen, unseen = random(out, width) / 50, activations(count, width), activations(300, width, seed=3)
     known = directions(seen)
     assert known is not None and known.codes.shape == (width, min(COUNT, count, width))
-    nearest, spared = (Fp8Matrix.quantize(weight, 1.0, d).dequantized() for d in (None, known))
+    nearest, spared = (quantize(weight, 1.0, d).dequantized() for d in (None, known))
     assert error(spared, weight, seen) < 0.3 * error(nearest, weight, seen)
     if count > COUNT:
         assert error(spared, weight, unseen) < 0.3 * error(nearest, weight, unseen)
@@ -90,18 +86,7 @@ def test_the_kernel_rounds_as_its_twin(rows: int, columns: int, num: int) -> Non
     assert not torch.equal(twin.float(), to_e4m3(given[0], given[1][:, None]).float()) or columns == 1
 
 
-def test_e2m1_in_blocks_by_the_kernel_and_its_twin() -> None:
-    weight, _, order, errors, answers = exact_sums(20, 32, 4)
-    inverse = torch.where(torch.arange(40, device=DEVICE).view(20, 2) % 3 == 0, 4.0, 1.0)
-    inverse[5, 1] = 0  # a block of zeros
-    weight[5, 16:] = 0
-
-    def twin(wanted: Tensor, column: int) -> Tensor:
-        by = inverse[:, column // 16]
-        return torch.where(by > 0, round_e2m1(wanted * by) / by.clamp(min=1), 0.0)
-
-    expected = columns_with_feedback(weight, order, errors, answers, twin)
-    assert torch.equal(round_with_feedback(weight, inverse, order, errors, answers), expected)
+def test_errors_of_nvfp4_cancel_too() -> None:
     weight, seen = random(20, 64) / 50, activations(200, 64)
     spared, nearest = round_nvfp4(weight, directions(seen)), round_nvfp4(weight)
     assert error(spared, weight, seen) < 0.3 * error(nearest, weight, seen)
@@ -121,15 +106,15 @@ def test_without_feedback_the_kernel_rounds_every_number_to_nearest() -> None:
 def test_nan_shows_in_its_row_alone() -> None:
     weight, known = random(20, 64), directions(activations(100, 64))
     weight[3, 10] = torch.nan
-    matrix = Fp8Matrix.quantize(weight, 1.0, known).dequantized()
+    matrix = quantize(weight, 1.0, known).dequantized()
     assert bool(matrix[3].isnan().any()) and bool(matrix[torch.arange(20) != 3].isfinite().all())
 
 
 def test_rows_of_fused_matrices_are_rounded_as_they_are_alone() -> None:
     weight, known = random(48, 64), directions(activations(100, 64))
-    whole = Fp8Matrix.quantize(weight, 1.0, known)
+    whole = quantize(weight, 1.0, known)
     for rows in (slice(0, 16), slice(16, 48)):
-        assert torch.equal(Fp8Matrix.quantize(weight[rows], 1.0, known).data.float(), whole.data[rows].float())
+        assert torch.equal(quantize(weight[rows], 1.0, known).data.float(), whole.data[rows].float())
 
 
 # Directions

@@ -14,7 +14,6 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.engine.fp8 import E4M3, Fp8Matrix
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.denoise import kernel as denoise
@@ -23,6 +22,7 @@ from turbopi.kernels.sm90.gemm import bf16 as gemm
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8
 from turbopi.kernels.sm90.gemm import products, vision_tower
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
+from turbopi.quantization.fp8 import E4M3, Fp8Matrix
 
 GPU = torch.device("cuda", 0)
 CPU = torch.device("cpu")

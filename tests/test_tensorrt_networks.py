@@ -7,8 +7,8 @@ from conftest import golden_cases, golden_model
 from torch import Tensor
 
 from turbopi.config import Kind
-from turbopi.engine.ops import embed_patches
 from turbopi.engine.weights import Weights, modulation, pack
+from turbopi.kernels.plain import embed_patches
 from turbopi.model.denoise import time_embedding, time_grid
 from turbopi.model.layers import rope_tables
 from turbopi.model.vision import normalize_images

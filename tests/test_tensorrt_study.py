@@ -16,7 +16,7 @@ from tensorrt_fakes import Twin
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
 from turbopi.observation import Observation
-from turbopi.tensorrt.studies import actions_study, attention_study, mask_study, throughput_study
+from turbopi.studies.tensorrt import actions_study, attention_study, mask_study, throughput_study
 
 
 def one() -> tuple[Observation, torch.Tensor]:

@@ -19,7 +19,7 @@ from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.recordings.sources import chosen_files
-from turbopi.verify import certificates
+from turbopi.studies import certificates
 from turbopi.verify.inputs import Plan
 from turbopi.verify.intermediates import Errors, Place, first_suspect, in_order, tensors_of
 from turbopi.verify.run import verify

@@ -26,9 +26,9 @@ PRODUCT = (
 )
 # Modules that those import and that only read files or format text on the host: CPU tests see all of what they do.
 HOST_ONLY = (
-    *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.serve", "turbopi.shipped"),
+    *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.shipped"),
     *("turbopi.export", "turbopi.tensorrt", "turbopi.errors", "turbopi.files", "turbopi.reading", "turbopi.arguments"),
-    *("turbopi.provenance", "turbopi.verify.golden"),
+    *("turbopi.provenance", "turbopi.recordings", "turbopi.examples", "turbopi.verify.golden"),
 )
 MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
 

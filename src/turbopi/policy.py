@@ -23,8 +23,8 @@ from turbopi.arguments import (
 )
 from turbopi.backends import Tier
 from turbopi.backends.lost import Guard
-from turbopi.calibrate.artifact import Quantization, for_policy
 from turbopi.checkpoint import Checkpoint, open_checkpoint
+from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import PolicyConfig
 from turbopi.engine.recent import Loop
 from turbopi.errors import ActionError, ConfigError, ObservationError
@@ -32,6 +32,7 @@ from turbopi.model.reference import Precision
 from turbopi.observation import ModelInputs, Observation, with_cameras
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.quantization.artifact import Quantization
 from turbopi.robots import Robot
 
 logger = logging.getLogger(__name__)

@@ -197,7 +197,7 @@ def read_recording(folder: str) -> None:
 
 
 def read_calibration(folder: str) -> None:
-    from turbopi.calibrate.artifact import Quantization
+    from turbopi.quantization.artifact import Quantization
 
     _told(lambda: repr(Quantization.load(f"{folder}/fp8.json")))
 

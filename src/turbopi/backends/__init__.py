@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import torch
 
 from turbopi.backends.base import Backend, Begun, LoadState, Sample, Tier
-from turbopi.calibrate.artifact import TIERS, Quantization
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.plan import TIERS
 
 __all__ = [
     "BACKENDS",

@@ -22,12 +22,13 @@ from turbopi.backends.base import LoadState, Sample, Tier, not_warm
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.config import ModelConfig
 from turbopi.engine import without_compiler
-from turbopi.engine.call import Cache, CallShape, Denoiser, Pictures, StaticCall
+from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
+from turbopi.engine.compiled import compiled
 from turbopi.engine.graph import Graph, Mark, building
-from turbopi.engine.ops import Ops, compiled
 from turbopi.engine.recent import Loop, RecentLoops
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError
+from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import Trace
 from turbopi.observation import Observation

@@ -12,10 +12,12 @@ from torch import Tensor, nn
 
 from turbopi.backends.base import LoadState, Tier
 from turbopi.backends.pytorch import PyTorchBackend
-from turbopi.calibrate.artifact import TIERS, Quantization, check_given
-from turbopi.calibrate.emulate import put_into_norm, round_activation, round_weight
-from turbopi.calibrate.sites import linears, norm_of, sites
 from turbopi.config import ModelConfig
+from turbopi.engine.emulate import put_into_norm, round_activation, round_weight
+from turbopi.model.sites import linears, norm_of
+from turbopi.quantization.artifact import Quantization, check_given
+from turbopi.quantization.plan import TIERS
+from turbopi.quantization.sites import sites
 
 
 class EmulatedFp8Backend(PyTorchBackend):

@@ -16,14 +16,16 @@ from torch import Tensor
 from turbopi.backends.base import LoadState, Tier
 from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, _bucket
 from turbopi.backends.lost import ADVICE
-from turbopi.calibrate.artifact import TIERS, Quantization, check_given
 from turbopi.config import ModelConfig
-from turbopi.engine.call import CallShape, Denoiser
-from turbopi.engine.fp8 import Directions, Fp8Matrix, Matrix
-from turbopi.engine.ops import Ops
+from turbopi.engine.call import CallShape
 from turbopi.engine.recent import Loop
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
+from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.kernels.quantize import quantize
+from turbopi.quantization.artifact import Quantization, check_given
+from turbopi.quantization.fp8 import Directions, Matrix
+from turbopi.quantization.plan import TIERS
 from turbopi.toolchain import missing_for_c
 
 if TYPE_CHECKING:
@@ -116,7 +118,7 @@ class FusedBackend(CudaGraphBackend):
         def make(place: str, matrix: Tensor) -> Matrix:
             if place not in scales:
                 return matrix
-            return Fp8Matrix.quantize(matrix, scales[place], self._directions.get(place))
+            return quantize(matrix, scales[place], self._directions.get(place))
 
         return pack(self.config, load(self.device, "bf16"), make)
 

@@ -17,11 +17,11 @@ from turbopi.bench.measure import WARMING, Observations, answers, at_horizon, be
 from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.summary import linear_models
 from turbopi.bench.work import Job, floor_ms, stage_work
-from turbopi.calibrate.artifact import TIERS
 from turbopi.checkpoint import Checkpoint
 from turbopi.errors import ConfigError, TurboPiError
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
+from turbopi.quantization.plan import TIERS
 
 Answered = tuple[dict[str, Any], Job, np.ndarray]  # a result, its job, and the policy's `answers`
 

@@ -2,8 +2,9 @@
 
     turbopi calibrate CKPT --observations RECORDING --out FILE     run.py      docs/quantization.md
 
-sites.py       the places where numbers may be rounded, by name
-statistics.py  what the float32 reference sees there, and the scales that follow
-emulate.py     the reference with these places rounded exactly: what the error is measured with
-artifact.py    the file: scales, plan, observations' and weights' hashes, report; refuses what it wasn't made for
+observations.py    what is measured on, and what is held out
+statistics.py      what the float32 reference sees at the sites, and the scales that follow
+product_errors.py  what rounding does to each site's own products
+
+The reference with its sites rounded exactly is engine/emulate.py; the file that is written, quantization/artifact.py.
 """

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from turbopi import shipped
-from turbopi.calibrate.artifact import RANDOM_NOISE
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.examples import Example, NoisyExample, prepared
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
+from turbopi.quantization.artifact import RANDOM_NOISE
 from turbopi.recordings import load_observation
 from turbopi.recordings.sources import chosen_files, spread
 

@@ -7,11 +7,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.calibrate.emulate import Round, RoundedWeights, replaced, round_activation, through_norm
-from turbopi.calibrate.sites import Site, linears, norm_of
+from turbopi.engine.emulate import Round, RoundedWeights, replaced, round_activation, through_norm
 from turbopi.model.layers import AdaRMSNorm
 from turbopi.model.reference import Pi0Model
+from turbopi.model.sites import linears, norm_of
 from turbopi.observation import Observation
+from turbopi.quantization.sites import Site
 
 
 def product_errors(

@@ -17,19 +17,19 @@ from torch import Tensor
 
 from turbopi import backends, shipped
 from turbopi.calibrate import observations as observed
-from turbopi.calibrate.artifact import RANDOM_NOISE, Quantization, SiteScale, shapes_of
-from turbopi.calibrate.directions import Rows, directions
-from turbopi.calibrate.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.calibrate.observations import Batch
 from turbopi.calibrate.product_errors import product_errors
-from turbopi.calibrate.sites import KINDS, MLP_KINDS, PARTS, Site, sites
 from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
 from turbopi.checkpoint import Checkpoint
-from turbopi.engine.fp8 import Directions
+from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.errors import CheckpointError
 from turbopi.examples import NoisyExample, with_noises
 from turbopi.model.reference import Pi0Model, parameter_dtype
 from turbopi.policy import UnifiedPolicy
+from turbopi.quantization.artifact import RANDOM_NOISE, Quantization, SiteScale, shapes_of
+from turbopi.quantization.directions import Rows, directions
+from turbopi.quantization.fp8 import Directions
+from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites
 
 TARGET = 0.9975  # cosine of the actions' deltas that automatic choice of sites aims at
 ROOM = 0.8  # of the error that the target allows, on the few calls that sites are chosen on: others may be harder

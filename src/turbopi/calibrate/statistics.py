@@ -11,13 +11,14 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from turbopi.calibrate.directions import Rows
-from turbopi.calibrate.sites import Site, linears, norm_of
-from turbopi.engine.fp8 import E4M3_MAX, to_e4m3
 from turbopi.errors import ObservationError
 from turbopi.model.layers import AdaRMSNorm
 from turbopi.model.reference import Pi0Model
+from turbopi.model.sites import linears, norm_of
 from turbopi.observation import Observation
+from turbopi.quantization.directions import Rows
+from turbopi.quantization.fp8 import E4M3_MAX, to_e4m3
+from turbopi.quantization.sites import Site
 
 BINS = 0x7F80  # the bins above hold infinities and NaN
 HEADROOM = 2.0  # of what was seen; costs a floating-point format only some of its smallest numbers

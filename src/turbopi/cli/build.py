@@ -142,7 +142,7 @@ def measure_scales(policy: "UnifiedPolicy", path: Path | None, method: str, outp
 
     model: Any = policy.backend.model  # type: ignore[attr-defined]
     if path is not None and path.suffix == ".json" and path.is_file():
-        from turbopi.calibrate.artifact import Quantization
+        from turbopi.quantization.artifact import Quantization
 
         quantization = Quantization.load(path)
         quantization.check(policy.config.model, policy._checkpoint.fingerprint())

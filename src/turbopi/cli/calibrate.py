@@ -14,7 +14,7 @@ from turbopi.config import LIMITS
 from turbopi.errors import ConfigError
 
 if TYPE_CHECKING:
-    from turbopi.calibrate.artifact import Quantization
+    from turbopi.quantization.artifact import Quantization
 
 
 @command(
@@ -87,7 +87,7 @@ def calibrate(
     output = Output(as_json)
     if out is None and (checkpoint is None or options.random_weights is not None):
         raise ConfigError("there is no checkpoint's folder to write beside: name a file with --out FILE")
-    from turbopi.calibrate.artifact import BESIDE
+    from turbopi.checkpoint.calibration import BESIDE
 
     opened = options.open(checkpoint)
     out = out or Path(str(checkpoint)) / BESIDE
@@ -115,8 +115,8 @@ def _replaced(out: Path) -> str | None:
     """What the calibration that stands at `out` was made on; None if nothing stands there. ConfigError for anything
     else: it would be lost.
     """
-    from turbopi.calibrate.artifact import Quantization
     from turbopi.errors import CalibrationError
+    from turbopi.quantization.artifact import Quantization
 
     if not out.exists():
         return None

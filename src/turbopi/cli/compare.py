@@ -134,7 +134,7 @@ def _run_variants(
 
 def _options_of(variant: "Variant", options: EvalOptions) -> EvalOptions:
     """The options that a way to run is run with; a calibration is for FP8 alone."""
-    from turbopi.calibrate.artifact import TIERS
+    from turbopi.quantization.plan import TIERS
 
     own = replace(options, backend=variant.backend, precision=variant.precision, steps=variant.steps)
     return own if variant.precision in TIERS else replace(own, quantization=None, fp8_parts=None)
@@ -144,7 +144,8 @@ def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint:
     """Refuse what can't run before hours of what can."""
     from turbopi import backends
     from turbopi.arguments import checked_steps
-    from turbopi.calibrate.artifact import TIERS, calibration_of
+    from turbopi.checkpoint.calibration import calibration_of
+    from turbopi.quantization.plan import TIERS
 
     device = backends.resolve_device(options.device)
     tiers = [variant.precision for variant in variants if variant.precision in TIERS]

@@ -117,7 +117,8 @@ def _errors(
     import torch
 
     from turbopi.observation import Observation
-    from turbopi.tensorrt import library, studies
+    from turbopi.studies import tensorrt as studies
+    from turbopi.tensorrt import library
 
     model: Any = policy.backend.model  # type: ignore[attr-defined]
     config = policy.config.model
@@ -142,7 +143,7 @@ def _actions(
     checkpoint: "Checkpoint", exact: "UnifiedPolicy", observations: dict[str, list[Any]], steps: int
 ) -> list[dict[str, Any]]:
     from turbopi.policy import UnifiedPolicy
-    from turbopi.tensorrt import studies
+    from turbopi.studies import tensorrt as studies
 
     observations["random"] = [exact.example_observation(seed) for seed in range(RANDOM_OBSERVATIONS)]
     results = []
@@ -169,7 +170,7 @@ def _throughput(
     checkpoint: "Checkpoint", given: list[dict[str, Any]], device: "torch.device", steps: int, calls: int
 ) -> dict[str, Any]:
     from turbopi.policy import UnifiedPolicy
-    from turbopi.tensorrt import studies
+    from turbopi.studies import tensorrt as studies
 
     policies = []
     for name in ("tensorrt", "tensorrt_pipelined"):

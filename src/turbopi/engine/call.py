@@ -8,7 +8,6 @@ Each part's inputs travel in one copy out of one pinned buffer, actions come bac
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,16 +17,9 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.engine import forward
 from turbopi.engine.graph import Mark
-from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights
+from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
-
-
-class Denoiser(Protocol):
-    """All denoising steps in one launch, for one number of steps and one horizon."""
-
-    def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
-        """From noise float32[H, A] and the cache's first `length` rows: x_t float32[N + 1, H, A], v_t [N, H, A]."""
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.engine.fp8 import input_of
-from turbopi.engine.ops import Ops
 from turbopi.engine.weights import Weights
+from turbopi.kernels.interface import Ops
 from turbopi.model.layers import rope_tables
+from turbopi.quantization.fp8 import input_of
 
 Rope = tuple[Tensor, Tensor]  # cos, sin float32[tokens, K/2]
 Normed = tuple[Tensor, Tensor, Tensor | None]  # residual stream, its norm, the gate of the next residual

@@ -5,44 +5,18 @@ Packing takes tensors out of the state as it goes, so that the device never hold
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.engine.fp8 import Matrix
 from turbopi.engine.graph import empty_cache
+from turbopi.kernels.interface import Affine, AffineMatrix, AnyMatrix, GemmaLayer, State, VisionLayer
 from turbopi.model.denoise import time_embedding, time_grid
+from turbopi.quantization.fp8 import Matrix
 
-State = dict[str, Tensor]
-Affine = tuple[Tensor, Tensor]  # weight [out, in], bias [out]; of a LayerNorm: weight, bias [W]
-AffineMatrix = tuple[Matrix, Tensor]
-AnyMatrix = TypeVar("AnyMatrix", bound=Matrix)
 MakeMatrix = Callable[[str, Tensor], Matrix]  # by its place, such as "vision.3.fc1" or "prefix.0.qkv"
-
-
-@dataclass(frozen=True)
-class VisionLayer:
-    norm1: Affine
-    qkv: AffineMatrix  # [3W, W], [3W]
-    out: AffineMatrix
-    norm2: Affine
-    fc1: AffineMatrix
-    fc2: AffineMatrix
-
-
-@dataclass(frozen=True)
-class GemmaLayer(Generic[AnyMatrix]):
-    """One layer of either stack. The norms are float32[D], 1 + scale; None where adaRMS replaces them."""
-
-    qkv: AnyMatrix  # [(heads + 2) * K, D]
-    out: AnyMatrix  # [D, heads * K]
-    gate_up: AnyMatrix  # [2F, D]: gate rows, then up rows
-    down: AnyMatrix  # [D, F]
-    norm1: Tensor | None
-    norm2: Tensor | None
 
 
 @dataclass(frozen=True)

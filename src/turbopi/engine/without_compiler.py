@@ -4,7 +4,8 @@ A small kernel takes two microseconds there, or four if its operands differ in d
 sums, all up to the next product is computed in float32, and products start from what is to be added to them: residual,
 mask, or what the shift of an adaRMS becomes in the product behind it.
 
-What is computed, and shapes: `engine.forward`, `engine.ops`. Vision and Pi0's suffix stay `PLAIN`, vision's GELU apart.
+What is computed, and shapes: `engine.forward`, `kernels.plain`. Vision and Pi0's suffix stay `PLAIN`, but for vision's
+GELU.
 """
 
 from dataclasses import dataclass, replace
@@ -16,9 +17,10 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine import forward
-from turbopi.engine import ops as plain
-from turbopi.engine.ops import PLAIN, Ops
-from turbopi.engine.weights import GemmaLayer, Weights
+from turbopi.engine.weights import Weights
+from turbopi.kernels import plain
+from turbopi.kernels.interface import GemmaLayer, Ops
+from turbopi.kernels.plain import PLAIN
 
 FEW = 64  # rows whose GeGLU is launches, not bytes
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from turbopi.calibrate.artifact import RANDOM_NOISE
 from turbopi.errors import ConfigError
 from turbopi.evaluate.pages import render
 from turbopi.evaluate.plots import write_comparison_plot
 from turbopi.evaluate.results import Results
 from turbopi.evaluate.statistics import Paired, Rate, percentiles
 from turbopi.files import write_whole
+from turbopi.quantization.artifact import RANDOM_NOISE
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""GeGLU behind a product that hasn't it in its epilogue. Twin: `engine.ops.geglu`."""
+"""GeGLU behind a product that hasn't it in its epilogue. Twin: `kernels.plain.geglu`."""
 
 import triton
 import triton.language as tl

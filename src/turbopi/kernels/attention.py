@@ -1,7 +1,7 @@
 """Attention without materialised logits: inside pictures, and of many query heads over one key/value head.
 
-Twins: `engine.ops.vision_attention`, `engine.ops.attention`, `engine.ops.masked_softmax`. Logits, softmax and sums are
-float32; probabilities are rounded to the values' dtype for their product, as in the twins.
+Twins: `vision_attention`, `attention`, `masked_softmax` of `kernels.plain`. Logits, softmax and sums are float32;
+probabilities are rounded to the values' dtype for their product, as in the twins.
 """
 
 import torch
@@ -68,7 +68,7 @@ def _vision_kernel(
 def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:
     """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
 
-    With `inverse` the result leaves as E4M3: see `engine.fp8`.
+    With `inverse` the result leaves as E4M3: see `quantization.fp8`.
     """
     assert qkv.is_contiguous(), "qkv is read as it lies in memory"
     rows, width = qkv.shape[0], qkv.shape[1] // 3

@@ -1,6 +1,6 @@
 """What the model is given, as it wants it.
 
-Twins: `engine.ops.patch_rows`, `engine.ops.embed_patches`, `engine.ops.embed_prompt`.
+Twins: `kernels.plain.patch_rows`, `kernels.plain.embed_patches`, `kernels.plain.embed_prompt`.
 """
 
 import torch

@@ -13,7 +13,7 @@ import triton.language as tl
 from torch import Tensor
 from triton.language.extra.cuda import gdc_launch_dependents, gdc_wait
 
-from turbopi.engine.fp8 import E4M3
+from turbopi.quantization.fp8 import E4M3
 
 
 @triton.jit

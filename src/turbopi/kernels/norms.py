@@ -1,8 +1,8 @@
 """Residual addition and the norm behind it in one pass: one row a program.
 
-Twins: `engine.ops.residual_rms_norm`, `engine.ops.residual_layer_norm`. `y` may also be [splits, tokens, D], float32
+Twins: `residual_rms_norm` and `residual_layer_norm` of `kernels.plain`. `y` may also be [splits, tokens, D], float32
 or as x: the partial sums of a product split over its inner axis, added up here in float32. With `inverse` the norm
-leaves as E4M3, rounded once from float32: see `engine.fp8`.
+leaves as E4M3, rounded once from float32: see `quantization.fp8`.
 """
 
 import torch

@@ -11,9 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.engine import ops as plain
-from turbopi.engine.ops import Ops
-from turbopi.kernels import attention, embedding, norms, rope
+from turbopi.kernels import attention, embedding, norms, plain, rope
+from turbopi.kernels.interface import Ops
 from turbopi.kernels.launch import capability
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.gemm import products

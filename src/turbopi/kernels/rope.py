@@ -1,4 +1,4 @@
-"""RoPE on queries and keys, split off a joint projection, and the cache. Twin: `engine.ops.rope_split`."""
+"""RoPE on queries and keys, split off a joint projection, and the cache. Twin: `kernels.plain.rope_split`."""
 
 import triton
 import triton.language as tl

@@ -1,4 +1,4 @@
-"""Weights to E4M3, or E2M1, with error feedback. Twin: `engine.rounding.columns_with_feedback`."""
+"""Weights to E4M3 with error feedback. Twin: `quantization.rounding.columns_with_feedback`."""
 
 import torch
 import triton
@@ -22,22 +22,14 @@ def _to_e4m3(x):
 
 
 @triton.jit
-def _to_e2m1(x):
-    x = tl.clamp(x, -6.0, 6.0)
-    step = tl.where(tl.abs(x) < 2, 0.5, tl.where(tl.abs(x) < 4, 1.0, 2.0))
-    return (x / step + 12582912.0 - 12582912.0) * step
-
-
-@triton.jit
 def _feedback_kernel(
     weight, inverse, order, errors, answers, out, rows, columns,
-    NUM: tl.constexpr, R: tl.constexpr, ROWS: tl.constexpr, E2M1_BLOCK: tl.constexpr,
+    NUM: tl.constexpr, R: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     valid, direction = row < rows, tl.arange(0, R)
-    if E2M1_BLOCK == 0:
-        by = tl.load(inverse + row, valid, 1.0)
-        scale = tl.div_rn(1.0, by)
+    by = tl.load(inverse + row, valid, 1.0)
+    scale = tl.div_rn(1.0, by)
     left = tl.zeros((ROWS, R), tl.float32)
     at = tl.load(order)
     exact = tl.load(weight + row * columns + at, valid, 0.0).to(tl.float32)
@@ -47,33 +39,25 @@ def _feedback_kernel(
         error = tl.load(errors + column * NUM + direction, direction < NUM, 0.0)
         answer = tl.load(answers + column * NUM + direction, direction < NUM, 0.0)
         wanted = exact - tl.sum(left * answer[None, :], 1)
-        if E2M1_BLOCK == 0:
-            rounded = _to_e4m3(wanted * by)
-            value = rounded * scale
-        else:
-            by = tl.load(inverse + row * (columns // E2M1_BLOCK) + at // E2M1_BLOCK, valid, 1.0)
-            rounded = tl.where(by > 0, _to_e2m1(wanted * by) / by, 0.0)
-            value = rounded
-        left += (value - exact)[:, None] * error[None, :]
+        rounded = _to_e4m3(wanted * by)
+        left += (rounded * scale - exact)[:, None] * error[None, :]
         tl.store(out + row * columns + at, rounded.to(out.dtype.element_ty), valid)
         at, exact = following, next_exact
 
 
 def round_with_feedback(weight: Tensor, inverse: Tensor, order: Tensor, errors: Tensor, answers: Tensor) -> Tensor:
-    """Weight [out, in] -> e4m3[out, in] of weight * inverse; or with inverse [out, in / 16], of E2M1's blocks (0: of
-    zeros), float32[out, in], what the E2M1 numbers stand for. `order`, `errors`, `answers`: `engine.rounding.feedback`.
+    """Weight [out, in] -> e4m3[out, in] of weight * inverse. `order`, `errors`, `answers`: of
+    `quantization.rounding.feedback`.
     """
     weight = weight.contiguous()
     rows, columns = weight.shape
-    num, e2m1 = errors.shape[1], inverse.dim() == 2
+    num = errors.shape[1]
     assert order.shape == (columns,) and errors.shape == answers.shape == (columns, num)
     assert errors.is_contiguous() and answers.is_contiguous() and inverse.is_contiguous()
-    block = columns // inverse.shape[1] if e2m1 else 0
-    assert inverse.shape == ((rows, columns // block) if e2m1 else (rows,))
-    dtype = torch.float32 if e2m1 else result_dtype(weight, 1.0)
-    out = torch.empty(rows, columns, dtype=dtype, device=weight.device)
+    assert inverse.shape == (rows,)
+    out = torch.empty(rows, columns, dtype=result_dtype(weight, 1.0), device=weight.device)
     _feedback_kernel[(triton.cdiv(rows, ROWS),)](
         weight, inverse, order, errors, answers, out, rows, columns,
-        NUM=num, R=triton.next_power_of_2(num), ROWS=ROWS, E2M1_BLOCK=block, num_warps=1,
+        NUM=num, R=triton.next_power_of_2(num), ROWS=ROWS, num_warps=1,
     )  # fmt: skip
     return out

@@ -16,11 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from turbopi.calibrate.artifact import Quantization
 from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.files import write_whole
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
+from turbopi.quantization.artifact import Quantization
 from turbopi.reading import Fields, read_json
 from turbopi.tensorrt.networks import Fp8Scales
 from turbopi.tensorrt.ops import FP8_MAX

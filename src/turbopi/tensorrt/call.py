@@ -17,9 +17,9 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import Mark
-from turbopi.engine.ops import embed_patches
 from turbopi.engine.weights import Weights
 from turbopi.errors import BackendError
+from turbopi.kernels.plain import embed_patches
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.model.layers import apply_rope, rope_tables
 from turbopi.tensorrt.networks import HIDDEN, matrix

@@ -20,8 +20,9 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.engine.fp8 import Matrix
-from turbopi.engine.weights import GemmaLayer, VisionLayer, Weights
+from turbopi.engine.weights import Weights
+from turbopi.kernels.interface import GemmaLayer, VisionLayer
+from turbopi.quantization.fp8 import Matrix
 from turbopi.tensorrt.ops import Dtype, NetworkOps, Value, to_fp8
 
 # Added to a hidden key's logit: behind any visible key its exp() is 0. Far from float32's lowest, which openpi takes,

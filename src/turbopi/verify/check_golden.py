@@ -22,12 +22,13 @@ import torch
 
 from turbopi import backends
 from turbopi.backends import Tier
-from turbopi.calibrate.artifact import TIERS, Quantization, shapes_of
 from turbopi.calibrate.run import Settings, calibrate_model
 from turbopi.config import Kind
 from turbopi.examples import Example, NoisyExample
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
+from turbopi.quantization.artifact import Quantization, shapes_of
+from turbopi.quantization.plan import TIERS
 from turbopi.verify.golden import Arrays, Case, GoldenFolder, Run
 
 # max absolute error against torch_fp32. Masks, positions and times must be equal.

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from turbopi import backends, shipped
-from turbopi.calibrate.artifact import Quantization, calibration_of
 from turbopi.checkpoint import Checkpoint
+from turbopi.checkpoint.calibration import calibration_of
 from turbopi.engine.graph import empty_cache
 from turbopi.errors import BackendError, CheckpointError
 from turbopi.examples import NoisyExample
@@ -25,6 +25,7 @@ from turbopi.model import exact
 from turbopi.model.reference import Pi0Model
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
+from turbopi.quantization.artifact import Quantization
 from turbopi.verify import control
 from turbopi.verify.inputs import Plan, check_observations, make_calls, read_examples
 from turbopi.verify.intermediates import Tensors, in_order, tensors_of

@@ -5,10 +5,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from turbopi.calibrate.artifact import TIERS
 from turbopi.errors import BackendError, ConfigError
 from turbopi.examples import NoisyExample
 from turbopi.plots import action_groups
+from turbopi.quantization.plan import TIERS
 from turbopi.verify.bounds import (
     BF16_FACTOR,
     BOUND_FACTORS,

@@ -1,6 +1,6 @@
 """Attention without materialised logits through wgmma and TMA, for compute capability 9.0: see kernel.cu.
 
-Twins: `engine.ops.vision_attention`, and `engine.ops.attention` without a suffix. The kernels for all other GPUs, and
+Twins: `vision_attention` of `kernels.plain`, and its `attention` without a suffix. The kernels for all other GPUs, and
 for heads that this one doesn't take, are in kernels/attention.py.
 """
 

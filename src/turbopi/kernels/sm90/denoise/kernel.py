@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.engine.weights import State
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct, enumeration
+from turbopi.kernels.interface import State
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.denoise.packing import (

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.engine.fp8 import E4M3, Directions, Fp8Matrix
-from turbopi.engine.weights import GemmaLayer
 from turbopi.errors import BackendError
+from turbopi.kernels.interface import GemmaLayer
+from turbopi.kernels.quantize import quantize
+from turbopi.quantization.fp8 import E4M3, Directions
 
 BLOCK = 16  # rows of a tile, columns of a block
 WARPS = 16  # that multiply
@@ -173,7 +174,7 @@ class PackedExpert:
             parts = layer.qkv, layer.out, layer.gate_up, layer.down
             if inputs is not None:
                 common = [(directions or {}).get(f"expert.{i}.{kind}") for kind in KINDS]
-                made = [Fp8Matrix.quantize(m, 1.0, d) for m, d in zip(parts, common, strict=True)]
+                made = [quantize(m, 1.0, d) for m, d in zip(parts, common, strict=True)]
                 bits = [matrix.data.view(torch.uint8) for matrix in made]
                 scales.append(torch.cat([matrix.scale for matrix in made]))
             else:

@@ -7,10 +7,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.engine.fp8 import to_e4m3
-from turbopi.engine.weights import GemmaLayer, State
+from turbopi.kernels.interface import GemmaLayer, State
 from turbopi.model.denoise import euler_step
 from turbopi.model.layers import rope_tables
+from turbopi.quantization.fp8 import to_e4m3
 
 Operand = Callable[[Tensor, int, int], Tensor]
 

@@ -1,7 +1,7 @@
 """Matrix products in bfloat16 with float32 sums and a fused epilogue, for compute capability 9.0: see kernel.cu.
 
-Twins: `engine.ops.linear`, `linear_gelu`, `linear_geglu`; "partial" and "parts" are `linear` before its sums are added
-up, which the norms in `norms.py` do.
+Twins: `linear`, `linear_gelu`, `linear_geglu` of `kernels.plain`; "partial" and "parts" are `linear` before its sums
+are added up, which the norms in `norms.py` do.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
 """Matrix products of E4M3 numbers, for compute capability 9.0: kernel.cu compiled for them.
 
-Twins: `engine.ops`' products with an `Fp8Matrix`. The results are bfloat16, E4M3 for a product that reads them next
+Twins: `kernels.plain`' products with an `Fp8Matrix`. The results are bfloat16, E4M3 for a product that reads them next
 (`inverse`), or parts of the sums ("partial", "parts") for the norms of `norms.py` to add up.
 """
 
@@ -10,7 +10,6 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from turbopi.engine.fp8 import ALIGNMENT, E4M3, Fp8Matrix
 from turbopi.kernels.sm90.gemm.bf16 import (
     SPLIT,
     Copy,
@@ -30,6 +29,7 @@ from turbopi.kernels.sm90.gemm.bf16 import (
     tile_constants,
 )
 from turbopi.kernels.sm90.instructions import DependentKernel
+from turbopi.quantization.fp8 import ALIGNMENT, E4M3, Fp8Matrix
 
 DEPTH = 128  # of a step along the inner axis
 PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are added up in float32

@@ -9,10 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.engine.fp8 import Fp8Matrix, Matrix, to_e4m3
 from turbopi.kernels import activations
 from turbopi.kernels.sm90.gemm.bf16 import DEPTH, SPLIT, Epilogue, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import best_tile, matmul_fp8
+from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
 
 GEGLU_TILES = (Tile(3, 128, 1, 2, overlap=True), Tile(3, 192), Tile(2, 256), Tile(2, 160, 1, 2, overlap=True))
 GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better

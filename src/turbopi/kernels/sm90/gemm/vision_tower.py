@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from turbopi.engine.fp8 import E4M3, Fp8Matrix, Matrix
 from turbopi.kernels import norms
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Epilogue, Folded, Sums, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
@@ -17,6 +16,7 @@ from turbopi.kernels.sm90.gemm.products import (
     tuned_residual_linear,
     vision_tile,
 )
+from turbopi.quantization.fp8 import E4M3, Fp8Matrix, Matrix
 
 # As `products.VISION_TILES`, for products that add their result to the residual stream. Where sums are gathered, all
 # clusters must be on the GPU at once: an H200 takes 15 of eight blocks and 30 of four.

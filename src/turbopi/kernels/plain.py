@@ -1,8 +1,7 @@
-"""What the engine computes, as operations that can be exchanged one by one.
+"""The twin of every operation, in plain PyTorch: what kernels are held against.
 
-`PLAIN` is their definition in PyTorch; `compiled()` is the same with Inductor's kernels between the matrix products;
-own kernels must equal `PLAIN`. Reductions and nonlinear functions are float32 inside; results have the activations'
-dtype.
+`PLAIN` defines what an operation computes; kernels of our own must equal it. Reductions and nonlinear functions are
+float32 inside; results have the activations' dtype.
 
 Where the product behind an operation is an `Fp8Matrix`, the operation gets that input's `inverse` scale, and its result
 is E4M3, rounded once from float32.
@@ -10,42 +9,16 @@ is E4M3, rounded once from float32.
 Shapes: D, W widths, F hidden width of an MLP, K head_dim, n query heads over one key/value head.
 """
 
-import inspect
-import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.engine.fp8 import Fp8Matrix, Matrix, to_e4m3
+from turbopi.kernels.interface import Ops
 from turbopi.model.layers import apply_rope, rms_normalize
 from turbopi.model.vision import normalize_images
-
-
-@dataclass(frozen=True)
-class Ops:
-    """Any of them may be exchanged for another implementation; `origin` says whose they are, for metadata.
-
-    `residual_linear` is a product that only the `y` of a residual norm reads, and such a norm's result only products
-    read; what they hand over is a matter between them.
-    """
-
-    embed_patches: Callable[..., Tensor]
-    embed_prompt: Callable[..., None]
-    residual_rms_norm: Callable[..., tuple[Tensor, Tensor]]
-    residual_layer_norm: Callable[..., tuple[Tensor, Any]]
-    linear: Callable[..., Tensor]
-    residual_linear: Callable[..., Any]
-    linear_gelu: Callable[..., Tensor]
-    linear_geglu: Callable[..., Tensor]
-    rope_split: Callable[..., Tensor]
-    vision_attention: Callable[..., Tensor]
-    attention: Callable[..., Tensor]
-    prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
-    origin: Mapping[str, str] = field(default_factory=dict)
+from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
 
 
 def patch_rows(images: Tensor, patch: int) -> Tensor:
@@ -225,63 +198,3 @@ PLAIN = Ops(
     attention=attention,
     origin={"matrix products": "cuBLAS", "vision attention": "scaled_dot_product_attention", "all else": "PyTorch"},
 )
-
-# Axes that differ from call to call (tokens, keys), by argument; all others are fixed by the model's sizes.
-_DYNAMIC_AXES: dict[Callable[..., Any], dict[str, tuple[int, ...]]] = {
-    residual_rms_norm: {"x": (0,), "y": (0,)},
-    residual_layer_norm: {"x": (0,), "y": (0,)},
-    gelu_by_sigmoid: {"x": (0,)},
-    geglu_by_sigmoid: {"gate_up": (0,)},
-    rope_split: {"qkv": (0,), "cos": (0,), "sin": (0,), "k_out": (0,), "v_out": (0,)},
-    masked_softmax: {"logits": (0, 1)},
-}
-_RECOMPILE_LIMIT = 64  # one compilation per width and per set of optional arguments; PyTorch's default is 8
-
-
-def compiled() -> Ops:
-    """The same operations with torch.compile between the matrix products, for any number of tokens and keys.
-
-    Where it is switched off (TORCH_COMPILE_DISABLE or TORCHDYNAMO_DISABLE is 1, which PyTorch reads when it compiles)
-    `without_compiler.OPS`, as what suits a compiler is slower one by one.
-    """
-    if torch._dynamo.config.disable or os.environ.get("TORCHDYNAMO_DISABLE") == "1":
-        from turbopi.engine import without_compiler  # which is made of this module
-
-        return without_compiler.OPS
-    softmax = _compiled(masked_softmax)
-    compiled_gelu, compiled_geglu = _compiled(gelu_by_sigmoid), _compiled(geglu_by_sigmoid)
-
-    def compiled_attention(*args: Any) -> Tensor:
-        return attention(*args, softmax=softmax)
-
-    return Ops(
-        embed_patches=embed_patches,
-        embed_prompt=embed_prompt,
-        residual_rms_norm=_compiled(residual_rms_norm),
-        residual_layer_norm=_compiled(residual_layer_norm),
-        linear=linear,
-        residual_linear=linear,
-        linear_gelu=lambda x, weight, bias: compiled_gelu(F.linear(x, weight, bias)),
-        linear_geglu=lambda x, gate_up: compiled_geglu(F.linear(x, gate_up)),
-        rope_split=_compiled(rope_split),
-        vision_attention=vision_attention,
-        attention=compiled_attention,
-        origin={**PLAIN.origin, "all else": "Inductor"},
-    )
-
-
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    jitted = torch.compile(function, fullgraph=True)
-    names = list(inspect.signature(function).parameters)
-    dynamic_axes = _DYNAMIC_AXES[function]
-    # elsewhere a second width would make widths unknown, too, and every index a division
-    unknown_numbers = function is masked_softmax  # `slots` differs from bucket to bucket
-
-    def call(*args: Any) -> Any:
-        for name, arg in zip(names, args, strict=False):
-            for axis in dynamic_axes.get(name, ()) if arg is not None else ():
-                torch._dynamo.maybe_mark_dynamic(arg, axis)
-        with torch._dynamo.config.patch(recompile_limit=_RECOMPILE_LIMIT, automatic_dynamic_shapes=unknown_numbers):
-            return jitted(*args)
-
-    return call

@@ -8,37 +8,12 @@ et al., 2022, arXiv:2210.17323) with a Hessian of low rank, in which an error ta
 Shapes: a matrix [out, in], R directions.
 """
 
-import importlib.util
 from collections.abc import Callable
-from functools import partial
 
 import torch
 from torch import Tensor
 
-from turbopi.engine.fp8 import Directions, to_e4m3
-
-
-def round_rows(weight: Tensor, inverse: Tensor, directions: Directions | None = None) -> Tensor:
-    """e4m3[out, in]: weight * inverse, rounded to nearest, or for the directions of what it is multiplied by.
-
-    inverse float32[out], 1 / scale. On a GPU with Triton by a kernel, which may round other weights up or down than a
-    CPU: a sum's last bit decides what all later weights of its row make up for.
-    """
-    if directions is None:
-        return to_e4m3(weight, inverse[:, None])
-    return by_kernel_or(partial(round_with_feedback_plain, weight, inverse), weight, inverse, directions)
-
-
-def by_kernel_or(
-    plain: Callable[[Tensor, Tensor, Tensor], Tensor], weight: Tensor, inverse: Tensor, directions: Directions
-) -> Tensor:
-    """`kernels.rounding.round_with_feedback` on a GPU with Triton; elsewhere plain(order, errors, answers)."""
-    feeding = feedback(directions.to(weight.device))
-    if weight.is_cuda and importlib.util.find_spec("triton") is not None:
-        from turbopi.kernels.rounding import round_with_feedback  # Triton isn't imported elsewhere
-
-        return round_with_feedback(weight, inverse, *feeding)
-    return plain(*feeding)
+from turbopi.quantization.fp8 import Directions, to_e4m3
 
 
 def feedback(directions: Directions) -> tuple[Tensor, Tensor, Tensor]:

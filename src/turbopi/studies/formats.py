@@ -9,9 +9,9 @@ from torch import Tensor
 
 import turbopi.model.gemma
 import turbopi.model.vision
-from turbopi.engine.fp8 import E4M3_MAX, Directions, to_e4m3
-from turbopi.engine.rounding import by_kernel_or, columns_with_feedback
 from turbopi.model.layers import attention
+from turbopi.quantization.fp8 import E4M3_MAX, Directions, to_e4m3
+from turbopi.quantization.rounding import columns_with_feedback, feedback
 
 # NVFP4 (Blackwell): E2M1 numbers in blocks of 16 with an E4M3 scale each, and one float32 scale for the tensor.
 E2M1 = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
@@ -37,14 +37,8 @@ def round_nvfp4(x: Tensor, directions: Directions | None = None) -> Tensor:
         return x
     scale = to_e4m3(largest / E2M1[-1], 1 / whole).float() * whole
     if directions is not None:
-        inverse = torch.where(scale > 0, 1 / scale.clamp(min=1e-30), 0.0).squeeze(2)
-
-        def plain(order: Tensor, errors: Tensor, answers: Tensor) -> Tensor:
-            return columns_with_feedback(
-                x, order, errors, answers, lambda wanted, i: _e2m1(wanted, scale[:, i // BLOCK, 0])
-            )
-
-        return by_kernel_or(plain, x, inverse, directions).to(x.dtype)
+        feeding = feedback(directions.to(x.device))
+        return columns_with_feedback(x, *feeding, lambda wanted, i: _e2m1(wanted, scale[:, i // BLOCK, 0])).to(x.dtype)
     return _e2m1(blocks, scale).flatten(-2).to(x.dtype)
 
 

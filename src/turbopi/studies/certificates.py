@@ -1,6 +1,6 @@
-"""FP8's certificates at full size, without a checkpoint: `python -m turbopi.verify.certificates --out DIR`.
+"""FP8's certificates at full size, without a checkpoint: `python -m turbopi.studies.certificates --out DIR`.
 
-For each kind of weights (calibrate/studied.py): a calibration on varied LIBERO pictures, then `verify` in both tiers on
+For each kind of weights (studies/weights.py): a calibration on varied LIBERO pictures, then `verify` in both tiers on
 other ones, each cut down to what fits in a table.
 """
 
@@ -17,12 +17,13 @@ import torch
 
 from turbopi import backends, shipped
 from turbopi.backends import Tier
-from turbopi.calibrate.artifact import TIERS, Quantization
 from turbopi.calibrate.run import Settings, calibrate
-from turbopi.calibrate.studied import WEIGHTS, Weights, studied_checkpoint
 from turbopi.checkpoint import Checkpoint
 from turbopi.files import write_whole
+from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.plan import TIERS
 from turbopi.recordings import RecordedCall, save_call
+from turbopi.studies.weights import WEIGHTS, Weights, studied_checkpoint
 from turbopi.verify.inputs import Plan
 from turbopi.verify.run import verify
 

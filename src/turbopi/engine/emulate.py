@@ -11,10 +11,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.calibrate.sites import Site, linears, norm_of
-from turbopi.engine.fp8 import Directions, Fp8Matrix, to_e4m3
+from turbopi.kernels.quantize import quantize
 from turbopi.model.layers import AdaRMSNorm, inverse_rms
 from turbopi.model.reference import Pi0Model
+from turbopi.model.sites import linears, norm_of
+from turbopi.quantization.fp8 import Directions, Fp8Matrix, to_e4m3
+from turbopi.quantization.sites import Site
 
 Round = Callable[[Tensor], Tensor]
 
@@ -26,7 +28,7 @@ def round_activation(x: Tensor, scale: float) -> Tensor:
 
 def round_weight(weight: Tensor, directions: Directions | None = None) -> Tensor:
     """A matrix [out, in] as E4M3 with a scale an output channel holds it, in its dtype."""
-    return Fp8Matrix.quantize(weight, 1.0, directions).dequantized().to(weight.dtype)
+    return quantize(weight, 1.0, directions).dequantized().to(weight.dtype)
 
 
 class RoundedWeights:
@@ -41,7 +43,7 @@ class RoundedWeights:
 
     def __call__(self, site: Site, weight: Tensor) -> Tensor:
         if id(weight) not in self._held:
-            self._held[id(weight)] = weight, Fp8Matrix.quantize(weight, 1.0, self._directions.get(site))
+            self._held[id(weight)] = weight, quantize(weight, 1.0, self._directions.get(site))
         return self._held[id(weight)][1].dequantized().to(weight.dtype)
 
 

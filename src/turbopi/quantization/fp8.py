@@ -4,7 +4,7 @@ A matrix has one scale an output channel, an activation one scale a site, fixed 
 are float32; the product of both scales is applied to them once, before bias and nonlinearity.
 
 Rounding is to nearest even. What lies beyond ±448, infinities too, becomes ±448; NaN stays NaN, so that damage shows.
-Weights whose activations' `Directions` are known are rounded with error feedback, see `rounding.round_rows`.
+Weights whose activations' `Directions` are known are rounded with error feedback, see rounding.py.
 """
 
 from dataclasses import dataclass
@@ -58,14 +58,6 @@ class Fp8Matrix:
     scale: Tensor  # float32[out]: the channel's scale times the input's
     inverse: float  # 1 / scale of the input
     dtype: torch.dtype  # of results that aren't E4M3
-
-    @classmethod
-    def quantize(cls, weight: Tensor, input_scale: float, directions: Directions | None = None) -> "Fp8Matrix":
-        """weight [out, in] in its channels' own scales, rounded for its input's directions."""
-        from turbopi.engine.rounding import round_rows  # which needs what stands here
-
-        scale = channel_scales(weight)
-        return cls(round_rows(weight, 1 / scale, directions), scale * input_scale, 1 / input_scale, weight.dtype)
 
     @property
     def shape(self) -> torch.Size:

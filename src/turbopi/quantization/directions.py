@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from turbopi.engine.fp8 import E4M3_MAX, Directions, to_e4m3
+from turbopi.quantization.fp8 import E4M3_MAX, Directions, to_e4m3
 
 COUNT = 16  # directions of a site: 4 leave a seventh more error, 64 a tenth less (docs/quantization.md)
 ROWS = 512  # of a site, in float32: 1.3 GB of the full model

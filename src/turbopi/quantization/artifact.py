@@ -7,29 +7,23 @@ is refused. What was measured to get there is kept in it and goes with it into e
 import base64
 import hashlib
 import json
-import logging
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
 
-from turbopi.calibrate.sites import MLP_KINDS, PARTS, Part, Site, sites
-from turbopi.checkpoint import Checkpoint
 from turbopi.config import ModelConfig
-from turbopi.engine.fp8 import E4M3, Directions
 from turbopi.errors import CalibrationError, ConfigError
 from turbopi.files import write_whole
+from turbopi.quantization.fp8 import E4M3, Directions
+from turbopi.quantization.plan import TIERS, Plan, reason_for_bf16
+from turbopi.quantization.sites import PARTS, Part, sites
 from turbopi.reading import is_finite, is_integer, one_line, read_json, shown
-
-logger = logging.getLogger(__name__)
 
 FORMAT, VERSION = "turbopi-quantization", 3  # 1 has no directions; 2 has no scales for the expert's activations
 RANDOM_NOISE = "random-noise"  # instead of observations: has to be asked for by this name
-Tier = Literal["fp8", "fp8-mlp"]
-TIERS: tuple[Tier, ...] = get_args(Tier)
 
 
 @dataclass(frozen=True)
@@ -167,7 +161,7 @@ class Quantization:
                 "checkpoint"
             )
 
-    def plan(self, config: ModelConfig, tier: str) -> "Plan":
+    def plan(self, config: ModelConfig, tier: str) -> Plan:
         """What runs in FP8 in a tier, and why the rest doesn't."""
         if tier not in TIERS:
             raise ConfigError(f"{tier!r} is no FP8 tier; choose one of {', '.join(TIERS)}")
@@ -176,7 +170,7 @@ class Quantization:
         common: dict[str, Directions] = {}
         for site in sites(config):
             entry = self.sites[str(site)]
-            reason = _reason(site, entry, tier, self.parts)
+            reason = reason_for_bf16(site, entry.scale, entry.kept, tier, self.parts)
             if reason is None:
                 assert entry.scale is not None  # or there is a reason
                 chosen[str(site)] = entry.scale
@@ -186,7 +180,7 @@ class Quantization:
                 kept[str(site)] = reason
         return Plan(tier, chosen, kept, common)
 
-    def describe(self, plan: "Plan") -> dict[str, Any]:
+    def describe(self, plan: Plan) -> dict[str, Any]:
         """What goes into the metadata of a policy that runs with it."""
         return {
             "plan": plan.describe(),
@@ -254,46 +248,6 @@ class Quantization:
             ) from error
 
 
-@dataclass(frozen=True)
-class Plan:
-    """A tier's choice: site -> scale of its activation, site -> why it stays in bfloat16, site -> directions."""
-
-    tier: str
-    scales: Mapping[str, float]
-    kept: Mapping[str, str]
-    directions: Mapping[str, Directions]
-
-    @property
-    def expert(self) -> Literal["fp8", "bf16"]:
-        """The denoising kernel takes all of the expert's matrices in one precision: FP8 only if none is to be kept."""
-        return "bf16" if any(name.startswith("expert.") for name in self.kept) else "fp8"
-
-    def describe(self) -> dict[str, Any]:
-        """Which sites run in what, by group, and why the others don't."""
-        by_group: dict[str, dict[str, list[str]]] = {}
-        for name in [*self.scales, *self.kept]:
-            part, layer, kind = name.split(".")
-            state = "fp8" if name in self.scales else f"bf16: {self.kept[name]}"
-            by_group.setdefault(f"{part}.{kind}", {}).setdefault(state, []).append(layer)
-        return {
-            group: next(iter(states))
-            if len(states) == 1
-            else {state: f"layers {', '.join(layers)}" for state, layers in states.items()}
-            for group, states in sorted(by_group.items())
-        }
-
-
-def _reason(site: Site, entry: SiteScale, tier: str, parts: Sequence[str]) -> str | None:
-    """Why a site stays in bfloat16."""
-    if site.part not in parts:
-        return f"FP8 is switched off in the {site.part}"
-    if tier == "fp8-mlp" and (site.kind not in MLP_KINDS or site.part == "expert"):
-        return "fp8-mlp takes the feed-forward products of vision and prefix alone"
-    if entry.scale is None:
-        return "its calibration is older than FP8 for this activation; run `turbopi calibrate` again"
-    return site.refusal or entry.kept
-
-
 _UNSOUND = (KeyError, TypeError, ValueError, OverflowError, RuntimeError)  # the last: tensors, or nested too deeply
 _MAX_BYTES = 512 * 2**20  # the directions of a full-size model are most of it
 _SCALES = (1e-30, 1e30)  # of an activation; further out float32 has no room for products
@@ -332,52 +286,3 @@ def check_given(precision: str, quantization: "str | Path | Quantization | None"
             f"precision {precision!r} needs FP8 calibration; make one with `turbopi calibrate` and give it as "
             "`quantization`"
         )
-
-
-BESIDE = "turbopi_fp8.json"  # in a checkpoint's folder: found there unless another file is named
-
-
-def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:
-    """The calibration that a policy in this precision runs with, checked against its checkpoint; None: it needs none.
-
-    Hashes all weights, which takes some seconds at full size, unless their files were hashed before. Raises
-    ConfigError if there is none, CalibrationError if it doesn't fit.
-    """
-    quantization = calibration_of(given, tier, checkpoint)
-    if quantization is None:
-        return None
-    if checkpoint.path is None:  # so not yet
-        quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
-    for warning in quantization.warnings:
-        logger.warning("FP8: %s", warning)
-    return quantization
-
-
-def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:
-    """What `for_policy` takes, checked before any work: against the weights only if they are on disk.
-
-    Raises ConfigError too where it leaves no site at all in FP8: such a policy would be bfloat16 under FP8's name.
-    """
-    if tier not in TIERS:
-        check_given(tier, given)
-        return None
-    if given is None:
-        beside = None if checkpoint.path is None else checkpoint.path / BESIDE
-        if beside is None or not beside.is_file():
-            raise ConfigError(
-                f"precision {tier!r} needs a calibration: run `turbopi calibrate` on this checkpoint and give the file "
-                f"that it writes (--quantization FILE, or as {BESIDE} beside the weights)"
-            )
-        given = beside
-    quantization = given if isinstance(given, Quantization) else Quantization.load(given)
-    if checkpoint.path is None:  # weights would have to be made to be hashed
-        quantization.check_shapes(checkpoint.config.model)
-    else:
-        quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
-    plan = quantization.plan(checkpoint.config.model, tier)
-    if not plan.scales:
-        reasons = "; ".join(f"{count} sites: {why}" for why, count in Counter(plan.kept.values()).items())
-        raise ConfigError(
-            f"{quantization.source or 'the calibration'} leaves nothing in {tier} ({reasons}); take 'bf16'"
-        )
-    return quantization

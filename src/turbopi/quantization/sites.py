@@ -6,16 +6,11 @@ Where an adaRMS norm stands in front of the expert's products, the activation is
 1 + scale: the denoising kernel rounds that, and divides by the rms and adds the shift behind the product.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
-
-from torch import nn
+from typing import Literal, get_args
 
 from turbopi.config import ModelConfig
-from turbopi.engine.fp8 import ALIGNMENT
-from turbopi.model.layers import AdaRMSNorm
-from turbopi.model.reference import Pi0Model
+from turbopi.quantization.fp8 import ALIGNMENT
 
 Part = Literal["vision", "prefix", "expert"]
 PARTS: tuple[Part, ...] = get_args(Part)
@@ -72,31 +67,3 @@ def sites(config: ModelConfig) -> list[Site]:
             last = part == "prefix" and layer + 1 == depth
             found += [Site(part, layer, kind, *sizes[kind]) for kind in (("qkv",) if last else KINDS[part])]
     return found
-
-
-def linears(model: Pi0Model, site: Site) -> Iterator[nn.Linear]:
-    """The reference's matrices of a site."""
-    stacks: dict[Part, Any] = {"vision": model.vision, "prefix": model.vlm, "expert": model.expert}
-    stack = stacks[site.part]
-    layer = stack.layers[site.layer]
-    attention, mlp = layer.self_attn, layer.mlp
-    modules: dict[str, Callable[[], tuple[nn.Linear, ...]]] = {
-        "qkv": lambda: (attention.q_proj, attention.k_proj, attention.v_proj),
-        "out": lambda: (attention.out_proj if site.part == "vision" else attention.o_proj,),
-        "gate_up": lambda: (mlp.gate_proj, mlp.up_proj),
-        "down": lambda: (mlp.down_proj,),
-        "fc1": lambda: (mlp.fc1,),
-        "fc2": lambda: (mlp.fc2,),
-    }
-    found = modules[site.kind]()
-    last = site.part == "prefix" and site.layer + 1 == len(stack.layers)
-    yield from found[1:] if last else found  # nothing asks for the last layer's queries
-
-
-def norm_of(model: Pi0Model, site: Site) -> AdaRMSNorm | None:
-    """The adaRMS norm inside which a site's activation is, or None: then it is what the matrices read."""
-    if site.part != "expert" or site.kind not in ("qkv", "gate_up"):
-        return None
-    layer = model.expert.layers[site.layer]
-    norm = layer.input_layernorm if site.kind == "qkv" else layer.post_attention_layernorm
-    return norm if isinstance(norm, AdaRMSNorm) else None

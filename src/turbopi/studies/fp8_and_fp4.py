@@ -1,4 +1,4 @@
-"""What numbers of eight and four bits do to actions: `python -m turbopi.calibrate.research --out FILE`.
+"""What numbers of eight and four bits do to actions: `python -m turbopi.studies.fp8_and_fp4 --out FILE`.
 
 Emulated exactly in float32 (emulate.py, formats.py) on three sets of full-size weights (studied.py).
 """
@@ -15,21 +15,22 @@ import torch
 from torch import Tensor
 
 from turbopi import backends, shipped
-from turbopi.calibrate.directions import Rows, directions
-from turbopi.calibrate.emulate import Round, RoundedWeights, delta_cosine, relative_rms, replaced, rounded
-from turbopi.calibrate.formats import attention_in_fp8, round_nvfp4
 from turbopi.calibrate.observations import Batch, batches
-from turbopi.calibrate.sites import MLP_KINDS, PARTS, Site, linears, sites
 from turbopi.calibrate.statistics import collect
-from turbopi.calibrate.studied import WEIGHTS, Weights, studied_checkpoint
 from turbopi.checkpoint import random_checkpoint
-from turbopi.engine.fp8 import Directions
+from turbopi.engine.emulate import Round, RoundedWeights, delta_cosine, relative_rms, replaced, rounded
 from turbopi.examples import Example, with_noises
 from turbopi.files import write_whole
 from turbopi.model.reference import Pi0Model
+from turbopi.model.sites import linears
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.provenance import provenance
+from turbopi.quantization.directions import Rows, directions
+from turbopi.quantization.fp8 import Directions
+from turbopi.quantization.sites import MLP_KINDS, PARTS, Site, sites
+from turbopi.studies.formats import attention_in_fp8, round_nvfp4
+from turbopi.studies.weights import WEIGHTS, Weights, studied_checkpoint
 
 
 def errors(

@@ -1,0 +1,60 @@
+"""A checkpoint's calibration: found beside its weights or given, and held against them."""
+
+import logging
+from collections import Counter
+from pathlib import Path
+
+from turbopi.checkpoint.base import Checkpoint
+from turbopi.errors import ConfigError
+from turbopi.quantization.artifact import Quantization, check_given
+from turbopi.quantization.plan import TIERS
+
+logger = logging.getLogger(__name__)
+
+BESIDE = "turbopi_fp8.json"  # in a checkpoint's folder: found there unless another file is named
+
+
+def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:
+    """The calibration that a policy in this precision runs with, checked against its checkpoint; None: it needs none.
+
+    Hashes all weights, which takes some seconds at full size, unless their files were hashed before. Raises
+    ConfigError if there is none, CalibrationError if it doesn't fit.
+    """
+    quantization = calibration_of(given, tier, checkpoint)
+    if quantization is None:
+        return None
+    if checkpoint.path is None:  # so not yet
+        quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
+    for warning in quantization.warnings:
+        logger.warning("FP8: %s", warning)
+    return quantization
+
+
+def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:
+    """What `for_policy` takes, checked before any work: against the weights only if they are on disk.
+
+    Raises ConfigError too where it leaves no site at all in FP8: such a policy would be bfloat16 under FP8's name.
+    """
+    if tier not in TIERS:
+        check_given(tier, given)
+        return None
+    if given is None:
+        beside = None if checkpoint.path is None else checkpoint.path / BESIDE
+        if beside is None or not beside.is_file():
+            raise ConfigError(
+                f"precision {tier!r} needs a calibration: run `turbopi calibrate` on this checkpoint and give the file "
+                f"that it writes (--quantization FILE, or as {BESIDE} beside the weights)"
+            )
+        given = beside
+    quantization = given if isinstance(given, Quantization) else Quantization.load(given)
+    if checkpoint.path is None:  # weights would have to be made to be hashed
+        quantization.check_shapes(checkpoint.config.model)
+    else:
+        quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
+    plan = quantization.plan(checkpoint.config.model, tier)
+    if not plan.scales:
+        reasons = "; ".join(f"{count} sites: {why}" for why, count in Counter(plan.kept.values()).items())
+        raise ConfigError(
+            f"{quantization.source or 'the calibration'} leaves nothing in {tier} ({reasons}); take 'bf16'"
+        )
+    return quantization

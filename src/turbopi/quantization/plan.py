@@ -1,0 +1,51 @@
+"""What runs in which precision."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from turbopi.quantization.fp8 import Directions
+from turbopi.quantization.sites import MLP_KINDS, Site
+
+Fp8Tier = Literal["fp8", "fp8-mlp"]
+TIERS: tuple[Fp8Tier, ...] = get_args(Fp8Tier)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A tier's choice: site -> scale of its activation, site -> why it stays in bfloat16, site -> directions."""
+
+    tier: str
+    scales: Mapping[str, float]
+    kept: Mapping[str, str]
+    directions: Mapping[str, Directions]
+
+    @property
+    def expert(self) -> Literal["fp8", "bf16"]:
+        """The denoising kernel takes all of the expert's matrices in one precision: FP8 only if none is to be kept."""
+        return "bf16" if any(name.startswith("expert.") for name in self.kept) else "fp8"
+
+    def describe(self) -> dict[str, Any]:
+        """Which sites run in what, by group, and why the others don't."""
+        by_group: dict[str, dict[str, list[str]]] = {}
+        for name in [*self.scales, *self.kept]:
+            part, layer, kind = name.split(".")
+            state = "fp8" if name in self.scales else f"bf16: {self.kept[name]}"
+            by_group.setdefault(f"{part}.{kind}", {}).setdefault(state, []).append(layer)
+        return {
+            group: next(iter(states))
+            if len(states) == 1
+            else {state: f"layers {', '.join(layers)}" for state, layers in states.items()}
+            for group, states in sorted(by_group.items())
+        }
+
+
+def reason_for_bf16(site: Site, scale: float | None, kept: str | None, tier: str, parts: Sequence[str]) -> str | None:
+    """Why a site stays in bfloat16; None: it doesn't. `scale` and `kept`: what its calibration says."""
+    if site.part not in parts:
+        return f"FP8 is switched off in the {site.part}"
+    if tier == "fp8-mlp" and (site.kind not in MLP_KINDS or site.part == "expert"):
+        return "fp8-mlp takes the feed-forward products of vision and prefix alone"
+    if scale is None:
+        return "its calibration is older than FP8 for this activation; run `turbopi calibrate` again"
+    return site.refusal or kept
