@@ -37,6 +37,7 @@ from turbopi.cli.process import (
     forget_output,
     is_closed_pipe,
 )
+from turbopi.cli.tables import fitted
 from turbopi.errors import ConfigError, DeviceLost, TurboPiError
 
 CHECK_FAILED, OUR_FAULT = 1, 3
@@ -76,7 +77,9 @@ class Output:
         self.console.print(markup, highlight=False, soft_wrap=True)
 
     def table(self, table: Table) -> None:
-        self.console.print(table)
+        """A table, in parts if it is wider than the terminal."""
+        for part in fitted(table, self.console):
+            self.console.print(part)
 
     def document(self, content: Mapping[str, Any]) -> None:
         """The JSON document, if one was asked for."""
