@@ -8,11 +8,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: spinning th
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import gpu_evidence
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel's module is imported, by whichever test comes first
@@ -70,6 +72,20 @@ def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
     """Whatever the user's cache remembers of weights stays out of tests."""
     folder = tmp_path_factory.getbasetemp() / "cache"
     monkeypatch.setattr("turbopi.checkpoint.known_hashes.cache_folder", lambda: folder)
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that were saved, in order: what they show can be compared with what they are to show."""
+    figures: list[Figure] = []
+    save = Figure.savefig
+
+    def keeping(self: Figure, *args: Any, **options: Any) -> None:
+        figures.append(self)
+        save(self, *args, **options)
+
+    monkeypatch.setattr(Figure, "savefig", keeping)
+    return figures
 
 
 @pytest.fixture(scope="session")

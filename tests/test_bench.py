@@ -241,7 +241,7 @@ def test_a_full_disk_keeps_the_earlier_benchmark(tmp_path: Path) -> None:
     assert file.read_text() == before and list(tmp_path.iterdir()) == [file]
 
 
-def test_the_command_writes_a_complete_document(tmp_path: Path) -> None:
+def test_the_command_writes_a_complete_document(tmp_path: Path, drawn: list[Any]) -> None:
     options = "--random-weights pi05_tiny --calls 2 --main-calls 3 --steps 1,2 --cameras 1 --horizons 7,10 --device cpu"
     more = ["--beside", "pytorch", "--profile", "--json", "--report", str(tmp_path)]
     result = CliRunner().invoke(app, ["bench", *options.split(), *more])
@@ -267,7 +267,21 @@ def test_the_command_writes_a_complete_document(tmp_path: Path) -> None:
     assert [line["horizon"] for line in document["linear"]] == [7, 10]
     assert json.loads((tmp_path / "results.json").read_text())["floors"] == document["floors"]
     for plot in ("stages.png", "steps.png", "roofline.png"):
-        assert (tmp_path / plot).stat().st_size > 5000
+        assert (tmp_path / plot).read_bytes().startswith(b"\x89PNG")
+    stages_plot, roofline, steps_plot = (figure.axes[0] for figure in drawn)
+    main = next(one for one in document["results"] if one["job"] == document["main_job"])
+    bars = [bar.get_width() for bar in stages_plot.patches]
+    of_call = [main["milliseconds"][stage]["p50"] for stage in ("vision", "prefix", "denoise")]
+    assert bars == pytest.approx(of_call + [main["floor_ms"][stage] for stage in ("vision", "prefix", "denoise")])
+    points = [line.get_xydata()[0] for line in roofline.get_lines() if len(line.get_xydata()) == 1]
+    expected = [
+        (work["flops"] / work["bytes"], work["flops"] / main["milliseconds"][stage]["p50"] / 1e9)
+        for stage, work in ((stage, main["work"][stage]) for stage in ("vision", "prefix", "denoise"))
+    ]
+    np.testing.assert_allclose(points, expected)
+    medians = [[one["milliseconds"]["total"]["p50"] for one in document["results"][i : i + 2]] for i in (0, 2)]
+    measured = [container.lines[0].get_xydata().tolist() for container in steps_plot.containers]
+    assert measured == [[[1, pytest.approx(a)], [2, pytest.approx(b)]] for a, b in medians]
     page = (tmp_path / "report.md").read_text()
     assert page == report(document)
     assert f"{document['results'][3]['milliseconds']['total']['p50']:.2f}" in page

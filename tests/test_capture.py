@@ -16,7 +16,11 @@ from turbopi.model import exact
 class FakeStream(SimpleNamespace):
     def wait_stream(self, other: Any) -> None: ...
 
-    def synchronize(self) -> None: ...
+    def synchronize(self) -> None:
+        DONE.append("waited")
+
+
+DONE: list[str] = []  # what graphs and streams were told to do
 
 
 class FakeCuda:
@@ -25,7 +29,7 @@ class FakeCuda:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.captures: list[dict[str, Any]] = []
         event = SimpleNamespace(record=lambda stream: None)
-        monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: SimpleNamespace(replay=lambda: None))
+        monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: SimpleNamespace(replay=lambda: DONE.append("launched")))
         monkeypatch.setattr(torch.cuda, "current_stream", lambda device: FakeStream(device=device))
         monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
         monkeypatch.setattr(torch.cuda, "Event", lambda **options: event)
@@ -46,6 +50,16 @@ def test_a_capture_is_thread_local(monkeypatch: pytest.MonkeyPatch) -> None:
     capture(lambda mark: mark("vision"))
     (options,) = cuda.captures
     assert options["capture_error_mode"] == "thread_local"
+
+
+def test_a_replay_is_waited_for_and_a_launch_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeCuda(monkeypatch)
+    graph = capture(lambda mark: mark("vision"))
+    DONE.clear()
+    graph.launch()
+    assert DONE == ["launched"]
+    graph.replay()
+    assert DONE == ["launched", "launched", "waited"], "actions are read when replay returns"
 
 
 def test_captures_of_several_threads_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:

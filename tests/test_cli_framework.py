@@ -17,11 +17,16 @@ from turbopi.cli import app
 from turbopi.cli.framework import plain, with_errors_told
 from turbopi.errors import ObservationError
 
-COMMANDS = ("demo", "infer", "serve", "inspect", "convert", "export", "backends", "doctor")
+COMMANDS = (
+    *("demo", "infer", "serve", "inspect", "convert", "calibrate", "build", "export", "verify", "bench", "study"),
+    *("eval", "compare", "backends", "doctor"),
+)
 
 
 def test_help_lists_every_command_and_the_exit_codes() -> None:
     help = text_of(turbopi("--help").stdout)
+    group: Any = typer.main.get_command(app)
+    assert set(COMMANDS) == set(group.commands), "a command came or went"
     for command in COMMANDS:
         assert f" {command} " in help
     assert "Start with `turbopi demo`: it needs no checkpoint and no GPU." in help

@@ -168,5 +168,14 @@ def test_time_in_which_the_device_waits_for_the_host_is_the_prefixs() -> None:
     assert stage_ms["prefix"] > 400 > stage_ms["vision"]
 
 
-def test_tf32_stays_out_of_the_oracle() -> None:
-    assert not torch.backends.cuda.matmul.allow_tf32
+def test_tf32_stays_out_of_the_oracle_whatever_the_caller_has_set() -> None:
+    case, oracle = golden_cases()["b_third_masked"], backend("pytorch", "pi05", "f32")
+    exact = oracle.sample(case.observation, case.noise, 3).actions
+    before, x = torch.get_float32_matmul_precision(), torch.randn(512, 512, device="cuda")
+    product = x @ x
+    try:
+        torch.set_float32_matmul_precision("high")
+        assert not torch.equal(x @ x, product), "this GPU has no TF32: nothing is shown"
+        assert torch.equal(oracle.sample(case.observation, case.noise, 3).actions, exact)
+    finally:
+        torch.set_float32_matmul_precision(before)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -142,8 +143,27 @@ def test_aloha_metadata_has_its_reset_pose() -> None:
     assert policy.metadata["reset_pose"] == [0, -1.5, 1.5, 0, 0, 0]
 
 
-def test_warmup_runs_the_policy(policy: UnifiedPolicy) -> None:
-    assert policy.warmup() > 0
+def test_warmup_runs_all_that_a_call_runs_and_tells_the_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu", num_denoising_steps=3)
+    now, ran = 100.0, list[str]()
+
+    def taking(name: str, seconds: float) -> Any:
+        real = getattr(policy.backend, name)
+
+        def run(observation: Any, *arguments: Any, **options: Any) -> Any:
+            nonlocal now
+            now += seconds
+            steps = next(argument for argument in arguments if isinstance(argument, int))
+            ran.append(f"{name}, {int(observation.image_mask.sum())} cameras, {steps} steps")
+            return real(observation, *arguments, **options)
+
+        return run
+
+    for name, seconds in (("warmup", 20.0), ("sample", 0.5)):
+        monkeypatch.setattr(policy.backend, name, taking(name, seconds))
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    assert policy.warmup() == now - 100 >= 20.5
+    assert ran[0] == "warmup, 2 cameras, 3 steps" and ran[-1] == "sample, 2 cameras, 3 steps"
 
 
 @pytest.mark.parametrize("value", [0, -1, 1001, 2.5, True, "10"])

@@ -50,7 +50,7 @@ def certified(backend: str, *more: object, exit_code: int = 0) -> dict[str, Any]
 # What is right
 
 
-def test_plain_bf16_passes_and_its_document_is_complete(tmp_path: Path) -> None:
+def test_plain_bf16_passes_and_its_document_is_complete(tmp_path: Path, drawn: list[Any]) -> None:
     document = certified("pytorch", "--report", tmp_path)
     assert document["ok"] is True
     assert document["first_off"] is None
@@ -78,8 +78,17 @@ def test_plain_bf16_passes_and_its_document_is_complete(tmp_path: Path) -> None:
     assert len(document["observations"]["sha256"]) == 64
     assert document["provenance"]["commit"]
     assert json.loads((tmp_path / "verify.json").read_text()) == document
-    for plot in ("layers.png", "steps.png"):
-        assert (tmp_path / plot).stat().st_size > 5000
+    plots = {"layers.png": ("kv_k", "kv_v"), "steps.png": ("v_t", "x_t")}
+    for figure, (plot, of_plot) in zip(drawn, plots.items(), strict=True):
+        assert (tmp_path / plot).read_bytes().startswith(b"\x89PNG")
+        lines = [line.get_xydata().tolist() for line in figure.axes[0].get_lines()]
+        expected: list[list[list[float]]] = []
+        for tensor in of_plot:  # an error's line, then its control's, of what a logarithmic axis can show
+            rows = [row for row in document["intermediates"] if row["name"] == tensor]
+            for of_line in ([(row["index"], row) for row in rows], [(row["index"], row["control"]) for row in rows]):
+                expected.append([[index, one["relative_rms"]] for index, one in of_line if one["relative_rms"] > 0])
+        assert lines == expected and all(expected)
+        assert "PASS" in figure.axes[0].get_title()
 
 
 def test_the_oracle_has_no_error_against_itself() -> None:

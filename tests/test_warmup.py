@@ -55,8 +55,9 @@ def reference() -> UnifiedPolicy:
 
 def test_nothing_is_captured_behind_warmup_whichever_cameras_the_robot_sends() -> None:
     policy = made()
-    assert policy.warmup() > 0
+    policy.warmup()
     before = captures(policy)
+    assert before
     for cameras in (1, 2, 3):
         for prompt in ("pick", "pick up the black bowl " * 5):
             policy.infer(seen_by(cameras, policy, prompt), seed=0)

@@ -1,0 +1,171 @@
+"""Our kernels' CUDA C++, compiled by g++ for machine.h's cluster and launched in the GPU's place.
+
+Only what gemm's source needs is there: an instruction that machine.h doesn't know is an error when it is translated.
+Slow (a product of 64 x 16 x 64 takes milliseconds) and not exact to the tensor cores' order of summation.
+"""
+
+import ctypes
+import hashlib
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from turbopi.kernels.arguments import TENSOR_MAP, Parameters
+
+COMPILER = shutil.which("g++")
+MACHINE = Path(__file__).with_name("machine.h")
+
+# What is in an asm statement's text -> the function of machine.h that does it; the first that fits.
+INSTRUCTIONS = (
+    *(("mbarrier.init", "mbarrier_init"), ("mbarrier.arrive.expect_tx", "mbarrier_expect")),
+    *(("mbarrier.arrive.shared::cluster", "mbarrier_arrive_remote"), ("mbarrier.arrive", "mbarrier_arrive")),
+    *(("mbarrier.try_wait.parity", "mbarrier_wait"), ("mbarrier.test_wait.parity", "mbarrier_test")),
+    *(("barrier.cluster.arrive", "cluster_sync"), ("bar.sync", "bar_sync"), ("mapa.", "mapa")),
+    *(("st.async", "st_async"), ("rcp.approx", "rcp"), ("tanh.approx", "tanh")),
+    *(("wgmma.commit_group", "wgmma_commit"), ("wgmma.wait_group", "wgmma_wait")),
+    *(("cvt.rn.bf16x2", "cvt_bf16x2"), ("cvt.rn.satfinite.e4m3x2", "cvt_e4m3x2")),
+    ("cp.async.bulk.tensor.2d", "copy_2d"),
+)
+# No effect on what is computed here: kernels run one by one, registers are plenty, and copies are seen at once.
+IGNORED = ("griddepcontrol", "setmaxnreg", "prefetch", "fence")
+
+
+def translated(source: str) -> str:
+    """The source with each asm statement as a call, and shared memory that the machine has."""
+    parts, end = [], 0
+    for start, statement, stop in _statements(source):
+        parts += [source[end:start], _call(statement)]
+        end = stop
+    text = "".join((*parts, source[end:]))
+    return re.sub(r"extern __shared__ char (\w+)\[\];", r"char* const \1 = machine::shared();", text)
+
+
+def _statements(source: str) -> Iterator[tuple[int, str, int]]:
+    """(begin, what is in the parentheses, end) of each asm statement."""
+    for found in re.finditer(r"\basm\b(?: volatile)?\s*\(", source):
+        depth, at, quoted = 1, found.end(), False
+        while depth:
+            if source[at] == '"' and source[at - 1] != "\\":
+                quoted = not quoted
+            elif not quoted:
+                depth += {"(": 1, ")": -1}.get(source[at], 0)
+            at += 1
+        yield found.start(), source[found.end() : at - 1], at
+
+
+def _call(statement: str) -> str:
+    strings = re.match(r'(?:\s*"(?:[^"\\]|\\.)*")*', statement)
+    assert strings is not None
+    text = "".join(re.findall(r'"((?:[^"\\]|\\.)*)"', strings[0]))
+    operands = _operands(statement[strings.end() :])
+    if not text or any(word in text for word in IGNORED):
+        return "ptx_nothing()"
+    name = next((name for word, name in INSTRUCTIONS if word in text), None)
+    if name is None:
+        raise NotImplementedError(f"machine.h has no instruction for: {text}")
+    if name == "bar_sync" and len(operands) == 1:
+        operands.append(text.split(",")[1].strip(" ;"))
+    return f"ptx_{name}({', '.join(operands)})"
+
+
+def _operands(text: str) -> list[str]:
+    """The expressions behind constraints, in order: "=r"(over) : "r"(bar) -> over, bar"""
+    found, at = [], 0
+    while (begin := re.compile(r'"[^"]*"\s*\(').search(text, at)) is not None:
+        depth, at = 1, begin.end()
+        while depth:
+            depth += {"(": 1, ")": -1}.get(text[at], 0)
+            at += 1
+        found.append(text[begin.end() : at - 1])
+    return found
+
+
+def wgmma(name: str, columns: int, *, numbers: str = "bf16", from_registers: bool = False, across: bool = False) -> str:
+    """In place of `instructions.wgmma`."""
+    if from_registers or across:
+        raise NotImplementedError("machine.h multiplies what is in shared memory, by rows")
+    fp8 = str(numbers == "e4m3").lower()
+    return (
+        f"inline void {name}(float (&sums)[{columns // 2}], u64 a, u64 b, int keep) "
+        f"{{ machine::product<{columns}, {fp8}>(sums, a, b, keep); }}"
+    )
+
+
+class Map(ctypes.Structure):
+    """machine.h's `Map`, in the 128 bytes of a tensor map."""
+
+    _fields_ = (
+        *(("address", ctypes.c_uint64), ("axes", ctypes.c_uint32), ("number_bytes", ctypes.c_uint32)),
+        *(("sizes", ctypes.c_uint64 * 3), ("strides", ctypes.c_uint64 * 2), ("box", ctypes.c_uint32 * 3)),
+        ("rest", ctypes.c_char * 60),
+    )
+
+
+def tensor_map(
+    address: int, sizes: tuple[int, ...], strides: tuple[int, ...], box: tuple[int, ...], fp8: bool = False
+) -> Map:
+    """In place of `instructions.tensor_map`."""
+    made = Map(address=address, axes=len(sizes), number_bytes=1 if fp8 else 2)
+    for values, given in ((made.sizes, sizes), (made.strides, (one * made.number_bytes for one in strides))):
+        for i, value in enumerate(given):
+            values[i] = value
+    for i, value in enumerate(box):
+        made.box[i] = value
+    return made
+
+
+def compiled(source: str, name: str, takes: Parameters, defines: dict[str, int], folder: Path) -> Path:
+    """A library with the kernel. Raises RuntimeError with the compiler's words."""
+    kinds = ["TensorMap" if one.type == TENSOR_MAP else one.type for one in takes.all]
+    call = ", ".join(f"machine::given<{kind}>(values[{i}])" for i, kind in enumerate(kinds))
+    text = f"""#include "{MACHINE}"
+{translated(source)}
+extern "C" const char* run(int blocks, int threads, int cluster, int seed, void** values) {{
+    static std::string why;
+    try {{
+        machine::grid.x = blocks, machine::cta_threads = threads, machine::ranks = cluster;
+        machine::random.seed(seed), machine::eager = seed % 2, machine::moved = 0;
+        machine::kernel = [&] {{ {name}({call}); }};
+        for (int first = 0; first < blocks; first += cluster) machine::run_cluster(first);
+        return nullptr;
+    }} catch (const std::exception& error) {{
+        why = error.what();
+        return why.c_str();
+    }}
+}}
+"""
+    options = [f"-D{key}={value}" for key, value in sorted(defines.items())]
+    key = hashlib.sha256("\0".join((text, MACHINE.read_text(), *options)).encode()).hexdigest()[:16]
+    file, library = folder / f"{key}.cpp", folder / f"{key}.so"
+    if not library.exists():
+        file.write_text(text)
+        command = [COMPILER or "g++", "-O1", "-std=c++17", "-w", "-shared", "-fPIC", *options]
+        done = subprocess.run([*command, "-o", library, file], capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(f"g++ doesn't compile {name}:\n{done.stderr[:4000]}")
+    return library
+
+
+@dataclass
+class EmulatedKernel:
+    """In place of `DependentKernel`."""
+
+    library: Path
+    takes: Parameters
+    threads: int
+    cluster: int
+    max_clusters: int
+    seed: int
+
+    def launch_dependent(self, blocks: int, given: dict[str, Any]) -> None:
+        """Raises RuntimeError where the kernel would hang."""
+        values = self.takes.values(given)
+        pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
+        run = ctypes.CDLL(str(self.library)).run
+        run.restype = ctypes.c_char_p
+        if (why := run(blocks, self.threads, self.cluster, self.seed, pointers)) is not None:
+            raise RuntimeError(why.decode())

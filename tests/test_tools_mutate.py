@@ -1,0 +1,31 @@
+"""The table of planted faults stays true: each text stands once in the code, each test is there."""
+
+import pytest
+from mutate.__main__ import ROOT, Ran, table
+from mutate.faults import FAULTS, Fault, place
+
+SOURCE = ROOT / "src"
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_a_faults_text_stands_once_in_the_code_and_its_tests_are_there(fault: Fault) -> None:
+    assert place(fault, SOURCE).is_file() and fault.planted != fault.text
+    for test in fault.tests:
+        file, _, name = test.partition("::")
+        assert f"def {name}" in (ROOT / file).read_text() if name else (ROOT / file).is_file()
+
+
+def test_a_fault_whose_text_is_gone_or_stands_twice_is_named() -> None:
+    one = Fault("gone", "turbopi.kernels", "no such text at all", "", "", ())
+    with pytest.raises(ValueError, match=r"'gone': .* it is in nowhere"):
+        place(one, SOURCE)
+    with pytest.raises(ValueError, match=r"'often': .*__init__\.py \("):
+        place(Fault("often", "turbopi", '"""', "", "", ()), SOURCE)
+
+
+def test_a_row_says_which_tests_failed_or_that_none_did() -> None:
+    fault = FAULTS[0]
+    names = [f"test_a::test_{name}[{i}]" for name in ("x", "y", "z") for i in range(3)]
+    found, unseen = table([(fault, Ran(9, 0, names)), (fault, Ran(9, 0, []))], "abc").splitlines()[-2:]
+    assert found.endswith("| `test_a::test_x`, `test_a::test_y` and 1 more |")
+    assert unseen.endswith("| **not found** |")

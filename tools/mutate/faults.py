@@ -1,0 +1,279 @@
+"""Faults that would send a robot's arm somewhere else, or stop it: each one line of code, as someone might write it.
+
+A fault is a text that stands exactly once in a package's files, and what takes its place. A text that is no longer
+there is an error (tests/test_tools_mutate.py), so the table follows the code.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+EMULATED = "tests/test_kernels_emulated.py::test_a_product_in_bf16_is_right_in_whatever_order_its_threads_go"
+CHOICE = "tests/test_fused_choice.py"
+ARGUMENTS = "tests/test_kernels_arguments.py"
+GEOMETRY = "tests/test_launch_geometry.py"
+ENGINE = "tests/test_engine.py::test_equals_the_reference_for_odd_prompts_and_cameras"
+PARITY = "tests/test_model_parity.py::test_float32_equals_openpi_within_float32_rounding"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One change that is fatal on a GPU.
+
+    package  whose .py and .cu files, in all its folders, have `text` exactly once
+    fatal    what a robot would see of it
+    tests    files or names of tests, as pytest takes them, of which one at least must fail
+    """
+
+    name: str
+    package: str
+    text: str
+    planted: str
+    fatal: str
+    tests: tuple[str, ...]
+
+
+FAULTS = (
+    Fault(
+        "M and N swapped at the FP8 product's launch",
+        "turbopi.kernels",
+        "norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),\n"
+        "        **copy_arguments(copy, n),\n        **size_arguments(m, n,",
+        "norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),\n"
+        "        **copy_arguments(copy, n),\n        **size_arguments(n, m,",
+        "rows beyond the result are written, columns of it are not",
+        (ARGUMENTS, GEOMETRY),
+    ),
+    Fault(
+        "two pointers swapped in the denoising kernel's struct",
+        "turbopi.kernels",
+        '"cache_k": cache_k, "cache_v": cache_v,',
+        '"cache_k": cache_v, "cache_v": cache_k,',
+        "queries meet values: actions are noise",
+        (GEOMETRY,),
+    ),
+    Fault(
+        "the denoising kernel's results swapped",
+        "turbopi.kernels",
+        '"x_t": x_t, "v_t": v_t}',
+        '"x_t": v_t, "v_t": x_t}',
+        "velocities leave as actions, and memory behind v_t is overwritten",
+        (GEOMETRY,),
+    ),
+    Fault(
+        "the denoising kernel's output projection not transposed",
+        "turbopi.kernels",
+        'small["action_out_proj.weight"].float().T.contiguous()',
+        'small["action_out_proj.weight"].float().contiguous()',
+        "every action is a mixture of other outputs",
+        (GEOMETRY,),
+    ),
+    Fault(
+        "scale and shift swapped in `Copy`",
+        "turbopi.kernels",
+        '"norm_scale": copy.scale.data_ptr(),\n        "norm_shift": copy.shift.data_ptr(),',
+        '"norm_scale": copy.shift.data_ptr(),\n        "norm_shift": copy.scale.data_ptr(),',
+        "LayerNorm's weights are applied as its biases in FP8 vision",
+        (ARGUMENTS,),
+    ),
+    Fault(
+        "the expert left on the host where operations denoise",
+        "turbopi.backends",
+        "self._keep_expert_on(self.device)  # while such a graph is kept, as it points to it",
+        "pass",
+        "the first call whose loop the kernel refuses fails, after another loop had its kernel",
+        (CHOICE,),
+    ),
+    Fault(
+        "the expert put away from under a graph of operations",
+        "turbopi.backends",
+        "if not self._refused:\n            self._keep_expert_on(",
+        "if True:\n            self._keep_expert_on(",
+        "replays read freed memory",
+        (CHOICE,),
+    ),
+    Fault(
+        "a horizon's bound off by one",
+        "turbopi.backends",
+        "if reason is None and horizon > MAX_SUFFIX:",
+        "if reason is None and horizon > MAX_SUFFIX + 1:",
+        "a horizon of 57 stops the server instead of taking operations",
+        (CHOICE,),
+    ),
+    Fault(
+        "the kernel's room for cache rows forgets the fourth camera",
+        "turbopi.backends",
+        "cameras = min(max(shape.cameras, 3), MAX_CAMERAS)",
+        "cameras = min(max(shape.cameras, 3), 3)",
+        "keys of the fourth picture are written beyond the buffer",
+        (CHOICE,),
+    ),
+    Fault(
+        "a prompt's bucket rounded down",
+        "turbopi",
+        "return max(BUCKET, -(-tokens // BUCKET) * BUCKET)",
+        "return max(BUCKET, tokens // BUCKET * BUCKET)",
+        "a prompt of 17 tokens doesn't fit into its call",
+        ("tests/test_begin.py",),
+    ),
+    Fault(
+        "the length counts padding",
+        "turbopi.engine",
+        'arrays["length"][0] = self.pictures.rows + len(tokens)',
+        'arrays["length"][0] = self.pictures.rows + len(padded)',
+        "the policy reads words that nobody said",
+        (ENGINE,),
+    ),
+    Fault(
+        "unseen rows of the cache not zeroed",
+        "turbopi.engine",
+        "cache[:, self._unseen] = 0",
+        "cache[:, self._unseen] += 0",
+        "0 * NaN: actions are NaN",
+        ("tests/test_engine.py::test_rows_between_prefix_and_suffix_are_seen_by_nobody", ENGINE),
+    ),
+    Fault(
+        "keys and values swapped in the prefix's cache",
+        "turbopi.engine",
+        "q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, k, v)",
+        "q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, v, k)",
+        "actions ignore what the cameras see",
+        (ENGINE,),
+    ),
+    Fault(
+        "gate and up swapped in the packed matrix",
+        "turbopi.engine",
+        'for p in ("gate", "up")])',
+        'for p in ("up", "gate")])',
+        "every feed-forward is wrong",
+        (ENGINE,),
+    ),
+    Fault(
+        "adaRMS scales without their 1",
+        "turbopi.engine",
+        "table[:, :, 0] += 1",
+        "table[:, :, 0] += 0",
+        "actions are near 0",
+        (ENGINE,),
+    ),
+    Fault(
+        "RoPE's sign in the reference",
+        "turbopi.model",
+        "x1 * cos - x2 * sin, x2 * cos + x1 * sin",
+        "x1 * cos + x2 * sin, x2 * cos - x1 * sin",
+        "positions count backwards",
+        (PARITY,),
+    ),
+    Fault(
+        "RoPE's sign in the Triton kernel",
+        "turbopi.kernels",
+        "lower, upper = first * c - second * s, second * c + first * s",
+        "lower, upper = first * c + second * s, second * c - first * s",
+        "positions count backwards where operations denoise, and in every prefix",
+        ("tests/test_kernels_ops.py::test_rope_split",),
+    ),
+    Fault(
+        "an Euler step in the wrong direction",
+        "turbopi.model",
+        "return x_t + float(np.float32(-1.0 / num_steps)) * v_t",
+        "return x_t - float(np.float32(-1.0 / num_steps)) * v_t",
+        "denoising adds noise",
+        (PARITY,),
+    ),
+    Fault(
+        "an FP8 matrix without its channels' scales",
+        "turbopi.engine",
+        "return cls(round_rows(weight, 1 / scale, directions), scale * input_scale, 1 / input_scale, weight.dtype)",
+        "return cls(round_rows(weight, 1 / scale, directions), scale * input_scale, input_scale, weight.dtype)",
+        "activations saturate or vanish",
+        ("tests/test_kernels_fp8.py::test_a_matrix_has_a_scale_for_each_channel",),
+    ),
+    Fault(
+        "a cluster's share of TMA's box",
+        "turbopi.kernels",
+        "matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True)",
+        "matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_m, fp8=True)",
+        "a CTA's shared memory is overwritten, or the kernel waits forever",
+        (GEOMETRY,),
+    ),
+    Fault(
+        "more clusters than the GPU holds",
+        "turbopi.kernels",
+        "return min(groups * (1 if tile.gather else tile.splits), at_once)",
+        "return groups * (1 if tile.gather else tile.splits)",
+        "the persistent kernel's second wave starts when the first has ended: the prefix takes twice as long",
+        (GEOMETRY,),
+    ),
+    Fault(
+        "wrong parity at a barrier of the product's ring",
+        "turbopi.kernels",
+        "barrier_wait(empty + 8 * slot, round & 1 ^ 1);",
+        "barrier_wait(empty + 8 * slot, round & 1);",
+        "the kernel waits forever, or operands are overwritten while they are multiplied",
+        (EMULATED,),
+    ),
+    Fault(
+        "consumers' parity isn't flipped when the ring begins again",
+        "turbopi.kernels",
+        "if (slot == STAGES) slot = 0, parity ^= 1;",
+        "if (slot == STAGES) slot = 0;",
+        "products read what isn't there yet",
+        (EMULATED,),
+    ),
+    Fault(
+        "a slot is given back before its products are done",
+        "turbopi.kernels",
+        "commit_products(), await_products<1>();",
+        "commit_products(), await_products<2>();",
+        "operands are overwritten while they are multiplied: wrong now and then",
+        (EMULATED,),
+    ),
+    Fault(
+        "a cluster's barrier forgets who shares",
+        "turbopi.kernels",
+        "barrier_init(empty + 8 * s, WGS * (CM + CN - 1));",
+        "barrier_init(empty + 8 * s, WGS);",
+        "a neighbour's operands are overwritten while it multiplies",
+        (EMULATED,),
+    ),
+    Fault(
+        "entries of the epilogues' enum swapped",
+        "turbopi.kernels",
+        '"bias": 1, "gelu": 2,',
+        '"bias": 2, "gelu": 1,',
+        "GELU is applied where it isn't wanted, and left out where it is",
+        (EMULATED,),
+    ),
+    Fault(
+        "gate and up swapped in GeGLU's epilogue",
+        "turbopi.kernels",
+        "x = (FP8 ? twice_gelu(x) : gelu(x)) * sums[BN / 4 + 4 * j + 2 * half];",
+        "x = (FP8 ? twice_gelu(sums[BN / 4 + 4 * j + 2 * half]) : gelu(sums[BN / 4 + 4 * j + 2 * half])) * x;",
+        "every second hidden unit is wrong",
+        (EMULATED,),
+    ),
+    Fault(
+        "a graph's replay isn't waited for",
+        "turbopi.engine",
+        "self.launch()\n        torch.cuda.current_stream(self._device).synchronize()",
+        "self.launch()",
+        "the robot gets the actions of the call before",
+        ("tests/test_capture.py",),
+    ),
+)
+
+
+def place(fault: Fault, source: Path) -> Path:
+    """The file that has the fault's text, below the folder `source` in which packages are.
+
+    Raises ValueError unless the text stands exactly once in its package.
+    """
+    folder = source / fault.package.replace(".", "/")
+    files = sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".cu"))
+    counts = {path: path.read_text(encoding="utf-8").count(fault.text) for path in files}
+    found = {path: count for path, count in counts.items() if count}
+    if list(found.values()) != [1]:
+        places = ", ".join(f"{path.name} ({count})" for path, count in found.items()) or "nowhere"
+        raise ValueError(
+            f"{fault.name!r}: expected its text once in {fault.package}, it is in {places}: {fault.text!r}"
+        )
+    return next(iter(found))
