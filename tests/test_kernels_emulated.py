@@ -15,11 +15,12 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.engine import ops as plain
-from turbopi.engine.fp8 import E4M3, Fp8Matrix, to_e4m3
+from turbopi.kernels import plain
+from turbopi.kernels.quantize import quantize
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.gemm import bf16, fp8
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Epilogue, Sums, Tile
+from turbopi.quantization.fp8 import E4M3, to_e4m3
 
 pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
 CPU = torch.device("cpu")
@@ -122,7 +123,7 @@ def test_a_product_in_fp8_is_right_in_whatever_order_its_threads_go(
     machine: Callable[[int], None], epilogue: Epilogue, tile: Tile, inverse: float | None
 ) -> None:
     m, n, k = 72, 40, 1008
-    weight = Fp8Matrix.quantize(random(2 * n if epilogue == "geglu" else n, k, seed=1) / k**0.5, 0.01)
+    weight = quantize(random(2 * n if epilogue == "geglu" else n, k, seed=1) / k**0.5, 0.01)
     x, bias = to_e4m3(random(m, k), weight.inverse), random(n) if epilogue == "gelu" else None
     sums = weight.product(x, bias)
     expected = plain.gelu(sums) if epilogue == "gelu" else plain.geglu(sums) if epilogue == "geglu" else sums
@@ -139,7 +140,7 @@ def test_an_fp8_product_leaves_a_copy_that_is_normed_with_the_norms_scale_and_sh
 ) -> None:
     m, n, k = 72, 40, 256
     tile = Tile(1, 24, ring=3)
-    weight = Fp8Matrix.quantize(random(n, k, seed=1) / k**0.5, 0.01)
+    weight = quantize(random(n, k, seed=1) / k**0.5, 0.01)
     x, bias, residual = to_e4m3(random(m, k), weight.inverse), random(n), 4 * random(m, n, seed=9)
     before = residual.float()
     sums_in = Sums(torch.stack((before.sum(1), before.square().sum(1)), dim=1)[None].contiguous())
