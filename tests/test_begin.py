@@ -12,9 +12,10 @@ from conftest import golden_model
 from test_engine import answer, made_up, shape_of, static_call
 
 from turbopi import UnifiedPolicy
-from turbopi.backends.cuda_graph import CudaGraphBackend, HostRow
+from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import Kind
+from turbopi.engine.runner import HostRow
 from turbopi.errors import BackendError, ObservationError
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN

@@ -12,10 +12,11 @@ from conftest import golden_cases, golden_model
 from torch import Tensor
 
 from turbopi import backends
-from turbopi.backends.cuda_graph import CudaGraphBackend, HostRow
+from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.config import Kind
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.compiled import compiled
+from turbopi.engine.runner import HostRow
 from turbopi.engine.weights import modulation, pack
 from turbopi.engine.without_compiler import OPS, Denoiser
 from turbopi.kernels.interface import Ops

@@ -12,9 +12,10 @@ from conftest import GOLDEN, golden_cases, golden_folder
 from test_engine import made_up, shape_of
 
 from turbopi import backends
-from turbopi.backends.cuda_graph import Graph, HostRow
 from turbopi.config import Kind
 from turbopi.engine.call import StaticCall
+from turbopi.engine.graph import Graph
+from turbopi.engine.runner import HostRow
 from turbopi.model.reference import Precision
 from turbopi.observation import Observation
 from turbopi.verify.check_golden import check_case

@@ -13,12 +13,12 @@ from test_begin import Unrun, on_cpu
 from test_engine import made_up
 from torch import Tensor
 
-from turbopi.backends.cuda_graph import HostRow
 from turbopi.backends.fused import FusedBackend
 from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
 from turbopi.engine.call import CallShape
 from turbopi.engine.recent import MOST_LOOPS, MOST_STEPS, RecentLoops, fit
+from turbopi.engine.runner import HostRow
 from turbopi.engine.without_compiler import OPS
 from turbopi.errors import BackendUnavailable
 

@@ -11,10 +11,10 @@ from test_begin import CPU, Unrun, on_cpu
 from test_engine import made_up
 
 from turbopi import UnifiedPolicy, backends
-from turbopi.backends.cuda_graph import HostRow
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import CAMERAS
+from turbopi.engine.runner import HostRow
 from turbopi.errors import BackendError, ConfigError, ObservationError
 from turbopi.observation import Observation, with_cameras
 from turbopi.robots import ROBOTS, LeRobot, Robot, create_robot

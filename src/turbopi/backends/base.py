@@ -1,7 +1,6 @@
 """The protocol that every backend implements. The policy knows nothing else about the one it holds."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
@@ -9,9 +8,9 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.errors import ObservationError
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import Precision, Trace
+from turbopi.model.sample import Sample
 from turbopi.observation import Observation
 
 # Loads the checkpoint's tensors, by canonical name, to a device in a precision.
@@ -20,16 +19,6 @@ LoadState = Callable[[torch.device, Precision], dict[str, Tensor]]
 
 # What a backend may run in. The FP8 tiers load bfloat16 and need a calibration: see `turbopi.calibrate`.
 Tier = Literal["bf16", "f32", "fp8", "fp8-mlp"]
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One answer of a backend."""
-
-    actions: Tensor  # float32[B, H, action_dim], on the host
-    # milliseconds of "vision", "prefix", "denoise", measured on the device; a stage it can't tell apart is absent
-    stage_ms: dict[str, float] = field(default_factory=dict)
-    queue_ms: float = 0.0  # of a `submit`: how long it waited for a free place before it began
 
 
 class Begun(Protocol):
@@ -107,18 +96,3 @@ class Backend(Protocol):
 
     def describe(self) -> dict[str, Any]:
         """What a user may want to know of this instance, as plain values: goes into the policy's metadata."""
-
-
-def not_warm(name: str, needs: str, warm: Iterable[str], **arguments: int) -> ObservationError:
-    """Why a strict backend refuses a call.
-
-    needs       the call's shape
-    warm        the shapes that are covered
-    arguments   what `UnifiedPolicy.warmup` is to be given
-    """
-    covered = "; ".join(sorted({*warm})) or "nothing yet"
-    given = ", ".join(f"{argument}={value}" for argument, value in arguments.items())
-    return ObservationError(
-        f"strict: this call needs {needs}, which backend {name!r} would have to prepare within the call. Warm is: "
-        f"{covered}. Call policy.warmup({given}) before the robot moves"
-    )

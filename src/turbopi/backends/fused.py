@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from turbopi.backends.base import LoadState, Tier
-from turbopi.backends.cuda_graph import MAX_CAMERAS, CudaGraphBackend, _bucket
+from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.lost import ADVICE
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
 from turbopi.engine.recent import Loop
+from turbopi.engine.runner import MAX_CAMERAS, bucket
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
 from turbopi.kernels.interface import Denoiser, Ops
@@ -151,7 +152,7 @@ class FusedBackend(CudaGraphBackend):
         """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, horizon or GPU."""
         horizon, steps = shape.horizon, shape.num_steps
         cameras = min(max(shape.cameras, 3), MAX_CAMERAS)
-        rows = cameras * self.config.vision.num_tokens + _bucket(self.config.max_prompt_tokens)
+        rows = cameras * self.config.vision.num_tokens + bucket(self.config.max_prompt_tokens)
         key = (steps, horizon, rows)
         if key not in self._denoisers and key not in self._refused:
             try:

@@ -11,9 +11,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample, not_warm
+from turbopi.backends.base import LoadState, Sample
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
+from turbopi.engine.limits import not_warm
 from turbopi.errors import ObservationError
 from turbopi.model.reference import Pi0Model, Precision
 from turbopi.observation import Observation

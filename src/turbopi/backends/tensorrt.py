@@ -19,11 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample, not_warm
-from turbopi.backends.cuda_graph import golden_trace
+from turbopi.backends.base import LoadState, Sample
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import Graph, Mark, building
+from turbopi.engine.limits import not_warm
 from turbopi.engine.recent import Loop, RecentLoops
+from turbopi.engine.runner import golden_trace
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError
 from turbopi.model.kv_cache import KVCache

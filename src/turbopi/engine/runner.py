@@ -1,0 +1,338 @@
+"""Calls as CUDA graphs: which are captured, kept, replayed and refused.
+
+A call is two graphs. The first, vision, is for a number of valid cameras; it can start before the prompt is known. The
+second, prefix and all denoising steps, is for a bucket, which rounds the prompt's length up to a multiple of 16, too;
+inside it nothing is captured anew when pictures, prompt, state or noise change. A bucket that warm-up didn't capture is
+captured when first needed, with a log line, or refused if the runner is `strict`. Graphs of the denoising loops (steps,
+horizon) used last are kept, see recent.py. Batches run one observation after the other.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
+from turbopi.engine.graph import Graph, Mark, building
+from turbopi.engine.limits import not_warm
+from turbopi.engine.recent import Loop, RecentLoops
+from turbopi.engine.weights import Weights, modulation
+from turbopi.errors import BackendError
+from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.model.kv_cache import KVCache
+from turbopi.model.reference import Trace
+from turbopi.model.sample import Sample
+from turbopi.observation import Observation
+
+logger = logging.getLogger(__name__)
+
+BUCKET = 16  # prompt tokens: at most 15 padded rows beside 256 a camera
+MAX_CAMERAS = 4  # the cache is allocated for them
+
+
+@dataclass(frozen=True)
+class HostRow:
+    """One row of an observation on the host, compacted: NumPy's views, since a small torch operation costs 3 us."""
+
+    images: list[np.ndarray]  # the valid cameras' (uint8|float32)[224, 224, 3]
+    tokens: np.ndarray  # int64[valid prompt tokens]
+    state: np.ndarray  # float32[action_dim]
+
+    @classmethod
+    def of(cls, observation: Observation, row: int) -> "HostRow":
+        def on_host(tensor: Tensor) -> np.ndarray:
+            return tensor[row].cpu().numpy() if tensor.is_cuda else tensor.numpy()[row]
+
+        images, mask = on_host(observation.images), on_host(observation.image_mask)
+        tokens = on_host(observation.tokens)[on_host(observation.token_mask)]
+        return cls([images[camera] for camera in np.flatnonzero(mask)], tokens, on_host(observation.state))
+
+
+class Begun:
+    """What `GraphRunner.begin` returns: the pictures of one observation on their way through vision."""
+
+    def __init__(self, runner: "GraphRunner", cameras: int, float_images: bool) -> None:
+        self._runner, self.cameras, self.float_images = runner, cameras, float_images
+
+    def finish(self, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+        """See `turbopi.backends.base.Begins`."""
+        call, graph = self._runner._continue(self, "answer", tokens, state, noise, num_steps)
+        return Sample(torch.from_numpy(call.actions_array[None].copy()), graph.stage_ms())
+
+
+class GraphRunner:
+    """The backends that capture: a subclass says what is packed, with which operations and which denoiser.
+
+    joint   whether the cache's keys and values are parts of one tensor
+    """
+
+    name: ClassVar[str]
+    strict = False
+
+    def __init__(
+        self, config: ModelConfig, weights: Weights, ops: Ops, device: torch.device, *, joint: bool = False
+    ) -> None:
+        self.config, self.device = config, device
+        self._weights, self._ops = weights, ops
+        rows = MAX_CAMERAS * config.vision.num_tokens + bucket(config.max_prompt_tokens) + config.action_horizon + 64
+        self._cache = Cache.allocate(config, rows, device, weights.embed_tokens.dtype, joint)
+        self._recent = RecentLoops(self._forget)
+        self._tables: dict[int, Tensor | None] = {}  # by number of steps
+        self._calls: dict[CallShape, StaticCall] = {}
+        self._pictures: dict[tuple[int, bool], Pictures] = {}  # by cameras, and whether they are float
+        self._graphs: dict[tuple[CallShape | Pictures, str], Graph] = {}
+        self._begun: Begun | None = None  # what may be finished
+        self._pool: Any = None
+        self._stream: torch.cuda.Stream | None = None  # that graphs are captured on
+        self._warming = False
+
+    def warmup(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None = None,
+        *,
+        required: bool = True,
+        last: bool = True,
+    ) -> None:
+        """Capture the whole call for every prompt length, with this observation's number of cameras."""
+        cameras, floats = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
+        actions = self.config.action_horizon if horizon is None else horizon
+        if not required and cameras > MAX_CAMERAS:
+            return
+        self._warming = True
+        try:
+            self._check_cameras(cameras)
+            for slots in range(BUCKET, bucket(self.config.max_prompt_tokens) + 1, BUCKET):
+                self._graph(CallShape(cameras, slots, actions, num_steps, floats), "answer")
+        finally:
+            self._warming = False
+
+    def prefix(self, observation: Observation) -> KVCache:
+        if observation.batch_size != 1:
+            raise BackendError(f"{self.name} holds the cache of one observation, not of {observation.batch_size}")
+        noise = np.zeros((self.config.action_horizon, self.config.action_dim), np.float32)
+        call, _ = self._run("prefix", HostRow.of(observation, 0), noise, 1)
+        length = int(call.host.length[0])
+        return KVCache(
+            call.cache_k[:, None, None, :length].clone(),
+            call.cache_v[:, None, None, :length].clone(),
+            None,
+            torch.tensor([length], device=self.device),
+            observation.state.to(self.device),
+        )
+
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int) -> Tensor:
+        if cache.k.shape[1] != 1 or cache.mask is not None:
+            raise BackendError(
+                f"{self.name} denoises one unpadded observation's cache, not a batch of {cache.k.shape[1]}"
+            )
+        length, per_image = cache.k.shape[3], self.config.vision.num_tokens
+        cameras = min(length // per_image, MAX_CAMERAS)
+        shape = CallShape(cameras, bucket(length - cameras * per_image), noise.shape[1], num_steps)
+        graph, call = self._graph(shape, "denoise"), self._calls[shape]
+        call.cache_k[:, :length], call.cache_v[:, :length] = cache.k[:, 0, 0], cache.v[:, 0, 0]
+        call.inputs.length.fill_(length)
+        call.inputs.noise.copy_(noise[0])
+        call.inputs.state.copy_(cache.state[0])
+        torch.cuda.current_stream(self.device).synchronize()
+        graph.replay()
+        return call.x_t[-1:].clone()
+
+    def begin(self, pictures: Sequence[np.ndarray]) -> Begun:
+        """See `turbopi.backends.base.Begins`. One observation at a time: this ends the turn of the one before."""
+        self._check_cameras(len(pictures))
+        begun = Begun(self, len(pictures), bool(pictures) and pictures[0].dtype == np.float32)
+        buffers = self._pictures_of(begun.cameras, begun.float_images)
+        self._begun = None  # one given up may still be read from the buffers, but nobody gets what becomes of it
+        buffers.write(pictures)
+        try:
+            self._graph(buffers, "vision").launch()
+        except RuntimeError as error:
+            self._explain(error)
+            raise
+        self._begun = begun
+        return begun
+
+    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+        x_1, rows = noise.cpu().numpy(), [HostRow.of(observation, row) for row in range(observation.batch_size)]
+        ran = [self.begin(row.images).finish(row.tokens, row.state, x_1[i], num_steps) for i, row in enumerate(rows)]
+        stages = {name: sum(one.stage_ms[name] for one in ran) for name in ran[0].stage_ms}
+        return Sample(torch.cat([one.actions for one in ran]), stages)
+
+    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
+        rows = [self._trace_row(observation, noise, row, num_steps) for row in range(observation.batch_size)]
+        return {name: torch.cat([row[name] for row in rows], dim=int(name != "actions")) for name in rows[0]}
+
+    def describe(self) -> dict[str, Any]:
+        captured = sorted(
+            {(s.cameras, s.prompt_slots, s.horizon, s.num_steps) for s in list(self._calls)}
+        )  # a call of another thread may add some
+        return {
+            "captured": [f"{c} cameras + {p} tokens, H={h}, {n} steps" for c, p, h, n in captured],
+            "graphs": {"kept": len(self._graphs), **self._recent.describe()},
+            "operations": dict(self._ops.origin),
+        }
+
+    def _check_cameras(self, count: int) -> None:
+        if count > MAX_CAMERAS:
+            raise BackendError(f"{self.name} takes up to {MAX_CAMERAS} cameras, this observation has {count}")
+
+    def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
+        """All denoising steps at once; None: the engine's operations one by one."""
+        return None
+
+    def _run(self, part: str, row: HostRow, noise: np.ndarray, num_steps: int) -> tuple[StaticCall, Graph]:
+        """Replay the call up to a part's end on one row and noise float32[H, action_dim]."""
+        return self._continue(self.begin(row.images), part, row.tokens, row.state, noise, num_steps)
+
+    def _continue(
+        self, begun: Begun, part: str, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int
+    ) -> tuple[StaticCall, Graph]:
+        """Replay a part behind vision, "prefix" or the whole "answer"."""
+        if self._begun is not begun:
+            raise BackendError(f"{self.name} has finished this observation, or begun another one since")
+        cameras, most = begun.cameras, self.config.max_prompt_tokens
+        if len(tokens) > most or cameras + len(tokens) == 0:
+            raise BackendError(
+                f"{self.name} takes up to {MAX_CAMERAS} cameras and {most} prompt tokens, this observation has "
+                f"{cameras} and {len(tokens)}"
+            )
+        shape = CallShape(cameras, bucket(len(tokens)), len(noise), num_steps, begun.float_images)
+        try:
+            graph, call = self._graph(shape, part), self._calls[shape]
+            call.write_inputs(noise, state, tokens)
+            graph.replay()
+        except RuntimeError as error:
+            self._explain(error)
+            raise
+        self._begun = None
+        return call, graph
+
+    def _explain(self, error: RuntimeError) -> None:
+        """A subclass that knows why the GPU failed for good raises a DeviceLost that says so."""
+
+    def _graph(self, of: CallShape | Pictures, part: str) -> Graph:
+        """The "vision" of pictures; of a shape the "answer" behind it, or its "prefix" or "denoise" alone.
+
+        Captured on first use; ObservationError if that isn't allowed.
+        """
+        graph = self._graphs.get((of, part))
+        if isinstance(of, CallShape):
+            if graph is None:
+                self._check_rows(of)
+            if graph is None and part == "answer":
+                self._refuse_if_cold(of)
+            self._recent.use((of.num_steps, of.horizon))
+        if graph is None:
+            start = time.perf_counter()
+            with building(self.device):
+                graph = self._graphs[of, part] = self._captured(of, part)
+            what = f"{of.cameras} cameras" if isinstance(of, Pictures) else of
+            logger.info("captured %s of %s in %.2f s", part, what, time.perf_counter() - start)
+        return graph
+
+    def _captured(self, of: CallShape | Pictures, part: str) -> Graph:
+        if isinstance(of, Pictures):
+            return self._capture(of.run, None)
+        call = self._call(of)
+        if part != "prefix" and call.denoiser is None:
+            call.denoiser = self._make_denoiser(of, call.table)
+        run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
+        return self._capture(run, None if part == "denoise" else self._graph(call.pictures, "vision"))
+
+    def _check_rows(self, shape: CallShape) -> None:
+        needs, has = shape.cache_rows(self.config), self._cache.k.shape[1]
+        if needs > has:
+            raise BackendError(
+                f"{self.name} has {has} cache rows, but {shape.cameras} cameras, {shape.prompt_slots} prompt tokens "
+                f"and an action horizon of {shape.horizon} need {needs}; the config's horizon is "
+                f"{self.config.action_horizon}"
+            )
+
+    def _refuse_if_cold(self, shape: CallShape) -> None:
+        """Raise ObservationError for a shape that isn't captured, if that isn't allowed now."""
+        if self.strict and not self._warming:
+            warm = [s for s, part in self._graphs if isinstance(s, CallShape) and part == "answer"]
+            raise not_warm(
+                self.name,
+                f"{shape.cameras} cameras, H={shape.horizon}, {shape.num_steps} steps",
+                (f"{s.cameras} cameras, H={s.horizon}, {s.num_steps} steps" for s in warm),
+                cameras=shape.cameras,
+                horizons=shape.horizon,
+                steps=shape.num_steps,
+            )
+
+    def _forget(self, loop: Loop) -> None:
+        """Let go of all that is a denoising loop's alone. Vision's graphs are every loop's."""
+        if self.device.type == "cuda":  # one may still run whose call was interrupted
+            torch.cuda.current_stream(self.device).synchronize()
+        gone = {shape for shape in self._calls if (shape.num_steps, shape.horizon) == loop}
+        for kept in [key for key in self._graphs if key[0] in gone]:
+            del self._graphs[kept]
+        for shape in gone:
+            del self._calls[shape]
+        if loop[0] not in {steps for steps, _ in self._recent}:
+            self._tables.pop(loop[0], None)
+
+    def _capture(self, run: Callable[[Mark], None], after: Graph | None) -> Graph:
+        """All graphs share memory, as they run one after the other."""
+        if self._stream is None:
+            self._pool = torch.cuda.graph_pool_handle()
+            self._stream = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
+        return Graph(run, self._pool, self._stream, after)
+
+    def _pictures_of(self, cameras: int, float_images: bool) -> Pictures:
+        key, slots = (cameras, float_images), bucket(self.config.max_prompt_tokens)
+        if key not in self._pictures:
+            if self.strict and not self._warming:
+                warm = (f"{count} cameras" for count, _ in self._pictures)
+                raise not_warm(self.name, f"{cameras} cameras", warm, cameras=cameras)
+            self._pictures[key] = Pictures(self.config, self._weights, self._ops, cameras, float_images, slots)
+        return self._pictures[key]
+
+    def _call(self, shape: CallShape) -> StaticCall:
+        if shape.num_steps not in self._tables:
+            table = modulation(self.config, self._weights.conditioning, shape.num_steps)
+            self._tables[shape.num_steps] = None if table is None else table.to(self.device)
+        if shape not in self._calls:
+            pictures, table = self._pictures_of(shape.cameras, shape.float_images), self._tables[shape.num_steps]
+            self._calls[shape] = StaticCall(self.config, self._weights, self._ops, shape, pictures, self._cache, table)
+        return self._calls[shape]
+
+    def _trace_row(self, observation: Observation, noise: Tensor, row: int, num_steps: int) -> Trace:
+        """One row's intermediates in golden layouts: the cache goes back to its padded slots."""
+        one, x_1 = HostRow.of(observation, row), noise[row].cpu().numpy()
+        call, _ = self._run("answer", one, x_1, num_steps)
+        length, per_image = int(call.host.length[0]), self.config.vision.num_tokens
+        cameras = observation.image_mask[row].repeat_interleave(per_image)
+        valid = torch.cat((cameras, observation.token_mask[row])).cpu()
+        return golden_trace(call, length, valid)
+
+
+def golden_trace(call: Any, length: int, valid: Tensor) -> Trace:
+    """A call's intermediates in golden layouts: its `length` cache rows go back to the slots in `valid` bool[S]."""
+
+    def padded(x: Tensor) -> Tensor:  # [layer, rows, K] -> [layer, 1, S, 1, K]
+        out = torch.zeros(x.shape[0], len(valid), x.shape[-1])
+        out[:, valid] = x[:, :length].float().cpu()
+        return out[:, None, :, None]
+
+    return {
+        "kv_k": padded(call.cache_k),
+        "kv_v": padded(call.cache_v),
+        "x_t": call.x_t[:, None].clone(),
+        "v_t": call.v_t[:, None].clone(),
+        "actions": call.x_t[-1:].clone(),
+    }
+
+
+def bucket(tokens: int) -> int:
+    """A prompt length rounded up to its bucket."""
+    return max(BUCKET, -(-tokens // BUCKET) * BUCKET)
