@@ -13,7 +13,7 @@ from PIL import Image
 
 from turbopi import demo, shipped
 from turbopi.backends.base import Sample
-from turbopi.backends.pytorch import PyTorchBackend
+from turbopi.backends.pytorch import PyTorchBackend, reference_model
 from turbopi.checkpoint import random_checkpoint
 from turbopi.errors import BackendError, TurboPiError
 from turbopi.observation import Observation
@@ -189,7 +189,7 @@ def test_an_error_is_the_same_however_many_frames_are_shown() -> None:
 
 
 def test_jitter_moves_what_bfloat16_would_round_and_is_undone() -> None:
-    model = tiny_oracle().backend.model  # type: ignore[attr-defined]
+    model = reference_model(tiny_oracle().backend)
     before = {name: parameter.clone() for name, parameter in model.named_parameters()}
     with control.jittered(model, 1):
         moved = {name for name, parameter in model.named_parameters() if not torch.equal(parameter, before[name])}

@@ -17,6 +17,7 @@ from small_policy.start import fresh_model
 from small_policy.train import Settings, Trainer, prompt_table, toy_memory
 from torch import Tensor
 
+from turbopi.backends.pytorch import reference_model
 from turbopi.model import denoise
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
@@ -120,7 +121,7 @@ def test_a_few_steps_on_a_few_frames_lower_the_loss_and_the_export_is_what_was_t
         trained, _ = velocity(
             trainer.model, observation.images[:, :2], tokens[4:5], masks[4:5], x_t, torch.tensor([0.5])
         )
-    loaded = reference_velocity(policy.backend.model, observation, x_t, 0.5)  # type: ignore[attr-defined]
+    loaded = reference_velocity(reference_model(policy.backend), observation, x_t, 0.5)
     torch.testing.assert_close(loaded, trained, rtol=0, atol=1e-4)
     assert json.loads((folder / "turbopi.json").read_text())["discrete_state_input"] is False
 

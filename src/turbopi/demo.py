@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from turbopi.backends import Tier
+from turbopi.backends.pytorch import reference_model
 from turbopi.errors import BackendError
-from turbopi.model.reference import Pi0Model
 from turbopi.policy import UnifiedPolicy
 from turbopi.verify.bounds import BOUND_FACTORS, TRAINED_FACTORS
 from turbopi.verify.control import CONTROL_SEEDS, ROUNDING, jittered
@@ -110,7 +110,7 @@ def check(
     assert (oracle.backend.name, oracle.backend.precision) == ("pytorch", "f32")
     exact = _chunks(run_frames(oracle, observed, seed, tick))
     units = action_units(oracle, observed[0])
-    model: Pi0Model = oracle.backend.model  # type: ignore[attr-defined]
+    model = reference_model(oracle.backend)
     moved = []
     for control_seed in CONTROL_SEEDS:
         with jittered(model, control_seed):

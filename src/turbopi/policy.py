@@ -184,12 +184,12 @@ class UnifiedPolicy:
         if not observations:
             raise ObservationError("infer_batch was given no observation")
         steps, actions = self._loop(num_steps, horizon)
-        if len(observations) == 1 and hasattr(self.backend, "begin"):
+        if len(observations) == 1 and isinstance(self.backend, backends.Begins):
             seen = self._pipeline.see(observations[0])
             asked = time.perf_counter()
             with self._lock, self._guard:
                 infer_start = time.perf_counter()
-                begun: backends.Begun = self.backend.begin(seen.pictures)
+                begun = self.backend.begin(seen.pictures)
                 self._pipeline.read(seen)  # while the device is at the pictures
                 x_1 = self._noise(1, actions, noise, seed)[0]
                 sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps)
@@ -225,7 +225,7 @@ class UnifiedPolicy:
         For the pipelined backends, which encode one observation while another is denoised. Other backends raise
         ConfigError, unless `serially` says that running it now, before returning, will do.
         """
-        if not hasattr(self.backend, "submit"):
+        if not isinstance(self.backend, backends.Submits):
             if not serially:
                 raise ConfigError(
                     f"backend {self.backend.name!r} runs one observation at a time: take backend 'tensorrt_pipelined', "
@@ -241,7 +241,7 @@ class UnifiedPolicy:
         x_1 = torch.from_numpy(self._noise(1, actions, None if noise is None else [noise], seed))
         asked = time.perf_counter()
         with self._guard:
-            running: Future[backends.Sample] = self.backend.submit(Observation.stack([inputs]), x_1, steps)
+            running = self.backend.submit(Observation.stack([inputs]), x_1, steps)
         answer: Future[dict[str, Any]] = Future()
 
         def finish(ran: "Future[backends.Sample]") -> None:
@@ -329,7 +329,7 @@ class UnifiedPolicy:
     @property
     def pipelined(self) -> bool:
         """Whether `submit` overlaps observations; the server uses it then."""
-        return hasattr(self.backend, "submit")
+        return isinstance(self.backend, backends.Submits)
 
     @property
     def pipeline(self) -> Pipeline:

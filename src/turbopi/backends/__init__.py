@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi.backends.base import Backend, Begun, LoadState, Sample, Tier
+from turbopi.backends.base import Backend, Begins, Begun, LoadState, RunsFp8, Sample, Submits, Tier
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
@@ -19,9 +19,12 @@ from turbopi.quantization.plan import TIERS
 __all__ = [
     "BACKENDS",
     "Backend",
+    "Begins",
     "Begun",
     "LoadState",
+    "RunsFp8",
     "Sample",
+    "Submits",
     "Tier",
     "availability",
     "choose",
@@ -163,7 +166,7 @@ def check(name: str, device: torch.device, precision: Tier) -> None:
                 f"{precision} needs an NVIDIA GPU of compute capability 9.0; take precision 'bf16', or to judge FP8 "
                 "without such a GPU backend 'emulated_fp8'"
             )
-        elif (other_gpu := cls.unavailable_in(device, precision)) is not None:  # type: ignore[attr-defined]
+        elif issubclass(cls, RunsFp8) and (other_gpu := cls.unavailable_in(device, precision)) is not None:
             reason, what = other_gpu, f"run in {precision}"  # before what a package would mend
     if reason is not None:
         raise BackendUnavailable(f"backend {name!r} can't {what} on {device}: {reason}")

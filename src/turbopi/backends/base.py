@@ -1,7 +1,8 @@
 """The protocol that every backend implements. The policy knows nothing else about the one it holds."""
 
-from collections.abc import Callable
-from typing import Any, ClassVar, Literal, Protocol
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -22,14 +23,7 @@ Tier = Literal["bf16", "f32", "fp8", "fp8-mlp"]
 
 
 class Begun(Protocol):
-    """One observation whose pictures a backend works on already: what a backend's `begin` returns, if it has that.
-
-        def begin(self, pictures: Sequence[np.ndarray]) -> Begun
-
-    `pictures` are the valid ones, (uint8|float32)[224, 224, 3], on the host. They are copied, and `begin` returns
-    without waiting for the device, so that the host can tokenise meanwhile. An observation that never gets to `finish`
-    is given up by the next `begin`, `sample` or `prefix`.
-    """
+    """One observation whose pictures a backend works on already: what `Begins.begin` returns."""
 
     def finish(self, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
         """What `sample` of this one observation returns.
@@ -43,8 +37,8 @@ class Begun(Protocol):
 class Backend(Protocol):
     """A way to run the model. All of them compute what `turbopi.model.reference.Pi0Model` computes.
 
-    Observations and noise may be on the host or on the device; both are moved where they are needed. Two methods are
-    optional: `begin`, see `Begun`, and `submit`, see `turbopi.backends.tensorrt_pipelined`.
+    Observations and noise may be on the host or on the device; both are moved where they are needed. What only some
+    can do besides are `Begins`, `Submits` and `RunsFp8`.
 
     any_horizon     whether noise may have another action horizon than the config's
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
@@ -96,3 +90,32 @@ class Backend(Protocol):
 
     def describe(self) -> dict[str, Any]:
         """What a user may want to know of this instance, as plain values: goes into the policy's metadata."""
+
+
+@runtime_checkable
+class Begins(Protocol):
+    """A backend that can start on an observation's pictures before its prompt is known."""
+
+    def begin(self, pictures: Sequence[np.ndarray]) -> Begun:
+        """Start on the valid pictures (uint8|float32)[224, 224, 3], on the host.
+
+        They are copied, and `begin` returns without waiting for the device, so that the host can tokenise meanwhile. An
+        observation that never gets to `finish` is given up by the next `begin`, `sample` or `prefix`.
+        """
+
+
+@runtime_checkable
+class Submits(Protocol):
+    """A backend that has several observations in flight."""
+
+    def submit(self, observation: Observation, noise: Tensor, num_steps: int) -> "Future[Sample]":
+        """`sample` of one observation that returns at once."""
+
+
+@runtime_checkable
+class RunsFp8(Protocol):
+    """A backend that has FP8 tiers among its precisions."""
+
+    @classmethod
+    def unavailable_in(cls, device: torch.device, precision: Tier) -> str | None:
+        """Why this precision can't run on a GPU that the backend runs on; None if it can."""

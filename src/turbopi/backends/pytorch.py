@@ -5,9 +5,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample, Tier
+from turbopi.backends.base import Backend, LoadState, Sample, Tier
 from turbopi.backends.timing import StageTimer
 from turbopi.config import ModelConfig
+from turbopi.errors import BackendError
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import Pi0Model, Precision, Trace
 from turbopi.observation import Observation
@@ -74,3 +75,10 @@ class PyTorchBackend:
 
     def describe(self) -> dict[str, Any]:
         return {"attention": "explicit float32" if self.precision == "f32" else "scaled_dot_product_attention"}
+
+
+def reference_model(backend: Backend) -> Pi0Model:
+    """The reference that a backend runs. Raises BackendError for one that runs something else."""
+    if not isinstance(backend, PyTorchBackend):
+        raise BackendError(f"backend {backend.name!r} doesn't run the reference; take 'pytorch'")
+    return backend.model

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from turbopi import backends, shipped
+from turbopi.backends.pytorch import reference_model
 from turbopi.calibrate import observations as observed
 from turbopi.calibrate.observations import Batch
 from turbopi.calibrate.product_errors import product_errors
@@ -76,7 +77,7 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     shape = (config.action_horizon, config.action_dim)
     calibration = with_noises(chosen, shape, settings.noises, settings.seed)
     held_out = with_noises(held, shape, settings.noises, settings.seed + len(calibration))
-    model: Pi0Model = policy.backend.model  # type: ignore[attr-defined]
+    model = reference_model(policy.backend)
     steps = int(policy.metadata["num_denoising_steps"])
     loaded = time.perf_counter()
     result = calibrate_model(model, calibration, held_out, steps, settings, progress)

@@ -81,12 +81,13 @@ def build(
             raise BackendUnavailable(f"can't build engines for {backend}: {reason}")
     opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
+    from turbopi.backends.pytorch import reference_model
     from turbopi.engine.weights import pack
     from turbopi.policy import UnifiedPolicy
 
     policy = UnifiedPolicy(opened, backend="pytorch", precision="bf16", device=resolved, progress=output.shows_progress)
     config = policy.config.model
-    state = dict(policy.backend.model.state_dict())  # type: ignore[attr-defined]
+    state = dict(reference_model(policy.backend).state_dict())
     weights_hash, folder = fingerprint(state), (cache or default_folder()).expanduser()
     found = measure_scales(policy, calibration, method, output) if precision == "fp8" else None
     if found is not None:
@@ -138,9 +139,10 @@ def build(
 
 def measure_scales(policy: "UnifiedPolicy", path: Path | None, method: str, output: Output) -> "Calibration":
     """Scales from observations, or from a file that `turbopi calibrate` wrote."""
+    from turbopi.backends.pytorch import reference_model
     from turbopi.tensorrt.calibrate import calibrate, from_quantization
 
-    model: Any = policy.backend.model  # type: ignore[attr-defined]
+    model = reference_model(policy.backend)
     if path is not None and path.suffix == ".json" and path.is_file():
         from turbopi.quantization.artifact import Quantization
 

@@ -116,11 +116,12 @@ def _errors(
     import numpy as np
     import torch
 
+    from turbopi.backends.pytorch import reference_model
     from turbopi.observation import Observation
     from turbopi.studies import tensorrt as studies
     from turbopi.tensorrt import library
 
-    model: Any = policy.backend.model  # type: ignore[attr-defined]
+    model = reference_model(policy.backend)
     config = policy.config.model
     one = Observation.stack([policy.prepare(given)]).to(model.device)
     shape = (1, config.action_horizon, config.action_dim)

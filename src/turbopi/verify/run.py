@@ -16,13 +16,13 @@ import numpy as np
 import torch
 
 from turbopi import backends, shipped
+from turbopi.backends.pytorch import reference_model
 from turbopi.checkpoint import Checkpoint
 from turbopi.checkpoint.calibration import calibration_of
 from turbopi.engine.graph import empty_cache
 from turbopi.errors import BackendError, CheckpointError
 from turbopi.examples import NoisyExample
 from turbopi.model import exact
-from turbopi.model.reference import Pi0Model
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
 from turbopi.quantization.artifact import Quantization
@@ -165,7 +165,7 @@ class _Reference:
             _free(self.device)
             return compared
         compared = Compared()
-        model: Pi0Model = self._policy.backend.model  # type: ignore[attr-defined]
+        model = reference_model(self._policy.backend)
         for seed in control.CONTROL_SEEDS:
             with control.jittered(model, seed):
                 self.compare(self._policy, progress, compared)
