@@ -11,7 +11,7 @@ import torch
 from file_helpers import no_room
 from typer.testing import CliRunner
 
-from turbopi.bench import barrier, profile
+from turbopi.bench import profile
 from turbopi.bench.floors import Floors
 from turbopi.bench.measure import (
     FEWEST,
@@ -32,6 +32,7 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.cli import app
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendError, BackendUnavailable, ConfigError, OutputError
+from turbopi.kernels import grid_barrier as barrier
 from turbopi.kernels.nvrtc import bindings, compile_cubin
 from turbopi.policy import UnifiedPolicy
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from turbopi.bench import barrier
 from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.kernels import grid_barrier as barrier
 from turbopi.kernels import nvrtc
 from turbopi.kernels.arguments import Parameter, Parameters
 from turbopi.kernels.sm90 import instructions

@@ -117,9 +117,9 @@ def test_scales_of_another_model_are_refused(calibration: Calibration, tmp_path:
 @needs_rtx
 def test_the_files_build_engines(folder: Path) -> None:
     """The prefix, with FP8 in it, needs a GPU or TensorRT-RTX 1.7: 1.4 asks the GPU for something."""
+    from turbopi.export.shapes import shapes_of
     from turbopi.tensorrt import library
     from turbopi.tensorrt.engine import build_onnx
-    from turbopi.tensorrt.onnx_shapes import shapes_of
 
     export, version = open_export(folder), library().version
     with_fp8 = ("prefix",) if tuple(map(int, version.split(".")[:2])) >= (1, 7) else ()

@@ -121,8 +121,8 @@ def test_an_exported_graph_is_an_engine(
 ) -> None:
     """Float32 products are TF32 in TensorRT-RTX, hence the bound; FP8 is compared with ONNX Runtime's FP8."""
     from turbopi.backends.onnx import Sessions
+    from turbopi.export.shapes import shapes_of
     from turbopi.tensorrt.engine import build_onnx
-    from turbopi.tensorrt.onnx_shapes import shapes_of
 
     export = exports(fp8)
     inputs = graph_inputs(graph)

@@ -21,14 +21,20 @@ PENDING = ROOT / "benchmarks/results/gpu_check_pending.json"
 # Files whose code runs on the GPU, or decides what does.
 PRODUCT = (
     *("src/turbopi/kernels/**/*", "src/turbopi/engine/*", "src/turbopi/model/*", "src/turbopi/backends/*"),
-    *("src/turbopi/calibrate/*", "src/turbopi/config.py", "src/turbopi/observation.py", "src/turbopi/policy.py"),
+    *(
+        "src/turbopi/quantization/*",
+        "src/turbopi/calibrate/*",
+        "src/turbopi/config.py",
+        "src/turbopi/observation.py",
+        "src/turbopi/policy.py",
+    ),
     "src/turbopi/verify/check_golden.py",
 )
 # Modules that those import and that only read files or format text on the host: CPU tests see all of what they do.
 HOST_ONLY = (
     *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.shipped"),
     *("turbopi.export", "turbopi.tensorrt", "turbopi.errors", "turbopi.files", "turbopi.reading", "turbopi.arguments"),
-    *("turbopi.provenance", "turbopi.recordings", "turbopi.examples", "turbopi.verify.golden"),
+    *("turbopi.provenance", "turbopi.toolchain", "turbopi.recordings", "turbopi.examples", "turbopi.verify.golden"),
 )
 MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
 

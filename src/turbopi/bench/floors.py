@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi.bench.barrier import barrier_us
+from turbopi.kernels.grid_barrier import barrier_us
 
 _DTYPES = {"bf16": torch.bfloat16, "f32": torch.float32, "fp8": torch.float8_e4m3fn, "fp8-mlp": torch.float8_e4m3fn}
 
