@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from turbopi.version import turbopi_version
+
 _GPU_FIELDS = ("name", "driver_version", "clocks.sm", "clocks.mem", "clocks_throttle_reasons.active", "temperature.gpu")
 
 
@@ -54,11 +56,6 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
-
-
-def turbopi_version() -> str:
-    """The installed version, or "from source" where Turbo-Pi runs without having been installed."""
-    return _version("turbopi") or "from source"
 
 
 def _commit() -> str:

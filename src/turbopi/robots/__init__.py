@@ -9,11 +9,12 @@ from typing import Any
 
 from turbopi.errors import ConfigError
 from turbopi.robots.aloha import Aloha
-from turbopi.robots.base import Robot, RobotInputs
+from turbopi.robots.base import Robot, RobotInputs, find, has, optional_prompt, read_prompt, read_state, require
 from turbopi.robots.described import Described, load_robot, robot_from_dict
 from turbopi.robots.droid import Droid
 from turbopi.robots.lerobot import LeRobot
 from turbopi.robots.libero import Libero
+from turbopi.robots.pictures import parse_chw_image, parse_image, parse_unit_image
 from turbopi.robots.plain import Plain
 
 __all__ = [
@@ -22,8 +23,17 @@ __all__ = [
     "Robot",
     "RobotInputs",
     "create_robot",
+    "find",
+    "has",
     "import_robot",
     "load_robot",
+    "optional_prompt",
+    "parse_chw_image",
+    "parse_image",
+    "parse_unit_image",
+    "read_prompt",
+    "read_state",
+    "require",
     "robot_from_dict",
 ]
 

@@ -19,7 +19,6 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
@@ -70,13 +69,6 @@ def networks_hash() -> str:
     here = Path(__file__).parent
     texts = b"".join((here / name).read_bytes() for name in ("networks.py", "ops.py", "parts.py", "engine.py"))
     return hashlib.sha256(texts).hexdigest()[:16]
-
-
-def turbopi_version() -> str:
-    try:
-        return metadata.version("turbopi")
-    except metadata.PackageNotFoundError:
-        return "from source"
 
 
 class EngineCache:

@@ -13,12 +13,13 @@ from turbopi.config import ModelConfig
 from turbopi.engine.weights import Weights
 from turbopi.errors import BackendError
 from turbopi.tensorrt import Library, parts
-from turbopi.tensorrt.cache import EngineCache, Environment, Report, default_folder, networks_hash, turbopi_version
+from turbopi.tensorrt.cache import EngineCache, Environment, Report, default_folder, networks_hash
 from turbopi.tensorrt.call import Part, Parts
 from turbopi.tensorrt.engine import Engine, Kernels, Specification, build
 from turbopi.tensorrt.networks import Fp8Scales
 from turbopi.tensorrt.ops import Dtype
 from turbopi.tensorrt.parts import EngineShape
+from turbopi.version import turbopi_version
 
 logger = logging.getLogger(__name__)
 

@@ -1,0 +1,44 @@
+"""The public interface: each promised name is there, and asking for none of them costs nothing."""
+
+import importlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import turbopi
+from turbopi import errors
+
+
+@pytest.mark.parametrize("name", turbopi.__all__)
+def test_every_public_name_can_be_imported(name: str) -> None:
+    found: dict[str, object] = {}
+    exec(f"from turbopi import {name}", found)
+    assert found[name] == getattr(turbopi, name)
+    assert name in dir(turbopi)
+
+
+def test_public_names_are_the_objects_that_their_modules_define() -> None:
+    for name, module in (("UnifiedPolicy", "policy"), ("Robot", "robots"), ("open_checkpoint", "checkpoint")):
+        assert getattr(turbopi, name) is getattr(importlib.import_module(f"turbopi.{module}"), name)
+    assert turbopi.errors is errors
+
+
+def test_every_error_is_public() -> None:
+    defined = {name for name, one in vars(errors).items() if isinstance(one, type) and issubclass(one, Exception)}
+    assert defined <= {*turbopi.__all__}
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'turbopi' has no attribute 'UnifiedPolice'"):
+        turbopi.UnifiedPolice  # noqa: B018
+
+
+def test_import_turbopi_imports_neither_torch_nor_numpy() -> None:
+    """Nor do the errors and the version."""
+    code = "import sys, turbopi; turbopi.__version__, turbopi.TurboPiError; print({'torch', 'numpy'} & {*sys.modules})"
+    here = {**os.environ, "PYTHONPATH": str(Path(turbopi.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=here)
+    assert done.stdout.strip() == "set()"
