@@ -20,7 +20,7 @@ if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel's module is imported, by whichever test comes first
 
 from turbopi.config import Kind
-from turbopi.model.reference import Pi0Model, Precision
+from turbopi.model.reference import FloatPrecision, Pi0Model
 from turbopi.verify.golden import Case, GoldenFolder
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -62,7 +62,7 @@ def golden_cases() -> dict[str, Case]:
 
 
 @lru_cache
-def golden_model(kind: Kind, precision: Precision = "f32") -> Pi0Model:
+def golden_model(kind: Kind, precision: FloatPrecision = "f32") -> Pi0Model:
     checkpoint = golden_folder().checkpoint(kind)
     return Pi0Model.from_state(checkpoint.config.model, checkpoint.load(torch.device("cpu"), precision).state)
 

@@ -12,13 +12,13 @@ from conftest import golden_cases, golden_folder
 from turbopi import backends
 from turbopi.backends.timing import StageTimer
 from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.model.reference import Precision
+from turbopi.model.reference import FloatPrecision
 from turbopi.verify.check_golden import check_case
 
 CPU = torch.device("cpu")
 
 
-def create(name: str, precision: Precision = "f32") -> backends.Backend:
+def create(name: str, precision: FloatPrecision = "f32") -> backends.Backend:
     checkpoint = golden_folder().checkpoint("pi05")
     model = checkpoint.config.model
     return backends.create(

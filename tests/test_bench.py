@@ -25,7 +25,7 @@ from turbopi.bench.measure import (
 )
 from turbopi.bench.ready import Start, empty_caches, measure_ready
 from turbopi.bench.report import report
-from turbopi.bench.run import Plan, stage_floors
+from turbopi.bench.run import BenchPlan, stage_floors
 from turbopi.bench.summary import linear_models
 from turbopi.bench.work import Job, Work, floor_ms, stage_work
 from turbopi.checkpoint import random_checkpoint
@@ -124,7 +124,7 @@ def test_the_oracle_has_no_error_against_itself(policy: UnifiedPolicy) -> None:
     assert 1e-4 < error["relative_rms"] < 0.1
 
 
-TABLE = Plan(["fused"], ["bf16"], (1, 2, 3), (48, 200), (10, 50), (1, 2, 3, 5, 10), beside=["pytorch"])
+TABLE = BenchPlan(["fused"], ["bf16"], (1, 2, 3), (48, 200), (10, 50), (1, 2, 3, 5, 10), beside=["pytorch"])
 
 
 def test_the_table_has_sixty_jobs_and_the_others_run_the_main_one() -> None:
@@ -135,17 +135,17 @@ def test_the_table_has_sixty_jobs_and_the_others_run_the_main_one() -> None:
 
 
 def test_many_calls_are_for_the_main_job_of_the_main_backends() -> None:
-    plan = Plan(["fused"], ["bf16"], steps=(1, 10), beside=["pytorch"], calls=5, main_calls=50)
+    plan = BenchPlan(["fused"], ["bf16"], steps=(1, 10), beside=["pytorch"], calls=5, main_calls=50)
     assert plan.calls_of("fused", plan.main) == 50
     assert plan.calls_of("pytorch", plan.main) == plan.calls_of("fused", Job(steps=1)) == 5
 
 
 def test_the_main_job_is_the_usual_one_or_the_nearest() -> None:
-    assert Plan(["x"], ["bf16"], (1, 3), (7, 48), (5,), (1, 3)).main == Job(1, 48, 5, 3)
+    assert BenchPlan(["x"], ["bf16"], (1, 3), (7, 48), (5,), (1, 3)).main == Job(1, 48, 5, 3)
 
 
 def test_a_backend_is_left_out_only_in_one_of_several_precisions() -> None:
-    both = Plan(["pytorch"], ["bf16", "f32"], beside=["onnx"])
+    both = BenchPlan(["pytorch"], ["bf16", "f32"], beside=["onnx"])
     assert [(precision, name) for precision, name, _ in both.policies()] == [
         ("bf16", "pytorch"),
         ("f32", "pytorch"),
@@ -153,7 +153,7 @@ def test_a_backend_is_left_out_only_in_one_of_several_precisions() -> None:
     ]
     both.check(CPU)
     with pytest.raises(ConfigError, match="onnx"):
-        Plan(["onnx"], ["bf16"]).check(CPU)
+        BenchPlan(["onnx"], ["bf16"]).check(CPU)
 
 
 def test_the_line_over_steps_is_found() -> None:

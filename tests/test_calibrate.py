@@ -37,7 +37,7 @@ from turbopi.recordings import RecordedCall, save_call
 from turbopi.studies import formats
 from turbopi.studies.weights import WEIGHTS, studied_checkpoint
 from turbopi.verify.check_golden import check_case, golden_calibration, golden_calls
-from turbopi.verify.inputs import Plan
+from turbopi.verify.inputs import VerifyPlan
 from turbopi.verify.run import verify
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
@@ -665,7 +665,7 @@ def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Pat
     seen = [sample.sha256 for sample in read_examples(policy, str(tmp_path), 2)[1]]
     report = {"observations": {"source": "x", "calibration": {"1": seen[1], "other": "0" * 64}}, "warnings": []}
     arguments = {"backend": "emulated_fp8", "precision": "fp8", "device": "cpu", "num_denoising_steps": 1}
-    plan = Plan(arguments | {"quantization": made_up(report=report)}, tmp_path, noises=1)
+    plan = VerifyPlan(arguments | {"quantization": made_up(report=report)}, tmp_path, noises=1)
     document = verify(checkpoint, plan)
     assert document["observations"]["calibrated_on"] == 1
     assert document["policy"]["backend_details"]["fp8"]["observations"] == "x"

@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 
 from turbopi.checkpoint import convert, open_checkpoint
 from turbopi.errors import CheckpointError
-from turbopi.model.reference import Precision
+from turbopi.model.reference import FloatPrecision
 
 V = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 
@@ -203,7 +203,7 @@ def test_a_tree_with_another_root_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("precision", ["f32", "bf16"])
-def test_a_value_that_is_no_number_is_found_at_loading(tmp_path: Path, value: float, precision: Precision) -> None:
+def test_a_value_that_is_no_number_is_found_at_loading(tmp_path: Path, value: float, precision: FloatPrecision) -> None:
     folder = torch_copy(tmp_path / "copy")
     weight = load_file(folder / "model.safetensors")["action_out_proj.weight"]
     weight[3, 5] = value

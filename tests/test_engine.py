@@ -21,7 +21,7 @@ from turbopi.engine.weights import modulation, pack
 from turbopi.engine.without_compiler import OPS, Denoiser
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.plain import PLAIN, geglu, geglu_by_sigmoid, gelu, gelu_by_sigmoid
-from turbopi.model.reference import Precision
+from turbopi.model.reference import FloatPrecision
 from turbopi.observation import Observation
 
 FIELDS = ("images", "image_mask", "tokens", "token_mask", "state")
@@ -29,7 +29,7 @@ CPU = torch.device("cpu")
 CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
 
 
-def static_call(kind: Kind, shape: CallShape, precision: Precision = "f32", ops: Ops = PLAIN) -> StaticCall:
+def static_call(kind: Kind, shape: CallShape, precision: FloatPrecision = "f32", ops: Ops = PLAIN) -> StaticCall:
     model = golden_model(kind, precision)
     weights = pack(model.config, dict(model.state_dict()))
     cache = Cache.allocate(

@@ -16,7 +16,7 @@ from turbopi.config import Kind
 from turbopi.engine.call import StaticCall
 from turbopi.engine.graph import Graph
 from turbopi.engine.runner import HostRow
-from turbopi.model.reference import Precision
+from turbopi.model.reference import FloatPrecision
 from turbopi.observation import Observation
 from turbopi.verify.check_golden import check_case
 
@@ -36,7 +36,7 @@ MODES = [  # pytorch_compile takes minutes to compile them all; gpu_check runs i
 
 
 @lru_cache
-def backend(name: str, kind: Kind, precision: Precision) -> backends.Backend:
+def backend(name: str, kind: Kind, precision: FloatPrecision) -> backends.Backend:
     checkpoint = golden_folder().checkpoint(kind)
     device = torch.device("cuda", 0)
     return backends.create(
@@ -50,7 +50,7 @@ def backend(name: str, kind: Kind, precision: Precision) -> backends.Backend:
 
 @pytest.mark.parametrize(("name", "precision"), MODES)
 @pytest.mark.parametrize("case", CASES)
-def test_golden_cases_hold_on_the_gpu(name: str, precision: Precision, case: str) -> None:
+def test_golden_cases_hold_on_the_gpu(name: str, precision: FloatPrecision, case: str) -> None:
     one = golden_cases()[case]
     comparisons = check_case(one, backend(name, one.kind, precision))
     assert {"v_t", "actions"} <= {c.tensor for c in comparisons}
@@ -63,7 +63,7 @@ def test_golden_cases_hold_on_the_gpu(name: str, precision: Precision, case: str
 
 
 @pytest.mark.parametrize(("name", "precision"), MODES)
-def test_repetition_is_bit_identical(name: str, precision: Precision) -> None:
+def test_repetition_is_bit_identical(name: str, precision: FloatPrecision) -> None:
     case = golden_cases()["b_third_masked"]
     runner = backend(name, "pi05", precision)
     first = runner.sample(case.observation, case.noise, 10).actions
@@ -110,7 +110,7 @@ def test_prefix_and_denoise_apart_equal_the_whole(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "precision"), MODES)
-def test_stage_times_are_within_the_call(name: str, precision: Precision) -> None:
+def test_stage_times_are_within_the_call(name: str, precision: FloatPrecision) -> None:
     case = golden_cases()["b_third_masked"]
     runner = backend(name, "pi05", precision)
     runner.sample(case.observation, case.noise, 10)

@@ -9,7 +9,7 @@ from conftest import golden_cases, golden_folder, golden_model
 from torch import Tensor
 
 from turbopi import backends
-from turbopi.backends import Tier
+from turbopi.backends import Precision
 from turbopi.backends.fused import FusedBackend
 from turbopi.config import Kind
 from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
@@ -44,7 +44,7 @@ def quantization(kind: Kind, target: float) -> Quantization:
 
 
 @lru_cache
-def backend(kind: Kind, precision: Tier, target: float = 0.0) -> backends.Backend:
+def backend(kind: Kind, precision: Precision, target: float = 0.0) -> backends.Backend:
     checkpoint = golden_folder().checkpoint(kind)
     return backends.create(
         "fused",
@@ -56,7 +56,7 @@ def backend(kind: Kind, precision: Tier, target: float = 0.0) -> backends.Backen
     )
 
 
-def emulated(case: Case, precision: Tier, target: float) -> tuple[Tensor, Tensor]:
+def emulated(case: Case, precision: Precision, target: float) -> tuple[Tensor, Tensor]:
     """(float32, float32 with the plan's sites rounded), on the host."""
     model, chosen = on_gpu(case.kind), quantization(case.kind, target)
     plan = chosen.plan(model.config, precision)
@@ -75,7 +75,7 @@ def emulated(case: Case, precision: Tier, target: float) -> tuple[Tensor, Tensor
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("precision", ["fp8", "fp8-mlp"])
-def test_the_engine_is_as_far_from_float32_as_its_emulation(case: str, precision: Tier) -> None:
+def test_the_engine_is_as_far_from_float32_as_its_emulation(case: str, precision: Precision) -> None:
     one = golden_cases()[case]
     exact, expected = emulated(one, precision, 0.0)
     ours = backend(one.kind, precision).sample(one.observation, one.noise, STEPS).actions
@@ -125,7 +125,7 @@ def test_operations_have_the_expert_again_when_they_need_it() -> None:
 
 
 @pytest.mark.parametrize("precision", ["fp8", "fp8-mlp"])
-def test_repetition_is_bit_identical(precision: Tier) -> None:
+def test_repetition_is_bit_identical(precision: Precision) -> None:
     case = golden_cases()["b_third_masked"]
     runner = backend("pi05", precision)
     first = runner.sample(case.observation, case.noise, STEPS).actions

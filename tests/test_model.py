@@ -14,7 +14,7 @@ from turbopi.config import GemmaConfig, Kind, ModelConfig
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.model.denoise import time_embedding, time_grid
 from turbopi.model.layers import attention
-from turbopi.model.reference import Pi0Model, Precision, parameter_dtype, parameter_shapes
+from turbopi.model.reference import FloatPrecision, Pi0Model, parameter_dtype, parameter_shapes
 from turbopi.observation import Observation
 
 STEPS = 3
@@ -42,7 +42,7 @@ def stack(*observations: Observation) -> Observation:
 
 @pytest.mark.parametrize("case", ["a_three_cams", "b_third_masked", "p0_pi0_state"])
 @pytest.mark.parametrize("precision", ["f32", "bf16"])
-def test_compaction_is_exact(case: str, precision: Precision) -> None:
+def test_compaction_is_exact(case: str, precision: FloatPrecision) -> None:
     one = golden_cases()[case]
     model = golden_model(one.kind, precision)
     padded = model.sample(one.observation, one.noise, 10, compact=False)

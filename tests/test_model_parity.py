@@ -14,14 +14,14 @@ from torch import Tensor
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.errors import CheckpointError
 from turbopi.model import denoise, reference
-from turbopi.model.reference import Pi0Model, Precision
+from turbopi.model.reference import FloatPrecision, Pi0Model
 from turbopi.verify.check_golden import Comparison, check_case
 from turbopi.verify.golden import GoldenFolder
 
 CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
 
 
-def judged(case: str, precision: Precision, change: Callable[[Pi0Model], None] | None = None) -> list[Comparison]:
+def judged(case: str, precision: FloatPrecision, change: Callable[[Pi0Model], None] | None = None) -> list[Comparison]:
     """The comparisons of a golden case, with a model that `change` may have broken first."""
     one = golden_cases()[case]
     model = golden_model(one.kind, precision)

@@ -20,7 +20,7 @@ from turbopi.policy import UnifiedPolicy
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.recordings.sources import chosen_files
 from turbopi.studies import certificates
-from turbopi.verify.inputs import Plan
+from turbopi.verify.inputs import VerifyPlan
 from turbopi.verify.intermediates import Errors, Place, first_suspect, in_order, tensors_of
 from turbopi.verify.run import verify
 from turbopi.verify.verdict import ACTIONS, Rule
@@ -341,6 +341,6 @@ def tiny_policy() -> UnifiedPolicy:
     return UnifiedPolicy(random_checkpoint("pi05_tiny"), backend="pytorch", device="cpu", num_denoising_steps=1)
 
 
-def quick_plan(**more: Any) -> Plan:
+def quick_plan(**more: Any) -> VerifyPlan:
     arguments = {"backend": "pytorch", "precision": "f32", "num_denoising_steps": 1, "device": "cpu"}
-    return Plan(arguments, **{"count": 1, "noises": 1, **more})
+    return VerifyPlan(arguments, **{"count": 1, "noises": 1, **more})

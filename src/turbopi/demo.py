@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.backends import Tier
+from turbopi.backends import Precision
 from turbopi.backends.pytorch import reference_model
 from turbopi.errors import BackendError
 from turbopi.policy import UnifiedPolicy
@@ -102,7 +102,7 @@ def check(
     oracle: UnifiedPolicy,
     observed: Sequence[Mapping[str, Any]],
     *,
-    precision: Tier,
+    precision: Precision,
     seed: int,
     tick: Tick = lambda: None,
 ) -> OracleCheck:

@@ -21,14 +21,14 @@ from turbopi.arguments import (
     several,
     warm_loops,
 )
-from turbopi.backends import Tier
+from turbopi.backends import Precision
 from turbopi.backends.lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import PolicyConfig
 from turbopi.engine.recent import Loop
 from turbopi.errors import ActionError, ConfigError, ObservationError
-from turbopi.model.reference import Precision
+from turbopi.model.reference import FloatPrecision
 from turbopi.observation import ModelInputs, Observation, with_cameras
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
@@ -74,7 +74,7 @@ class UnifiedPolicy:
         *,
         config: str | Path | PolicyConfig = "auto",
         backend: str = "auto",
-        precision: Tier = "bf16",
+        precision: Precision = "bf16",
         quantization: str | Path | Quantization | None = None,
         num_denoising_steps: int | None = None,
         device: str | torch.device = "auto",
@@ -109,7 +109,7 @@ class UnifiedPolicy:
             logger.warning("%s", note)
         self._loading: dict[str, Any] = {}
 
-        def load(to: torch.device, in_precision: Precision) -> dict[str, torch.Tensor]:
+        def load(to: torch.device, in_precision: FloatPrecision) -> dict[str, torch.Tensor]:
             loaded = checkpoint.load(to, in_precision, progress=progress)
             self._loading = {"load_seconds": round(loaded.seconds, 3), "weight_bytes": loaded.bytes}
             return loaded.state

@@ -12,7 +12,7 @@ from turbopi.checkpoint.convert import convert
 from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, Shape
 from turbopi.config import PolicyConfig, preset
-from turbopi.model.reference import Precision
+from turbopi.model.reference import FloatPrecision
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 
 ASSET_ID = "turbopi/libero_spatial"
@@ -42,7 +42,7 @@ class TrainedWeights:
             yield Piece(name, 0, value.detach().to(device, torch.float32))
 
 
-def export(state: dict[str, Tensor], stats: NormStats, folder: Path, precision: Precision = "bf16") -> Path:
+def export(state: dict[str, Tensor], stats: NormStats, folder: Path, precision: FloatPrecision = "bf16") -> Path:
     """Write canonical weights, statistics and the tokenizer into a new folder."""
     checkpoint = Checkpoint(
         path=None,

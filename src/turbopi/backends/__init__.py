@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi.backends.base import Backend, Begins, Begun, LoadState, RunsFp8, Sample, Submits, Tier
+from turbopi.backends.base import Backend, Begins, Begun, LoadState, Precision, RunsFp8, Sample, Submits
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
@@ -22,17 +22,17 @@ __all__ = [
     "Begins",
     "Begun",
     "LoadState",
+    "Precision",
     "RunsFp8",
     "Sample",
     "Submits",
-    "Tier",
     "availability",
     "choose",
     "create",
     "resolve_device",
 ]
 
-PRECISIONS: tuple[Tier, ...] = ("bf16", "f32", *TIERS)
+PRECISIONS: tuple[Precision, ...] = ("bf16", "f32", *TIERS)
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def availability(name: str, device: torch.device) -> str | None:
     return _backend_class(name).unavailable(device)
 
 
-def choose(device: torch.device, precision: Tier = "bf16") -> tuple[str, str]:
+def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, str]:
     """The backend that "auto" stands for on a device in a precision, and why."""
     if precision in TIERS:
         return "fused", f"auto: the fast one of those that run in {precision}"
@@ -152,7 +152,7 @@ def _unproven(name: str, device: torch.device) -> str | None:
     return f"it was never run on compute capability {major}.{minor}; try it with backend={name!r}"
 
 
-def check(name: str, device: torch.device, precision: Tier) -> None:
+def check(name: str, device: torch.device, precision: Precision) -> None:
     """Raise ConfigError for an unknown name or precision, BackendUnavailable where the backend can't run."""
     if precision not in PRECISIONS:
         raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(PRECISIONS)}")
@@ -178,7 +178,7 @@ def create(
     load: LoadState,
     *,
     device: torch.device,
-    precision: Tier,
+    precision: Precision,
     quantization: Quantization | None = None,
 ) -> Backend:
     """Build the backend called `name` around a checkpoint's tensors. Raises what `check` raises.
@@ -191,7 +191,7 @@ def create(
         return _backend_class(name)(config, load, device=device, precision=precision, **more)
 
 
-def precisions(name: str) -> tuple[Tier, ...]:
+def precisions(name: str) -> tuple[Precision, ...]:
     """The precisions a backend runs in."""
     return _backend_class(name).precisions
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -10,16 +10,13 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Precision, Trace
+from turbopi.model.reference import FloatPrecision, Trace
 from turbopi.model.sample import Sample
 from turbopi.observation import Observation
+from turbopi.quantization.plan import Precision
 
 # Loads the checkpoint's tensors, by canonical name, to a device in a precision.
-LoadState = Callable[[torch.device, Precision], dict[str, Tensor]]
-
-
-# What a backend may run in. The FP8 tiers load bfloat16 and need a calibration: see `turbopi.calibrate`.
-Tier = Literal["bf16", "f32", "fp8", "fp8-mlp"]
+LoadState = Callable[[torch.device, FloatPrecision], dict[str, Tensor]]
 
 
 class Begun(Protocol):
@@ -46,14 +43,14 @@ class Backend(Protocol):
     """
 
     name: ClassVar[str]
-    precisions: ClassVar[tuple[Tier, ...]]
+    precisions: ClassVar[tuple[Precision, ...]]
     any_horizon: ClassVar[bool]
     config: ModelConfig
     device: torch.device
-    precision: Tier
+    precision: Precision
     strict: bool
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Tier) -> None:
+    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
         """Load the weights; whatever can be prepared without an observation is prepared here."""
 
     @classmethod
@@ -117,5 +114,5 @@ class RunsFp8(Protocol):
     """A backend that has FP8 tiers among its precisions."""
 
     @classmethod
-    def unavailable_in(cls, device: torch.device, precision: Tier) -> str | None:
+    def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
         """Why this precision can't run on a GPU that the backend runs on; None if it can."""

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Tier
+from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.config import ModelConfig
 from turbopi.engine import without_compiler
@@ -26,10 +26,10 @@ class CudaGraphBackend(GraphRunner):
     """The engine's forward pass with PyTorch's kernels, those between products fused by Inductor if it is there."""
 
     name: ClassVar[str] = "cuda_graph"
-    precisions: ClassVar[tuple[Tier, ...]] = ("bf16", "f32")
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
     any_horizon: ClassVar[bool] = True
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Tier) -> None:
+    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
         if config.vlm.num_kv_heads != 1:
             raise BackendError(f"{self.name} needs one key/value head, this model has {config.vlm.num_kv_heads}")
         self.config, self.device, self.precision = config, device, precision

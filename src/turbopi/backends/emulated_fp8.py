@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from turbopi.backends.base import LoadState, Tier
+from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
 from turbopi.engine.emulate import put_into_norm, round_activation, round_weight
@@ -24,7 +24,7 @@ class EmulatedFp8Backend(PyTorchBackend):
     """Rounds weights once, with a scale for each output channel, and activations whenever a product reads them."""
 
     name: ClassVar[str] = "emulated_fp8"
-    precisions: ClassVar[tuple[Tier, ...]] = TIERS
+    precisions: ClassVar[tuple[Precision, ...]] = TIERS
 
     def __init__(
         self,
@@ -32,7 +32,7 @@ class EmulatedFp8Backend(PyTorchBackend):
         load: LoadState,
         *,
         device: torch.device,
-        precision: Tier,
+        precision: Precision,
         quantization: Quantization | None = None,
     ) -> None:
         check_given(precision, quantization)
@@ -53,7 +53,7 @@ class EmulatedFp8Backend(PyTorchBackend):
                     linear.register_forward_pre_hook(partial(_round_input, scale=scale))
 
     @classmethod
-    def unavailable_in(cls, device: torch.device, precision: Tier) -> str | None:
+    def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
         return None
 
     def describe(self) -> dict[str, Any]:

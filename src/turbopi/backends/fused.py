@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Tier
+from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.lost import ADVICE
 from turbopi.config import ModelConfig
@@ -38,7 +38,7 @@ class FusedBackend(CudaGraphBackend):
     """As `cuda_graph`, in bfloat16 or, as a calibration says, partly in FP8; `describe()` says what runs where."""
 
     name: ClassVar[str] = "fused"
-    precisions: ClassVar[tuple[Tier, ...]] = ("bf16", *TIERS)
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class FusedBackend(CudaGraphBackend):
         load: LoadState,
         *,
         device: torch.device,
-        precision: Tier,
+        precision: Precision,
         quantization: Quantization | None = None,
     ) -> None:
         check_given(precision, quantization)
@@ -73,7 +73,7 @@ class FusedBackend(CudaGraphBackend):
         return None
 
     @classmethod
-    def unavailable_in(cls, device: torch.device, precision: Tier) -> str | None:
+    def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
         """Why this precision, besides the backend, can't run on a GPU that the backend runs on; or None."""
         if precision not in TIERS:
             return None

@@ -12,14 +12,14 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import LoadState, Sample, Tier
+from turbopi.backends.base import LoadState, Precision, Sample
 from turbopi.backends.timing import StageTimer
 from turbopi.config import ModelConfig
 from turbopi.errors import CheckpointError, ObservationError
 from turbopi.export.onnx import EXPORT_NEEDS, GRAPHS, Export, export_onnx, missing_library, open_export
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.model.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
-from turbopi.model.reference import Pi0Model, Precision, Trace
+from turbopi.model.reference import FloatPrecision, Pi0Model, Trace
 from turbopi.model.vision import normalize_images
 from turbopi.observation import Observation
 
@@ -59,11 +59,13 @@ class OnnxBackend:
     """Exports the weights into a temporary folder and runs that, or runs a folder exported before (`open`)."""
 
     name: ClassVar[str] = "onnx"
-    precisions: ClassVar[tuple[Tier, ...]] = ("f32",)
+    precisions: ClassVar[tuple[Precision, ...]] = ("f32",)
     any_horizon: ClassVar[bool] = True
     strict = False  # nothing here depends on shapes
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+    def __init__(
+        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
+    ) -> None:
         model = Pi0Model.from_state(config, load(device, precision))
         with tempfile.TemporaryDirectory(prefix="turbopi-onnx-") as folder:
             self._use(export_onnx(model, Path(folder) / "export"))

@@ -5,12 +5,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from turbopi.backends.base import Backend, LoadState, Sample, Tier
+from turbopi.backends.base import Backend, LoadState, Precision, Sample
 from turbopi.backends.timing import StageTimer
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendError
 from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Pi0Model, Precision, Trace
+from turbopi.model.reference import FloatPrecision, Pi0Model, Trace
 from turbopi.observation import Observation
 
 
@@ -18,15 +18,17 @@ class PyTorchBackend:
     """Runs `Pi0Model`; a batch of one is compacted exactly, larger ones as far as their masks allow."""
 
     name: ClassVar[str] = "pytorch"
-    precisions: ClassVar[tuple[Tier, ...]] = ("bf16", "f32")
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
     any_horizon: ClassVar[bool] = True
     model_class: ClassVar[type[Pi0Model]] = Pi0Model
     strict = False  # nothing here depends on shapes
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+    def __init__(
+        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
+    ) -> None:
         self.config = config
         self.device = device
-        self.precision: Tier = precision
+        self.precision: Precision = precision
         self._warm = False
         self.model = self.model_class.from_state(config, load(device, precision))
 

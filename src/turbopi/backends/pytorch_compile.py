@@ -16,7 +16,7 @@ from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
 from turbopi.engine.limits import not_warm
 from turbopi.errors import ObservationError
-from turbopi.model.reference import Pi0Model, Precision
+from turbopi.model.reference import FloatPrecision, Pi0Model
 from turbopi.observation import Observation
 from turbopi.toolchain import missing_for_c, missing_for_cpp
 
@@ -80,7 +80,9 @@ class PyTorchCompileBackend(PyTorchBackend):
     name: ClassVar[str] = "pytorch_compile"
     model_class: ClassVar[type[Pi0Model]] = CompiledModel
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+    def __init__(
+        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
+    ) -> None:
         super().__init__(config, load, device=device, precision=precision)
         self._compiled: set[Compiled] = set()
         self._warming = False

@@ -28,7 +28,7 @@ from turbopi.engine.runner import golden_trace
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError
 from turbopi.model.kv_cache import KVCache
-from turbopi.model.reference import Precision, Trace
+from turbopi.model.reference import FloatPrecision, Trace
 from turbopi.observation import Observation
 from turbopi.tensorrt import library, missing
 from turbopi.tensorrt.call import EngineCall
@@ -71,11 +71,13 @@ class TensorRTBackend:
     """See the top of this file. Batches run one observation after the other."""
 
     name: ClassVar[str] = "tensorrt"
-    precisions: ClassVar[tuple[Precision, ...]] = ("bf16",)
+    precisions: ClassVar[tuple[FloatPrecision, ...]] = ("bf16",)
     any_horizon: ClassVar[bool] = False  # engines are built for one
     strict = False
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+    def __init__(
+        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
+    ) -> None:
         if config.vlm.num_kv_heads != 1:
             raise BackendError(f"{self.name} needs one key/value head, this model has {config.vlm.num_kv_heads}")
         self.config, self.device, self.precision = config, device, precision

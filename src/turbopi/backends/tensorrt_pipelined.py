@@ -24,7 +24,7 @@ from turbopi.backends.tensorrt import CallKey, TensorRTBackend
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import Graph
 from turbopi.errors import BackendError
-from turbopi.model.reference import Precision, Trace
+from turbopi.model.reference import FloatPrecision, Trace
 from turbopi.observation import Observation
 
 BUFFERS = 2
@@ -50,7 +50,9 @@ class TensorRTPipelinedBackend(TensorRTBackend):
 
     name: ClassVar[str] = "tensorrt_pipelined"
 
-    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+    def __init__(
+        self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
+    ) -> None:
         super().__init__(config, load, device=device, precision=precision)
         self._slots = [_InFlight() for _ in range(BUFFERS)]
         self._next = 0

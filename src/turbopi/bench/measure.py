@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from turbopi.backends import Tier
+from turbopi.backends import Precision
 from turbopi.bench.work import Job
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import CAMERAS, Normalization
@@ -28,7 +28,7 @@ FEWEST = 20  # calls that a measurement has, however slow they are
 def bench_policy(
     checkpoint: Checkpoint,
     backend: str,
-    precision: Tier,
+    precision: Precision,
     device: torch.device,
     job: Job,
     *,

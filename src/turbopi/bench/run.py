@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from turbopi import backends
-from turbopi.backends import PRECISIONS, Tier
+from turbopi.backends import PRECISIONS, Precision
 from turbopi.bench.floors import Floors, measure_floors
 from turbopi.bench.measure import WARMING, Observations, answers, at_horizon, bench_policy, error_against, measure_calls
 from turbopi.bench.profile import stage_kernels, start_profiler
@@ -27,11 +27,11 @@ Answered = tuple[dict[str, Any], Job, np.ndarray]  # a result, its job, and the 
 
 
 @dataclass(frozen=True)
-class Plan:
+class BenchPlan:
     """What to measure: all backends and precisions on all jobs."""
 
     backends: Sequence[str]
-    precisions: Sequence[Tier]
+    precisions: Sequence[Precision]
     cameras: Sequence[int] = (2,)
     prompt_tokens: Sequence[int] = (48,)
     horizons: Sequence[int] = (10,)
@@ -79,8 +79,8 @@ class Plan:
             for steps in self.steps:
                 yield Job(cameras, tokens, horizon, steps)
 
-    def policies(self) -> Iterator[tuple[Tier, str, list[Job]]]:
-        """Tier, backend, and the jobs it runs. A backend without one of several precisions is left out there."""
+    def policies(self) -> Iterator[tuple[Precision, str, list[Job]]]:
+        """Precision, backend, and the jobs it runs. A backend without one of several precisions is left out there."""
         for precision, name in itertools.product(self.precisions, [*self.backends, *self.beside]):
             if len(self.precisions) == 1 or precision in backends.precisions(name):
                 yield precision, name, list(self.jobs()) if name in self.backends else [self.main]
@@ -100,7 +100,7 @@ class Plan:
 
 
 @dataclass
-class Progress:
+class BenchProgress:
     """How a run tells what it is doing; by default it doesn't."""
 
     doing: Callable[[str], None] = field(default=lambda text: None)
@@ -108,14 +108,16 @@ class Progress:
     keep: Callable[[dict[str, Any]], None] = field(default=lambda document: None)  # what is measured so far
 
 
-def run(checkpoint: Checkpoint, plan: Plan, device: torch.device, progress: Progress | None = None) -> dict[str, Any]:
+def run(
+    checkpoint: Checkpoint, plan: BenchPlan, device: torch.device, progress: BenchProgress | None = None
+) -> dict[str, Any]:
     """Measure everything in the plan.
 
     A backend that refuses or breaks on its jobs is named under `failed`, and the others go on; if none is left, its
-    error is raised. What can be refused beforehand is, before anything is measured (`Plan.check`). `progress.keep` gets
-    what there is after each job, marked as "unfinished".
+    error is raised. What can be refused beforehand is, before anything is measured (`BenchPlan.check`). `progress.keep`
+    gets what there is after each job, marked as "unfinished".
     """
-    progress = progress or Progress()
+    progress = progress or BenchProgress()
     plan.check(device)
     progress.doing("measuring this machine's floors")
     floors = {precision: measure_floors(device, precision) for precision in plan.precisions}
@@ -171,14 +173,14 @@ def run(checkpoint: Checkpoint, plan: Plan, device: torch.device, progress: Prog
 
 def _measure(
     checkpoint: Checkpoint,
-    plan: Plan,
+    plan: BenchPlan,
     device: torch.device,
     backend: str,
-    precision: Tier,
+    precision: Precision,
     jobs: list[Job],
     floors: Floors,
     answered: list[Answered],
-    progress: Progress,
+    progress: BenchProgress,
     keep: Callable[[list[dict[str, Any]]], None],
 ) -> list[dict[str, Any]]:
     """One backend in one precision on its jobs. What it answers where errors are wanted goes to `answered`."""
@@ -218,7 +220,7 @@ def _measure(
     return results
 
 
-def _judge(checkpoint: Checkpoint, plan: Plan, device: torch.device, answered: list[Answered]) -> None:
+def _judge(checkpoint: Checkpoint, plan: BenchPlan, device: torch.device, answered: list[Answered]) -> None:
     """Write the error against the float32 reference into the results. The reference answers each job once."""
     oracle = _policy(checkpoint, plan, "pytorch", "f32", device)
     exact: dict[Job, np.ndarray] = {}
@@ -231,7 +233,12 @@ def _judge(checkpoint: Checkpoint, plan: Plan, device: torch.device, answered: l
 
 
 def _profile(
-    checkpoint: Checkpoint, plan: Plan, device: torch.device, backend: str, precision: Tier, progress: Progress
+    checkpoint: Checkpoint,
+    plan: BenchPlan,
+    device: torch.device,
+    backend: str,
+    precision: Precision,
+    progress: BenchProgress,
 ) -> dict[str, Any]:
     """The main job's kernels, with a policy of its own: graphs captured before the profiler runs may be dark to it."""
     progress.doing(f"{backend} {precision}: profile")
@@ -256,7 +263,9 @@ def _work(policy: UnifiedPolicy, job: Job) -> dict[str, Any]:
     return stage_work(policy.config.model, job, {"f32": 4, "bf16": 2}.get(policy.backend.precision, 1))
 
 
-def _policy(checkpoint: Checkpoint, plan: Plan, backend: str, precision: Tier, device: torch.device) -> UnifiedPolicy:
+def _policy(
+    checkpoint: Checkpoint, plan: BenchPlan, backend: str, precision: Precision, device: torch.device
+) -> UnifiedPolicy:
     """A policy that runs any job of the plan with `at_horizon`."""
     return bench_policy(
         checkpoint, backend, precision, device, plan.main, tokenizer=plan.tokenizer, quantization=plan.quantization

@@ -20,7 +20,7 @@ from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.checkpoint.source import Piece, WeightSource, check_finite
 from turbopi.config import PolicyConfig
 from turbopi.errors import CheckpointError
-from turbopi.model.reference import Precision, parameter_dtype
+from turbopi.model.reference import FloatPrecision, parameter_dtype
 
 PARTS = ("vision", "projector", "vlm", "expert")  # the rest: action, state and time projections
 
@@ -52,7 +52,7 @@ class Checkpoint:
         """One of "openpi_torch", "openpi_jax", "lerobot", "random"."""
         return self.source.format
 
-    def load(self, device: torch.device | str, precision: Precision, *, progress: bool = False) -> Loaded:
+    def load(self, device: torch.device | str, precision: FloatPrecision, *, progress: bool = False) -> Loaded:
         """Read all weights straight into their final dtype and device, a piece at a time.
 
         Host memory besides the result stays small: safetensors are mapped, Orbax arrays decoded one chunk at a time.

@@ -35,9 +35,12 @@ from turbopi.checkpoint.torch_files import WEIGHTS
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
 from turbopi.files import new_folder
-from turbopi.model.reference import Precision
+from turbopi.model.reference import FloatPrecision
 
-_DTYPES: dict[Precision, tuple[str, torch.dtype]] = {"bf16": ("BF16", torch.bfloat16), "f32": ("F32", torch.float32)}
+_DTYPES: dict[FloatPrecision, tuple[str, torch.dtype]] = {
+    "bf16": ("BF16", torch.bfloat16),
+    "f32": ("F32", torch.float32),
+}
 _VARIANTS = {  # openpi's names of sizes: width, MLP
     "gemma_2b": GemmaConfig(width=2048, mlp_dim=16384),
     "gemma_300m": GemmaConfig(width=1024, mlp_dim=4096),
@@ -49,7 +52,7 @@ def convert(
     src: str | Path | Checkpoint,
     dst: str | Path,
     *,
-    precision: Precision,
+    precision: FloatPrecision,
     config: ConfigSource = "auto",
     progress: bool = False,
 ) -> Path:
@@ -86,7 +89,12 @@ def convert(
 
 
 def write_random(
-    preset: str | PolicyConfig, dst: str | Path, *, precision: Precision = "bf16", seed: int = 0, progress: bool = False
+    preset: str | PolicyConfig,
+    dst: str | Path,
+    *,
+    precision: FloatPrecision = "bf16",
+    seed: int = 0,
+    progress: bool = False,
 ) -> Path:
     """Write random weights of a preset as a checkpoint folder; see `random_checkpoint` and `convert`."""
     return convert(random_checkpoint(preset, seed), dst, precision=precision, progress=progress)
@@ -103,7 +111,7 @@ class _Slot:
     row_bytes: int
 
 
-def _write_weights(checkpoint: Checkpoint, file: Path, precision: Precision, progress: bool) -> None:
+def _write_weights(checkpoint: Checkpoint, file: Path, precision: FloatPrecision, progress: bool) -> None:
     """Header first, then every piece at its place."""
     stored, dtype = _DTYPES[precision]
     shapes = {to_openpi(name): shape for name, shape in checkpoint.source.shapes.items()}
@@ -145,7 +153,7 @@ def _header(shapes: dict[str, Shape], stored: str, itemsize: int) -> tuple[bytes
 # -- what goes beside them ---------------------------------------------------------------------------------------------
 
 
-def _openpi_config(model: ModelConfig, precision: Precision) -> dict[str, Any]:
+def _openpi_config(model: ModelConfig, precision: FloatPrecision) -> dict[str, Any]:
     return {
         "action_dim": model.action_dim,
         "action_horizon": model.action_horizon,

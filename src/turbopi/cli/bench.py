@@ -22,7 +22,7 @@ from turbopi.reading import shown
 if TYPE_CHECKING:
     import torch
 
-    from turbopi.bench.run import Plan
+    from turbopi.bench.run import BenchPlan
 
 RESULTS = "results.json"
 _ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps": "10"}
@@ -135,7 +135,7 @@ def bench(
     # before Triton is imported and looks for its cache: what the measured starts compile serves this process, too
     with empty_caches() if ready else nullcontext():
         from turbopi import backends as registry
-        from turbopi.bench.run import Plan, run
+        from turbopi.bench.run import BenchPlan, run
 
         output = Output(as_json)
         opened = options.open(checkpoint)
@@ -143,7 +143,7 @@ def bench(
         resolved = registry.resolve_device(device)
         tiers = _names(precisions)
         names = _backends(_names(backends), tiers, resolved)
-        plan = Plan(
+        plan = BenchPlan(
             names,
             tiers,  # type: ignore[arg-type]  # checked when a backend is created
             cameras=_axis("--cameras", cameras, table),
@@ -177,7 +177,7 @@ def bench(
         raise typer.Exit(1)
 
 
-def _starts(checkpoint: str | None, options: WeightOptions, plan: "Plan", device: str) -> list[dict[str, Any]]:
+def _starts(checkpoint: str | None, options: WeightOptions, plan: "BenchPlan", device: str) -> list[dict[str, Any]]:
     """How long a program with each of the plan's main backends takes until its first answer."""
     from turbopi.bench.ready import Start, measure_ready
 
@@ -191,8 +191,8 @@ def _starts(checkpoint: str | None, options: WeightOptions, plan: "Plan", device
     return starts
 
 
-def _run_with_bar(work: Any, plan: "Plan", folder: Path | None, output: Output) -> dict[str, Any]:
-    from turbopi.bench.run import Progress as Told
+def _run_with_bar(work: Any, plan: "BenchPlan", folder: Path | None, output: Output) -> dict[str, Any]:
+    from turbopi.bench.run import BenchProgress
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = new_console(stderr=True)
@@ -203,7 +203,7 @@ def _run_with_bar(work: Any, plan: "Plan", folder: Path | None, output: Output) 
             if folder is not None:
                 _write_results(document, folder)
 
-        told = Told(lambda text: bar.update(task, description=text), lambda: bar.advance(task), keep)
+        told = BenchProgress(lambda text: bar.update(task, description=text), lambda: bar.advance(task), keep)
         document: dict[str, Any] = work(told)
     return document
 

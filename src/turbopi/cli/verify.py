@@ -73,12 +73,12 @@ def verify(
         check_folder(report)
     output = Output(as_json)
     opened = options.open(checkpoint)
-    from turbopi.verify.inputs import Plan
-    from turbopi.verify.run import Progress
+    from turbopi.calibrate.run import Progress
+    from turbopi.verify.inputs import VerifyPlan
     from turbopi.verify.run import verify as run
 
     options.tell_if_random(opened, output)
-    plan = Plan(
+    plan = VerifyPlan(
         options.policy_arguments(),
         observations,
         count,

@@ -26,7 +26,7 @@ from turbopi.model.prefix import camera_slots, embed_images, embed_prompt, prefi
 from turbopi.model.vision import VisionTower
 from turbopi.observation import Observation
 
-Precision = Literal["bf16", "f32"]
+FloatPrecision = Literal["bf16", "f32"]
 
 # Names of what a trace records. N steps, B batch, S padded prefix slots, C cameras, H horizon, L layers.
 #   prefix_embs [B, S, D]   prefix_pad_mask bool[B, S]   prefix_positions int[B, S]   vision_last_hidden [C, B, 256, W]
@@ -237,7 +237,7 @@ def _scatter(x: Tensor, dim: int, index: Tensor, size: int) -> Tensor:
     return out.index_copy_(dim, index, x)
 
 
-def parameter_dtype(name: str, precision: Precision) -> torch.dtype:
+def parameter_dtype(name: str, precision: FloatPrecision) -> torch.dtype:
     """The dtype of a parameter (canonical name) in a precision.
 
     bf16 follows openpi's PyTorch: patch and position embeddings, all Gemma norms with the adaRMS matrices, and the

@@ -18,7 +18,7 @@ from turbopi.config import ModelConfig
 from turbopi.errors import CalibrationError, ConfigError
 from turbopi.files import write_whole
 from turbopi.quantization.fp8 import E4M3, Directions
-from turbopi.quantization.plan import TIERS, Plan, reason_for_bf16
+from turbopi.quantization.plan import TIERS, PrecisionPlan, reason_for_bf16
 from turbopi.quantization.sites import PARTS, Part, sites
 from turbopi.reading import is_finite, is_integer, one_line, read_json, shown
 
@@ -161,7 +161,7 @@ class Quantization:
                 "checkpoint"
             )
 
-    def plan(self, config: ModelConfig, tier: str) -> Plan:
+    def plan(self, config: ModelConfig, tier: str) -> PrecisionPlan:
         """What runs in FP8 in a tier, and why the rest doesn't."""
         if tier not in TIERS:
             raise ConfigError(f"{tier!r} is no FP8 tier; choose one of {', '.join(TIERS)}")
@@ -178,9 +178,9 @@ class Quantization:
                     common[str(site)] = entry.directions
             else:
                 kept[str(site)] = reason
-        return Plan(tier, chosen, kept, common)
+        return PrecisionPlan(tier, chosen, kept, common)
 
-    def describe(self, plan: Plan) -> dict[str, Any]:
+    def describe(self, plan: PrecisionPlan) -> dict[str, Any]:
         """What goes into the metadata of a policy that runs with it."""
         return {
             "plan": plan.describe(),

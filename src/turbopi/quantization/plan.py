@@ -7,12 +7,13 @@ from typing import Any, Literal, get_args
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, Site
 
+Precision = Literal["bf16", "f32", "fp8", "fp8-mlp"]  # that a policy runs in; the FP8 tiers need a calibration
 Fp8Tier = Literal["fp8", "fp8-mlp"]
 TIERS: tuple[Fp8Tier, ...] = get_args(Fp8Tier)
 
 
 @dataclass(frozen=True)
-class Plan:
+class PrecisionPlan:
     """A tier's choice: site -> scale of its activation, site -> why it stays in bfloat16, site -> directions."""
 
     tier: str

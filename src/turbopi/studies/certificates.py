@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from turbopi import backends, shipped
-from turbopi.backends import Tier
+from turbopi.backends import Precision
 from turbopi.calibrate.run import Settings, calibrate
 from turbopi.checkpoint import Checkpoint
 from turbopi.files import write_whole
@@ -24,7 +24,7 @@ from turbopi.quantization.artifact import Quantization
 from turbopi.quantization.plan import TIERS
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.studies.weights import WEIGHTS, Weights, studied_checkpoint
-from turbopi.verify.inputs import Plan
+from turbopi.verify.inputs import VerifyPlan
 from turbopi.verify.run import verify
 
 _MOST_SHIFT = 20  # pixels
@@ -58,15 +58,15 @@ def _record(folder: Path, seed: int, count: int) -> Path:
 def certify(
     checkpoint: Checkpoint,
     quantization: Quantization,
-    tiers: Sequence[Tier],
+    tiers: Sequence[Precision],
     device: torch.device,
     observations: Path,
     noises: int,
-) -> Iterator[tuple[Tier, dict[str, Any]]]:
+) -> Iterator[tuple[Precision, dict[str, Any]]]:
     """A certificate of `fused` for each tier."""
     for tier in tiers:
         arguments = {"backend": "fused", "precision": tier, "quantization": quantization, "device": str(device)}
-        yield tier, verify(checkpoint, Plan(arguments, observations, noises=noises))
+        yield tier, verify(checkpoint, VerifyPlan(arguments, observations, noises=noises))
 
 
 def condensed(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def _rounded(value: Any) -> Any:
 def run(
     out: Path,
     kinds: Sequence[Weights],
-    tiers: Sequence[Tier],
+    tiers: Sequence[Precision],
     *,
     preset: str = "pi05_libero",
     device: str = "auto",

@@ -16,11 +16,11 @@ Float32 rounds 2^16 times finer, and so is its control. Compiled float32 lands a
 since every way of adding up differs, and bugs are as much further off.
 """
 
-from turbopi.backends import Tier
+from turbopi.backends import Precision
 
 # times the control (control.py), for actions in the model's units
-BOUND_FACTORS: dict[Tier, float] = {"bf16": 5.0, "f32": 30.0, "fp8": 5.0, "fp8-mlp": 5.0}
-TRAINED_FACTORS: dict[Tier, float] = BOUND_FACTORS | {"bf16": 10.0}
+BOUND_FACTORS: dict[Precision, float] = {"bf16": 5.0, "f32": 30.0, "fp8": 5.0, "fp8-mlp": 5.0}
+TRAINED_FACTORS: dict[Precision, float] = BOUND_FACTORS | {"bf16": 10.0}
 
 # of `turbopi verify`
 F32_BOUND = 1e-5  # relative rms of the actions

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from turbopi import backends
-from turbopi.backends import Tier
+from turbopi.backends import Precision
 from turbopi.calibrate.run import Settings, calibrate_model
 from turbopi.config import Kind
 from turbopi.examples import Example, NoisyExample
@@ -70,7 +70,7 @@ class Comparison:
 
     case: str
     num_steps: int
-    precision: Tier
+    precision: Precision
     against: str
     tensor: str
     max: float
@@ -81,10 +81,10 @@ class Comparison:
 
 
 def check_folder(
-    folder: GoldenFolder, backend: str, precisions: tuple[Tier, ...], device: torch.device
+    folder: GoldenFolder, backend: str, precisions: tuple[Precision, ...], device: torch.device
 ) -> Iterator[list[Comparison]]:
     """Compare every run of every case: yields one list a case and precision."""
-    loaded: dict[tuple[str, Tier], backends.Backend] = {}
+    loaded: dict[tuple[str, Precision], backends.Backend] = {}
     for case in folder.cases():
         for precision in precisions:
             if (case.kind, precision) not in loaded:
@@ -160,7 +160,7 @@ def _compare_f32(case: Case, run: Run, ours: Arrays) -> list[Comparison]:
     return comparisons
 
 
-def _compare_rounded(case: Case, run: Run, ours: Arrays, precision: Tier) -> list[Comparison]:
+def _compare_rounded(case: Case, run: Run, ours: Arrays, precision: Precision) -> list[Comparison]:
     oracle = run.variants.get("torch_fp32") or run.variants.get("jax_fp32") or {}
     against = "torch_fp32" if "torch_fp32" in run.variants else "jax_fp32"
     comparisons = []

@@ -15,7 +15,7 @@ DEFAULT_OBSERVATIONS = 8
 
 
 @dataclass(frozen=True)
-class Plan:
+class VerifyPlan:
     """What to verify and on what. `arguments` are UnifiedPolicy's besides the checkpoint; `observations` a path or None
     for Turbo-Pi's own; `count` at most so many of them, evenly spread."""
 
@@ -29,7 +29,7 @@ class Plan:
     fingerprint: bool = True
 
 
-def check_observations(plan: Plan) -> None:
+def check_observations(plan: VerifyPlan) -> None:
     """Refuse now what can't be read, before minutes of loading."""
     if plan.observations is None:
         return
@@ -37,12 +37,12 @@ def check_observations(plan: Plan) -> None:
         load_observation(file)
 
 
-def read_examples(policy: UnifiedPolicy, plan: Plan) -> Iterator[Example]:
+def read_examples(policy: UnifiedPolicy, plan: VerifyPlan) -> Iterator[Example]:
     """The observations as the model gets them. Raises ObservationError naming the one that can't be used."""
     return prepared(policy, _observations(policy, plan))
 
 
-def _observations(policy: UnifiedPolicy, plan: Plan) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def _observations(policy: UnifiedPolicy, plan: VerifyPlan) -> Iterator[tuple[str, Mapping[str, Any]]]:
     if plan.observations is not None:
         for name, file in chosen_files(plan.observations, plan.count):
             yield name, load_observation(file)
@@ -55,7 +55,7 @@ def _observations(policy: UnifiedPolicy, plan: Plan) -> Iterator[tuple[str, Mapp
         yield f"random example {seed}", policy.example_observation(seed)
 
 
-def make_calls(policy: UnifiedPolicy, examples: Sequence[Example], plan: Plan) -> list[NoisyExample]:
+def make_calls(policy: UnifiedPolicy, examples: Sequence[Example], plan: VerifyPlan) -> list[NoisyExample]:
     """Every observation with `noises` noises."""
     model = policy.config.model
     return with_noises(examples, (model.action_horizon, model.action_dim), plan.noises, plan.seed)

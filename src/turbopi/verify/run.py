@@ -8,8 +8,7 @@ them holds weights at a time. What the noise doesn't enter is compared once an o
 import gc
 import hashlib
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ import torch
 
 from turbopi import backends, shipped
 from turbopi.backends.pytorch import reference_model
+from turbopi.calibrate.run import Progress
 from turbopi.checkpoint import Checkpoint
 from turbopi.checkpoint.calibration import calibration_of
 from turbopi.engine.graph import empty_cache
@@ -27,25 +27,17 @@ from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
 from turbopi.quantization.artifact import Quantization
 from turbopi.verify import control
-from turbopi.verify.inputs import Plan, check_observations, make_calls, read_examples
+from turbopi.verify.inputs import VerifyPlan, check_observations, make_calls, read_examples
 from turbopi.verify.intermediates import Tensors, in_order, tensors_of
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
 
 _DEMANDED = ("kv_k", "kv_v", "v_t", "actions")  # by the Backend protocol
 
 
-@dataclass
-class Progress:
-    """How a run tells what it is doing; by default it doesn't."""
-
-    begin: Callable[[str, int], None] = field(default=lambda text, total: None)
-    advance: Callable[[], None] = field(default=lambda: None)
-
-
 # -- the run -----------------------------------------------------------------------------------------------------------
 
 
-def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None) -> dict[str, Any]:
+def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None = None) -> dict[str, Any]:
     """The whole verdict as one plain document (docs/verify.md).
 
     Raises ConfigError or BackendUnavailable before anything is loaded, ObservationError naming the observation that
@@ -111,7 +103,9 @@ def verify(checkpoint: Checkpoint, plan: Plan, progress: Progress | None = None)
 class _Reference:
     """The oracle's answers to all calls, kept on the host."""
 
-    def __init__(self, checkpoint: Checkpoint, arguments: Mapping[str, Any], plan: Plan, progress: Progress) -> None:
+    def __init__(
+        self, checkpoint: Checkpoint, arguments: Mapping[str, Any], plan: VerifyPlan, progress: Progress
+    ) -> None:
         self._policy: UnifiedPolicy | None = UnifiedPolicy(
             checkpoint, **(dict(arguments) | {"backend": "pytorch", "precision": "f32"})
         )
@@ -183,7 +177,7 @@ class _Reference:
             return np.full(shape, np.nan)
         return self._pipeline.after(chunk, call.example.state)["actions"]
 
-    def describe(self, plan: Plan, quantization: Quantization | None) -> dict[str, Any]:
+    def describe(self, plan: VerifyPlan, quantization: Quantization | None) -> dict[str, Any]:
         """What it was run on, with a hash of all of the model's inputs."""
         digest, calibrated = hashlib.sha256(), 0
         known = {} if quantization is None else quantization.report["observations"].get("calibration", {})
