@@ -333,6 +333,16 @@ def test_a_damaged_lock_is_no_lock(left: str, tmp_path: Path, disk: str) -> None
         pass
 
 
+def test_a_full_disk_leaves_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(OutputError, match="No space left on device"), alone_in(tmp_path, "a test"):
+        pass
+    assert names(tmp_path) == []
+
+
 def test_without_locks_another_hosts_is_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fcntl", None)  # as on systems that have none
     (tmp_path / ".turbopi.lock").write_text("process 7 on elsewhere\n")

@@ -260,8 +260,12 @@ def _lock(file: Path) -> int | None:
                 os.close(descriptor)
                 return None
             if _is_the_same(descriptor, file):  # the one before may have removed it between our opening and locking
-                os.ftruncate(descriptor, 0)
-                os.write(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode())
+                try:
+                    os.ftruncate(descriptor, 0)
+                    os.write(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode())
+                except OSError:  # a full disk: leave nothing behind
+                    file.unlink(missing_ok=True)
+                    raise
                 return descriptor
         except BaseException:
             os.close(descriptor)

@@ -1,0 +1,47 @@
+"""The tutorial's commands, as they stand in docs/tutorial.md, one after the other in an empty folder."""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_serve_openpi_client import PYTHON as CLIENT
+
+ROOT = Path(__file__).parents[1]
+TUTORIAL = ROOT / "docs" / "tutorial.md"
+
+
+def commands() -> list[str]:
+    return re.findall(r"^```bash\n(.*?)^```$", TUTORIAL.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.timeout(1200)
+def test_the_tutorial_runs_from_its_first_line_to_its_last(tmp_path: Path) -> None:
+    if not CLIENT.is_file():
+        pytest.skip(f"openpi-client isn't installed at {CLIENT}")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+    script = "set -euo pipefail\nset -m\n" + "\n".join(commands())
+    # what a reader does by hand: another environment for the client; and a port that no other test uses
+    script = script.replace("python robot_loop.py", f"{CLIENT} robot_loop.py")
+    script = script.replace("8000", port).replace("--record recordings", f"--record recordings --port {port}")
+    script = script.replace("kill %1\nwait", "kill %1\nwait || true")
+    environment = os.environ | {
+        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
+        "PYTHONPATH": str(ROOT / "src"),
+        "COLUMNS": "80",
+    }
+    ended = subprocess.run(
+        ["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-3000:]
+    for left in ("actions.npz", "actions.png", "fp8.json", "bench-report/results.json"):
+        assert (tmp_path / left).is_file(), f"the tutorial left no {left}"
+    assert "(10, 7)" in ended.stdout, "the robot's loop got a chunk"
+    assert "PASS" in ended.stdout
+    assert not re.search(r"^Traceback", ended.stdout + ended.stderr, flags=re.MULTILINE)
+    tables = [line for line in ended.stdout.splitlines() if "│" in line or "┃" in line]
+    assert tables and not any("…" in line or len(line) > 80 for line in tables), "a table was cut at 80 columns"
