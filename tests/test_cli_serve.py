@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
@@ -103,7 +104,9 @@ def test_a_client_gets_actions_and_ctrl_c_stops(tmp_path: Path) -> None:
 
 def test_no_warmup_hides_the_policys_warmup_from_the_server(monkeypatch: Any) -> None:
     served: dict[str, Any] = {}
-    monkeypatch.setattr("turbopi.serve.run", lambda policy, **options: served.update(policy=policy, **options))
+    monkeypatch.setattr(
+        "turbopi.serve.run", lambda policy, options, **_: served.update(policy=policy, **asdict(options))
+    )
     result = turbopi("serve", *TINY, "--port", 0, "--no-warmup", "--queue-limit", 3, "--max-message-mb", 1.5)
     assert result.exit_code == 0, result.output
     assert not hasattr(served["policy"], "warmup")
@@ -114,7 +117,7 @@ def test_no_warmup_hides_the_policys_warmup_from_the_server(monkeypatch: Any) ->
 
 def test_strict_reaches_the_policy_and_needs_a_warm_up(monkeypatch: Any) -> None:
     served: dict[str, Any] = {}
-    monkeypatch.setattr("turbopi.serve.run", lambda policy, **options: served.update(policy=policy))
+    monkeypatch.setattr("turbopi.serve.run", lambda policy, options, **_: served.update(policy=policy))
     assert turbopi("serve", *TINY, "--port", 0, "--strict").exit_code == 0
     assert served["policy"].metadata["strict"] is True
     assert "with --no-warmup that would be everything" in refusal(turbopi("serve", *TINY, "--strict", "--no-warmup"))

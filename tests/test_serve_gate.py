@@ -10,6 +10,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Awaitable, Callable
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -225,7 +226,7 @@ def test_a_file_without_a_key_is_refused(content: bytes | None, message: str, tm
 
 def test_a_key_is_read_from_a_file_and_given_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     served_with: dict[str, Any] = {}
-    monkeypatch.setattr("turbopi.serve.run", lambda policy, **options: served_with.update(options))
+    monkeypatch.setattr("turbopi.serve.run", lambda policy, options, **_: served_with.update(asdict(options)))
     (tmp_path / "key").write_text("s3cret\n")
     tiny = ("serve", "--random-weights", "pi05_tiny", "--port", 0, "--api-key-file", tmp_path / "key")
     assert turbopi(*tiny, "--allowed-hosts", "robot.lab, x").exit_code == 0

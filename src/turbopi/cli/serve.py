@@ -12,6 +12,7 @@ from turbopi.cli.framework import Output, command, log_to_stderr
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.ports import why_not_free
 from turbopi.errors import ConfigError
+from turbopi.serve.options import ServerOptions
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -32,8 +33,10 @@ if TYPE_CHECKING:
 def serve(
     options: PolicyOptions,
     checkpoint: CheckpointArgument = None,
-    host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets other machines in.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", "-p", min=0, max=65535, help="0 takes a free one.")] = 8000,
+    host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets other machines in.")] = ServerOptions.host,
+    port: Annotated[
+        int, typer.Option("--port", "-p", min=0, max=65535, help="0 takes a free one.")
+    ] = ServerOptions.port,
     api_key: Annotated[
         str | None,
         typer.Option(
@@ -62,13 +65,13 @@ def serve(
     ] = None,
     max_message_mb: Annotated[
         float, typer.Option("--max-message-mb", metavar="MB", help="Larger messages end the connection.")
-    ] = 64,
+    ] = ServerOptions.max_message_mb,
     queue_limit: Annotated[
         int, typer.Option("--queue-limit", min=0, metavar="N", help="Requests that may wait while one runs.")
-    ] = 16,
+    ] = ServerOptions.queue_limit,
     max_clients: Annotated[
         int, typer.Option("--max-clients", min=1, metavar="N", help="Connected at once; more are refused (HTTP 503).")
-    ] = 256,
+    ] = ServerOptions.max_clients,
     record: Annotated[
         Path | None, typer.Option("--record", metavar="DIR", help="Write every observation and its actions below DIR.")
     ] = None,
@@ -94,19 +97,16 @@ def serve(
     if strict and not warmup:
         raise ConfigError("--strict refuses what warm-up didn't cover: with --no-warmup that would be everything")
     shown = api_key is not None and api_key != os.environ.get("TURBOPI_API_KEY")
-    api_key = _key(api_key, api_key_file)
-    hosts = [] if allowed_hosts is None else [name.strip() for name in allowed_hosts.split(",")]
-    from turbopi.serve.hosts import AllowedHosts
-    from turbopi.serve.server import check_options
-
-    check_options(
+    wanted = ServerOptions(
+        host=host,
         port=port,
-        api_key=api_key,
+        api_key=_key(api_key, api_key_file),
         max_message_mb=max_message_mb,
         queue_limit=queue_limit,
+        record_dir=record,
+        allowed_hosts=[] if allowed_hosts is None else [name.strip() for name in allowed_hosts.split(",")],
         max_clients=max_clients,
     )
-    AllowedHosts(host, hosts)
     if record is not None:
         check_folder(record)
     reason = why_not_free(host, port)
@@ -124,18 +124,7 @@ def serve(
 
     logging.getLogger("turbopi").setLevel(logging.INFO)
     log_to_stderr(stamped=True)
-    serving.run(
-        policy if warmup else _Cold(policy),
-        host=host,
-        port=port,
-        api_key=api_key,
-        max_message_mb=max_message_mb,
-        queue_limit=queue_limit,
-        record_dir=record,
-        allowed_hosts=hosts,
-        max_clients=max_clients,
-        console=output.console,
-    )
+    serving.run(policy if warmup else _Cold(policy), wanted, console=output.console)
 
 
 def _key(given: str | None, file: Path | None) -> str | None:

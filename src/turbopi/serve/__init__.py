@@ -9,11 +9,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from turbopi.serve.calls import Policy
     from turbopi.serve.launch import run, running
+    from turbopi.serve.options import ServerOptions
     from turbopi.serve.server import PolicyServer
 
-__all__ = ["Policy", "PolicyServer", "run", "running"]
+__all__ = ["Policy", "PolicyServer", "ServerOptions", "run", "running"]
 
-_MODULES = {"run": "launch", "Policy": "calls", "PolicyServer": "server", "running": "launch"}
+_MODULES = {
+    "run": "launch",
+    "Policy": "calls",
+    "PolicyServer": "server",
+    "ServerOptions": "options",
+    "running": "launch",
+}
 
 
 def __getattr__(name: str) -> Any:

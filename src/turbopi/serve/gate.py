@@ -8,18 +8,12 @@ from http import HTTPStatus
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from turbopi.errors import ConfigError
 from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limited_log import LimitedLog
 from turbopi.serve.metrics import CONTENT_TYPE, Metrics
+from turbopi.serve.options import check_key
 
 logger = logging.getLogger(__name__)
-
-
-def check_key(api_key: str | None) -> None:
-    """Raise ConfigError for a key that no header can carry."""
-    if api_key is not None and not (api_key and api_key.isascii() and api_key.isprintable() and " " not in api_key):
-        raise ConfigError("the API key must be printable ASCII without spaces, and not empty")
 
 
 class Gate:

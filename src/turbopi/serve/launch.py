@@ -12,23 +12,24 @@ from rich.markup import escape
 
 from turbopi.serve.calls import Policy
 from turbopi.serve.hosts import LOOPBACK
+from turbopi.serve.options import ServerOptions
 from turbopi.serve.server import PolicyServer
 
 
-def run(policy: Policy, *, console: Console | None = None, **options: Any) -> None:
-    """Warm `policy` up, print the address, and serve until SIGINT or SIGTERM. `options` are PolicyServer's.
+def run(policy: Policy, options: ServerOptions | None = None, *, console: Console | None = None, **given: Any) -> None:
+    """Warm `policy` up, print the address, and serve until SIGINT or SIGTERM. `options` and `given` are PolicyServer's.
 
     Raises ConfigError for an option that can't be right, a port that is taken, a folder that can't be written; and
     DeviceLost when the GPU has failed for good: the process must end then, and a new one can serve.
     """
     console = Console() if console is None else console
-    server = PolicyServer(policy, **options)
+    server = PolicyServer(policy, options, **given)
 
     def tell(text: str) -> None:
         encoding = console.encoding  # of a stdout that may know ASCII alone
         console.print(text.encode(encoding, "backslashreplace").decode(encoding), soft_wrap=True)
 
-    if server.host not in LOOPBACK and options.get("api_key") is None:
+    if server.host not in LOOPBACK and server.options.api_key is None:
         tell(
             f"[yellow]Anyone who can reach {escape(server.host)} can use this policy: an API key protects it "
             "(TURBOPI_API_KEY or --api-key-file).[/]"

@@ -16,11 +16,11 @@ may send it. See docs/serving.md for the limits, and for what differs from openp
 import asyncio
 import contextlib
 import logging
-import math
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,12 +31,13 @@ from turbopi.errors import ConfigError, DeviceLost
 from turbopi.recordings import Recorder
 from turbopi.serve.calls import Outcome, Policy, PolicyCalls
 from turbopi.serve.connection import GuardedConnection, Shared
-from turbopi.serve.gate import Gate, check_key
+from turbopi.serve.gate import Gate
 from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limited_log import LimitedLog
 from turbopi.serve.limits import Limits, limits_for
 from turbopi.serve.listener import Listener
 from turbopi.serve.metrics import Metrics
+from turbopi.serve.options import ServerOptions
 from turbopi.serve.signals import stop_signals
 from turbopi.serve.worker import Busy, Stopping, Worker
 from turbopi.wire import WireError, pack, unpack
@@ -68,66 +69,31 @@ class _PolicyFailed(Exception):
     """The policy raised something that isn't the client's fault; holds the traceback's text."""
 
 
-def check_options(*, port: int, api_key: str | None, max_message_mb: float, queue_limit: int, max_clients: int) -> None:
-    """Raise ConfigError for options of a server that can't be right."""
-    if not 0 <= port <= 65535:
-        raise ConfigError(f"port must be between 0 and 65535, not {port}")
-    if not 0 < max_message_mb < math.inf:
-        raise ConfigError(f"max_message_mb must be more than 0 and finite, not {max_message_mb}")
-    if queue_limit < 0:
-        raise ConfigError(f"queue_limit must be 0 or more, not {queue_limit}")
-    if max_clients < 1:
-        raise ConfigError(f"max_clients must be 1 or more, not {max_clients}")
-    check_key(api_key)
-
-
 class PolicyServer:
     """Serves one policy over openpi's websocket protocol. Good for one start.
 
-    host, port      where to listen; port 0 takes a free one (`server.port` says which, once started)
-    api_key         if given, every client must send `Authorization: Api-Key <api_key>`, for /metrics too
-    max_message_mb  larger messages end the connection with close code 1009
-    queue_limit     requests that may wait while another one runs; more get a text frame "busy: ..."
-    record_dir      if given, every observation and its actions are written below this folder
-    allowed_hosts   names, besides its own, by which web pages may address this server (`hosts.AllowedHosts`)
-    max_clients     connected at once; more are refused with HTTP 503
-    limits          what else a client may cost; its `clients` and `message_bytes` are those given above
+    options  what it is asked for; `given` are ServerOptions' fields, instead of its own
+    limits   what else a client may cost; its `clients` and `message_bytes` are those of the options
 
-    Raises ConfigError for options that can't be right.
+    `host` and `port` are where it listens; port 0 becomes the free one that it took, once started. Raises ConfigError
+    for options that can't be right.
     """
 
     def __init__(
-        self,
-        policy: Policy,
-        *,
-        host: str = "127.0.0.1",
-        port: int = 8000,
-        api_key: str | None = None,
-        max_message_mb: float = 64,
-        queue_limit: int = 16,
-        record_dir: str | Path | None = None,
-        allowed_hosts: Sequence[str] = (),
-        max_clients: int = Limits.clients,
-        limits: Limits | None = None,
+        self, policy: Policy, options: ServerOptions | None = None, *, limits: Limits | None = None, **given: Any
     ) -> None:
-        check_options(
-            port=port,
-            api_key=api_key,
-            max_message_mb=max_message_mb,
-            queue_limit=queue_limit,
-            max_clients=max_clients,
-        )
-        self.host, self.port = host, port
+        self.options = options = replace(options or ServerOptions(), **given)
+        self.host, self.port = options.host, options.port
         self.metrics = Metrics()
         self._policy = policy
-        self._limits = limits_for(max_message_mb, max_clients, limits)
+        self._limits = limits_for(options.max_message_mb, options.max_clients, limits)
         self._log = LimitedLog(logger)
-        gate = Gate(api_key, self.metrics, AllowedHosts(host, allowed_hosts), lambda: self.lost)
+        gate = Gate(options.api_key, self.metrics, AllowedHosts(options.host, options.allowed_hosts), lambda: self.lost)
         self._listener = Listener(gate, self._handle, Shared(self._limits, self.metrics, self._log))
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
-        self._record_dir = None if record_dir is None else Path(record_dir)
+        self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
-        self._worker = Worker(queue_limit)
+        self._worker = Worker(options.queue_limit)
         self._calls = PolicyCalls(policy, self._worker, self.metrics, on_lost=self._lose)
         self._lost: Future[str] = Future()  # set from the worker's thread
         self.metrics.watch(lambda: self._worker.waiting, lambda: self._worker.running)

@@ -1,0 +1,51 @@
+"""What a server is asked for: said once, for `turbopi serve`, `serve.run`, `serve.running` and PolicyServer."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from turbopi.errors import ConfigError
+from turbopi.serve.hosts import AllowedHosts
+from turbopi.serve.limits import Limits
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """Raises ConfigError for options that can't be right.
+
+    host, port      where to listen; port 0 takes a free one
+    api_key         if given, every client must send `Authorization: Api-Key <api_key>`, for /metrics too
+    max_message_mb  larger messages end the connection with close code 1009
+    queue_limit     requests that may wait while another one runs; more get a text frame "busy: ..."
+    record_dir      if given, every observation and its actions are written below this folder
+    allowed_hosts   names, besides its own, by which web pages may address this server (`hosts.AllowedHosts`)
+    max_clients     connected at once; more are refused with HTTP 503
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8000
+    api_key: str | None = field(default=None, repr=False)
+    max_message_mb: float = 64
+    queue_limit: int = 16
+    record_dir: str | Path | None = None
+    allowed_hosts: Sequence[str] = ()
+    max_clients: int = Limits.clients
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535:
+            raise ConfigError(f"port must be between 0 and 65535, not {self.port}")
+        if not 0 < self.max_message_mb < math.inf:
+            raise ConfigError(f"max_message_mb must be more than 0 and finite, not {self.max_message_mb}")
+        if self.queue_limit < 0:
+            raise ConfigError(f"queue_limit must be 0 or more, not {self.queue_limit}")
+        if self.max_clients < 1:
+            raise ConfigError(f"max_clients must be 1 or more, not {self.max_clients}")
+        check_key(self.api_key)
+        AllowedHosts(self.host, self.allowed_hosts)
+
+
+def check_key(api_key: str | None) -> None:
+    """Raise ConfigError for a key that no header can carry."""
+    if api_key is not None and not (api_key and api_key.isascii() and api_key.isprintable() and " " not in api_key):
+        raise ConfigError("the API key must be printable ASCII without spaces, and not empty")
