@@ -1,7 +1,9 @@
 """The table of planted faults stays true: each text stands once in the code, each test is there."""
 
+import re
+
 import pytest
-from mutate.__main__ import ROOT, Ran, table
+from mutate.__main__ import ROOT, TABLE, Ran, table
 from mutate.faults import FAULTS, Fault, place
 
 SOURCE = ROOT / "src"
@@ -21,6 +23,12 @@ def test_a_fault_whose_text_is_gone_or_stands_twice_is_named() -> None:
         place(one, SOURCE)
     with pytest.raises(ValueError, match=r"'often': .*__init__\.py \("):
         place(Fault("often", "turbopi", '"""', "", "", ()), SOURCE)
+
+
+def test_the_checked_in_table_is_of_these_faults_and_the_tool_that_writes_it() -> None:
+    rows = re.findall(r"^\| (.*?) \| .* \| (.*?) \|$", TABLE.read_text(), re.MULTILINE)[1:]
+    assert [name for name, _ in rows] == [fault.name for fault in FAULTS]
+    assert table([], "abc").splitlines()[0] == TABLE.read_text().splitlines()[0]
 
 
 def test_a_row_says_which_tests_failed_or_that_none_did() -> None:
