@@ -107,6 +107,15 @@ def test_a_models_actions_are_finite_and_have_two_dimensions() -> None:
     assert shape_fault(b"\xc1") is not None
 
 
+def test_a_models_answer_is_judged_by_its_shape_and_only_where_there_was_a_message() -> None:
+    actions = pack({"actions": np.zeros((10, 7))})
+    message = pack(OBSERVATION)
+    assert judge(message, Reply("binary", actions), valid=True, shape=(10, 7)).fault is None
+    assert judge(message, Reply("binary", actions), valid=True, shape=(50, 7)).fault is not None
+    assert judge(message, Reply("binary", pack({"actions": np.full((10, 7), np.nan)})), valid=True, shape=(10, 7)).fault
+    assert judge(b"\xc1", Reply("binary", actions), valid=False, shape=(10, 7)).fault is not None
+
+
 def test_a_bar_that_could_not_be_measured_is_broken() -> None:
     assert Bar("ratio", 1.5, 1.5).held
     assert not Bar("ratio", 1.51, 1.5).held

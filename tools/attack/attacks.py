@@ -55,10 +55,10 @@ def _alone(attack: Callable[[int, int, Path, Found, Tick], None]) -> Any:
     return run
 
 
-def _frames(siege: Siege) -> Any:
+def _frames(siege: Siege, shape: tuple[int, int] | None = None) -> Any:
     def run(seed: int, size: Size, folder: Path, tick: Tick) -> tuple[Found, dict[str, Any]]:
         async def assault(arena: Arena) -> None:
-            await frames.frames(arena, seed, size.count)
+            await frames.frames(arena, seed, size.count, shape)
 
         return besiege(siege, assault, seed=seed, seconds=0, count=size.count, folder=folder, tick=tick)
 
@@ -70,6 +70,7 @@ def _loud(limits: Limits, **changes: Any) -> Limits:
 
 
 _FLOOD = Limits()
+_ROBOT = Path(__file__).with_name("robot.json")  # whose observations are those of messages.py
 _QUICK = Siege(
     policy="fake:0", limits=Limits(ratio=None, mean_ratio=None, log_kb_s=None), quiet_seconds=1.0, settle_seconds=1.0
 )
@@ -92,7 +93,7 @@ ATTACKS: dict[str, Attack] = {
             "as above; the model's own checks refuse what isn't its robot's",
             Size(5_000, pieces=2, few=100),
             3.0,
-            _frames(replace(_QUICK, policy="pi05_tiny")),
+            _frames(replace(_QUICK, policy="pi05_tiny", options=("--robot", str(_ROBOT))), shape=(10, 7)),
             timed=False,
         ),
         Attack(

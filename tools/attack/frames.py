@@ -19,13 +19,13 @@ def reproduce(seed: int, number: int) -> str:
     return f"python -m attack frame {seed} {number}"
 
 
-async def frames(arena: Arena, seed: int, total: int) -> None:
-    """Frames 0 to `total` of a seed, dealt out to some connections."""
+async def frames(arena: Arena, seed: int, total: int, shape: Sequence[int] | None = None) -> None:
+    """Frames 0 to `total` of a seed, dealt out to some connections; `shape` of the actions where a model answers."""
     done = 0
 
     async def client(first: int) -> None:
         nonlocal done
-        with Sender(arena.port, seed, arena.found) as sender:
+        with Sender(arena.port, seed, arena.found, shape) as sender:
             for start in range(first * AHEAD, total, CONNECTIONS * AHEAD):
                 numbers = range(start, min(start + AHEAD, total))
                 await sender.send(numbers)
@@ -44,8 +44,8 @@ async def send(port: int, seed: int, numbers: Sequence[int], found: Found) -> No
 class Sender:
     """Sends cases over a connection, and opens the next one when it is closed."""
 
-    def __init__(self, port: int, seed: int, found: Found) -> None:
-        self._port, self._seed, self._found = port, seed, found
+    def __init__(self, port: int, seed: int, found: Found, shape: Sequence[int] | None = None) -> None:
+        self._port, self._seed, self._found, self._shape = port, seed, found, shape
         self._raw: Raw | None = None
 
     def __enter__(self) -> "Sender":
@@ -91,7 +91,7 @@ class Sender:
                 return  # a close has been judged; what was sent behind it gets no answer
 
     def _judge(self, number: int, one: Case, reply: Reply) -> None:
-        judged = judge(one.message, reply, valid=one.valid, may_close=one.may_close)
+        judged = judge(one.message, reply, valid=one.valid, may_close=one.may_close, shape=self._shape)
         self._found.count += 1
         self._found.outcomes[judged.outcome] += 1
         if judged.fault is not None:

@@ -129,11 +129,19 @@ class Judged:
     fault: str | None = None
 
 
-def judge(message: bytes | None, reply: Reply, *, valid: bool, may_close: bool = False) -> Judged:
+def judge(
+    message: bytes | None,
+    reply: Reply,
+    *,
+    valid: bool,
+    may_close: bool = False,
+    shape: Sequence[int] | None = None,
+) -> Judged:
     """Judge the `reply` to the payload `message` (None: the frame carried none that could be answered).
 
     valid       the message is a good observation: anything but its result is a fault (but for "busy")
     may_close   the frame breaks the websocket protocol: a close with a sensible code is right, too
+    shape       of a model's actions, which are finite; without it the fake's, which are a digest of the observation
     """
     if reply.kind == "silence":
         return Judged("silence", "no answer, and no close")
@@ -141,7 +149,7 @@ def judge(message: bytes | None, reply: Reply, *, valid: bool, may_close: bool =
         return _judge_close(reply.code, may_close and not valid)
     if reply.kind == "text":
         return _judge_text(reply.data.decode("utf-8", "replace"), valid)
-    return _judge_result(message, reply.data)
+    return _judge_result(message, reply.data, shape)
 
 
 def _judge_close(code: int, may_close: bool) -> Judged:
@@ -165,7 +173,7 @@ def _judge_text(text: str, valid: bool) -> Judged:
     return Judged(outcome)
 
 
-def _judge_result(message: bytes | None, data: bytes) -> Judged:
+def _judge_result(message: bytes | None, data: bytes, shape: Sequence[int] | None) -> Judged:
     try:
         actions = np.asarray(decode(data)["actions"])
     except (Undecodable, KeyError, TypeError, IndexError) as error:
@@ -176,6 +184,8 @@ def _judge_result(message: bytes | None, data: bytes) -> Judged:
         expected = digest_actions(decode(message))
     except Undecodable as error:
         return Judged("wrong", f"a result for a message that isn't one: {error}")
+    if shape is not None:
+        return Judged("result", shape_fault(data, shape))
     if actions.shape != DIGEST_SHAPE or not np.array_equal(actions, expected):
         return Judged("wrong", "the result belongs to another observation")
     return Judged("result")
