@@ -229,7 +229,17 @@ struct PrefixShare {
   }
 };
 
-// ring: full and empty, by slot
+// ---- barriers. Who waits at which, and what each protects: docs/dev/denoising_kernel.md.
+
+// Of warps of a CTA (bar.sync, bar.arrive); 0 is __syncthreads. score.cu and attention_many.cu name those of attention, 2
+// to 6. Macros, as one constant more in this scope changes the code that ptxas makes.
+#define CONSUMERS_MEET 1     // all W warps that multiply
+#define SQUARES_KEPT 7       // SPREAD: the warps that keep the stream have stored their tiles' sums of squares
+#define TILE_MEETS 8         // and 7 more: the warps that share a tile, or pairs of warps, have stored partial sums
+#define HIDDEN_BLOCK_MADE 2  // and 3 more (COPY_HIDDEN), between attentions: four warps have made two tiles' hidden units
+
+// In shared memory (mbarrier): the stream, queries, largest logits, partial outputs to be combined, attention, hidden
+// units, what ranks add to v_t, the next step, 1 / rms; ring: full and empty, by slot
 enum Barrier { BAR_X, BAR_Q, BAR_TOPS, BAR_COMB, BAR_ATT, BAR_HID, BAR_V, BAR_GO, BAR_RMS, BAR_RING };
 // if SPREAD: region X read by all warps here, by all ranks; the stream multiplied by all ranks; all warps have seen
 // this rank's slice of the next; sums of squares here

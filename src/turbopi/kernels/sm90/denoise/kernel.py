@@ -3,7 +3,7 @@
 Ten steps read the action expert's 311 M weights ten times and do little else, so the loop is a race between memory and
 the delay of some thousand dependent operations. One kernel keeps its clusters resident, streams the weights through
 shared memory without pause, and passes activations through distributed shared memory; only sums over heads or hidden
-units cross clusters. How, and why it is safe, is said in base.cu.
+units cross clusters. How, and why it is safe: docs/dev/denoising_kernel.md and base.cu.
 
 Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns, A action_dim.
 """

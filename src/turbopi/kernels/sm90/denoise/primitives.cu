@@ -32,8 +32,8 @@ __device__ __forceinline__ void sync() {
   __syncwarp();
   asm volatile("bar.sync %0, %1;" ::"n"(BARRIER), "n"(WARPS * 32) : "memory");
 }
-__device__ __forceinline__ void consumers_sync() { sync<1, W>(); }
-__device__ __forceinline__ void consumers_arrive() { arrive<1, W>(); }  // of a warp that goes on at once
+__device__ __forceinline__ void consumers_sync() { sync<CONSUMERS_MEET, W>(); }
+__device__ __forceinline__ void consumers_arrive() { arrive<CONSUMERS_MEET, W>(); }  // of a warp that goes on at once
 // ---- moving data
 
 // An address at all ranks. All of them first, as a send reads its registers late.

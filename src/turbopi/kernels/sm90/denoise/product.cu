@@ -234,7 +234,7 @@ struct Own {
   }
   __device__ __forceinline__ void meet() const {  // the warps of my tile, in the one group
     __syncwarp();
-    asm volatile("bar.sync %0, %1;" ::"r"(8 + (tile[0] & 7)), "n"(group_parts(group_tiles(MT)) * 32) : "memory");
+    asm volatile("bar.sync %0, %1;" ::"r"(TILE_MEETS + (tile[0] & 7)), "n"(group_parts(group_tiles(MT)) * 32) : "memory");
   }
   // Of two parts: the other's to `to`, the rest to `sums`.
   template <int PART>

@@ -129,7 +129,7 @@ struct QkvProduct {
           *place(i, n) = make_float4(sums[i][n][0], sums[i][n][1], sums[i][n][2], sums[i][n][3]);
     if (!QKV_PAIRS) return;
     __syncwarp();
-    asm volatile("bar.sync %0, 64;" ::"r"(8 + part) : "memory");
+    asm volatile("bar.sync %0, 64;" ::"r"(TILE_MEETS + part) : "memory");
 #pragma unroll
     for (int i = 0; i < QKV; ++i)
 #pragma unroll

@@ -102,7 +102,7 @@ __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS
 #pragma unroll
     for (int j = 0; j < ITEMS_X; ++j) keep_squares(b, x[j], j, stream_item(b, j).real);
     __syncwarp();
-    asm volatile("bar.sync 7, %0;" ::"n"(KEEPERS * 32) : "memory");
+    asm volatile("bar.sync %0, %1;" ::"n"(SQUARES_KEPT), "n"(KEEPERS * 32) : "memory");
     if (b.thread < OWN_T)
       if (const int n = b.cluster() + int(b.thread) / 8 * NC; n < NT)
         publish((float*)(b.a.scratch + B_SQUARES + (b.turn & 1) * N_SQUARES) + (b.rank() * NT + n) * 8 + b.thread % 8,

@@ -373,7 +373,7 @@ __device__ __forceinline__ void gate_up(Block& b, const float* shifted, const fl
     show_to_products();  // to the copy engine, that is
     if (const int block = own.tile[0] >> 1; block < GTL / 2) {
       __syncwarp();
-      asm volatile("bar.sync %0, 128;" ::"r"(2 + block) : "memory");  // attention's barriers are free
+      asm volatile("bar.sync %0, 128;" ::"r"(HIDDEN_BLOCK_MADE + block) : "memory");  // attention's barriers are free
       await_room(b);
       if ((own.tile[0] & 1) == 0 && Share(b, group_parts(GTL)).part == 0 && b.lane() == 0) {  // of the four warps one
         constexpr u32 BYTES = NT * OPERAND;
