@@ -73,7 +73,7 @@ def test_a_server_is_found_by_its_url_and_its_key_is_asked_for() -> None:
     with serve.running(SeekingPolicy(), api_key="secret") as server:
         RemotePolicy(server.url, api_key="secret").close()
         for key in (None, "other"):
-            with pytest.raises(ConfigError, match="wants its API key: --api-key KEY, or TURBOPI_API_KEY"):
+            with pytest.raises(ConfigError, match="wants its API key: --api-key-file FILE, or TURBOPI_API_KEY"):
                 RemotePolicy("127.0.0.1", server.port, key)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from turbopi.cli.api_key import ApiKey, chosen_key
 from turbopi.cli.files import check_folder
 from turbopi.cli.framework import Output, command, log_to_stderr
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
@@ -37,15 +38,7 @@ def serve(
     port: Annotated[
         int, typer.Option("--port", "-p", min=0, max=65535, help="0 takes a free one.")
     ] = ServerOptions.port,
-    api_key: Annotated[
-        str | None,
-        typer.Option(
-            "--api-key",
-            envvar="TURBOPI_API_KEY",
-            metavar="KEY",
-            hidden=True,  # `ps` shows a key on the command line to everyone on this machine
-        ),
-    ] = None,
+    api_key: ApiKey = None,
     api_key_file: Annotated[
         Path | None,
         typer.Option(
@@ -100,7 +93,7 @@ def serve(
     wanted = ServerOptions(
         host=host,
         port=port,
-        api_key=_key(api_key, api_key_file),
+        api_key=chosen_key(api_key, api_key_file),
         max_message_mb=max_message_mb,
         queue_limit=queue_limit,
         record_dir=record,
@@ -125,25 +118,6 @@ def serve(
     logging.getLogger("turbopi").setLevel(logging.INFO)
     log_to_stderr(stamped=True)
     serving.run(policy if warmup else _Cold(policy), wanted, console=output.console)
-
-
-def _key(given: str | None, file: Path | None) -> str | None:
-    """The API key that the user means, None for none. Raises ConfigError if it can't be known."""
-    if given is None and "TURBOPI_API_KEY" in os.environ:  # which the option takes for none, and would let all in
-        raise ConfigError("TURBOPI_API_KEY is empty; give it the key, or unset it to serve without one")
-    if file is None:
-        return given
-    if given is not None:
-        raise ConfigError("--api-key-file was given, and a key besides it (TURBOPI_API_KEY or --api-key); give one")
-    try:
-        key = file.read_bytes()[:10_000].decode("ascii").strip()
-    except OSError as error:
-        raise ConfigError(f"the API key can't be read from {file}: {error.strerror}") from error
-    except UnicodeDecodeError:
-        raise ConfigError(f"{file} holds no API key: it should be one line of printable ASCII") from None
-    if not key:
-        raise ConfigError(f"{file} is empty; it should hold the API key")
-    return key
 
 
 class _Cold:

@@ -135,7 +135,7 @@ class RemotePolicy:
             raise ConfigError(f"{url} is no address of a server: {error}") from error
         except (OSError, TimeoutError, WebSocketException) as error:
             if isinstance(error, InvalidStatus) and error.response.status_code in (401, 403):
-                raise ConfigError(f"{url} wants its API key: --api-key KEY, or TURBOPI_API_KEY") from error
+                raise ConfigError(f"{url} wants its API key: --api-key-file FILE, or TURBOPI_API_KEY") from error
             chosen = "" if port is None else f" --port {port}"
             raise PolicyLost(
                 f"no policy server at {url}: {_reason(error)}. Start one (turbopi serve CHECKPOINT{chosen}), "
