@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import on_hopper
-from denoise_helpers import (
+from kernel_turns.problems import (
     CONFIGS,
     FULL,
     GPU,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from denoise_helpers import Problem, problem
+from kernel_turns.problems import Problem, problem
 from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from conftest import on_hopper
-from denoise_helpers import CONFIGS, has_nvrtc
+from kernel_turns.problems import CONFIGS, has_nvrtc
 from kernel_turns.stalls import Instruction, by_function, compiled, disassembled, functions, instructions, waits
 from kernel_turns.turns import Job, marks_by_rank, time_in_turns
 from kernel_turns.variants import Variant

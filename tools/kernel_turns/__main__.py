@@ -1,6 +1,6 @@
 """Time variants of the denoising kernel, and see where they wait. Run from the repository, on a Hopper GPU:
 
-    export PYTHONPATH=src:tools:tests
+    export PYTHONPATH=src:tools
     python -m kernel_turns time here other.patch here+TP_ROUND_FRAGMENTS=4 --tokens 10,50 --marks
     ncu --clock-control none --kernel-name turbopi_denoise --launch-skip 1 --launch-count 1 \\
         --section SourceCounters --warp-sampling-interval 4 -o samples -f \\

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from denoise_helpers import GPU, input_scales, plain, problem, relative
 from torch import Tensor
 
+from kernel_turns.problems import GPU, input_scales, plain, problem, relative
 from kernel_turns.variants import Variant
 from turbopi.backends import resolve_device
 from turbopi.errors import BackendUnavailable

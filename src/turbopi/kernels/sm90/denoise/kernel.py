@@ -29,7 +29,7 @@ from turbopi.kernels.sm90.denoise.packing import (
     Tables,
     most,
 )
-from turbopi.kernels.sm90.denoise.plain import affine, inverse_frequencies
+from turbopi.kernels.sm90.denoise.small import affine, inverse_frequencies
 
 FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
 PARTS = tuple(

@@ -1,4 +1,4 @@
-"""The denoising kernel's twin: the loop in plain PyTorch, and the small parts that both need."""
+"""The denoising kernel's twin: the loop in plain PyTorch."""
 
 from collections.abc import Callable
 
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.kernels.interface import GemmaLayer, State
+from turbopi.kernels.sm90.denoise.small import affine
 from turbopi.model.denoise import euler_step
 from turbopi.model.layers import rope_tables
 from turbopi.quantization.fp8 import to_e4m3
@@ -72,13 +73,3 @@ def _rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     """RoPE in x's dtype. x [T, heads, K]"""
     first, second = x.chunk(2, dim=-1)
     return torch.cat((first * cos - second * sin, second * cos + first * sin), dim=-1)
-
-
-def affine(small: State, name: str, x: Tensor) -> Tensor:
-    return F.linear(x, small[f"{name}.weight"].to(x.dtype), small[f"{name}.bias"].to(x.dtype))
-
-
-def inverse_frequencies(config: ModelConfig, device: torch.device) -> Tensor:
-    """float32[K/2], as `model.layers.rope_tables` computes them."""
-    exponents = torch.arange(0, config.expert.head_dim, 2, dtype=torch.float32, device=device) / config.expert.head_dim
-    return 1.0 / config.rope_base**exponents
