@@ -74,6 +74,12 @@ def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
     monkeypatch.setattr("turbopi.checkpoint.known_hashes.cache_folder", lambda: folder)
 
 
+@pytest.fixture(scope="session")
+def cubins(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where CUDA kernels are kept, so that each is compiled once a session."""
+    return tmp_path_factory.mktemp("cubins")
+
+
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """The figures that were saved, in order: what they show can be compared with what they are to show."""

@@ -4,7 +4,10 @@ import json
 from pathlib import Path
 
 import gpu_evidence
+import machine_code
 import pytest
+
+from turbopi.kernels import nvrtc
 
 SOURCE = '''"""A module."""
 # why
@@ -32,6 +35,33 @@ def test_the_checked_in_gpu_result_is_of_this_code() -> None:
         "GPU and check its result in; where none can be had, scripts/gpu_check --pending REASON says so"
     )
     assert waiting is None or gpu_evidence.changed_since(result["fingerprint"]), "nothing is pending: remove that file"
+
+
+def test_the_kernels_compile_to_the_machine_code_that_was_tested(cubins: Path) -> None:
+    here = machine_code.machine_code(cubins)
+    if here is None:
+        pytest.skip("no NVRTC here: only the source's fingerprint is compared")
+    known = [json.loads(gpu_evidence.RESULT.read_text()), gpu_evidence.pending() or {}]
+    recorded = [one["machine_code"] for one in known if one.get("machine_code")]
+    assert recorded, "no machine code was recorded: run scripts/gpu_check on a Hopper GPU"
+    if all(one["NVRTC"] != here["NVRTC"] for one in recorded):
+        versions = " and ".join(one["NVRTC"] for one in recorded)
+        pytest.skip(
+            f"recorded with NVRTC {versions}, here is {here['NVRTC']}: only the source's fingerprint is compared"
+        )
+    differing = [sorted(name for name in {*here, *one} if here.get(name) != one.get(name)) for one in recorded]
+    assert [] in differing, f"machine code that no GPU has run: {differing}. Run scripts/gpu_check"
+
+
+@pytest.mark.skipif(machine_code.compiler() is None, reason="no NVRTC here")
+def test_a_comment_leaves_the_machine_code_as_it_is_and_another_number_does_not(cubins: Path) -> None:
+    def hash_of(source: str) -> str:
+        return machine_code.hash_of(nvrtc.compile_cubin(source, "sm_90a", {}, folder=cubins))
+
+    source = 'extern "C" __global__ void f(float* x) { x[threadIdx.x] *= 3; }'
+    assert hash_of(source) == hash_of(f"// why\n\n{source}")
+    assert hash_of(source) != hash_of(source.replace("3", "5"))
+    assert hash_of(source) != hash_of(source.replace("void f", "void __launch_bounds__(64) f"))
 
 
 def test_comments_and_docstrings_do_not_count_and_all_else_does(tmp_path: Path) -> None:

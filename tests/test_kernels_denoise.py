@@ -273,18 +273,18 @@ def test_the_source_compiles_for_hopper(tmp_path: Path, name: str, suffix: int, 
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [code]  # kept for the next start
 
 
-def machine_code(name: str, folder: Path, *, suffix: int, fp8: bool = False) -> str:
-    """The kernel's, as text."""
+def machine_code(name: str, folder: Path, cubins: Path, *, suffix: int, fp8: bool = False) -> str:
+    """The kernel's, as text. `folder` is for the disassembler, `cubins` keeps what was compiled in this session."""
     arrangement = packing.Arrangement(CONFIGS[name])
     sizes = denoise.kernel_sizes(arrangement, cache_rows=48, suffix=suffix, shared_bytes=232448, fp8=fp8)
     pytest.importorskip("triton")
-    return disassembled(denoise.compiled("sm_90a", sizes, folder=folder / "kept"), folder)
+    return disassembled(denoise.compiled("sm_90a", sizes, folder=cubins), folder)
 
 
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
-def test_the_product_that_keeps_tensor_cores_awake_is_in_the_machine_code(tmp_path: Path) -> None:
+def test_the_product_that_keeps_tensor_cores_awake_is_in_the_machine_code(tmp_path: Path, cubins: Path) -> None:
     # ptxas leaves out products whose sums nobody reads
-    code = machine_code("golden", tmp_path, suffix=10)
+    code = machine_code("golden", tmp_path, cubins, suffix=10)
     assert re.search(r"HMMA[^\n]*\n[^\n]*NANOSLEEP 0x64", code), "100 ns without a product before them"
 
 
@@ -293,9 +293,11 @@ def test_the_product_that_keeps_tensor_cores_awake_is_in_the_machine_code(tmp_pa
     ("suffix", "fp8", "together"),  # rounds are of two products where slots are small
     [(10, False, 3), (10, True, 3), (24, True, 3), (50, False, 2), (50, True, 2)],
 )
-def test_products_do_not_wait_for_each_other(tmp_path: Path, suffix: int, fp8: bool, together: int) -> None:
+def test_products_do_not_wait_for_each_other(
+    tmp_path: Path, cubins: Path, suffix: int, fp8: bool, together: int
+) -> None:
     # where ptxas can't tell who touches their registers it puts a fence and a wait around every single one
-    code = machine_code("full", tmp_path, suffix=suffix, fp8=fp8)
+    code = machine_code("full", tmp_path, cubins, suffix=suffix, fp8=fp8)
     products, fences = len(re.findall("[HQ]GMMA", code)), len(re.findall("WARPGROUP.ARRIVE", code))
     assert products >= together * fences > 0
     assert products >= 3 * len(re.findall(r"WARPGROUP\.DEPBAR\.LE gsb0, 0x0", code)) > 0
@@ -303,10 +305,12 @@ def test_products_do_not_wait_for_each_other(tmp_path: Path, suffix: int, fp8: b
 
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize(("suffix", "fp8"), [(10, False), (10, True), (24, False), (50, True)])
-def test_ptxas_knows_that_the_lanes_of_a_warp_stay_together(tmp_path: Path, suffix: int, fp8: bool) -> None:
+def test_ptxas_knows_that_the_lanes_of_a_warp_stay_together(
+    tmp_path: Path, cubins: Path, suffix: int, fp8: bool
+) -> None:
     # else products find their operands' places lane by lane: see `of_warp`. With few tokens those of a spare warp may
     # part, and the others' at the very end
-    code = machine_code("full", tmp_path, suffix=suffix, fp8=fp8)
+    code = machine_code("full", tmp_path, cubins, suffix=suffix, fp8=fp8)
     assert len(re.findall(r"BRA\.DIV", code)) <= (2 if suffix <= denoise.FEW else 0)
 
 
