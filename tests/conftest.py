@@ -74,6 +74,19 @@ def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
     monkeypatch.setattr("turbopi.checkpoint.known_hashes.cache_folder", lambda: folder)
 
 
+# Files about the fast path that take seconds, without a GPU or a compiler: `scripts/test -m quick`.
+QUICK = (
+    *("test_backend_choice", "test_capture", "test_fused_choice", "test_kernels_arguments", "test_kernels_launch"),
+    *("test_launch_geometry", "test_recent", "test_tools_mutate"),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.stem in QUICK and item.get_closest_marker("gpu") is None:
+            item.add_marker(pytest.mark.quick)
+
+
 @pytest.fixture(scope="session")
 def cubins(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where CUDA kernels are kept, so that each is compiled once a session."""

@@ -118,8 +118,10 @@ def test_verify_and_bench_run_it(calibration: Quantization, tmp_path: Path) -> N
         app,
         ["verify", small, "--backend", "emulated_fp8", "--precision", "fp8", *few, *options],
     )
-    assert verified.exit_code in (0, 1), verified.output
-    assert json.loads(verified.stdout)["backend"] == "emulated_fp8"
+    document = json.loads(verified.stdout)
+    assert verified.exit_code == (0 if document["ok"] else 1), verified.output
+    assert (document["backend"], document["precision"]) == ("emulated_fp8", "fp8")
+    assert document["actions"]["relative_rms"] > 0, "nothing was rounded"
     benched = run(
         app,
         ["bench", small, "--backends", "emulated_fp8", "--precisions", "fp8", "--calls", "1", "--steps", "1", *options],
