@@ -1,5 +1,6 @@
 """How graphs are captured: thread-locally, one at a time in the process, in exact float32."""
 
+import gc
 import threading
 from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
@@ -60,6 +61,29 @@ def test_a_replay_is_waited_for_and_a_launch_is_not(monkeypatch: pytest.MonkeyPa
     assert DONE == ["launched"]
     graph.replay()
     assert DONE == ["launched", "launched", "waited"], "actions are read when replay returns"
+
+
+def test_no_garbage_is_collected_within_a_capture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Destroying a graph that was let go earlier would break the capture."""
+    FakeCuda(monkeypatch)
+    collecting: list[bool] = []
+    capture(lambda mark: collecting.append(gc.isenabled()))
+    assert collecting == [True, True, False]  # twice to compile, then captured
+    assert gc.isenabled()
+
+    def fail(mark: Any) -> None:
+        if not gc.isenabled():
+            raise RuntimeError("out of memory")
+
+    with pytest.raises(RuntimeError, match="out of memory"):
+        capture(fail)
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        capture(lambda mark: None)
+        assert not gc.isenabled(), "who has turned it off keeps it off"
+    finally:
+        gc.enable()
 
 
 def test_captures_of_several_threads_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:

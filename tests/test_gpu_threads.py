@@ -4,6 +4,7 @@ Run by scripts/gpu_check; two of them need a second GPU.
 """
 
 import gc
+import os
 import subprocess
 import sys
 import threading
@@ -247,7 +248,8 @@ print("lost:", policy.lost)
 def test_an_error_that_sticks_is_found_out_and_out_of_memory_isnt_one(name: str) -> None:
     policy(name)  # skips where it can't be
     program = [sys.executable, "-u", "-c", ASSERTS_ON_THE_DEVICE % name]
-    ran = subprocess.run(program, capture_output=True, text=True, timeout=300, check=False)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ran = subprocess.run(program, capture_output=True, text=True, timeout=300, check=False, env=environment)
     lines = ran.stdout.splitlines()
     assert lines[:2] == ["out of memory", "lost: None"], ran.stdout + ran.stderr
     assert len(lines) == 5 and lines[2].startswith("0 ") and lines[3].startswith("1 "), ran.stdout + ran.stderr

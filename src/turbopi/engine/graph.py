@@ -9,6 +9,7 @@ default CUDA generator of PyTorch while a graph is captured: every capture takes
 increment outside graph capture"). A generator of its own works.
 """
 
+import gc
 import itertools
 import threading
 from collections.abc import Callable, Iterator
@@ -40,6 +41,20 @@ def building(device: torch.device) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Without Python's garbage collector. It may run at any line, and destroying a graph or an event that was let go
+    earlier breaks the capture of the thread in which it happens.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 def empty_cache() -> None:
     """Give the allocator's free memory back to the device, when nobody captures."""
     if torch.cuda.is_available():
@@ -68,7 +83,10 @@ class Graph:
                 for _ in range(2):  # compiles and allocates whatever the kernels need, outside the capture
                     run(lambda stage: None)
             stream.synchronize()
-            with torch.cuda.graph(self._graph, pool=pool, stream=stream, capture_error_mode="thread_local"):
+            with (
+                uncollected(),
+                torch.cuda.graph(self._graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
+            ):
                 if after is None:
                     self._mark("start")
                 run(self._mark)
