@@ -10,7 +10,7 @@ from doc_tables.__main__ import main
 from doc_tables.tables import TABLES, headline, whole_calls
 
 ROOT = Path(__file__).parents[1]
-RESULT = ROOT / "benchmarks" / "results" / "h200_2026-11-23_pi05_libero" / "results.json"
+RESULT = ROOT / "benchmarks" / "results" / "h200_2026-11-24_pi05_libero" / "results.json"
 _LINK = re.compile(r"\]\(([^()\s]+(?:\([^()\s]*\)[^()\s]*)*)\)")
 
 
