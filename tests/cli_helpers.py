@@ -1,10 +1,14 @@
 """Running the command line inside the test's process."""
 
 import re
+import signal
 
 from typer.testing import CliRunner, Result
 
 from turbopi.cli import app
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job; what tests start inherits it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def turbopi(*arguments: object) -> Result:

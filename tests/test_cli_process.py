@@ -9,6 +9,7 @@ import sys
 import textwrap
 from pathlib import Path
 
+import cli_helpers  # noqa: F401  # it lets the processes that are started hear Ctrl-C
 import pytest
 
 TURBOPI = (sys.executable, "-m", "turbopi")
