@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from attack import commands, damages, files, results, zygote
 from attack.__main__ import main
 from attack.arena import Found, Limits, server_bars
@@ -24,7 +25,7 @@ from attack.frames import send
 from attack.judging import Bar, Reply, decode, digest, digest_actions, judge, mean, percentile, ratio, shape_fault
 from attack.messages import case
 from attack.server import answers
-from attack.specimens import SPECIMENS
+from attack.specimens import SPECIMENS, read_observation
 from attack.websocket import check_loopback
 from rich.console import Console
 
@@ -362,6 +363,13 @@ def test_damaged_files_through_their_readers(tmp_path: Path) -> None:
     files.files(1, 3, tmp_path, found, lambda share: None, quick)
     assert found.count == 6 == sum(found.outcomes.values())
     assert set(found.outcomes) <= {"refused", "fault", "read, the same", "read, other numbers"}
+
+
+def test_an_observation_of_no_robot_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "observation.json").write_text('{"a":' * 50 + "1" + "}" * 50)
+    with pytest.raises(typer.Exit) as ended:
+        read_observation(str(tmp_path))
+    assert ended.value.exit_code == 2 and "observation/image" in capsys.readouterr().err
 
 
 def test_a_tiny_run_leaves_its_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

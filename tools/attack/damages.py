@@ -180,7 +180,9 @@ _JSON: dict[str, Damage] = {
     "a key twice": _key_twice,
     "UTF-16": _utf16,
 }
-_CHECKED = (".npz", ".png", "")  # formats with checksums: zip, PNG, and OCDBT's files, which have no suffix
+# Formats with checksums: zip, PNG, OCDBT's manifest. Its other files, which have no suffix, hold the index, which has
+# them, and chunks of weights without (src/turbopi/checkpoint/orbax.py): what a flipped bit met isn't known.
+_CHECKED = (".npz", ".png", ".ocdbt")
 _NOTICEABLE = ("cut", "replaced", "a folder", "deep")
 
 

@@ -185,9 +185,16 @@ def read_observation_npz(folder: str) -> None:
 
 
 def read_observation(path: str) -> None:
+    """The file, and what LIBERO's robot takes of it: any keys and values are an observation of some robot."""
     from turbopi.recordings import load_observation
+    from turbopi.robots import create_robot
 
-    _told(lambda: load_observation(path))
+    def read() -> Any:
+        observation = load_observation(path)
+        create_robot("libero").inputs(observation)
+        return observation
+
+    _told(read)
 
 
 def read_recording(folder: str) -> None:
