@@ -132,6 +132,23 @@ def test_the_first_wrong_intermediate_is_named(
     assert document["checks"][0]["ok"] is False
 
 
+def test_an_error_above_what_is_allowed_says_that_it_informs_and_another_number_decides(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plant(monkeypatch, "WrongTrace")
+    monkeypatch.setenv("COLUMNS", "140")
+    result = turbopi("verify", *QUICK, "--backend", "faulty")
+    assert result.exit_code == 0, result.output
+    rows = {line.split("│")[1].strip(): line for line in result.stdout.splitlines() if line.startswith("│")}
+    above = rows[f"kv_k, {verify_fakes.FAULTY_LAYER}"]
+    assert "above, informs" in above
+    assert "ok, decides" in rows["actions"]
+    assert sum("above" in row or "decides" in row for row in rows.values()) == 2
+    assert "Of all else `allowed` is informative" in result.stdout
+    assert "(informative: the actions decide, and they pass)" in result.stdout
+    assert result.stdout.splitlines()[-1].startswith("PASS: ")
+
+
 def test_what_is_not_finite_fails_with_a_whole_report(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     plant(monkeypatch, "NotFinite")
     document = certified("faulty", "--report", tmp_path, "--noises", 1, exit_code=1)
@@ -320,7 +337,7 @@ def test_a_jump_is_suspect_only_where_the_control_does_not_jump() -> None:
     allowed = dict.fromkeys(places, 1e-2)
     suspect = first_suspect(_off_by(jumping), _off_by(dict.fromkeys(places, 3e-3)), allowed, 10)
     assert suspect is not None
-    assert str(suspect) == "v_t step 2 (relative rms 6.00e-03, 30 x that before)"
+    assert str(suspect) == "v_t step 2 (relative rms 0.00600, 30 x that before)"
     assert first_suspect(_off_by(jumping), _off_by(jumping), allowed, 10) is None
 
 

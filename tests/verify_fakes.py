@@ -51,6 +51,15 @@ class EarlySuffix(Correct):
     model_class: ClassVar[type[Pi0Model]] = _EarlySuffix
 
 
+class WrongTrace(Correct):
+    """What it shows of one layer's keys is wrong, and what it does with them right."""
+
+    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
+        trace = super().intermediates(observation, noise, num_steps)
+        trace["kv_k"][FAULTY_LAYER] *= 2
+        return trace
+
+
 class NotFinite(Correct):
     """A velocity isn't finite."""
 

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from turbopi.wording import significant
+
 STAGES = ("vision", "prefix", "denoise")
 Document = dict[str, Any]
 Result = dict[str, Any]
@@ -29,7 +31,7 @@ def _ms(result: Result | None, name: str = "total", percentile: str = "p50", dig
 
 def _error(result: Result | None) -> str:
     error = None if result is None else result.get("error_against_f32")
-    return f"{error['relative_rms']:.4f}" if error else ""
+    return significant(error["relative_rms"]) if error else ""
 
 
 _MEASURED = (

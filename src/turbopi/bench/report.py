@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from turbopi.bench.plots import job_label, label, main_results
+from turbopi.wording import significant
 
 _STAGES = ("vision", "prefix", "denoise")
 
@@ -53,7 +54,7 @@ def _ms(result: dict[str, Any], name: str, percentile: str = "p50") -> str:
 def error_of(result: dict[str, Any]) -> str:
     """Relative rms against the float32 reference, or a dash."""
     error = result.get("error_against_f32")
-    return f"{error['relative_rms']:.4f}" if error else "-"
+    return significant(error["relative_rms"]) if error else "-"
 
 
 def _main(document: dict[str, Any]) -> list[str]:

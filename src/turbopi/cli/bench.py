@@ -230,8 +230,7 @@ def _show(document: dict[str, Any], output: Output) -> None:
     for precision, floor in document["floors"].items():
         output.line(floors_line(precision, floor))
     table = Table(title=f"{document['model']}, {document['weights']}: milliseconds, medians", title_justify="left")
-    for column in ("backend", "job"):
-        table.add_column(column)
+    table.add_column("backend and job")  # in one: where the table is cut into parts, each says which row is whose
     columns = ("vision", "prefix", "denoise", "device", "total", "p5", "p95", "p99", "floor", "x floor", "error")
     for column in columns:
         table.add_column(column, justify="right")
@@ -267,7 +266,7 @@ def _row(result: dict[str, Any]) -> list[str]:
         return f"{times[stage]['p50']:.2f}" if stage in times else "-"
 
     return [
-        f"{result['backend']} {result['precision']}",
+        f"{result['backend']} {result['precision']}: "
         f"{job['cameras']} cam, {job['prompt_tokens']} tok, H={job['horizon']}, {job['steps']} steps",
         *(median(stage) for stage in ("vision", "prefix", "denoise", "device", "total")),
         *(f"{times['total'][percentile]:.2f}" for percentile in ("p5", "p95", "p99")),

@@ -12,6 +12,7 @@ from turbopi.cli.options import MOST_NOISES, MOST_OBSERVATIONS, CheckpointArgume
 from turbopi.cli.progress import with_stages
 from turbopi.config import LIMITS
 from turbopi.errors import ConfigError
+from turbopi.wording import significant
 
 if TYPE_CHECKING:
     from turbopi.quantization.artifact import Quantization
@@ -135,15 +136,16 @@ def _show(result: "Quantization", output: Output) -> None:
         f"{report['model']}: {len(seen['calibration'])} observations ({seen['source']}), {len(seen['held_out'])} more "
         f"held out; {seen['noises']} noises, {report['steps']} steps, on {report['device']}"
     )
-    methods = ", ".join(f"{name} {error['relative_rms']:.4f}" for name, error in report["methods"].items())
+    methods = ", ".join(f"{name} {significant(error['relative_rms'])}" for name, error in report["methods"].items())
     output.line(f"scales by {report['method']} (actions' relative rms: {methods})")
     output.table(_table("one group of sites in FP8 alone, calibration observations", report["groups_alone"]))
     held = {name: error for name, error in report["held_out"].items() if name != "worst"}
     output.table(_table("held-out observations, against float32; sites that are kept run in float32 here", held))
     worst = report["held_out"]["worst"]
     output.line(
-        f"worst: {worst['observation']}, noise seed {worst['seed']}: relative rms {worst['relative_rms']:.4f}; "
-        f"largest saturation {max(site.saturated for site in result.sites.values()):.2e}"
+        f"worst: {worst['observation']}, noise seed {worst['seed']}: "
+        f"relative rms {significant(worst['relative_rms'])}; "
+        f"largest saturation {significant(max(site.saturated for site in result.sites.values()))}"
     )
     kept: dict[str, list[str]] = {}
     for name, site in result.sites.items():
@@ -164,5 +166,6 @@ def _table(title: str, errors: dict[str, dict[str, float]]) -> Table:
     for column in ("relative rms of the actions", "cosine of the deltas", "max"):
         table.add_column(column, justify="right")
     for name, error in errors.items():
-        table.add_row(name, f"{error['relative_rms']:.4f}", f"{error['delta_cosine']:.5f}", f"{error['max']:.3f}")
+        rms, most = significant(error["relative_rms"]), significant(error["max"])
+        table.add_row(name, rms, f"{error['delta_cosine']:.6f}", most)
     return table

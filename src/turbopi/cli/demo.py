@@ -13,6 +13,7 @@ from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_c
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.timings import timing_columns
 from turbopi.files import write_whole
+from turbopi.wording import significant
 
 if TYPE_CHECKING:
     import numpy as np
@@ -146,27 +147,26 @@ class _Run:
         self.output.table(table)
 
     def _show_timings(self) -> None:
-        columns = timing_columns(self.results[0]["policy_timing"])
+        for number, frame in enumerate(self.frames):
+            self.output.line(f"frame {number}: {frame.prompt}")
         table = Table(title="milliseconds", title_justify="left")
-        table.add_column("frame")
-        table.add_column("prompt", overflow="fold")
-        for name in columns:
-            table.add_column(name, justify="right")
-        for number, (frame, result) in enumerate(zip(self.frames, self.results, strict=True)):
-            timing = result["policy_timing"]
-            table.add_row(str(number), frame.prompt, *(f"{timing[key]:.1f}" for key in columns.values()))
+        table.add_column("stage")
+        for number in range(len(self.frames)):
+            table.add_column(f"frame {number}", justify="right")
+        for name, key in timing_columns(self.results[0]["policy_timing"]).items():
+            table.add_row(name, *(f"{result['policy_timing'][key]:.1f}" for result in self.results))
         self.output.table(table)
 
     def _show_chunk(self, actions: "np.ndarray") -> None:
         from turbopi.plots import action_groups
 
         steps, dims = actions.shape
-        shown = min(steps, 10, max(3, (self.output.console.width - 30) // 9))
+        shown = min(steps, 10, max(3, (self.output.console.width - 42) // 9))
         cut = f"; the first {shown}" if shown < steps else ""
         title = f"frame 0: the chunk, {steps} steps of {dims}{cut} (step 0 is the next to execute)"
         table = Table(title=title, title_justify="left")
         for heading in ("action", "unit"):
-            table.add_column(heading, no_wrap=True)
+            table.add_column(heading)
         for step in range(shown):
             table.add_column(str(step), justify="right")
         for group in action_groups(self.robot, dims):
@@ -184,27 +184,27 @@ class _Run:
         for number, difference in enumerate(check.differences):
             ok = difference.rms <= check.bound
             verdict = "[green]ok[/]" if ok else "[bold red]FAIL[/]"
-            values = (f"{value:.1e}" for value in (difference.rms, check.bound, difference.max))
+            values = map(significant, (difference.rms, check.bound, difference.max))
             table.add_row(str(number), *values, verdict)
         self.output.table(table)
         precision = self.metadata["precision"]
         step = "half a bfloat16 step" if precision == "bf16" else "half a float32 step (scaled from bfloat16's)"
         self.output.line(
             "Errors are in units of the model's normalised actions. "
-            f"The bound is {check.factor:g} times the control, {check.control:.1e}: how far the oracle itself moves "
-            f"when every weight moves by up to {step}.",
+            f"The bound is {check.factor:g} times the control, {significant(check.control)}: how far the oracle itself "
+            f"moves when every weight moves by up to {step}.",
             "dim",
         )
         backend = self.metadata["backend"]
+        error, bound = significant(worst.rms), significant(check.bound)
         if check.ok:
             self.output.line(
-                f"OK: {backend} {precision} is within {worst.rms:.1e} of the oracle (bound {check.bound:.1e}).",
-                "bold green",
+                f"OK: {backend} {precision} is within {error} of the oracle (bound {bound}).", "bold green"
             )
         else:
             self.output.line(
-                f"FAIL: {backend} {precision} is {worst.rms:.1e} from the oracle, beyond its bound "
-                f"{check.bound:.1e}: this is more than rounding.",
+                f"FAIL: {backend} {precision} is {error} from the oracle, beyond its bound "
+                f"{bound}: this is more than rounding.",
                 "bold red",
             )
 
@@ -243,7 +243,7 @@ class _Run:
         rows = [
             Row(
                 heading=f"“{frame.prompt}”    {result['policy_timing']['total_ms']:.0f} ms, "
-                f"rms error {difference.rms:.2%}",
+                f"rms error {significant(difference.rms)}",
                 pictures={"base camera": frame.base, "wrist camera": frame.wrist},
                 actions=result["actions"],
                 oracle=truth,

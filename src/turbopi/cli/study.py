@@ -12,6 +12,7 @@ from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
 from turbopi.config import LIMITS
 from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.files import write_whole
+from turbopi.wording import significant
 
 if TYPE_CHECKING:
     import torch
@@ -162,7 +163,7 @@ def _actions_table(results: list[dict[str, Any]]) -> Table:
     for column in ("count", "worst cosine", "worst relative error"):
         table.add_column(column, justify="right")
     for one in results:
-        errors = (_number(one["worst_cosine"], ".6f"), _number(one["worst_relative"]))
+        errors = (_cosine(one["worst_cosine"]), significant(one["worst_relative"]))
         table.add_row(one["backend"], one["observations"], str(one["count"]), *errors)
     return table
 
@@ -187,14 +188,14 @@ def _throughput_table(result: dict[str, Any]) -> Table:
         table.add_column(column, justify="right")
     rows = {f"{name}, one at a time": one for name, one in result["one at a time"].items()}
     for name, one in {**rows, "in flight": result["in flight"]}.items():
-        table.add_row(name, _number(one["total_ms"], ".2f"), _number(one["per_second"], ".1f"))
+        table.add_row(name, f"{one['total_ms']:.2f}", f"{one['per_second']:.1f}")
     equal = "equal" if result["actions_equal_bit_for_bit"] else "NOT equal"
     table.caption = f"actions of all three: {equal}, bit for bit"
     return table
 
 
-def _number(value: float | None, form: str = ".2e") -> str:
-    return "not finite" if value is None else format(value, form)
+def _cosine(value: float | None) -> str:
+    return "not finite" if value is None else f"{value:.6f}"
 
 
 def _precision_table(results: list[dict[str, Any]], library: str) -> Table:
@@ -208,11 +209,9 @@ def _precision_table(results: list[dict[str, Any]], library: str) -> Table:
         table.add_row(
             one["attention"],
             one["precision"],
-            *(_number(value) for value in (first["k_relative"], last["k_relative"], last["v_relative"])),
-            _number(last["v_max"], ".3f"),
-            _number(actions["relative"]),
-            _number(actions["max"], ".4f"),
-            _number(actions["cosine"], ".6f"),
+            *map(significant, (first["k_relative"], last["k_relative"], last["v_relative"], last["v_max"])),
+            *map(significant, (actions["relative"], actions["max"])),
+            _cosine(actions["cosine"]),
         )
     return table
 
@@ -223,6 +222,6 @@ def _mask_table(results: list[dict[str, Any]]) -> Table:
     for column in ("slots", "steps", "cosine of actions", "relative error"):
         table.add_column(column, justify="right")
     for one in results:
-        numbers = (_number(one["cosine"], ".6f"), _number(one["relative"]))
+        numbers = (_cosine(one["cosine"]), significant(one["relative"]))
         table.add_row(one["cache"], str(one["slots"]), str(one["steps"]), *numbers)
     return table

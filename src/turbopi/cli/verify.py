@@ -12,6 +12,7 @@ from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, plain
 from turbopi.cli.options import MOST_NOISES, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
 from turbopi.files import write_whole
+from turbopi.wording import significant
 
 
 @command(
@@ -123,13 +124,16 @@ def _show(document: dict[str, Any], output: Output) -> None:
         output.line(f"{seen} of {observed['count']} observations were calibrated on", "yellow" if seen else None)
     output.table(_intermediates(document))
     output.line(
-        f"Where a name has layers or steps, the worst beside its control. Control: {document['control']}.", "dim"
+        f"Where a name has layers or steps, the worst, with its number. Control: {document['control']}. The error of "
+        "the actions decides, by their bound. Of all else `allowed` is informative: an error above it hints at where "
+        "a fault may be, and fails nothing by itself.",
+        "dim",
     )
     output.table(_dimensions(document["actions"]["dimensions"]))
     worst = document["actions"]["worst"]
     output.line(
-        f"worst: {worst['observation']}, noise seed {worst['seed']}: relative rms {worst['relative_rms']:.2e}, "
-        f"cosine {worst['cosine']:.6f}"
+        f"worst: {worst['observation']}, noise seed {worst['seed']}: "
+        f"relative rms {significant(worst['relative_rms'])}, cosine {worst['cosine']:.6f}"
     )
     for title, key in ((subject, "backend"), (document["oracle"], "oracle")):
         time = times[key]
@@ -143,10 +147,11 @@ def _show(document: dict[str, Any], output: Output) -> None:
             f"throttling {gpu['clocks_throttle_reasons.active']}"
         )
     if document["first_off"] is not None:
-        output.line(f"first off: {document['first_off']['text']}", "yellow")
+        informs = " (informative: the actions decide, and they pass)" if document["ok"] else ""
+        output.line(f"first off: {document['first_off']['text']}{informs}", "yellow")
     bounds = document["bounds"]
     own = " (overridden)" if bounds["overridden"] else ""
-    output.line(f"bound{own}: actions' relative rms {bounds['actions_relative_rms']:.2e}: {bounds['reason']}")
+    output.line(f"bound{own}: actions' relative rms {significant(bounds['actions_relative_rms'])}: {bounds['reason']}")
     for check in document["checks"]:
         output.line(f"{'ok  ' if check['ok'] else 'FAIL'} {check['text']}", None if check["ok"] else "red")
 
@@ -163,8 +168,10 @@ def _intermediates(document: dict[str, Any]) -> Table:
     """One row a name: its worst layer or step, in proportion to what is allowed there."""
     table = Table(title="against the float32 reference, attended slots", title_justify="left")
     table.add_column("intermediate")
-    table.add_column("worst at")
-    for column in ("relative rms", "control's", "allowed", "cosine", "max"):
+    for column in ("relative rms", "control's", "allowed"):
+        table.add_column(column, justify="right")
+    table.add_column("which")
+    for column in ("cosine", "max"):
         table.add_column(column, justify="right")
     worst: dict[str, dict[str, Any]] = {}
     for row in document["intermediates"]:
@@ -172,16 +179,19 @@ def _intermediates(document: dict[str, Any]) -> Table:
         if name not in worst or _badness(row) > _badness(worst[name]):
             worst[name] = row
     for name, row in worst.items():
-        control = row["control"]
+        control, decides = row["control"], name == "actions"
+        above = row["relative_rms"] > row["allowed"]
+        if decides:
+            table.add_section()
         table.add_row(
-            name,
-            "" if row["index"] is None else str(row["index"]),
-            f"{row['relative_rms']:.2e}",
-            "-" if control is None else f"{control['relative_rms']:.2e}",
-            f"{row['allowed']:.2e}",
+            name if row["index"] is None else f"{name}, {row['index']}",
+            significant(row["relative_rms"]),
+            "-" if control is None else significant(control["relative_rms"]),
+            significant(row["allowed"]),
+            ("FAIL, decides" if above else "ok, decides") if decides else ("above, informs" if above else ""),
             f"{row['cosine']:.6f}",
-            f"{row['max']:.1e}",
-            style="red" if row["relative_rms"] > row["allowed"] else None,
+            significant(row["max"]),
+            style=("red" if decides else "yellow") if above else None,
         )
     return table
 
@@ -198,5 +208,5 @@ def _dimensions(dimensions: list[dict[str, Any]]) -> Table:
         table.add_column(column, justify="right")
     for row in dimensions:
         values = (row["rms"], row["control_rms"], row["max"], row["control_max"])
-        table.add_row(row["name"], row["unit"], *(f"{value:.1e}" for value in values))
+        table.add_row(row["name"], row["unit"], *map(significant, values))
     return table

@@ -13,6 +13,7 @@ from turbopi.evaluate.results import Results
 from turbopi.evaluate.statistics import Paired, Rate, percentiles
 from turbopi.files import write_whole
 from turbopi.quantization.artifact import RANDOM_NOISE
+from turbopi.wording import significant
 
 
 @dataclass(frozen=True)
@@ -185,11 +186,11 @@ def cells(run: Compared) -> list[str]:
         row += [
             f"{100 * (run.paired.difference or 0):+.1f} % [{100 * low:+.1f}, {100 * high:+.1f}]",
             f"{run.paired.only_first} : {run.paired.only_second}",
-            f"{run.paired.p_value:.3f}",
+            significant(run.paired.p_value),
         ]
     row += [f"{run.call_ms[name]:.1f}" if run.call_ms else "-" for name in ("p50", "p95")]
     row.append(f"{run.steps['p50']:.0f}" if run.steps else "-")
-    row.append(f"{run.error['rms']:.2g}" if run.error else "-")
+    row.append(significant(run.error["rms"]) if run.error else "-")
     return row
 
 

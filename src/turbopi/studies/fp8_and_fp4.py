@@ -31,6 +31,7 @@ from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, PARTS, Site, sites
 from turbopi.studies.formats import attention_in_fp8, round_nvfp4
 from turbopi.studies.weights import WEIGHTS, Weights, studied_checkpoint
+from turbopi.wording import significant
 
 
 def errors(
@@ -148,7 +149,8 @@ def run(
         for name, error in errors(model, made, seen, steps, formats):
             results[kind][name] = error
             print(
-                f"{kind}: {name:42} relative rms {error['relative_rms']:.2e}  cosine {error['delta_cosine']:.6f}",
+                f"{kind}: {name:42} relative rms {significant(error['relative_rms'])}  "
+                f"cosine {error['delta_cosine']:.6f}",
                 flush=True,
             )
             write_whole(out, json.dumps({**about, "errors": results}, indent=1) + "\n")

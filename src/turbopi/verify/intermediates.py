@@ -14,6 +14,7 @@ from torch import Tensor
 
 from turbopi.model.reference import Trace
 from turbopi.observation import ModelInputs
+from turbopi.wording import significant
 
 _PREFIX = ("prefix_pad_mask", "prefix_positions", "vision_last_hidden", "prefix_embs")
 BY_LAYER = ("kv_k", "kv_v")
@@ -181,10 +182,12 @@ def first_suspect(errors: ErrorsBy, control: ErrorsBy, allowed: dict[Place, floa
         if not errors[place].finite:
             return Suspect(place, error, plain, "not finite")
         if error > limit:
-            return Suspect(place, error, plain, f"relative rms {error:.2e}, more than {limit:.2e}")
+            return Suspect(place, error, plain, f"relative rms {significant(error)}, more than {significant(limit)}")
         previous = errors[before].relative_rms if before in errors else 0.0
         if before is not None and previous > 0 and error > jump * previous and error > limit / 3:
             grown = control[before].relative_rms if before in control else 0.0
             if not grown or error / previous > 3 * plain / grown:
-                return Suspect(place, error, plain, f"relative rms {error:.2e}, {error / previous:.0f} x that before")
+                return Suspect(
+                    place, error, plain, f"relative rms {significant(error)}, {error / previous:.0f} x that before"
+                )
     return None

@@ -22,6 +22,7 @@ from turbopi.verify.bounds import (
     TRAINED_FACTORS,
 )
 from turbopi.verify.intermediates import Errors, ErrorsBy, Place, Suspect, Tensors, first_suspect, in_order
+from turbopi.wording import significant
 
 ACTIONS = Place("actions")
 Control = Literal["bf16", "jitter"]
@@ -192,11 +193,11 @@ def _checks(
     """What decides, the actions first."""
     error, plain = compared.actions.relative_rms, control.actions.relative_rms
     stated = "the bound that was given" if rule.overridden else "the stated bound"
-    origin = f"{rule.factor:g} x the control's {plain:.2e}" if rule.bound is None else stated
+    origin = f"{rule.factor:g} x the control's {significant(plain)}" if rule.bound is None else stated
     ok = bool(error <= limit)
     relation = "within" if ok else "not within"
     if compared.actions.finite:
-        text = f"actions' relative rms {error:.2e} is {relation} {limit:.2e} ({origin})"
+        text = f"actions' relative rms {significant(error)} is {relation} {significant(limit)} ({origin})"
     else:
         text = "the actions aren't finite"
     wrong = [place for place in in_order(compared.by_place) if not compared.by_place[place].finite]
@@ -225,7 +226,7 @@ def _checks(
             "value": repetition.calls - repetition.identical,
             "bound": 0,
             "text": f"{repetition.identical} of {repetition.calls} repeated calls were bit-identical"
-            + ("" if same else f" (off by up to {repetition.max:.1e})"),
+            + ("" if same else f" (off by up to {significant(repetition.max)})"),
         },
     ]
 

@@ -1,0 +1,13 @@
+"""How numbers are written for people, in one way everywhere."""
+
+import math
+
+
+def significant(value: float | None) -> str:
+    """An error with three significant digits: 0.0425, 4.61e-05. None, NaN and infinity are "not finite".
+
+    A fixed number of decimals would show a small error as 0.0000.
+    """
+    if value is None or not math.isfinite(value):
+        return "not finite"
+    return "0" if value == 0 else f"{value:#.3g}".removesuffix(".")

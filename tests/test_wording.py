@@ -1,0 +1,28 @@
+"""Numbers as people read them."""
+
+import math
+
+import pytest
+
+from turbopi.wording import significant
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (0.04254, "0.0425"),
+        (0.007, "0.00700"),
+        (4.6149e-5, "4.61e-05"),
+        (1e-12, "1.00e-12"),
+        (0, "0"),
+        (0.0, "0"),
+        (1.5, "1.50"),
+        (123.4, "123"),
+        (12345.0, "1.23e+04"),
+        (None, "not finite"),
+        (math.nan, "not finite"),
+        (math.inf, "not finite"),
+    ],
+)
+def test_an_error_has_three_significant_digits_however_small(value: float | None, shown: str) -> None:
+    assert significant(value) == shown
