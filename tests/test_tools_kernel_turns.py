@@ -21,11 +21,11 @@ SIZES: dict[str, Any] = {"cache_rows": 976, "suffix": 50, "shared_bytes": 232448
 @pytest.fixture
 def patch(tmp_path: Path) -> Path:
     """Of this tree's kernels: five staged streams, not four."""
-    text = (denoise.FOLDER / "denoise/base.cu").read_text()
+    text = (denoise.FOLDER / "denoise/many/memory.cu").read_text()
     assert text.count("STAGED = 4;") == 1
     for name, version in (("a", text), ("b", text.replace("STAGED = 4;", "STAGED = 5;"))):
-        (tmp_path / name / "src/turbopi/kernels/sm90/denoise").mkdir(parents=True)
-        (tmp_path / name / "src/turbopi/kernels/sm90/denoise/base.cu").write_text(version)
+        (tmp_path / name / "src/turbopi/kernels/sm90/denoise/many").mkdir(parents=True)
+        (tmp_path / name / "src/turbopi/kernels/sm90/denoise/many/memory.cu").write_text(version)
     command = ["git", "diff", "--no-index", "--no-prefix", "a", "b"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
     file = tmp_path / "five.patch"
@@ -76,7 +76,7 @@ def test_a_folder_that_would_read_this_trees_sources_is_refused(tmp_path: Path) 
 
 def test_a_patch_of_other_sources_is_refused(patch: Path) -> None:
     patch.write_text(patch.read_text().replace("STAGED = 4;", "STAGED = 3;"))
-    with pytest.raises(ValueError, match=r"five\.patch doesn't fit these kernels: .*denoise/base\.cu"):
+    with pytest.raises(ValueError, match=r"five\.patch doesn't fit these kernels: .*denoise/many/memory\.cu"):
         Variant(str(patch))
 
 

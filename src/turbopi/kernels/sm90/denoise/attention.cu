@@ -1,6 +1,6 @@
-// Part 11 of 13: attention. The keys are split over the ranks of the head's cluster.
+// Attention with each warp's products its own: of few tokens, and of many behind many keys. The keys are split over the
+// ranks of the head's cluster.
 
-// The same (see `attend_together`) with each warp's products its own: few tokens, or many keys.
 __device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 bit, const Keys& keys) {
   const int tiles = keys.tiles, prefix = keys.keys, slots = keys.slots, suffix0 = keys.suffix0, suffix = keys.suffix;
   const bool scorer = b.warp() < SCORERS, for_suffix = b.warp() >= SUFFIX_WARP;
@@ -70,7 +70,7 @@ __device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 b
 #pragma unroll
         for (int n = 0; n < NT; ++n)
           if (n * 8 + 2 * b.t() < T) {
-            if constexpr (SPREAD)
+            if constexpr (MANY)
               send(to[j] + n * OUTPUT, pack(out[j][n][0], out[j][n][1]), pack(out[j][n][2], out[j][n][3]), to_bar[j]);
             else
               send(to[j] + n * OUTPUT, make_float4(out[j][n][0], out[j][n][1], out[j][n][2], out[j][n][3]), to_bar[j]);
@@ -238,87 +238,4 @@ __device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 b
     send_outputs(out);
     if (b.warp() == LEADER) send_sums(b, tiles, suffix);
   }
-}
-
-// Ranks' outputs of this one's columns, by their largest logits, which come first; then attention to all ranks.
-__device__ __forceinline__ void combine(Block& b) {
-  b.forget();
-  static_assert(QTL * NT <= W, "a warp for 8 tokens of a tile");
-  const int qn = b.qn(), tile = b.warp() % imax(qn, 1), n = b.warp() / imax(qn, 1), token = n * 8 + 2 * b.t();
-  const bool mine = b.warp() < qn * NT;
-  float2 w[S];
-  Everyone places, bars;
-  if (!COPY_ATTENTION) places = Everyone(columns_place(b, M_ATT, b.q0() + tile, n)), bars = Everyone(b.bar(BAR_ATT));
-  receive(b, BAR_TOPS, b.n, TOPS_EXPECT, WAIT_TOPS);
-  float2 highest = make_float2(LOWEST, LOWEST);
-#pragma unroll
-  for (int s = 0; s < S; ++s) {
-    w[s] = *(const float2*)(b.smem + M_X + X_TOPS + (s * NT * 8 + min(token, NT * 8 - 2)) * 4);
-    highest.x = fmaxf(highest.x, w[s].x), highest.y = fmaxf(highest.y, w[s].y);
-  }
-#pragma unroll
-  for (int s = 0; s < S; ++s)
-    w[s] = make_float2(exp2_approx(w[s].x - highest.x), exp2_approx(w[s].y - highest.y));
-  MARK(MARK_TOPS_HERE)
-  receive(b, BAR_COMB, b.n, outputs_expect(b), WAIT_COMB);
-  MARK(MARK_OUTPUTS_HERE)
-  if (mine) {
-    float4 o = make_float4(0, 0, 0, 0);
-    float2 sum = make_float2(0, 0);
-#pragma unroll
-    for (int s = 0; s < S; ++s) {
-      const byte* p = b.smem + M_X + X_COMB + ((s * QTL + tile) * NT + n) * OUTPUT + b.lane() * (OUTPUT / 32);
-      float4 v;
-      if constexpr (SPREAD) {
-        const uint2 both = *(const uint2*)p;
-        v = make_float4(bf16_low(both.x), bf16_high(both.x), bf16_low(both.y), bf16_high(both.y));
-      } else {
-        v = *(const float4*)p;
-      }
-      const float2 l = *(const float2*)(b.smem + M_X + X_SUMS + (s * NT * 8 + token) * 4);
-      sum.x += w[s].x * l.x, sum.y += w[s].y * l.y;
-      o.x += w[s].x * v.x, o.y += w[s].y * v.y, o.z += w[s].x * v.z, o.w += w[s].y * v.w;
-    }
-    const float x = __fdividef(1.0f, sum.x), y = __fdividef(1.0f, sum.y);
-    const float4 v = make_float4(o.x * x, o.y * y, o.z * x, o.w * y);
-    if constexpr (COPY_ATTENTION) {
-      const uint2 columns = columns_of(b, v);
-      byte* const p = b.smem + (columns_place(b, M_ATT, b.q0() + tile, n) - b.base);
-      if (FP8)
-        *(u32*)p = columns.x;
-      else
-        *(uint2*)p = columns;
-    } else {
-      send_columns(b, places, bars, n, v, true);
-    }
-  }
-  if constexpr (COPY_ATTENTION) {
-    consumers_sync();
-    if (b.warp() == COPY_WARP) {
-      if (b.lane() == 0) {
-        constexpr u32 BYTES = QTL * NT * OPERAND;
-        const u32 place = b.q0() * NT * OPERAND;
-        byte* const there = (byte*)(b.a.scratch + B_ATT) + size_t(b.cluster()) * QT * NT * OPERAND + place;
-        show_to_products();
-        copy_to_all(b, M_ATT + place, there, M_ATT + place, BYTES, BAR_ATT);
-      }
-      __syncwarp();
-    }
-  }
-  MARK(MARK_COMBINED)
-  // A rank without queries has nothing to send now, but what has come may not land over the stream that comes next.
-  if (IDLE_Q && b.thread < S) send(at_rank(b.base + M_TOKEN, b.thread), 0, at_rank(b.bar(BAR_ATT), b.thread));
-}
-
-// Attention of this cluster's head, sent to all ranks. Everything local lies in region X.
-__device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix) {
-  b.forget();
-  asm volatile("" : "+r"(prefix));
-  const Keys keys(b, prefix);
-  if constexpr (ASYNC)
-    attend_together(b, kv, bit, keys);
-  else
-    attend_by_warps(b, kv, bit, keys);
-  MARK(MARK_OUTPUTS_SENT)
-  combine(b);
 }

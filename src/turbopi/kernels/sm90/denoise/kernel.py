@@ -3,7 +3,7 @@
 Ten steps read the action expert's 311 M weights ten times and do little else, so the loop is a race between memory and
 the delay of some thousand dependent operations. One kernel keeps its clusters resident, streams the weights through
 shared memory without pause, and passes activations through distributed shared memory; only sums over heads or hidden
-units cross clusters. How, and why it is safe: docs/dev/denoising_kernel.md and base.cu.
+units cross clusters. How, and why it is safe: docs/dev/denoising_kernel.md and sizes.cu.
 
 Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns, A action_dim.
 """
@@ -32,12 +32,11 @@ from turbopi.kernels.sm90.denoise.packing import (
 from turbopi.kernels.sm90.denoise.small import affine, inverse_frequencies
 
 FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
-PARTS = tuple(
-    f"denoise/{part}.cu"
-    for part in (
-        *("base", "primitives", "wgmma", "producer", "product", "spread", "stream"),
-        *("project", "score", "attention_many", "attention", "step", "loop"),
-    )
+PARTS = (  # of the kernel, in their order; {form}: "few" or "many" tokens
+    *("sizes", "{form}/memory", "block", "primitives", "wgmma", "producer", "product"),
+    *("stream", "{form}/stream", "residual", "project", "{form}/project", "feed_forward", "{form}/feed_forward"),
+    *("score", "attention", "{form}/attention", "combine", "step", "{form}/step"),
+    *("layer", "watch", "{form}/loop", "kernel"),
 )
 THREADS = (WARPS + 4) * 32
 WAITS = {  # what a CTA waits for: the kernel's enum, and what users are told
@@ -82,7 +81,7 @@ MARKS = {  # up to where the tracer counts cycles, in the order in which a layer
     "MARK_EMBEDDED": "x_t embedded",
     "MARK_STEP_DONE": "the step's Euler step done",
 }
-FEW = 16  # tokens: `FEW` of base.cu
+FEW = 16  # tokens: up to so many take the form in few/
 MAX_SUFFIX = 56  # beyond it too little shared memory is left for weights on their way
 
 
@@ -172,7 +171,9 @@ def source(suffix: int, fp8: bool) -> str:
         instructions.wgmma("add_keys", 2 * 8),
     )
     generated = (*products, enumeration("What", tuple(WAITS)), enumeration("Mark", tuple(MARKS)), ARGS.source)
-    return instructions.source(*PARTS, generated="\n".join(generated) + "\n", folder=FOLDER)
+    form = "few" if suffix <= FEW else "many"
+    files = (f"denoise/{part.format(form=form)}.cu" for part in PARTS)
+    return instructions.source(*files, generated="\n".join(generated) + "\n", folder=FOLDER)
 
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
@@ -195,7 +196,7 @@ def megahertz(cycles: int, nanoseconds: int) -> float | None:
 
 
 def stuck(words: list[int]) -> str | None:
-    """What the blocks' words of `watch` (primitives.cu) say, or None: none has said anything."""
+    """What the blocks' words of `watch` (watch.cu) say, or None: none has said anything."""
     waits = sorted({(word & 0xFFFFF, word >> 20 & 0x7FF) for word in words if word})
     told = tuple(WAITS.values())
     where = ", ".join(f"layer {layer} for {told[what]}" for layer, what in waits[:8])

@@ -1,4 +1,4 @@
-"""The action expert's weights in the order in which the denoising kernel reads them: see base.cu.
+"""The action expert's weights in the order in which the denoising kernel reads them: see sizes.cu.
 
 Shapes: N steps, L layers, D width, F feed-forward width, n query heads of K columns.
 """
@@ -55,7 +55,7 @@ def most(count: int, parts: int) -> int:
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Who does what: see base.cu."""
+    """Who does what: see sizes.cu."""
 
     config: ModelConfig
 

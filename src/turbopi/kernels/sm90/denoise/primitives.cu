@@ -1,4 +1,4 @@
-// Part 2 of 13: waiting, moving data, arithmetic.
+// Waiting, moving data, arithmetic.
 
 // ---- waiting
 
@@ -21,6 +21,11 @@ __device__ __forceinline__ void receive(const Block& b, int bar, int n, u32 byte
   __syncwarp();
   if (b.thread == 0) barrier_expect(b.bar(bar), bytes);
 }
+// An arrival at a rank's barrier. Nothing was written that a peer reads, so nothing is to be released: that would cost a
+// microsecond.
+__device__ __forceinline__ void arrive_at(u32 bar) {
+  asm volatile("mbarrier.arrive.relaxed.cluster.shared::cluster.b64 _, [%0];" ::"r"(bar) : "memory");
+}
 // Barriers of some warps. Lanes leave a wait one by one, and these barriers count warps.
 template <int BARRIER, int WARPS>
 __device__ __forceinline__ void arrive() {
@@ -34,6 +39,7 @@ __device__ __forceinline__ void sync() {
 }
 __device__ __forceinline__ void consumers_sync() { sync<CONSUMERS_MEET, W>(); }
 __device__ __forceinline__ void consumers_arrive() { arrive<CONSUMERS_MEET, W>(); }  // of a warp that goes on at once
+
 // ---- moving data
 
 // An address at all ranks. All of them first, as a send reads its registers late.

@@ -1,11 +1,11 @@
-// Part 4 of 13: what brings weights, keys and values.
+// What brings weights, keys and values.
 
 // One thread of a CTA, which never waits for activations. What it loads is the same in every layer, so a list of it is
 // made first: 100 cycles more for a slot are a microsecond in a layer.
 struct Producer {
   // Few tokens' weights take up to half of the loop's time to load. At full speed they come in bursts, and what the
   // CTAs tell each other is late: so loads are some cycles apart, and those of gate|up wait for the keys' scores.
-  static constexpr u32 PACE = FEW ? (FP8 ? 450 : 750) : 0;
+  static constexpr u32 PACE = MANY ? 0 : FP8 ? 450 : 750;
   static constexpr bool AHEAD = plan_slots(GTL, D16) > STAGES;  // some of gate|up finds no slot before it begins
   Block& b;
   uint2* list;  // of slots: where from, bytes; an odd number of bytes: of keys or values, else of weights
@@ -98,8 +98,7 @@ struct Producer {
 extern "C" __global__ void __launch_bounds__(256) turbopi_denoise_prepare(const __grid_constant__ Args a) {
   const int first = blockIdx.x * 256 + threadIdx.x;
   for (size_t at = first; at < SCRATCH; at += size_t(gridDim.x) * 256) {
-    const bool absent = SPREAD && at >= B_STAGE && at < B_SQUARES && word_exists(int(at - B_STAGE));
-    const u32 v = absent ? ABSENT : 0;
+    const u32 v = word_at_start(at);
     a.scratch[at] = make_uint4(v, v, v, v);
   }
   const int l = blockIdx.x / KEY_TILES, tile = blockIdx.x % KEY_TILES, length = int(*a.length);

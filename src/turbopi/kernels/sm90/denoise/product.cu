@@ -1,4 +1,4 @@
-// Part 5 of 13: matrix products.
+// Matrix products.
 
 __device__ __forceinline__ u32 take_slot(Block& b) {
   const u32 slot = b.slot;
@@ -71,7 +71,7 @@ struct GroupProduct {
   static constexpr int PARTS = group_parts(TILES_);
   static constexpr bool EXACT = EVEN % (KB * filled(TILES_)) == 0;
   static constexpr bool SOME_REST = TILES_ <= 4 && PARTS == 2;  // warpgroups that have no tile
-  static constexpr int UNROLL = EXACT && SPREAD ? 16 : 1;  // where the number of rounds is known
+  static constexpr int UNROLL = EXACT && MANY ? 16 : 1;  // where the number of rounds is known
   Block& b;
   const Share my;
   const int blocks, tiles, rounds, rounds_of_slot;
@@ -248,15 +248,14 @@ struct Own {
         *(float4*)(to + partial_place(b, n)) = sum;
     }
   }
-  // To `sums` come all parts' sums of what is mine. They lie APART, or in `region`: over the operand of the
-  // product unless SPREAD.
+  // To `sums` come all parts' sums of what is mine. They pass through `region`, or a place of their own.
   __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
-    byte* const place = b.smem + (APART ? M_SUMS : region);
+    byte* const place = b.smem + partials_place(region);
     auto other = [&](int i, int parts, int part, int n) {
       return (float4*)(place + (plan_others(i * 8) + (tile[i] & 7) * (parts - 1) + part) * PARTIAL +
                        partial_place(b, n));
     };
-    if (!APART && !SPREAD) consumers_sync();
+    if (PARTIALS_OVER_OPERAND) consumers_sync();
     if constexpr (plan_groups(MT) == 1 && group_parts(group_tiles(MT)) == 2) {  // branches, where else are selections
       const bool real = tile[0] < imin(tiles, group_tiles(MT));
       byte* const to = place + (tile[0] & 7) * PARTIAL;

@@ -1,12 +1,11 @@
-// Part 9 of 13: attention's steps, of which attention_many.cu and attention.cu make the whole.
+// Attention's steps, of which attention.cu and many/attention.cu make the whole.
 
 // Who does what: the first SCORERS warps score a tile of prefix keys each, and the next if there are more; the last
 // four score the suffix's keys, a quarter of the columns each, as they come through L2 and so later than the queries.
 // If tokens are few (HOLD) the other eight warps weigh the values, and keys and values wait in registers for queries
 // and weights; else all warps weigh, and the third warpgroup fetches the suffix's values. Queries of many tokens are
-// more than shared memory can bring to each warp by itself (ASYNC): see attention_many.cu.
+// more than shared memory can bring to each warp by itself (ASYNC): see many/attention.cu.
 constexpr int LEADER = SCORERS - 1, SUFFIX_WARP = 12;
-constexpr bool HOLD = FEW && ROUNDS == 1 && KT <= 2 * SLOT_TILES && STAGES >= 4;
 // Blocks of its keys that a scoring warp holds, tiles of values that a weighing warp does: more would spill.
 constexpr int HELD_KEYS = QT < 12 ? QT : 12, HELD_TILES = KT < 4 ? KT : 4;
 constexpr int WEIGHERS = HOLD ? W - SCORERS : W, CT = most(QT, WEIGHERS);  // tiles of columns of a weighing warp
@@ -43,7 +42,7 @@ __device__ __forceinline__ void mma_tokens(float (&c)[NT][4], uint4 a, u32 from)
 // fragment of the keys. Returns a word that needs all it read, for give_slot.
 template <int STEPS, int UNROLL, typename Fetch>
 __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int steps, float (&c)[NT][4]) {
-  constexpr int CHAINS = FEW && STEPS > 4 ? 2 : 1;
+  constexpr int CHAINS = !MANY && STEPS > 4 ? 2 : 1;
   float sums[CHAINS][NT][4];
 #pragma unroll
   for (int i = 0; i < CHAINS; ++i) clear(sums[i]);
@@ -61,11 +60,6 @@ __device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int
 #pragma unroll
     for (int i = 0; i < 4; ++i) c[n][i] = CHAINS == 2 ? sums[0][n][i] + sums[CHAINS - 1][n][i] : sums[0][n][i];
   return seen;
-}
-
-// Where 8 columns of a key among the rows (ASYNC) lie.
-__device__ __forceinline__ int key_row(int row, int eight) {
-  return M_X + X_KEY_ROWS + eight * KEY_COLUMNS + row / 8 * 128 + row % 8 * 16;
 }
 
 // Suffix keys (kind 0) or values (1) from all clusters to shared memory, asked for first and kept later: of `rows` of
@@ -100,8 +94,7 @@ struct SuffixPart {
       const int row = item(i) / quads, quad = first + item(i) % quads;
       const uint2 four = make_uint2(pack(__uint_as_float(v[i].x), __uint_as_float(v[i].y)),
                                     pack(__uint_as_float(v[i].z), __uint_as_float(v[i].w)));
-      const int rows_at = M_X + (kind ? X_VALUE_ROWS : X_KEY_ROWS) + row * RS + quad * 8;
-      *(uint2*)(b.smem + (ASYNC && !kind ? key_row(row, quad / 2) + quad % 2 * 8 : rows_at)) = four;
+      *(uint2*)(b.smem + suffix_place(kind, row, quad)) = four;
     }
   }
 };
@@ -206,11 +199,7 @@ __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[
   for (int n = 0; n < NT; ++n)
     if (n * 8 + 2 * b.t() < T) send(to + n * 32, __float_as_uint(v[n].x), __float_as_uint(v[n].y), at);
 }
-constexpr u32 ATT_EXPECT = HD * (COPY_ATTENTION ? NT * 8 : T) * (OPERAND / 128) + (IDLE_Q ? S * 4 : 0);
 constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
-__device__ __forceinline__ u32 outputs_expect(const Block& b) {
-  return S * ((T + 1) / 2) * 8 + (S - ASYNC) * b.qn() * ((T + 1) / 2) * (OUTPUT / 4);  // ASYNC: its own by stores
-}
 // The suffix's keys come last. Their weights go by the prefix's largest logits, too, unless theirs are
 // so much larger (2^64) that the prefix's weights count for nothing: then those are dropped, which `X_KEEP` says.
 __device__ __forceinline__ void weigh_suffix(const Block& b, float (&c)[1][NT][4], int rows) {

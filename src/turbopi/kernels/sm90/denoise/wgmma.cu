@@ -1,4 +1,4 @@
-// Part 3 of 13: asynchronous products of the tensor cores (wgmma). The four warps of a warpgroup together add 64 rows x
+// Asynchronous products of the tensor cores (wgmma). The four warps of a warpgroup together add 64 rows x
 // 16 columns of operand A, from shared memory or registers, times 16 columns x NT * 8 tokens of operand B, from shared
 // memory, to float32 sums: warp i has rows 16 i.., laid out as those of mma.m16n8k16, 8 tokens after 8.
 //

@@ -1,0 +1,1 @@
+"""Attention of vision and prefix by wgmma and TMA."""

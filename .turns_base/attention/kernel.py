@@ -1,0 +1,170 @@
+"""Attention without materialised logits through wgmma and TMA, for compute capability 9.0: see kernel.cu.
+
+Twins: `vision_attention` of `kernels.plain`, and its `attention` without a suffix. The kernels for all other GPUs, and
+for heads that this one doesn't take, are in kernels/attention.py.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
+from turbopi.kernels.attention import LOG2_E
+from turbopi.kernels.launch import result_dtype
+from turbopi.kernels.nvrtc import compile_cubin
+from turbopi.kernels.sm90 import instructions
+from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
+
+PARAMETERS = Parameters(
+    (
+        *(Parameter(TENSOR_MAP, f"map_{name}") for name in "qkv"),
+        Parameter("Element*", "out"),  # bfloat16 or E4M3: kernel.cu
+        Parameter("const long long*", "length"),
+        *(Parameter("int", name) for name in ("rows", "keys", "heads", "k_first", "v_first", "tiles")),
+        Parameter("float", "scale"),
+        Parameter("float", "inverse"),
+    )
+)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """How attention is cut: 64 query rows a CTA, `keys` keys at a time for each of one or two warpgroups."""
+
+    dim: int  # columns of a head
+    keys: int
+    warpgroups: int = 2
+    sharing: int = 1  # CTAs in a cluster, which load keys and values together
+
+    @property
+    def stages(self) -> int:
+        """Tiles of keys or values in flight: as many as fit, beside the queries, 1 KB of alignment and the barriers."""
+        panels = -(-self.dim // 64)
+        return min(12, (SHARED_BYTES - 2048 - 64 * panels * 128) // (self.keys * panels * 128))
+
+    def holds(self, keys: int) -> bool:
+        """Whether shared memory takes so many keys and values at once."""
+        return 2 * self.warpgroups * -(-keys // (self.keys * self.warpgroups)) <= self.stages
+
+
+def takes(dim: int) -> bool:
+    """Whether there is a kernel for heads of that many columns."""
+    return dim % 8 == 0 and 16 <= dim <= 256
+
+
+def prefix_attention(
+    q: Tensor, k: Tensor, v: Tensor, length: Tensor, heads: int, inverse: float | None = None, tile: Tile | None = None
+) -> Tensor:
+    """Rows q [tokens * n, K] over the first `length` (int64[1], on the device, at least 1) keys -> [tokens, n * K].
+
+    k, v [keys, K]; what lies beyond `length` has no influence. With `inverse` the result leaves as E4M3. All bfloat16
+    and contiguous.
+    """
+    assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
+    rows, dim = q.shape
+    tile = tile or Tile(dim, keys=64)
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
+    _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, length, rows, k.shape[0], 1, inverse)
+    return out
+
+
+def vision_attention(
+    qkv: Tensor, images: int, heads: int, inverse: float | None = None, tile: Tile | None = None
+) -> Tensor:
+    """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
+
+    bfloat16, contiguous. With `inverse` the result leaves as E4M3.
+    """
+    assert qkv.is_contiguous() and qkv.dtype == torch.bfloat16
+    rows, width = qkv.shape[0], qkv.shape[1] // 3
+    tokens, dim = rows // images, width // heads
+    out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse))
+    places, tile = (3 * heads,) * 3, tile or _vision_tile(tokens, dim)
+    _launch(tile, (qkv,) * 3, places, (0, heads, 2 * heads), out, None, tokens, tokens, images * heads, inverse)
+    return out
+
+
+def _vision_tile(tokens: int, dim: int) -> Tile:
+    tile = Tile(dim, keys=128 if dim <= 128 else 64)
+    pair = replace(tile, sharing=2)
+    return pair if -(-tokens // 64) % 2 == 0 and pair.holds(tokens) else tile
+
+
+def _launch(
+    tile: Tile,
+    matrices: tuple[Tensor, ...],
+    heads: tuple[int, ...],
+    first: tuple[int, ...],
+    out: Tensor,
+    length: Tensor | None,
+    rows: int,
+    keys: int,
+    groups: int,
+    inverse: float | None,
+) -> None:
+    """matrices q, k, v of `heads` heads side by side, theirs beginning with the `first`; groups of pictures and heads.
+
+    rows and keys: of one picture.
+    """
+    count = out.shape[-1] // tile.dim if length is None else 1  # query heads beside each other
+    boxes = (64, tile.keys // tile.sharing, tile.keys // tile.sharing)
+    maps = [
+        instructions.tensor_map(
+            matrix.data_ptr(),
+            (tile.dim, width, matrix.numel() // (width * tile.dim)),
+            (tile.dim, width * tile.dim),
+            (64, 1, box),
+        )
+        for matrix, width, box in zip(matrices, heads, boxes, strict=True)
+    ]
+    tiles = -(-rows // 64)
+    assert tile.sharing == 1 or (tiles % tile.sharing == 0 and tile.holds(keys)), "who shares never waits for a slot"
+    whole = length is None and keys == tile.keys * tile.warpgroups
+    kernel = _kernel(tile, inverse is not None, whole, out.device)
+    given = {
+        **dict(zip(("map_q", "map_k", "map_v"), maps, strict=True)),
+        "out": out.data_ptr(),
+        "length": None if length is None else length.data_ptr(),
+        "rows": rows,
+        "keys": keys,
+        "heads": count,
+        "k_first": first[1],
+        "v_first": first[2],
+        "tiles": tiles,
+        "scale": tile.dim**-0.5 * LOG2_E,
+        "inverse": 1.0 if inverse is None else inverse,
+    }
+    kernel.launch_dependent(tiles * groups, given)
+
+
+def constants(tile: Tile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
+    """What kernel.cu is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
+    return {
+        "TP_DIM": tile.dim,
+        "TP_WGS": tile.warpgroups,
+        "TP_KEYS": tile.keys,
+        "TP_STAGES": tile.stages,
+        "TP_OUT_FP8": int(out_fp8),
+        "TP_SHARING": tile.sharing,
+        "TP_WHOLE": int(whole),
+    }
+
+
+def source(tile: Tile) -> str:
+    """kernel.cu with the instructions for a tile."""
+    logits = instructions.wgmma("mma_logits", tile.keys)
+    values = instructions.wgmma("mma_values", tile.dim, from_registers=True, across=True)
+    parameters = f"#define ATTENTION_PARAMETERS {PARAMETERS.declarations}"
+    return instructions.source("attention/kernel.cu", generated=f"{logits}\n{values}\n{parameters}\n")
+
+
+@cache
+def _kernel(tile: Tile, out_fp8: bool, whole: bool, device: torch.device) -> DependentKernel:
+    with torch.cuda.device(device):
+        cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8, whole))
+        threads = 128 * (tile.warpgroups + 1)
+        return DependentKernel(
+            cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=threads, cluster=tile.sharing
+        )

@@ -1,0 +1,1 @@
+"""The whole denoising loop in one kernel of resident clusters."""

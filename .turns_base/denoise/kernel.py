@@ -1,0 +1,310 @@
+"""The whole denoising loop of Pi0.5 in one kernel of resident thread block clusters: its sizes and launch.
+
+Ten steps read the action expert's 311 M weights ten times and do little else, so the loop is a race between memory and
+the delay of some thousand dependent operations. One kernel keeps its clusters resident, streams the weights through
+shared memory without pause, and passes activations through distributed shared memory; only sums over heads or hidden
+units cross clusters. How, and why it is safe: docs/dev/denoising_kernel.md and base.cu.
+
+Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns, A action_dim.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.kernels.arguments import Parameter, Struct, enumeration
+from turbopi.kernels.interface import State
+from turbopi.kernels.nvrtc import Kernel, compile_cubin
+from turbopi.kernels.sm90 import instructions
+from turbopi.kernels.sm90.denoise.packing import (
+    BLOCK,
+    RANKS,
+    WARPS,
+    Arrangement,
+    PackedExpert,
+    Tables,
+    most,
+)
+from turbopi.kernels.sm90.denoise.small import affine, inverse_frequencies
+
+FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
+PARTS = tuple(
+    f"denoise/{part}.cu"
+    for part in (
+        *("base", "primitives", "wgmma", "producer", "product", "spread", "stream"),
+        *("project", "score", "attention_many", "attention", "step", "loop"),
+    )
+)
+THREADS = (WARPS + 4) * 32
+WAITS = {  # what a CTA waits for: the kernel's enum, and what users are told
+    "WAIT_NONE": "nothing",
+    "WAIT_X": "the stream",
+    "WAIT_Q": "queries",
+    "WAIT_TOPS": "largest logits",
+    "WAIT_COMB": "outputs",
+    "WAIT_ATT": "attention",
+    "WAIT_X2": "attention's sums",
+    "WAIT_HID": "hidden units",
+    "WAIT_X1": "feed-forward sums",
+    "WAIT_V": "v_t",
+    "WAIT_GO": "the next step",
+    "FINISHED": "its end",
+}
+MARKS = {  # up to where the tracer counts cycles, in the order in which a layer comes there: the kernel's enum
+    "MARK_STREAM_FOR_ATTENTION": "the stream is here",
+    "MARK_QKV_MULTIPLIED": "q|k|v multiplied",
+    "MARK_QKV_SENT": "queries sent, keys and values published",
+    "MARK_QUERIES_HERE": "all ranks' queries are here",
+    "MARK_PREFIX_SCORED": "prefix keys scored",
+    "MARK_ROWS_HERE": "of warps that score rows: keys here",
+    "MARK_ROWS_SCORED": "of warps that score rows: scored",
+    "MARK_ROWS_WEIGHED": "of warps that score rows: weights stored, tops sent",
+    "MARK_WEIGHTS_STORED": "weights stored; beyond 16 tokens: of all warps",
+    "MARK_OUTPUTS_SENT": "this warp's part of the outputs sent",
+    "MARK_TOPS_HERE": "largest logits of all ranks here",
+    "MARK_OUTPUTS_HERE": "partial outputs of all ranks here",
+    "MARK_COMBINED": "combined, attention sent",
+    "MARK_ATTENTION_HERE": "all ranks' attention here",
+    "MARK_OUT_PUBLISHED": "out multiplied, its sums published",
+    "MARK_OUT_SUMS_HERE": "all clusters' sums of out here",
+    "MARK_SLICE_AFTER_ATTENTION": "slice of the stream sent",
+    "MARK_STREAM_FOR_FEED_FORWARD": "the stream is here",
+    "MARK_GATE_UP_MULTIPLIED": "gate|up multiplied",
+    "MARK_HIDDEN_SENT": "hidden units sent",
+    "MARK_HIDDEN_HERE": "all ranks' hidden units here",
+    "MARK_DOWN_PUBLISHED": "down multiplied, its sums published",
+    "MARK_DOWN_SUMS_HERE": "all clusters' sums of down here",
+    "MARK_SLICE_AFTER_FEED_FORWARD": "slice of the stream sent",
+    "MARK_EMBEDDED": "x_t embedded",
+    "MARK_STEP_DONE": "the step's Euler step done",
+}
+FEW = 16  # tokens: `FEW` of base.cu
+MAX_SUFFIX = 56  # beyond it too little shared memory is left for weights on their way
+
+
+def unavailable(device: torch.device) -> str | None:
+    """Why the kernel can't run on this device, or None if it can."""
+    if device.type != "cuda":
+        return "the denoising kernel needs an NVIDIA GPU"
+    major, minor = torch.cuda.get_device_capability(device)
+    if (major, minor) != (9, 0):
+        return f"the denoising kernel is written for compute capability 9.0, this GPU has {major}.{minor}"
+    return None
+
+
+ARGS = Struct(
+    "Args",
+    (
+        Parameter("const unsigned char*", "weights", "fragments [L][layer_bytes], a CTA's in the order of their use"),
+        Parameter("const long long*", "starts", "[NC * S]: where a CTA's begin in a layer, bytes"),
+        Parameter("const float*", "table", "[N][2L+1][3][D]: scale, shift, gate"),
+        Parameter("const float*", "shifted", "[N][L][NC * S][TILES][16]: W shift"),
+        Parameter("const float*", "out_w", "[D][A]"),
+        Parameter("const float*", "out_shift", "[N][A]: action_out_proj of the final norm's shift, and its bias"),
+        Parameter("const float*", "in_w", "[D][A]"),
+        Parameter("const float*", "in_b", "[D]"),
+        Parameter("const float*", "inv_freq", "[HD/2]"),
+        Parameter("const unsigned char*", "cache_k", "bf16 [L][rows][HD], layer_stride bytes from layer to layer"),
+        Parameter("const unsigned char*", "cache_v"),
+        Parameter("unsigned char*", "keys", "bf16 [L][2][KEY_TILES][QT] fragments: the cache as tensor cores take it"),
+        Parameter("const long long*", "length", "valid rows of the cache"),
+        Parameter("const float*", "noise", "[T][A]"),
+        Parameter("float*", "x_t", "[N+1][T][A]"),
+        Parameter("float*", "v_t", "[N][T][A]"),
+        Parameter("uint4*", "scratch", "zero at the start"),
+        Parameter("u32*", "hang", "[NC * S] host memory: see `watch`"),
+        Parameter("long long*", "clock", "[2] host memory: cycles and nanoseconds of a launch, of CTA 0"),
+        Parameter("u32*", "trace", "[NC * S][64] cycles up to each mark, with TP_TRACED_WARP"),
+        Parameter("long long", "layer_stride"),
+        Parameter("long long", "layer_bytes"),
+        Parameter("int", "steps"),
+        Parameter("float", "dt"),
+        Parameter("float", "eps"),
+        Parameter("u32", "zero", "0, which the compiler doesn't know"),
+        Parameter("const float*", "row_scales", "[L][NC * S][TILES][16]: FP8; those of out and down are in the gates"),
+        Parameter("const float*", "values_times", "[L]: FP8, makes attention's outputs fit E4M3; a power of two"),
+    ),
+)
+
+
+def kernel_sizes(
+    arrangement: Arrangement, *, cache_rows: int, suffix: int, shared_bytes: int, fp8: bool = False
+) -> dict[str, int]:
+    """The kernel's compile-time constants."""
+    config, g = arrangement.config, arrangement.config.expert
+    groups = most(suffix, 8)
+    stream = arrangement.clusters // 2 * (g.width // BLOCK) * groups * 32
+    scratch = 4 * stream + suffix * g.head_dim
+    if suffix > FEW:
+        words = 8 if fp8 else 16  # of a block's activations of 8 tokens
+        scratch += (4 * g.width // BLOCK * words + RANKS * 4) * groups + arrangement.blocks
+        head, hidden = g.head_dim // BLOCK, most(g.mlp_dim // BLOCK, arrangement.clusters)
+        scratch += arrangement.clusters * groups * (head * (16 + words) + hidden * words)
+    return {
+        "TP_WIDTH": g.width,
+        "TP_MLP_DIM": g.mlp_dim,
+        "TP_DEPTH": g.depth,
+        "TP_HEADS": g.num_heads,
+        "TP_HEAD_DIM": g.head_dim,
+        "TP_TOKENS": suffix,
+        "TP_ACTION_DIM": config.action_dim,
+        "TP_RANKS": RANKS,
+        "TP_KEY_TILES": most(cache_rows, BLOCK),
+        "TP_FP8": int(fp8),
+        # Larger slots of weights are faster, if enough of them fit.
+        "TP_ROUND_FRAGMENTS": 4 if suffix <= (40 if cache_rows <= 1024 else 24) else 2,
+        "TP_SHARED_BYTES": shared_bytes,
+        "TP_SCRATCH_WORDS": scratch,
+    }
+
+
+def source(suffix: int, fp8: bool) -> str:
+    columns = most(suffix, 8) * 8
+    numbers: instructions.Numbers = "e4m3" if fp8 else "bf16"
+    products = (
+        instructions.wgmma("add_product", columns, numbers=numbers),
+        instructions.wgmma("add_from_registers", columns, numbers=numbers, from_registers=True),
+        instructions.wgmma("add_rows", columns, from_registers=True),
+        instructions.wgmma("add_keys", 2 * 8),
+    )
+    generated = (*products, enumeration("What", tuple(WAITS)), enumeration("Mark", tuple(MARKS)), ARGS.source)
+    return instructions.source(*PARTS, generated="\n".join(generated) + "\n", folder=FOLDER)
+
+
+def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
+    """The kernel's machine code. Raises BackendUnavailable if a block has too little shared memory for these sizes."""
+    try:
+        return compile_cubin(source(sizes["TP_TOKENS"], bool(sizes["TP_FP8"])), arch, sizes, folder=folder)
+    except BackendError as e:
+        if "too little shared memory" not in str(e):
+            raise
+        tokens, keys = sizes["TP_TOKENS"], sizes["TP_KEY_TILES"] * BLOCK
+        raise BackendUnavailable(
+            f"{tokens} suffix tokens and {keys} cache rows leave the denoising kernel too little of a "
+            f"block's {sizes['TP_SHARED_BYTES']} bytes of shared memory"
+        ) from e
+
+
+def megahertz(cycles: int, nanoseconds: int) -> float | None:
+    """A clock in MHz, or None if no time was measured."""
+    return cycles / nanoseconds * 1e3 if nanoseconds else None
+
+
+def stuck(words: list[int]) -> str | None:
+    """What the blocks' words of `watch` (primitives.cu) say, or None: none has said anything."""
+    waits = sorted({(word & 0xFFFFF, word >> 20 & 0x7FF) for word in words if word})
+    told = tuple(WAITS.values())
+    where = ", ".join(f"layer {layer} for {told[what]}" for layer, what in waits[:8])
+    return f"blocks of the denoising kernel waited for seconds (counted over all steps): {where}" if waits else None
+
+
+class DenoiseKernel:
+    """The loop for a fixed number of steps and suffix tokens; capturable in a CUDA graph.
+
+    `table` float32[N, 2L + 1, 3, D] is the modulation (`engine.weights.modulation`), `small` holds action_in_proj and
+    action_out_proj, `cache_rows` is an upper bound of the valid cache rows. Raises BackendError for a model or suffix
+    that it doesn't cover, BackendUnavailable for a GPU, or more cache rows than fit.
+    """
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        packed: PackedExpert,
+        small: State,
+        table: Tensor,
+        *,
+        cache_rows: int,
+        suffix: int,
+        device: torch.device,
+    ) -> None:
+        reason = unavailable(device)
+        if reason is not None:
+            raise BackendUnavailable(reason)
+        if not 1 <= suffix <= MAX_SUFFIX:
+            raise BackendError(f"the denoising kernel takes 1 to {MAX_SUFFIX} suffix tokens, not {suffix}")
+        self._config = config
+        self._packed = packed
+        arrangement = self._packed.arrangement
+        g, properties = config.expert, torch.cuda.get_device_properties(device)
+        assert table.shape[1:] == (2 * g.depth + 1, 3, g.width), table.shape
+        sizes = kernel_sizes(
+            arrangement,
+            cache_rows=cache_rows,
+            suffix=suffix,
+            fp8=self._packed.fp8,
+            shared_bytes=properties.shared_memory_per_block_optin,  # type: ignore[attr-defined]
+        )
+        with torch.cuda.device(device):
+            arch = f"sm_{properties.major}{properties.minor}a"
+            cubin = compiled(arch, sizes)
+            self._kernel = Kernel(cubin, "turbopi_denoise", sizes["TP_SHARED_BYTES"])
+            self._prepare = Kernel(cubin, "turbopi_denoise_prepare", 0)
+            self._tiles = g.depth * sizes["TP_KEY_TILES"]
+            fitting = self._kernel.max_active_clusters(RANKS, THREADS)
+            if fitting < arrangement.clusters:
+                raise BackendUnavailable(
+                    f"the denoising kernel needs {arrangement.clusters} clusters of {RANKS} multiprocessors at once, "
+                    f"{torch.cuda.get_device_name(device)} holds {fitting}"
+                )
+        self._suffix, self._blocks = suffix, arrangement.blocks
+        self._table = table.to(device).float().contiguous()
+        tables = Tables.make(self._packed, self._table)
+        self._tensors = {
+            "weights": self._packed.weights,
+            "starts": self._packed.starts,
+            "table": tables.modulation,
+            "row_scales": tables.row_scales,
+            "shifted": tables.shifted,
+            "values_times": tables.values_times,
+            "out_w": small["action_out_proj.weight"].float().T.contiguous(),
+            "out_shift": affine(small, "action_out_proj", self._table[:, -1, 1].double()).float().contiguous(),
+            "in_w": small["action_in_proj.weight"].float().contiguous(),
+            "in_b": small["action_in_proj.bias"].float().contiguous(),
+            "inv_freq": inverse_frequencies(config, device),
+            "keys": torch.empty(
+                g.depth * 2 * sizes["TP_KEY_TILES"] * BLOCK * g.head_dim, dtype=torch.bfloat16, device=device
+            ),
+            "scratch": torch.empty(4 * sizes["TP_SCRATCH_WORDS"], dtype=torch.int32, device=device),
+            "hang": torch.zeros(self._blocks, dtype=torch.int32, pin_memory=True),  # see `why_it_trapped`
+            "clock": torch.zeros(2, dtype=torch.int64, pin_memory=True),  # see `clock_mhz`
+            "trace": torch.zeros(self._blocks, 64, dtype=torch.int32, device=device),
+        }
+
+    def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
+        """Denoise on the current stream.
+
+        noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], the first `length` (int64[1], on the device) rows
+        valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A].
+        """
+        steps, g, chunk = self._table.shape[0], self._config.expert, (self._suffix, self._config.action_dim)
+        assert noise.shape == chunk and x_t.shape == (steps + 1, *chunk) and v_t.shape == (steps, *chunk)
+        assert cache_k.stride() == cache_v.stride() and cache_k.stride()[1:] == (g.head_dim, 1), cache_k.stride()
+        assert cache_k.dtype == cache_v.dtype == torch.bfloat16 and length.dtype == torch.int64
+        assert all(t.is_contiguous() and t.dtype == torch.float32 for t in (noise, x_t, v_t))
+        named = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "length": length, "noise": noise}
+        pointers = {name: t.data_ptr() for name, t in {**named, "x_t": x_t, "v_t": v_t}.items()}
+        numbers = {
+            "layer_stride": cache_k.stride(0) * 2,
+            "layer_bytes": self._packed.layer_bytes,
+            "steps": steps,
+            "dt": float(np.float32(-1.0 / steps)),
+            "eps": self._config.rms_norm_eps,
+            "zero": 0,
+        }
+        args = ARGS.value(pointers | numbers)
+        self._prepare.launch(self._tiles, 256, args)
+        self._kernel.launch_cooperative(self._blocks, THREADS, args)  # clusters wait for one another
+
+    def clock_mhz(self) -> float | None:
+        """The multiprocessors' clock during the last launch that has ended, in MHz, which may be lower than what
+        nvidia-smi says; None before the first.
+        """
+        return megahertz(*self._tensors["clock"].tolist())
+
+    def why_it_trapped(self) -> str | None:
+        """After a launch that failed: where blocks waited for seconds before they gave up, or None."""
+        return stuck(self._tensors["hang"].tolist())

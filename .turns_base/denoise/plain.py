@@ -1,0 +1,75 @@
+"""The denoising kernel's twin: the loop in plain PyTorch."""
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.kernels.interface import GemmaLayer, State
+from turbopi.kernels.sm90.denoise.small import affine
+from turbopi.model.denoise import euler_step
+from turbopi.model.layers import rope_tables
+from turbopi.quantization.fp8 import to_e4m3
+
+Operand = Callable[[Tensor, int, int], Tensor]
+
+
+def denoise_plain(
+    config: ModelConfig,
+    layers: list[GemmaLayer],
+    small: State,
+    table: Tensor,
+    noise: Tensor,
+    cache_k: Tensor,
+    cache_v: Tensor,
+    length: int,
+    operand: Operand = lambda x, layer, product: x,
+) -> tuple[Tensor, Tensor]:
+    """What the kernel computes, in PyTorch and in `noise`'s dtype throughout: (x_t [N + 1, T, A], v_t [N, T, A]).
+
+    operand  what becomes of the activations that meet a layer's weights: (x, layer, which of `KINDS`) -> x. The
+        stream comes without its 1 / rms and the norm's shift, as the kernel adds both behind the product.
+    """
+    g, dtype, suffix = config.expert, noise.dtype, noise.shape[0]
+    positions = length + torch.arange(suffix, device=noise.device)
+    cos, sin = (t[0].to(dtype) for t in rope_tables(positions[None], g.head_dim, config.rope_base))
+    cos, sin = cos[0][:, None], sin[0][:, None]  # [T, 1, K/2]
+    x_t, v_t = [noise], []
+    for modulation in table.to(dtype):
+
+        def normed(x: Tensor, index: int, modulation: Tensor = modulation) -> tuple[Tensor, Tensor]:
+            scale, shift, gate = modulation[index]
+            inverse = torch.rsqrt(x.square().mean(-1, keepdim=True) + config.rms_norm_eps)
+            scaled = x * scale if index == 2 * g.depth else operand(x * scale, *divmod(2 * index, 4))
+            return scaled * inverse + shift, gate
+
+        x = affine(small, "action_in_proj", x_t[-1])
+        for i, layer in enumerate(layers):
+            y, gate = normed(x, 2 * i)
+            parts = (y @ layer.qkv.to(dtype).T).view(suffix, -1, g.head_dim)
+            q, k, v = parts[:, :-2], parts[:, -2:-1], parts[:, -1:]
+            q, k = (_rotate(part, cos, sin) for part in (q, k))
+            keys = torch.cat((cache_k[i, :length].to(dtype), k[:, 0]))
+            values = torch.cat((cache_v[i, :length].to(dtype), v[:, 0]))
+            attended = (q @ keys.T * g.head_dim**-0.5).softmax(-1) @ values
+            x = x + operand(attended.reshape(suffix, -1), i, 1) @ layer.out.to(dtype).T * gate
+            y, gate = normed(x, 2 * i + 1)
+            up_gate, up = (y @ layer.gate_up.to(dtype).T).chunk(2, dim=-1)
+            x = x + operand(F.gelu(up_gate, approximate="tanh") * up, i, 3) @ layer.down.to(dtype).T * gate
+        v_t.append(affine(small, "action_out_proj", normed(x, 2 * g.depth)[0]))
+        x_t.append(euler_step(x_t[-1], v_t[-1], table.shape[0]))
+    return torch.stack(x_t), torch.stack(v_t)
+
+
+def in_e4m3(inputs: Tensor) -> Operand:
+    """Activations rounded to E4M3 with scales float32[L, 4], `PackedExpert.inputs`."""
+    scales = inputs.tolist()
+    return lambda x, layer, product: to_e4m3(x, 1 / scales[layer][product]).to(x.dtype) * scales[layer][product]
+
+
+def _rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """RoPE in x's dtype. x [T, heads, K]"""
+    first, second = x.chunk(2, dim=-1)
+    return torch.cat((first * cos - second * sin, second * cos + first * sin), dim=-1)

@@ -1,0 +1,232 @@
+"""Matrix products of E4M3 numbers, for compute capability 9.0: kernel.cu compiled for them.
+
+Twins: `kernels.plain`' products with an `Fp8Matrix`. The results are bfloat16, E4M3 for a product that reads them next
+(`inverse`), or parts of the sums ("partial", "parts") for the norms of `norms.py` to add up.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from turbopi.kernels.sm90.gemm.bf16 import (
+    SPLIT,
+    Copy,
+    Epilogue,
+    Sums,
+    Tile,
+    build,
+    copied_parts,
+    copy_arguments,
+    launch,
+    layout,
+    matrix_map,
+    norm_arguments,
+    parameters,
+    product_arguments,
+    size_arguments,
+    tile_constants,
+)
+from turbopi.kernels.sm90.instructions import DependentKernel
+from turbopi.quantization.fp8 import ALIGNMENT, E4M3, Fp8Matrix
+
+DEPTH = 128  # of a step along the inner axis
+PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are added up in float32
+# Of sums shorter than these steps the tensor cores lose too little to matter: 2e-3 of 8192 random products, where
+# rounding to E4M3 costs 4e-2; products of one sign lose more, so longer sums are promoted.
+UNPROMOTED_STEPS = 17
+PROMOTED_COLUMNS = {1: 184, 2: 192, 3: 112}  # by warpgroups: of wider tiles the sums don't fit registers twice
+
+
+# A `Copy` of a stream may be so many times larger than calibration saw in its norm before it saturates, as the stream
+# grows between two norms. Costs nothing: the numbers below 2^-6, which lose precision, are far below any deviation.
+HEADROOM = 16.0
+NO_EPS = 1e-12  # the sums of a copy have it; what is left keeps a variance that rounding made 0 from dividing
+
+
+@dataclass(frozen=True)
+class FoldedFp8:
+    """An E4M3 matrix behind a LayerNorm whose input comes as a `Copy`, HEADROOM times smaller than calibrated."""
+
+    matrix: Fp8Matrix
+    scale: Tensor  # float32[N]: the matrix's, for such a copy
+    of_scale: Tensor  # float32[N]: the matrix times the norm's scale
+    of_shift: Tensor  # float32[N]: the matrix times its shift
+
+    @classmethod
+    def fold(cls, matrix: Fp8Matrix, scale: Tensor, shift: Tensor) -> "FoldedFp8":
+        wide = matrix.dequantized()
+        return cls(matrix, matrix.scale * HEADROOM, wide @ scale.float(), wide @ shift.float())
+
+
+def promotion(tile: Tile, k: int) -> int:
+    """Steps between two promotions of sums over k values; 0: none is needed, or the tile is too wide."""
+    return 0 if _short(tile, k) or tile.columns > PROMOTED_COLUMNS[tile.warpgroups] else PROMOTE
+
+
+def matmul_fp8(
+    a: Tensor,
+    weight: Fp8Matrix | FoldedFp8,
+    tile: Tile,
+    epilogue: Epilogue,
+    bias: Tensor | None = None,
+    out: Tensor | None = None,
+    inverse: float | None = None,
+    promote: int | None = None,
+    *,
+    residual: Tensor | None = None,
+    sums_out: Sums | None = None,
+    sums: Sums | None = None,
+    copy: Copy | None = None,
+    ahead: Tensor | None = None,
+) -> Tensor:
+    """a e4m3[M, K] @ weightᵀ with the epilogue -> bfloat16[M, N], or with `inverse` e4m3[M, N] = round(… * inverse);
+    "partial" -> float32, "parts" -> bfloat16[splits, M, N].
+
+    With "bias" alone, `residual` bfloat16[M, N] is added, the sums of the result's rows go into `sums_out`, and a
+    `copy` may leave, too. With a `FoldedFp8` ("bias" or "gelu"), a is a `Copy` and `sums` its `sums_out`: its LayerNorm
+    is multiplied.
+    weight [N, K], for "geglu" [2N, K]; bias bfloat16[N] of any epilogue but "geglu" and "parts". All contiguous, K a
+    multiple of 16, N of 8.
+    """
+    folded, weight = (weight, weight.matrix) if isinstance(weight, FoldedFp8) else (None, weight)
+    assert (folded is None) == (sums is None) and (folded is None or epilogue in ("bias", "gelu"))
+    assert not tile.gather or folded is None, "sums are gathered after that"
+    assert copy is None or (residual is not None and sums is None and inverse is None)
+    m, k = a.shape
+    n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
+    assert a.dtype == weight.data.dtype == E4M3 and a.is_contiguous() and weight.data.is_contiguous()
+    assert k % ALIGNMENT == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
+    columns, groups = layout(tile, epilogue, m, n, -(-k // DEPTH), residual, sums_out)
+    partial = epilogue == "partial"
+    assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu", "parts"))
+    if out is None:
+        shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
+        out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)
+    assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
+    promote = promotion(tile, k) if promote is None else promote
+    normed = 0 if sums is None else sums.count
+    copied = copied_parts(copy, m, n)
+    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, copied, a.device)
+    given = {
+        "map_a": matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
+        "map_w": matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
+        **product_arguments(out, bias, residual, sums_out),
+        "scale": (weight if folded is None else folded).scale.data_ptr(),
+        "inverse": 1.0 if inverse is None else inverse,
+        **({} if folded is None else norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),
+        **copy_arguments(copy, n),
+        **size_arguments(m, n, -(-k // DEPTH), groups),
+    }
+    launch(kernel, tile, groups, given, ahead)
+    return out
+
+
+def _result_dtype(partial: bool, inverse: float | None) -> torch.dtype:
+    return torch.float32 if partial else torch.bfloat16 if inverse is None else E4M3
+
+
+def constants(
+    tile: Tile,
+    epilogue: Epilogue,
+    out_fp8: bool,
+    promote: int,
+    residual: bool = False,
+    normed: int = 0,
+    copied: int = 0,
+) -> dict[str, int]:
+    """What kernel.cu is compiled with."""
+    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": copied}
+    if out_fp8:
+        own["TP_APART"] = 0  # such blocks go in fours, which may need more room than `Tile.apart` counts
+    return tile_constants(tile, epilogue, residual, factors=2 if normed else 1) | own
+
+
+@cache
+def _kernel(
+    tile: Tile,
+    epilogue: Epilogue,
+    out_fp8: bool,
+    promote: int,
+    residual: bool,
+    normed: int,
+    copied: int,
+    device: torch.device,
+) -> DependentKernel:
+    takes = parameters(fp8=True, residual=residual, normed=normed > 0, copied=copied > 0)
+    return build(takes, constants(tile, epilogue, out_fp8, promote, residual, normed, copied), tile, device)
+
+
+# -- which tile --------------------------------------------------------------------------------------------------------
+
+# Clock cycles, fitted to 200 measurements on an H200 (median error 5 %): of a product besides its tiles, of a tile for
+# each of its results (with GELU twice as many), of a step, and of its loads for each byte. A step's products take
+# rows * columns / 32. Partial sums cost as much again in the norm that adds them up, those in bfloat16 half.
+FIXED, WRITING, STEP, LOADING, ADDING = 2300, 0.098, 205, 0.013, 0.00042
+
+GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that gather sums may not all fit at once
+
+# The fastest of some 25 tiles each, by [rows, out, in]. Rows count in whole 64, the least that a tile has: so fewer
+# kernels are compiled for all the prompt lengths.
+MEASURED = {
+    (256, 3456, 1152): Tile(1, 112, cluster_m=2),
+    (256, 4304, 1152): Tile(2, 72),
+    (512, 3456, 1152): Tile(2, 112, cluster_m=2),
+    (512, 1152, 1152): Tile(1, 96),
+    (512, 4304, 1152): Tile(2, 136, ring=5),
+    (768, 3456, 1152): Tile(2, 160, cluster_m=2),
+    (768, 4304, 1152): Tile(3, 136),
+    (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
+    (320, 2560, 2048): Tile(1, 112),
+    (576, 2560, 2048): Tile(3, 64),
+    (576, 2048, 2048): Tile(1, 160),
+    **{(rows, 16384, 2048): Tile(3, 128, cluster_n=2, overlap=True) for rows in (320, 576, 704, 768, 960)},
+    (832, 16384, 2048): Tile(2, 176, cluster_n=2, overlap=True),
+    (576, 2048, 16384): Tile(3, 96, splits=2),
+    (832, 2048, 16384): Tile(2, 128, cluster_n=2),
+    (576, 512, 2048): Tile(1, 80),
+    (832, 512, 2048): Tile(1, 64),
+}
+
+
+def candidates(epilogue: Epilogue) -> list[Tile]:
+    """All that may be worth trying."""
+    unit = 16 if epilogue == "geglu" else 8
+    found = [
+        Tile(warpgroups, columns, splits=splits)
+        for warpgroups in (1, 2, 3)
+        for columns in range(2 * unit, 257, unit)
+        if 64 * warpgroups * columns <= 192 * 192
+        for splits in ((1, 2, 3, 4) if epilogue in SPLIT else (1,))
+    ]
+    return [tile for tile in found if tile.stages(factors=1, lines=epilogue == "parts") >= 3]
+
+
+def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> float:
+    """Estimated clock cycles of a product."""
+    columns = tile.columns // 2 if epilogue == "geglu" else tile.columns
+    waves = -(-(-(-m // tile.rows) * -(-n // columns) * tile.splits) // sms)
+    steps = -(-k // DEPTH) / tile.splits
+    step = max(tile.rows * tile.columns / 32, (tile.rows + tile.columns) * DEPTH * LOADING) + STEP
+    writing = tile.rows * tile.columns * WRITING * (2 if epilogue in ("gelu", "geglu") else 1)
+    adding = (4 if epilogue == "parts" else 8) * m * n * tile.splits * ADDING if tile.splits > 1 else 0
+    return waves * (steps * step + writing) + FIXED + adding
+
+
+@cache
+def best_tile(m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> Tile:
+    """The measured tile for a @ weightᵀ of [m, k] and [n, k] (GeGLU: [2n, k]), else that of least estimated cost."""
+    m = -(-m // 64) * 64
+    measured = MEASURED.get((m, n, k))
+    if measured is not None and (sms >= GATHERING_SMS or not measured.gather):
+        return measured
+    fitting = [tile for tile in candidates(epilogue) if tile.splits <= -(-k // DEPTH)]
+    if -(-k // DEPTH) > UNPROMOTED_STEPS:  # long sums need room for promotion
+        fitting = [tile for tile in fitting if _short(tile, k) or promotion(tile, k)]
+    best = min(fitting, key=lambda tile: cost(tile, m, n, k, epilogue, sms))
+    return replace(best, cluster_n=2) if epilogue == "geglu" else best
+
+
+def _short(tile: Tile, k: int) -> bool:
+    return -(-k // DEPTH) <= UNPROMOTED_STEPS * tile.splits

@@ -1,0 +1,152 @@
+"""Matrix products, each by the kernel that is fastest for it: ours for what was measured so, cuBLAS's else.
+
+`tuned_` ones need compute capability 9.0, the others any.
+"""
+
+from functools import lru_cache
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.kernels import activations
+from turbopi.kernels.sm90.gemm.bf16 import DEPTH, SPLIT, Epilogue, Tile, matmul
+from turbopi.kernels.sm90.gemm.fp8 import best_tile, matmul_fp8
+from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
+
+GEGLU_TILES = (Tile(3, 128, 1, 2, overlap=True), Tile(3, 192), Tile(2, 256), Tile(2, 160, 1, 2, overlap=True))
+GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
+
+# SigLIP So400m's products that beat cuBLAS on an H200, by [rows, out, in]: the tiles fill its SMs just once.
+VISION_TILES = {
+    (256, 3456, 1152): Tile(1, 112, cluster_m=2),
+    (256, 1152, 1152): Tile(2, 40, splits=2),
+    (256, 4304, 1152): Tile(2, 72),
+    (256, 1152, 4304): Tile(2, 72, cluster_n=2, splits=4),
+    (256, 2048, 1152): Tile(1, 64),
+    (512, 3456, 1152): Tile(2, 112, cluster_m=2, ring=5),
+    (512, 1152, 1152): Tile(2, 40),
+    (512, 4304, 1152): Tile(2, 144, cluster_m=2, ring=5),
+    (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2),
+    (512, 2048, 1152): Tile(2, 64),
+    (768, 3456, 1152): Tile(2, 160, ring=5),
+    (768, 1152, 1152): Tile(2, 64, cluster_m=2),
+    (768, 4304, 1152): Tile(3, 136),
+    (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2),
+    (768, 2048, 1152): Tile(2, 96),
+}
+
+# The prefix's products that leave as bfloat16 parts and so beat cuBLAS and its pass that adds parts up, by [rows in
+# whole 64, out, in]: in our tiles, or as so many products over parts of the inner axis that cuBLAS makes at once.
+PARTS: dict[tuple[int, int, int], Tile | int] = {
+    (320, 2048, 16384): 4,
+    (512, 2048, 16384): 2,
+    (576, 2048, 16384): Tile(3, 192, splits=4),
+    (768, 2048, 16384): Tile(3, 192, splits=3),
+    (832, 2048, 16384): 2,
+}
+
+
+def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+    if out is None:
+        return F.linear(x, weight, bias)
+    return torch.mm(x, weight.t(), out=out) if bias is None else torch.addmm(bias, x, weight.t(), out=out)
+
+
+def linear_gelu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    return torch._addmm_activation(bias, x, weight.t(), use_gelu=True)  # on CUDA: tanh's GELU, in the epilogue
+
+
+def linear_geglu(x: Tensor, gate_up: Tensor) -> Tensor:
+    return activations.geglu(F.linear(x, gate_up))
+
+
+def vision_tile(x: Tensor, weight: Tensor) -> Tile | None:
+    return VISION_TILES.get((x.shape[0], weight.shape[0], weight.shape[1]))
+
+
+def tuned_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+    if isinstance(weight, Fp8Matrix):
+        return _fp8(x, weight, "plain" if bias is None else "bias", bias, out)
+    tile = vision_tile(x, weight)
+    if tile is None or bias is None:
+        return linear(x, weight, bias, out)
+    return matmul(x, weight, tile, "bias", bias, out)
+
+
+def tuned_residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, ahead: Tensor | None = None) -> Tensor:
+    """The product, or parts of it that the norms add up."""
+    if isinstance(weight, Fp8Matrix):
+        return _fp8(x, weight, "parts" if bias is None else "partial", bias, ahead=ahead)
+    if bias is None:
+        cut = PARTS.get((-(-x.shape[0] // 64) * 64, weight.shape[0], weight.shape[1]))
+        if isinstance(cut, Tile):
+            return matmul(x, weight, cut, "parts", ahead=ahead)
+        return linear(x, weight) if cut is None else parts_at_once(x, weight, cut)
+    tile = vision_tile(x, weight)
+    if tile is None:
+        return linear(x, weight, bias)
+    return matmul(x, weight, tile, "partial" if tile.splits > 1 else "bias", bias, ahead=ahead)
+
+
+def parts_at_once(x: Tensor, weight: Tensor, count: int) -> Tensor:
+    """[count, tokens, out]: products over `count` parts of the inner axis, as one batch of the library's."""
+    rows, inner = x.shape[0], x.shape[1] // count
+    a = x.view(rows, count, inner).transpose(0, 1)
+    return torch.bmm(a, weight.view(-1, count, inner).permute(1, 2, 0))
+
+
+def tuned_linear_gelu(
+    x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None, ahead: Tensor | None = None
+) -> Tensor:
+    if isinstance(weight, Fp8Matrix):
+        return _fp8(x, weight, "gelu", bias, inverse=inverse, ahead=ahead)
+    tile = vision_tile(x, weight)
+    result = linear_gelu(x, weight, bias) if tile is None else matmul(x, weight, tile, "gelu", bias, ahead=ahead)
+    return as_input(result, inverse)
+
+
+def tuned_linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None) -> Tensor:
+    if isinstance(gate_up, Fp8Matrix):
+        return _fp8(x, gate_up, "geglu", inverse=inverse)
+    tile = _geglu_tile(x.shape[0], gate_up.shape[0] // 2, x.shape[1], x.device)
+    return as_input(linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu"), inverse)
+
+
+def as_input(x: Tensor, inverse: float | None) -> Tensor:
+    """x, rounded to E4M3 in a pass of its own where only the product behind this one is in E4M3."""
+    return x if inverse is None else to_e4m3(x, inverse)
+
+
+def _fp8(
+    x: Tensor,
+    weight: Fp8Matrix,
+    epilogue: Epilogue,
+    bias: Tensor | None = None,
+    out: Tensor | None = None,
+    inverse: float | None = None,
+    ahead: Tensor | None = None,
+) -> Tensor:
+    n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
+    tile = best_tile(x.shape[0], n, weight.shape[1], epilogue, num_sms(x.device))
+    if epilogue in SPLIT and (tile.splits == 1 or tile.gather):
+        epilogue = "bias"
+    return matmul_fp8(x, weight, tile, epilogue, bias, out, inverse, ahead=ahead)
+
+
+@lru_cache
+def num_sms(device: torch.device) -> int:
+    return torch.cuda.get_device_properties(device).multi_processor_count
+
+
+@lru_cache
+def _geglu_tile(rows: int, hidden: int, inner: int, device: torch.device) -> Tile | None:
+    """The first tile to waste least on the matrix's ragged edges and on the last wave of tiles, if that is little."""
+    sms = num_sms(device)
+
+    def fill(tile: Tile) -> float:
+        tiles = -(-rows // tile.rows) * -(-2 * hidden // tile.columns)
+        return rows * 2 * hidden / (-(-tiles // sms) * sms * tile.rows * tile.columns)
+
+    best = max((tile for tile in GEGLU_TILES if tile.takes("geglu", -(-inner // DEPTH))), key=fill)
+    return best if fill(best) > GEGLU_FILL else None

@@ -1,0 +1,79 @@
+// Few tokens: the loop.
+
+__device__ __forceinline__ u32 hidden_bytes(const Block& b) {
+  return b.hn() * 16 * T * (OPERAND / 128) + (IDLE ? S * 4 : 0);
+}
+
+// The warps that multiply.
+__device__ __forceinline__ void consume(Block& b) {
+  const Args& a = b.a;
+  const int prefix = int(*a.length);
+  for (int i = b.thread; i < T * A; i += CONSUMERS) {
+    ((float*)(b.smem + M_XT))[i] = a.noise[i];
+    if (b.cta == 0) a.x_t[i] = a.noise[i];
+  }
+  keep_rope(b, prefix);
+  float4 x[ITEMS_X];
+  const u32 expect_hidden = hidden_bytes(b);
+  begin_trace(b);
+  const Embedding first(b, a.table);
+  consumers_sync();
+  first.multiply(b, x), first.send(b, x);
+#pragma unroll 1
+  for (int step = 0; step < a.steps; ++step) {
+    const float* const table = a.table + size_t(step) * (2 * L + 1) * 3 * D;
+    MARK(MARK_EMBEDDED)
+#pragma unroll 1
+    for (; b.n < u32(step + 1) * L; ++b.n) {
+      const bool last = b.n + 1 == u32(step + 1) * L;
+#pragma unroll 1
+      for (int half = 0; half < 2; ++half) {  // attention, feed-forward
+        b.forget();
+        const u32 bit = flag(b.n), layer = b.n - step * L;
+        float2 gates[ITEMS_X], scales[ITEMS_X];
+        Sent sent = {};
+        if (half) {
+          gate_up(b, of_tiles(b, a.shifted, b.n), of_tiles(b, a.row_scales, layer), sent);
+          MARK(MARK_HIDDEN_SENT)
+          load_norm(b, step, half, gates, scales);
+        } else {
+          float* const kv = suffix_buffer(b);
+          project(b, of_tiles(b, a.shifted, b.n), of_tiles(b, a.row_scales, layer), kv, bit);
+          MARK(MARK_QKV_SENT)
+          attend(b, kv, bit, prefix);
+        }
+        uint4* const buffer = sums_buffer(b, half);
+        auto await = [&] { await_operand(b, half, expect_hidden); };
+        auto then = [&] {
+          if (!half) load_norm(b, step, half, gates, scales);
+        };
+        // one piece of code for both
+        constexpr int EVEN = HIDDEN % 16 == 0 && QT % 16 == 0 ? 16 : HIDDEN % 8 == 0 && QT % 8 == 0 ? 8 : 1;
+        residual_product<EVEN>(b, half ? M_HID : M_ATT, half ? b.hn() : QT, M_H, buffer, bit, await, then, sent);
+        MARK(half ? MARK_DOWN_PUBLISHED : MARK_OUT_PUBLISHED)
+        note(b, half ? WAIT_X1 : WAIT_X2);
+        gather(b, x, buffer, bit, gates, scales, !half || !last, half, half && last);
+        MARK(half ? MARK_SLICE_AFTER_FEED_FORWARD : MARK_SLICE_AFTER_ATTENTION)
+      }
+    }
+    advance(b, x, step + 1 < a.steps ? table + (2 * L + 1) * 3 * D : table, step);
+  }
+  note(b, FINISHED);
+  end_trace(b);
+}
+
+// The last of the spare warps.
+__device__ __forceinline__ void help(const Block& b) {
+  float c[4] = {0, 0, 0, 0};
+  const u32 zero = b.a.zero;
+#pragma unroll 1
+  while (*(volatile u32*)(b.smem + M_PROGRESS) >> 20 != FINISHED) {
+#pragma unroll
+    for (int i = 0; i < 8; ++i) stay_awake(c, zero);  // to look seldom: who looks takes time from others
+  }
+  pretend_to_need(b, c);
+}
+
+__device__ __forceinline__ u32 arrivals(const Block&, int) { return 1; }
+__device__ __forceinline__ void init_own_barriers(const Block&) {}
+__device__ __forceinline__ void expect_own(const Block&) {}
