@@ -81,8 +81,8 @@ def test_kernels_comments_do_not_count_and_their_strings_do(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "file",
     [
-        *("kernels/norms.py", "kernels/sm90/instructions.cu", "kernels/sm90/denoise/kernel.py"),
-        *("kernels/sm90/denoise/loop.cu", "kernels/sm90/gemm/fp8.py", "kernels/sm90/gemm/kernel.cu"),
+        *("kernels/portable/norms.py", "kernels/sm90/instructions.cu", "kernels/sm90/denoise/kernel.py"),
+        *("kernels/sm90/denoise/few/loop.cu", "kernels/sm90/gemm/fp8.py", "kernels/sm90/gemm/kernel.cu"),
         *("backends/fused.py", "backends/cuda_graph.py", "engine/call.py", "model/reference.py"),
     ],
 )

@@ -8,8 +8,9 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.kernels import norms, plain
-from turbopi.kernels import ops as fused
+from turbopi.kernels import plain
+from turbopi.kernels.ops import fused_ops
+from turbopi.kernels.portable import norms
 from turbopi.kernels.quantize import quantize
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Folded, Sums, Tile, clusters, matmul
@@ -287,7 +288,7 @@ def test_a_norm_of_a_copy_errs_no_more_than_one_before_the_product(
 @pytest.mark.parametrize("fp8", ["", "fc1", "fc1 fc2", "qkv", "qkv out", "qkv out fc1 fc2", "fc1 fc2 projector"])
 def test_two_layers_and_the_projector_in_fused_operations(fp8: str, rows: int) -> None:
     """What the second layer gets from the first; the float32 twin has the same E4M3 matrices, but exact inputs."""
-    ops, depth = fused.fused_ops(DEVICE), 2
+    ops, depth = fused_ops(DEVICE), 2
     sizes = {"qkv": (3 * WIDTH, WIDTH), "out": (WIDTH, WIDTH), "fc1": (HIDDEN, WIDTH), "fc2": (WIDTH, HIDDEN)}
     sizes["projector"] = (2048, WIDTH)
     makers = [
@@ -339,7 +340,7 @@ def test_two_layers_and_the_projector_in_fused_operations(fp8: str, rows: int) -
 @pytest.mark.parametrize("fp8", ["", "fc2", "fc1 fc2"])
 def test_layers_of_the_vision_tower_in_fused_operations(fp8: str, rows: int) -> None:
     """What the operations hand over to each other, in any mixture; twice, as weights are folded the first time."""
-    ops = fused.fused_ops(DEVICE)
+    ops = fused_ops(DEVICE)
     scales, shifts = [random(WIDTH) for _ in range(4)], [random(WIDTH) for _ in range(4)]
     sizes = {"out": (WIDTH, WIDTH), "fc1": (HIDDEN, WIDTH), "fc2": (WIDTH, HIDDEN), "qkv": (3 * WIDTH, WIDTH)}
     weights = {name: random(*size) / size[1] ** 0.5 for name, size in sizes.items()}
@@ -376,7 +377,7 @@ def test_layers_of_the_vision_tower_in_fused_operations(fp8: str, rows: int) -> 
 @pytest.mark.parametrize("keys", [64, 128])
 def test_keys_loaded_together_are_the_same_keys(images: int, tokens: int, dim: int, keys: int) -> None:
     qkv = random(images * tokens, 3 * 4 * dim)
-    alone, pair = (attention_hopper.Tile(dim, keys, sharing=sharing) for sharing in (1, 2))
+    alone, pair = (attention_hopper.AttentionTile(dim, keys, sharing=sharing) for sharing in (1, 2))
     expected = attention_hopper.vision_attention(qkv, images, 4, tile=alone)
     for _ in range(5):
         assert torch.equal(attention_hopper.vision_attention(qkv, images, 4, tile=pair), expected)

@@ -15,11 +15,8 @@ from torch import Tensor
 ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.kernels import (  # noqa: E402
-    attention,
-    norms,
-    plain,
-)
+from turbopi.kernels import plain  # noqa: E402
+from turbopi.kernels.portable import attention, norms  # noqa: E402
 from turbopi.kernels.quantize import quantize  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8  # noqa: E402

@@ -14,15 +14,10 @@ from torch import Tensor
 ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
-from turbopi.kernels import (  # noqa: E402
-    activations,
-    attention,
-    embedding,
-    norms,
-    plain,
-    rope,
-)
-from turbopi.kernels import ops as fused  # noqa: E402
+from turbopi.kernels import plain  # noqa: E402
+from turbopi.kernels.portable import activations, attention, embedding, norms, rope  # noqa: E402
+from turbopi.kernels.portable import products as portable_products  # noqa: E402
+from turbopi.kernels.portable.ops import EmbedPatches  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
 from turbopi.kernels.sm90.gemm import products  # noqa: E402
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402
@@ -192,7 +187,7 @@ def test_vision_attention_on_hopper(
     qkv = random(images * tokens, 3 * heads * head_dim)
     qkv[:, ::17] *= 8
     poison_allocator()
-    tile = attention_hopper.Tile(head_dim, keys, warpgroups) if keys else None
+    tile = attention_hopper.AttentionTile(head_dim, keys, warpgroups) if keys else None
     ours = attention_hopper.vision_attention(qkv, images, heads, tile=tile)
     assert_as_good(ours, plain.vision_attention(qkv, images, heads), plain.vision_attention(qkv.float(), images, heads))
 
@@ -205,7 +200,7 @@ def test_vision_attention_on_hopper(
 )
 def test_prefix_attention_on_hopper(heads: int, head_dim: int, slots: int, length: int, warpgroups: int) -> None:
     inputs, twin, exact = prefix_problem(heads, head_dim, slots, length)
-    tile = attention_hopper.Tile(head_dim, 64, warpgroups) if warpgroups else None
+    tile = attention_hopper.AttentionTile(head_dim, 64, warpgroups) if warpgroups else None
     first = attention_hopper.prefix_attention(*inputs, heads, tile=tile)
     assert_as_good(first, twin, exact)
     for _ in range(5):
@@ -261,7 +256,7 @@ def test_embed_patches_loses_nothing_of_float32(images: int, dtype: torch.dtype)
     pictures = torch.randint(0, 256, (images, 224, 224, 3), generator=g).to(DEVICE, torch.uint8)
     given = pictures if dtype == torch.uint8 else pictures.float() / 255 * 2 - 1
     weight, position = random(1152, 588, dtype=torch.float32), random(256, 1152, dtype=torch.float32)
-    ours = fused.EmbedPatches()(given, weight, position, torch.float32)
+    ours = EmbedPatches()(given, weight, position, torch.float32)
     normalised = pictures.double() / 255 * 2 - 1
     exact = plain.embed_patches(normalised, weight.double(), position.double(), torch.float64)
     assert (ours - exact).square().mean().sqrt() < 1e-5 * exact.square().mean().sqrt()
@@ -417,4 +412,4 @@ def test_matmul_waits_for_the_kernel_before_it() -> None:
 def test_linear_gelu_is_tanhs(m: int, n: int, k: int) -> None:
     x, weight, bias = random(m, k, outliers=True), random(n, k), random(n)
     exact = plain.gelu(plain.linear(x.float(), weight.float(), bias.float()))
-    assert_as_good(products.linear_gelu(x, weight, bias), plain.gelu(plain.linear(x, weight, bias)), exact)
+    assert_as_good(portable_products.linear_gelu(x, weight, bias), plain.gelu(plain.linear(x, weight, bias)), exact)

@@ -20,7 +20,7 @@ from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise.packing import RANKS, PackedExpert, Tables
 from turbopi.kernels.sm90.gemm import bf16 as gemm
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8
-from turbopi.kernels.sm90.gemm import products, vision_tower
+from turbopi.kernels.sm90.gemm import products, vision_products
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
 from turbopi.quantization.fp8 import E4M3, Fp8Matrix
 
@@ -37,8 +37,8 @@ def chosen() -> Iterator[tuple[Tile, int, int, int, Epilogue, bool]]:
     tables: list[tuple[Mapping[tuple[int, int, int], Any], bool]] = [
         (products.VISION_TILES, False),
         (products.PARTS, False),
-        (vision_tower.RESIDUAL_TILES, False),
-        (vision_tower.RESIDUAL_TILES_FP8, True),
+        (vision_products.RESIDUAL_TILES, False),
+        (vision_products.RESIDUAL_TILES_FP8, True),
         (gemm_fp8.MEASURED, True),
     ]
     for table, fp8 in tables:
@@ -172,9 +172,9 @@ def test_what_is_fetched_ahead_is_shared_out_and_never_reaches_beyond_the_matrix
 def test_visions_attention_has_a_block_for_each_64_queries_of_a_head_of_a_picture(
     images: int, tokens: int, heads: int, dim: int, maps: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kernel, tiles = Launched(1), list[attention_hopper.Tile]()
+    kernel, tiles = Launched(1), list[attention_hopper.AttentionTile]()
 
-    def compiled(tile: attention_hopper.Tile, *rest: Any) -> Launched:
+    def compiled(tile: attention_hopper.AttentionTile, *rest: Any) -> Launched:
         tiles.append(tile)
         return kernel
 

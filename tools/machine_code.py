@@ -47,7 +47,7 @@ def _product_fp8(tile: Tile, epilogue: Epilogue, inner: int, copied: int, out_fp
     return nvrtc.compile_cubin(bf16.source(tile.columns, takes, fp8=True), ARCH, sizes, folder=folder)
 
 
-def _attention(tile: attention.Tile, whole: bool, folder: Path | None) -> bytes:
+def _attention(tile: attention.AttentionTile, whole: bool, folder: Path | None) -> bytes:
     return nvrtc.compile_cubin(attention.source(tile), ARCH, attention.constants(tile, False, whole), folder=folder)
 
 
@@ -64,8 +64,8 @@ SHAPES: dict[str, Callable[[Path | None], bytes]] = {
     "prefix's GeGLU, bf16": partial(_product, Tile(3, 128, 1, 2, overlap=True), "geglu", False),
     "prefix's GeGLU, fp8": partial(_product_fp8, Tile(3, 128, cluster_n=2, overlap=True), "geglu", 2048, 0, True),
     "product that leaves a copy, fp8": partial(_product_fp8, Tile(1, 80, cluster_m=2), "bias", 1152, 15, False),
-    "vision's attention": partial(_attention, attention.Tile(72, 128, sharing=2), True),
-    "prefix's attention": partial(_attention, attention.Tile(256, 64), False),
+    "vision's attention": partial(_attention, attention.AttentionTile(72, 128, sharing=2), True),
+    "prefix's attention": partial(_attention, attention.AttentionTile(256, 64), False),
 }
 
 

@@ -9,9 +9,9 @@ from functools import cache
 
 import torch
 from torch import Tensor
+from turbopi.kernels.attention import LOG2_E
 
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
-from turbopi.kernels.attention import LOG2_E
 from turbopi.kernels.launch import result_dtype
 from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.sm90 import instructions

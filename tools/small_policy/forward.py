@@ -19,12 +19,12 @@ from turbopi.model.gemma import Layer
 from turbopi.model.layers import gated_residual, rope_tables
 from turbopi.model.prefix import embed_prompt
 from turbopi.model.reference import Pi0Model
-from turbopi.model.vision import Block
+from turbopi.model.vision import EncoderLayer
 
 Rope = tuple[Tensor, Tensor]
 
 
-def vision_block(block: Block, x: Tensor) -> Tensor:
+def vision_block(block: EncoderLayer, x: Tensor) -> Tensor:
     return block(x)
 
 

@@ -1,6 +1,5 @@
 """One benchmark run: floors, then every backend on every job, then the errors, as one plain document."""
 
-import gc
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -18,6 +17,7 @@ from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.summary import linear_models
 from turbopi.bench.work import Job, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
+from turbopi.engine.graph import collect_and_empty_cache
 from turbopi.errors import ConfigError, TurboPiError
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
@@ -121,7 +121,7 @@ def run(
     plan.check(device)
     progress.doing("measuring this machine's floors")
     floors = {precision: measure_floors(device, precision) for precision in plan.precisions}
-    _free(device)
+    collect_and_empty_cache()
     before = provenance(device)
     results: list[dict[str, Any]] = []
     answered: list[Answered] = []
@@ -151,7 +151,7 @@ def run(
         except TurboPiError as error:
             failed.append({"backend": backend, "precision": precision, "error": str(error)})
             last = error
-        _free(device)
+        collect_and_empty_cache()
     if not results:
         raise last
     if answered:
@@ -216,7 +216,7 @@ def _measure(
         keep(results)
     results[-1]["backend_details"] = policy.metadata["backend_details"]
     del policy, shaped
-    _free(device)
+    collect_and_empty_cache()
     return results
 
 
@@ -229,7 +229,7 @@ def _judge(checkpoint: Checkpoint, plan: BenchPlan, device: torch.device, answer
             exact[job] = answers(at_horizon(oracle, job.horizon), job)
         result["error_against_f32"] = error_against(actions, exact[job])
     del oracle
-    _free(device)
+    collect_and_empty_cache()
 
 
 def _profile(
@@ -246,7 +246,7 @@ def _profile(
     policy = _policy(checkpoint, plan, backend, precision, device)
     stages = stage_kernels(policy, plan.main)
     del policy
-    _free(device)
+    collect_and_empty_cache()
     return {"backend": backend, "precision": precision, "job": asdict(plan.main), "stages": stages}
 
 
@@ -288,9 +288,3 @@ def _memory(device: torch.device, before: int) -> dict[str, int]:
     if device.type != "cuda":
         return host
     return {"device_reserved": torch.cuda.max_memory_reserved(device) - before, **host}
-
-
-def _free(device: torch.device) -> None:
-    gc.collect()
-    if device.type == "cuda":
-        torch.cuda.empty_cache()

@@ -4,7 +4,6 @@ bfloat16, and a report on observations that had no say in any of it.
 Everything is measured with the emulated reference (emulate.py) against the float32 one, so it needs no FP8 hardware.
 """
 
-import gc
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +22,7 @@ from turbopi.calibrate.product_errors import product_errors
 from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
+from turbopi.engine.graph import collect_and_empty_cache
 from turbopi.errors import CheckpointError
 from turbopi.examples import NoisyExample, with_noises
 from turbopi.model.reference import Pi0Model, parameter_dtype
@@ -112,7 +112,7 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
         "hashing the weights": round(time.perf_counter() - finished, 2),
     }
     del model, policy
-    _free(arguments["device"])
+    collect_and_empty_cache()
     return Quantization(fingerprint, shapes_of(config), result.sites, report)
 
 
@@ -395,9 +395,3 @@ def _version() -> str:
         return metadata.version("turbopi")
     except metadata.PackageNotFoundError:
         return "not installed"
-
-
-def _free(device: torch.device) -> None:
-    gc.collect()
-    if device.type == "cuda":
-        torch.cuda.empty_cache()

@@ -62,6 +62,12 @@ def empty_cache() -> None:
             torch.cuda.empty_cache()
 
 
+def collect_and_empty_cache() -> None:
+    """The same, of what only circles of references still hold, too."""
+    gc.collect()
+    empty_cache()
+
+
 class Graph:
     """A sequence of kernels captured once, with timing events at its start and at every mark.
 

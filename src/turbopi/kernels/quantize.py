@@ -25,7 +25,7 @@ def round_rows(weight: Tensor, inverse: Tensor, directions: Directions | None = 
         return to_e4m3(weight, inverse[:, None])
     feeding = feedback(directions.to(weight.device))
     if weight.is_cuda and importlib.util.find_spec("triton") is not None:
-        from turbopi.kernels.rounding import round_with_feedback  # Triton isn't imported elsewhere
+        from turbopi.kernels.portable.rounding import round_with_feedback  # Triton isn't imported elsewhere
 
         return round_with_feedback(weight, inverse, *feeding)
     return round_with_feedback_plain(weight, inverse, *feeding)

@@ -32,7 +32,7 @@ class MLP(nn.Module):
         return self.fc2(F.gelu(self.fc1(x), approximate="tanh"))
 
 
-class Block(nn.Module):
+class EncoderLayer(nn.Module):
     def __init__(self, config: VisionConfig) -> None:
         super().__init__()
         # eps is 1e-6: PyTorch's default of 1e-5 moves the actions by 2e-5
@@ -54,7 +54,7 @@ class VisionTower(nn.Module):
         self.config = config
         self.patch_embedding = nn.Conv2d(3, config.width, config.patch_size, config.patch_size)
         self.position_embedding = nn.Embedding(config.num_tokens, config.width)
-        self.layers = nn.ModuleList(Block(config) for _ in range(config.depth))
+        self.layers = nn.ModuleList(EncoderLayer(config) for _ in range(config.depth))
         self.post_layernorm = nn.LayerNorm(config.width, eps=config.layer_norm_eps)
 
     def forward(self, images: Tensor) -> Tensor:

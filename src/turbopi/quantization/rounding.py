@@ -36,7 +36,7 @@ def feedback(directions: Directions) -> tuple[Tensor, Tensor, Tensor]:
 def round_with_feedback_plain(
     weight: Tensor, inverse: Tensor, order: Tensor, errors: Tensor, answers: Tensor
 ) -> Tensor:
-    """A column at a time: what `kernels.rounding.round_with_feedback` does."""
+    """A column at a time: what `kernels.portable.rounding.round_with_feedback` does."""
     scale = 1 / inverse
     rounded = columns_with_feedback(
         weight, order, errors, answers, lambda wanted, _: to_e4m3(wanted, inverse).float() * scale

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
-from turbopi.kernels.attention import LOG2_E
 from turbopi.kernels.launch import result_dtype
 from turbopi.kernels.nvrtc import compile_cubin
+from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
 
@@ -30,7 +30,7 @@ PARAMETERS = Parameters(
 
 
 @dataclass(frozen=True)
-class Tile:
+class AttentionTile:
     """How attention is cut: 64 query rows a CTA, `keys` keys at a time for each of one or two warpgroups."""
 
     dim: int  # columns of a head
@@ -55,7 +55,13 @@ def takes(dim: int) -> bool:
 
 
 def prefix_attention(
-    q: Tensor, k: Tensor, v: Tensor, length: Tensor, heads: int, inverse: float | None = None, tile: Tile | None = None
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    length: Tensor,
+    heads: int,
+    inverse: float | None = None,
+    tile: AttentionTile | None = None,
 ) -> Tensor:
     """Rows q [tokens * n, K] over the first `length` (int64[1], on the device, at least 1) keys -> [tokens, n * K].
 
@@ -64,14 +70,14 @@ def prefix_attention(
     """
     assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
     rows, dim = q.shape
-    tile = tile or Tile(dim, keys=64)
+    tile = tile or AttentionTile(dim, keys=64)
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
     _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, length, rows, k.shape[0], 1, inverse)
     return out
 
 
 def vision_attention(
-    qkv: Tensor, images: int, heads: int, inverse: float | None = None, tile: Tile | None = None
+    qkv: Tensor, images: int, heads: int, inverse: float | None = None, tile: AttentionTile | None = None
 ) -> Tensor:
     """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
 
@@ -86,14 +92,14 @@ def vision_attention(
     return out
 
 
-def _vision_tile(tokens: int, dim: int) -> Tile:
-    tile = Tile(dim, keys=128 if dim <= 128 else 64)
+def _vision_tile(tokens: int, dim: int) -> AttentionTile:
+    tile = AttentionTile(dim, keys=128 if dim <= 128 else 64)
     pair = replace(tile, sharing=2)
     return pair if -(-tokens // 64) % 2 == 0 and pair.holds(tokens) else tile
 
 
 def _launch(
-    tile: Tile,
+    tile: AttentionTile,
     matrices: tuple[Tensor, ...],
     heads: tuple[int, ...],
     first: tuple[int, ...],
@@ -139,7 +145,7 @@ def _launch(
     kernel.launch_dependent(tiles * groups, given)
 
 
-def constants(tile: Tile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
+def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
     """What kernel.cu is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
     return {
         "TP_DIM": tile.dim,
@@ -152,7 +158,7 @@ def constants(tile: Tile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
     }
 
 
-def source(tile: Tile) -> str:
+def source(tile: AttentionTile) -> str:
     """kernel.cu with the instructions for a tile."""
     logits = instructions.wgmma("mma_logits", tile.keys)
     values = instructions.wgmma("mma_values", tile.dim, from_registers=True, across=True)
@@ -161,7 +167,7 @@ def source(tile: Tile) -> str:
 
 
 @cache
-def _kernel(tile: Tile, out_fp8: bool, whole: bool, device: torch.device) -> DependentKernel:
+def _kernel(tile: AttentionTile, out_fp8: bool, whole: bool, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8, whole))
         threads = 128 * (tile.warpgroups + 1)

@@ -1,7 +1,7 @@
 // Attention with each warp's products its own: of few tokens, and of many behind many keys. The keys are split over the
 // ranks of the head's cluster.
 
-__device__ __forceinline__ void attend_by_warps(Block& b, const float* kv, u32 bit, const Keys& keys) {
+__device__ __forceinline__ void attend_by_warps(Cta& b, const float* kv, u32 bit, const Keys& keys) {
   const int tiles = keys.tiles, prefix = keys.keys, slots = keys.slots, suffix0 = keys.suffix0, suffix = keys.suffix;
   const bool scorer = b.warp() < SCORERS, for_suffix = b.warp() >= SUFFIX_WARP;
   const int column = (b.warp() - (W - WEIGHERS)) * CT;  // this warp's first tile of them

@@ -1,7 +1,7 @@
 // The end of attention: what the ranks' keys gave comes together.
 
 // Ranks' outputs of this one's columns, by their largest logits, which come first; then attention to all ranks.
-__device__ __forceinline__ void combine(Block& b) {
+__device__ __forceinline__ void combine(Cta& b) {
   b.forget();
   static_assert(QTL * NT <= W, "a warp for 8 tokens of a tile");
   const int qn = b.qn(), tile = b.warp() % imax(qn, 1), n = b.warp() / imax(qn, 1), token = n * 8 + 2 * b.t();
@@ -49,7 +49,7 @@ __device__ __forceinline__ void combine(Block& b) {
 }
 
 // Attention of this cluster's head, sent to all ranks. Everything local lies in region X.
-__device__ __forceinline__ void attend(Block& b, const float* kv, u32 bit, int prefix) {
+__device__ __forceinline__ void attend(Cta& b, const float* kv, u32 bit, int prefix) {
   b.forget();
   asm volatile("" : "+r"(prefix));
   const Keys keys(b, prefix);

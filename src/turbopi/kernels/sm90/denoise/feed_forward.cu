@@ -15,7 +15,7 @@ constexpr int GROUPS_GU = plan_groups(GTL);
 // Shift and scale of a lane's rows of gate|up; a tile has 8 units' gate rows, then their up rows.
 struct GateUpRows {
   float2 shift[GROUPS_GU], scale[GROUPS_GU];
-  __device__ __forceinline__ GateUpRows(const Own<GTL>& own, const Block& b, const float* shifted, const float* row_scales) {
+  __device__ __forceinline__ GateUpRows(const Own<GTL>& own, const Cta& b, const float* shifted, const float* row_scales) {
 #pragma unroll
     for (int i = 0; i < GROUPS_GU; ++i) {
       const int row = (QTL + KVL + min(own.tile[i], GTL - 1)) * 16 + b.g();
@@ -25,19 +25,19 @@ struct GateUpRows {
   }
 };
 // Where the hidden units of token `token` of 8 tokens n begin, of gate|up tile `tile`, at any rank.
-__device__ __forceinline__ u32 units_place(const Block& b, int tile, int n, int token) {
+__device__ __forceinline__ u32 units_place(const Cta& b, int tile, int n, int token) {
   const int at = b.g0() + tile;
   return b.base + M_HID + ((at >> 1) * NT + n) * OPERAND + (at & 1) * (FP8 ? 8 : 128) + token * 16;
 }
 // Two units of token 2 t + g % 2, of a lane's sums for two tokens.
-__device__ __forceinline__ u32 two_units(const Block& b, float4 c, float2 r, float2 shift) {
+__device__ __forceinline__ u32 two_units(const Cta& b, float4 c, float2 r, float2 shift) {
   const float h0 = gelu(c.x * r.x + shift.x) * (c.z * r.x + shift.y),
               h1 = gelu(c.y * r.y + shift.x) * (c.w * r.y + shift.y);
   const float got = exchange(b.g() & 1 ? h0 : h1, 4);
   return b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got);
 }
 // Of four lanes' two units all 8, which each of them gets. E4M3: the first two words.
-__device__ __forceinline__ uint4 eight_units(const Block& b, u32 two) {
+__device__ __forceinline__ uint4 eight_units(const Cta& b, u32 two) {
   const u32 next = exchange(two, 8);
   const u32 lo = b.g() & 2 ? next : two, hi = b.g() & 2 ? two : next;
   if constexpr (FP8) {
@@ -50,7 +50,7 @@ __device__ __forceinline__ uint4 eight_units(const Block& b, u32 two) {
 // Four lanes have the same units: they share the ranks to which those go.
 constexpr int QUARTER = most(S, 4);
 static_assert(S % 4 == 0, "four lanes share the ranks");
-__device__ __forceinline__ int receiver(const Block& b, int d) { return (b.g() >> 1) * QUARTER + d; }
+__device__ __forceinline__ int receiver(const Cta& b, int d) { return (b.g() >> 1) * QUARTER + d; }
 __device__ __forceinline__ void send_units(const u32 (&data)[QUARTER], uint4 units, const u32 (&bars)[QUARTER]) {
 #pragma unroll
   for (int d = 0; d < QUARTER; ++d)
@@ -60,7 +60,7 @@ __device__ __forceinline__ void send_units(const u32 (&data)[QUARTER], uint4 uni
       send(data[d], units, bars[d]);
 }
 // In small models: a rank without hidden units has nothing to send.
-__device__ __forceinline__ void send_no_units(const Block& b) {
+__device__ __forceinline__ void send_no_units(const Cta& b) {
   inverse_rms(b, 0, 1), consumers_sync();  // no warp may be left behind by a whole use of a barrier
   if (b.thread < S) send(at_rank(b.base + M_TOKEN, b.thread), 0, at_rank(b.bar(BAR_HID), b.thread));
 }

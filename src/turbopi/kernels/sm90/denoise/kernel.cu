@@ -3,7 +3,7 @@
 extern "C" __global__ void __launch_bounds__(THREADS, 1) __cluster_dims__(S, 1, 1)
     turbopi_denoise(const __grid_constant__ Args args) {
   extern __shared__ __align__(128) byte smem[];
-  Block b(args, smem);
+  Cta b(args, smem);
   if (threadIdx.x == 0) {
     note(b, WAIT_NONE);
     for (u32 i = 0; i < STAGES; ++i) barrier_init(b.full(i), 1), barrier_init(b.empty(i), W);

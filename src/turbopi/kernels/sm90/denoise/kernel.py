@@ -33,7 +33,7 @@ from turbopi.kernels.sm90.denoise.small import affine, inverse_frequencies
 
 FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
 PARTS = (  # of the kernel, in their order; {form}: "few" or "many" tokens
-    *("sizes", "{form}/memory", "block", "primitives", "wgmma", "producer", "product"),
+    *("sizes", "{form}/memory", "cta", "primitives", "wgmma", "producer", "product"),
     *("stream", "{form}/stream", "residual", "project", "{form}/project", "feed_forward", "{form}/feed_forward"),
     *("score", "attention", "{form}/attention", "combine", "step", "{form}/step"),
     *("layer", "watch", "{form}/loop", "kernel"),

@@ -1,21 +1,21 @@
 // Half a layer, attention (half 0) or feed-forward (half 1): where its weights' tables and sums lie.
 
 // A CTA's rows of all tiles.
-__device__ __forceinline__ const float* of_tiles(const Block& b, const float* all, u32 layer) {
+__device__ __forceinline__ const float* of_tiles(const Cta& b, const float* all, u32 layer) {
   return all + (settled(layer) * (NC * S) + b.cta) * (TILES * 16);
 }
 // The gates of this half, and the scales of the next norm: the final one behind the last layer.
-__device__ __forceinline__ void load_norm(const Block& b, int step, int half, float2 (&gates)[ITEMS_X], float2 (&scales)[ITEMS_X]) {
+__device__ __forceinline__ void load_norm(const Cta& b, int step, int half, float2 (&gates)[ITEMS_X], float2 (&scales)[ITEMS_X]) {
   const float* const table = b.a.table + (2 * settled(b.n) + step) * (3 * D);
   load_columns(b, gates, table + (half ? 5 : 2) * D);
   load_columns(b, scales, table + (half ? 6 : 3) * D);
 }
-__device__ __forceinline__ uint4* sums_buffer(const Block& b, int half) {
+__device__ __forceinline__ uint4* sums_buffer(const Cta& b, int half) {
   return b.a.scratch + (half ? B_X1 : B_X2) + (settled(b.n) & 1) * N_STREAM;
 }
-__device__ __forceinline__ float* suffix_buffer(const Block& b) { return (float*)(b.a.scratch + B_KV + (b.n & 1) * N_KV); }
+__device__ __forceinline__ float* suffix_buffer(const Cta& b) { return (float*)(b.a.scratch + B_KV + (b.n & 1) * N_KV); }
 // Until what goes back into the stream is here: attention or hidden units.
-__device__ __forceinline__ void await_operand(const Block& b, int half, u32 expect_hidden) {
+__device__ __forceinline__ void await_operand(const Cta& b, int half, u32 expect_hidden) {
   if (half) {
     receive(b, BAR_HID, b.n, expect_hidden, WAIT_HID);
     MARK(MARK_HIDDEN_HERE)
@@ -26,13 +26,13 @@ __device__ __forceinline__ void await_operand(const Block& b, int half, u32 expe
 }
 constexpr int HIDDEN = F16 % NC == 0 ? HC : 1;  // blocks of the hidden units are a multiple of it
 
-__device__ __forceinline__ void begin_trace(const Block& b) {
+__device__ __forceinline__ void begin_trace(const Cta& b) {
 #ifdef TP_TRACED_WARP
   if (threadIdx.x < 32) ((u32*)(b.smem + M_BAR + 256))[threadIdx.x] = threadIdx.x ? 0 : u32(clock64());
   consumers_sync();
 #endif
 }
-__device__ __forceinline__ void end_trace(const Block& b) {
+__device__ __forceinline__ void end_trace(const Cta& b) {
 #ifdef TP_TRACED_WARP
   consumers_sync();
   if (threadIdx.x < 32) b.a.trace[blockIdx.x * 64 + threadIdx.x] = ((u32*)(b.smem + M_BAR + 256))[threadIdx.x];

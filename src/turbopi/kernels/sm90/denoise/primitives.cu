@@ -6,7 +6,7 @@
 // word in shared memory, and if that stays the same for seconds the kernel says where (in memory of the host, which
 // outlives the trap; [NC * S] words: 1 << 31 | what << 20 | layer) and traps.
 // `What` they wait for is generated: WAITS of kernel.py.
-__device__ __forceinline__ void note(const Block& b, int what) {
+__device__ __forceinline__ void note(const Cta& b, int what) {
   if (b.thread == 0) *(volatile u32*)(b.smem + M_PROGRESS) = u32(what) << 20 | u32(b.n);
 }
 __device__ __forceinline__ void pause(u32 since, u32 cycles) {
@@ -15,7 +15,7 @@ __device__ __forceinline__ void pause(u32 since, u32 cycles) {
 }
 __device__ __forceinline__ void prefetch_line(const float* at) { asm volatile("prefetch.global.L2 [%0];" ::"l"(at)); }
 // All threads wait for use n of an exchange in the cluster; one of them arms the barrier for the next.
-__device__ __forceinline__ void receive(const Block& b, int bar, int n, u32 bytes, int what) {
+__device__ __forceinline__ void receive(const Cta& b, int bar, int n, u32 bytes, int what) {
   note(b, what);
   barrier_wait(b.bar(bar), n & 1);
   __syncwarp();
@@ -92,7 +92,7 @@ __device__ __forceinline__ void load_for_all(u32 to, const void* from, u32 bytes
       : "memory");
 }
 // From one place in shared memory to one of all ranks, by way of `there` in L2.
-__device__ __forceinline__ void copy_to_all(const Block& b, u32 from, byte* there, u32 to, u32 bytes, int bar) {
+__device__ __forceinline__ void copy_to_all(const Cta& b, u32 from, byte* there, u32 to, u32 bytes, int bar) {
   bulk_store(there, b.base + from, bytes);
   await_stored();
   load_for_all(b.base + to, there, bytes, b.bar(bar));

@@ -7,12 +7,12 @@ struct Producer {
   // CTAs tell each other is late: so loads are some cycles apart, and those of gate|up wait for the keys' scores.
   static constexpr u32 PACE = MANY ? 0 : FP8 ? 450 : 750;
   static constexpr bool AHEAD = plan_slots(GTL, D16) > STAGES;  // some of gate|up finds no slot before it begins
-  Block& b;
+  Cta& b;
   uint2* list;  // of slots: where from, bytes; an odd number of bytes: of keys or values, else of weights
   int slots = 0;
   u32 at = 0;
 
-  __device__ explicit Producer(Block& block) : b(block), list((uint2*)(block.smem + M_LIST)) {}
+  __device__ explicit Producer(Cta& block) : b(block), list((uint2*)(block.smem + M_LIST)) {}
   __device__ __forceinline__ void add(u32 from, u32 bytes, bool keys) {
     list[slots++] = make_uint2(from, bytes | keys);
   }

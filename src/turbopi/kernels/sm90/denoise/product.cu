@@ -1,6 +1,6 @@
 // Matrix products.
 
-__device__ __forceinline__ u32 take_slot(Block& b) {
+__device__ __forceinline__ u32 take_slot(Cta& b) {
   const u32 slot = b.slot;
   barrier_wait(b.full(slot), b.phase);
   __syncwarp();
@@ -9,7 +9,7 @@ __device__ __forceinline__ u32 take_slot(Block& b) {
 }
 // Give a slot back. Not before the loads from it have arrived: the copy engine isn't ordered behind loads that are
 // still on their way (seen as wrong sums). Hence an address that needs what they brought.
-__device__ __forceinline__ void give_slot(const Block& b, u32 slot, u32 seen = 0, u32 warps = 1) {
+__device__ __forceinline__ void give_slot(const Cta& b, u32 slot, u32 seen = 0, u32 warps = 1) {
   __syncwarp();
   if (b.lane() == 0)  // for so many warps
     asm volatile("mbarrier.arrive.shared::cta.b64 _, [%0], %1;" ::"r"(b.empty(slot) + (seen & b.a.zero)), "r"(warps)
@@ -17,7 +17,7 @@ __device__ __forceinline__ void give_slot(const Block& b, u32 slot, u32 seen = 0
 }
 
 // The same without a branch, which would make products wait for each other, for what products alone have read.
-__device__ __forceinline__ void give_slot_if(const Block& b, u32 slot, bool really) {
+__device__ __forceinline__ void give_slot_if(const Cta& b, u32 slot, bool really) {
   asm volatile("{.reg .pred p; setp.ne.u32 p, %1, 0; @p mbarrier.arrive.shared::cta.b64 _, [%0];}" ::"r"(b.empty(slot)),
                "r"(u32(really && b.lane() == 0))
                : "memory");
@@ -29,14 +29,14 @@ __device__ __forceinline__ u32 fold(uint4 v) { return v.x; }
 // A warp's share of a group whose reduction has so many parts: its tile, the first of its warpgroup, its part.
 struct Share {
   int part, first, tile;
-  __device__ __forceinline__ Share(const Block& b, int parts) {
+  __device__ __forceinline__ Share(const Cta& b, int parts) {
     const int group = b.warp() >> 2, rows = W / 4 / parts;
     part = group / rows, first = group % rows * 4, tile = first + (b.warp() & 3);
   }
 };
 
 // A lane's share of a fragment of weights, as operand A.
-__device__ __forceinline__ uint4 load_weights(const Block& b, u32 at) {
+__device__ __forceinline__ uint4 load_weights(const Cta& b, u32 at) {
   uint4 v;  // ldmatrix's second quarter of lanes fetches rows g + 8, which lie behind the other columns of rows g
   ldmatrix(v, b.base + at + b.lane() % 8 * 16 + b.lane() / 8 % 2 * 256 + b.lane() / 16 * 128);
   return v;
@@ -47,7 +47,7 @@ template <int TILES_, int ROUNDS>
 struct Ahead {
   uint4 weights[imax(ROUNDS * ROUND_FRAGMENTS, 1)];
 
-  __device__ __forceinline__ explicit Ahead(Block& b) {
+  __device__ __forceinline__ explicit Ahead(Cta& b) {
     constexpr int PARTS = group_parts(TILES_);
     const Share my(b, PARTS);
 #pragma unroll
@@ -72,13 +72,13 @@ struct GroupProduct {
   static constexpr bool EXACT = EVEN % (KB * filled(TILES_)) == 0;
   static constexpr bool SOME_REST = TILES_ <= 4 && PARTS == 2;  // warpgroups that have no tile
   static constexpr int UNROLL = EXACT && MANY ? 16 : 1;  // where the number of rounds is known
-  Block& b;
+  Cta& b;
   const Share my;
   const int blocks, tiles, rounds, rounds_of_slot;
   const u32 first;  // this part's first activations, as an operand's place
   float (&sums)[NT * 4];
 
-  __device__ __forceinline__ GroupProduct(Block& block, int x, int n, int t, float (&to)[NT * 4])
+  __device__ __forceinline__ GroupProduct(Cta& block, int x, int n, int t, float (&to)[NT * 4])
       : b(block), my(block, PARTS), blocks(n), tiles(t), rounds(plan_rounds(TILES_, blocks)),
         rounds_of_slot(slot_rounds(PARTS, t)),
         first(behind(operand_place(b.start() + x, FP8 ? NT * 128 : 128), EXACT ? my.part * NT * 256 : 0)), sums(to) {
@@ -156,7 +156,7 @@ struct GroupProduct {
 
 // Up to MT tiles (`tiles` of them) times the activations at x.
 template <int MT, int EVEN, int AHEAD>
-__device__ __forceinline__ void multiply(Block& b, int x, int blocks, int tiles, float (*sums)[NT * 4],
+__device__ __forceinline__ void multiply(Cta& b, int x, int blocks, int tiles, float (*sums)[NT * 4],
                                          Ahead<group_tiles(MT), AHEAD>& ahead) {
   constexpr int N = group_tiles(MT);
   if constexpr (AHEAD > 0) {
@@ -171,7 +171,7 @@ __device__ __forceinline__ void multiply(Block& b, int x, int blocks, int tiles,
 }
 
 // Where a lane's partial sums of 8 tokens lie. Of the last 8 only pairs that exist are kept.
-__device__ __forceinline__ int partial_place(const Block& b, int n) {
+__device__ __forceinline__ int partial_place(const Cta& b, int n) {
   return n * 512 + (TAIL == 4 || n + 1 < NT ? b.lane() : b.g() * TAIL + min(b.t(), TAIL - 1)) * 16;
 }
 // So many parts of a tile, always in the same order.
@@ -189,7 +189,7 @@ __device__ __forceinline__ float4 add_up(const byte* p) {
 }
 // The warps' partial sums to shared memory, and a tile's total back.
 template <int MT, int FIRST = 0>
-__device__ __forceinline__ void store_partials(const Block& b, byte* to, int tiles, float (*sums)[NT * 4]) {
+__device__ __forceinline__ void store_partials(const Cta& b, byte* to, int tiles, float (*sums)[NT * 4]) {
   if constexpr (FIRST < MT) {
     constexpr int N = group_tiles(MT - FIRST), PARTS = group_parts(N);
     const Share my(b, PARTS);
@@ -205,7 +205,7 @@ __device__ __forceinline__ void store_partials(const Block& b, byte* to, int til
   }
 }
 template <int MT, int FIRST = 0>
-__device__ __forceinline__ float4 total(const Block& b, const byte* from, int tile, int n) {
+__device__ __forceinline__ float4 total(const Cta& b, const byte* from, int tile, int n) {
   constexpr int N = group_tiles(MT - FIRST), PARTS = group_parts(N);
   if constexpr (FIRST + N < MT)
     if (tile >= FIRST + N) return total<MT, FIRST + N>(b, from, tile, n);
@@ -221,7 +221,7 @@ struct Own {
   float4 sums[plan_groups(MT)][OWN<MT>];
   int tile[plan_groups(MT)], n[plan_groups(MT)][OWN<MT>];
   bool mine[plan_groups(MT)][OWN<MT>];
-  __device__ __forceinline__ Own(const Block& b, int tiles) {
+  __device__ __forceinline__ Own(const Cta& b, int tiles) {
 #pragma unroll
     for (int i = 0; i < plan_groups(MT); ++i) {
       const int size = group_tiles(MT - i * 8), parts = group_parts(size);
@@ -238,7 +238,7 @@ struct Own {
   }
   // Of two parts: the other's to `to`, the rest to `sums`.
   template <int PART>
-  __device__ __forceinline__ void share_out(const Block& b, byte* to, bool real, const float (&mixed)[NT * 4]) {
+  __device__ __forceinline__ void share_out(const Cta& b, byte* to, bool real, const float (&mixed)[NT * 4]) {
 #pragma unroll
     for (int n = 0; n < NT; ++n) {
       const float4 sum = make_float4(mixed[n * 4], mixed[n * 4 + 1], mixed[n * 4 + 2], mixed[n * 4 + 3]);
@@ -249,7 +249,7 @@ struct Own {
     }
   }
   // To `sums` come all parts' sums of what is mine. They pass through `region`, or a place of their own.
-  __device__ __forceinline__ void add_up(const Block& b, int region, int tiles, const float (*mixed)[NT * 4]) {
+  __device__ __forceinline__ void add_up(const Cta& b, int region, int tiles, const float (*mixed)[NT * 4]) {
     byte* const place = b.smem + partials_place(region);
     auto other = [&](int i, int parts, int part, int n) {
       return (float4*)(place + (plan_others(i * 8) + (tile[i] & 7) * (parts - 1) + part) * PARTIAL +

@@ -6,19 +6,19 @@ struct QkvItem {
   int i, k;             // among all: queries first; among keys and values, negative: a query
   int n, kv_tile, at;   // 8 tokens; tile of keys or values; tile among all of this CTA
   bool mine;            // there is such an item
-  __device__ __forceinline__ QkvItem(const Block& b, int j) : i(b.warp() + j * W) {
+  __device__ __forceinline__ QkvItem(const Cta& b, int j) : i(b.warp() + j * W) {
     const int qn = b.qn(), kvn = b.kvn();
     k = i - qn * NT, mine = i < (qn + kvn) * NT;
     n = k < 0 ? i / qn : KVL == 1 ? k : k / kvn;
     kv_tile = KVL == 1 ? 0 : k % kvn, at = k < 0 ? i % qn : qn + kv_tile;
   }
-  __device__ __forceinline__ int row(const Block& b) const {  // in `shifted` and `row_scales`
+  __device__ __forceinline__ int row(const Cta& b) const {  // in `shifted` and `row_scales`
     return (!mine ? 0 : k < 0 ? i % b.qn() : QTL + kv_tile) * 16 + b.g();
   }
 };
 
 // Cosine and sine of an item, for tokens 2t and 2t + 1; values aren't turned.
-__device__ __forceinline__ float4 rope_of(const Block& b, int prefix, QkvItem item) {
+__device__ __forceinline__ float4 rope_of(const Cta& b, int prefix, QkvItem item) {
   float4 turn = make_float4(1, 0, 1, 0);
   const int tile = item.k < 0 ? b.q0() + item.at : b.kv0() + item.kv_tile;
   if (!item.mine || item.k >= 0 && tile >= QT) return turn;
@@ -35,7 +35,7 @@ __device__ __forceinline__ int ordered(float v) { return ordered(__float_as_int(
 // An item's sums times scale and 1 / rms, shifted, turned: a query to `staged`, its other half OTHER_HALF numbers behind;
 // keys and values to all clusters as float32 with their flags.
 template <int OTHER_HALF>
-__device__ __forceinline__ void finish_item(const Block& b, QkvItem item, float4 c, float2 shift, float4 turn, byte* staged,
+__device__ __forceinline__ void finish_item(const Cta& b, QkvItem item, float4 c, float2 shift, float4 turn, byte* staged,
                                             float* kv, u32 bit) {
   const int token = item.n * 8 + 2 * b.t();
   const float2 r = inverse_rms(b, token, 0);
@@ -57,7 +57,7 @@ __device__ __forceinline__ void finish_item(const Block& b, QkvItem item, float4
 }
 
 // Queries, staged [item][half][8 tokens][8], to all ranks.
-__device__ __forceinline__ void send_queries(const Block& b, const byte* staged) {
+__device__ __forceinline__ void send_queries(const Cta& b, const byte* staged) {
   const int qn = b.qn();
   static_assert(S == 8, "half a warp serves half of the ranks");
 #pragma unroll

@@ -1,7 +1,7 @@
 // The stream's norms, and the products that go back into it.
 
 // A spare warp makes 1 / rms of all tokens.
-__device__ __forceinline__ void make_inverse_rms(const Block& b) {
+__device__ __forceinline__ void make_inverse_rms(const Cta& b) {
   const int uses = b.a.steps * L * 2;
 #pragma unroll 1
   for (int use = 0; use < uses; ++use) {
@@ -23,7 +23,7 @@ __device__ __forceinline__ void make_inverse_rms(const Block& b) {
 }
 
 // A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
-__device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X], const float* row) {
+__device__ __forceinline__ void load_columns(const Cta& b, float2 (&v)[ITEMS_X], const float* row) {
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j)
     v[j] = __ldg((const float2*)(row + (b.x0() + stream_item(b, j).tile) * 16 + 2 * b.g()));
@@ -35,7 +35,7 @@ __device__ __forceinline__ void load_columns(const Block& b, float2 (&v)[ITEMS_X
 // follows what is published here. `sent` is kept until weights have been read; `await` until the operand is here;
 // `then`, behind the product, what else there is.
 template <int EVEN, typename Await, typename Then>
-__device__ __forceinline__ void residual_product(Block& b, int x, int blocks, int region, uint4* buffer, u32 bit,
+__device__ __forceinline__ void residual_product(Cta& b, int x, int blocks, int region, uint4* buffer, u32 bit,
                                                  Await await, Then then, const Sent& sent) {
   Ahead<group_tiles(DX), RESIDUAL_AHEAD> ahead(b);
   Own<DX> own(b, b.xn());

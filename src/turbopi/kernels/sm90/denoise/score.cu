@@ -17,14 +17,14 @@ constexpr int TOPS = 2, SUFFIX_SUMS = 3, WEIGHTS = 4, WEIGHTS_FOR_SUFFIX = 5, SU
 struct Keys : PrefixShare {
   int slots;            // that tiles of prefix keys, or values, take
   int suffix0, suffix;  // the first of the suffix's keys, how many
-  __device__ __forceinline__ Keys(const Block& b, int all) : PrefixShare(all, b.rank()) {
+  __device__ __forceinline__ Keys(const Cta& b, int all) : PrefixShare(all, b.rank()) {
     slots = most(tiles, SLOT_TILES);
     suffix0 = share(T, S, b.rank()), suffix = share(T, S, b.rank() + 1) - suffix0;
   }
 };
 
 // A lane's address for `mma_tokens` in activations [block][half][NT][8 tokens][8 columns], standard order.
-__device__ __forceinline__ u32 token_address(const Block& b, u32 region) {
+__device__ __forceinline__ u32 token_address(const Cta& b, u32 region) {
   return b.base + region + ((b.lane() >> 3 & 1) * NT + (b.lane() >> 4)) * 128 + (b.lane() & 7) * 16;
 }
 // One block: a tile's rows times all tokens. What is read beyond the last tokens isn't used.
@@ -41,7 +41,7 @@ __device__ __forceinline__ void mma_tokens(float (&c)[NT][4], uint4 a, u32 from)
 // Logits of 16 keys over STEPS blocks of columns from block `first` on, `steps` of which exist. fetch(k) is the k-th
 // fragment of the keys. Returns a word that needs all it read, for give_slot.
 template <int STEPS, int UNROLL, typename Fetch>
-__device__ __forceinline__ u32 score(const Block& b, Fetch fetch, int first, int steps, float (&c)[NT][4]) {
+__device__ __forceinline__ u32 score(const Cta& b, Fetch fetch, int first, int steps, float (&c)[NT][4]) {
   constexpr int CHAINS = !MANY && STEPS > 4 ? 2 : 1;
   float sums[CHAINS][NT][4];
 #pragma unroll
@@ -80,7 +80,7 @@ struct SuffixPart {
 #pragma unroll
     for (int i = 0; i < MOST; ++i) v[i] = peek(place(i));
   }
-  __device__ __forceinline__ void keep(const Block& b) {
+  __device__ __forceinline__ void keep(const Cta& b) {
 #pragma unroll 1
     for (bool again = true; again;) {
       again = false;
@@ -100,7 +100,7 @@ struct SuffixPart {
 };
 
 // Logits of the rank's suffix keys, by the last four warps; SUFFIX_WARP gets them.
-__device__ __forceinline__ void score_suffix(const Block& b, int count, float (&c)[NT][4]) {
+__device__ __forceinline__ void score_suffix(const Cta& b, int count, float (&c)[NT][4]) {
   const int part = b.warp() - SUFFIX_WARP, first = share(QT, 4, part), steps = share(QT, 4, part + 1) - first;
   const u32 from = b.base + M_X + X_KEY_ROWS + min(b.lane() & 7, count - 1) * RS + first * 32 + (b.lane() >> 4) * 16;
   auto fetch = [&](int k) {  // rows beyond the last key hold anything
@@ -130,7 +130,7 @@ __device__ __forceinline__ float no_logit() { return __int_as_float(0xff800000);
 __device__ __forceinline__ float logit_scale() { return rsqrtf(float(HD)) * 1.4426950408889634f; }  // and log2 e
 // Logits times the scale, or none in rows that don't exist; the largest of each token.
 template <int R>
-__device__ __forceinline__ void scale_logits(const Block& b, float (&c)[R][NT][4], int rows, float2 (&top)[NT]) {
+__device__ __forceinline__ void scale_logits(const Cta& b, float (&c)[R][NT][4], int rows, float2 (&top)[NT]) {
   const float scale = logit_scale(), none = no_logit();
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
@@ -153,7 +153,7 @@ __device__ __forceinline__ void scale_logits(const Block& b, float (&c)[R][NT][4
 __device__ __forceinline__ float weight(float logit, float top, float scale = 1) {
   return exp2_approx(logit * scale - top);
 }
-__device__ __forceinline__ byte* weights_place(const Block& b, int tile) {
+__device__ __forceinline__ byte* weights_place(const Cta& b, int tile) {
   return b.smem + M_X + X_P + (tile * 2 + (b.g() >> 2)) * NT * 128 + b.t() * 32 + (b.g() & 3) * 4;
 }
 __device__ __forceinline__ void store_weights(byte* to, const float (&c)[NT][4], const float2 (&top)[NT],
@@ -167,7 +167,7 @@ __device__ __forceinline__ void store_weights(byte* to, const float (&c)[NT][4],
     }
 }
 // The largest logits of the rank's prefix.
-__device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT], float scale = 1) {
+__device__ __forceinline__ void load_tops(const Cta& b, float2 (&top)[NT], float scale = 1) {
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
     const int2 v = *(const int2*)(b.smem + M_PART + (n * 8 + 2 * b.t()) * 4);
@@ -176,7 +176,7 @@ __device__ __forceinline__ void load_tops(const Block& b, float2 (&top)[NT], flo
 }
 // Warps that score: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist.
 template <int R>
-__device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4], int tile, int rows) {
+__device__ __forceinline__ void weigh_prefix(const Cta& b, float (&c)[R][NT][4], int tile, int rows) {
   float2 top[NT];
   if (rows > 0) {
     scale_logits(b, c, rows, top);
@@ -192,7 +192,7 @@ __device__ __forceinline__ void weigh_prefix(const Block& b, float (&c)[R][NT][4
     if (rows > r * SCORERS * 16) store_weights(weights_place(b, tile + r * SCORERS), c[r], top);
 }
 // Of each token something of this rank, to all ranks.
-__device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[NT], int region, int bar) {
+__device__ __forceinline__ void send_by_token(const Cta& b, const float2 (&v)[NT], int region, int bar) {
   const u32 to = at_rank(b.base + M_X + region + (b.rank() * NT * 8 + 2 * b.t()) * 4, b.g());
   const u32 at = at_rank(b.bar(bar), b.g());
 #pragma unroll
@@ -202,7 +202,7 @@ __device__ __forceinline__ void send_by_token(const Block& b, const float2 (&v)[
 constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
 // The suffix's keys come last. Their weights go by the prefix's largest logits, too, unless theirs are
 // so much larger (2^64) that the prefix's weights count for nothing: then those are dropped, which `X_KEEP` says.
-__device__ __forceinline__ void weigh_suffix(const Block& b, float (&c)[1][NT][4], int rows) {
+__device__ __forceinline__ void weigh_suffix(const Cta& b, float (&c)[1][NT][4], int rows) {
   float2 own[NT], top[NT];
   scale_logits(b, c, rows, own);
   sync<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
@@ -217,7 +217,7 @@ __device__ __forceinline__ void weigh_suffix(const Block& b, float (&c)[1][NT][4
   if (HOLD) arrive<SUFFIX_WEIGHTS, WEIGHERS + 1>();
   send_by_token(b, top, X_TOPS, BAR_TOPS);
 }
-__device__ __forceinline__ void keep_prefix(const Block& b, float (&c)[NT][4]) {
+__device__ __forceinline__ void keep_prefix(const Cta& b, float (&c)[NT][4]) {
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
     const float2 keep = *(const float2*)(b.smem + M_X + X_KEEP + (n * 8 + 2 * b.t()) * 4);
@@ -225,7 +225,7 @@ __device__ __forceinline__ void keep_prefix(const Block& b, float (&c)[NT][4]) {
   }
 }
 // The sums of the weights of 8 tokens, as rounded: a product with ones.
-__device__ __forceinline__ void send_some_sums(const Block& b, int n, int tiles, int suffix) {
+__device__ __forceinline__ void send_some_sums(const Cta& b, int n, int tiles, int suffix) {
   float c[4] = {0, 0, 0, 0};
   const u32 one = 0x3f803f80;
   const u32 from = b.base + M_X + X_P + ((b.lane() >> 3) * NT + n) * 128 + (b.lane() & 7) * 16;
@@ -244,7 +244,7 @@ __device__ __forceinline__ void send_some_sums(const Block& b, int n, int tiles,
     send(to, __float_as_uint(c[0]), __float_as_uint(c[1]), at_rank(b.bar(BAR_COMB), b.g()));
 }
 // The same of all tokens, by one warp.
-__device__ __forceinline__ void send_sums(const Block& b, int tiles, int suffix) {
+__device__ __forceinline__ void send_sums(const Cta& b, int tiles, int suffix) {
   float c[NT][4];
   clear(c);
   const u32 p = token_address(b, M_X + X_P), one = 0x3f803f80;

@@ -9,7 +9,7 @@ struct Item {
 };
 
 // Of an item's lane pair the four columns 2g.. of one token (even g: 2t, odd g: 2t + 1); in E4M3 the first word alone.
-__device__ __forceinline__ uint2 columns_of(const Block& b, float4 v) {
+__device__ __forceinline__ uint2 columns_of(const Cta& b, float4 v) {
   const u32 w0 = pack_operand(v.x, v.z), w1 = pack_operand(v.y, v.w), got = exchange(b.g() & 1 ? w0 : w1, 4);
   const uint2 both = make_uint2(b.g() & 1 ? got : w0, b.g() & 1 ? w1 : got);
   return FP8 ? make_uint2(both.x | both.y << 16, 0) : both;
@@ -24,12 +24,12 @@ __device__ __forceinline__ float2 squares_of(float4 x) {
 }
 
 // `columns_of` to all ranks, where `columns_place` says.
-__device__ __forceinline__ u32 columns_place(const Block& b, int region, int block, int n) {
+__device__ __forceinline__ u32 columns_place(const Cta& b, int region, int block, int n) {
   const int token = 2 * b.t() + (b.g() & 1);
   const int in_row = FP8 ? (b.g() >> 1) * 4 : (b.g() >> 2) * 128 + (b.g() >> 1 & 1) * 8;
   return b.base + region + (block * NT + n) * OPERAND + token * 16 + in_row;
 }
-__device__ __forceinline__ void send_columns(const Block& b, const Everyone& data, const Everyone& bars, int n,
+__device__ __forceinline__ void send_columns(const Cta& b, const Everyone& data, const Everyone& bars, int n,
                                              float4 v, bool real) {
   const uint2 columns = columns_of(b, v);
   const int token = 2 * b.t() + (b.g() & 1);
@@ -44,14 +44,14 @@ __device__ __forceinline__ void send_columns(const Block& b, const Everyone& dat
 }
 
 // 1 / rms of tokens `token` and `token` + 1 (even), once the stream is here: a spare warp makes them.
-__device__ __forceinline__ float2 known_rms(const Block& b, int token) {
+__device__ __forceinline__ float2 known_rms(const Cta& b, int token) {
   return *(const float2*)(b.smem + M_RMS + token * 4);
 }
-__device__ __forceinline__ float2 inverse_rms(const Block& b, int token, int half) {
+__device__ __forceinline__ float2 inverse_rms(const Cta& b, int token, int half) {
   barrier_wait(b.bar(BAR_RMS), half);
   return known_rms(b, token);
 }
-__device__ __forceinline__ float rms_from(const Block& b, float squares) {  // 1 / rms
+__device__ __forceinline__ float rms_from(const Cta& b, float squares) {  // 1 / rms
   return rsqrtf(squares * (1.0f / D) + b.a.eps);
 }
 

@@ -6,11 +6,11 @@ __device__ __forceinline__ void stay_awake(float (&c)[4], u32 zero) {
   mma_half(c, make_uint4(zero, zero, zero, zero), make_uint2(zero, zero));
   __nanosleep(100);
 }
-__device__ __forceinline__ void pretend_to_need(const Block& b, const float (&c)[4]) {
+__device__ __forceinline__ void pretend_to_need(const Cta& b, const float (&c)[4]) {
   if (c[0] != 0) *(volatile u32*)(b.smem + M_TOKEN) = 0;  // never, but the compiler can't know
 }
 // Between two looks of the warp that watches: half a microsecond. Of many tokens it is the one that multiplies zeros.
-__device__ __forceinline__ void rest(const Block& b) {
+__device__ __forceinline__ void rest(const Cta& b) {
   if (!MANY) return __nanosleep(500);
   float c[4] = {0, 0, 0, 0};
   const u32 zero = b.a.zero;
@@ -20,7 +20,7 @@ __device__ __forceinline__ void rest(const Block& b) {
 }
 // What the norms of layer n need, to L2: it is read once, by everybody at the same time, while memory is busy with
 // weights.
-__device__ __forceinline__ void prefetch(const Block& b, int n) {
+__device__ __forceinline__ void prefetch(const Cta& b, int n) {
   const int step = n / L, l = n % L;
   if (step >= b.a.steps) return;
   auto lines = [&](const float* from, int floats) {
@@ -37,7 +37,7 @@ __device__ __forceinline__ long long nanoseconds() {
   asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(v));
   return v;
 }
-__device__ __forceinline__ void watch(const Block& b) {
+__device__ __forceinline__ void watch(const Cta& b) {
   u32 last = 0, layer = ~0u;
   const long long begun = clock64(), begun_at = nanoseconds();
   long long since = begun;

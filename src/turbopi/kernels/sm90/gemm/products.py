@@ -1,15 +1,11 @@
-"""Matrix products, each by the kernel that is fastest for it: ours for what was measured so, cuBLAS's else.
-
-`tuned_` ones need compute capability 9.0, the others any.
-"""
+"""Matrix products, each by the kernel that is fastest for it: ours for what was measured so, cuBLAS's else."""
 
 from functools import lru_cache
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.kernels import activations
+from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
 from turbopi.kernels.sm90.gemm.bf16 import DEPTH, SPLIT, Epilogue, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import best_tile, matmul_fp8
 from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
@@ -45,20 +41,6 @@ PARTS: dict[tuple[int, int, int], Tile | int] = {
     (768, 2048, 16384): Tile(3, 192, splits=3),
     (832, 2048, 16384): 2,
 }
-
-
-def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
-    if out is None:
-        return F.linear(x, weight, bias)
-    return torch.mm(x, weight.t(), out=out) if bias is None else torch.addmm(bias, x, weight.t(), out=out)
-
-
-def linear_gelu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    return torch._addmm_activation(bias, x, weight.t(), use_gelu=True)  # on CUDA: tanh's GELU, in the epilogue
-
-
-def linear_geglu(x: Tensor, gate_up: Tensor) -> Tensor:
-    return activations.geglu(F.linear(x, gate_up))
 
 
 def vision_tile(x: Tensor, weight: Tensor) -> Tile | None:

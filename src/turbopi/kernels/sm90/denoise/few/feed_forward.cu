@@ -1,6 +1,6 @@
 // Few tokens: gate|up and GeGLU. Awaits the stream. The next slice of the stream arrives in region X only when a peer has
 // all of this rank's hidden units.
-__device__ __forceinline__ void gate_up(Block& b, const float* shifted, const float* row_scales, Sent& sent) {
+__device__ __forceinline__ void gate_up(Cta& b, const float* shifted, const float* row_scales, Sent& sent) {
   const int gn = b.gn(), token = 2 * b.t() + (b.g() & 1);
   Own<GTL> own(b, gn);
   const GateUpRows rows(own, b, shifted, row_scales);

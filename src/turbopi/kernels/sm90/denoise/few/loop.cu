@@ -1,11 +1,11 @@
 // Few tokens: the loop.
 
-__device__ __forceinline__ u32 hidden_bytes(const Block& b) {
+__device__ __forceinline__ u32 hidden_bytes(const Cta& b) {
   return b.hn() * 16 * T * (OPERAND / 128) + (IDLE ? S * 4 : 0);
 }
 
 // The warps that multiply.
-__device__ __forceinline__ void consume(Block& b) {
+__device__ __forceinline__ void consume(Cta& b) {
   const Args& a = b.a;
   const int prefix = int(*a.length);
   for (int i = b.thread; i < T * A; i += CONSUMERS) {
@@ -63,7 +63,7 @@ __device__ __forceinline__ void consume(Block& b) {
 }
 
 // The last of the spare warps.
-__device__ __forceinline__ void help(const Block& b) {
+__device__ __forceinline__ void help(const Cta& b) {
   float c[4] = {0, 0, 0, 0};
   const u32 zero = b.a.zero;
 #pragma unroll 1
@@ -74,6 +74,6 @@ __device__ __forceinline__ void help(const Block& b) {
   pretend_to_need(b, c);
 }
 
-__device__ __forceinline__ u32 arrivals(const Block&, int) { return 1; }
-__device__ __forceinline__ void init_own_barriers(const Block&) {}
-__device__ __forceinline__ void expect_own(const Block&) {}
+__device__ __forceinline__ u32 arrivals(const Cta&, int) { return 1; }
+__device__ __forceinline__ void init_own_barriers(const Cta&) {}
+__device__ __forceinline__ void expect_own(const Cta&) {}

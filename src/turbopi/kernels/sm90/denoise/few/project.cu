@@ -17,7 +17,7 @@ struct QkvProduct {
   }
   // Missing tiles are loaded, too: whatever lies there. A warp waits for its own slot alone; the others are full, too,
   // before it waits for their next contents, as all warps meet behind the products.
-  __device__ __forceinline__ void load(Block& b) {
+  __device__ __forceinline__ void load(Cta& b) {
     if (!some()) return;
     // A slot has 2^in_slot fragments a tile, and a warp QKV_ROUNDS: both powers of two, so shifts are enough.
     const int in_slot = tiles == QKV       ? slot_log2(QKV)
@@ -50,7 +50,7 @@ struct QkvProduct {
     }
     give_slot(b, slot, seen, slots);
   }
-  __device__ __forceinline__ void multiply(const Block& b) {
+  __device__ __forceinline__ void multiply(const Cta& b) {
     constexpr bool EXACT = D16 % (KB * W) == 0;
     auto add = [&](int k, int n, uint2 x) {
 #pragma unroll
@@ -81,7 +81,7 @@ struct QkvProduct {
     }
   }
   // With QKV_PAIRS warps i and i + 8 add up their sums, each of them half.
-  __device__ __forceinline__ void store(const Block& b, byte* to) {
+  __device__ __forceinline__ void store(const Cta& b, byte* to) {
     const int upper = b.warp() / QKV_PARTS, part = b.warp() % QKV_PARTS;
     auto exists = [&](int i, int n) { return i < tiles && (n + 1 < NT || b.t() < TAIL); };
     auto place = [&](int i, int n) {
@@ -106,7 +106,7 @@ struct QkvProduct {
               make_float4(sums[i][n][0] + v.x, sums[i][n][1] + v.y, sums[i][n][2] + v.z, sums[i][n][3] + v.w);
         }
   }
-  static __device__ __forceinline__ float4 total(const Block& b, const byte* from, int tile, int n) {
+  static __device__ __forceinline__ float4 total(const Cta& b, const byte* from, int tile, int n) {
     const byte* p = from + tile * QKV_PARTS * PARTIAL + partial_place(b, n);
     float4 sum = make_float4(0, 0, 0, 0);
 #pragma unroll
@@ -118,7 +118,7 @@ struct QkvProduct {
   }
 };
 
-__device__ __forceinline__ void keep_rope(const Block& b, int prefix) {
+__device__ __forceinline__ void keep_rope(const Cta& b, int prefix) {
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j)
     if (const int i = b.warp() + j * W; i < QKV * NT)
@@ -127,7 +127,7 @@ __device__ __forceinline__ void keep_rope(const Block& b, int prefix) {
 
 // Awaits the stream. q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream; queries are sent when all of those have been read, so what a peer sends after it has them may lie there too.
-__device__ __forceinline__ void project(Block& b, const float* shifted, const float* row_scales, float* kv, u32 bit) {
+__device__ __forceinline__ void project(Cta& b, const float* shifted, const float* row_scales, float* kv, u32 bit) {
   const int tiles = b.qn() + b.kvn();
   float2 shift[ITEMS_Q], scale[ITEMS_Q];
 #pragma unroll

@@ -8,13 +8,13 @@ struct Embedding {
   float4 weights[EARLY ? A / 4 : 1][2];
   float2 bias[ITEMS_X], scale[ITEMS_X];
 
-  static __device__ __forceinline__ int column(const Block& b, int j) {
+  static __device__ __forceinline__ int column(const Cta& b, int j) {
     return (b.x0() + stream_item(b, j).tile) * 16 + 2 * b.g();
   }
-  static __device__ __forceinline__ float4 weight(const Block& b, int column, int k, int odd) {
+  static __device__ __forceinline__ float4 weight(const Cta& b, int column, int k, int odd) {
     return __ldg((const float4*)(b.a.in_w + size_t(column + odd) * A) + k);
   }
-  __device__ __forceinline__ Embedding(const Block& b, const float* scales) {
+  __device__ __forceinline__ Embedding(const Cta& b, const float* scales) {
 #pragma unroll
     for (int j = 0; j < ITEMS_X; ++j) {
       bias[j] = __ldg((const float2*)(b.a.in_b + column(b, j)));
@@ -24,7 +24,7 @@ struct Embedding {
 #pragma unroll
       for (int i = 0; i < A / 2; ++i) weights[i / 2][i % 2] = weight(b, column(b, 0), i / 2, i % 2);
   }
-  __device__ __forceinline__ void multiply(const Block& b, float4 (&x)[ITEMS_X]) const {
+  __device__ __forceinline__ void multiply(const Cta& b, float4 (&x)[ITEMS_X]) const {
 #pragma unroll
     for (int j = 0; j < ITEMS_X; ++j) {
       const Item item = stream_item(b, j);
@@ -40,7 +40,7 @@ struct Embedding {
       x[j] = item.real ? c : make_float4(0, 0, 0, 0);
     }
   }
-  __device__ __forceinline__ void send(const Block& b, const float4 (&x)[ITEMS_X]) const {
+  __device__ __forceinline__ void send(const Cta& b, const float4 (&x)[ITEMS_X]) const {
     __syncwarp();
 #pragma unroll
     for (int j = 0; j < ITEMS_X; ++j) {
@@ -54,7 +54,7 @@ struct Embedding {
 
 // action_out_proj of what `gather` kept, behind the final norm's scale: this rank's partial sums of v_t to all ranks. A
 // warp multiplies its items, then a warp has a token. Region X is free for the sums, see `kept_item`.
-__device__ __forceinline__ void send_v(const Block& b) {
+__device__ __forceinline__ void send_v(const Cta& b) {
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const int i = b.warp() + j * W, xn = b.xn();
@@ -104,7 +104,7 @@ __device__ __forceinline__ void send_v(const Block& b) {
 }
 
 // From the step's end to the next one's stream, whose norm has these scales: v_t, the Euler step, action_in_proj.
-__device__ __forceinline__ void advance(Block& b, float4 (&x)[ITEMS_X], const float* scales, int step) {
+__device__ __forceinline__ void advance(Cta& b, float4 (&x)[ITEMS_X], const float* scales, int step) {
   send_squares(b, x, BAR_V);
   __syncwarp();
   send_v(b);

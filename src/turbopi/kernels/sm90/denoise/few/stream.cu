@@ -1,14 +1,14 @@
 // Few tokens: every cluster keeps the whole stream. Each CTA adds up its slice for all tokens, and the ranks send their
 // slices to each other.
 
-__device__ __forceinline__ Item stream_item(const Block& b, int j) {
+__device__ __forceinline__ Item stream_item(const Cta& b, int j) {
   const u32 i = b.warp() + j * W, xn = b.xn();  // unsigned: divisions become shifts
   const int tile = i < xn * NT ? i % xn : 0, n = i < xn * NT ? i / xn : 0;
   return {tile, n, n * 8 + 2 * b.t(), i < xn * NT, i < xn * NT && n * 8 + 2 * b.t() < T};
 }
 
 // Sums of squares to all ranks, which add them up: every warp sends those of its tiles, as soon as it has them.
-__device__ __forceinline__ void send_tile_squares(const Block& b, float2 q, int i, int bar) {
+__device__ __forceinline__ void send_tile_squares(const Cta& b, float2 q, int i, int bar) {
   const int xn = b.xn(), absent = i - xn * NT;  // tiles that a rank lacks are sent as zeros
   if (i >= DX * NT) return;
   const int lacks = imax(DX - xn, 1);
@@ -19,24 +19,24 @@ __device__ __forceinline__ void send_tile_squares(const Block& b, float2 q, int 
   if (n * 8 + 2 * b.t() < T)
     send(at_rank(to, b.g()), __float_as_uint(q.x), __float_as_uint(q.y), at_rank(b.bar(bar), b.g()));
 }
-__device__ __forceinline__ void send_squares(const Block& b, const float4 (&x)[ITEMS_X], int bar) {
+__device__ __forceinline__ void send_squares(const Cta& b, const float4 (&x)[ITEMS_X], int bar) {
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) send_tile_squares(b, squares_of(x[j]), b.warp() + j * W, bar);
 }
 constexpr u32 SQUARES_EXPECT = SQ * ((T + 1) / 2) * 8;
 // A spare warp: until sums of squares of the stream's use `use` are here.
-__device__ __forceinline__ void await_squares(const Block& b, int use) { barrier_wait(b.bar(BAR_X), use & 1); }
+__device__ __forceinline__ void await_squares(const Cta& b, int use) { barrier_wait(b.bar(BAR_X), use & 1); }
 
 constexpr u32 X_EXPECT = D16 * T * (OPERAND / 8) + SQUARES_EXPECT;
 // The stream that comes before attention, or (half 1) the feed-forward.
-__device__ __forceinline__ void receive_stream(const Block& b, int half) {
+__device__ __forceinline__ void receive_stream(const Cta& b, int half) {
   receive(b, BAR_X, half, X_EXPECT, WAIT_X);
 }
 
 // Partial sums of an item of the stream from all clusters, a lane's four of two
 // clusters side by side in a word.
 constexpr int FETCH = imin(PAIRS, 4);  // words at a time
-__device__ __forceinline__ const uint4* partials(const Block& b, const uint4* buffer, Item item) {
+__device__ __forceinline__ const uint4* partials(const Cta& b, const uint4* buffer, Item item) {
   return buffer + ((b.x0() + item.tile) * NT + item.n) * PAIRS * 32 + b.lane();
 }
 // Asks until what the clusters send is there, in words `first` and on (of `real` tokens: others never come); adds it up,
@@ -71,10 +71,10 @@ __device__ __forceinline__ void take(float4& sum, const uint4* p, int first, int
 
 // For `advance`: a warp's item as [16 columns][8 tokens]. Region X is free: every rank's hidden units have
 // come, so no sums of gate|up are still being read there.
-__device__ __forceinline__ float* kept_item(const Block& b, int i) {
+__device__ __forceinline__ float* kept_item(const Cta& b, int i) {
   return (float*)(b.smem + M_X + X_XS + i * XS_ITEM);
 }
-__device__ __forceinline__ void keep_item(const Block& b, int j, float4 y) {
+__device__ __forceinline__ void keep_item(const Cta& b, int j, float4 y) {
   const int i = b.warp() + j * W;
   if (i >= b.xn() * NT) return;
   float* const to = kept_item(b, i) + b.g() * 16 + b.t() * 2;
@@ -84,7 +84,7 @@ __device__ __forceinline__ void keep_item(const Block& b, int j, float4 y) {
 constexpr u32 PATIENCE = 500;  // clock cycles before sums are asked for: polls slow down what they wait for
 // Fetch the clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
 // slice times the next norm's scale to all ranks, if `last` keep it. buffer: [D16][NT][PAIRS][32] 16-byte words.
-__device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, u32 bit,
+__device__ __forceinline__ void gather(Cta& b, float4 (&x)[ITEMS_X], const uint4* buffer, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
                                        int half, bool last) {
   const u32 since = u32(clock64());
@@ -128,7 +128,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
 }
 
 // Where a cluster's partial sums of (tile, 8 tokens n) of the slice go, for `gather`.
-__device__ __forceinline__ uint2* sums_place(const Block& b, uint4* buffer, int tile, int n) {
+__device__ __forceinline__ uint2* sums_place(const Cta& b, uint4* buffer, int tile, int n) {
   const uint4* const words = buffer + ((b.x0() + tile) * NT + n) * PAIRS * 32 + b.lane();
   return settled((uint2*)(words + b.cluster() / 2 * 32) + (b.cluster() & 1));
 }

@@ -15,7 +15,7 @@ static_assert(!ASYNC || (W == 16 && QT <= W && KT <= SCORERS && NT <= 8), "a war
 // Logits of a warpgroup's keys: each warp has 16 of its own, whose first blocks it holds; fetch(k) is the k-th block.
 constexpr int SCORE_CHUNK = QT % 4 == 0 ? 4 : 1;
 template <typename Fetch>
-__device__ __forceinline__ void score_together(const Block& b, uint4 (&now)[SCORE_CHUNK], Fetch fetch,
+__device__ __forceinline__ void score_together(const Cta& b, uint4 (&now)[SCORE_CHUNK], Fetch fetch,
                                                float (&c)[NT][4]) {
   const u32 queries = operand_place(b.start() + M_Q, NT * 128);
   float sums[NT * 4];
@@ -42,8 +42,8 @@ __device__ __forceinline__ void score_together(const Block& b, uint4 (&now)[SCOR
 // Logits of the rows' keys, by the last warpgroup: each warp has 16 tokens, which here are operand A; c[j][0], c[j][1]
 // of token g and keys 8j + 2t, 8j + 2t + 1, the others of token g + 8. Tokens that don't exist are any.
 __device__ __forceinline__ void score_rows(float (&c)[2][4]) {
-  const u32 queries = operand_place(Block::start() + M_Q, NT * 128),
-            keys = operand_place(Block::start() + M_X + X_KEY_ROWS, KEY_COLUMNS);
+  const u32 queries = operand_place(Cta::start() + M_Q, NT * 128),
+            keys = operand_place(Cta::start() + M_X + X_KEY_ROWS, KEY_COLUMNS);
   float sums[8];
 #pragma unroll
   for (int i = 0; i < 8; ++i) sums[i] = 0;
@@ -58,13 +58,13 @@ __device__ __forceinline__ void score_rows(float (&c)[2][4]) {
   for (int i = 0; i < 8; ++i) c[i / 4][i % 4] = sums[i];
 }
 // To the rank's largest logits: this one of token 2t + g % 2 of 8 tokens n.
-__device__ __forceinline__ void raise_top(const Block& b, int n, float logit) {
+__device__ __forceinline__ void raise_top(const Cta& b, int n, float logit) {
   if (n < NT) atomicMax((int*)(b.smem + M_PART) + n * 8 + 2 * b.t() + (b.g() & 1), ordered(logit));
 }
 // Of each pair one number goes to the lane that bit O of g tells apart, which keeps the other: the larger of both
 // stays.
 template <int PAIRS_, int O, int N>
-__device__ __forceinline__ void exchange_tops(const Block& b, float (&v)[N]) {
+__device__ __forceinline__ void exchange_tops(const Cta& b, float (&v)[N]) {
   const bool upper = b.g() >> O & 1;
 #pragma unroll
   for (int i = 0; i < PAIRS_; ++i) {
@@ -75,7 +75,7 @@ __device__ __forceinline__ void exchange_tops(const Block& b, float (&v)[N]) {
 // The largest logit of each token among a warp's keys. Lane (g, t) has those of its own keys, for tokens 2t and 2t + 1
 // of each 8. By exchanges of half of them, a quarter, an eighth it gets those of all keys for token 2t + g % 2 of 8
 // tokens g / 2 and g / 2 + 4.
-__device__ __forceinline__ void raise_tops(const Block& b, const float (&c)[NT][4]) {
+__device__ __forceinline__ void raise_tops(const Cta& b, const float (&c)[NT][4]) {
   constexpr int N = NT > 4 ? 16 : 8;
   float v[N];
 #pragma unroll
@@ -94,14 +94,14 @@ struct LooseRows {
   uint4 v[MOST];
   float times;
   __device__ __forceinline__ bool exists(int i) const { return me + i * THREADS_ < rows * EIGHTS; }
-  __device__ __forceinline__ void ask(const Block& b, int from) {
+  __device__ __forceinline__ void ask(const Cta& b, int from) {
     const byte* const all = (kind ? b.a.cache_v : b.a.cache_k) + (b.n % L) * b.a.layer_stride + size_t(from) * HD * 2;
 #pragma unroll
     for (int i = 0; i < MOST; ++i)
       if (exists(i)) v[i] = __ldg((const uint4*)all + me + i * THREADS_);
     if (FP8 && kind) times = __ldg(b.a.values_times + b.n % L);
   }
-  __device__ __forceinline__ void keep(const Block& b) {
+  __device__ __forceinline__ void keep(const Cta& b) {
     auto scaled = [&](u32 two) { return pack(bf16_low(two) * times, bf16_high(two) * times); };
 #pragma unroll
     for (int i = 0; i < MOST; ++i)
@@ -115,7 +115,7 @@ struct LooseRows {
 // Of 16 tokens from 8 n on the rows' logits, `count` of which exist, to weights of the tile behind all others, as
 // `store_weights` has them. They go by the largest logits of the prefix's tiles, too, unless theirs are 2^100 times as
 // large: then the tiles' weights count for nothing, whatever they go by. What a token's weights go by to all ranks.
-__device__ __forceinline__ void weigh_rows(const Block& b, int n, int count) {
+__device__ __forceinline__ void weigh_rows(const Cta& b, int n, int count) {
   float c[2][4], own[2] = {no_logit(), no_logit()};
   score_rows(c);
   MARK(MARK_ROWS_SCORED)
@@ -154,7 +154,7 @@ __device__ __forceinline__ u32 slot_behind(u32 first, u32 i) {
 // Values times weights, of a warp's tile of columns: of so many slots from the i-th on (missing tiles are zeros), and,
 // if given, of the rows behind the tiles.
 template <int SLOTS>
-__device__ __forceinline__ void weigh_some(Block& b, int i, u32 first, int tiles, u32 weights, float (&sums)[NT * 4],
+__device__ __forceinline__ void weigh_some(Cta& b, int i, u32 first, int tiles, u32 weights, float (&sums)[NT * 4],
                                            const uint4* rows = nullptr) {
   constexpr int N = SLOTS * SLOT_TILES;
   uint4 v[imax(N, 1)];
@@ -177,7 +177,7 @@ __device__ __forceinline__ void weigh_some(Block& b, int i, u32 first, int tiles
   await_products<0>();
 }
 // Partial outputs of the rank's keys for all tokens: each rank's columns to it.
-__device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 bit, const Keys& keys) {
+__device__ __forceinline__ void attend_together(Cta& b, const float* kv, u32 bit, const Keys& keys) {
   const int tiles = keys.tiles, slots = keys.slots, rows = keys.suffix + keys.loose;
   const u32 first_keys = b.slot;
   if (b.warp() < SCORERS) {
@@ -299,13 +299,13 @@ __device__ __forceinline__ void attend_together(Block& b, const float* kv, u32 b
   }
 }
 
-__device__ __forceinline__ void attend_keys(Block& b, const float* kv, u32 bit, const Keys& keys) {
+__device__ __forceinline__ void attend_keys(Cta& b, const float* kv, u32 bit, const Keys& keys) {
   if constexpr (ASYNC)
     attend_together(b, kv, bit, keys);
   else
     attend_by_warps(b, kv, bit, keys);
 }
-__device__ __forceinline__ u32 outputs_expect(const Block& b) {
+__device__ __forceinline__ u32 outputs_expect(const Cta& b) {
   return S * ((T + 1) / 2) * 8 + (S - ASYNC) * b.qn() * ((T + 1) / 2) * (OUTPUT / 4);  // ASYNC: its own by stores
 }
 
@@ -313,10 +313,10 @@ constexpr u32 ATT_EXPECT = HD * (COPY_ATTENTION ? NT * 8 : T) * (OPERAND / 128) 
 // How 8 tokens of a tile of this rank's attention get to all ranks.
 struct AttentionSender {
   Everyone places, bars;
-  __device__ __forceinline__ AttentionSender(const Block& b, int tile, int n) {
+  __device__ __forceinline__ AttentionSender(const Cta& b, int tile, int n) {
     if (!COPY_ATTENTION) places = Everyone(columns_place(b, M_ATT, b.q0() + tile, n)), bars = Everyone(b.bar(BAR_ATT));
   }
-  __device__ __forceinline__ void send(const Block& b, int tile, int n, float4 v) const {
+  __device__ __forceinline__ void send(const Cta& b, int tile, int n, float4 v) const {
     if (!COPY_ATTENTION) return send_columns(b, places, bars, n, v, true);
     const uint2 columns = columns_of(b, v);
     byte* const p = b.smem + (columns_place(b, M_ATT, b.q0() + tile, n) - b.base);
@@ -326,7 +326,7 @@ struct AttentionSender {
       *(uint2*)p = columns;
   }
   // By all warps, when all that this rank has is sent.
-  static __device__ __forceinline__ void end(const Block& b) {
+  static __device__ __forceinline__ void end(const Cta& b) {
     if (!COPY_ATTENTION) return;
     consumers_sync();
     if (b.warp() == COPY_WARP) {

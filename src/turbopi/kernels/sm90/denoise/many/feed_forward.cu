@@ -1,5 +1,5 @@
 // Many tokens: gate|up and GeGLU. Awaits the stream. Hidden units land over it when all ranks have multiplied it.
-__device__ __forceinline__ void gate_up(Block& b, const float* shifted, const float* row_scales, Sent&) {
+__device__ __forceinline__ void gate_up(Cta& b, const float* shifted, const float* row_scales, Sent&) {
   const int gn = b.gn(), token = 2 * b.t() + (b.g() & 1);
   Own<GTL> own(b, gn);
   const GateUpRows rows(own, b, shifted, row_scales);

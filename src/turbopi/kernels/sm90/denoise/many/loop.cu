@@ -1,12 +1,12 @@
 // Many tokens: the loop.
 
-__device__ __forceinline__ u32 hidden_bytes(const Block& b) {
+__device__ __forceinline__ u32 hidden_bytes(const Cta& b) {
   if (COPY_HIDDEN) return HC * NT * OPERAND;
   return b.hn() * 16 * T * (OPERAND / 128) + (IDLE ? S * 4 : 0);
 }
 
 // The warps that multiply.
-__device__ __forceinline__ void consume(Block& b) {
+__device__ __forceinline__ void consume(Cta& b) {
   const Args& a = b.a;
   const int prefix = int(*a.length);
   Actions actions(b);
@@ -62,13 +62,13 @@ __device__ __forceinline__ void consume(Block& b) {
 }
 
 // The last of the spare warps.
-__device__ __forceinline__ void help(const Block& b) { fetch_stream(b); }
+__device__ __forceinline__ void help(const Cta& b) { fetch_stream(b); }
 
-__device__ __forceinline__ u32 arrivals(const Block& b, int bar) {  // warps that store partial outputs here arrive, too
+__device__ __forceinline__ u32 arrivals(const Cta& b, int bar) {  // warps that store partial outputs here arrive, too
   return ASYNC && bar == BAR_COMB ? 1 + b.qn() : 1;
 }
-__device__ __forceinline__ void init_own_barriers(const Block& b) {
+__device__ __forceinline__ void init_own_barriers(const Cta& b) {
   barrier_init(b.bar(BAR_DONE), W), barrier_init(b.bar(BAR_FREE), S);
   barrier_init(b.bar(BAR_ROOM), S), barrier_init(b.bar(BAR_HERE), W), barrier_init(b.bar(BAR_SQUARES), 1);
 }
-__device__ __forceinline__ void expect_own(const Block& b) { barrier_expect(b.bar(BAR_SQUARES), SQUARES_EXPECT); }
+__device__ __forceinline__ void expect_own(const Cta& b) { barrier_expect(b.bar(BAR_SQUARES), SQUARES_EXPECT); }

@@ -1,7 +1,7 @@
 // Many tokens: queries, keys and values of the suffix.
 
 // By one warp: this rank's queries, staged [half][tile][NT][8 tokens][8] at M_ATT, to all ranks when there is room.
-__device__ __forceinline__ void copy_queries(const Block& b) {
+__device__ __forceinline__ void copy_queries(const Cta& b) {
   constexpr u32 BYTES = QTL * NT * 128, HALF = QT * NT * 128;  // of half the columns: this rank's, all
   const u32 place = b.q0() * NT * 128;
   byte* const there = (byte*)(b.a.scratch + B_QUERIES) + size_t(b.cluster()) * 2 * HALF + place;
@@ -21,7 +21,7 @@ __device__ __forceinline__ void copy_queries(const Block& b) {
 
 // Awaits the stream. q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream.
-__device__ __forceinline__ void project(Block& b, const float* shifted, const float* row_scales, float* kv, u32 bit,
+__device__ __forceinline__ void project(Cta& b, const float* shifted, const float* row_scales, float* kv, u32 bit,
                                         const float4 (&rope)[ITEMS_Q]) {
   const int tiles = b.qn() + b.kvn();
   float2 shift[ITEMS_Q], scale[ITEMS_Q];

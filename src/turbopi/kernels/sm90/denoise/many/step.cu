@@ -9,20 +9,20 @@ constexpr int GROUPS = CONSUMERS / A, OWNERS = imin(GROUPS, OWN_T), HELD = most(
 struct Actions {
   float kept[HELD];
 
-  static __device__ __forceinline__ int number(const Block& b) { return b.thread % A; }
-  static __device__ __forceinline__ int group(const Block& b) { return b.thread / A; }
-  static __device__ __forceinline__ int index(const Block& b, int i) {  // among the OWN_T
+  static __device__ __forceinline__ int number(const Cta& b) { return b.thread % A; }
+  static __device__ __forceinline__ int group(const Cta& b) { return b.thread / A; }
+  static __device__ __forceinline__ int index(const Cta& b, int i) {  // among the OWN_T
     return group(b) % OWNERS + i * OWNERS;
   }
-  static __device__ __forceinline__ int token(const Block& b, int i) {
+  static __device__ __forceinline__ int token(const Cta& b, int i) {
     return (b.cluster() + index(b, i) / 8 * NC) * 8 + index(b, i) % 8;
   }
-  static __device__ __forceinline__ bool exists(const Block& b, int i) {
+  static __device__ __forceinline__ bool exists(const Cta& b, int i) {
     return group(b) < OWNERS && index(b, i) < OWN_T && token(b, i) < T;
   }
-  static __device__ __forceinline__ int place(const Block& b, int i) { return token(b, i) * A + number(b); }
+  static __device__ __forceinline__ int place(const Cta& b, int i) { return token(b, i) * A + number(b); }
 
-  __device__ __forceinline__ explicit Actions(const Block& b) {
+  __device__ __forceinline__ explicit Actions(const Cta& b) {
 #pragma unroll
     for (int i = 0; i < HELD; ++i) {
       const bool real = exists(b, i);
@@ -33,7 +33,7 @@ struct Actions {
 };
 
 // x_t to the stream: action_in_proj, this rank's slice.
-__device__ __forceinline__ void embed_own(Block& b, const Actions& actions, float4 (&x)[ITEMS_X], const float* scale) {
+__device__ __forceinline__ void embed_own(Cta& b, const Actions& actions, float4 (&x)[ITEMS_X], const float* scale) {
   float* const xt = (float*)(b.smem + M_X + X_OWN_XT);
 #pragma unroll
   for (int i = 0; i < HELD; ++i)  // of tokens that don't exist zeros
@@ -64,7 +64,7 @@ __device__ __forceinline__ void embed_own(Block& b, const Actions& actions, floa
 }
 
 // Final norm, action_out_proj and the Euler step; as many threads as there are share the columns.
-__device__ __forceinline__ void advance_own(Block& b, Actions& actions, const float4 (&x)[ITEMS_X], const float* scale,
+__device__ __forceinline__ void advance_own(Cta& b, Actions& actions, const float4 (&x)[ITEMS_X], const float* scale,
                                             int step) {
   float* const xs = (float*)(b.smem + M_X + X_OWN_XS);
 #pragma unroll

@@ -5,7 +5,7 @@
 // up for those, and puts what the next products take into L2. Of each cluster rank r asks for slice r until all of it is
 // there, then a spare warp fetches it, and the copy engine writes it to all ranks at once.
 
-__device__ __forceinline__ Item stream_item(const Block& b, int j) {
+__device__ __forceinline__ Item stream_item(const Cta& b, int j) {
   const u32 i = b.warp() + j * W, xn = b.xn();  // unsigned: divisions become shifts
   const int tile = i % DX, n = b.cluster() + i / DX * NC;
   const bool real = i < DX * OWN_N && u32(tile) < xn && n < NT;
@@ -17,28 +17,28 @@ __device__ __forceinline__ Item stream_item(const Block& b, int j) {
 // stream, the consumers do (ROOM).
 
 // This warp has read what it needs of region X, up to the next exchange of the stream.
-__device__ __forceinline__ void done_with_x(const Block& b) {
+__device__ __forceinline__ void done_with_x(const Cta& b) {
   show_to_products();  // the copy engine comes behind our reads and writes
   __syncwarp();
   if (b.lane() == 0) barrier_arrive(b.bar(BAR_DONE));
 }
 // All warps here have multiplied the stream; all ranks have.
-__device__ __forceinline__ void give_room(const Block& b) {
+__device__ __forceinline__ void give_room(const Cta& b) {
   if (b.thread < S) arrive_at(at_rank(b.bar(BAR_ROOM), b.thread));
 }
-__device__ __forceinline__ void await_room(const Block& b) {
+__device__ __forceinline__ void await_room(const Cta& b) {
   barrier_wait(b.bar(BAR_ROOM), b.room & 1);
   __syncwarp();
 }
 
 // An item's sums of squares to float[8 tokens at a time][DX][8].
-__device__ __forceinline__ void keep_squares(const Block& b, float4 x, int j, bool real) {
+__device__ __forceinline__ void keep_squares(const Cta& b, float4 x, int j, bool real) {
   const float2 q = squares_of(x);
   if (const int i = b.warp() + j * W; i < DX * OWN_N && b.g() == 0)
     *(float2*)(b.smem + M_PART + (i * 8 + 2 * b.t()) * 4) = real ? make_float2(q.x, q.y) : make_float2(0, 0);
 }
 // Those of the slice of one of this CTA's tokens.
-__device__ __forceinline__ float slice_squares(const Block& b, int token) {
+__device__ __forceinline__ float slice_squares(const Cta& b, int token) {
   float sum = 0;
 #pragma unroll
   for (int tile = 0; tile < DX; ++tile)
@@ -49,7 +49,7 @@ __device__ __forceinline__ float slice_squares(const Block& b, int token) {
 // of squares, with flags in their lowest bits. A flag for the stream would need a fence before it, of 1,100 to 1,800
 // cycles: instead its words themselves say whether they are there. Those of the turn before are ABSENT again, as all
 // clusters have read them: what was published now follows sums that they made of them.
-__device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS_X], const float2 (&scales)[ITEMS_X]) {
+__device__ __forceinline__ void publish_stream(Cta& b, const float4 (&x)[ITEMS_X], const float2 (&scales)[ITEMS_X]) {
   auto stage = [&](u32 turn) { return (byte*)(b.a.scratch + B_STAGE + turn % STAGED * N_STAGE); };
   byte *const to = stage(b.turn), *const last = stage(b.turn + STAGED - 1);
 #pragma unroll
@@ -82,7 +82,7 @@ __device__ __forceinline__ void publish_stream(Block& b, const float4 (&x)[ITEMS
 
 // The warps that multiply: until the slice of the stream that was published last is in L2, all of it. One question at a
 // time: more of them slow down what they ask for.
-__device__ __forceinline__ void await_slice(const Block& b) {
+__device__ __forceinline__ void await_slice(const Cta& b) {
   constexpr int WORDS = OPERAND / 16, MOST = most(DX * NT * WORDS, CONSUMERS);
   const uint4* const from = b.a.scratch + B_STAGE + (b.turn - 1) % STAGED * N_STAGE + b.x0() * NT * WORDS;
   const uint4* words[MOST];  // in the place of those that are never written the first one
@@ -105,7 +105,7 @@ __device__ __forceinline__ void await_slice(const Block& b) {
 }
 // All lanes of a spare warp: the slice's sums of squares, use `turn`, to all ranks when they are there. Answers take
 // long, so three questions are on their way at any time.
-__device__ __forceinline__ void pass_on_squares(const Block& b, u32 turn) {
+__device__ __forceinline__ void pass_on_squares(const Cta& b, u32 turn) {
   const int mine = imin(b.lane(), NT * 4 - 1);
   const uint2* const from =
       (const uint2*)(b.a.scratch + B_SQUARES + (turn & 1) * N_SQUARES) + b.rank() * NT * 4 + mine;
@@ -132,7 +132,7 @@ __device__ __forceinline__ void pass_on_squares(const Block& b, u32 turn) {
 }
 // A spare warp. The copy engine reads L2, as those did who have seen that the slice is there, and only then. Sums of
 // squares have a barrier of their own, as they come later and are needed later.
-__device__ __forceinline__ void fetch_stream(const Block& b) {
+__device__ __forceinline__ void fetch_stream(const Cta& b) {
   const u32 place = b.x0() * NT, items = b.xn() * NT;
   u32 uses = 0, turn = 0;
 #pragma unroll 1
@@ -168,14 +168,14 @@ __device__ __forceinline__ void fetch_stream(const Block& b) {
 
 constexpr u32 SQUARES_EXPECT = S * NT * 32;
 // A spare warp: until sums of squares of the stream's use `use` are here.
-__device__ __forceinline__ void await_squares(const Block& b, int use) {
+__device__ __forceinline__ void await_squares(const Cta& b, int use) {
   barrier_wait(b.bar(BAR_SQUARES), use & 1);
   if (b.lane() == 0) barrier_expect(b.bar(BAR_SQUARES), SQUARES_EXPECT);
 }
 
 constexpr u32 X_EXPECT = D16 * NT * 8 * (OPERAND / 8);
 // The stream that comes before attention, or (half 1) the feed-forward.
-__device__ __forceinline__ void receive_stream(const Block& b, int half) {
+__device__ __forceinline__ void receive_stream(const Cta& b, int half) {
   note(b, WAIT_X), await_slice(b);
   receive(b, BAR_X, half, X_EXPECT, WAIT_X);
 }
@@ -212,7 +212,7 @@ __device__ __forceinline__ void take_singly(float4& sum, const uint2* p, int fro
 constexpr u32 PATIENCE = FP8 ? 300 : 400;  // clock cycles before sums are asked for: polls slow down what they wait for
 // Fetch the clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, publish the
 // slice times the next norm's scale. buffer: [D16][NT][NC][32] 8-byte words.
-__device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uint4* buffer, u32 bit,
+__device__ __forceinline__ void gather(Cta& b, float4 (&x)[ITEMS_X], const uint4* buffer, u32 bit,
                                        const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
                                        int half) {
   const u32 since = u32(clock64());
@@ -241,7 +241,7 @@ __device__ __forceinline__ void gather(Block& b, float4 (&x)[ITEMS_X], const uin
 }
 
 // Where a cluster's partial sums of (tile, 8 tokens n) of the slice go, for `gather`.
-__device__ __forceinline__ uint2* sums_place(const Block& b, uint4* buffer, int tile, int n) {
+__device__ __forceinline__ uint2* sums_place(const Cta& b, uint4* buffer, int tile, int n) {
   const uint4* const words = buffer + ((b.x0() + tile) * NT + n) * PAIRS * 32;
   return (uint2*)words + b.cluster() * 32 + b.lane();
 }

@@ -6,7 +6,7 @@
 // lanes alone may decide where a warp goes on.
 __device__ __forceinline__ u32 of_warp(u32 v) { return __shfl_sync(~0u, v, 0); }
 
-struct Block {
+struct Cta {
   const Args& a;
   byte* smem;
   u32 base;                 // of smem in the shared window
@@ -15,7 +15,7 @@ struct Block {
   u32 slot = 0, phase = 0;  // of the ring
   u32 turn = 0, room = 0;   // exchanges of the stream, uses of BAR_ROOM
 
-  __device__ Block(const Args& args, byte* s)
+  __device__ Cta(const Args& args, byte* s)
       : a(args), smem(s), base(u32(__cvta_generic_to_shared(s))), cta(blockIdx.x), thread(threadIdx.x),
         warp_(of_warp(threadIdx.x / 32)) {}
   // The same as `base`, known to be so in all lanes.

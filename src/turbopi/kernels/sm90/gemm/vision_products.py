@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from turbopi.kernels import norms
+from turbopi.kernels.portable import norms
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Epilogue, Folded, Sums, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
 from turbopi.kernels.sm90.gemm.products import (
@@ -68,8 +68,8 @@ class NormedCopy:
     shift: Tensor
 
 
-class VisionTower:
-    """Its products. Those in front of a LayerNorm add the residual stream themselves, those behind do the norm."""
+class VisionProducts:
+    """The tower's products: those in front of a LayerNorm add the residual stream themselves, those behind norm it."""
 
     def __init__(self) -> None:
         # by the weight's address; the weight stays with it, so that no other one can come to lie there

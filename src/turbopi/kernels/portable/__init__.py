@@ -1,0 +1,1 @@
+"""Kernels that run on every NVIDIA GPU: in Triton, and the library's products."""

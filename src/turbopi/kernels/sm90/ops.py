@@ -1,0 +1,67 @@
+"""The engine's operations on Hopper: our products and attention where they win, the portable ones elsewhere."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbopi.kernels.interface import Ops
+from turbopi.kernels.portable import attention as portable_attention
+from turbopi.kernels.portable.ops import attend as attend_portably
+from turbopi.kernels.portable.ops import portable_ops
+from turbopi.kernels.sm90.attention import kernel as attention
+from turbopi.kernels.sm90.gemm import products
+from turbopi.kernels.sm90.gemm.bf16 import Tile
+from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
+from turbopi.kernels.sm90.gemm.vision_products import RESIDUAL_TILES, VisionProducts
+
+
+def hopper_ops(device: torch.device) -> Ops:
+    portable, vision = portable_ops(), VisionProducts()
+    origin = {
+        "vision products": f"CUDA for {_rows(products.VISION_TILES)} rows, else cuBLAS",
+        "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS",
+        "product behind the prefix's GeGLU": "in parts that the norm behind it adds up: "
+        f"CUDA for {_rows(products.PARTS, Tile)} rows, cuBLAS for {_rows(products.PARTS, int)}, in whole 64; else "
+        "cuBLAS at once",
+        "vision and prefix attention": "CUDA; Triton where head_dim isn't a multiple of 8 from 16 to 256",
+    }
+    if products.num_sms(device) >= GATHERING_SMS:
+        origin["LayerNorm"] = f"most in the products around them for {_rows(RESIDUAL_TILES)} rows, else Triton"
+    return replace(
+        portable,
+        residual_layer_norm=vision.residual_layer_norm,
+        linear=vision.linear,
+        residual_linear=vision.residual_linear,
+        linear_gelu=vision.linear_gelu,
+        linear_geglu=products.tuned_linear_geglu,
+        vision_attention=vision_attention,
+        attention=attend,
+        origin={**portable.origin, **origin},
+    )
+
+
+def _rows(tiles: Mapping[tuple[int, int, int], Tile | int], kind: type = Tile) -> str:
+    return ", ".join(str(rows) for rows in sorted({rows for (rows, _, _), tile in tiles.items() if type(tile) is kind}))
+
+
+def attend(
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    length: Tensor,
+    slots: int,
+    heads: int,
+    *state_token: Any,
+    inverse: float | None = None,
+) -> Tensor:
+    if k.shape[0] == slots and attention.takes(q.shape[1]):  # no suffix behind the prefix
+        return attention.prefix_attention(q, k, v, length, heads, inverse)
+    return attend_portably(q, k, v, length, slots, heads, *state_token, inverse=inverse)
+
+
+def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:
+    ours = attention if attention.takes(qkv.shape[1] // 3 // heads) else portable_attention
+    return ours.vision_attention(qkv, images, heads, inverse)
