@@ -3,7 +3,6 @@
 import html
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from evaluate_fakes import SeekingPolicy, run
 from file_helpers import no_room
+from msgspec.structs import replace
 
 from turbopi.errors import ConfigError, OutputError
 from turbopi.evaluate.compare import HEADS, cells, compare, write_comparison
@@ -122,8 +122,9 @@ def test_pages_are_escaped_whatever_a_results_object_holds(tmp_path: Path) -> No
     """Also where `load_results` would have refused it."""
     results = run(tmp_path, SeekingPolicy(), states=(0,))
     (episode,) = results.in_order()
-    results.episodes[0, 0] = replace(episode, status=EVIL, message=EVIL, seed=EVIL)  # type: ignore[arg-type]
-    results.started = results.protocol["suite"] = EVIL  # type: ignore[index]
+    results.episodes[0, 0] = replace(episode, status=EVIL, message=EVIL, seed=EVIL)
+    results.started = EVIL
+    results.protocol = {**results.protocol, "suite": EVIL}
     assert "<script" not in write_report(results).read_text()
 
 
@@ -157,7 +158,7 @@ def test_a_comparison_tells_the_precision_and_calibration_on_noise(tmp_path: Pat
     runs = [run(tmp_path / name, policy, states=(0,)) for name, policy in (("a", exact), ("b", rounded))]
     compared = compare(runs)
     assert [cells(one)[HEADS.index("precision")] for one in compared] == ["f32", "fp8, random noise"]
-    assert [one.as_json()["precision"] for one in compared] == ["f32", "fp8, random noise"]
+    assert [one.document.precision for one in compared] == ["f32", "fp8, random noise"]
 
 
 def in_fp8(calibration: str) -> SeekingPolicy:
@@ -174,16 +175,17 @@ def test_runs_of_two_calibrations_are_only_compared_on_purpose(tmp_path: Path) -
         compare([exact, one, other])
     compared = compare([exact, one, other], across_calibrations=True)
     assert [run.precision for run in compared] == ["f32", "fp8, aaaaaaaa", "fp8, bbbbbbbb"]
-    assert [run.as_json()["calibration"] for run in compared] == [None, "aaaaaaaaaaaa", "bbbbbbbbbbbb"]
+    assert [run.document.calibration for run in compared] == [None, "aaaaaaaaaaaa", "bbbbbbbbbbbb"]
 
 
 def test_what_servers_tell_stands_for_their_weights(tmp_path: Path) -> None:
     one, other = (run(tmp_path / name, in_fp8(name * 12), states=(0,)) for name in "ab")
     for results, config in ((one, "pi05_base"), (other, "pi05_libero")):
-        calibration = results.policy["identity"]["calibration"]
-        results.policy = {**results.policy, "identity": {"server": {"config": config}, "calibration": calibration}}
+        calibration = results.policy.identity["calibration"]
+        told = {"server": {"config": config}, "calibration": calibration}
+        results.policy = replace(results.policy, identity=told)
     assert len(compare([one, other])) == 2
-    other.policy = {**other.policy, "identity": {**other.policy["identity"], "server": {"config": "pi05_base"}}}
+    other.policy = replace(other.policy, identity={**other.policy.identity, "server": {"config": "pi05_base"}})
     with pytest.raises(ConfigError, match="FP8 of one model by different calibrations"):
         compare([one, other])
 
@@ -226,9 +228,9 @@ def test_visited_observations_give_the_action_error(tmp_path: Path) -> None:
     assert again.seen == 9
     assert [str(entry["prompt"]) for entry in again.entries] == [str(entry["prompt"]) for entry in visited.entries]
     exact = action_error(again.entries, source)
-    assert exact is not None and exact["rms"] == exact["max"] == 0
+    assert exact is not None and exact.rms == exact.max == 0
     off = action_error(again.entries, LocalPolicy(Off()))
-    assert off is not None and off["max"] >= off["rms"] > 0.1
+    assert off is not None and off.max >= off.rms > 0.1
     assert action_error([], source) is None
 
 

@@ -66,6 +66,6 @@ def test_percentiles_are_numpys() -> None:
     values = list(np.random.default_rng(0).exponential(10, 501))
     found = percentiles(values)
     assert found is not None
-    assert found["p50"] == np.median(values) and found["p99"] == np.percentile(values, 99)
-    assert found["max"] == max(values) and found["count"] == 501
+    assert found.p50 == np.median(values) and found.p99 == np.percentile(values, 99)
+    assert found.max == max(values) and found.count == 501
     assert percentiles([]) is None

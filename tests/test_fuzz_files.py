@@ -30,7 +30,7 @@ from turbopi.cli.files import load_noise
 from turbopi.config import LIMITS, preset
 from turbopi.errors import TurboPiError
 from turbopi.evaluate.reading import load_results
-from turbopi.evaluate.results import Episode, Results
+from turbopi.evaluate.results import Episode, PolicyTold, Results
 from turbopi.evaluate.visited import Visited
 from turbopi.export.onnx import GRAPHS, MANIFEST, open_export
 from turbopi.preprocess.normalize import Normalizer
@@ -121,7 +121,7 @@ def _results(folder: Path) -> None:
     results = Results(
         folder,
         {"simulator": "reacher", "suite": "reacher", "sim": {"seed": 7}, "replan": 5},
-        {"label": "tiny", "identity": {"precision": "bf16"}, "about": {"backend_details": {}}},
+        PolicyTold("tiny", {"precision": "bf16"}, {"backend_details": {}}),
         [Task(0, "reach", "reach the target", 3, 20)],
         {"simulator": {"name": "reacher"}},
         {"workers": 1},
@@ -292,7 +292,7 @@ TARGETS = (
     Target("calibration of engines", lambda f: _engines(f), "calibration.json", lambda f: _scales(f), _as_json, 120),
     Target("export", _export, MANIFEST, lambda f: open_export(f).config, _as_json, 200),
     Target("robot", _robot, "robot.json", _in("robot.json", load_robot), _as_json, 300),
-    Target("results", _results, "results.json", lambda f: load_results(f).as_json()["summary"], _as_json, 300),
+    Target("results", _results, "results.json", lambda f: load_results(f).summary(), _as_json, 300),
     Target("tokenizer", _file("tokenizer.model", lambda f: shutil.copy(TINY_TOKENIZER, f)), "tokenizer.model", _tokens,
            _as_bytes, 120),
     Target("observation.json", _by_hand, "observation.json", lambda f: _arrays(load_observation(f)), _as_json, 200),

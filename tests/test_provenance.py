@@ -35,12 +35,11 @@ def repository(folder: Path, *files: str) -> str:
 def told(monkeypatch: pytest.MonkeyPatch, file: Path) -> str:
     """The commit that is recorded if provenance.py is this file."""
     monkeypatch.setattr(module, "__file__", str(file))
-    commit: str = provenance(torch.device("cpu"))["commit"]
-    return commit
+    return provenance(torch.device("cpu")).commit
 
 
 def test_the_version_is_always_recorded() -> None:
-    assert provenance(torch.device("cpu"))["turbopi"] == version("turbopi")
+    assert provenance(torch.device("cpu")).turbopi == version("turbopi")
 
 
 def test_a_checkout_of_ours_is_told_by_its_commit_and_by_its_changes(

@@ -168,7 +168,7 @@ def test_actions_of_another_width_end_a_run_in_libero_and_what_was_finished_stay
         evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=videos)
     (first,) = results.in_order()
     assert (first.status, first.steps) == ("failure", 6)
-    assert results.versions["simulator"]["mujoco"] == "3.2.3"
+    assert json.loads(results.path.read_text())["versions"]["simulator"]["mujoco"] == "3.2.3"
 
 
 def test_the_command_runs_two_tasks_with_random_weights(tmp_path: Path) -> None:

@@ -6,41 +6,89 @@ import subprocess
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 import torch
+from msgspec import UNSET, Struct, UnsetType, field
 
 from turbopi.version import turbopi_version
 
 _GPU_FIELDS = ("name", "driver_version", "clocks.sm", "clocks.mem", "clocks_throttle_reasons.active", "temperature.gpu")
 
 
-def provenance(device: torch.device) -> dict[str, Any]:
-    """Plain values for a result file; the clocks are those of the moment of the call."""
-    about: dict[str, Any] = {
-        "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
-        "turbopi": turbopi_version(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        **{name: _version(name) for name in ("triton", "numpy", "sentencepiece")},
-        "commit": _commit(),
-        "device": str(device),
-    }
-    if device.type == "cuda":
-        properties = torch.cuda.get_device_properties(device)
-        about["gpu"] = {
-            "compute_capability": f"{properties.major}.{properties.minor}",
-            "multiprocessors": properties.multi_processor_count,
-            "memory_bytes": properties.total_memory,
-            "cuda": torch.version.cuda,
-            **_nvidia_smi(device),
-        }
-    else:
-        about["cpu"] = {"machine": platform.machine(), "name": _cpu_name(), "threads": torch.get_num_threads()}
-    return about
+class Gpu(Struct, frozen=True, omit_defaults=True):
+    """An NVIDIA GPU at one moment. What nvidia-smi tells is its own text; left out where there is no nvidia-smi."""
+
+    compute_capability: str | None = None  # "9.0"
+    multiprocessors: int | None = None
+    memory_bytes: int | None = None
+    cuda: str | None = None  # PyTorch's
+    name: str | None = None
+    driver_version: str | None = None
+    clock_sm: str | None = field(default=None, name="clocks.sm")  # "345 MHz"
+    clock_memory: str | None = field(default=None, name="clocks.mem")
+    throttling: str | None = field(default=None, name="clocks_throttle_reasons.active")  # bits: "0x0000000000000001"
+    temperature: str | None = field(default=None, name="temperature.gpu")  # degrees Celsius
 
 
-def _nvidia_smi(device: torch.device) -> dict[str, str]:
+class Cpu(Struct, frozen=True):
+    machine: str  # "x86_64"
+    name: str
+    threads: int  # PyTorch's
+
+
+class Provenance(Struct, frozen=True, kw_only=True):
+    """What a result file says of where it comes from. UNSET: the file doesn't say, as older ones don't say all."""
+
+    date: str  # "2026-11-24", UTC
+    turbopi: str | UnsetType = UNSET
+    python: str
+    torch: str
+    triton: str | UnsetType | None = UNSET  # None: not installed
+    numpy: str | UnsetType | None = UNSET
+    sentencepiece: str | UnsetType | None = UNSET
+    commit: str  # "+" behind it: and changes
+    device: str  # "cpu", "cuda:0"
+    gpu: Gpu | UnsetType = UNSET
+    cpu: Cpu | UnsetType = UNSET
+
+    @property
+    def device_name(self) -> str:
+        """The GPU's name, else the CPU's."""
+        if self.gpu and self.gpu.name:
+            return self.gpu.name
+        return self.cpu.name if self.cpu else "CPU"
+
+
+def provenance(device: torch.device) -> Provenance:
+    """For a result file; the clocks are those of the moment of the call."""
+    return Provenance(
+        date=datetime.now(timezone.utc).strftime("%Y-%m-%d"),
+        turbopi=turbopi_version(),
+        python=platform.python_version(),
+        torch=str(torch.__version__),
+        triton=_version("triton"),
+        numpy=_version("numpy"),
+        sentencepiece=_version("sentencepiece"),
+        commit=_commit(),
+        device=str(device),
+        gpu=_gpu(device) if device.type == "cuda" else UNSET,
+        cpu=Cpu(platform.machine(), _cpu_name(), torch.get_num_threads()) if device.type != "cuda" else UNSET,
+    )
+
+
+def _gpu(device: torch.device) -> Gpu:
+    properties = torch.cuda.get_device_properties(device)
+    return Gpu(
+        f"{properties.major}.{properties.minor}",
+        properties.multi_processor_count,
+        properties.total_memory,
+        torch.version.cuda,
+        *_nvidia_smi(device),
+    )
+
+
+def _nvidia_smi(device: torch.device) -> list[str]:
+    """What it says of _GPU_FIELDS, or nothing."""
     command = [
         "nvidia-smi",
         f"--query-gpu={','.join(_GPU_FIELDS)}",
@@ -48,7 +96,7 @@ def _nvidia_smi(device: torch.device) -> dict[str, str]:
         f"--id={device.index or 0}",
     ]
     values = _output(command).split(", ")
-    return dict(zip(_GPU_FIELDS, values, strict=True)) if len(values) == len(_GPU_FIELDS) else {}
+    return values if len(values) == len(_GPU_FIELDS) else []
 
 
 def _version(package: str) -> str | None:

@@ -22,6 +22,7 @@ def piece(attack: Attack, seed: int, size: Size, found: Found, seen: dict[str, A
     import torch
 
     from turbopi.provenance import provenance
+    from turbopi.reading import plain_document
 
     held = not found.violations and not found.more_violations and all(bar.held for bar in found.bars)
     return {
@@ -39,7 +40,7 @@ def piece(attack: Attack, seed: int, size: Size, found: Found, seen: dict[str, A
         "server": seen or None,
         "notes": found.notes,
         "verdict": "held" if held else "broken",
-        "provenance": provenance(torch.device("cpu")),
+        "provenance": plain_document(provenance(torch.device("cpu"))),
     }
 
 

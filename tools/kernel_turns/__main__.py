@@ -62,6 +62,7 @@ def main() -> None:
 def _time(arguments: argparse.Namespace) -> None:
     from kernel_turns.turns import GPU, MARKS, RANKS, Job, marks_by_rank, time_in_turns
     from turbopi.provenance import provenance
+    from turbopi.reading import plain_document
 
     variants, console, rows = [Variant(spec) for spec in arguments.variants], Console(), []
     for tokens in (int(text) for text in arguments.tokens.split(",")):
@@ -85,7 +86,7 @@ def _time(arguments: argparse.Namespace) -> None:
                     )
                 console.print(table)
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps({"provenance": provenance(GPU), "rows": rows}, indent=1))
+        arguments.json.write_text(json.dumps({"provenance": plain_document(provenance(GPU)), "rows": rows}, indent=1))
 
 
 def _launch(arguments: argparse.Namespace) -> None:

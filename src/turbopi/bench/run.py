@@ -22,6 +22,7 @@ from turbopi.errors import ConfigError, TurboPiError
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
 from turbopi.quantization.plan import TIERS
+from turbopi.reading import plain_document
 
 Answered = tuple[dict[str, Any], Job, np.ndarray]  # a result, its job, and the policy's `answers`
 
@@ -122,7 +123,7 @@ def run(
     progress.doing("measuring this machine's floors")
     floors = {precision: measure_floors(device, precision) for precision in plan.precisions}
     collect_and_empty_cache()
-    before = provenance(device)
+    before = plain_document(provenance(device))
     results: list[dict[str, Any]] = []
     answered: list[Answered] = []
     failed: list[dict[str, str]] = []
@@ -159,7 +160,7 @@ def run(
         _judge(checkpoint, plan, device, answered)
         keep([])
     complete = document(results)
-    complete["provenance"] = {**before, "clocks_at_the_end": provenance(device).get("gpu", {})}
+    complete["provenance"] = {**before, "clocks_at_the_end": plain_document(provenance(device)).get("gpu", {})}
     complete["linear"] = linear_models(results)
     if plan.profile:
         complete["profile"] = [

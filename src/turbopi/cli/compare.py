@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
     from turbopi.evaluate.compare import Variant
     from turbopi.evaluate.results import Results
+    from turbopi.evaluate.visited import ActionDifference
 
 
 @command(
@@ -78,7 +79,7 @@ def compare_command(
         results, errors = _run_variants(options, runs, checkpoint, simulator, out, output)
         compared = compare(results, errors, across_calibrations=across_calibrations)
     table = Table(
-        title=escape(f"{compared[0].results.protocol['suite']}: {compared[0].rate.trials} episodes"),
+        title=escape(f"{compared[0].results.suite}: {compared[0].rate.trials} episodes"),
         title_justify="left",
     )
     for number, name in enumerate(HEADS):
@@ -94,7 +95,7 @@ def compare_command(
 
 def _run_variants(
     options: EvalOptions, texts: list[str], checkpoint: str | None, simulator_name: str, out: Path, output: Output
-) -> "tuple[list[Results], list[dict[str, float] | None]]":
+) -> "tuple[list[Results], list[ActionDifference | None]]":
     """Evaluate each way to run into a folder of its own, then ask the reference about what they met."""
     from turbopi.evaluate.compare import Variant
     from turbopi.evaluate.visited import Visited, action_error

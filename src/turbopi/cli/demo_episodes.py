@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from turbopi.cli.framework import Output
+from turbopi.reading import plain_document
 
 if TYPE_CHECKING:
     from turbopi.evaluate.results import Episode, Results
@@ -18,7 +19,7 @@ DEFAULT = 3
 
 def play_episodes(
     make_policy: "Callable[[], UnifiedPolicy]", wanted: int | None, folder: Path, output: Output
-) -> dict[str, Any] | None:
+) -> dict[str, object] | None:
     """Play and tell; returns the results' summary. `wanted` None: DEFAULT, or nothing where LIBERO isn't installed.
 
     Raises SimulatorUnavailable if episodes were asked for and can't be played.
@@ -56,10 +57,10 @@ def play_episodes(
 
     evaluate(results, protocol, source, simulator, jobs, num_workers=1, max_batch=1, videos=plan, on_episode=told)
     summary = results.summary()
-    success, call = summary["success"], summary["call_ms"]
+    success, call = summary.success, summary.call_ms
+    took = f"; a chunk took {call.p50:.0f} ms (95 %: {call.p95:.0f} ms)" if call else ""
     output.line(
-        f"{success['successes']} of {success['trials']} episodes solved; a chunk took {call['p50']:.0f} ms "
-        f"(95 %: {call['p95']:.0f} ms); videos in {folder / 'videos'}",
+        f"{success.successes} of {success.trials} episodes solved{took}; videos in {folder / 'videos'}",
         "bold",
     )
-    return {"folder": str(folder), **summary}
+    return {"folder": str(folder), **plain_document(summary)}

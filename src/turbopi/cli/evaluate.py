@@ -16,6 +16,7 @@ from turbopi.cli.files import check_folder, let_import_from_here
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.errors import ConfigError
+from turbopi.reading import plain_document
 
 if TYPE_CHECKING:
     from turbopi.evaluate.plan import Job, Protocol, VideoPlan
@@ -250,7 +251,7 @@ def evaluate_command(
     finally:
         source.close()
     _show(results, output)
-    output.document({"folder": results.folder, **results.summary()})
+    output.document({"folder": results.folder, **plain_document(results.summary())})
     if not results.complete:
         raise typer.Exit(CHECK_FAILED)
 
@@ -354,7 +355,7 @@ def _show(results: "Results", output: Output) -> None:
     from turbopi.evaluate.results import rate
 
     episodes = results.in_order()
-    table = Table(title=escape(f"{results.protocol['suite']}: {results.label}"), title_justify="left")
+    table = Table(title=escape(f"{results.suite}: {results.label}"), title_justify="left")
     table.add_column("task", justify="right")
     table.add_column("instruction", overflow="fold")
     for name in ("solved", "success [95 % interval]", "steps", "crashed"):
@@ -373,17 +374,16 @@ def _show(results: "Results", output: Output) -> None:
             )
     output.table(table)
     summary = results.summary()
-    for name, what in (("call_ms", "the policy's whole call"), ("infer_ms", "the model alone")):
-        if summary[name]:
-            found_ms = ", ".join(f"{q} {summary[name][q]:.1f}" for q in ("p50", "p95", "p99"))
-            output.line(f"{what}: {found_ms} ms")
-    if summary["aborted"]:
+    for ms, what in ((summary.call_ms, "the policy's whole call"), (summary.infer_ms, "the model alone")):
+        if ms is not None:
+            output.line(f"{what}: p50 {ms.p50:.1f}, p95 {ms.p95:.1f}, p99 {ms.p99:.1f} ms")
+    if summary.aborted:
         output.line(
-            f"{summary['aborted']} episodes were aborted, as actions weren't finite; they count as failures", "red"
+            f"{summary.aborted} episodes were aborted, as actions weren't finite; they count as failures", "red"
         )
-    if summary["crashes"]:
+    if summary.crashes:
         output.line(
-            f"{summary['crashes']} episodes crashed and count as nothing; the same command tries them again", "red"
+            f"{summary.crashes} episodes crashed and count as nothing; the same command tries them again", "red"
         )
     output.line(f"report: {results.folder / 'report.html'}")
 

@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import rich
 import typer
+from msgspec import Struct
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -39,6 +40,7 @@ from turbopi.cli.process import (
 )
 from turbopi.cli.tables import fitted
 from turbopi.errors import ConfigError, DeviceLost, TurboPiError
+from turbopi.reading import plain_document
 
 CHECK_FAILED, OUR_FAULT = 1, 3
 MAX_MESSAGE = 2000  # characters of an error
@@ -81,10 +83,11 @@ class Output:
         for part in fitted(table, self.console):
             self.console.print(part)
 
-    def document(self, content: Mapping[str, Any]) -> None:
+    def document(self, content: Mapping[str, object] | Struct) -> None:
         """The JSON document, if one was asked for."""
         if self.as_json:
-            text = json.dumps(plain(content), indent=1, ensure_ascii=not can_encode_all(sys.stdout))
+            values = plain_document(content) if isinstance(content, Struct) else content
+            text = json.dumps(plain(values), indent=1, ensure_ascii=not can_encode_all(sys.stdout))
             print(text, flush=True)
 
     @property
@@ -101,7 +104,7 @@ def new_console(*, stderr: bool) -> Console:
     return console
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> object:
     """`value` as JSON's types: arrays as lists, paths as text, what isn't finite as null."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}

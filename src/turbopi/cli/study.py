@@ -12,6 +12,7 @@ from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
 from turbopi.config import LIMITS
 from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.files import write_whole
+from turbopi.reading import plain_document
 from turbopi.wording import significant
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ def study(
     policy = UnifiedPolicy(opened, backend="pytorch", precision="f32", device=resolved, progress=output.shows_progress)
     given, source = given_observations(policy, observation)
     document: dict[str, Any] = {
-        "provenance": provenance(resolved),
+        "provenance": plain_document(provenance(resolved)),
         "model": policy.config.name,
         "random_weights": opened.format == "random",
         "observations": source,

@@ -4,15 +4,18 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+from msgspec import Struct
 
 from turbopi.errors import ConfigError
 from turbopi.evaluate.pages import render
 from turbopi.evaluate.plots import write_comparison_plot
-from turbopi.evaluate.results import Results
-from turbopi.evaluate.statistics import Paired, Rate, percentiles
+from turbopi.evaluate.results import Plain, Results
+from turbopi.evaluate.statistics import Paired, PairedDocument, Percentiles, Rate, RateDocument, percentiles
+from turbopi.evaluate.visited import ActionDifference
 from turbopi.files import write_whole
 from turbopi.quantization.artifact import RANDOM_NOISE
+from turbopi.reading import plain_document
 from turbopi.wording import significant
 
 
@@ -29,6 +32,31 @@ class Variant:
         return f"{self.backend}-{self.precision}-{self.steps}steps"
 
 
+class ComparedRun(Struct, frozen=True):
+    """A run in compare.json. Rates, times and steps are of the episodes that all runs have a verdict for."""
+
+    label: str
+    precision: str
+    calibration: str | None  # FP8's
+    folder: str
+    success: RateDocument
+    paired_with_first: PairedDocument | None  # None: it is the first
+    call_ms: Percentiles | None
+    infer_ms: Percentiles | None
+    steps_to_success: Percentiles | None
+    action_error: ActionDifference | None  # None: not measured
+    crashes: int
+    episodes: int  # that this run has, crashed ones too
+
+
+class ComparisonDocument(Struct, frozen=True):
+    """compare.json."""
+
+    protocol: Plain
+    episodes: int  # common ones
+    runs: list[ComparedRun]
+
+
 @dataclass(frozen=True)
 class Compared:
     """A run among others.
@@ -42,41 +70,42 @@ class Compared:
     label: str
     rate: Rate
     paired: Paired | None
-    call_ms: dict[str, float] | None
-    infer_ms: dict[str, float] | None
-    steps: dict[str, float] | None
-    error: dict[str, float] | None
+    call_ms: Percentiles | None
+    infer_ms: Percentiles | None
+    steps: Percentiles | None
+    error: ActionDifference | None
 
     @property
     def precision(self) -> str:
         """What the policy ran in, where it told; FP8 that was calibrated on noise says so."""
         policy = self.results.policy
-        precision = str(_at(policy, "identity", "precision") or "-")
-        noisy = _at(policy, "about", "backend_details", "fp8", "observations") == RANDOM_NOISE
+        precision = str(policy.identity.get("precision") or "-")
+        noisy = _at(policy.about, "backend_details", "fp8", "observations") == RANDOM_NOISE
         calibration = _calibration(self.results)
         told = [precision, *([] if calibration is None else [calibration[:8]]), *(["random noise"] if noisy else [])]
         return ", ".join(told)
 
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "label": self.label,
-            "precision": self.precision,
-            "calibration": _calibration(self.results),
-            "folder": str(self.results.folder),
-            "success": self.rate.as_json(),
-            "paired_with_first": None if self.paired is None else self.paired.as_json(),
-            "call_ms": self.call_ms,
-            "infer_ms": self.infer_ms,
-            "steps_to_success": self.steps,
-            "action_error": self.error,
-            "crashes": sum(not episode.judged for episode in self.results.episodes.values()),
-            "episodes": len(self.results.episodes),
-        }
+    @property
+    def document(self) -> ComparedRun:
+        return ComparedRun(
+            label=self.label,
+            precision=self.precision,
+            calibration=_calibration(self.results),
+            folder=str(self.results.folder),
+            success=self.rate.document,
+            paired_with_first=None if self.paired is None else self.paired.document,
+            call_ms=self.call_ms,
+            infer_ms=self.infer_ms,
+            steps_to_success=self.steps,
+            action_error=self.error,
+            crashes=sum(not episode.judged for episode in self.results.episodes.values()),
+            episodes=len(self.results.episodes),
+        )
 
 
 def compare(
     runs: Sequence[Results],
-    errors: Sequence[dict[str, float] | None] | None = None,
+    errors: Sequence[ActionDifference | None] | None = None,
     *,
     across_calibrations: bool = False,
 ) -> list[Compared]:
@@ -132,7 +161,7 @@ def check_same_calibration(runs: Sequence[Results]) -> None:
         if calibration is None:
             continue
         # a server doesn't tell its weights: what it tells besides stands for them
-        told = _at(run.policy, "identity", "weights") or _at(run.policy, "identity", "server", "config")
+        told = run.policy.identity.get("weights") or _at(run.policy.identity, "server", "config")
         other = first.setdefault(str(told), run)
         if _calibration(other) != calibration:
             raise ConfigError(
@@ -143,23 +172,19 @@ def check_same_calibration(runs: Sequence[Results]) -> None:
 
 
 def _calibration(run: Results) -> str | None:
-    found = _at(run.policy, "identity", "calibration")
+    found = run.policy.identity.get("calibration")
     return None if found is None else str(found)
 
 
-def _at(value: Any, *keys: str) -> Any:
+def _at(value: object, *keys: str) -> object:
     """What is at these keys inside each other; None if there is nothing, as in results that tell something else."""
     for key in keys:
         value = value.get(key) if isinstance(value, Mapping) else None
     return value
 
 
-def document(compared: Sequence[Compared]) -> dict[str, Any]:
-    return {
-        "protocol": compared[0].results.protocol,
-        "episodes": compared[0].rate.trials,
-        "runs": [run.as_json() for run in compared],
-    }
+def document(compared: Sequence[Compared]) -> ComparisonDocument:
+    return ComparisonDocument(compared[0].results.protocol, compared[0].rate.trials, [run.document for run in compared])
 
 
 HEADS = (
@@ -188,9 +213,9 @@ def cells(run: Compared) -> list[str]:
             f"{run.paired.only_first} : {run.paired.only_second}",
             significant(run.paired.p_value),
         ]
-    row += [f"{run.call_ms[name]:.1f}" if run.call_ms else "-" for name in ("p50", "p95")]
-    row.append(f"{run.steps['p50']:.0f}" if run.steps else "-")
-    row.append(significant(run.error["rms"]) if run.error else "-")
+    row += [f"{ms:.1f}" for ms in (run.call_ms.p50, run.call_ms.p95)] if run.call_ms else ["-", "-"]
+    row.append(f"{run.steps.p50:.0f}" if run.steps else "-")
+    row.append(significant(run.error.rms) if run.error else "-")
     return row
 
 
@@ -206,10 +231,10 @@ def write_comparison(folder: Path, compared: Sequence[Compared]) -> list[Path]:
     """compare.json, compare.png and compare.html."""
     folder.mkdir(parents=True, exist_ok=True)
     told = folder / "compare.json"
-    write_whole(told, json.dumps(document(compared), indent=1, ensure_ascii=False) + "\n")
+    write_whole(told, json.dumps(plain_document(document(compared)), indent=1, ensure_ascii=False) + "\n")
     plot = write_comparison_plot(folder / "compare.png", [(run.label, run.rate) for run in compared])
     shown = folder / "compare.html"
-    suite = str(compared[0].results.protocol["suite"])
+    suite = compared[0].results.suite
     page = render(
         "comparison.html",
         title=f"{suite}: comparison",

@@ -2,8 +2,8 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -33,9 +33,6 @@ class Protocol:
         for name, value in (("replan", self.replan), ("image_px", self.image_px), ("max_steps", self.max_steps)):
             if value is not None and value < 1:
                 raise ConfigError(f"{name} is {value}; it should be at least 1")
-
-    def as_json(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,11 @@
 """report.html: one page that opens from disk, beside the plots and videos it shows. It loads nothing else."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from turbopi.evaluate.pages import render
 from turbopi.evaluate.plots import write_plots
-from turbopi.evaluate.results import Episode, Results, rate
+from turbopi.evaluate.results import Episode, Results, Summary, rate
 from turbopi.evaluate.statistics import Rate, percentiles
 from turbopi.files import write_whole
 
@@ -25,8 +24,8 @@ def _page(results: Results, plots: Sequence[str]) -> str:
     summary, episodes = results.summary(), results.in_order()
     return render(
         "report.html",
-        title=f"{results.protocol['suite']}: {results.label}",
-        suite=results.protocol["suite"],
+        title=f"{results.suite}: {results.label}",
+        suite=results.suite,
         label=results.label,
         started=results.started,
         planned=len(results.planned),
@@ -41,40 +40,33 @@ def _page(results: Results, plots: Sequence[str]) -> str:
     )
 
 
-def _notes(results: Results, summary: dict[str, Any]) -> list[str]:
+def _notes(results: Results, summary: Summary) -> list[str]:
     notes = []
-    if results.policy.get("about", {}).get("random_weights"):
+    if results.policy.about.get("random_weights"):
         notes.append("Random weights: the actions mean nothing.")
     if not results.complete:
         notes.append("The run isn't complete. The same command continues it.")
-    if summary["crashes"]:
-        notes.append(f"Crashed episodes: {summary['crashes']}. They count neither as success nor as failure.")
-    if summary["aborted"]:
-        notes.append(f"Aborted, as actions weren't finite: {summary['aborted']} episodes. They count as failures.")
+    if summary.crashes:
+        notes.append(f"Crashed episodes: {summary.crashes}. They count neither as success nor as failure.")
+    if summary.aborted:
+        notes.append(f"Aborted, as actions weren't finite: {summary.aborted} episodes. They count as failures.")
     return notes
 
 
-def _cards(summary: dict[str, Any], episodes: Sequence[Episode]) -> list[tuple[str, str, str]]:
+def _cards(summary: Summary, episodes: Sequence[Episode]) -> list[tuple[str, str, str]]:
     """What is read first: name, value, more."""
     overall = rate(episodes)
     low, high = overall.interval
     value = "-" if overall.value is None else f"{100 * overall.value:.1f} %"
     cards = [("success", value, f"{overall.successes}/{overall.trials}, 95 %: {100 * low:.1f} to {100 * high:.1f} %")]
-    if summary["call_ms"]:
-        call = summary["call_ms"]
-        batch = summary["mean_batch"]
+    if (call := summary.call_ms) is not None:
+        batch = summary.mean_batch or 1.0
         batched = f", {batch:.1f} requests at once" if batch > 1.0001 else ""
-        cards.append(
-            ("a call, median", f"{call['p50']:.1f} ms", f"p95 {call['p95']:.1f}, p99 {call['p99']:.1f}{batched}")
-        )
-    if summary["infer_ms"]:
-        model = summary["infer_ms"]
-        cards.append(("the model, median", f"{model['p50']:.1f} ms", f"p95 {model['p95']:.1f}, p99 {model['p99']:.1f}"))
-    if summary["steps_to_success"]:
-        steps = summary["steps_to_success"]
-        cards.append(
-            ("steps to success", f"{steps['p50']:.0f}", f"median; mean {steps['mean']:.0f}, most {steps['max']:.0f}")
-        )
+        cards.append(("a call, median", f"{call.p50:.1f} ms", f"p95 {call.p95:.1f}, p99 {call.p99:.1f}{batched}"))
+    if (model := summary.infer_ms) is not None:
+        cards.append(("the model, median", f"{model.p50:.1f} ms", f"p95 {model.p95:.1f}, p99 {model.p99:.1f}"))
+    if (steps := summary.steps_to_success) is not None:
+        cards.append(("steps to success", f"{steps.p50:.0f}", f"median; mean {steps.mean:.0f}, most {steps.max:.0f}"))
     return cards
 
 
@@ -95,28 +87,28 @@ def _rate_cells(episodes: Sequence[Episode]) -> list[str]:
         f"{own.successes}/{own.trials}",
         "-" if own.value is None else f"{100 * own.value:.1f} %",
         f"{100 * low:.1f} to {100 * high:.1f} %" if own.trials else "-",
-        f"{steps['p50']:.0f}" if steps else "-",
+        f"{steps.p50:.0f}" if steps else "-",
         str(sum(not e.judged for e in episodes)),
     ]
 
 
 def _median(values: Sequence[float]) -> str:
     found = percentiles(values)
-    return f"{found['p50']:.1f}" if found else "-"
+    return f"{found.p50:.1f}" if found else "-"
 
 
 def _settings(results: Results) -> list[tuple[str, list[list[str]]]]:
     """Everything that results.json says about how it was run, by section."""
     sections = {
         "protocol": results.protocol,
-        "policy": results.policy.get("about", {}),
+        "policy": results.policy.about,
         "options": results.options,
         "versions": results.versions,
     }
     return [(name, _rows(value)) for name, value in sections.items()]
 
 
-def _rows(value: Any, name: str = "") -> list[list[str]]:
-    if isinstance(value, dict):
+def _rows(value: object, name: str = "") -> list[list[str]]:
+    if isinstance(value, Mapping):
         return [row for key, item in value.items() for row in _rows(item, f"{name}.{key}" if name else str(key))]
     return [[name, str(value)]]

@@ -4,29 +4,33 @@ import json
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Final, Literal
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Protocol
-from turbopi.evaluate.statistics import Rate, percentiles
+from turbopi.evaluate.statistics import Percentiles, Rate, RateDocument, percentiles
 from turbopi.files import write_whole
+from turbopi.reading import plain_document
 from turbopi.sim import Task
 
-FORMAT = 1
+FORMAT: Final = 1
 FILE = "results.json"
 _SAVE_EVERY_S = 3.0  # episodes of the last seconds are lost by a kill, and run again
 
 Status = Literal["success", "failure", "aborted", "crash"]
-STATUSES: tuple[str, ...] = get_args(Status)
+Count = Annotated[int, Meta(ge=0, le=10**9)]
+Time = Annotated[float, Meta(ge=0, le=1e12)]  # in seconds or milliseconds
+Text = Annotated[str, Meta(pattern=r"\S")]
+Plain = Mapping[str, object]  # an object of JSON that is shown and compared, whatever it holds
 
 
-@dataclass(frozen=True)
-class Episode:
+class Episode(Struct, frozen=True):
     """What became of one episode.
 
     status       success or failure: the simulator's verdict within the step limit; aborted: the policy's actions
@@ -34,17 +38,20 @@ class Episode:
     steps        control steps after the wait
     call_ms      for each time the policy was asked: the whole call, with the requests it was batched with
     infer_ms     the model's part of it, where the policy tells
+    batch        for each of these calls, the requests that were answered together
+    message      what the simulator or the policy said, if it isn't a plain success or failure
+    video        the film's path in the run's folder
     """
 
-    task: int
-    initial_state: int
+    task: Count
+    initial_state: Count
     status: Status
-    steps: int
-    seed: int
-    seconds: float
-    call_ms: list[float] = field(default_factory=list)
-    infer_ms: list[float] = field(default_factory=list)
-    batch: list[int] = field(default_factory=list)
+    steps: Count
+    seed: Annotated[int, Meta(ge=0)]  # below 2**64
+    seconds: Time
+    call_ms: list[Time] = []
+    infer_ms: list[Time] = []
+    batch: list[Annotated[int, Meta(ge=1, le=10**9)]] = []
     message: str | None = None
     video: str | None = None
 
@@ -67,20 +74,59 @@ def rate(episodes: Iterable[Episode]) -> Rate:
     return Rate(sum(episode.success for episode in judged), len(judged))
 
 
-class Results:
-    """A run's episodes and what they were run with, in a folder.
+class PolicyTold(Struct, frozen=True, omit_defaults=True):
+    """What was evaluated. `identity` decides whether a run may be continued; `about` is for the report."""
 
-    policy    what was evaluated, as plain values; `policy["identity"]` decides whether a run may be continued
-    """
+    label: str | None = None  # None: the folder's name
+    identity: Plain = {}
+    about: Plain = {}
+
+
+class TaskSummary(Struct, frozen=True):
+    task: int
+    instruction: str
+    success: RateDocument
+    crashes: int
+
+
+class Summary(Struct, frozen=True):
+    """What all episodes come to, those of a run that isn't complete too."""
+
+    success: RateDocument
+    tasks: list[TaskSummary]  # those with an episode
+    episodes: int
+    planned: int
+    crashes: int
+    aborted: int
+    steps_to_success: Percentiles | None  # None: of nothing
+    call_ms: Percentiles | None
+    infer_ms: Percentiles | None
+    mean_batch: float | None
+
+
+class RunDocument(Struct, frozen=True):
+    """results.json of an evaluation. `summary` and `complete` follow from the rest."""
+
+    format: Literal[1]
+    complete: bool
+    protocol: Plain  # `Protocol`; other versions' may have other fields, which then tell two runs apart
+    policy: PolicyTold
+    versions: Plain  # the simulator's, and `Provenance` of the machine that ran it
+    options: Plain  # what doesn't change outcomes: workers, batches, videos
+    started: Text  # ISO 8601, UTC
+    updated: Text
+    wall_seconds: Time  # of all processes that worked on it, one after the other
+    summary: Summary
+    tasks: list[Task]
+    planned: list[Annotated[tuple[Count, Count], Meta(description="a task and an initial state")]]
+    episodes: list[Episode]
+
+
+class Results:
+    """A run's episodes and what they were run with, in a folder."""
 
     def __init__(
-        self,
-        folder: Path,
-        protocol: Mapping[str, Any],
-        policy: Mapping[str, Any],
-        tasks: Sequence[Task],
-        versions: Mapping[str, Any],
-        options: Mapping[str, Any],
+        self, folder: Path, protocol: Plain, policy: PolicyTold, tasks: Sequence[Task], versions: Plain, options: Plain
     ) -> None:
         self.folder = folder
         self.protocol, self.policy, self.versions, self.options = protocol, policy, versions, options
@@ -98,7 +144,11 @@ class Results:
 
     @property
     def label(self) -> str:
-        return str(self.policy.get("label", self.folder.name))
+        return self.folder.name if self.policy.label is None else self.policy.label
+
+    @property
+    def suite(self) -> str:
+        return str(self.protocol["suite"])
 
     @property
     def complete(self) -> bool:
@@ -133,59 +183,66 @@ class Results:
         write_whole(self.path, json.dumps(self.as_json(), ensure_ascii=False, allow_nan=False))
         self._saved_at = time.monotonic()
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Summary:
         episodes = self.in_order()
         by_task = {index: [e for e in episodes if e.task == index] for index in sorted(self.tasks)}
-        return {
-            "success": rate(episodes).as_json(),
-            "tasks": [
-                {"task": index, "instruction": self.tasks[index].instruction}
-                | {"success": rate(own).as_json(), "crashes": sum(not e.judged for e in own)}
+        return Summary(
+            success=rate(episodes).document,
+            tasks=[
+                TaskSummary(index, self.tasks[index].instruction, rate(own).document, sum(not e.judged for e in own))
                 for index, own in by_task.items()
                 if own
             ],
-            "episodes": len(episodes),
-            "planned": len(self.planned),
-            "crashes": sum(not e.judged for e in episodes),
-            "aborted": sum(e.status == "aborted" for e in episodes),
-            "steps_to_success": percentiles([e.steps for e in episodes if e.success]),
-            "call_ms": percentiles([ms for e in episodes for ms in e.call_ms]),
-            "infer_ms": percentiles([ms for e in episodes for ms in e.infer_ms]),
-            "mean_batch": _mean([size for e in episodes for size in e.batch]),
-        }
+            episodes=len(episodes),
+            planned=len(self.planned),
+            crashes=sum(not e.judged for e in episodes),
+            aborted=sum(e.status == "aborted" for e in episodes),
+            steps_to_success=percentiles([e.steps for e in episodes if e.success]),
+            call_ms=percentiles([ms for e in episodes for ms in e.call_ms]),
+            infer_ms=percentiles([ms for e in episodes for ms in e.infer_ms]),
+            mean_batch=_mean([size for e in episodes for size in e.batch]),
+        )
 
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "format": FORMAT,
-            "complete": self.complete,
-            "protocol": plain(self.protocol),
-            "policy": plain(self.policy),
-            "versions": plain(self.versions),
-            "options": plain(self.options),
-            "started": self.started,
-            "updated": _now(),
-            "wall_seconds": round(self.wall_seconds, 1),
-            "summary": self.summary(),
-            "tasks": [asdict(self.tasks[index]) for index in sorted(self.tasks)],
-            "planned": sorted(self.planned),
-            "episodes": [asdict(episode) for episode in self.in_order()],
-        }
+    def document(self) -> RunDocument:
+        about = PolicyTold(self.policy.label, plain_object(self.policy.identity), plain_object(self.policy.about))
+        return RunDocument(
+            format=FORMAT,
+            complete=self.complete,
+            protocol=plain_object(self.protocol),
+            policy=about,
+            versions=plain_object(self.versions),
+            options=plain_object(self.options),
+            started=self.started,
+            updated=_now(),
+            wall_seconds=round(self.wall_seconds, 1),
+            summary=self.summary(),
+            tasks=[self.tasks[index] for index in sorted(self.tasks)],
+            planned=sorted(self.planned),
+            episodes=self.in_order(),
+        )
 
-    def _decisive(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
+        return plain_document(self.document())
+
+    def _decisive(self) -> Plain:
         simulator = {name: value for name, value in self.versions.items() if name == "simulator"}
-        return {"protocol": self.protocol, "policy": self.policy.get("identity", {}), "versions": simulator}
+        return {"protocol": self.protocol, "policy": self.policy.identity, "versions": simulator}
 
 
-def protocol_json(protocol: Protocol) -> dict[str, Any]:
+def protocol_json(protocol: Protocol) -> Plain:
     """As it looks after a round trip through JSON, so that it compares equal."""
-    value: dict[str, Any] = plain(protocol.as_json())
-    return value
+    return plain_object(asdict(protocol))
 
 
-def plain(value: Any) -> Any:
+def plain_object(values: Plain) -> dict[str, object]:
+    """`values` as `plain` has them."""
+    return {str(key): plain(item) for key, item in values.items()}
+
+
+def plain(value: object) -> object:
     """`value` as JSON has it: arrays as lists, numbers that aren't finite as null, anything else as its text."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return plain_object(value)
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
@@ -200,9 +257,9 @@ def writable(text: str) -> str:
     return text.encode(errors="replace").decode()
 
 
-def _flat(value: Any, name: str = "") -> dict[str, Any]:
+def _flat(value: object, name: str = "") -> dict[str, object]:
     if isinstance(value, Mapping):
-        found: dict[str, Any] = {}
+        found: dict[str, object] = {}
         for key, item in value.items():
             found |= _flat(item, f"{name}.{key}" if name else str(key))
         return found

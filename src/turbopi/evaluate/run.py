@@ -15,13 +15,14 @@ from turbopi.evaluate.episode import WorkerSetup
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan
 from turbopi.evaluate.reading import check_is_run, load_results
 from turbopi.evaluate.report import write_report
-from turbopi.evaluate.results import FILE, Episode, Results, protocol_json
+from turbopi.evaluate.results import FILE, Episode, PolicyTold, Results, protocol_json
 from turbopi.evaluate.schedule import OnAnswer, Scheduler
 from turbopi.evaluate.sources import PolicySource
 from turbopi.evaluate.video import check_can_write
 from turbopi.evaluate.workers import LOG
 from turbopi.files import alone_in
 from turbopi.provenance import provenance
+from turbopi.reading import plain_document
 from turbopi.sim import Simulator
 
 # Is told of every episode as it ends, with the results so far
@@ -45,8 +46,8 @@ def prepare(
     if folder.is_dir():
         with _alone(folder):  # `evaluate` needs to be; who can't be should know before it is prepared
             pass
-    policy = {"label": source.label, "identity": source.identity, "about": source.about}
-    versions = {"simulator": simulator.versions(), **provenance(torch.device("cpu"))}
+    policy = PolicyTold(source.label, source.identity, source.about)
+    versions = {"simulator": simulator.versions(), **plain_document(provenance(torch.device("cpu")))}
     results = Results(folder, protocol_json(protocol), policy, [job.task for job in jobs], versions, {})
     if restart:
         check_is_run(folder)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 Z95 = 1.959963984540054
 PERCENTILES = (50, 90, 95, 99)
@@ -28,6 +29,40 @@ def wilson(successes: int, trials: int, z: float = Z95) -> tuple[float, float]:
     return low, high
 
 
+class RateDocument(Struct, frozen=True):
+    """A rate as result files have it."""
+
+    successes: int
+    trials: int
+    rate: float | None  # None: of nothing
+    wilson95: tuple[float, float]
+
+
+class PairedDocument(Struct, frozen=True):
+    """A paired comparison as result files have it: counts of episodes, and what follows from them."""
+
+    pairs: int
+    both: int
+    only_first: int
+    only_second: int
+    neither: int
+    difference: float | None  # the second rate less the first
+    difference95: tuple[float, float]
+    mcnemar_p: float
+
+
+class Percentiles(Struct, frozen=True):
+    """How values are spread, in their own unit."""
+
+    p50: float
+    p90: float
+    p95: float
+    p99: float
+    mean: float
+    max: float
+    count: int
+
+
 @dataclass(frozen=True)
 class Rate:
     """Successes among the episodes that came to a verdict."""
@@ -43,13 +78,9 @@ class Rate:
     def interval(self) -> tuple[float, float]:
         return wilson(self.successes, self.trials)
 
-    def as_json(self) -> dict[str, float | int | list[float] | None]:
-        return {
-            "successes": self.successes,
-            "trials": self.trials,
-            "rate": self.value,
-            "wilson95": list(self.interval),
-        }
+    @property
+    def document(self) -> RateDocument:
+        return RateDocument(self.successes, self.trials, self.value, self.interval)
 
     def __str__(self) -> str:
         if self.value is None:
@@ -97,25 +128,18 @@ class Paired:
         n, fewer = self.only_first + self.only_second, min(self.only_first, self.only_second)
         return min(1.0, 2 * sum(math.comb(n, k) for k in range(fewer + 1)) / 2**n)
 
-    def as_json(self) -> dict[str, float | int | list[float] | None]:
-        return {
-            "pairs": self.pairs,
-            "both": self.both,
-            "only_first": self.only_first,
-            "only_second": self.only_second,
-            "neither": self.neither,
-            "difference": self.difference,
-            "difference95": list(self.interval),
-            "mcnemar_p": self.p_value,
-        }
+    @property
+    def document(self) -> PairedDocument:
+        cells = (self.both, self.only_first, self.only_second, self.neither)
+        return PairedDocument(self.pairs, *cells, self.difference, self.interval, self.p_value)
 
 
 _CELLS = ((True, True), (True, False), (False, True), (False, False))
 
 
-def percentiles(values: Sequence[float]) -> dict[str, float] | None:
-    """p50, p90, p95, p99, mean and max; None of nothing."""
+def percentiles(values: Sequence[float]) -> Percentiles | None:
+    """None of nothing."""
     if not len(values):
         return None
-    found = {f"p{q}": float(np.percentile(values, q)) for q in PERCENTILES}
-    return found | {"mean": float(np.mean(values)), "max": float(np.max(values)), "count": len(values)}
+    p50, p90, p95, p99 = map(float, np.percentile(values, PERCENTILES))
+    return Percentiles(p50, p90, p95, p99, float(np.mean(values)), float(np.max(values)), len(values))

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Job
@@ -72,11 +73,18 @@ class Recording:
         return f"recorded {self._recorder.written} observations in {self._recorder.folder}{lost}"
 
 
-def action_error(entries: Sequence[dict[str, Any]], reference: PolicySource) -> dict[str, float] | None:
+class ActionDifference(Struct, frozen=True):
+    """Difference to the reference's actions, each dimension in units of its own spread over the reference's chunks."""
+
+    rms: float
+    max: float
+    observations: int
+
+
+def action_error(entries: Sequence[dict[str, Any]], reference: PolicySource) -> ActionDifference | None:
     """How far the entries' actions are from the reference's, given the same observations and noise.
 
-    Root mean square and largest difference, each action dimension in units of its own spread over the reference's
-    chunks. None without entries.
+    None without entries.
     """
     if not entries:
         return None
@@ -89,11 +97,7 @@ def action_error(entries: Sequence[dict[str, Any]], reference: PolicySource) -> 
     spread = truth.std(axis=(0, 1))
     spread[spread == 0] = 1
     error = (given - truth) / spread
-    return {
-        "rms": float(np.sqrt(np.mean(error**2))),
-        "max": float(np.abs(error).max()),
-        "observations": len(entries),
-    }
+    return ActionDifference(float(np.sqrt(np.mean(error**2))), float(np.abs(error).max()), len(entries))
 
 
 def _read(path: Path) -> tuple[int, list[dict[str, np.ndarray]]]:

@@ -7,6 +7,7 @@ size, its depth and the sizes that it claims are checked, so that it costs neith
     content = read_json(file)                        an object, or CheckpointError
     fields = Fields(content, file)                   its values, one by one, checked
     horizon = fields.integer("action_horizon", 1, 1024)
+    line = read_document(file, Line)                 all of them at once, as a kind of document (documents.py)
     arrays = read_npz(file)                          name -> array
     noise = read_npy(file)
 
@@ -14,8 +15,9 @@ An .npz is checked by its CRC-32, so damage to its numbers is found. Neither an 
 flipped digit in one that still reads well stays unnoticed.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from turbopi.reading.documents import as_document, plain_document, read_document
 from turbopi.reading.fields import Fields, is_finite, is_integer
 from turbopi.reading.files import file_inside, listing, one_line, open_file, read_bytes, shown
 from turbopi.reading.json import MAX_JSON_BYTES, MAX_JSON_DEPTH, parse_json, read_json
@@ -29,6 +31,7 @@ __all__ = [
     "MAX_JSON_DEPTH",
     "Fields",
     "Npz",
+    "as_document",
     "file_inside",
     "is_finite",
     "is_integer",
@@ -36,7 +39,9 @@ __all__ = [
     "one_line",
     "open_file",
     "parse_json",
+    "plain_document",
     "read_bytes",
+    "read_document",
     "read_json",
     "read_npy",
     "read_npz",
@@ -46,9 +51,10 @@ __all__ = [
 _ARRAYS = ("MAX_ARRAY_BYTES", "Npz", "read_npy", "read_npz")
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name in _ARRAYS:  # imported when asked for: `turbopi --help` needs no NumPy
         from turbopi.reading import arrays
 
-        return getattr(arrays, name)
+        found: object = getattr(arrays, name)
+        return found
     raise AttributeError(f"module 'turbopi.reading' has no attribute {name!r}")

@@ -115,10 +115,15 @@ def _constants(value: Any, path: str) -> Iterator[tuple[str, float]]:
         yield path, value
     elif isinstance(value, dict):
         for key, item in value.items():
-            yield from _constants(item, f"{path}.{key if key.isidentifier() else shown(key)}")
+            yield from _constants(item, path + key_path(key))
     elif isinstance(value, list):
         for i, item in enumerate(value):
             yield from _constants(item, f"{path}[{i}]")
+
+
+def key_path(key: str) -> str:
+    """A step on the way to a value: `.key`, and `.'a key'` where that isn't a name."""
+    return f".{key if key.isidentifier() else shown(key)}"
 
 
 def _check_text(value: Any, where: object, error: Error) -> None:

@@ -5,9 +5,10 @@ Modules of simulators are imported by worker processes, many at once: they impor
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from turbopi.errors import ConfigError, TurboPiError
 
@@ -18,15 +19,17 @@ class SimulatorUnavailable(TurboPiError):
     """A simulator can't run on this machine; the message says why and what to do."""
 
 
-@dataclass(frozen=True)
-class Task:
-    """One task of a suite."""
+_Count = Annotated[int, Meta(ge=0, le=10**9)]
 
-    index: int
+
+class Task(Struct, frozen=True):
+    """One task of a suite, as result files have it, too."""
+
+    index: _Count
     name: str
     instruction: str
-    num_initial_states: int
-    max_steps: int  # openpi's limit, in control steps after the wait
+    num_initial_states: _Count
+    max_steps: _Count  # openpi's limit, in control steps after the wait
 
 
 @dataclass(frozen=True)

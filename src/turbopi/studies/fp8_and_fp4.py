@@ -29,6 +29,7 @@ from turbopi.provenance import provenance
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, PARTS, Site, sites
+from turbopi.reading import plain_document
 from turbopi.studies.formats import attention_in_fp8, round_nvfp4
 from turbopi.studies.weights import WEIGHTS, Weights, studied_checkpoint
 from turbopi.wording import significant
@@ -141,7 +142,7 @@ def run(
         [batch for _, batch in batches(with_noises(some, shape, 1, seed), 8, device)]
         for seed, some in enumerate((examples[:count], examples[count:]))
     )
-    about = {"provenance": provenance(device), "preset": preset, "steps": steps, "observations": count}
+    about = {"provenance": plain_document(provenance(device)), "preset": preset, "steps": steps, "observations": count}
     results: dict[str, Any] = {}
     for kind in kinds:
         model = Pi0Model.from_state(sizes, studied_checkpoint(kind, preset, device).load(device, "f32").state)

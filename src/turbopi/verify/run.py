@@ -26,6 +26,7 @@ from turbopi.model import exact
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
 from turbopi.quantization.artifact import Quantization
+from turbopi.reading import plain_document
 from turbopi.verify import control
 from turbopi.verify.inputs import VerifyPlan, check_observations, make_calls, read_examples
 from turbopi.verify.intermediates import Tensors, in_order, tensors_of
@@ -95,7 +96,7 @@ def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None =
             "fingerprint": fingerprint,
         },
         "policy": details,
-        "provenance": about,
+        "provenance": plain_document(about),
     }
     return document
 

@@ -1,0 +1,136 @@
+"""Result documents: each kind is one Struct; what is checked in reads through it and comes out as it was."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import pytest
+from msgspec import Meta, Struct
+
+from turbopi.errors import ConfigError
+from turbopi.provenance import Provenance
+from turbopi.reading import as_document, plain_document, read_document
+
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
+
+
+class Inner(Struct, frozen=True):
+    count: Annotated[int, Meta(ge=1, le=8)]
+    kind: Literal["one", "other"] = "one"
+    pair: tuple[int, float] = (1, 2.0)
+    share: Annotated[float, Meta(ge=0)] | None = None
+
+
+class Outer(Struct, frozen=True):
+    format: Literal[1]
+    by_name: dict[str, Inner]
+    rows: list[Inner]
+    told: Mapping[str, object]
+    limit: int | float | None
+    name: Annotated[str, Meta(pattern=r"\S")]
+
+
+GOOD = {
+    "format": 1,
+    "by_name": {"a name": {"count": 1}},
+    "rows": [{"count": 2, "kind": "other", "pair": [3, 4.5], "share": 0.5}],
+    "told": {"anything": [1, {"x": None}]},
+    "limit": 3,
+    "name": "a",
+}
+
+
+def test_a_document_comes_out_as_it_went_in() -> None:
+    document = as_document(GOOD, Outer, "FILE")
+    assert document.rows[0] == Inner(2, "other", (3, 4.5), 0.5)
+    written = json.loads(json.dumps(plain_document(document)))
+    assert written == {**GOOD, "by_name": {"a name": {"count": 1, "kind": "one", "pair": [1, 2.0], "share": None}}}
+    assert isinstance(written["limit"], int)  # not 3.0
+
+
+def test_numpys_numbers_and_paths_are_written_as_jsons() -> None:
+    inner = Inner(np.int64(3), share=np.float64(0.5))
+    assert json.dumps(plain_document(inner)) == '{"count": 3, "kind": "one", "pair": [1, 2.0], "share": 0.5}'
+    outer = Outer(1, {}, [], {"file": Path("a/b")}, None, "a")
+    assert plain_document(outer)["told"] == {"file": "a/b"}
+    with pytest.raises(TypeError, match="a document holds <object obj"):
+        plain_document(Outer(1, {}, [], {"x": object()}, None, "a"))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"format": 2}, "format is 2; expected 1"),
+        ({"format": None}, "format is None; expected 1"),
+        ({"by_name": {"a name": {}}}, "by_name.'a name'.count is missing; expected a whole number from 1 to 8"),
+        ({"by_name": {"b": {"count": True}}}, "by_name.b.count is True; expected a whole number from 1 to 8"),
+        ({"by_name": []}, "by_name is []; expected an object"),
+        ({"rows": {}}, "rows is {}; expected a list"),
+        ({"rows": [{"count": 1}, 7]}, "rows[1] is 7; expected an object"),
+        ({"rows": [{"count": 9}]}, "rows[0].count is 9; expected a whole number from 1 to 8"),
+        ({"rows": [{"count": 1.5}]}, "rows[0].count is 1.5; expected a whole number from 1 to 8"),
+        ({"rows": [{"count": 1, "kind": "neither"}]}, "rows[0].kind is 'neither'; expected one of one, other"),
+        ({"rows": [{"count": 1, "kind": ["one"]}]}, "rows[0].kind is ['one']; expected one of one, other"),
+        ({"rows": [{"count": 1, "pair": [1]}]}, "rows[0].pair is [1]; expected a list of 2"),
+        ({"rows": [{"count": 1, "pair": [1, "x"]}]}, "rows[0].pair[1] is 'x'; expected a finite number"),
+        ({"rows": [{"count": 1, "share": -1}]}, "rows[0].share is -1; expected a finite number from 0 or null"),
+        ({"rows": [{"count": 1, "share": "x"}]}, "rows[0].share is 'x'; expected a finite number from 0 or null"),
+        ({"told": None}, "told is None; expected an object"),
+        ({"limit": "x"}, "limit is 'x'; expected a finite number or null"),
+        ({"name": " "}, "name is ' '; expected a text that isn't blank"),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_way_and_what_was_expected(
+    change: dict[str, object], said: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "document.json"
+    file.write_text(json.dumps(GOOD | change))
+    with pytest.raises(ConfigError) as told:
+        read_document(file, Outer, ConfigError, hint="; make it again")
+    assert str(told.value) == f"{file}: {said}; make it again"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"limit": NaN}', "limit is nan, which no JSON has"),
+        ('{"limit": 1e999}', "beyond float64"),
+        (f'{{"limit": {"9" * 30}}}', "beyond 64 bits"),
+        (f'{{"told": {"[" * 70}{"]" * 70}}}', "more than 64 deep"),
+        ('{"limit": 1, "limit": 2}', "the key 'limit' is given twice"),
+        ("[]", "expected an object"),
+    ],
+)
+def test_what_no_json_may_hold_is_refused_in_documents_too(text: str, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "document.json"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=f"^{file}.*{said}"):
+        read_document(file, Outer, ConfigError)
+
+
+# -- what is checked in ------------------------------------------------------------------------------------------------
+
+EVERY = sorted(path.relative_to(RESULTS).as_posix() for path in RESULTS.rglob("*.json"))
+
+
+def _provenance(content: object) -> list[dict[str, object]]:
+    """Every `provenance` in a document that names a device: the tools' own."""
+    if isinstance(content, list):
+        return [one for item in content for one in _provenance(item)]
+    if not isinstance(content, dict):
+        return []
+    own = content.get("provenance")
+    inside = [one for item in content.values() for one in _provenance(item)]
+    return [*([own] if isinstance(own, dict) and "device" in own else []), *inside]
+
+
+def test_every_provenance_that_is_checked_in_reads_and_comes_out_as_it_was() -> None:
+    found = {name: _provenance(json.loads((RESULTS / name).read_text())) for name in EVERY}
+    assert sum(map(len, found.values())) > 70
+    more = {"clocks_at_the_end", "command", "environment"}  # a benchmark's own
+    for name, all_of_it in found.items():
+        for one in all_of_it:
+            written = plain_document(as_document(one, Provenance, name))
+            assert json.dumps(written) == json.dumps({key: one[key] for key in one if key not in more}), name
