@@ -46,7 +46,8 @@ def test_a_presets_edges_are_kept_and_its_sizes_are_not() -> None:
 
 @pytest.mark.parametrize("config", ["pi05_liber0", "", "somewhere/else", 5, None])
 def test_an_unknown_config_lists_the_choices(config: Any) -> None:
-    with pytest.raises(ConfigError, match=r"config is .*; expected 'auto', a path to a .json.*pi05_libero"):
+    expected = r"config='.*' is neither a preset, nor 'auto', nor a path to a .json; presets are .*pi05_libero"
+    with pytest.raises(ConfigError, match=expected):
         open_checkpoint(PI05, config)
 
 

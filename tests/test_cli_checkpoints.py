@@ -12,6 +12,13 @@ from cli_helpers import refusal, text_of, turbopi
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
 from turbopi.shipped import FRAMES, load_frames
 
+ARM = {
+    "name": "my_arm",
+    "cameras": {"front": "base_0_rgb"},
+    "state": {"joints": 6},
+    "action_dim": 6,
+}
+
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -50,7 +57,7 @@ def test_inspect_json_is_the_checkpoints_own_description(tiny: Path) -> None:
     result = turbopi("inspect", tiny, "--json", "--hash")
     document = json.loads(result.stdout)
     opened = open_checkpoint(tiny)
-    assert document == {**opened.info(), "sha256": opened.fingerprint()}
+    assert document.items() >= ({**opened.info(), "sha256": opened.fingerprint()}).items()
     assert len(document["sha256"]) == 64
 
 
@@ -68,6 +75,54 @@ def test_inspect_without_a_configuration_shows_the_rest_and_the_choices() -> Non
     assert "not known yet: " in result.stdout
     assert "suggest pi05_libero" in result.stdout
     assert "443,232" in result.stdout
+
+
+def test_inspect_shows_the_robots_keys_whoever_names_the_robot(tiny: Path) -> None:
+    """The turbopi.json beside the weights here; a preset with random weights; --robot."""
+    own, preset = turbopi("inspect", tiny), turbopi("inspect", "--random-weights", "pi05_libero")
+    for result in (own, preset, turbopi("inspect", tiny, "--robot", "libero")):
+        assert result.exit_code == 0, result.output
+        assert "its observation/wrist_image" in text_of(result.stdout)
+        assert "its observation/state" in text_of(result.stdout)
+
+
+def test_inspect_shows_a_folder_whose_robot_does_not_fit_and_says_so(tiny: Path, tmp_path: Path) -> None:
+    settings = json.loads((tiny / "turbopi.json").read_text()) | {"robot": "aloha"}
+    (tmp_path / "aloha.json").write_text(json.dumps(settings))
+    result = turbopi("inspect", tiny, "--config", tmp_path / "aloha.json")
+    assert result.exit_code == 0, result.output
+    assert "no policy can be made of this: robot aloha has 14 values of state" in text_of(result.stdout)
+
+
+def test_random_weights_take_a_configuration(tmp_path: Path) -> None:
+    """The robot, the horizon and the rest are the configuration's, the sizes the preset's."""
+    for config, robot, horizon in (("pi05_droid", "droid", 15), (tmp_path / "own.json", "my_arm", 12)):
+        if robot == "my_arm":
+            (tmp_path / "my_arm.json").write_text(json.dumps(ARM))
+            config.write_text(json.dumps({"robot": "my_arm.json", "action_horizon": 12, "name": "mine"}))
+        made = tmp_path / f"made-for-{robot}"
+        result = turbopi("convert", "--random-weights", "pi05_tiny", made, "--config", config)
+        assert result.exit_code == 0, result.output
+        assert "RANDOM WEIGHTS (pi05_tiny, seed 0)" in result.stdout
+        document = json.loads(turbopi("inspect", made, "--json").stdout)
+        assert document["action_horizon"] == horizon
+        assert document["robot"] == robot
+        assert document["parameters"]["total"] == 5_672_480
+
+
+def test_random_weights_refuse_what_describes_other_weights(tmp_path: Path) -> None:
+    file = tmp_path / "c.json"
+    file.write_text(json.dumps({"weights_sha256": "0" * 64}))
+    refused = refusal(turbopi("convert", "--random-weights", "pi05_tiny", tmp_path / "out", "--config", file))
+    assert refused == f"{file}: weights_sha256 only applies to a checkpoint's own weights"
+    wrong = turbopi("convert", "--random-weights", "pi05_tiny", tmp_path / "out", "--config", "pi0_libero")
+    assert "preset pi0_libero is for pi0, but the preset pi05_tiny of the random weights holds pi05" in refusal(wrong)
+
+
+def test_a_converted_folders_description_has_no_empty_entries(tiny: Path) -> None:
+    settings = json.loads((tiny / "turbopi.json").read_text())
+    assert "robot" in settings
+    assert None not in settings.values()
 
 
 def test_inspect_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:

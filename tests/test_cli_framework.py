@@ -1,21 +1,27 @@
 """The command line as a whole: help, exit codes, where output and errors go."""
 
+import inspect
 import json
 import re
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import typer
+from checkpoint_helpers import GOLDEN
 from cli_helpers import refusal, text_of, turbopi
 from typer.testing import CliRunner
 
+from turbopi.checkpoint import open_checkpoint
 from turbopi.cli import app
 from turbopi.cli.framework import plain, with_errors_told
-from turbopi.errors import ObservationError
+from turbopi.cli.typed import OPTIONS, as_typed
+from turbopi.errors import ConfigError, ObservationError
+from turbopi.policy import UnifiedPolicy
 
 COMMANDS = (
     *("demo", "infer", "serve", "inspect", "convert", "calibrate", "build", "export", "verify", "bench", "study"),
@@ -93,8 +99,44 @@ def test_weights_must_be_named_exactly_once() -> None:
 
 def test_options_that_would_be_ignored_are_refused() -> None:
     assert "--weights-seed is the seed of --random-weights" in refusal(turbopi("inspect", "x", "--weights-seed", 1))
-    both = turbopi("inspect", "--random-weights", "pi05_tiny", "--config", "pi05_droid")
-    assert "--config describes a checkpoint; random weights take everything from their preset" in refusal(both)
+
+
+def test_messages_name_options_as_they_were_typed(tmp_path: Path) -> None:
+    """The library says config= to a program, and the command line --config to whoever types."""
+    golden = GOLDEN / "pi05" / "torch"
+    with pytest.raises(ConfigError, match=r"Choose with config= one of pi05_base, "):
+        open_checkpoint(golden)
+    told = refusal(turbopi("convert", golden, tmp_path / "out"))
+    assert "Choose with --config one of pi05_base, " in told and "config=" not in told
+    told = turbopi("inspect", golden).stdout
+    assert "Choose with --config one of pi05_base, " in told and "config=" not in told
+    assert refusal(turbopi("convert", golden, tmp_path / "out", "--config", "pi06")).startswith(
+        "--config pi06 is neither a preset, nor 'auto', nor a path to a .json; presets are pi05_base, "
+    )
+
+
+@pytest.mark.parametrize(
+    ("said", "shown"),
+    [
+        ("Choose with config= one of a, b", "Choose with --config one of a, b"),
+        ('use config="auto", and', "use --config auto, and"),
+        ("config='' is none", "--config '' is none"),
+        ("Or pass its path as tokenizer=, or put", "Or pass its path as --tokenizer, or put"),
+        ("try it with backend='fused'", "try it with --backend fused"),
+        ("give num_denoising_steps=", "give --steps"),
+        ("runs/config=a.json isn't there", "runs/config=a.json isn't there"),
+        ("my_config= is nothing of ours", "my_config= is nothing of ours"),
+    ],
+)
+def test_only_arguments_are_worded_as_options(said: str, shown: str) -> None:
+    assert as_typed(said) == shown
+
+
+def test_every_argument_of_the_policy_is_an_option_of_the_policy_commands() -> None:
+    arguments = set(inspect.signature(UnifiedPolicy.__init__).parameters) - {"self", "checkpoint_dir", "progress"}
+    assert set(OPTIONS) == arguments
+    shown = turbopi("serve", "--help").stdout
+    assert all(option in text_of(shown) for option in OPTIONS.values())
 
 
 def test_an_unknown_preset_lists_the_choices() -> None:

@@ -86,7 +86,7 @@ def _main(start: Start) -> None:
         assert start.checkpoint is not None
         checkpoint = open_checkpoint(start.checkpoint, start.config or "auto")
     else:
-        checkpoint = random_checkpoint(start.preset, start.seed)
+        checkpoint = random_checkpoint(start.preset, start.seed, start.config or "auto")
     begin = time.perf_counter()
     policy = UnifiedPolicy(
         checkpoint,

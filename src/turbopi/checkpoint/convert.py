@@ -192,6 +192,9 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, Any], Path
         "num_denoising_steps": config.num_denoising_steps,
         "vision_heads": config.model.vision.num_heads,
     }
+    for name in ("default_prompt", "prompt_state_dim"):  # null says nothing where the preset has none either
+        if values[name] is None and getattr(PRESETS[preset], name) is None:
+            del values[name]
     parsed = Settings(SETTINGS, values=parse_values(json.loads(json.dumps(values)), SETTINGS))
     back = policy_config(parsed, config.model.kind, horizon=None, assets=[], where=Path(SETTINGS))
     lost = [

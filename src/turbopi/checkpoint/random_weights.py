@@ -14,7 +14,9 @@ bfloat16 by 0.4 %.
 
 import hashlib
 from collections.abc import Iterator
+from dataclasses import replace
 from math import prod, sqrt
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,6 +24,7 @@ from torch import Tensor
 
 from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
+from turbopi.checkpoint.settings import ABOUT_WEIGHTS, ConfigSource, Settings, policy_config, read_settings, with_values
 from turbopi.checkpoint.source import Piece, Shape, row_ranges
 from turbopi.config import PolicyConfig, preset
 from turbopi.errors import ConfigError
@@ -59,23 +62,45 @@ class RandomSource:
                 yield Piece(name, start, values.view(stop - start, *shape[1:]))
 
 
-def random_checkpoint(preset_name: str | PolicyConfig, seed: int = 0) -> Checkpoint:
+def random_checkpoint(
+    preset_name: str | PolicyConfig, seed: int = 0, config_source: ConfigSource = "auto"
+) -> Checkpoint:
     """A checkpoint of random weights for a preset (or any PolicyConfig), with statistics of its robot's width.
 
-    Raises ConfigError for an unknown preset or a seed outside [0, 2**32).
+    The sizes are the preset's; so is all else, unless `config_source` (see settings.py) says it.
+
+    Raises ConfigError for an unknown preset, a configuration that doesn't fit, or a seed outside [0, 2**32).
     """
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
         raise ConfigError(f"seed is {seed!r}; expected a whole number in [0, 2**32)")
     config = preset_name if isinstance(preset_name, PolicyConfig) else preset(preset_name)
+    made_of = f"random weights, preset {config.name}, seed {seed}"
+    if config_source != "auto":
+        settings = read_settings(config_source, Path())
+        config, made_of = _configured(config, settings), f"{made_of}, with {settings.source}"
     state, actions = _ROBOT_DIMS.get(config.robot, (config.model.action_dim, config.model.action_dim))
     return Checkpoint(
         path=None,
         config=config,
-        config_source=f"random weights, preset {config.name}, seed {seed}",
+        config_source=made_of,
         norm_stats=NormStats(_plausible(state), _plausible(actions)),
         source=RandomSource(config, seed),
         asset_id=config.asset_id,
     )
+
+
+def _configured(base: PolicyConfig, settings: Settings) -> PolicyConfig:
+    """What the settings say, over the sizes of `base`."""
+    about_weights = sorted(settings.values.keys() & ABOUT_WEIGHTS)
+    if about_weights:
+        raise ConfigError(f"{settings.source}: {', '.join(about_weights)} only applies to a checkpoint's own weights")
+    if settings.policy is None and "preset" not in settings.values:
+        config = with_values(base, settings)
+    else:
+        where = Path(f"the preset {base.name} of the random weights")
+        config = policy_config(settings, base.model.kind, horizon=None, assets=[], where=where)
+    free = {name: getattr(config.model, name) for name in ("action_horizon", "max_prompt_tokens", "time_grid")}
+    return replace(config, model=replace(base.model, **free))
 
 
 def _plausible(dim: int) -> FeatureStats:

@@ -46,6 +46,7 @@ from turbopi.errors import ConfigError
 from turbopi.reading import is_finite, is_integer, read_json, shown
 
 FILE_NAME = "turbopi.json"
+ABOUT_WEIGHTS = {"lora_alpha", "lora_rslora", "base_model", "weights_sha256", "lerobot_semantics"}  # keys of a .json
 ConfigSource = str | Path | PolicyConfig
 
 
@@ -84,7 +85,8 @@ def read_settings(config: ConfigSource, folder: Path) -> Settings:
     if isinstance(config, str | Path) and str(config).endswith(".json"):
         return _read_file(Path(config))
     raise ConfigError(
-        f"config is {config!r}; expected 'auto', a path to a .json, a PolicyConfig, or one of {', '.join(PRESETS)}"
+        f"config={str(config)!r} is neither a preset, nor 'auto', nor a path to a .json; "
+        f"presets are {', '.join(PRESETS)}"
     )
 
 

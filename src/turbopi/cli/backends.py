@@ -7,6 +7,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from turbopi.cli.framework import JsonFlag, Output, command
+from turbopi.cli.typed import as_typed
 from turbopi.errors import BackendUnavailable, ConfigError
 
 
@@ -26,6 +27,7 @@ def backends(
     if precision not in registry.PRECISIONS:
         raise ConfigError(f"unknown precision {precision!r}; choose one of {', '.join(registry.PRECISIONS)}")
     chosen, why = registry.choose(resolved, precision)
+    why = as_typed(why)
     listed = [
         {
             "name": spec.name,

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, RobotOptions
+from turbopi.cli.typed import as_typed
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
 
@@ -49,8 +50,8 @@ def inspect(
 ) -> None:
     """Show what a checkpoint holds, without loading it: format, sizes, statistics, robot, horizon.
 
-    If its robot can't be known without --config, the rest is shown. --robot holds a robot against the checkpoint and
-    shows the keys that its observations have.
+    With the robot come the keys that its observations have. If it can't be known without --config, the rest is shown.
+    --robot holds another robot against the checkpoint.
     """
     output = Output(as_json)
     options.check(checkpoint)
@@ -60,7 +61,9 @@ def inspect(
         info = options.open(None).info()
     else:
         info = inspect_checkpoint(checkpoint, "auto" if options.config is None else options.config)
-    if options.robot is not None:
+    if "config_error" in info:
+        info["config_error"] = as_typed(info["config_error"])
+    if "robot" in info or options.robot is not None:
         info |= _with_robot(options, checkpoint, info["notes"])
     if hash:
         opened = options.open(checkpoint)
@@ -71,10 +74,19 @@ def inspect(
 
 
 def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str]) -> dict[str, Any]:
-    """What is shown of the robot that --robot names. Raises ConfigError if it doesn't fit the checkpoint."""
+    """What is shown of the robot: --robot's, or the configuration's.
+
+    If it doesn't fit the checkpoint, ConfigError is raised for --robot's; of the configuration's a note says why.
+    """
     from turbopi.robots.base import described
 
-    pipeline = robot_pipeline(options.open(checkpoint), options.make_robot())
+    opened = options.open(checkpoint)
+    try:
+        pipeline = robot_pipeline(opened, options.make_robot())
+    except ConfigError as error:
+        if options.robot is not None:
+            raise
+        return {"notes": [*notes, f"no policy can be made of this: {error}"]}
     about = pipeline.metadata
     return {
         **{key: about[key] for key in ("robot", "robot_state_dim", "robot_action_dim", "default_prompt")},

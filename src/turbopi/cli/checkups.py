@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 from turbopi.cli.ports import why_not_free
+from turbopi.cli.typed import as_typed
 from turbopi.errors import TurboPiError
 from turbopi.toolchain import missing_for_c, missing_for_cpp
 
@@ -260,7 +261,7 @@ def open_for_check(path: str, config: str | None) -> tuple[Any, Row]:
     try:
         opened = open_checkpoint(path, "auto" if config is None else config)
     except TurboPiError as error:
-        return None, Row("FAIL", "checkpoint", str(error), "see the message")
+        return None, Row("FAIL", "checkpoint", as_typed(str(error)), "see the message")
     info = opened.info()
     found = (
         f"{info['path']}: {info['format']}, {info['kind']}, {info['name']} for {info['robot']}, "

@@ -39,6 +39,7 @@ from turbopi.cli.process import (
     is_closed_pipe,
 )
 from turbopi.cli.tables import fitted
+from turbopi.cli.typed import as_typed
 from turbopi.errors import ConfigError, DeviceLost, TurboPiError
 from turbopi.reading import plain_document
 
@@ -222,7 +223,7 @@ def _exit_code(error: Exception) -> int:
 def _users_message(error: Exception) -> str | None:
     """What to tell of an error that isn't a fault in the program; None if it is one."""
     if isinstance(error, TurboPiError):
-        return str(error)
+        return as_typed(str(error))
     if isinstance(error, OSError) and error.filename is not None:  # a file of the user's: unwritable, vanished, …
         return f"{os.fsdecode(error.filename)}: {error.strerror}"
     if isinstance(error, OSError) and error.errno in _NO_ROOM:  # of writes, which know no name
@@ -247,7 +248,7 @@ class _StderrHandler(logging.Handler):
         time = f"{_iso(record.created)} " if self.stamped else ""
         level = "" if record.levelno == logging.INFO else f"{record.levelname.lower()}: "
         with contextlib.suppress(OSError, ValueError):  # whoever read the log has left: no reason to stop working
-            print(f"{time}{level}{record.getMessage()}", file=sys.stderr, flush=True)
+            print(f"{time}{level}{as_typed(record.getMessage())}", file=sys.stderr, flush=True)
             if record.exc_info:
                 traceback.print_exception(*record.exc_info, file=sys.stderr)
 

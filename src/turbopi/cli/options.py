@@ -10,6 +10,7 @@ import typer
 from turbopi.cli.files import let_import_from_here
 from turbopi.cli.framework import Output
 from turbopi.cli.process import interrupts_end_at_once
+from turbopi.cli.typed import as_typed
 from turbopi.config import PRESETS
 from turbopi.errors import ConfigError
 
@@ -69,20 +70,21 @@ class WeightOptions:
             panel=_WEIGHTS,
             metavar="PRESET|FILE",
             help="What the checkpoint doesn't record (robot, horizon, …): a preset's name or a .json. Unless given, "
-            "the turbopi.json beside the weights, or LeRobot's own files.",
+            "the turbopi.json beside the weights, or LeRobot's own files. Of random weights it leaves the sizes.",
         ),
     ] = None
 
     def open(self, checkpoint: str | None) -> "Checkpoint":
         """The checkpoint that the user means. Raises ConfigError unless exactly one is named."""
         self.check(checkpoint)
+        config = "auto" if self.config is None else self.config
         with interrupts_end_at_once():
             from turbopi.checkpoint import open_checkpoint, random_checkpoint
 
             if self.random_weights is not None:
-                return random_checkpoint(self.random_weights, self.weights_seed or 0)
+                return random_checkpoint(self.random_weights, self.weights_seed or 0, config)
             assert checkpoint is not None
-            return open_checkpoint(checkpoint, "auto" if self.config is None else self.config)
+            return open_checkpoint(checkpoint, config)
 
     def split(self, command: str, paths: Sequence[str], other: str) -> tuple[str | None, str]:
         """`[CHECKPOINT] OTHER` as it was typed: the checkpoint, if there should be one, and the other path."""
@@ -111,14 +113,12 @@ class WeightOptions:
             )
         if self.random_weights is None and self.weights_seed is not None:
             raise ConfigError("--weights-seed is the seed of --random-weights, which wasn't given")
-        if self.random_weights is not None and self.config is not None:
-            raise ConfigError("--config describes a checkpoint; random weights take everything from their preset")
 
     def tell_if_random(self, checkpoint: "Checkpoint", output: Output) -> None:
         if checkpoint.format == "random":
             seed = self.weights_seed or 0
             output.line(
-                f"RANDOM WEIGHTS ({checkpoint.config.name}, seed {seed}): the actions mean nothing.", "bold yellow"
+                f"RANDOM WEIGHTS ({self.random_weights}, seed {seed}): the actions mean nothing.", "bold yellow"
             )
 
 
@@ -236,7 +236,7 @@ class PolicyOptions(RobotOptions):
             f"({about['device_name']}), {about['num_denoising_steps']} steps; "
             f"weights: {about['weight_bytes'] / 1e6:,.0f} MB in {about['load_seconds']:.1f} s"
         )
-        output.line(f"backend: {about['backend']} ({about['backend_reason']})")
+        output.line(f"backend: {about['backend']} ({as_typed(about['backend_reason'])})")
         return policy
 
     def _quantization(self) -> Any:
