@@ -39,7 +39,7 @@ def main() -> None:
     time.add_argument("--rounds", type=int, default=8)
     time.add_argument("--marks", action="store_true", help="also cycles between the kernel's marks, by rank")
     time.add_argument("--warp", type=int, default=0, choices=range(MULTIPLYING), metavar="0..15", help="whose marks")
-    time.add_argument("--json", type=Path, help="also write the rows here")
+    time.add_argument("--json", type=Path, help="also write the rows, and marks by rank, here")
     launch = commands.add_parser("launch", help="launch one variant three times, for ncu")
     stalls = commands.add_parser("stalls", help="ncu's samples beside the source")
     stalls.add_argument("--samples", type=Path, required=True, help="what `ncu --page source --csv` printed")
@@ -64,7 +64,8 @@ def _time(arguments: argparse.Namespace) -> None:
     from turbopi.provenance import provenance
     from turbopi.reading import plain_document
 
-    variants, console, rows = [Variant(spec) for spec in arguments.variants], Console(), []
+    variants, console = [Variant(spec) for spec in arguments.variants], Console()
+    rows, marks = list[dict[str, object]](), list[dict[str, object]]()
     for tokens in (int(text) for text in arguments.tokens.split(",")):
         for precision in arguments.precisions.split(","):
             job = Job(tokens, precision, arguments.length)
@@ -78,15 +79,16 @@ def _time(arguments: argparse.Namespace) -> None:
             for variant in variants if arguments.marks else ():
                 title = f"cycles a layer up to each mark, warp {arguments.warp}, {variant.spec}"
                 table = Table("mark", *(f"rank {rank}" for rank in range(RANKS)), title=title)
-                for (mark, about), cycles in zip(
-                    MARKS.items(), marks_by_rank(job, variant, arguments.warp).T, strict=True
-                ):
-                    table.add_row(
-                        f"{mark.removeprefix('MARK_').lower()}: {about}", *(f"{count:.0f}" for count in cycles)
-                    )
+                cycles = dict(zip(MARKS, marks_by_rank(job, variant, arguments.warp).T.tolist(), strict=True))
+                for mark, about in MARKS.items():
+                    name = f"{mark.removeprefix('MARK_').lower()}: {about}"
+                    table.add_row(name, *(f"{count:.0f}" for count in cycles[mark]))
                 console.print(table)
+                what = {"tokens": tokens, "precision": precision, "variant": variant.spec, "warp": arguments.warp}
+                marks.append({**what, "cycles": cycles})
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps({"provenance": plain_document(provenance(GPU)), "rows": rows}, indent=1))
+        document = {"provenance": plain_document(provenance(GPU)), "rows": rows, "marks": marks}
+        arguments.json.write_text(json.dumps(document, indent=1))
 
 
 def _launch(arguments: argparse.Namespace) -> None:
