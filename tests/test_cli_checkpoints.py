@@ -96,10 +96,10 @@ def test_inspect_shows_a_folder_whose_robot_does_not_fit_and_says_so(tiny: Path,
 
 def test_random_weights_take_a_configuration(tmp_path: Path) -> None:
     """The robot, the horizon and the rest are the configuration's, the sizes the preset's."""
-    for config, robot, horizon in (("pi05_droid", "droid", 15), (tmp_path / "own.json", "my_arm", 12)):
-        if robot == "my_arm":
-            (tmp_path / "my_arm.json").write_text(json.dumps(ARM))
-            config.write_text(json.dumps({"robot": "my_arm.json", "action_horizon": 12, "name": "mine"}))
+    own = tmp_path / "own.json"
+    own.write_text(json.dumps({"robot": "my_arm.json", "action_horizon": 12, "name": "mine"}))
+    (tmp_path / "my_arm.json").write_text(json.dumps(ARM))
+    for config, robot, horizon in (("pi05_droid", "droid", 15), (own, "my_arm", 12)):
         made = tmp_path / f"made-for-{robot}"
         result = turbopi("convert", "--random-weights", "pi05_tiny", made, "--config", config)
         assert result.exit_code == 0, result.output

@@ -83,10 +83,14 @@ def test_plain_bf16_passes_and_its_document_is_complete(tmp_path: Path, drawn: l
         assert (tmp_path / plot).read_bytes().startswith(b"\x89PNG")
         lines = [line.get_xydata().tolist() for line in figure.axes[0].get_lines()]
         expected: list[list[list[float]]] = []
-        for tensor in of_plot:  # an error's line, then its control's, of what a logarithmic axis can show
+        for tensor in of_plot:  # an error, its control, what is allowed; of these what a logarithmic axis can show
             rows = [row for row in document["intermediates"] if row["name"] == tensor]
             for of_line in ([(row["index"], row) for row in rows], [(row["index"], row["control"]) for row in rows]):
                 expected.append([[index, one["relative_rms"]] for index, one in of_line if one["relative_rms"] > 0])
+            expected.append([[row["index"], row["allowed"]] for row in rows if row["control"]["relative_rms"] > 0])
+        if plot == "steps.png":
+            bound = document["bounds"]["actions_relative_rms"]
+            expected += [[[STEPS, actions["relative_rms"]]], [[0, bound], [1, bound]]]  # the latter from edge to edge
         assert lines == expected and all(expected)
         assert "PASS" in figure.axes[0].get_title()
 

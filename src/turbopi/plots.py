@@ -1,7 +1,8 @@
-"""Pictures of action chunks, as PNG files."""
+"""Pictures of action chunks, as PNG files, and the colours of all plots: one colour for one thing."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import pi
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,22 @@ from turbopi.errors import ConfigError
 from turbopi.files import write_whole
 
 _DPI = 110
-_WARNING = "#b00020"
+STAGES = {"vision": "#4c72b0", "prefix": "#dd8452", "denoise": "#55a868"}
+MEASURED, SOLVED, BOUND, MUTED = "#3b6fb6", "#2f8f5b", "#b00020", "#9aa0a6"
+_GRIPPERS = {"gripper": "C9", "left": "C9", "right": "C8"}  # as no axis and no joint, which have C0 to C7
 
 
 @dataclass(frozen=True)
 class ActionGroup:
-    """Action dimensions that share one unit, and so one axis."""
+    """Action dimensions that share one unit, and so one axis.
+
+    limits   what the unit's values range over: the axis shows at least that, so that noise looks as small as it is
+    """
 
     title: str
     unit: str
     names: dict[int, str]  # dimension -> what it moves
+    limits: tuple[float, float] | None = None
 
 
 def _numbered(prefix: str, indices: Sequence[int]) -> dict[int, str]:
@@ -34,18 +41,18 @@ def _numbered(prefix: str, indices: Sequence[int]) -> dict[int, str]:
 # LIBERO: inputs of robosuite's OSC_POSE controller, whose output_max is 0.05 m and 0.5 rad
 _GROUPS: dict[str, list[ActionGroup]] = {
     "libero": [
-        ActionGroup("translation", "1 = 0.05 m a step", {0: "x", 1: "y", 2: "z"}),
-        ActionGroup("rotation", "1 = 0.5 rad a step", {3: "about x", 4: "about y", 5: "about z"}),
-        ActionGroup("gripper", "−1 open, 1 closed", {6: "gripper"}),
+        ActionGroup("translation", "1 = 0.05 m a step", {0: "x", 1: "y", 2: "z"}, (-1, 1)),
+        ActionGroup("rotation", "1 = 0.5 rad a step", {3: "about x", 4: "about y", 5: "about z"}, (-1, 1)),
+        ActionGroup("gripper", "−1 open, 1 closed", {6: "gripper"}, (-1, 1)),
     ],
     "droid": [
-        ActionGroup("joint velocities", "1 = the fastest command", _numbered("joint", range(7))),
-        ActionGroup("gripper", "0 open, 1 closed", {7: "gripper"}),
+        ActionGroup("joint velocities", "1 = the fastest command", _numbered("joint", range(7)), (-1, 1)),
+        ActionGroup("gripper", "0 open, 1 closed", {7: "gripper"}, (0, 1)),
     ],
     "aloha": [
-        ActionGroup("left arm", "rad", _numbered("joint", range(6))),
-        ActionGroup("right arm", "rad", _numbered("joint", range(7, 13))),
-        ActionGroup("grippers", "0 closed, 1 open", {6: "left", 13: "right"}),
+        ActionGroup("left arm", "rad", _numbered("joint", range(6)), (-pi, pi)),
+        ActionGroup("right arm", "rad", _numbered("joint", range(7, 13)), (-pi, pi)),
+        ActionGroup("grippers", "0 closed, 1 open", {6: "left", 13: "right"}, (0, 1)),
     ],
 }
 
@@ -78,21 +85,23 @@ class Row:
 def plot_chunks(file: Path, rows: Sequence[Row], *, robot: str, title: str, random_weights: bool) -> None:
     """Write a PNG with one row an observation: its pictures, then its action chunk by groups of one unit.
 
-    Raises as `write_figure` does.
+    A group's axis is the same in every row. Raises as `write_figure` does.
     """
     groups = action_groups(robot, rows[0].actions.shape[1])
     num_pictures = max(len(row.pictures) for row in rows)
+    limits = [_limits(group, rows) for group in groups]
     widths = [1.0] * num_pictures + [1.45] * len(groups)
     figure = Figure(figsize=(0.8 + 2.45 * sum(widths), 0.9 + 2.75 * len(rows)), dpi=_DPI, layout="constrained")
     if random_weights:
         title += "\nrandom weights: the actions mean nothing"
-    figure.suptitle(as_text(title), fontsize=14, fontweight="bold", color=_WARNING if random_weights else "black")
+    figure.suptitle(as_text(title), fontsize=14, fontweight="bold", color=BOUND if random_weights else "black")
     for row, panel in zip(rows, np.atleast_1d(np.array(figure.subfigures(len(rows), 1))), strict=True):
         panel.suptitle(as_text(row.heading), fontsize=10.5, x=0.01, ha="left")
         axes = np.atleast_1d(panel.subplots(1, num_pictures + len(groups), width_ratios=widths))
         _draw_pictures(axes[:num_pictures], row.pictures)
-        for ax, group in zip(axes[num_pictures:], groups, strict=True):
+        for ax, group, span in zip(axes[num_pictures:], groups, limits, strict=True):
             _draw_group(ax, group, row)
+            ax.set_ylim(span)
     write_figure(file, figure)
 
 
@@ -113,6 +122,23 @@ def as_text(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def _limits(group: ActionGroup, rows: Sequence[Row]) -> tuple[float, float]:
+    """What a group's axis shows: its limits, and whatever is beyond them.
+
+    Without limits the values of all rows, but not less than a fifth of the largest: noise on a constant stays small.
+    """
+    drawn = [chunk for row in rows for chunk in (row.actions, row.oracle, row.expert) if chunk is not None]
+    values = np.concatenate([chunk[:, list(group.names)].ravel() for chunk in drawn])
+    values = values[np.isfinite(values)]
+    low, high = group.limits or (np.inf, -np.inf)
+    low, high = min(low, values.min(initial=np.inf)), max(high, values.max(initial=-np.inf))
+    if low > high:
+        return -1.0, 1.0  # nothing to draw
+    missing = max(0.2 * max(abs(low), abs(high)) - (high - low), 0) or (0.0 if high > low else 1.0)
+    margin = 0.05 * (high - low + missing) + missing / 2
+    return float(low - margin), float(high + margin)
+
+
 def _draw_pictures(axes: Any, pictures: dict[str, np.ndarray]) -> None:
     for ax in axes:
         ax.set_axis_off()
@@ -131,12 +157,13 @@ def _draw_group(ax: Axes, group: ActionGroup, row: Row) -> None:
     }
     broken: dict[str, Any] = {"linestyle": "--", "linewidth": 1.0, "alpha": 0.8}
     handles = []
-    for color, (index, name) in enumerate(group.names.items()):
-        handles += ax.plot(steps, row.actions[:, index], color=f"C{color}", linewidth=1.6, label=name)
+    for number, (index, name) in enumerate(group.names.items()):
+        color = _GRIPPERS.get(name, f"C{number}")
+        handles += ax.plot(steps, row.actions[:, index], color=color, linewidth=1.6, label=name)
         if row.oracle is not None:
-            ax.plot(steps, row.oracle[:, index], color=f"C{color}", **dot)
+            ax.plot(steps, row.oracle[:, index], color=color, **dot)
         if row.expert is not None:
-            ax.plot(steps[: len(row.expert)], row.expert[: len(steps), index], color=f"C{color}", **broken)
+            ax.plot(steps[: len(row.expert)], row.expert[: len(steps), index], color=color, **broken)
     if row.oracle is not None:
         handles.append(
             Line2D([], [], marker="o", color="0.3", linestyle="", markerfacecolor="none", label="f32 oracle")

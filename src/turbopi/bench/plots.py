@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from turbopi.plots import as_text, write_figure
+from turbopi.plots import STAGES, as_text, write_figure
 
 DRAWN_OF = "Drawn of"  # the PNG text in which a plot names its document
 SHAPE = ("cameras", "prompt_tokens", "horizon")
-STAGES = {"vision": "#4c72b0", "prefix": "#dd8452", "denoise": "#55a868"}
 
 
 def label(result: dict[str, Any]) -> str:

@@ -9,10 +9,9 @@ from matplotlib.figure import Figure
 
 from turbopi.evaluate.results import Results, rate
 from turbopi.evaluate.statistics import Rate
-from turbopi.plots import as_text, write_figure
+from turbopi.plots import MEASURED, MUTED, SOLVED, as_text, write_figure
 
 _DPI = 120
-BLUE, GREEN, RED, GRAY = "#3b6fb6", "#2f8f5b", "#c0504d", "#9aa0a6"
 
 
 def write_plots(results: Results) -> list[str]:
@@ -35,7 +34,7 @@ def _success(results: Results, path: Path) -> Path:
     figure = Figure(figsize=(6.2, 1.2 + 0.3 * len(rows)), layout="constrained")
     axes = figure.subplots()
     for place, (_, one) in enumerate(rows):
-        _rate_bar(axes, place, one, GREEN if place == 0 else BLUE)
+        _rate_bar(axes, place, one, SOLVED if place == 0 else MEASURED)
     axes.set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=9)
     axes.invert_yaxis()
     axes.set_xlim(0, 100)
@@ -47,26 +46,33 @@ def _success(results: Results, path: Path) -> Path:
 
 def _rate_bar(axes: Any, place: int, one: Rate, color: str) -> None:
     if one.value is None:
-        axes.text(1, place, "no verdict", va="center", fontsize=8, color=GRAY)
+        axes.text(1, place, "no verdict", va="center", fontsize=8, color=MUTED)
         return
     low, high = one.interval
     axes.barh(place, 100 * one.value, color=color, alpha=0.75, height=0.65)
+    # where the bar ends, which shows a rate of 0, too
+    axes.plot(100 * one.value, place, "o", color=color, markersize=7, clip_on=False, zorder=3)
     axes.plot([100 * low, 100 * high], [place, place], color="0.15", linewidth=1.4)
     axes.plot([100 * low, 100 * high], [place, place], "|", color="0.15", markersize=8)
-    axes.text(101.5, place, f"{one.successes}/{one.trials}", va="center", fontsize=8)
+    axes.text(102.5, place, f"{one.successes}/{one.trials}", va="center", fontsize=8)
 
 
 def _steps(results: Results, path: Path) -> Path:
     """How many episodes were solved by which step: where more steps would still help, and where not."""
     judged = [episode for episode in results.in_order() if episode.judged]
-    limit = max(max(e.steps for e in judged), 1)
+    allowed = results.protocol.get("max_steps")
+    own = allowed if isinstance(allowed, int) else max(task.max_steps for task in results.tasks.values())
+    limit = max(own, *(e.steps for e in judged))
     solved = np.sort([e.steps for e in judged if e.success])
     figure = Figure(figsize=(6.2, 3.6), layout="constrained")
     axes = figure.subplots()
     share = 100 * np.arange(1, len(solved) + 1) / len(judged)
-    axes.step(np.r_[0, solved, limit], np.r_[0, share, share[-1] if len(share) else 0], where="post", color=GREEN)
-    axes.set_xlim(0, limit)
-    axes.set_ylim(0, 100)
+    end = 1.04 * limit  # beyond the last step that an episode may take: a success there is seen, too
+    axes.step(np.r_[0, solved, end], np.r_[0, share, share[-1]], where="post", color=SOLVED)
+    axes.axvline(limit, color=MUTED, linestyle="--", linewidth=1, label=f"the limit, {limit} steps")
+    axes.legend(fontsize=8, frameon=False, loc="upper left")
+    axes.set_xlim(0, end)
+    axes.set_ylim(0, 103)
     axes.set_xlabel("control steps")
     axes.set_ylabel("solved by then [% of episodes]")
     axes.grid(alpha=0.3)
@@ -81,7 +87,7 @@ def _latency(results: Results, path: Path) -> Path:
     edge = p99 * 1.15
     figure = Figure(figsize=(6.2, 3.6), layout="constrained")
     axes = figure.subplots()
-    axes.hist(calls[calls <= edge], bins=50, color=BLUE, alpha=0.75)
+    axes.hist(calls[calls <= edge], bins=50, color=MEASURED, alpha=0.75)
     for value, name, style in ((p50, "p50", "-"), (p95, "p95", "--"), (p99, "p99", ":")):
         axes.axvline(value, color="0.2", linestyle=style, linewidth=1.2, label=f"{name} {value:.1f} ms")
     axes.set_xlim(left=0)
@@ -97,7 +103,7 @@ def write_comparison_plot(path: Path, rows: Sequence[tuple[str, Rate]]) -> Path:
     figure = Figure(figsize=(7.5, 1.2 + 0.42 * len(rows)), layout="constrained")
     axes = figure.subplots()
     for place, (_, one) in enumerate(rows):
-        _rate_bar(axes, place, one, BLUE)
+        _rate_bar(axes, place, one, MEASURED)
     axes.set_yticks(range(len(rows)), [as_text(_short(name, 60)) for name, _ in rows], fontsize=9)
     axes.invert_yaxis()
     axes.set_xlim(0, 100)
