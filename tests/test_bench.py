@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 from file_helpers import no_room
+from msgspec.structs import replace
 from typer.testing import CliRunner
 
 from turbopi.bench import profile
+from turbopi.bench.document import BenchDocument, Kernel, Memory, Result, Times, read_benchmark
 from turbopi.bench.floors import Floors
 from turbopi.bench.measure import (
     FEWEST,
@@ -35,8 +37,10 @@ from turbopi.errors import BackendError, BackendUnavailable, ConfigError, Output
 from turbopi.kernels import grid_barrier as barrier
 from turbopi.kernels.nvrtc import bindings, compile_cubin
 from turbopi.policy import UnifiedPolicy
+from turbopi.reading import as_document
 
 CPU = torch.device("cpu")
+CHECKED_IN = Path(__file__).parents[1] / "benchmarks/results/cpu_2026-11-21_small_policy_bench.json"
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +65,8 @@ def test_work_grows_with_the_job() -> None:
 
 
 def test_the_floor_is_the_larger_of_arithmetic_and_memory() -> None:
-    assert floor_ms(Work(flops=2e12, bytes=1e9), 1e15, 1e12) == pytest.approx(2.0)
-    assert floor_ms(Work(flops=1e12, bytes=3e9), 1e15, 1e12) == pytest.approx(3.0)
+    assert floor_ms(Work(flops=2 * 10**12, bytes=10**9), 1e15, 1e12) == pytest.approx(2.0)
+    assert floor_ms(Work(flops=10**12, bytes=3 * 10**9), 1e15, 1e12) == pytest.approx(3.0)
 
 
 def test_stage_floors_add_up(policy: UnifiedPolicy) -> None:
@@ -118,10 +122,10 @@ def test_another_horizon_shares_the_backend(policy: UnifiedPolicy) -> None:
 
 def test_the_oracle_has_no_error_against_itself(policy: UnifiedPolicy) -> None:
     exact = answers(policy, Job(steps=1), observations=1)
-    assert error_against(answers(policy, Job(steps=1), observations=1), exact)["max"] == 0
+    assert error_against(answers(policy, Job(steps=1), observations=1), exact).max == 0
     rounded = bench_policy(random_checkpoint("pi05_tiny"), "pytorch", "bf16", CPU, Job(steps=1))
     error = error_against(answers(rounded, Job(steps=1), observations=1), exact)
-    assert 1e-4 < error["relative_rms"] < 0.1
+    assert 1e-4 < error.relative_rms < 0.1
 
 
 TABLE = BenchPlan(["fused"], ["bf16"], (1, 2, 3), (48, 200), (10, 50), (1, 2, 3, 5, 10), beside=["pytorch"])
@@ -158,17 +162,23 @@ def test_a_backend_is_left_out_only_in_one_of_several_precisions() -> None:
 
 def test_the_line_over_steps_is_found() -> None:
     results = [
-        {
-            "backend": "x",
-            "precision": "bf16",
-            "job": {"cameras": 2, "prompt_tokens": 48, "horizon": 10, "steps": steps},
-            "milliseconds": {"total": {"p50": 5 + 0.25 * steps}},
-        }
+        Result(
+            backend="x",
+            precision="bf16",
+            job=Job(steps=steps),
+            calls=1,
+            load_seconds=0.0,
+            first_call_seconds=0.0,
+            milliseconds={"total": Times(p50=5 + 0.25 * steps, p95=9.0)},
+            floor_ms={},
+            times_floor=1.0,
+            memory=Memory(),
+        )
         for steps in (1, 3, 10)
     ]
     (line,) = linear_models(results)
-    assert (line["a_ms"], line["b_ms"]) == pytest.approx((5, 0.25))
-    assert line["worst_ms"] == pytest.approx(0, abs=1e-9)
+    assert (line.a_ms, line.b_ms) == pytest.approx((5, 0.25))
+    assert line.worst_ms == pytest.approx(0, abs=1e-9)
     assert linear_models(results[:1]) == []
 
 
@@ -187,8 +197,8 @@ def test_kernels_belong_to_the_stage_in_which_they_ran() -> None:
     parts = profile.split(ran, [0.0, 9.0, 19.0, 30.0])
     assert [[one.name for one in part] for part in parts] == [["v"], ["p"], ["d", "after"]]
     top = profile.top([profile.Ran("x", 0, 300.0), profile.Ran("x", 1, 100.0), profile.Ran("y", 2, 100.0)], 2, 1)
-    assert (top["busy_ms"], top["launches"]) == (0.25, 1.5)
-    assert top["kernels"] == [{"kernel": "x", "ms_per_call": 0.2, "launches_per_call": 1.0, "share": 0.8}]
+    assert (top.busy_ms, top.launches) == (0.25, 1.5)
+    assert top.kernels == [Kernel("x", ms_per_call=0.2, launches_per_call=1.0, share=0.8)]
 
 
 def has_nvrtc() -> bool:
@@ -209,10 +219,9 @@ def test_ready_is_measured_in_a_process_of_its_own() -> None:
     start = Start(None, "pi05_tiny", 0, None, "pytorch", "bf16", "cpu", 1, None)
     with empty_caches():
         measured = measure_ready(start)
-    assert set(measured) == {"cold", "cached"}
-    for one in measured.values():
-        assert one["ready"] == pytest.approx(one["import"] + one["load"] + one["warmup"], abs=0.02)
-        assert one["import"] > 0
+    for one in (measured.cold, measured.cached):
+        assert one.ready == pytest.approx(one.imports + one.load + one.warmup, abs=0.02)
+        assert one.imports > 0
 
 
 def test_a_start_that_fails_says_why() -> None:
@@ -235,10 +244,11 @@ def test_anothers_results_arent_replaced_and_what_cant_be_written_is_told_first(
 def test_a_full_disk_keeps_the_earlier_benchmark(tmp_path: Path) -> None:
     from turbopi.cli.bench import _write_results
 
-    file = _write_results({"floors": {}}, tmp_path)
+    document = read_benchmark(CHECKED_IN)
+    file = _write_results(replace(document, results=[]), tmp_path)
     before = file.read_text()
     with no_room(10), pytest.raises(OutputError, match=rf"can't write {file}: File too large"):
-        _write_results({"floors": {}, "results": [1, 2, 3]}, tmp_path)
+        _write_results(document, tmp_path)
     assert file.read_text() == before and list(tmp_path.iterdir()) == [file]
 
 
@@ -284,10 +294,11 @@ def test_the_command_writes_a_complete_document(tmp_path: Path, drawn: list[Any]
     measured = [container.lines[0].get_xydata().tolist() for container in steps_plot.containers]
     assert measured == [[[1, pytest.approx(a)], [2, pytest.approx(b)]] for a, b in medians]
     page = (tmp_path / "report.md").read_text()
-    assert page == report(document)
+    assert page == report(as_document(document, BenchDocument, "stdout"))
     assert f"{document['results'][3]['milliseconds']['total']['p50']:.2f}" in page
     document["results"][-1]["backend_details"]["denoising_clock_mhz"] = {"H=10, 2 steps": 1795}
-    assert "1795 (H=10, 2 steps). nvidia-smi said nothing." in report(document)
+    told = report(as_document(document, BenchDocument, "stdout"))
+    assert "1795 (H=10, 2 steps). nvidia-smi said nothing." in told
 
 
 def test_a_run_that_is_ended_has_kept_what_it_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

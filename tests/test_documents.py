@@ -9,6 +9,8 @@ from doc_tables import blocks, drawn
 from doc_tables.__main__ import main
 from doc_tables.tables import TABLES, headline, whole_calls
 
+from turbopi.bench.document import read_benchmark
+
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "benchmarks" / "results" / "h200_2026-11-24_pi05_libero" / "results.json"
 _LINK = re.compile(r"\]\(([^()\s]+(?:\([^()\s]*\)[^()\s]*)*)\)")
@@ -101,13 +103,9 @@ def test_plots_of_another_document_are_drawn_anew(tmp_path: Path) -> None:
 
 
 def test_tables_hold_the_numbers_of_their_job() -> None:
-    document = json.loads(RESULT.read_text(encoding="utf-8"))
-    (measured,) = [
-        result
-        for result in document["results"]
-        if result["backend"] == "fused" and result["precision"] == "fp8" and result["job"] == document["main_job"]
-    ]
-    median = measured["milliseconds"]["total"]["p50"]
+    document = read_benchmark(RESULT)
+    (measured,) = [result for result in document.main_results if (result.backend, result.precision) == ("fused", "fp8")]
+    median = measured.milliseconds["total"].p50
     assert f"**{median:.1f} ms**" in headline(document)[2]
     (row,) = [line for line in whole_calls(document)[-6:] if line.startswith("| 2, 48 |")]
     assert f"/ {median:.2f} |" in row

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from msgspec import Meta, Struct
 
+from turbopi.bench.document import BenchDocument, read_benchmark
+from turbopi.bench.plots import fingerprint
+from turbopi.bench.report import report
 from turbopi.errors import ConfigError
 from turbopi.provenance import Provenance
 from turbopi.reading import as_document, plain_document, read_document
@@ -134,3 +137,38 @@ def test_every_provenance_that_is_checked_in_reads_and_comes_out_as_it_was() -> 
         for one in all_of_it:
             written = plain_document(as_document(one, Provenance, name))
             assert json.dumps(written) == json.dumps({key: one[key] for key in one if key not in more}), name
+
+
+# shortened by hand, before result files were checked in as the tools write them
+SHORTENED = {
+    "h200_2026-11-21_pi05_libero_pytorch.json": "observations_seed is missing; expected a whole number",
+    "h200_2026-11-21_pi05_libero_tensorrt.json": r"results\[0\]\.milliseconds\.preprocess is .*; expected an object",
+    "h200_2026-11-22_pi05_libero_cuda_graph_without_inductor.json": r"results\[0\]\.milliseconds\.preprocess is .*; "
+    "expected an object",
+}
+BENCHMARKS = [name for name in EVERY if '"floors"' in (RESULTS / name).read_text()]
+
+
+@pytest.mark.parametrize("name", [name for name in BENCHMARKS if name not in SHORTENED])
+def test_a_checked_in_benchmark_reads_and_comes_out_as_it_was(name: str) -> None:
+    content = json.loads((RESULTS / name).read_text())
+    document = read_benchmark(RESULTS / name)
+    assert json.dumps(plain_document(document)) == json.dumps(content)
+    assert document.main_results and document.model in report(document)
+
+
+@pytest.mark.parametrize("name", SHORTENED)
+def test_a_benchmark_that_lacks_what_the_tool_writes_is_refused_by_key(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"{name}: {SHORTENED[name]}"):
+        read_benchmark(RESULTS / name)
+
+
+def test_a_benchmark_reads_the_same_whichever_way_a_number_is_written() -> None:
+    """Plots name their document by its values: 0 and 0.0 are one."""
+    content = json.loads((RESULTS / "cpu_2026-11-21_small_policy_bench.json").read_text())
+    first = as_document(content, BenchDocument, "FILE")
+    content["results"][0]["load_seconds"] = 1
+    content["results"][0]["milliseconds"]["total"]["p50"] = 141.0
+    whole = as_document(content, BenchDocument, "FILE")
+    content["results"][0]["milliseconds"]["total"]["p50"] = 141
+    assert fingerprint(as_document(content, BenchDocument, "FILE")) == fingerprint(whole) != fingerprint(first)

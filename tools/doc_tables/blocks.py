@@ -1,12 +1,11 @@
 """The marked places in documents, and what belongs there."""
 
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from doc_tables.tables import TABLES
+from doc_tables.tables import TABLES, Table
 
 RESULTS = Path("benchmarks") / "results"
 _BLOCK = re.compile(r"<!-- table: (?P<what>[^\n]*?) -->\n(?P<text>.*?)<!-- end of table -->", re.DOTALL)
@@ -24,23 +23,26 @@ def documents(root: Path) -> list[Path]:
 def filled(text: str, root: Path) -> str:
     """A document's text with its tables written anew. Raises TableError."""
 
-    def table(found: re.Match[str]) -> str:
+    def written(found: re.Match[str]) -> str:
         name, *files = found["what"].split()
         if name not in TABLES:
             raise TableError(f"no table is named {name!r}: there are {', '.join(sorted(TABLES))}")
-        contents = [_load(root / RESULTS / file) for file in files]
-        lines = TABLES[name](*contents)
+        table = TABLES[name]
+        lines = table.lines(*(_load(root / RESULTS / file, table) for file in files))
         return f"<!-- table: {found['what']} -->\n" + "".join(f"{line}\n" for line in lines) + "<!-- end of table -->"
 
     if text.count("<!-- table:") != len(_BLOCK.findall(text)):
         raise TableError('a line "<!-- table: … -->" has no "<!-- end of table -->" behind it')
-    return _BLOCK.sub(table, text)
+    return _BLOCK.sub(written, text)
 
 
-def _load(file: Path) -> Any:
+def _load(file: Path, table: Table) -> Any:
     if not file.is_file():
         raise TableError(f"there is no result file {file.name} in {file.parent}")
-    return json.loads(file.read_text(encoding="utf-8"))
+    try:
+        return table.read(file)
+    except ValueError as error:
+        raise TableError(str(error)) from error
 
 
 def _wanted(root: Path) -> Iterator[tuple[Path, str, str]]:

@@ -1,21 +1,19 @@
 """Plots of benchmark results, and of which document each was drawn."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 from PIL import Image
 
+from turbopi.bench.document import BenchDocument, read_benchmark
 from turbopi.bench.plots import DRAWN_OF, fingerprint, write_plots
 
 PLOTS = ("stages.png", "roofline.png", "steps.png")
 
 
-def _benchmarks(root: Path) -> list[tuple[Path, dict[str, Any]]]:
+def _benchmarks(root: Path) -> list[tuple[Path, BenchDocument]]:
     """Folder and document of every benchmark report."""
     files = sorted((root / "benchmarks" / "results").glob("*/results.json"))
-    found = [(file.parent, json.loads(file.read_text(encoding="utf-8"))) for file in files]
-    return [(folder, document) for folder, document in found if "main_job" in document]
+    return [(file.parent, read_benchmark(file)) for file in files]
 
 
 def draw(root: Path) -> list[Path]:

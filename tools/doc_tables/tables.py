@@ -1,13 +1,17 @@
-"""The tables themselves: each takes the contents of result files and returns Markdown lines."""
+"""The tables themselves: each takes what result files hold and returns Markdown lines."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from msgspec.structs import replace
+
+from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
+from turbopi.provenance import Gpu
 from turbopi.wording import significant
 
 STAGES = ("vision", "prefix", "denoise")
-Document = dict[str, Any]
-Result = dict[str, Any]
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers_from: int = 1) -> list[str]:
@@ -15,23 +19,23 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers_from: 
     return ["| " + " | ".join(head) + " |", f"|{rule}|", *("| " + " | ".join(row) + " |" for row in rows)]
 
 
-def _result(document: Document, backend: str, precision: str, **job: int) -> Result | None:
-    wanted = {**document["main_job"], **job}
-    for result in document["results"]:
-        if (result["backend"], result["precision"], result["job"]) == (backend, precision, wanted):
+def _result(document: BenchDocument, backend: str, precision: str, **job: int) -> Result | None:
+    wanted = replace(document.main_job, **job)
+    for result in document.results:
+        if (result.backend, result.precision, result.job) == (backend, precision, wanted):
             return result
     return None
 
 
-def _ms(result: Result | None, name: str = "total", percentile: str = "p50", digits: int = 2) -> str:
-    if result is None or name not in result["milliseconds"]:
+def _ms(result: Result | None, name: str = "total", percentile: Percentile = "p50", digits: int = 2) -> str:
+    if result is None or name not in result.milliseconds:
         return ""
-    return f"{result['milliseconds'][name][percentile]:.{digits}f}"
+    return result.milliseconds[name].text(percentile, digits)
 
 
 def _error(result: Result | None) -> str:
-    error = None if result is None else result.get("error_against_f32")
-    return significant(error["relative_rms"]) if error else ""
+    error = None if result is None else result.error_against_f32
+    return significant(error.relative_rms) if error else ""
 
 
 _MEASURED = (
@@ -43,12 +47,12 @@ _MEASURED = (
 )
 
 
-def _of_main_job(document: Document) -> list[tuple[str, str, Result]]:
+def _of_main_job(document: BenchDocument) -> list[tuple[str, str, Result]]:
     found = ((backend, precision, _result(document, backend, precision)) for backend, precision in _MEASURED)
     return [(backend, precision, result) for backend, precision, result in found if result is not None]
 
 
-def headline(document: Document) -> list[str]:
+def headline(document: BenchDocument) -> list[str]:
     """README's: whole call, a chunk of 50, what the hardware allows, error."""
     rows = []
     for backend, precision, result in _of_main_job(document):
@@ -58,21 +62,21 @@ def headline(document: Document) -> list[str]:
                 f"`{backend}` {precision.upper() if precision == 'fp8' else precision}",
                 f"**{_ms(result, digits=1)} ms**" if backend == "fused" else f"{_ms(result, digits=1)} ms",
                 f"{_ms(long, digits=1)} ms" if long else "",
-                f"{result['floor_ms']['total']:.1f} ms",
+                f"{result.floor_ms['total']:.1f} ms",
                 _error(result),
             ]
         )
     return _table(["", "H = 10", "H = 50", "the hardware's limit", "error"], rows)
 
 
-def main_job(document: Document) -> list[str]:
+def main_job(document: BenchDocument) -> list[str]:
     """Every backend on the job that counts, stage by stage, beside the floor of its precision."""
     rows = []
     floors: set[str] = set()
     for backend, precision, result in _of_main_job(document):
         if precision not in floors:
             floors.add(precision)
-            floor = result["floor_ms"]
+            floor = result.floor_ms
             rows.append(
                 [f"floor, {precision}", *(f"{floor[stage]:.2f}" for stage in (*STAGES, "total")), "", "", "", "", "1"]
             )
@@ -82,26 +86,26 @@ def main_job(document: Document) -> list[str]:
                 *(_ms(result, name) for name in (*STAGES, "device")),
                 f"**{_ms(result)}**",
                 f"{_ms(result, percentile='p5')} / {_ms(result, percentile='p95')} / {_ms(result, percentile='p99')}",
-                f"{result['calls']:,}",
+                f"{result.calls:,}",
                 _error(result),
-                f"{result['times_floor']:.1f}",
+                f"{result.times_floor:.1f}",
             ]
         )
     head = ["ms", *STAGES, "device", "whole call", "p5 / p95 / p99", "calls", "error", "× floor"]
     return _table(head, rows)
 
 
-def whole_calls(document: Document) -> list[str]:
+def whole_calls(document: BenchDocument) -> list[str]:
     """`fused`: medians of the whole call for every shape and number of steps."""
-    jobs = [result["job"] for result in document["results"] if result["backend"] == "fused"]
-    steps = sorted({job["steps"] for job in jobs})
+    jobs = [result.job for result in document.results if result.backend == "fused"]
+    steps = sorted({job.steps for job in jobs})
     lines: list[str] = []
     for precision in ("bf16", "fp8"):
         rows = []
-        for cameras in sorted({job["cameras"] for job in jobs}):
-            for tokens in sorted({job["prompt_tokens"] for job in jobs}):
+        for cameras in sorted({job.cameras for job in jobs}):
+            for tokens in sorted({job.prompt_tokens for job in jobs}):
                 cells = []
-                for horizon in sorted({job["horizon"] for job in jobs}):
+                for horizon in sorted({job.horizon for job in jobs}):
                     shape = {"cameras": cameras, "prompt_tokens": tokens, "horizon": horizon}
                     cells.append(
                         " / ".join(_ms(_result(document, "fused", precision, **shape, steps=n)) for n in steps)
@@ -109,30 +113,30 @@ def whole_calls(document: Document) -> list[str]:
                 rows.append([f"{cameras}, {tokens}", *cells])
         some = " / ".join(map(str, steps))
         head = [f"{precision}: cameras, prompt tokens"]
-        head += [f"H = {horizon}: {some} steps" for horizon in sorted({job["horizon"] for job in jobs})]
+        head += [f"H = {horizon}: {some} steps" for horizon in sorted({job.horizon for job in jobs})]
         lines += [*_table(head, rows), ""]
     return lines[:-1]
 
 
-def lines_over_steps(document: Document) -> list[str]:
+def lines_over_steps(document: BenchDocument) -> list[str]:
     """What a denoising step adds to a call: two cameras and the main job's prompt."""
-    main = document["main_job"]
+    main = document.main_job
     rows = [
         [
-            f"`{line['backend']}` {line['precision']}, H = {line['horizon']}",
-            f"{line['a_ms']:.2f}",
-            f"{line['b_ms']:.3f}",
+            f"`{line.backend}` {line.precision}, H = {line.horizon}",
+            f"{line.a_ms:.2f}",
+            f"{line.b_ms:.3f}",
         ]
-        for line in document["linear"]
-        if (line["cameras"], line["prompt_tokens"]) == (main["cameras"], main["prompt_tokens"])
+        for line in document.linear or ()
+        if (line.cameras, line.prompt_tokens) == (main.cameras, main.prompt_tokens)
     ]
     return _table(["ms", "without steps", "for each step"], rows)
 
 
-def errors(document: Document) -> list[str]:
+def errors(document: BenchDocument) -> list[str]:
     """Relative rms of the actions against the float32 reference, by horizon and steps."""
-    steps = sorted({result["job"]["steps"] for result in document["results"]})
-    horizons = sorted({result["job"]["horizon"] for result in document["results"]})
+    steps = all_steps(document.results)
+    horizons = sorted({result.job.horizon for result in document.results})
     rows = []
     for backend, precision, _ in _of_main_job(document):
         for horizon in horizons:
@@ -142,71 +146,78 @@ def errors(document: Document) -> list[str]:
     return _table(["", *(f"{n} step{'s' * (n > 1)}" for n in steps)], rows)
 
 
-def ready(document: Document) -> list[str]:
+def ready(document: BenchDocument) -> list[str]:
     """Seconds from a program's start to its first answer, and the GPU memory that it then holds."""
     rows = []
-    for one in document["ready"]:
-        for kind, said in (("cold", "nothing kept"), ("cached", "kernels kept")):
-            times = one[kind]
+    for one in document.ready or ():
+        for times, said in ((one.cold, "nothing kept"), (one.cached, "kernels kept")):
             rows.append(
                 [
-                    f"`{one['backend']}` {one['precision']}, {said}",
-                    *(f"{times[part]:.1f}" for part in ("import", "load", "warmup", "ready")),
-                    f"{times['device_reserved'] / 1e9:.2f} GB",
+                    f"`{one.backend}` {one.precision}, {said}",
+                    *(f"{part:.1f}" for part in (times.imports, times.load, times.warmup, times.ready)),
+                    f"{(times.device_reserved or 0) / 1e9:.2f} GB",
                 ]
             )
     return _table(["seconds", "imports", "weights", "warm-up", "ready", "GPU memory"], rows)
 
 
-def kernels(document: Document) -> list[str]:
+def kernels(document: BenchDocument) -> list[str]:
     """Where the GPU's time goes: the main job under the profiler, kernels of 0.02 ms and more."""
     rows = []
-    for one in document["profile"]:
-        for stage, part in one["stages"].items():
-            for kernel in part["kernels"]:
-                if kernel["ms_per_call"] >= 0.02:
-                    name = kernel["kernel"].replace("|", "\\|")[:60]
+    for one in document.profile or ():
+        for stage, part in one.stages.items():
+            for kernel in part.kernels:
+                if kernel.ms_per_call >= 0.02:
+                    name = kernel.kernel.replace("|", "\\|")[:60]
                     rows.append(
                         [
-                            f"{one['precision']}, {stage}: `{name}`",
-                            f"{kernel['launches_per_call']:.0f}",
-                            f"{kernel['ms_per_call']:.2f}",
-                            f"{kernel['share']:.0%}",
+                            f"{one.precision}, {stage}: `{name}`",
+                            f"{kernel.launches_per_call:.0f}",
+                            f"{kernel.ms_per_call:.2f}",
+                            f"{kernel.share:.0%}",
                         ]
                     )
     return _table(["", "launches", "ms", "of the stage"], rows)
 
 
-def machine(document: Document) -> list[str]:
+def machine(document: BenchDocument) -> list[str]:
     """Where it was measured, in one line."""
-    about = document["provenance"]
-    gpu = about["gpu"]
+    about = document.provenance
+    gpu = about.gpu or Gpu()
     floors = "; ".join(
-        f"{precision}: {floor['matmul_flops_per_second'] / 1e12:.0f} TFLOP/s, "
-        f"{floor['copy_bytes_per_second'] / 1e12:.2f} TB/s"
-        for precision, floor in document["floors"].items()
+        f"{precision}: {floor.matmul_flops_per_second / 1e12:.0f} TFLOP/s, "
+        f"{floor.copy_bytes_per_second / 1e12:.2f} TB/s"
+        for precision, floor in document.floors.items()
     )
     return [
-        f"{gpu['name']}, driver {gpu['driver_version']}, torch {about['torch']}, {about['date']}. "
+        f"{gpu.name}, driver {gpu.driver_version}, torch {about.torch}, {about.date}. "
         f"Measured on the same GPU: {floors}."
     ]
 
 
-def attacks(*pieces: Document) -> list[str]:
+def attacks(*files: list[dict[str, Any]]) -> list[str]:
     """What the attack tool found."""
     from attack import results
 
-    return results.markdown([piece for document in pieces for piece in document["pieces"]]).splitlines()
+    return results.markdown([piece for pieces in files for piece in pieces]).splitlines()
 
 
-TABLES: dict[str, Callable[..., list[str]]] = {
-    "headline": headline,
-    "main_job": main_job,
-    "whole_calls": whole_calls,
-    "lines_over_steps": lines_over_steps,
-    "errors": errors,
-    "ready": ready,
-    "kernels": kernels,
-    "machine": machine,
-    "attacks": attacks,
+@dataclass(frozen=True)
+class Table:
+    """A table of one or several result files."""
+
+    read: Callable[[Path], Any]  # a file; raises ValueError for one of another kind
+    lines: Callable[..., list[str]]  # of what was read of each file
+
+
+def _read_attacks(file: Path) -> list[dict[str, Any]]:
+    from attack import results
+
+    return results.load(file)
+
+
+_OF_BENCHMARKS = (headline, main_job, whole_calls, lines_over_steps, errors, ready, kernels, machine)
+TABLES = {
+    **{lines.__name__: Table(read_benchmark, lines) for lines in _OF_BENCHMARKS},
+    "attacks": Table(_read_attacks, attacks),
 }

@@ -2,17 +2,16 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
+from msgspec import Struct
 
 from turbopi.kernels.grid_barrier import barrier_us
 
 _DTYPES = {"bf16": torch.bfloat16, "f32": torch.float32, "fp8": torch.float8_e4m3fn, "fp8-mlp": torch.float8_e4m3fn}
 
 
-@dataclass(frozen=True)
-class Floors:
+class Floors(Struct, frozen=True):
     """Ceilings of one device in one precision."""
 
     copy_bytes_per_second: float  # a large device copy, read and written bytes both counted

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from turbopi.backends import Precision
+from turbopi.bench.document import PolicyError, Times
 from turbopi.bench.work import Job
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import CAMERAS, Normalization
@@ -113,8 +114,10 @@ class Latency:
     def median(self) -> float:
         return self.percentiles[50]
 
-    def as_dict(self) -> dict[str, float]:
-        return {"mean": self.mean, **{f"p{p}": value for p, value in self.percentiles.items()}}
+    @property
+    def times(self) -> Times:
+        p5, p50, p95, p99 = (self.percentiles[p] for p in PERCENTILES)
+        return Times(mean=self.mean, p5=p5, p50=p50, p95=p95, p99=p99)
 
 
 def measure_calls(
@@ -160,14 +163,8 @@ def answers(policy: UnifiedPolicy, job: Job, *, observations: int = 4) -> np.nda
     return np.stack(chunks)
 
 
-def error_against(ours: np.ndarray, exact: np.ndarray) -> dict[str, float]:
-    """The error of a policy's `answers` against the float32 reference's.
-
-    Relative rms is of the whole set; max is the worst single value.
-    """
+def error_against(ours: np.ndarray, exact: np.ndarray) -> PolicyError:
+    """The error of a policy's `answers` against the float32 reference's."""
     difference = ours - exact
-    return {
-        "relative_rms": float(np.sqrt(np.mean(difference**2) / np.mean(exact**2))),
-        "max": float(np.abs(difference).max()),
-        "observations": len(exact),
-    }
+    relative_rms = float(np.sqrt(np.mean(difference**2) / np.mean(exact**2)))
+    return PolicyError(relative_rms, float(np.abs(difference).max()), len(exact))

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch.profiler import ProfilerActivity, profile, record_function
 
+from turbopi.bench.document import Kernel, StageKernels
 from turbopi.bench.measure import WARMING, Observations
 from turbopi.bench.work import Job
 from turbopi.policy import UnifiedPolicy
@@ -44,7 +45,7 @@ def start_profiler(device: torch.device) -> None:
             torch.cuda.synchronize(device)
 
 
-def stage_kernels(policy: UnifiedPolicy, job: Job, *, calls: int = 3, count: int = 8) -> dict[str, Any]:
+def stage_kernels(policy: UnifiedPolicy, job: Job, *, calls: int = 3, count: int = 8) -> dict[str, StageKernels]:
     """Stage -> the time its kernels take, how many there are, and the `count` that take longest, all a call.
 
     Kernels are told apart by when they ran, since graphs have no other names for stages. Timings under a profiler are a
@@ -98,23 +99,15 @@ def split(ran: Sequence[Ran], edges: Sequence[float]) -> list[list[Ran]]:
     ]
 
 
-def top(ran: Sequence[Ran], calls: int, count: int) -> dict[str, Any]:
+def top(ran: Sequence[Ran], calls: int, count: int) -> StageKernels:
     """Busy milliseconds and launches a call, and the `count` names with most of them."""
     times: dict[str, list[float]] = {}
     for one in ran:
         times.setdefault(one.name, []).append(one.busy_us)
     total = sum(map(sum, times.values()))
     longest = sorted(times.items(), key=lambda item: -sum(item[1]))[:count]
-    return {
-        "busy_ms": total / calls / 1e3,
-        "launches": len(ran) / calls,
-        "kernels": [
-            {
-                "kernel": name,
-                "ms_per_call": sum(each) / calls / 1e3,
-                "launches_per_call": len(each) / calls,
-                "share": sum(each) / total if total else 0.0,
-            }
-            for name, each in longest
-        ],
-    }
+    kernels = [
+        Kernel(name, sum(each) / calls / 1e3, len(each) / calls, sum(each) / total if total else 0.0)
+        for name, each in longest
+    ]
+    return StageKernels(total / calls / 1e3, len(ran) / calls, kernels)

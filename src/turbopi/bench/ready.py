@@ -15,6 +15,10 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import msgspec
+from msgspec import Struct
+
+from turbopi.bench.document import Ready, ReadyTimes
 from turbopi.errors import BackendError
 
 _TIMEOUT = 900  # seconds
@@ -53,16 +57,21 @@ def empty_caches() -> Iterator[None]:
                     os.environ[name] = value
 
 
-def measure_ready(start: Start) -> dict[str, dict[str, float]]:
-    """Seconds, "cold" and "cached": `import`, `load`, `warmup` (every length of prompt) and `ready`, all of it.
-
-    On a GPU also `device_reserved`, the most bytes that PyTorch held. To be called under `empty_caches`. Raises
-    BackendError with what the process said.
-    """
-    return {name: _run(start) for name in ("cold", "cached")}
+def measure_ready(start: Start) -> Ready:
+    """To be called under `empty_caches`. Raises BackendError with what the process said."""
+    return Ready(start.backend, start.precision, cold=_run(start), cached=_run(start))
 
 
-def _run(start: Start) -> dict[str, float]:
+class _Told(Struct, frozen=True):
+    """What the process says: seconds, the moment of its answer, and bytes."""
+
+    load: float
+    warmup: float
+    at: float
+    device_reserved: int | None
+
+
+def _run(start: Start) -> ReadyTimes:
     command = [sys.executable, "-m", "turbopi.bench.ready", json.dumps(asdict(start))]
     began = time.time()
     try:
@@ -71,9 +80,15 @@ def _run(start: Start) -> dict[str, float]:
         raise BackendError(f"{start.backend} wasn't ready after {_TIMEOUT} s") from None
     if done.returncode != 0:
         raise BackendError(f"{start.backend} didn't start:\n{done.stderr[-2000:]}")
-    told: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
-    ready = told.pop("at") - began
-    return {"import": round(ready - told["load"] - told["warmup"], 2), **told, "ready": round(ready, 2)}
+    told = msgspec.json.decode(done.stdout.splitlines()[-1], type=_Told)
+    ready = told.at - began
+    return ReadyTimes(
+        imports=round(ready - told.load - told.warmup, 2),
+        load=told.load,
+        warmup=told.warmup,
+        device_reserved=told.device_reserved,
+        ready=round(ready, 2),
+    )
 
 
 def _main(start: Start) -> None:
@@ -99,10 +114,8 @@ def _main(start: Start) -> None:
     )
     load = time.perf_counter() - begin
     warmup = policy.warmup()  # ends with an answer
-    told: dict[str, float] = {"load": round(load, 2), "warmup": round(warmup, 2), "at": time.time()}
-    if torch.cuda.is_available():
-        told["device_reserved"] = torch.cuda.max_memory_reserved()
-    print(json.dumps(told))
+    at, reserved = time.time(), torch.cuda.max_memory_reserved() if torch.cuda.is_available() else None
+    print(msgspec.json.encode(_Told(round(load, 2), round(warmup, 2), at, reserved)).decode())
 
 
 if __name__ == "__main__":

@@ -2,29 +2,29 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from msgspec.structs import asdict, replace
 
 from turbopi import backends
 from turbopi.backends import PRECISIONS, Precision
+from turbopi.bench.document import BenchDocument, BenchProvenance, Failed, Memory, Profile, Result
 from turbopi.bench.floors import Floors, measure_floors
 from turbopi.bench.measure import WARMING, Observations, answers, at_horizon, bench_policy, error_against, measure_calls
 from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.summary import linear_models
-from turbopi.bench.work import Job, floor_ms, stage_work
+from turbopi.bench.work import Job, Work, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.graph import collect_and_empty_cache
 from turbopi.errors import ConfigError, TurboPiError
 from turbopi.policy import UnifiedPolicy
-from turbopi.provenance import provenance
+from turbopi.provenance import Gpu, provenance
 from turbopi.quantization.plan import TIERS
-from turbopi.reading import plain_document
 
-Answered = tuple[dict[str, Any], Job, np.ndarray]  # a result, its job, and the policy's `answers`
+Answered = dict[tuple[str, str, Job], np.ndarray]  # backend, precision and job -> the policy's `answers`
 
 
 @dataclass(frozen=True)
@@ -106,12 +106,12 @@ class BenchProgress:
 
     doing: Callable[[str], None] = field(default=lambda text: None)
     advance: Callable[[], None] = field(default=lambda: None)
-    keep: Callable[[dict[str, Any]], None] = field(default=lambda document: None)  # what is measured so far
+    keep: Callable[[BenchDocument], None] = field(default=lambda document: None)  # what is measured so far
 
 
 def run(
     checkpoint: Checkpoint, plan: BenchPlan, device: torch.device, progress: BenchProgress | None = None
-) -> dict[str, Any]:
+) -> BenchDocument:
     """Measure everything in the plan.
 
     A backend that refuses or breaks on its jobs is named under `failed`, and the others go on; if none is left, its
@@ -121,28 +121,29 @@ def run(
     progress = progress or BenchProgress()
     plan.check(device)
     progress.doing("measuring this machine's floors")
-    floors = {precision: measure_floors(device, precision) for precision in plan.precisions}
+    floors: dict[str, Floors] = {precision: measure_floors(device, precision) for precision in plan.precisions}
     collect_and_empty_cache()
-    before = plain_document(provenance(device))
-    results: list[dict[str, Any]] = []
-    answered: list[Answered] = []
-    failed: list[dict[str, str]] = []
+    before = BenchProvenance(**asdict(provenance(device)))
+    results: list[Result] = []
+    answered: Answered = {}
+    failed: list[Failed] = []
 
-    def document(measured: list[dict[str, Any]]) -> dict[str, Any]:
-        return {
-            "provenance": before,
-            "model": checkpoint.config.name,
-            "weights": _weights_name(checkpoint),
-            "random_weights": checkpoint.format == "random",
-            "observations_seed": 0,
-            "main_job": asdict(plan.main),
-            "floors": {precision: asdict(floor) for precision, floor in floors.items()},
-            "results": measured,
-            "failed": failed,
-        }
+    def document(measured: list[Result], *, unfinished: bool) -> BenchDocument:
+        return BenchDocument(
+            provenance=before,
+            model=checkpoint.config.name,
+            weights=_weights_name(checkpoint),
+            random_weights=checkpoint.format == "random",
+            observations_seed=0,
+            main_job=plan.main,
+            floors=floors,
+            results=measured,
+            failed=failed,
+            unfinished=unfinished,
+        )
 
-    def keep(measured: list[dict[str, Any]]) -> None:
-        progress.keep({**document(results + measured), "unfinished": True})
+    def keep(measured: list[Result]) -> None:
+        progress.keep(document(results + measured, unfinished=True))
 
     for precision, backend, jobs in plan.policies():
         progress.doing(f"{backend} {precision}: loading")
@@ -150,26 +151,21 @@ def run(
         try:
             results += _measure(checkpoint, plan, device, backend, precision, jobs, floor, answered, progress, keep)
         except TurboPiError as error:
-            failed.append({"backend": backend, "precision": precision, "error": str(error)})
+            failed.append(Failed(backend, precision, str(error)))
             last = error
         collect_and_empty_cache()
     if not results:
         raise last
     if answered:
         progress.doing("the float32 reference's answers")
-        _judge(checkpoint, plan, device, answered)
+        results = _judged(checkpoint, plan, device, results, answered)
         keep([])
-    complete = document(results)
-    complete["provenance"] = {**before, "clocks_at_the_end": plain_document(provenance(device)).get("gpu", {})}
-    complete["linear"] = linear_models(results)
-    if plan.profile:
-        complete["profile"] = [
-            _profile(checkpoint, plan, device, backend, precision, progress)
-            for precision, backend, _ in plan.policies()
-            if backend in plan.backends
-            and not any((one["backend"], one["precision"]) == (backend, precision) for one in failed)
-        ]
-    return complete
+    return replace(
+        document(results, unfinished=False),
+        provenance=replace(before, clocks_at_the_end=provenance(device).gpu or Gpu()),
+        linear=linear_models(results),
+        profile=_profiles(checkpoint, plan, device, failed, progress) if plan.profile else None,
+    )
 
 
 def _measure(
@@ -180,10 +176,10 @@ def _measure(
     precision: Precision,
     jobs: list[Job],
     floors: Floors,
-    answered: list[Answered],
+    answered: Answered,
     progress: BenchProgress,
-    keep: Callable[[list[dict[str, Any]]], None],
-) -> list[dict[str, Any]]:
+    keep: Callable[[list[Result]], None],
+) -> list[Result]:
     """One backend in one precision on its jobs. What it answers where errors are wanted goes to `answered`."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -198,39 +194,57 @@ def _measure(
             shaped, job, plan.calls_of(backend, job), seconds=plan.seconds, advance=progress.advance
         )
         floor = stage_floors(shaped, job, floors)
-        result: dict[str, Any] = {
-            "backend": policy.backend.name,
-            "precision": precision,
-            "job": asdict(job),
-            "calls": latency["total"].calls,
-            "load_seconds": policy.metadata["load_seconds"],
-            "first_call_seconds": round(first / 1e3, 3),  # compiles and captures what only this job needs
-            "milliseconds": {name: values.as_dict() for name, values in latency.items()},
-            "floor_ms": floor,
-            "times_floor": latency["total"].median / floor["total"],
-            "work": {stage: asdict(one) for stage, one in _work(shaped, job).items()},
-            "memory": _memory(device, before),
-        }
+        result = Result(
+            backend=policy.backend.name,
+            precision=precision,
+            job=job,
+            calls=latency["total"].calls,
+            load_seconds=policy.metadata["load_seconds"],
+            first_call_seconds=round(first / 1e3, 3),
+            milliseconds={name: values.times for name, values in latency.items()},
+            floor_ms=floor,
+            times_floor=latency["total"].median / floor["total"],
+            work=_work(shaped, job),
+            memory=_memory(device, before),
+        )
         if plan.judges(job) and (policy.backend.name, precision) != ("pytorch", "f32"):
-            answered.append((result, job, answers(shaped, job)))
+            answered[result.backend, precision, job] = answers(shaped, job)
         results.append(result)
         keep(results)
-    results[-1]["backend_details"] = policy.metadata["backend_details"]
+    results[-1] = replace(results[-1], backend_details=policy.metadata["backend_details"])
     del policy, shaped
     collect_and_empty_cache()
     return results
 
 
-def _judge(checkpoint: Checkpoint, plan: BenchPlan, device: torch.device, answered: list[Answered]) -> None:
-    """Write the error against the float32 reference into the results. The reference answers each job once."""
+def _judged(
+    checkpoint: Checkpoint, plan: BenchPlan, device: torch.device, results: list[Result], answered: Answered
+) -> list[Result]:
+    """The results with their errors against the float32 reference, where it was asked. It answers each job once."""
     oracle = _policy(checkpoint, plan, "pytorch", "f32", device)
-    exact: dict[Job, np.ndarray] = {}
-    for result, job, actions in answered:
-        if job not in exact:
-            exact[job] = answers(at_horizon(oracle, job.horizon), job)
-        result["error_against_f32"] = error_against(actions, exact[job])
+    exact = {job: answers(at_horizon(oracle, job.horizon), job) for job in dict.fromkeys(key[2] for key in answered)}
     del oracle
     collect_and_empty_cache()
+
+    def judged(result: Result) -> Result:
+        actions = answered.get((result.backend, result.precision, result.job))
+        if actions is None:
+            return result
+        return replace(result, error_against_f32=error_against(actions, exact[result.job]))
+
+    return [judged(result) for result in results]
+
+
+def _profiles(
+    checkpoint: Checkpoint, plan: BenchPlan, device: torch.device, failed: list[Failed], progress: BenchProgress
+) -> list[Profile]:
+    """Of every backend that didn't fail, but for those beside."""
+    broken = {(one.backend, one.precision) for one in failed}
+    return [
+        _profile(checkpoint, plan, device, backend, precision, progress)
+        for precision, backend, _ in plan.policies()
+        if backend in plan.backends and (backend, precision) not in broken
+    ]
 
 
 def _profile(
@@ -240,7 +254,7 @@ def _profile(
     backend: str,
     precision: Precision,
     progress: BenchProgress,
-) -> dict[str, Any]:
+) -> Profile:
     """The main job's kernels, with a policy of its own: graphs captured before the profiler runs may be dark to it."""
     progress.doing(f"{backend} {precision}: profile")
     start_profiler(device)
@@ -248,7 +262,7 @@ def _profile(
     stages = stage_kernels(policy, plan.main)
     del policy
     collect_and_empty_cache()
-    return {"backend": backend, "precision": precision, "job": asdict(plan.main), "stages": stages}
+    return Profile(backend, precision, plan.main, stages)
 
 
 def stage_floors(policy: UnifiedPolicy, job: Job, floors: Floors) -> dict[str, float]:
@@ -260,7 +274,7 @@ def stage_floors(policy: UnifiedPolicy, job: Job, floors: Floors) -> dict[str, f
     return {**stages, "total": sum(stages.values())}
 
 
-def _work(policy: UnifiedPolicy, job: Job) -> dict[str, Any]:
+def _work(policy: UnifiedPolicy, job: Job) -> dict[str, Work]:
     return stage_work(policy.config.model, job, {"f32": 4, "bf16": 2}.get(policy.backend.precision, 1))
 
 
@@ -279,13 +293,10 @@ def _weights_name(checkpoint: Checkpoint) -> str:
     return Path(str(checkpoint.path)).name
 
 
-def _memory(device: torch.device, before: int) -> dict[str, int]:
-    """Bytes: on a GPU what PyTorch reserved at most less what was there before; on the host the resident set."""
-    status = Path("/proc/self/status")
-    host = {}
+def _memory(device: torch.device, before: int) -> Memory:
+    status, host = Path("/proc/self/status"), None
     if status.exists():
         lines = dict(line.split(":", 1) for line in status.read_text().splitlines() if ":" in line)
-        host = {"host_anonymous": int(lines["RssAnon"].split()[0]) * 1024}
-    if device.type != "cuda":
-        return host
-    return {"device_reserved": torch.cuda.max_memory_reserved(device) - before, **host}
+        host = int(lines["RssAnon"].split()[0]) * 1024
+    reserved = torch.cuda.max_memory_reserved(device) - before if device.type == "cuda" else None
+    return Memory(reserved, host)

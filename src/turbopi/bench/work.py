@@ -4,28 +4,30 @@ A stage's floor is the larger of operations / matrix rate and bytes / bandwidth.
 not counted: the floor is what no implementation in that precision gets under, not what one should reach.
 """
 
-from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta, Struct
 
 from turbopi.config import GemmaConfig, ModelConfig
 
+_Count = Annotated[int, Meta(ge=1)]
 
-@dataclass(frozen=True)
-class Job:
+
+class Job(Struct, frozen=True):
     """One benchmark point. `prompt_tokens` counts valid tokens, the state's among them."""
 
-    cameras: int = 2
-    prompt_tokens: int = 48
-    horizon: int = 10
-    steps: int = 10
+    cameras: _Count = 2
+    prompt_tokens: _Count = 48
+    horizon: _Count = 10
+    steps: _Count = 10
 
     def __str__(self) -> str:
         return f"{self.cameras} cameras, {self.prompt_tokens} tokens, H={self.horizon}, {self.steps} steps"
 
 
-@dataclass(frozen=True)
-class Work:
-    flops: float  # multiply and add counted apart
-    bytes: float  # weights read once (denoising: once a step), the KV cache written and read
+class Work(Struct, frozen=True):
+    flops: int  # multiply and add counted apart
+    bytes: int  # weights read once (denoising: once a step), the KV cache written and read
 
     def __add__(self, other: "Work") -> "Work":
         return Work(self.flops + other.flops, self.bytes + other.bytes)

@@ -3,11 +3,13 @@
 import itertools
 import json
 import sys
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from msgspec.structs import replace
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -17,12 +19,13 @@ from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
 from turbopi.config import CAMERAS, LIMITS
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
-from turbopi.reading import shown
+from turbopi.reading import plain_document, shown
 
 if TYPE_CHECKING:
     import torch
 
-    from turbopi.bench.run import BenchPlan
+    from turbopi.bench.document import BenchDocument, Profile, Ready, Result, StageKernels
+    from turbopi.bench.run import BenchPlan, BenchProgress
 
 RESULTS = "results.json"
 _ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps": "10"}
@@ -165,19 +168,18 @@ def bench(
             check_replaces(report / RESULTS, "floors", "a benchmark's results")
         starts = _starts(checkpoint, options, plan, str(resolved)) if ready else []
         document = _run_with_bar(lambda progress: run(opened, plan, resolved, progress), plan, report, output)
-    document["provenance"]["command"] = ["turbopi", *sys.argv[1:]]
-    if ready:
-        document["ready"] = starts
+    told = replace(document.provenance, command=["turbopi", *sys.argv[1:]])
+    document = replace(document, provenance=told, ready=starts if ready else None)
     _show(document, output)
     if report is not None:
         written = _write(document, report)
         output.line(f"wrote {', '.join(str(path) for path in written)}")
     output.document(document)
-    if document["failed"]:
+    if document.failed:
         raise typer.Exit(1)
 
 
-def _starts(checkpoint: str | None, options: WeightOptions, plan: "BenchPlan", device: str) -> list[dict[str, Any]]:
+def _starts(checkpoint: str | None, options: WeightOptions, plan: "BenchPlan", device: str) -> "list[Ready]":
     """How long a program with each of the plan's main backends takes until its first answer."""
     from turbopi.bench.ready import Start, measure_ready
 
@@ -187,11 +189,13 @@ def _starts(checkpoint: str | None, options: WeightOptions, plan: "BenchPlan", d
         if name in plan.backends:
             weights = (checkpoint, options.random_weights, seed, options.config)
             start = Start(*weights, name, precision, device, steps, plan.tokenizer, plan.quantization)
-            starts.append({"backend": name, "precision": precision, **measure_ready(start)})
+            starts.append(measure_ready(start))
     return starts
 
 
-def _run_with_bar(work: Any, plan: "BenchPlan", folder: Path | None, output: Output) -> dict[str, Any]:
+def _run_with_bar(
+    work: "Callable[[BenchProgress], BenchDocument]", plan: "BenchPlan", folder: Path | None, output: Output
+) -> "BenchDocument":
     from turbopi.bench.run import BenchProgress
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -199,16 +203,15 @@ def _run_with_bar(work: Any, plan: "BenchPlan", folder: Path | None, output: Out
     with Progress(*columns, console=console, transient=True, disable=not output.shows_progress) as bar:
         task = bar.add_task("", total=plan.total_calls)
 
-        def keep(document: dict[str, Any]) -> None:
+        def keep(document: "BenchDocument") -> None:
             if folder is not None:
                 _write_results(document, folder)
 
         told = BenchProgress(lambda text: bar.update(task, description=text), lambda: bar.advance(task), keep)
-        document: dict[str, Any] = work(told)
-    return document
+        return work(told)
 
 
-def _write(document: dict[str, Any], folder: Path) -> list[Path]:
+def _write(document: "BenchDocument", folder: Path) -> list[Path]:
     from turbopi.bench.plots import write_plots
     from turbopi.bench.report import report
 
@@ -217,72 +220,74 @@ def _write(document: dict[str, Any], folder: Path) -> list[Path]:
     return [results, page, *write_plots(document, folder)]
 
 
-def _write_results(document: dict[str, Any], folder: Path) -> Path:
+def _write_results(document: "BenchDocument", folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     results = folder / RESULTS
-    write_whole(results, json.dumps(document, indent=1) + "\n")
+    write_whole(results, json.dumps(plain_document(document), indent=1) + "\n")
     return results
 
 
-def _show(document: dict[str, Any], output: Output) -> None:
+def _show(document: "BenchDocument", output: Output) -> None:
+    from turbopi.bench.document import label
     from turbopi.bench.report import floors_line
 
-    for precision, floor in document["floors"].items():
+    for precision, floor in document.floors.items():
         output.line(floors_line(precision, floor))
-    table = Table(title=f"{document['model']}, {document['weights']}: milliseconds, medians", title_justify="left")
+    table = Table(title=f"{document.model}, {document.weights}: milliseconds, medians", title_justify="left")
     table.add_column("backend and job")  # in one: where the table is cut into parts, each says which row is whose
     columns = ("vision", "prefix", "denoise", "device", "total", "p5", "p95", "p99", "floor", "x floor", "error")
     for column in columns:
         table.add_column(column, justify="right")
-    for result in document["results"]:
+    for result in document.results:
         table.add_row(*_row(result))
     output.table(table)
-    for one in document["failed"]:
-        output.line(f"{one['backend']} {one['precision']} failed: {one['error']}", "red")
+    for broken in document.failed:
+        output.line(f"{label(broken)} failed: {broken.error}", "red")
     output.line("device: the stages' sum; total: host to host; error: relative rms of the actions against float32")
-    for line in document["linear"]:
+    for line in document.linear or ():
         output.line(
-            f"{line['backend']} {line['precision']}, {line['cameras']} cameras, {line['prompt_tokens']} tokens, "
-            f"H={line['horizon']}: {line['a_ms']:.2f} + {line['b_ms']:.3f} x steps ms, off by {line['worst_ms']:.2f}"
+            f"{label(line)}, {line.cameras} cameras, {line.prompt_tokens} tokens, "
+            f"H={line.horizon}: {line.a_ms:.2f} + {line.b_ms:.3f} x steps ms, off by {line.worst_ms:.2f}"
         )
-    for one in document.get("ready", ()):
-        for kind in ("cold", "cached"):
-            parts = ", ".join(f"{name} {one[kind][name]:.1f}" for name in ("import", "load", "warmup"))
-            name = f"{one['backend']} {one['precision']}, kernels {kind}"
-            output.line(f"{name}: ready in {one[kind]['ready']:.1f} s ({parts})")
-    for one in document.get("profile", ()):
-        if not one["stages"]:
-            output.line(f"{one['backend']} {one['precision']}: the profiler saw no kernels", "yellow")
-        for stage, part in one["stages"].items():
+    for start in document.ready or ():
+        for kind, took in (("cold", start.cold), ("cached", start.cached)):
+            parts = f"import {took.imports:.1f}, load {took.load:.1f}, warmup {took.warmup:.1f}"
+            output.line(f"{label(start)}, kernels {kind}: ready in {took.ready:.1f} s ({parts})")
+    for one in document.profile or ():
+        if not one.stages:
+            output.line(f"{label(one)}: the profiler saw no kernels", "yellow")
+        for stage, part in one.stages.items():
             output.table(_profile_table(one, stage, part))
 
 
-def _row(result: dict[str, Any]) -> list[str]:
-    from turbopi.bench.report import error_of
+def _row(result: "Result") -> list[str]:
+    from turbopi.bench.document import label
+    from turbopi.bench.report import PERCENTILES, error_of
 
-    times, job = result["milliseconds"], result["job"]
+    times, job = result.milliseconds, result.job
 
     def median(stage: str) -> str:
-        return f"{times[stage]['p50']:.2f}" if stage in times else "-"
+        return times[stage].text() if stage in times else "-"
 
     return [
-        f"{result['backend']} {result['precision']}: "
-        f"{job['cameras']} cam, {job['prompt_tokens']} tok, H={job['horizon']}, {job['steps']} steps",
+        f"{label(result)}: {job.cameras} cam, {job.prompt_tokens} tok, H={job.horizon}, {job.steps} steps",
         *(median(stage) for stage in ("vision", "prefix", "denoise", "device", "total")),
-        *(f"{times['total'][percentile]:.2f}" for percentile in ("p5", "p95", "p99")),
-        f"{result['floor_ms']['total']:.2f}",
-        f"{result['times_floor']:.1f}",
+        *(times["total"].text(percentile) for percentile in PERCENTILES),
+        f"{result.floor_ms['total']:.2f}",
+        f"{result.times_floor:.1f}",
         error_of(result),
     ]
 
 
-def _profile_table(profile: dict[str, Any], stage: str, part: dict[str, Any]) -> Table:
-    title = f"{profile['backend']} {profile['precision']}, {stage}: kernels {part['busy_ms']:.2f} ms"
-    table = Table(title=f"{title} in {part['launches']:.0f} launches", title_justify="left")
+def _profile_table(profile: "Profile", stage: str, part: "StageKernels") -> Table:
+    from turbopi.bench.document import label
+
+    title = f"{label(profile)}, {stage}: kernels {part.busy_ms:.2f} ms"
+    table = Table(title=f"{title} in {part.launches:.0f} launches", title_justify="left")
     table.add_column("kernel", max_width=80)
     for column in ("ms a call", "launches a call", "share"):
         table.add_column(column, justify="right")
-    for kernel in part["kernels"]:
-        numbers = (f"{kernel['ms_per_call']:.3f}", f"{kernel['launches_per_call']:.0f}", f"{kernel['share']:.1%}")
-        table.add_row(kernel["kernel"], *numbers)
+    for kernel in part.kernels:
+        numbers = (f"{kernel.ms_per_call:.3f}", f"{kernel.launches_per_call:.0f}", f"{kernel.share:.1%}")
+        table.add_row(kernel.kernel, *numbers)
     return table
