@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from typer.testing import CliRunner
 
 from turbopi.bench import profile
+from turbopi.bench import run as running
 from turbopi.bench.document import BenchDocument, Kernel, Memory, Result, Times, read_benchmark
 from turbopi.bench.floors import Floors
 from turbopi.bench.measure import (
@@ -252,7 +253,64 @@ def test_a_full_disk_keeps_the_earlier_benchmark(tmp_path: Path) -> None:
     assert file.read_text() == before and list(tmp_path.iterdir()) == [file]
 
 
-def test_the_command_writes_a_complete_document(tmp_path: Path, drawn: list[Any]) -> None:
+def floors_of(monkeypatch: pytest.MonkeyPatch, bytes_per_second: float, flops_per_second: float) -> None:
+    """Floors that don't depend on what else runs here."""
+    monkeypatch.setattr(running, "measure_floors", lambda *_: Floors(bytes_per_second, flops_per_second))
+
+
+def test_points_above_the_roofline_are_warned_about(
+    tmp_path: Path, drawn: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stage faster than its floor says that the floor is wrong; the rates here are those of a very busy machine."""
+    floors_of(monkeypatch, 1e7, 1e8)
+    words = ("bench", "--random-weights", "pi05_tiny", "--calls", "1", "--steps", "1", "--no-error", "--device", "cpu")
+    result = CliRunner().invoke(app, [*words, "--report", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    document = json.loads((tmp_path / "results.json").read_text())
+    (warning,) = document["warnings"]
+    (one,) = document["results"]
+    assert "pytorch bf16, 2 cameras, 48 tokens, H=10, 1 steps is faster than its floor in vision " in warning
+    assert f"prefix {one['milliseconds']['prefix']['p50']:.3g} ms (floor {one['floor_ms']['prefix']:.3g})" in warning
+    assert "run again when it is idle" in warning
+    assert f"WARNING: {warning}" in result.stdout
+    assert f"**Warning:** {warning}" in (tmp_path / "report.md").read_text()
+    roofline = drawn[1].axes[0]
+    circled = [line.get_xydata()[0].tolist() for line in roofline.get_lines() if line.get_markersize() == 16]
+    points = [line.get_xydata()[0].tolist() for line in roofline.get_lines() if line.get_markersize() == 8]
+    assert circled and all(point in points for point in circled)
+    roof = min(1e7 * circled[0][0], 1e8) / 1e12
+    assert circled[0][1] > roof
+    assert "above the roof" in roofline.get_legend().get_texts()[-1].get_text()
+
+
+def test_a_robots_own_observations_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    floors_of(monkeypatch, 1e15, 1e18)
+    seen: list[dict[str, Any]] = []
+    infer = UnifiedPolicy.infer
+
+    def kept(self: UnifiedPolicy, obs: Any, **options: Any) -> Any:
+        seen.append(dict(obs))
+        return infer(self, obs, **options)
+
+    monkeypatch.setattr(UnifiedPolicy, "infer", kept)
+    words = ["bench", "--random-weights", "pi05_tiny", "--robot", "libero", "--device", "cpu"]
+    result = CliRunner().invoke(app, [*words, "--calls", "1", "--steps", "1", "--no-error", "--json"])
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["robot"] == "libero"
+    assert {**document["main_job"], "prompt_tokens": 0} == {"cameras": 2, "prompt_tokens": 0, "horizon": 10, "steps": 1}
+    assert document["main_job"]["prompt_tokens"] > 20
+    assert all("observation/wrist_image" in observation for observation in seen)
+    assert len({observation["observation/state"].tobytes() for observation in seen}) == len(seen)
+    clash = CliRunner().invoke(app, [*words, "--cameras", "1", "--table"])
+    assert clash.exit_code == 2
+    assert "--robot brings its own cameras and prompt: leave out --cameras, --table, or --robot" in clash.stderr
+
+
+def test_the_command_writes_a_complete_document(
+    tmp_path: Path, drawn: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    floors_of(monkeypatch, 1e15, 1e18)
     options = "--random-weights pi05_tiny --calls 2 --main-calls 3 --steps 1,2 --cameras 1 --horizons 7,10 --device cpu"
     more = ["--beside", "pytorch", "--profile", "--json", "--report", str(tmp_path)]
     result = CliRunner().invoke(app, ["bench", *options.split(), *more])
@@ -260,6 +318,7 @@ def test_the_command_writes_a_complete_document(tmp_path: Path, drawn: list[Any]
     document = json.loads(result.stdout)
     assert document["random_weights"] is True
     assert document["provenance"]["commit"]
+    assert "warnings" not in document and "robot" not in document
     assert [(one["job"]["horizon"], one["job"]["steps"]) for one in document["results"]] == [
         (7, 1),
         (7, 2),

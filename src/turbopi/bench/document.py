@@ -146,10 +146,12 @@ class BenchDocument(Struct, frozen=True, kw_only=True, omit_defaults=True):
     weights: str
     random_weights: bool
     observations_seed: int
+    robot: str | None = None  # whose own observations were measured; None: random ones of the jobs' shapes
     main_job: Job  # the one that counts
     floors: dict[str, Floors]  # by precision
     results: list[Result]
     failed: list[Failed]
+    warnings: list[str] | None = None  # why the numbers can't all be right
     linear: list[Line] | None = None  # None: not finished
     profile: list[Profile] | None = None  # None: not asked for
     ready: list[Ready] | None = None

@@ -17,6 +17,9 @@ from turbopi.checkpoint import Checkpoint
 from turbopi.config import CAMERAS, Normalization
 from turbopi.errors import ConfigError
 from turbopi.policy import UnifiedPolicy
+from turbopi.preprocess.pipeline import Pipeline
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.robots import Plain, Robot
 
 _WORDS = "pick up the red black white bowl mug plate and place put it on in left right drawer stove open a to of"
 WORDS = _WORDS.split()
@@ -35,15 +38,20 @@ def bench_policy(
     *,
     tokenizer: Any = None,
     quantization: str | None = None,
+    robot: str | Robot | None = None,
 ) -> UnifiedPolicy:
     """The checkpoint's policy for a job: its model with the `plain` robot, so that cameras and prompt can be chosen.
 
-    The state stays out of the prompt and nothing is normalised: actions are the model's own.
+    The state stays out of the prompt and nothing is normalised: actions are the model's own. With a `robot` all of
+    that is the robot's, and the job has to have its cameras (`robots_job`).
     """
-    identity = Normalization("identity", "identity")
-    config = dataclasses.replace(
-        checkpoint.config, robot="plain", robot_options={}, discrete_state_input=False, normalization=identity
-    ).with_model(action_horizon=job.horizon)
+    config = checkpoint.config
+    if robot is None:
+        identity = Normalization("identity", "identity")
+        config = dataclasses.replace(
+            config, robot="plain", robot_options={}, discrete_state_input=False, normalization=identity
+        )
+    config = config.with_model(action_horizon=job.horizon)
     return UnifiedPolicy(
         dataclasses.replace(checkpoint, config=config),
         backend=backend,
@@ -52,7 +60,21 @@ def bench_policy(
         device=device,
         tokenizer=tokenizer,
         quantization=quantization if precision.startswith("fp8") else None,
+        robot=robot,
     )
+
+
+def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None = None) -> tuple[int, int]:
+    """How many cameras and prompt tokens an example observation of the robot has, for a `Job`."""
+    found = load_tokenizer(
+        TINY_TOKENIZER if tokenizer is None and checkpoint.format == "random" else tokenizer,
+        checkpoint_dir=checkpoint.path,
+        candidates=checkpoint.tokenizer_candidates,
+        vocab_size=checkpoint.config.model.vocab_size,
+    )
+    pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, found, robot=robot)
+    inputs, _ = pipeline.before(pipeline.example())
+    return int(inputs.image_mask.sum()), int(inputs.token_mask.sum())
 
 
 def at_horizon(policy: UnifiedPolicy, horizon: int) -> UnifiedPolicy:
@@ -63,22 +85,28 @@ def at_horizon(policy: UnifiedPolicy, horizon: int) -> UnifiedPolicy:
 
 
 class Observations:
-    """Random observations of a job: another picture, state and prompt each time, the same ones for the same seed."""
+    """Random observations of a job: another picture, state and prompt each time, the same ones for the same seed.
+
+    Of any robot but `plain` they are its own examples, which all have its prompt.
+    """
 
     def __init__(self, policy: UnifiedPolicy, job: Job, seed: int = 0) -> None:
         if not 1 <= job.cameras <= len(CAMERAS):
             raise ConfigError(f"a job has 1 to {len(CAMERAS)} cameras, not {job.cameras}")
+        self._own = None if isinstance(policy.pipeline.robot, Plain) else 10**6 * seed  # of the next example
         most = policy.config.model.max_prompt_tokens
         if not 1 <= job.prompt_tokens <= most:
             raise ConfigError(f"this model reads 1 to {most} prompt tokens; a job can't have {job.prompt_tokens}")
         self._rng = np.random.default_rng(seed)
         self._cameras = CAMERAS[: job.cameras]
         self._policy = policy
-        self._prompts = [self._prompt(job.prompt_tokens) for _ in range(PROMPTS)]
+        self._prompts = [self._prompt(job.prompt_tokens) for _ in range(PROMPTS)] if self._own is None else []
         self._next = 0
 
     def __next__(self) -> dict[str, Any]:
         self._next += 1
+        if self._own is not None:
+            return self._policy.example_observation(self._own + self._next)
         return self._observation(self._prompts[self._next % PROMPTS])
 
     def _observation(self, prompt: str) -> dict[str, Any]:

@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from turbopi.bench.document import BenchDocument, Line, Result, Times, all_steps, label
-from turbopi.plots import STAGES, as_text, write_figure
+from turbopi.bench.summary import below_floor
+from turbopi.plots import BOUND, STAGES, as_text, write_figure
 from turbopi.reading import as_document, plain_document
 
 DRAWN_OF = "Drawn of"  # the PNG text in which a plot names its document
@@ -131,9 +132,14 @@ def _roofline(document: BenchDocument) -> Figure:
             work, seconds = result.work[stage], result.milliseconds[stage].p50 / 1e3
             x, y = work.flops / work.bytes, work.flops / seconds / 1e12
             axes.loglog(x, y, marker, color=color, markersize=8)
+            if stage in below_floor(result):
+                axes.loglog(x, y, "o", color=BOUND, markersize=16, markerfacecolor="none", markeredgewidth=1.6)
         axes.loglog([], [], marker, color="0.6", label=label(result))
     for stage, color in STAGES.items():
         axes.loglog([], [], "s", color=color, label=stage)
+    if any(map(below_floor, document.main_results)):
+        text = "above the roof: the machine was busy\nwhile the floors were measured"
+        axes.loglog([], [], "o", color=BOUND, markersize=12, markerfacecolor="none", label=text)
     axes.set_xlabel("least operations / least bytes [FLOP/byte]")
     axes.set_ylabel("least operations / median time [TFLOP/s]")
     axes.set_title(f"{as_text(document.model)}: {document.main_job}", fontsize=10)

@@ -38,6 +38,7 @@ class Start:
     steps: int
     tokenizer: str | None
     quantization: str | None = None
+    robot: str | None = None  # as --robot is typed
 
 
 @contextmanager
@@ -96,6 +97,7 @@ def _main(start: Start) -> None:
 
     from turbopi.checkpoint import open_checkpoint, random_checkpoint
     from turbopi.policy import UnifiedPolicy
+    from turbopi.robots import import_robot
 
     if start.preset is None:
         assert start.checkpoint is not None
@@ -111,6 +113,7 @@ def _main(start: Start) -> None:
         device=start.device,
         tokenizer=start.tokenizer,
         quantization=start.quantization if start.precision.startswith("fp8") else None,
+        robot=import_robot(start.robot) if start.robot is not None and ":" in start.robot else start.robot,
     )
     load = time.perf_counter() - begin
     warmup = policy.warmup()  # ends with an answer

@@ -34,6 +34,7 @@ def report(document: BenchDocument) -> str:
         *(f"- {floors_line(precision, floor)}" for precision, floor in document.floors.items()),
         "",
         *(f"**{label(one)} failed**: {one.error}\n" for one in document.failed),
+        *(f"**Warning:** {text}\n" for text in document.warnings or ()),
         *_main(document),
         *_all(document),
     ]

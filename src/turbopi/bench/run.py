@@ -15,7 +15,7 @@ from turbopi.bench.document import BenchDocument, BenchProvenance, Failed, Memor
 from turbopi.bench.floors import Floors, measure_floors
 from turbopi.bench.measure import WARMING, Observations, answers, at_horizon, bench_policy, error_against, measure_calls
 from turbopi.bench.profile import stage_kernels, start_profiler
-from turbopi.bench.summary import linear_models
+from turbopi.bench.summary import linear_models, warnings_on
 from turbopi.bench.work import Job, Work, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.graph import collect_and_empty_cache
@@ -23,6 +23,7 @@ from turbopi.errors import ConfigError, TurboPiError
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import Gpu, provenance
 from turbopi.quantization.plan import TIERS
+from turbopi.robots import Robot
 
 Answered = dict[tuple[str, str, Job], np.ndarray]  # backend, precision and job -> the policy's `answers`
 
@@ -45,6 +46,7 @@ class BenchPlan:
     seconds: float = 60.0  # one measurement ends after them, though not before 20 calls
     profile: bool = False
     quantization: str | None = None  # what the FP8 precisions need
+    robot: str | Robot | None = None  # whose own observations are measured; None: random ones of the jobs' shapes
 
     @property
     def main(self) -> Job:
@@ -132,6 +134,7 @@ def run(
         return BenchDocument(
             provenance=before,
             model=checkpoint.config.name,
+            robot=plan.robot if plan.robot is None or isinstance(plan.robot, str) else plan.robot.name,
             weights=_weights_name(checkpoint),
             random_weights=checkpoint.format == "random",
             observations_seed=0,
@@ -163,6 +166,7 @@ def run(
     return replace(
         document(results, unfinished=False),
         provenance=replace(before, clocks_at_the_end=provenance(device).gpu or Gpu()),
+        warnings=warnings_on(results) or None,
         linear=linear_models(results),
         profile=_profiles(checkpoint, plan, device, failed, progress) if plan.profile else None,
     )
@@ -283,7 +287,14 @@ def _policy(
 ) -> UnifiedPolicy:
     """A policy that runs any job of the plan with `at_horizon`."""
     return bench_policy(
-        checkpoint, backend, precision, device, plan.main, tokenizer=plan.tokenizer, quantization=plan.quantization
+        checkpoint,
+        backend,
+        precision,
+        device,
+        plan.main,
+        tokenizer=plan.tokenizer,
+        quantization=plan.quantization,
+        robot=plan.robot,
     )
 
 

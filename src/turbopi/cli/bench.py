@@ -15,7 +15,7 @@ from rich.table import Table
 
 from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
-from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
+from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions
 from turbopi.config import CAMERAS, LIMITS
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from turbopi.bench.document import BenchDocument, Profile, Ready, Result, StageKernels
     from turbopi.bench.run import BenchPlan, BenchProgress
+    from turbopi.checkpoint import Checkpoint
 
 RESULTS = "results.json"
 _ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps": "10"}
@@ -58,6 +59,26 @@ def _axis(option: str, given: str | None, table: bool) -> list[int]:
     return _numbers(option, (_TABLE if table else _ONE)[option] if given is None else given)
 
 
+def _robots_own(
+    axes: dict[str, str | None], table: bool, checkpoint: "Checkpoint", robot: Any, tokenizer: str | None
+) -> dict[str, str | None]:
+    """The axes of a benchmark with a robot's own observations: these have its cameras and its prompt."""
+    from turbopi.bench.measure import robots_job
+
+    clash = [option for option in ("--cameras", "--prompt-tokens") if axes[option] is not None]
+    clash += ["--table"] if table else []
+    if clash:
+        raise ConfigError(f"--robot brings its own cameras and prompt: leave out {', '.join(clash)}, or --robot")
+    cameras, tokens = robots_job(checkpoint, robot, tokenizer)
+    config = checkpoint.config
+    return {
+        "--cameras": str(cameras),
+        "--prompt-tokens": str(tokens),
+        "--horizons": axes["--horizons"] or str(config.model.action_horizon),
+        "--steps": axes["--steps"] or str(config.num_denoising_steps),
+    }
+
+
 def _names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
 
@@ -77,16 +98,17 @@ def _backends(names: list[str], precisions: list[Any], device: "torch.device") -
 
 @command(
     "bench",
-    shared=WeightOptions,
+    shared=RobotOptions,
     examples=(
         "turbopi bench --random-weights pi05_tiny --calls 20",
         "turbopi bench --random-weights pi05_libero --backends pytorch,cuda_graph --steps 1,3,10",
         "turbopi bench checkpoints/pi05_libero --table --main-calls 2000 --ready --profile --report bench-report",
         "turbopi bench checkpoints/pi05_libero --backends fused --precisions bf16,fp8 --quantization fp8.json",
+        "turbopi bench checkpoints/my_arm --config pi05_base --robot my_arm.json",
     ),
 )
 def bench(
-    options: WeightOptions,
+    options: RobotOptions,
     checkpoint: CheckpointArgument = None,
     backends: Annotated[str, typer.Option(metavar="NAME,NAME,…", help="From `turbopi backends`.")] = "auto",
     beside: Annotated[
@@ -131,7 +153,9 @@ def bench(
 ) -> None:
     """Measure the policy's latency, each stage beside the floor that this machine sets.
 
-    Every call gets new pictures, another prompt and new noise, and is timed from host to host.
+    Every call gets new pictures, another prompt and new noise, and is timed from host to host. With --robot the
+    observations are random ones of that robot, with its cameras and its prompt, and the job has the checkpoint's own
+    horizon and steps unless they are given.
     """
     from turbopi.bench.ready import empty_caches
 
@@ -146,13 +170,18 @@ def bench(
         resolved = registry.resolve_device(device)
         tiers = _names(precisions)
         names = _backends(_names(backends), tiers, resolved)
+        robot = options.make_robot()
+        axes = {"--cameras": cameras, "--prompt-tokens": prompt_tokens, "--horizons": horizons, "--steps": steps}
+        if robot is not None:
+            axes = _robots_own(axes, table, opened, robot, tokenizer)
         plan = BenchPlan(
             names,
             tiers,  # type: ignore[arg-type]  # checked when a backend is created
-            cameras=_axis("--cameras", cameras, table),
-            prompt_tokens=_axis("--prompt-tokens", prompt_tokens, table),
-            horizons=_axis("--horizons", horizons, table),
-            steps=_axis("--steps", steps, table),
+            cameras=_axis("--cameras", axes["--cameras"], table),
+            prompt_tokens=_axis("--prompt-tokens", axes["--prompt-tokens"], table),
+            horizons=_axis("--horizons", axes["--horizons"], table),
+            steps=_axis("--steps", axes["--steps"], table),
+            robot=robot,
             calls=calls,
             error=error,
             tokenizer=tokenizer,
@@ -179,7 +208,7 @@ def bench(
         raise typer.Exit(1)
 
 
-def _starts(checkpoint: str | None, options: WeightOptions, plan: "BenchPlan", device: str) -> "list[Ready]":
+def _starts(checkpoint: str | None, options: RobotOptions, plan: "BenchPlan", device: str) -> "list[Ready]":
     """How long a program with each of the plan's main backends takes until its first answer."""
     from turbopi.bench.ready import Start, measure_ready
 
@@ -188,7 +217,7 @@ def _starts(checkpoint: str | None, options: WeightOptions, plan: "BenchPlan", d
     for precision, name, _ in plan.policies():
         if name in plan.backends:
             weights = (checkpoint, options.random_weights, seed, options.config)
-            start = Start(*weights, name, precision, device, steps, plan.tokenizer, plan.quantization)
+            start = Start(*weights, name, precision, device, steps, plan.tokenizer, plan.quantization, options.robot)
             starts.append(measure_ready(start))
     return starts
 
@@ -243,7 +272,12 @@ def _show(document: "BenchDocument", output: Output) -> None:
     output.table(table)
     for broken in document.failed:
         output.line(f"{label(broken)} failed: {broken.error}", "red")
-    output.line("device: the stages' sum; total: host to host; error: relative rms of the actions against float32")
+    units = "" if document.robot is None else ", in the robot's units"
+    output.line(
+        f"device: the stages' sum; total: host to host; error: relative rms of the actions against float32{units}"
+    )
+    for text in document.warnings or ():
+        output.line(f"WARNING: {text}", "bold yellow")
     for line in document.linear or ():
         output.line(
             f"{label(line)}, {line.cameras} cameras, {line.prompt_tokens} tokens, "

@@ -20,6 +20,7 @@ from turbopi.robots.plain import Plain
 __all__ = [
     "ROBOTS",
     "Described",
+    "Plain",
     "Robot",
     "RobotInputs",
     "create_robot",
