@@ -517,9 +517,9 @@ def test_fp8_is_held_to_what_denoising_did_where_the_noise_hides_it(off: float, 
     compared = Compared()
     exact, ours = {ACTIONS: noise[0] + did}, {ACTIONS: noise[0] + did + off * wrong}
     compared.add(call, ours, exact, ours[ACTIONS], exact[ACTIONS])
-    checks = judge(Rule.of("fused", "fp8"), "fp8", "plain", compared, compared, Repetition())["checks"]
-    assert [check["ok"] for check in checks if check["name"] == "actions"] == [True]
-    assert [check["ok"] for check in checks if check["name"] == "deltas"] == [passes]
+    checks = judge(Rule.of("fused", "fp8"), "fp8", "plain", compared, compared, Repetition()).checks
+    assert [check.ok for check in checks if check.name == "actions"] == [True]
+    assert [check.ok for check in checks if check.name == "deltas"] == [passes]
 
 
 # Weights to study
@@ -667,8 +667,8 @@ def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Pat
     arguments = {"backend": "emulated_fp8", "precision": "fp8", "device": "cpu", "num_denoising_steps": 1}
     plan = VerifyPlan(arguments | {"quantization": made_up(report=report)}, tmp_path, noises=1)
     document = verify(checkpoint, plan)
-    assert document["observations"]["calibrated_on"] == 1
-    assert document["policy"]["backend_details"]["fp8"]["observations"] == "x"
+    assert document.observations.calibrated_on == 1
+    assert document.fp8 is not None and document.fp8["observations"] == "x"
 
 
 def test_held_out_observations_that_are_none_are_warned_of(tmp_path: Path) -> None:

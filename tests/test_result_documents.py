@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import pytest
+import torch
 from msgspec import Meta, Struct
 
 from turbopi.bench.document import BenchDocument, read_benchmark
@@ -15,6 +16,9 @@ from turbopi.bench.report import report
 from turbopi.errors import ConfigError
 from turbopi.provenance import Provenance
 from turbopi.reading import as_document, plain_document, read_document
+from turbopi.studies.certificates import CondensedDimension, WorstPlace
+from turbopi.studies.fp8_and_fp4 import Research
+from turbopi.verify.document import Determinism
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 
@@ -56,8 +60,8 @@ def test_a_document_comes_out_as_it_went_in() -> None:
 def test_numpys_numbers_and_paths_are_written_as_jsons() -> None:
     inner = Inner(np.int64(3), share=np.float64(0.5))
     assert json.dumps(plain_document(inner)) == '{"count": 3, "kind": "one", "pair": [1, 2.0], "share": 0.5}'
-    outer = Outer(1, {}, [], {"file": Path("a/b")}, None, "a")
-    assert plain_document(outer)["told"] == {"file": "a/b"}
+    outer = Outer(1, {}, [], {"file": Path("a/b"), "version": torch.__version__}, None, "a")
+    assert plain_document(outer)["told"] == {"file": "a/b", "version": str(torch.__version__)}
     with pytest.raises(TypeError, match="a document holds <object obj"):
         plain_document(Outer(1, {}, [], {"x": object()}, None, "a"))
 
@@ -172,3 +176,24 @@ def test_a_benchmark_reads_the_same_whichever_way_a_number_is_written() -> None:
     whole = as_document(content, BenchDocument, "FILE")
     content["results"][0]["milliseconds"]["total"]["p50"] = 141
     assert fingerprint(as_document(content, BenchDocument, "FILE")) == fingerprint(whole) != fingerprint(first)
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if name.endswith("fp8_research.json")])
+def test_checked_in_research_reads_and_comes_out_as_it_was(name: str) -> None:
+    document = read_document(RESULTS / name, Research, ConfigError)
+    assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
+
+
+def test_the_tables_of_checked_in_certificates_read_and_come_out_as_they_were() -> None:
+    """The certificates as a whole were shortened by hand."""
+    kinds: dict[str, type[Struct]] = {"dimensions": CondensedDimension, "intermediates": WorstPlace}
+    content = json.loads((RESULTS / "h200_2026-11-22_fp8_certificates.json").read_text())
+    read = 0
+    for tiers in content["certificates"].values():
+        for tier in (tiers["fp8"], tiers["fp8-mlp"]):
+            assert plain_document(as_document(tier["determinism"], Determinism, "FILE")) == tier["determinism"]
+            for key, kind in kinds.items():
+                for row in tier.get(key, {}).values():
+                    assert plain_document(as_document(row, kind, "FILE")) == row
+                    read += 1
+    assert read > 30

@@ -17,9 +17,11 @@ from turbopi.errors import CheckpointError
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
+from turbopi.reading import as_document, plain_document, read_document
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.recordings.sources import chosen_files
 from turbopi.studies import certificates
+from turbopi.verify.document import Certificate
 from turbopi.verify.inputs import VerifyPlan
 from turbopi.verify.intermediates import Errors, Place, first_suspect, in_order, tensors_of
 from turbopi.verify.run import verify
@@ -52,6 +54,8 @@ def certified(backend: str, *more: object, exit_code: int = 0) -> dict[str, Any]
 
 def test_plain_bf16_passes_and_its_document_is_complete(tmp_path: Path, drawn: list[Any]) -> None:
     document = certified("pytorch", "--report", tmp_path)
+    read_again = read_document(tmp_path / "verify.json", Certificate)
+    assert plain_document(read_again) == document == json.loads((tmp_path / "verify.json").read_text())
     assert document["ok"] is True
     assert document["first_off"] is None
     assert document["bounds"]["factor_of_control"] == 5
@@ -184,7 +188,7 @@ def test_a_certificate_says_that_the_oracle_was_float32_whatever_the_program_had
         document = verify(random_checkpoint("pi05_tiny"), quick_plan())
     finally:
         torch.set_float32_matmul_precision(before)
-    said = document["oracle_float32"]
+    said: Any = document.oracle_float32
     assert said["exact"] is True and said["within"]["products"]["all"] == "highest"
     assert said["callers"]["products"]["all"] == "high"
     json.dumps(said)
@@ -219,8 +223,8 @@ def test_a_recording_is_verified_by_its_files(tmp_path: Path) -> None:
         call = RecordedCall(policy.example_observation(number), {"actions": np.zeros((10, 7))}, 0.0)
         save_call(tmp_path / f"{number:06d}.npz", call)
     document = verify(random_checkpoint("pi05_tiny"), quick_plan(observations=tmp_path, count=2))
-    assert document["observations"]["names"] == ["000000.npz", "000001.npz"]
-    assert document["observations"]["count"] == 2
+    assert document.observations.names == ["000000.npz", "000001.npz"]
+    assert document.observations.count == 2
 
 
 def test_observations_made_by_hand_are_verified_too_evenly_spread(tmp_path: Path) -> None:
@@ -284,7 +288,7 @@ def test_no_weights_are_refused() -> None:
 
 def test_a_certificate_is_condensed_to_the_worst_of_every_name() -> None:
     document = certified("pytorch", "--precision", "bf16")
-    condensed = certificates.condensed(document)
+    condensed: Any = plain_document(certificates.condensed(as_document(document, Certificate, "stdout")))
     rows = [row for row in document["intermediates"] if row["name"] == "kv_k"]
     worst = max(rows, key=lambda row: row["relative_rms"])
     assert condensed["intermediates"]["kv_k"]["at"] == worst["index"]
@@ -295,9 +299,9 @@ def test_a_certificate_is_condensed_to_the_worst_of_every_name() -> None:
 
 def test_varied_observations_are_no_two_alike_and_come_again() -> None:
     first, again, other = (list(certificates.varied(seed, 8)) for seed in (0, 0, 1))
-    pictures = [one["observation/image"].tobytes() for one in (*first, *other)]
+    pictures = [np.asarray(one["observation/image"]).tobytes() for one in (*first, *other)]
     assert len(set(pictures)) == 16
-    assert [one["observation/image"].tobytes() for one in again] == pictures[:8]
+    assert [np.asarray(one["observation/image"]).tobytes() for one in again] == pictures[:8]
     assert tiny_policy().prepare(first[7]).token_mask.any()
 
 

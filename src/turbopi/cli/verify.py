@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -12,7 +12,11 @@ from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, plain
 from turbopi.cli.options import MOST_NOISES, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
 from turbopi.files import write_whole
+from turbopi.reading import as_document, plain_document
 from turbopi.wording import significant
+
+if TYPE_CHECKING:
+    from turbopi.verify.document import Certificate, Dimension, Fp8Details, IntermediateDocument
 
 
 @command(
@@ -93,78 +97,83 @@ def verify(
     _show(document, output)
     if report is not None:
         _write(document, report, output)
-    output.line(document["verdict"], "bold green" if document["ok"] else "bold red")
+    output.line(document.verdict, "bold green" if document.ok else "bold red")
     output.document(document)
-    if not document["ok"]:
+    if not document.ok:
         raise typer.Exit(CHECK_FAILED)
 
 
-def _write(document: dict[str, Any], folder: Path, output: Output) -> None:
+def _write(document: "Certificate", folder: Path, output: Output) -> None:
     from turbopi.verify.plots import write_plots
 
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "verify.json"
-    write_whole(file, json.dumps(plain(document), indent=1, ensure_ascii=False) + "\n")
+    write_whole(file, json.dumps(plain(plain_document(document)), indent=1, ensure_ascii=False) + "\n")
     written = [file, *write_plots(document, folder)]
     output.line(f"wrote {', '.join(str(path) for path in written)}")
 
 
-def _show(document: dict[str, Any], output: Output) -> None:
-    observed, weights, times = document["observations"], document["weights"], document["latency_ms"]
-    subject = f"{document['backend']} {document['precision']}"
+def _show(document: "Certificate", output: Output) -> None:
+    from turbopi.verify.document import Fp8Details
+
+    observed = document.observations
+    subject = f"{document.backend} {document.precision}"
     output.line(
-        f"{document['model']}, {subject} on {document['policy']['device_name']}, {document['steps']} steps; "
-        f"{observed['count']} observations x {observed['noises']} noises"
+        f"{document.model}, {subject} on {document.policy['device_name']}, {document.steps} steps; "
+        f"{observed.count} observations x {observed.noises} noises"
     )
-    output.line(f"weights {weights['fingerprint'] or 'not hashed'}")
-    output.line(f"observations {observed['sha256']}")
-    if "fp8" in document["policy"]["backend_details"]:
-        output.line(_calibration(document["policy"]["backend_details"]["fp8"]))
-        seen = observed["calibrated_on"]
-        output.line(f"{seen} of {observed['count']} observations were calibrated on", "yellow" if seen else None)
+    output.line(f"weights {document.weights.fingerprint or 'not hashed'}")
+    output.line(f"observations {observed.sha256}")
+    if document.fp8 is not None:
+        output.line(_calibration(as_document(document.fp8, Fp8Details, "the policy's FP8")))
+        seen = observed.calibrated_on
+        output.line(f"{seen} of {observed.count} observations were calibrated on", "yellow" if seen else None)
     output.table(_intermediates(document))
     output.line(
-        f"Where a name has layers or steps, the worst, with its number. Control: {document['control']}. The error of "
+        f"Where a name has layers or steps, the worst, with its number. Control: {document.control}. The error of "
         "the actions decides, by their bound. Of all else `allowed` is informative: an error above it hints at where "
         "a fault may be, and fails nothing by itself.",
         "dim",
     )
-    output.table(_dimensions(document["actions"]["dimensions"]))
-    worst = document["actions"]["worst"]
+    output.table(_dimensions(document.actions.dimensions))
+    worst = document.actions.worst
     output.line(
-        f"worst: {worst['observation']}, noise seed {worst['seed']}: "
-        f"relative rms {significant(worst['relative_rms'])}, cosine {worst['cosine']:.6f}"
+        f"worst: {worst.observation}, noise seed {worst.seed}: "
+        f"relative rms {significant(worst.relative_rms)}, cosine {_cosine(worst.cosine)}"
     )
-    for title, key in ((subject, "backend"), (document["oracle"], "oracle")):
-        time = times[key]
-        output.line(f"latency of {title}: median {time['p50']:.2f} ms, p95 {time['p95']:.2f} ms, {time['calls']} calls")
-    if document["gpu_bytes"] is not None:
-        output.line(f"GPU memory of {subject}, weights and all that stays: {document['gpu_bytes'] / 1e9:.2f} GB")
-    gpu = document["provenance"].get("gpu", {})
-    if "clocks.sm" in gpu:
+    for title, time in ((subject, document.latency_ms.backend), (document.oracle, document.latency_ms.oracle)):
+        output.line(f"latency of {title}: median {time.p50:.2f} ms, p95 {time.p95:.2f} ms, {time.calls} calls")
+    if document.gpu_bytes is not None:
+        output.line(f"GPU memory of {subject}, weights and all that stays: {document.gpu_bytes / 1e9:.2f} GB")
+    gpu = document.provenance.gpu
+    if gpu and gpu.clock_sm is not None:
         output.line(
-            f"GPU {gpu['name']}, driver {gpu['driver_version']}, SM {gpu['clocks.sm']}, memory {gpu['clocks.mem']}, "
-            f"throttling {gpu['clocks_throttle_reasons.active']}"
+            f"GPU {gpu.name}, driver {gpu.driver_version}, SM {gpu.clock_sm}, memory {gpu.clock_memory}, "
+            f"throttling {gpu.throttling}"
         )
-    if document["first_off"] is not None:
-        informs = " (informative: the actions decide, and they pass)" if document["ok"] else ""
-        output.line(f"first off: {document['first_off']['text']}{informs}", "yellow")
-    bounds = document["bounds"]
-    own = " (overridden)" if bounds["overridden"] else ""
-    output.line(f"bound{own}: actions' relative rms {significant(bounds['actions_relative_rms'])}: {bounds['reason']}")
-    for check in document["checks"]:
-        output.line(f"{'ok  ' if check['ok'] else 'FAIL'} {check['text']}", None if check["ok"] else "red")
+    if document.first_off is not None:
+        informs = " (informative: the actions decide, and they pass)" if document.ok else ""
+        output.line(f"first off: {document.first_off.text}{informs}", "yellow")
+    bounds = document.bounds
+    own = " (overridden)" if bounds.overridden else ""
+    output.line(f"bound{own}: actions' relative rms {significant(bounds.actions_relative_rms)}: {bounds.reason}")
+    for check in document.checks:
+        output.line(f"{'ok  ' if check.ok else 'FAIL'} {check.text}", None if check.ok else "red")
 
 
-def _calibration(fp8: dict[str, Any]) -> str:
+def _cosine(value: float | None) -> str:
+    return "not finite" if value is None else f"{value:.6f}"
+
+
+def _calibration(fp8: "Fp8Details") -> str:
     """Which products run in FP8, by what."""
-    groups = {name: state if isinstance(state, str) else "in part" for name, state in fp8["plan"].items()}
+    groups = {name: state if isinstance(state, str) else "in part" for name, state in fp8.plan.items()}
     others = sorted(name for name, state in groups.items() if not state.startswith("fp8"))
     kept = f"all but {', '.join(others)}" if others else "every site"
-    return f"FP8 in {kept}; calibration {fp8['calibration']} ({fp8['identity'][:16]}…), on {fp8['observations']}"
+    return f"FP8 in {kept}; calibration {fp8.calibration} ({fp8.identity[:16]}…), on {fp8.observations}"
 
 
-def _intermediates(document: dict[str, Any]) -> Table:
+def _intermediates(document: "Certificate") -> Table:
     """One row a name: its worst layer or step, in proportion to what is allowed there."""
     table = Table(title="against the float32 reference, attended slots", title_justify="left")
     table.add_column("intermediate")
@@ -173,40 +182,34 @@ def _intermediates(document: dict[str, Any]) -> Table:
     table.add_column("which")
     for column in ("cosine", "max"):
         table.add_column(column, justify="right")
-    worst: dict[str, dict[str, Any]] = {}
-    for row in document["intermediates"]:
-        name = row["name"]
-        if name not in worst or _badness(row) > _badness(worst[name]):
-            worst[name] = row
+    worst: dict[str, IntermediateDocument] = {}
+    for row in document.intermediates:
+        if row.name not in worst or row.badness > worst[row.name].badness:
+            worst[row.name] = row
     for name, row in worst.items():
-        control, decides = row["control"], name == "actions"
-        above = row["relative_rms"] > row["allowed"]
+        control, decides, above = row.control, name == "actions", row.above
         if decides:
             table.add_section()
         table.add_row(
-            name if row["index"] is None else f"{name}, {row['index']}",
-            significant(row["relative_rms"]),
-            "-" if control is None else significant(control["relative_rms"]),
-            significant(row["allowed"]),
+            name if row.index is None else f"{name}, {row.index}",
+            significant(row.relative_rms),
+            "-" if control is None else significant(control.relative_rms),
+            significant(row.allowed),
             ("FAIL, decides" if above else "ok, decides") if decides else ("above, informs" if above else ""),
-            f"{row['cosine']:.6f}",
-            significant(row["max"]),
+            _cosine(row.cosine),
+            significant(row.max),
             style=("red" if decides else "yellow") if above else None,
         )
     return table
 
 
-def _badness(row: dict[str, Any]) -> float:
-    return row["relative_rms"] / row["allowed"] if row["allowed"] else row["relative_rms"]
-
-
-def _dimensions(dimensions: list[dict[str, Any]]) -> Table:
+def _dimensions(dimensions: "list[Dimension]") -> Table:
     table = Table(title="actions in the robot's units", title_justify="left")
     table.add_column("action")
     table.add_column("unit")
     for column in ("rms", "control's rms", "max", "control's max"):
         table.add_column(column, justify="right")
     for row in dimensions:
-        values = (row["rms"], row["control_rms"], row["max"], row["control_max"])
-        table.add_row(row["name"], row["unit"], *map(significant, values))
+        values = (row.rms, row.control_rms, row.max, row.control_max)
+        table.add_row(row.name, row.unit, *map(significant, values))
     return table

@@ -61,7 +61,7 @@ def plain_document(document: msgspec.Struct) -> dict[str, object]:
 
 
 def _plain(value: object) -> object:
-    if isinstance(value, PurePath):
+    if isinstance(value, str | PurePath):  # a str: of a class of its own, as torch.__version__ is
         return str(value)
     if hasattr(value, "tolist"):  # NumPy
         return value.tolist()

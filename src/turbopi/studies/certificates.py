@@ -10,10 +10,11 @@ import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import numpy as np
 import torch
+from msgspec import Struct
 
 from turbopi import backends, shipped
 from turbopi.backends import Precision
@@ -22,15 +23,27 @@ from turbopi.checkpoint import Checkpoint
 from turbopi.files import write_whole
 from turbopi.quantization.artifact import Quantization
 from turbopi.quantization.plan import TIERS
+from turbopi.reading import plain_document
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.studies.weights import WEIGHTS, Weights, studied_checkpoint
+from turbopi.verify.document import (
+    ActionsControl,
+    Bounds,
+    Certificate,
+    Check,
+    Deltas,
+    Determinism,
+    Number,
+    SuspectDocument,
+    WorstCall,
+)
 from turbopi.verify.inputs import VerifyPlan
 from turbopi.verify.run import verify
 
 _MOST_SHIFT = 20  # pixels
 
 
-def varied(seed: int, count: int) -> Iterator[dict[str, Any]]:
+def varied(seed: int, count: int) -> Iterator[dict[str, np.ndarray | str]]:
     """Observations made of the packaged LIBERO frames: shifted, relit, with another state."""
     frames, rng = shipped.load_frames(), np.random.default_rng(seed)
     for number in range(count):
@@ -62,50 +75,114 @@ def certify(
     device: torch.device,
     observations: Path,
     noises: int,
-) -> Iterator[tuple[Precision, dict[str, Any]]]:
+) -> Iterator[tuple[Precision, Certificate]]:
     """A certificate of `fused` for each tier."""
     for tier in tiers:
         arguments = {"backend": "fused", "precision": tier, "quantization": quantization, "device": str(device)}
         yield tier, verify(checkpoint, VerifyPlan(arguments, observations, noises=noises))
 
 
-def condensed(document: Mapping[str, Any]) -> dict[str, Any]:
-    """A certificate without what a reader of tables doesn't need: intermediates by name, their worst layer or step."""
-    worst: dict[str, dict[str, Any]] = {}
-    for row in document["intermediates"]:
-        name = row["name"]
-        if name not in worst or row["relative_rms"] > worst[name]["relative_rms"]:
-            control = row["control"] or {}
-            worst[name] = {
-                "at": row["index"],
-                "relative_rms": row["relative_rms"],
-                "control": control.get("relative_rms"),
-                "cosine": row["cosine"],
-            }
-    actions = document["actions"]
-    kept = ("verdict", "model", "backend", "precision", "steps", "oracle", "control", "bounds", "checks", "first_off")
-    return _rounded(
-        {name: document[name] for name in kept}
-        | {
-            "actions": {
-                name: actions[name] for name in ("relative_rms", "cosine", "max", "deltas", "control", "worst")
-            },
-            "dimensions": {
-                f"{one['name']} [{one['unit']}]": {"rms": one["rms"], "max": one["max"], "bf16_rms": one["control_rms"]}
-                for one in actions["dimensions"]
-            },
-            "intermediates": worst,
-            "determinism": document["determinism"],
-            "gpu_bytes": document["gpu_bytes"],
-            "weights": document["weights"]["fingerprint"],
-            "observations": {name: document["observations"][name] for name in ("count", "noises", "seed", "sha256")},
-            "fp8": document["policy"]["backend_details"].get("fp8"),
-            "random_weights": document["weights"]["random"],
-        }
+class CondensedActions(Struct, frozen=True):
+    """`ActionsDocument` without its dimensions."""
+
+    relative_rms: Number
+    cosine: Number
+    max: Number
+    deltas: Deltas
+    control: ActionsControl
+    worst: WorstCall
+
+
+class CondensedDimension(Struct, frozen=True):
+    """In the robot's unit."""
+
+    rms: Number
+    max: Number
+    bf16_rms: Number
+
+
+class WorstPlace(Struct, frozen=True):
+    """The layer or step (`at`) where an intermediate is furthest off."""
+
+    at: int | None
+    relative_rms: Number
+    control: Number
+    cosine: Number
+
+
+class CondensedObservations(Struct, frozen=True):
+    count: int
+    noises: int
+    seed: int
+    sha256: str
+
+
+class CondensedCertificate(Struct, frozen=True):
+    """A certificate without what a reader of tables doesn't need: four digits, of cosines seven."""
+
+    verdict: str
+    model: str
+    backend: str
+    precision: str
+    steps: int
+    oracle: str
+    control: str
+    bounds: Bounds
+    checks: list[Check]
+    first_off: SuspectDocument | None
+    actions: CondensedActions
+    dimensions: dict[str, CondensedDimension]  # by name and unit
+    intermediates: dict[str, WorstPlace]  # by name
+    determinism: Determinism
+    gpu_bytes: int | None
+    weights: str | None  # their fingerprint
+    observations: CondensedObservations
+    fp8: Mapping[str, object] | None
+    random_weights: bool
+
+
+def condensed(certificate: Certificate) -> CondensedCertificate:
+    worst: dict[str, WorstPlace] = {}
+    for row in certificate.intermediates:
+        before = worst.get(row.name)
+        if before is None or _size(row.relative_rms) > _size(before.relative_rms):
+            control = None if row.control is None else row.control.relative_rms
+            worst[row.name] = WorstPlace(row.index, row.relative_rms, control, row.cosine)
+    actions, seen = certificate.actions, certificate.observations
+    whole = CondensedCertificate(
+        verdict=certificate.verdict,
+        model=certificate.model,
+        backend=certificate.backend,
+        precision=certificate.precision,
+        steps=certificate.steps,
+        oracle=certificate.oracle,
+        control=certificate.control,
+        bounds=certificate.bounds,
+        checks=certificate.checks,
+        first_off=certificate.first_off,
+        actions=CondensedActions(
+            actions.relative_rms, actions.cosine, actions.max, actions.deltas, actions.control, actions.worst
+        ),
+        dimensions={
+            f"{one.name} [{one.unit}]": CondensedDimension(one.rms, one.max, one.control_rms)
+            for one in actions.dimensions
+        },
+        intermediates=worst,
+        determinism=certificate.determinism,
+        gpu_bytes=certificate.gpu_bytes,
+        weights=certificate.weights.fingerprint,
+        observations=CondensedObservations(seen.count, seen.noises, seen.seed, seen.sha256),
+        fp8=certificate.fp8,
+        random_weights=certificate.weights.random,
     )
+    return msgspec.convert(_rounded(plain_document(whole)), CondensedCertificate)
 
 
-def _rounded(value: Any) -> Any:
+def _size(error: Number) -> float:
+    return math.inf if error is None else error
+
+
+def _rounded(value: object) -> object:
     """Four digits, of cosines seven: more is noise here."""
     if isinstance(value, Mapping):
         return {name: _rounded(item) for name, item in value.items()}
@@ -128,11 +205,13 @@ def run(
     calibration: int = 16,
     verification: int = 4,
     noises: int = 2,
-) -> dict[str, Any]:
-    """All of them; certificates.json and every calibration are written into `out` as they come."""
+) -> bool:
+    """Whether all pass. certificates.json and every calibration are written into `out` as they come."""
+    passed = True
     on = backends.resolve_device(device)
     out.mkdir(parents=True, exist_ok=True)
-    document: dict[str, Any] = {"preset": preset, "calibration_observations": calibration, "certificates": {}}
+    found: dict[str, dict[str, object]] = {}
+    document: dict[str, object] = {"preset": preset, "calibration_observations": calibration, "certificates": found}
     with tempfile.TemporaryDirectory() as temporary:
         seen = _record(Path(temporary) / "calibration", 0, calibration)
         unseen = _record(Path(temporary) / "verification", 1, verification)
@@ -140,17 +219,18 @@ def run(
             checkpoint = studied_checkpoint(kind, preset, on)
             quantization = calibrate(checkpoint, Settings({"device": str(on)}, str(seen), calibration))
             quantization.save(out / f"{kind.replace(' ', '_')}.json")
-            found = document["certificates"].setdefault(kind, {})
-            found["calibration"] = _rounded(
+            of_kind = found.setdefault(kind, {})
+            of_kind["calibration"] = _rounded(
                 {name: quantization.report[name] for name in ("method", "groups_alone", "held_out", "seconds")}
             )
             for tier, certificate in certify(checkpoint, quantization, tiers, on, unseen, noises):
-                document["provenance"] = certificate["provenance"]
-                found[tier] = condensed(certificate)
-                print(f"{kind}, {tier}: {certificate['verdict']}", flush=True)
+                document["provenance"] = plain_document(certificate.provenance)
+                of_kind[tier] = plain_document(condensed(certificate))
+                passed = passed and certificate.ok
+                print(f"{kind}, {tier}: {certificate.verdict}", flush=True)
                 text = json.dumps(document, indent=1, ensure_ascii=False)
                 write_whole(out / "certificates.json", text + "\n")
-    return document
+    return passed
 
 
 def main() -> None:
@@ -164,7 +244,7 @@ def main() -> None:
     parser.add_argument("--noises", type=int, default=2, help="for each of these")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    document = run(
+    passed = run(
         options.out,
         options.weights or WEIGHTS[1:],
         options.tier or TIERS,
@@ -174,8 +254,7 @@ def main() -> None:
         verification=options.verification,
         noises=options.noises,
     )
-    tiers = [one for kind in document["certificates"].values() for name, one in kind.items() if name in TIERS]
-    raise SystemExit(not all(one["verdict"].startswith("PASS") for one in tiers))
+    raise SystemExit(not passed)
 
 
 if __name__ == "__main__":

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import torch
+from msgspec import Struct
 from torch import Tensor
 
 from turbopi import backends, shipped
@@ -25,7 +26,7 @@ from turbopi.model.reference import Pi0Model
 from turbopi.model.sites import linears
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
-from turbopi.provenance import provenance
+from turbopi.provenance import Provenance, provenance
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, PARTS, Site, sites
@@ -35,9 +36,26 @@ from turbopi.studies.weights import WEIGHTS, Weights, studied_checkpoint
 from turbopi.wording import significant
 
 
+class FormatError(Struct, frozen=True):
+    """Of the actions, against float32."""
+
+    relative_rms: float
+    delta_cosine: float  # of what denoising did
+
+
+class Research(Struct, frozen=True):
+    """What this writes."""
+
+    provenance: Provenance
+    preset: str
+    steps: int  # of denoising
+    observations: int
+    errors: dict[str, dict[str, FormatError]]  # by weights, then by format and place
+
+
 def errors(
     model: Pi0Model, made: list[Batch], seen: list[Batch], steps: int, formats: Sequence[str] | None = None
-) -> Iterator[tuple[str, dict[str, float]]]:
+) -> Iterator[tuple[str, FormatError]]:
     """Formats and places, all or some, each with the actions' error; weights are rounded for what `seen` have in
     common, where that is said.
     """
@@ -72,10 +90,7 @@ def errors(
             continue
         with context():
             actions = _actions(model, made, steps)
-        yield (
-            name,
-            {"relative_rms": relative_rms(actions, exact), "delta_cosine": delta_cosine(actions, exact, noise)},
-        )
+        yield name, FormatError(relative_rms(actions, exact), delta_cosine(actions, exact, noise))
 
 
 @contextmanager
@@ -103,7 +118,7 @@ def in_nvfp4(
         yield
 
 
-def _observation(frame: shipped.Frame, prompt: str) -> dict[str, Any]:
+def _observation(frame: shipped.Frame, prompt: str) -> dict[str, np.ndarray | str]:
     return {
         "observation/image": frame.base,
         "observation/wrist_image": frame.wrist,
@@ -124,7 +139,7 @@ def run(
     out: Path,
     kinds: Sequence[Weights] = WEIGHTS,
     formats: Sequence[str] | None = None,
-) -> dict[str, Any]:
+) -> Research:
     """All errors, on LIBERO pictures: by weights and format; written to `out` as they come."""
     checkpoint = shipped.with_libero_stats(random_checkpoint(preset))
     sizes = checkpoint.config.model
@@ -142,21 +157,19 @@ def run(
         [batch for _, batch in batches(with_noises(some, shape, 1, seed), 8, device)]
         for seed, some in enumerate((examples[:count], examples[count:]))
     )
-    about = {"provenance": plain_document(provenance(device)), "preset": preset, "steps": steps, "observations": count}
-    results: dict[str, Any] = {}
+    document = Research(provenance(device), preset, steps, count, errors={})
     for kind in kinds:
         model = Pi0Model.from_state(sizes, studied_checkpoint(kind, preset, device).load(device, "f32").state)
-        results[kind] = {}
+        of_kind = document.errors.setdefault(kind, {})
         for name, error in errors(model, made, seen, steps, formats):
-            results[kind][name] = error
+            of_kind[name] = error
             print(
-                f"{kind}: {name:42} relative rms {significant(error['relative_rms'])}  "
-                f"cosine {error['delta_cosine']:.6f}",
+                f"{kind}: {name:42} relative rms {significant(error.relative_rms)}  cosine {error.delta_cosine:.6f}",
                 flush=True,
             )
-            write_whole(out, json.dumps({**about, "errors": results}, indent=1) + "\n")
+            write_whole(out, json.dumps(plain_document(document), indent=1) + "\n")
         del model
-    return results
+    return document
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from turbopi.model.reference import Trace
 from turbopi.observation import ModelInputs
+from turbopi.verify.document import ErrorsDocument, finite
 from turbopi.wording import significant
 
 _PREFIX = ("prefix_pad_mask", "prefix_positions", "vision_last_hidden", "prefix_embs")
@@ -137,14 +138,15 @@ class Errors:
         norm = float(np.sqrt(self._ours * self._exact))
         return self._product / norm if norm else 0.0
 
-    def as_json(self) -> dict[str, float | bool]:
-        return {
-            "relative_rms": self.relative_rms,
-            "cosine": self.cosine,
-            "rms": self.rms,
-            "max": self.max if self.finite else float("inf"),
-            "finite": self.finite,
-        }
+    @property
+    def document(self) -> ErrorsDocument:
+        return ErrorsDocument(
+            relative_rms=finite(self.relative_rms),
+            cosine=finite(self.cosine),
+            rms=finite(self.rms),
+            max=self.max if self.finite else None,
+            finite=self.finite,
+        )
 
 
 ErrorsBy = dict[Place, Errors]

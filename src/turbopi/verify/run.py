@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from msgspec.structs import asdict
 
 from turbopi import backends, shipped
 from turbopi.backends.pytorch import reference_model
@@ -26,8 +27,8 @@ from turbopi.model import exact
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
 from turbopi.quantization.artifact import Quantization
-from turbopi.reading import plain_document
 from turbopi.verify import control
+from turbopi.verify.document import Certificate, Latencies, Latency, ObservationsDocument, WeightsDocument
 from turbopi.verify.inputs import VerifyPlan, check_observations, make_calls, read_examples
 from turbopi.verify.intermediates import Tensors, in_order, tensors_of
 from turbopi.verify.verdict import ACTIONS, Compared, Repetition, Rule, judge
@@ -38,8 +39,8 @@ _DEMANDED = ("kv_k", "kv_v", "v_t", "actions")  # by the Backend protocol
 # -- the run -----------------------------------------------------------------------------------------------------------
 
 
-def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None = None) -> dict[str, Any]:
-    """The whole verdict as one plain document (docs/verify.md).
+def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None = None) -> Certificate:
+    """The whole verdict (docs/verify.md).
 
     Raises ConfigError or BackendUnavailable before anything is loaded, ObservationError naming the observation that
     can't be used, CheckpointError where the reference itself gives values that aren't finite.
@@ -74,31 +75,27 @@ def verify(checkpoint: Checkpoint, plan: VerifyPlan, progress: Progress | None =
     del subject
     _free(device)
 
-    document = judge(rule, precision, details["robot"], compared, control, repetition)
+    judged = judge(rule, precision, details["robot"], compared, control, repetition)
     exposed = {place.name for place in compared.by_place}
-    document |= {
-        "model": checkpoint.config.name,
-        "backend": name,
-        "precision": precision,
-        "steps": steps,
-        "oracle": "pytorch f32",
-        "oracle_float32": exact.certificate(),
-        "control": rule.control_says,
-        "not_exposed": sorted(reference.names - exposed),
-        "latency_ms": {"backend": _latency(repetition.milliseconds), "oracle": _latency(reference.milliseconds)},
-        "warmup_seconds": round(warmup, 3),
-        "gpu_bytes": memory,  # after all calls: weights, and all else that stays
-        "observations": reference.describe(plan, quantization),
-        "weights": {
-            "path": None if checkpoint.path is None else str(checkpoint.path),
-            "format": checkpoint.format,
-            "random": checkpoint.format == "random",
-            "fingerprint": fingerprint,
-        },
-        "policy": details,
-        "provenance": plain_document(about),
-    }
-    return document
+    path = None if checkpoint.path is None else str(checkpoint.path)
+    return Certificate(
+        **asdict(judged),
+        model=checkpoint.config.name,
+        backend=name,
+        precision=precision,
+        steps=steps,
+        oracle="pytorch f32",
+        oracle_float32=exact.certificate(),
+        control=rule.control_says,
+        not_exposed=sorted(reference.names - exposed),
+        latency_ms=Latencies(_latency(repetition.milliseconds), _latency(reference.milliseconds)),
+        warmup_seconds=round(warmup, 3),
+        gpu_bytes=memory,
+        observations=reference.describe(plan, quantization),
+        weights=WeightsDocument(path, checkpoint.format, checkpoint.format == "random", fingerprint),
+        policy=details,
+        provenance=about,
+    )
 
 
 class _Reference:
@@ -178,7 +175,7 @@ class _Reference:
             return np.full(shape, np.nan)
         return self._pipeline.after(chunk, call.example.state)["actions"]
 
-    def describe(self, plan: VerifyPlan, quantization: Quantization | None) -> dict[str, Any]:
+    def describe(self, plan: VerifyPlan, quantization: Quantization | None) -> ObservationsDocument:
         """What it was run on, with a hash of all of the model's inputs."""
         digest, calibrated = hashlib.sha256(), 0
         known = {} if quantization is None else quantization.report["observations"].get("calibration", {})
@@ -186,15 +183,15 @@ class _Reference:
             inputs = example.bytes()
             digest.update(inputs)
             calibrated += hashlib.sha256(inputs).hexdigest() in known.values()
-        return {
-            "calibrated_on": None if quantization is None else calibrated,
-            "path": None if plan.observations is None else str(plan.observations),
-            "count": len(self.examples),
-            "names": [example.source for example in self.examples],
-            "sha256": digest.hexdigest(),
-            "noises": plan.noises,
-            "seed": plan.seed,
-        }
+        return ObservationsDocument(
+            calibrated_on=None if quantization is None else calibrated,
+            path=None if plan.observations is None else str(plan.observations),
+            count=len(self.examples),
+            names=[example.source for example in self.examples],
+            sha256=digest.hexdigest(),
+            noises=plan.noises,
+            seed=plan.seed,
+        )
 
 
 def _run(policy: UnifiedPolicy, call: NoisyExample, steps: int) -> Tensors:
@@ -239,9 +236,9 @@ def _repeat(policy: UnifiedPolicy, calls: Sequence[NoisyExample], steps: int, pr
     return result
 
 
-def _latency(milliseconds: Sequence[float]) -> dict[str, float]:
+def _latency(milliseconds: Sequence[float]) -> Latency:
     median, high = np.percentile(milliseconds, (50, 95))
-    return {"calls": len(milliseconds), "p50": float(median), "p95": float(high)}
+    return Latency(len(milliseconds), float(median), float(high))
 
 
 def _free(device: torch.device) -> None:

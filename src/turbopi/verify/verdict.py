@@ -1,9 +1,10 @@
 """The rules a backend is held to, and the verdict on what was measured. docs/verify.md has the reasons at length."""
 
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
+from msgspec.structs import asdict
 
 from turbopi.errors import BackendError, ConfigError
 from turbopi.examples import NoisyExample
@@ -20,6 +21,20 @@ from turbopi.verify.bounds import (
     JUMP,
     SUSPECT_FACTOR,
     TRAINED_FACTORS,
+)
+from turbopi.verify.document import (
+    ActionsControl,
+    ActionsDocument,
+    Bounds,
+    Check,
+    Deltas,
+    Determinism,
+    Dimension,
+    IntermediateDocument,
+    Judged,
+    SuspectDocument,
+    WorstCall,
+    finite,
 )
 from turbopi.verify.intermediates import Errors, ErrorsBy, Place, Suspect, Tensors, first_suspect, in_order
 from turbopi.wording import significant
@@ -143,8 +158,8 @@ class Repetition:
 
 def judge(
     rule: Rule, precision: str, robot: str, compared: Compared, control: Compared, repetition: Repetition
-) -> dict[str, Any]:
-    """Checks, verdict, errors and their controls, as plain values."""
+) -> Judged:
+    """Checks, verdict, errors and their controls."""
     plain = control.by_place
     allowed = {
         place: rule.allowed(precision, plain[place].relative_rms if place in plain else 0.0)
@@ -154,42 +169,40 @@ def judge(
     allowed[ACTIONS] = limit
     suspect = first_suspect(compared.by_place, plain, allowed, JUMP)
     checks = _checks(rule, limit, compared, control, repetition)
-    failed = [check for check in checks if not check["ok"]]
-    verdict = "; ".join(str(check["text"]) for check in failed or checks[:1])
+    failed = [check for check in checks if not check.ok]
+    verdict = "; ".join(check.text for check in failed or checks[:1])
     if failed and suspect is not None:
         verdict += f"; first off: {suspect}"
-    return {
-        "ok": not failed,
-        "verdict": f"{'FAIL' if failed else 'PASS'}: {verdict}",
-        "checks": checks,
-        "bounds": {
-            "actions_relative_rms": limit,
-            "factor_of_control": None if rule.bound is not None else rule.factor,
-            "reason": rule.reason,
-            "deltas_cosine": rule.cosine,
-            "overridden": rule.overridden,
-            "suspect_factor": None if precision == "f32" else FP8_STEP if precision in TIERS else rule.suspect_factor,
-            "jump": JUMP,
-        },
-        "first_off": None if suspect is None else _suspect_json(suspect),
-        "actions": _actions(robot, compared, control),
-        "intermediates": [
-            {
-                "name": place.name,
-                "index": place.at,
-                **compared.by_place[place].as_json(),
-                "allowed": allowed[place],
-                "control": plain[place].as_json() if place in plain else None,
-            }
+    return Judged(
+        ok=not failed,
+        verdict=f"{'FAIL' if failed else 'PASS'}: {verdict}",
+        checks=checks,
+        bounds=Bounds(
+            actions_relative_rms=finite(limit),
+            factor_of_control=None if rule.bound is not None else rule.factor,
+            reason=rule.reason,
+            deltas_cosine=rule.cosine,
+            overridden=rule.overridden,
+            suspect_factor=None if precision == "f32" else FP8_STEP if precision in TIERS else rule.suspect_factor,
+            jump=JUMP,
+        ),
+        first_off=None if suspect is None else _suspect(suspect),
+        actions=_actions(robot, compared, control),
+        intermediates=[
+            IntermediateDocument(
+                name=place.name,
+                index=place.at,
+                **asdict(compared.by_place[place].document),
+                allowed=finite(allowed[place]),
+                control=plain[place].document if place in plain else None,
+            )
             for place in in_order(compared.by_place)
         ],
-        "determinism": {name: value for name, value in asdict(repetition).items() if name != "milliseconds"},
-    }
+        determinism=Determinism(repetition.calls, repetition.identical, repetition.max, repetition.differing),
+    )
 
 
-def _checks(
-    rule: Rule, limit: float, compared: Compared, control: Compared, repetition: Repetition
-) -> list[dict[str, Any]]:
+def _checks(rule: Rule, limit: float, compared: Compared, control: Compared, repetition: Repetition) -> list[Check]:
     """What decides, the actions first."""
     error, plain = compared.actions.relative_rms, control.actions.relative_rms
     stated = "the bound that was given" if rule.overridden else "the stated bound"
@@ -203,35 +216,20 @@ def _checks(
     wrong = [place for place in in_order(compared.by_place) if not compared.by_place[place].finite]
     same = repetition.identical == repetition.calls
     cosine = compared.deltas.cosine
-    of_deltas = {
-        "name": "deltas",
-        "ok": bool(cosine >= (rule.cosine or 0.0)),
-        "value": cosine,
-        "bound": rule.cosine,
-        "text": f"cosine of what denoising did is {cosine:.5f}, at least {rule.cosine} is stated",
-    }
+    did = f"cosine of what denoising did is {cosine:.5f}, at least {rule.cosine} is stated"
+    of_deltas = Check("deltas", bool(cosine >= (rule.cosine or 0.0)), finite(cosine), rule.cosine, did)
+    values = f"values that aren't finite in {len(wrong)} intermediates" if wrong else "everything is finite"
+    repeated = f"{repetition.identical} of {repetition.calls} repeated calls were bit-identical"
+    repeated += "" if same else f" (off by up to {significant(repetition.max)})"
     return [
-        {"name": "actions", "ok": ok, "value": error, "bound": limit, "text": text},
+        Check("actions", ok, finite(error), finite(limit), text),
         *([] if rule.cosine is None else [of_deltas]),
-        {
-            "name": "finite",
-            "ok": not wrong,
-            "value": len(wrong),
-            "bound": 0,
-            "text": f"values that aren't finite in {len(wrong)} intermediates" if wrong else "everything is finite",
-        },
-        {
-            "name": "determinism",
-            "ok": same,
-            "value": repetition.calls - repetition.identical,
-            "bound": 0,
-            "text": f"{repetition.identical} of {repetition.calls} repeated calls were bit-identical"
-            + ("" if same else f" (off by up to {significant(repetition.max)})"),
-        },
+        Check("finite", not wrong, len(wrong), 0, values),
+        Check("determinism", same, repetition.calls - repetition.identical, 0, repeated),
     ]
 
 
-def _actions(robot: str, compared: Compared, control: Compared) -> dict[str, Any]:
+def _actions(robot: str, compared: Compared, control: Compared) -> ActionsDocument:
     call, errors = compared.worst
     groups = action_groups(robot, len(compared.by_dimension))
     labels = {
@@ -239,32 +237,19 @@ def _actions(robot: str, compared: Compared, control: Compared) -> dict[str, Any
         for group in groups
         for index, name in group.names.items()
     }
-    return {
-        **compared.actions.as_json(),
-        "deltas": {"cosine": compared.deltas.cosine, "relative_rms": compared.deltas.relative_rms},
-        "control": control.actions.as_json() | {"deltas_cosine": control.deltas.cosine},
-        "worst": {"observation": call.example.source, "seed": call.seed, **errors.as_json()},
-        "dimensions": [
-            {
-                "index": index,
-                "name": labels[index][0],
-                "unit": labels[index][1],
-                "rms": one.rms,
-                "max": one.as_json()["max"],
-                "control_rms": plain.rms,
-                "control_max": plain.as_json()["max"],
-            }
-            for index, (one, plain) in enumerate(zip(compared.by_dimension, control.by_dimension, strict=True))
+    own, plain = ([errors.document for errors in some.by_dimension] for some in (compared, control))
+    return ActionsDocument(
+        **asdict(compared.actions.document),
+        deltas=Deltas(finite(compared.deltas.cosine), finite(compared.deltas.relative_rms)),
+        control=ActionsControl(**asdict(control.actions.document), deltas_cosine=finite(control.deltas.cosine)),
+        worst=WorstCall(observation=call.example.source, seed=call.seed, **asdict(errors.document)),
+        dimensions=[
+            Dimension(index, *labels[index], one.rms, one.max, other.rms, other.max)
+            for index, (one, other) in enumerate(zip(own, plain, strict=True))
         ],
-    }
+    )
 
 
-def _suspect_json(suspect: Suspect) -> dict[str, Any]:
-    return {
-        "name": suspect.place.name,
-        "index": suspect.place.at,
-        "relative_rms": suspect.relative_rms,
-        "control_relative_rms": suspect.control,
-        "why": suspect.why,
-        "text": str(suspect),
-    }
+def _suspect(suspect: Suspect) -> SuspectDocument:
+    place, errors = suspect.place, (finite(suspect.relative_rms), finite(suspect.control))
+    return SuspectDocument(place.name, place.at, *errors, suspect.why, str(suspect))
