@@ -16,6 +16,7 @@ from turbopi import backends
 from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_fp8 import TensorRTFp8Backend
 from turbopi.errors import BackendError, ConfigError
+from turbopi.installation import install_command
 from turbopi.quantization.artifact import RANDOM_NOISE, Quantization, SiteScale
 from turbopi.tensorrt import Library
 from turbopi.tensorrt.cache import EngineCache
@@ -88,7 +89,7 @@ def test_a_missing_modelopt_is_told_before_anything_is_loaded(monkeypatch: pytes
     monkeypatch.setattr("turbopi.backends.availability", lambda name, device: None)
     monkeypatch.setattr("turbopi.tensorrt.calibrate.importlib.util.find_spec", lambda name: None)
     said = refusal(turbopi("build", *TINY, "--precision", "fp8", "--method", "modelopt"))
-    assert "ModelOpt isn't installed; pip install 'turbopi[modelopt]'" in said
+    assert f"ModelOpt isn't installed; {install_command('modelopt')}, or" in said
 
 
 # -- the file of `turbopi calibrate` -----------------------------------------------------------------------------------

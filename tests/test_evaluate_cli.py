@@ -12,6 +12,7 @@ from typer.testing import CliRunner, Result
 from turbopi import serve
 from turbopi.cli import app
 from turbopi.cli.options import PolicyOptions
+from turbopi.installation import install_command
 from turbopi.recordings import load_call, recorded_files
 from turbopi.sim import libero
 
@@ -183,7 +184,7 @@ def test_a_policy_for_another_robot_is_refused(tmp_path: Path) -> None:
 
 def test_without_the_simulator_its_install_command_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(libero.importlib.util, "find_spec", lambda name: None)
-    assert "pip install 'turbopi[libero]'" in refused(f"eval libero {QUICK}")
+    assert install_command("libero") in refused(f"eval libero {QUICK}")
 
 
 @pytest.mark.usefixtures("seeking")

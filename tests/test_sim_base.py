@@ -1,5 +1,6 @@
 """What holds for every simulator, and what is said where one can't run."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from turbopi.errors import ConfigError
+from turbopi.installation import install_command
 from turbopi.sim import SIMULATORS, SimSettings, SimulatorUnavailable, create, graphics, libero
 from turbopi.sim.base import full_suite_name
 
@@ -53,7 +55,7 @@ def test_a_simulator_of_ones_own_that_fails_is_refused_with_the_reason(
 
 def test_without_the_extra_the_one_command_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(libero.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SimulatorUnavailable, match=r"LIBERO isn't installed .*: pip install 'turbopi\[libero\]'"):
+    with pytest.raises(SimulatorUnavailable, match=re.escape(install_command("libero"))):
         create("libero").check()
 
 

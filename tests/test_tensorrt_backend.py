@@ -15,6 +15,7 @@ from turbopi import backends
 from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
 from turbopi.errors import BackendError
+from turbopi.installation import install_command
 from turbopi.observation import Observation
 from turbopi.tensorrt.parts import EngineShape
 from turbopi.verify.check_golden import check_case
@@ -204,4 +205,5 @@ def test_submit_takes_one_observation() -> None:
 def test_a_machine_without_the_library_is_told_what_to_install(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
     reason = backends.availability(name, torch.device("cpu"))
-    assert reason is not None and "neither tensorrt_rtx nor tensorrt is installed; pip install" in reason
+    assert reason is not None and "neither tensorrt_rtx nor tensorrt is installed; " in reason
+    assert install_command("tensorrt") in reason

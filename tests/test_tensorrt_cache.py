@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 import json
 import multiprocessing
+import re
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -21,6 +22,7 @@ from tensorrt_fakes import ENVIRONMENT
 from turbopi import tensorrt
 from turbopi.config import Kind
 from turbopi.errors import BackendError, BackendUnavailable, OutputError
+from turbopi.installation import install_command
 from turbopi.tensorrt.cache import CorruptEngine, EngineCache, StaleEngine
 from turbopi.tensorrt.engine import Input, Kernels, Specification, build
 from turbopi.tensorrt.networks import Fp8Scales
@@ -192,9 +194,8 @@ def nothing_imported() -> Iterator[None]:
 
 def test_no_library_is_an_error_with_the_command(monkeypatch: pytest.MonkeyPatch, nothing_imported: None) -> None:
     monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
-    with pytest.raises(
-        BackendUnavailable, match=r"neither tensorrt_rtx nor tensorrt is installed; pip install 'turbopi"
-    ):
+    said = f"neither tensorrt_rtx nor tensorrt is installed; {install_command('tensorrt')} (TensorRT-RTX"
+    with pytest.raises(BackendUnavailable, match=re.escape(said)):
         tensorrt.library()
 
 
@@ -280,7 +281,8 @@ def test_build_refuses_before_it_loads(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "--calibration is for --precision fp8" in refusal(turbopi("build", *tiny, "--calibration", "x"))
     monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
     said = refusal(turbopi("build", *tiny, "--device", "cpu"))
-    assert "can't build engines for tensorrt: neither tensorrt_rtx nor tensorrt is installed; pip install" in said
+    assert "can't build engines for tensorrt: neither tensorrt_rtx nor tensorrt is installed; " in said
+    assert install_command("tensorrt") in said
 
 
 def test_the_manifest_names_everything_an_engine_depends_on(cache: EngineCache) -> None:

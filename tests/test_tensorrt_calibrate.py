@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from tensorrt_fakes import golden_backend
 
 from turbopi.backends.tensorrt_fp8 import TensorRTFp8Backend
 from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.installation import install_command
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.tensorrt import calibrate as calibrating
@@ -94,7 +96,7 @@ def test_nothing_to_calibrate_on_is_refused() -> None:
 
 def test_modelopt_that_is_missing_is_never_imitated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("turbopi.tensorrt.calibrate.importlib.util.find_spec", lambda name: None)
-    with pytest.raises(BackendUnavailable, match=r"pip install 'turbopi\[modelopt\]', or take --method max"):
+    with pytest.raises(BackendUnavailable, match=re.escape(f"{install_command('modelopt')}, or take --method max")):
         calibrate(golden_model("pi05"), observations(), method="modelopt")
 
 

@@ -20,6 +20,7 @@ from packaging.version import Version
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.typed import as_typed
 from turbopi.errors import TurboPiError
+from turbopi.installation import install_command
 from turbopi.toolchain import missing_for_c, missing_for_cpp
 
 Level = Literal["OK", "WARN", "FAIL"]
@@ -75,7 +76,7 @@ def check_packages() -> Row:
         required = metadata.requires("turbopi") or []
         version = metadata.version("turbopi")
     except metadata.PackageNotFoundError:
-        return Row("WARN", "packages", "turbopi itself isn't installed", "pip install -e . in its folder")
+        return Row("WARN", "packages", "turbopi itself isn't installed", install_command())
     problems = []
     for requirement in map(Requirement, required):
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
@@ -88,7 +89,7 @@ def check_packages() -> Row:
         if not requirement.specifier.contains(installed, prereleases=True):
             problems.append(f"{requirement.name} is {installed}, not {requirement.specifier}")
     if problems:
-        return Row("FAIL", "packages", "; ".join(problems), "pip install --upgrade turbopi")
+        return Row("FAIL", "packages", "; ".join(problems), install_command())
     return Row("OK", "packages", f"turbopi {version} and all that it requires")
 
 

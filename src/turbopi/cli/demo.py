@@ -60,8 +60,8 @@ def demo(
     """Run a policy on real LIBERO pictures, check it against the float32 oracle, and let it act in the simulator.
 
     Without a checkpoint it is the small policy that comes with Turbo-Pi, trained on these tasks; its chunks are set
-    against what the expert did that it learned from. Where the simulator is installed (pip install 'turbopi[libero]')
-    it acts in a few episodes, with success, latency and videos at the end. The report folder gets demo.png,
+    against what the expert did that it learned from. Where the simulator is installed (in a clone: scripts/setup
+    libero) it acts in a few episodes, with success, latency and videos at the end. The report folder gets demo.png,
     actions.npz, report.json and episodes/. Exit code 1: the check failed.
     """
     if checkpoint is None and options.random_weights is None:

@@ -27,6 +27,7 @@ from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError
 from turbopi.export.graphs import Graph, graphs
 from turbopi.export.quantized import quantize_mlps
 from turbopi.files import new_folder
+from turbopi.installation import install_command
 from turbopi.model.reference import Pi0Model
 from turbopi.reading import Fields, file_inside, is_integer, read_json, shown
 from turbopi.tensorrt.calibrate import Calibration
@@ -37,7 +38,6 @@ GRAPHS = ("vision", "prompt", "prefix", "denoise_step")
 OPSET = 20  # the first with Gelu as one node
 FORMAT_VERSION = 1
 _AXIS = re.compile(r"\w+( \+ \d{1,6})?")  # a free axis: "prompt", "horizon + 1"
-INSTALL = "pip install 'turbopi[onnx]'"
 EXPORT_NEEDS = ("onnx", "onnxscript")
 
 
@@ -60,7 +60,7 @@ class Export:
 def missing_library(needed: tuple[str, ...]) -> str | None:
     """None if all of these packages are installed, else which one isn't and what to do."""
     absent = [name for name in needed if importlib.util.find_spec(name) is None]
-    return f"{' and '.join(absent)} isn't installed; {INSTALL}" if absent else None
+    return f"{' and '.join(absent)} isn't installed; {install_command('onnx')}" if absent else None
 
 
 def check_target(dst: Path) -> None:

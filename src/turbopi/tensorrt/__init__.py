@@ -10,12 +10,9 @@ from functools import cache
 from typing import Any
 
 from turbopi.errors import BackendUnavailable
+from turbopi.installation import install_command
 
 NAMES = ("tensorrt_rtx", "tensorrt")  # in order of preference: the first one is what our results were measured with
-INSTALL = (
-    "pip install 'turbopi[tensorrt]' (TensorRT-RTX for desktop and workstation GPUs), "
-    "or on Jetson and data-centre GPUs `pip install tensorrt`"
-)
 
 
 @dataclass(frozen=True)
@@ -36,7 +33,14 @@ def missing() -> str | None:
     """None if one of the libraries is installed, else what to do. Imports nothing."""
     if any(importlib.util.find_spec(name) is not None for name in NAMES):
         return None
-    return f"neither {' nor '.join(NAMES)} is installed; {INSTALL}"
+    return f"neither {' nor '.join(NAMES)} is installed; {_install()}"
+
+
+def _install() -> str:
+    return (
+        f"{install_command('tensorrt')} (TensorRT-RTX for desktop and workstation GPUs), "
+        "or on Jetson and data-centre GPUs `pip install tensorrt`"
+    )
 
 
 @cache
@@ -52,5 +56,5 @@ def library() -> Library:
     try:
         module = importlib.import_module(name)
     except (ImportError, OSError) as error:
-        raise BackendUnavailable(f"{name} is installed but can't be loaded ({error}); {INSTALL}") from error
+        raise BackendUnavailable(f"{name} is installed but can't be loaded ({error}); {_install()}") from error
     return Library(name, str(module.__version__), module)

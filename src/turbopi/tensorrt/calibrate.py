@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.files import write_whole
+from turbopi.installation import install_command
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.quantization.artifact import Quantization
@@ -76,9 +77,7 @@ def unavailable(method: str) -> str | None:
     if method not in METHODS:
         raise ConfigError(f"unknown calibration method {method!r}; choose one of {', '.join(METHODS)}")
     if method == "modelopt" and importlib.util.find_spec("modelopt") is None:
-        return (
-            "ModelOpt isn't installed; pip install 'turbopi[modelopt]', or take --method max, which measures the same"
-        )
+        return f"ModelOpt isn't installed; {install_command('modelopt')}, or take --method max, which measures the same"
     return None
 
 
