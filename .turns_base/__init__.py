@@ -1,1 +1,0 @@
-"""CUDA C++ kernels for compute capability 9.0 (H100, H200)."""

@@ -1,1 +1,0 @@
-"""Attention of vision and prefix by wgmma and TMA."""

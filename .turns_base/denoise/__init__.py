@@ -1,1 +1,0 @@
-"""The whole denoising loop in one kernel of resident clusters."""
