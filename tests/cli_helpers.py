@@ -1,5 +1,6 @@
 """Running the command line inside the test's process."""
 
+import gc
 import re
 import signal
 
@@ -12,7 +13,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background jo
 
 
 def turbopi(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"TURBOPI_DEBUG": None})
+    gc.freeze()  # in a process of its own a command's `gc.collect` wouldn't look through all that tests have imported
+    try:
+        return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"TURBOPI_DEBUG": None})
+    finally:
+        gc.unfreeze()
 
 
 def text_of(output: str) -> str:

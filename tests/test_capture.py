@@ -118,7 +118,7 @@ def test_captures_of_several_threads_take_turns(monkeypatch: pytest.MonkeyPatch)
     for thread in threads:
         thread.join(30)
     assert order[:3] == ["first"] * 3 and order.count("second") == 3 and order.count("cache") == 1
-    assert CAPTURING.acquire(timeout=10)
+    assert CAPTURING.acquire(timeout=120)
     CAPTURING.release()
 
 

@@ -95,7 +95,7 @@ CALLS: dict[str, Callable[[UnifiedPolicy, dict[str, Any]], Any]] = {
     "infer": lambda policy, obs: policy.infer(obs),
     "infer_batch": lambda policy, obs: policy.infer_batch([obs, obs]),
     "warmup": lambda policy, obs: policy.warmup(),
-    "submit": lambda policy, obs: policy.submit(obs).result(timeout=10),
+    "submit": lambda policy, obs: policy.submit(obs).result(timeout=120),
 }
 
 

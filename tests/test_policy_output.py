@@ -78,7 +78,7 @@ def whole() -> UnifiedPolicy:
 CALLS: dict[str, Callable[[UnifiedPolicy, dict[str, Any]], dict[str, Any]]] = {
     "sample": lambda policy, obs: policy.infer(obs, seed=0),
     "begin": lambda policy, obs: policy.infer(obs, seed=0),
-    "submit": lambda policy, obs: policy.submit(obs, seed=0).result(timeout=10),
+    "submit": lambda policy, obs: policy.submit(obs, seed=0).result(timeout=120),
 }
 
 

@@ -82,7 +82,7 @@ def test_what_is_no_file_is_refused_and_never_waited_for(tmp_path: Path) -> None
         ("absent.json", "No such file"),
         (".", "it is a folder"),
         ("pipe.json", "it is no regular file"),
-        ("nul\0.json", "null byte"),
+        ("nul\0.json", "embedded null"),
         ("x" * 5000, "File name too long"),
     ):
         message = _refused(lambda name=name: read_json(tmp_path / name, hint="; is the download complete?"))

@@ -44,7 +44,7 @@ async def upgrade(server: PolicyServer, host: str, *headers: str) -> int:
     key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
     usual = ("Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13", key)
     writer.write("\r\n".join(["GET / HTTP/1.1", f"Host: {host}", *usual, *headers, "", ""]).encode())
-    line = await asyncio.wait_for(reader.readline(), 10)
+    line = await asyncio.wait_for(reader.readline(), 120)
     writer.close()
     return int(line.split()[1])
 
@@ -110,7 +110,7 @@ def test_metrics_are_for_known_hosts_and_health_is_for_all() -> None:
     async def status(server: PolicyServer, path: str, *headers: str) -> int:
         reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
         writer.write("\r\n".join([f"GET {path} HTTP/1.1", *headers, "", ""]).encode())
-        line = await asyncio.wait_for(reader.readline(), 10)
+        line = await asyncio.wait_for(reader.readline(), 120)
         writer.close()
         return int(line.split()[1])
 
@@ -287,7 +287,7 @@ def test_a_server_whose_device_is_lost_says_503_and_then_exits_with_4() -> None:
             url = next(word for word in line.split() if word.startswith("ws://"))
             asyncio.run(lose(url))
             with pytest.raises(urllib.error.HTTPError) as unhealthy:
-                urllib.request.urlopen(url.replace("ws://", "http://") + "/healthz", timeout=10)
+                urllib.request.urlopen(url.replace("ws://", "http://") + "/healthz", timeout=120)
             assert unhealthy.value.code == 503
             unhealthy.value.close()
             process.terminate()  # which ends the notice

@@ -41,7 +41,7 @@ def seen(request: pytest.FixtureRequest) -> dict[str, Any]:
             [PYTHON, Path(__file__).parent / "openpi_client" / "drive.py", str(server.port), API_KEY],
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=300,
         )
     assert client.returncode == 0, client.stderr
     return {**json.loads(client.stdout), "received": policy.observations["pick up the block"]}

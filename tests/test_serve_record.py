@@ -154,7 +154,7 @@ def test_a_slow_disk_drops_calls_with_a_counted_warning(
     recorder = Recorder(tmp_path, {}, count=counted.append, **limits)
     for n, size in enumerate(sizes):
         recorder.put({"n": n}, RESULT, size=size)
-        assert disk.writing.wait(5)  # the first call is out of the queue before the second comes
+        assert disk.writing.wait(120)  # the first call is out of the queue before the second comes
     assert recorder.dropped == 3
     assert "2 calls weren't recorded: the disk can't keep up" in caplog.text
     disk.may_write.set()

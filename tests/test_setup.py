@@ -30,6 +30,8 @@ case "$*" in
 esac
 """
 
+ANY = "torch --no-deps"  # a PyTorch for tests about something else: with an option, so that no index is asked
+
 
 class Machine:
     """A new user's machine: a clone, an interpreter, and perhaps a GPU and a way to PyTorch's index."""
@@ -121,7 +123,7 @@ def test_an_index_out_of_reach_is_done_without_and_said(
 @no_driver
 def test_an_index_that_fails_later_says_what_else_there_is(machine: Machine, index: str) -> None:
     said = machine.setup(ok=False, TORCH_CPU_INDEX=index, PIP_FAILS="yes")
-    assert f"torch==2.13.0 can't be had from {index}" in said and "TORCH=torch==2.13.0" in said
+    assert f"torch==2.13.0 can't be had from {index}" in said and "TORCH='torch==2.13.0 --index-url" in said
     assert not (machine.clone / ".venv" / ".turbopi-run").exists()
 
 
@@ -143,38 +145,44 @@ def test_with_a_gpu_the_tested_versions_are_taken(machine: Machine, nowhere: str
     assert "3 GB" in said and (how in said or HAS_DRIVER)
 
 
-def test_a_pytorch_that_is_asked_for_is_taken(machine: Machine, nowhere: str) -> None:
+@no_driver
+def test_another_pytorch_is_the_cpu_build_too(machine: Machine, index: str) -> None:
+    machine.setup(TORCH="torch==2.8.0", TORCH_CPU_INDEX=index)
+    assert machine.installed()[0] == f"--index-url {index} torch==2.8.0"
+
+
+@pytest.mark.parametrize("torch", ["torch==2.8.0", "torch==2.8.0 --index-url https://example.org/cu128"])
+def test_on_a_gpu_a_pytorch_that_is_asked_for_is_taken(machine: Machine, nowhere: str, torch: str) -> None:
     machine.program("nvidia-smi", "#!/bin/sh\necho 'GPU 0: NVIDIA H200 (UUID: GPU-0)'\n")
-    said = machine.setup(TORCH="torch==2.8.0 --index-url https://example.org/cu128", TORCH_CPU_INDEX=nowhere)
-    assert machine.installed()[0] == "torch==2.8.0 --index-url https://example.org/cu128"
-    assert "torch==2.8.0" in said and "GPU" not in said
+    said = machine.setup(TORCH=torch, TORCH_CPU_INDEX=nowhere)
+    assert machine.installed()[0] == torch and torch in said
 
 
 def test_a_second_run_installs_nothing(machine: Machine) -> None:
-    machine.setup(TORCH="torch")
+    machine.setup(TORCH=ANY)
     before = machine.installed()
-    assert machine.setup(TORCH="torch") == "" and machine.installed() == before
+    assert machine.setup(TORCH=ANY) == "" and machine.installed() == before
 
 
 def test_a_terminal_sees_pips_progress(machine: Machine) -> None:
     master, slave = os.openpty()
     try:
-        machine.setup(TORCH="torch", to=slave)
+        machine.setup(TORCH=ANY, to=slave)
     finally:
         os.close(slave)
         os.close(master)
-    assert machine.log.read_text().splitlines()[0] == "install --disable-pip-version-check torch"
+    assert machine.log.read_text().splitlines()[0] == f"install --disable-pip-version-check {ANY}"
 
 
 def test_another_folder_and_interpreter(machine: Machine) -> None:
     (machine.bin / "python3").rename(machine.bin / "python3.99")
-    machine.setup(TORCH="torch", PYTHON="python3.99", VENV=".venv-3.99")
+    machine.setup(TORCH=ANY, PYTHON="python3.99", VENV=".venv-3.99")
     assert (machine.clone / ".venv-3.99" / "bin" / "python").exists()
     assert not (machine.clone / ".venv").exists()
 
 
 def test_the_tests_take_the_extras_versions_of_what_cpu_builds_lack(machine: Machine) -> None:
-    machine.setup("dev", TORCH="torch")
+    machine.setup("dev", TORCH=ANY)
     pinned = pins()
     triton, nvrtc = machine.installed()[-2:]
     assert triton.split()[0] == f"triton=={pinned['triton']}"

@@ -18,7 +18,7 @@ def commands() -> list[str]:
     return re.findall(r"^```bash\n(.*?)^```$", TUTORIAL.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.timeout(1200)
+@pytest.mark.timeout(3600)  # some ten commands
 def test_the_tutorial_runs_from_its_first_line_to_its_last(tmp_path: Path) -> None:
     if not CLIENT.is_file():
         pytest.skip(f"openpi-client isn't installed at {CLIENT}")

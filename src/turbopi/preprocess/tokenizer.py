@@ -204,7 +204,8 @@ def _open(path: Path, vocab_size: int) -> PromptTokenizer:
     try:
         content = read_bytes(path, TokenizerError, limit=_MAX_BYTES)
         processor = sentencepiece.SentencePieceProcessor(model_proto=content)
-        pieces, bos = processor.vocab_size(), processor.bos_id()
+        pieces = processor.vocab_size()
+        bos = processor.bos_id() if pieces else -1  # sentencepiece 0.2.0 dies of asking an empty model
     except (RuntimeError, UnicodeDecodeError) as error:  # the second: a message that quotes a damaged piece
         raise TokenizerError(f"{path} isn't a readable SentencePiece model: {shown(str(error))}") from error
     if pieces == 0:  # an empty file parses as an empty model
