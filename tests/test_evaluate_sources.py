@@ -184,7 +184,8 @@ def test_what_a_server_tells_of_itself_fits_into_the_results(tmp_path: Path) -> 
         {"reset_pose": np.array([0.5, 1.0]), "robot": None, "precision": np.float32(2), "config": "\x1b[2J[/red]"}
     )
     with foreign(pose) as source:
-        assert source.about["metadata"] | {"config": 0} == {
+        told: Any = source.about["metadata"]
+        assert told | {"config": 0} == {
             "reset_pose": [0.5, 1.0],
             "robot": None,
             "precision": 2.0,

@@ -18,6 +18,7 @@ from turbopi.provenance import Provenance
 from turbopi.reading import as_document, plain_document, read_document
 from turbopi.studies.certificates import CondensedDimension, WorstPlace
 from turbopi.studies.fp8_and_fp4 import Research
+from turbopi.studies.tensorrt import BackendOff, CacheOff, Throughput
 from turbopi.verify.document import Determinism
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -197,3 +198,12 @@ def test_the_tables_of_checked_in_certificates_read_and_come_out_as_they_were() 
                     assert plain_document(as_document(row, kind, "FILE")) == row
                     read += 1
     assert read > 30
+
+
+def test_the_parts_of_the_checked_in_study_read_and_come_out_as_they_were() -> None:
+    """Two runs were put into one file by hand, and the precision study lost its cosines."""
+    content = json.loads((RESULTS / "h200_2026-11-21_tensorrt_study.json").read_text())
+    rows: list[tuple[type[Struct], dict[str, object]]] = [(Throughput, content["throughput"])]
+    rows += [(CacheOff, row) for row in content["mask"]] + [(BackendOff, row) for row in content["actions"]]
+    for kind, row in rows:
+        assert json.dumps(plain_document(as_document(row, kind, "FILE"))) == json.dumps(row)

@@ -16,7 +16,8 @@ from tensorrt_fakes import Twin
 from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
 from turbopi.observation import Observation
-from turbopi.studies.tensorrt import actions_study, attention_study, mask_study, throughput_study
+from turbopi.reading import plain_document, read_document
+from turbopi.studies.tensorrt import StudyDocument, actions_study, attention_study, mask_study, throughput_study
 
 
 def one() -> tuple[Observation, torch.Tensor]:
@@ -25,24 +26,29 @@ def one() -> tuple[Observation, torch.Tensor]:
     return Observation(*(getattr(o, name)[:1] for name in o.__dataclass_fields__)), case.noise[:1]
 
 
+def finite(value: float | None) -> float:
+    assert value is not None
+    return value
+
+
 def test_each_style_shows_its_own_rounding() -> None:
     results = attention_study(golden_model("pi05"), *one(), 3, Twin)
-    errors = {(r["attention"], r["precision"]): r for r in results}
+    errors = {(r.attention, r.precision): r for r in results}
     assert len(errors) == 6
     for attention in ("fused", "written out"):
-        f16, bf16, f32 = (errors[attention, dtype]["layers"][-1]["k_relative"] for dtype in ("f16", "bf16", "f32"))
+        f16, bf16, f32 = (finite(errors[attention, dtype].layers[-1].k_relative) for dtype in ("f16", "bf16", "f32"))
         assert f32 < 5e-6 < f16 < bf16 < 5e-2
-        assert errors[attention, "f32"]["actions"]["relative"] < 1e-5
-        assert len(errors[attention, "f32"]["layers"]) == golden_model("pi05").config.vlm.depth
+        assert finite(errors[attention, "f32"].actions.relative) < 1e-5
+        assert len(errors[attention, "f32"].layers) == golden_model("pi05").config.vlm.depth
 
 
 def test_a_mask_that_is_missing_shows_and_one_that_is_there_doesnt() -> None:
-    results = {(r["cache"], r["steps"]): r for r in mask_study(golden_model("pi05"), *one(), (1, 10))}
+    results = {(r.cache, r.steps): r for r in mask_study(golden_model("pi05"), *one(), (1, 10))}
     for steps in (1, 10):
-        assert results["compacted", steps]["relative"] == 0
-        assert results["padded, masked", steps]["relative"] < 1e-5
-        assert results["padded, not masked", steps]["relative"] > 1e-2
-    assert results["padded, masked", 1]["slots"] > results["compacted", 1]["slots"]
+        assert results["compacted", steps].relative == 0
+        assert finite(results["padded, masked", steps].relative) < 1e-5
+        assert finite(results["padded, not masked", steps].relative) > 1e-2
+    assert results["padded, masked", 1].slots > results["compacted", 1].slots
 
 
 def test_the_actions_study_finds_the_error_that_was_put_in() -> None:
@@ -51,7 +57,7 @@ def test_the_actions_study_finds_the_error_that_was_put_in() -> None:
     observations = {"some": [exact.example_observation(seed) for seed in range(2)]}
     (same,) = actions_study(exact, exact, observations, 2)
     approx = pytest.approx
-    assert same == {
+    assert plain_document(same) == {
         "backend": "pytorch",
         "observations": "some",
         "count": 2,
@@ -59,7 +65,7 @@ def test_the_actions_study_finds_the_error_that_was_put_in() -> None:
         "worst_relative": 0,
     }
     (found,) = actions_study(exact, judged, observations, 2)
-    assert 1e-4 < found["worst_relative"] < 0.05 and 0.999 < found["worst_cosine"] < 1
+    assert 1e-4 < finite(found.worst_relative) < 0.05 and 0.999 < finite(found.worst_cosine) < 1
 
 
 class InFlight:
@@ -81,9 +87,9 @@ class InFlight:
 def test_throughput_compares_every_answer_bit_for_bit(wrong: float, equal: bool) -> None:
     pair: Any = InFlight("tensorrt"), InFlight("tensorrt_pipelined", wrong)
     result = throughput_study(pair[0], pair[1], [1.0, 2.0, 3.0], 7)
-    assert result["actions_equal_bit_for_bit"] is equal
-    assert result["one at a time"].keys() == {"tensorrt", "tensorrt_pipelined"}
-    assert result["in flight"]["total_ms"] == 2.0 and result["in flight"]["per_second"] > 0
+    assert result.actions_equal_bit_for_bit is equal
+    assert result.one_at_a_time.keys() == {"tensorrt", "tensorrt_pipelined"}
+    assert result.in_flight["total_ms"] == 2.0 and result.in_flight["per_second"] > 0
 
 
 def test_the_command_writes_what_it_measured(tmp_path: Path) -> None:
@@ -91,7 +97,7 @@ def test_the_command_writes_what_it_measured(tmp_path: Path) -> None:
     result = turbopi("study", "mask", "--random-weights", "pi05_tiny", "--device", "cpu", "--out", out, "--json")
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
-    assert json.loads(out.read_text()) == document
+    assert json.loads(out.read_text()) == document == plain_document(read_document(out, StudyDocument))
     assert [r["steps"] for r in document["mask"]] == [1, 10] * 3 and document["random_weights"]
 
 

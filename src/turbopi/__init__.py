@@ -6,7 +6,7 @@ The names in `__all__` are the public interface, with those that docs/api.md lis
 import importlib
 import os
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from turbopi import errors
@@ -65,7 +65,7 @@ if "torch" not in sys.modules:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     # imported when asked for: `turbopi --help` and the server's wire format need no torch
     if name == "__version__":
         return importlib.import_module("turbopi.version").turbopi_version()

@@ -74,7 +74,7 @@ class OracleCheck:
     def ok(self) -> bool:
         return all(difference.rms <= self.bound for difference in self.differences)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, object]:
         return {
             "ok": self.ok,
             "rms": [difference.rms for difference in self.differences],
@@ -87,7 +87,7 @@ class OracleCheck:
 
 
 def run_frames(
-    policy: UnifiedPolicy, observed: Sequence[Mapping[str, Any]], seed: int, tick: Tick
+    policy: UnifiedPolicy, observed: Sequence[Mapping[str, object]], seed: int, tick: Tick
 ) -> list[dict[str, Any]]:
     """One inference for each observation, with the noise of `seed`, `seed + 1`, …"""
     results = []
@@ -100,7 +100,7 @@ def run_frames(
 def check(
     actions: Sequence[np.ndarray],
     oracle: UnifiedPolicy,
-    observed: Sequence[Mapping[str, Any]],
+    observed: Sequence[Mapping[str, object]],
     *,
     precision: Precision,
     seed: int,
@@ -133,7 +133,7 @@ def num_oracle_runs(num_frames: int) -> int:
     return num_frames * (1 + len(CONTROL_SEEDS))
 
 
-def action_units(policy: UnifiedPolicy, observation: Mapping[str, Any]) -> np.ndarray:
+def action_units(policy: UnifiedPolicy, observation: Mapping[str, object]) -> np.ndarray:
     """float64[d]: how far each of the robot's numbers moves with one unit of the model's normalised actions.
 
     Known from the statistics alone, so that an error means the same however many frames are shown.

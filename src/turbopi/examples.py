@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -49,7 +48,7 @@ class NoisyExample:
         return Observation.stack([self.example.inputs])
 
 
-def prepared(policy: UnifiedPolicy, named: Iterable[tuple[str, Mapping[str, Any]]]) -> Iterator[Example]:
+def prepared(policy: UnifiedPolicy, named: Iterable[tuple[str, Mapping[str, object]]]) -> Iterator[Example]:
     """(name, observation) as the model gets them. Raises ObservationError naming the one that can't be used."""
     for name, observation in named:
         try:

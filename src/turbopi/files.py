@@ -24,7 +24,7 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from turbopi.errors import OutputError, TurboPiError
 
@@ -199,7 +199,7 @@ def _errors_named(file: Path, error: Error) -> Iterator[None]:
         raise error(f"can't write {file}: {_what(reason, file)}") from reason
 
 
-def _is_about(name: Any, file: Path) -> bool:
+def _is_about(name: object, file: Path) -> bool:
     """Whether the file that an OSError tells is this one, or its folder, or the temporary one."""
     target = os.path.realpath(file)
     path = os.path.realpath(os.fsdecode(name)) if isinstance(name, str | bytes) else ""

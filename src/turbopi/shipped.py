@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -61,7 +60,7 @@ def with_libero_stats(checkpoint: Checkpoint) -> Checkpoint:
     return replace(checkpoint, norm_stats=load_norm_stats(FRAMES / "norm_stats.json"))
 
 
-def observations(policy: UnifiedPolicy, frames: Sequence[Frame]) -> list[dict[str, Any]]:
+def observations(policy: UnifiedPolicy, frames: Sequence[Frame]) -> list[dict[str, object]]:
     """The frames in the keys of the policy's robot.
 
     For another robot than LIBERO's they are its example observations, with these pictures in place of its cameras'.
@@ -79,11 +78,11 @@ def observations(policy: UnifiedPolicy, frames: Sequence[Frame]) -> list[dict[st
     return [_with_pictures(policy.example_observation(seed), frame) for seed, frame in enumerate(frames)]
 
 
-def _with_pictures(observation: Mapping[str, Any], frame: Frame) -> dict[str, Any]:
+def _with_pictures(observation: Mapping[str, object], frame: Frame) -> dict[str, object]:
     """`observation` with each of its pictures replaced: the first by the base camera's, the others by the wrist's."""
     pictures = iter([frame.base])
 
-    def replaced(key: str, value: Any) -> Any:
+    def replaced(key: str, value: object) -> object:
         if isinstance(value, Mapping):
             return {inner: replaced(inner, item) for inner, item in value.items()}
         if isinstance(value, np.ndarray) and value.ndim == 3:

@@ -48,7 +48,7 @@ class WireError(ObservationError):
 # --- encoding ---------------------------------------------------------------------------------------------------------
 
 
-def pack(value: Any) -> bytes:
+def pack(value: object) -> bytes:
     """Encode `value`: dicts, lists, strings, bytes, numbers, None, numpy arrays and scalars.
 
     Raises WireError for anything else, and for void, object and complex dtypes.
@@ -63,7 +63,7 @@ def pack(value: Any) -> bytes:
     return packed
 
 
-def _pack_numpy(value: Any) -> dict[bytes, Any]:
+def _pack_numpy(value: object) -> dict[bytes, object]:
     if isinstance(value, int):  # msgpack asks about what it can't hold
         raise WireError(f"can't send the integer {_shown(value)}: the format's integers have 64 bits")
     if not isinstance(value, np.ndarray | np.generic):
@@ -197,10 +197,10 @@ def _incomplete(start: int, needed: int, there: int) -> str:
     return f"not a msgpack message: the value at byte {start} needs {needed} more bytes, of which {there} are there"
 
 
-def _unique_keys(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+def _unique_keys(pairs: list[tuple[object, object]]) -> dict[object, object]:
     value = dict(pairs)
     if len(value) != len(pairs):
-        seen: set[Any] = set()
+        seen: set[object] = set()
         repeated = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
         raise WireError(f"a map holds the key {_shown(repeated)} more than once")
     return value
@@ -224,7 +224,7 @@ def _restore(value: Any, path: tuple[Any, ...]) -> Any:
     return value
 
 
-def _array(fields: dict[Any, Any], path: tuple[Any, ...]) -> np.ndarray:
+def _array(fields: dict[object, object], path: tuple[object, ...]) -> np.ndarray:
     _check_fields(fields, (b"__ndarray__", b"data", b"dtype", b"shape"), path)
     dtype = _dtype(fields[b"dtype"], path)
     data, shape = fields[b"data"], fields[b"shape"]
@@ -262,7 +262,7 @@ def _scalar(fields: dict[Any, Any], path: tuple[Any, ...]) -> Any:
     return value
 
 
-def _check_fields(fields: dict[Any, Any], expected: tuple[bytes, ...], path: tuple[Any, ...]) -> None:
+def _check_fields(fields: dict[object, object], expected: tuple[bytes, ...], path: tuple[object, ...]) -> None:
     if set(fields) != set(expected):
         keys = _shown(list(fields))
         raise WireError(f"{_at(path)}: a map with {expected[0]!r} must have the keys {expected}, not {keys}")
@@ -288,7 +288,7 @@ def _dtype(text: Any, path: tuple[Any, ...]) -> np.dtype[Any]:
     return dtype
 
 
-def _at(path: tuple[Any, ...]) -> str:
+def _at(path: tuple[object, ...]) -> str:
     return "/".join(_shown(key) for key in path) if path else "the message"
 
 

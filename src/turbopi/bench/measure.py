@@ -36,7 +36,7 @@ def bench_policy(
     device: torch.device,
     job: Job,
     *,
-    tokenizer: Any = None,
+    tokenizer: object = None,
     quantization: str | None = None,
     robot: str | Robot | None = None,
 ) -> UnifiedPolicy:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch.profiler import ProfilerActivity, profile, record_function
@@ -62,7 +61,7 @@ def stage_kernels(policy: UnifiedPolicy, job: Job, *, calls: int = 3, count: int
     return {stage: top(ran, calls, count) for stage, ran in kernels.items() if ran}
 
 
-def _one_call(policy: UnifiedPolicy, observation: dict[str, Any], job: Job) -> tuple[list[Ran], list[float]]:
+def _one_call(policy: UnifiedPolicy, observation: dict[str, object], job: Job) -> tuple[list[Ran], list[float]]:
     """What ran, and the times on the profiler's clock [us] at which each stage began and the last one ended."""
     on_gpu = policy.backend.device.type == "cuda"
     activities = [ProfilerActivity.CUDA] if on_gpu else [ProfilerActivity.CPU]

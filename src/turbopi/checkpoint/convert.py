@@ -18,7 +18,6 @@ import struct
 from dataclasses import asdict, dataclass, fields
 from math import prod
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -137,7 +136,8 @@ def _write_weights(checkpoint: Checkpoint, file: Path, precision: FloatPrecision
 
 def _header(shapes: dict[str, Shape], stored: str, itemsize: int) -> tuple[bytes, dict[str, _Slot], int]:
     """The bytes before the data, each tensor's slot, and the length of the data."""
-    entries: dict[str, Any] = {"__metadata__": {TIED_EMBEDDING: TIED_HEAD}}  # openpi's files record the tie like this
+    # openpi's files record the tie like this
+    entries: dict[str, object] = {"__metadata__": {TIED_EMBEDDING: TIED_HEAD}}
     spans, end = {}, 0
     for name in sorted(shapes):
         start, end = end, end + prod(shapes[name]) * itemsize
@@ -153,7 +153,7 @@ def _header(shapes: dict[str, Shape], stored: str, itemsize: int) -> tuple[bytes
 # -- what goes beside them ---------------------------------------------------------------------------------------------
 
 
-def _openpi_config(model: ModelConfig, precision: FloatPrecision) -> dict[str, Any]:
+def _openpi_config(model: ModelConfig, precision: FloatPrecision) -> dict[str, object]:
     return {
         "action_dim": model.action_dim,
         "action_horizon": model.action_horizon,
@@ -167,7 +167,7 @@ def _variant(sizes: GemmaConfig) -> str:
     return next((name for name, known in _VARIANTS.items() if known == sizes), "custom")
 
 
-def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, Any], Path | None]:
+def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], Path | None]:
     """The turbopi.json that brings `config` back, and the robot's own file if it has one.
 
     Raises ConfigError if some value of a hand-made PolicyConfig has no place in it.
@@ -227,7 +227,7 @@ def _is_preset(config: PolicyConfig) -> bool:
     return config.name in PRESETS and PRESETS[config.name].model.kind == config.model.kind
 
 
-def _write_json(file: Path, content: dict[str, Any]) -> None:
+def _write_json(file: Path, content: dict[str, object]) -> None:
     file.write_text(json.dumps(content, indent=2) + "\n")
 
 

@@ -9,7 +9,7 @@ the processors' steps may be in lerobot_pipeline.py.
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
@@ -238,7 +238,7 @@ class LeRobotFolder:
 
     # -- the robot -----------------------------------------------------------------------------------------------------
 
-    def _robot_options(self) -> dict[str, Any]:
+    def _robot_options(self) -> dict[str, object]:
         """Cameras in the model's order and names, what observations call them, and the widths of state and actions."""
         inputs = self._features("input_features")
         for key, feature in inputs.items():
@@ -259,7 +259,7 @@ class LeRobotFolder:
                 f"{self.folder / POSTPROCESSOR} adds the state to {self.action_dim} relative actions, but the state "
                 f"has {self.state_dim} values; LeRobot can't run it either"
             )
-        options: dict[str, Any] = {
+        options: dict[str, object] = {
             "image_keys": cameras,
             "num_missing_cameras": len(empty),
             "state_dim": self.state_dim,
@@ -277,7 +277,7 @@ class LeRobotFolder:
                 "run it either"
             )
 
-    def _features(self, key: str) -> dict[str, dict[str, Any]]:
+    def _features(self, key: str) -> dict[str, dict[str, object]]:
         found = self.config.values.get(key) or {}
         if not isinstance(found, dict) or not all(isinstance(feature, dict) for feature in found.values()):
             self.config.refuse(key, "features with type and shape")
@@ -300,9 +300,9 @@ def is_lerobot(folder: Path) -> bool:
     return (folder / CONFIG).is_file() and "type" in _read_config(folder)
 
 
-def _bare(value: Any) -> str:
+def _bare(value: object) -> str:
     return shown(value).strip("'")
 
 
-def _read_config(folder: Path) -> Mapping[str, Any]:
+def _read_config(folder: Path) -> Mapping[str, object]:
     return read_json(folder / CONFIG, hint="; is the download complete?")

@@ -32,7 +32,6 @@ Sources: LeRobot 0.4.0 to 0.6.1, `processor/`, `policies/pi0/processor_pi0.py` a
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from turbopi.config import LIMITS, Kind
 from turbopi.errors import CheckpointError
@@ -203,7 +202,7 @@ def _known(file: Path, kind: Kind) -> dict[str, tuple[str, ...]]:
     return {name: keys for name, keys in _STEPS[file.name].items() if name != STATE_STEP or kind == "pi05"}
 
 
-def _step(entry: dict[str, Any], file: Path, kind: Kind) -> Step:
+def _step(entry: dict[str, object], file: Path, kind: Kind) -> Step:
     known = _known(file, kind)
     given = entry.get("registry_name", entry.get("class"))
     name = _OTHER_NAMES.get(given, given) if isinstance(given, str) else None
@@ -224,5 +223,5 @@ def _step(entry: dict[str, Any], file: Path, kind: Kind) -> Step:
     return Step(name, config, file, state_file)
 
 
-def _list_or_null(step: Step, key: str) -> list[Any]:
+def _list_or_null(step: Step, key: str) -> list[object]:
     return [] if step.config.values.get(key) is None else step.config.list(key)

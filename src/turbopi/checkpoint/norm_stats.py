@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -106,7 +105,7 @@ class NormStats:
                 )
 
 
-def feature_stats(values: Mapping[str, Any], where: str) -> FeatureStats:
+def feature_stats(values: Mapping[str, object], where: str) -> FeatureStats:
     """FeatureStats from lists or arrays by name; absent or null ones stay None.
 
     Raises CheckpointError for anything but numbers (text and booleans aren't), and for what `FeatureStats.check` does.

@@ -177,7 +177,7 @@ def _read_file(file: Path) -> Settings:
     return Settings(str(file), values=parsed)
 
 
-def parse_values(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+def parse_values(values: Mapping[str, object], where: str) -> dict[str, Any]:
     """Check a settings object and bring it into PolicyConfig's types. ConfigError names the key and what it may be."""
     unknown = [key for key in values if key not in _SCHEMA]
     if unknown:
@@ -197,56 +197,58 @@ def _require(condition: bool) -> None:
         raise ValueError
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     _require(isinstance(value, str) and bool(value.strip()))
     return str(value)
 
 
-def _text_or_null(value: Any) -> str | None:
+def _text_or_null(value: object) -> str | None:
     return None if value is None else _text(value)
 
 
-def _name(value: Any) -> str:
+def _name(value: object) -> str:
     _require(isinstance(value, str) and value.isprintable() and len(value) < 1000)
     return _text(value)
 
 
-def _name_or_null(value: Any) -> str | None:
+def _name_or_null(value: object) -> str | None:
     return None if value is None else _name(value)
 
 
-def _flag(value: Any) -> bool:
+def _flag(value: object) -> bool:
     _require(isinstance(value, bool))
     return bool(value)
 
 
-def _count(limit: int) -> tuple[str, Callable[[Any], int]]:
+def _count(limit: int) -> tuple[str, Callable[[object], int]]:
     """What is expected, and the parser of it."""
 
-    def parse(value: Any) -> int:
-        _require(is_integer(value) and 1 <= value <= limit)
-        return int(value)
+    def parse(value: object) -> int:
+        if not is_integer(value) or not 1 <= value <= limit:
+            raise ValueError
+        return value
 
     return f"a whole number from 1 to {limit}", parse
 
 
-def _count_or_null(limit: int) -> tuple[str, Callable[[Any], int | None]]:
+def _count_or_null(limit: int) -> tuple[str, Callable[[object], int | None]]:
     expected, parse = _count(limit)
     return f"{expected}, or null", lambda value: None if value is None else parse(value)
 
 
-def _sha256(value: Any) -> str:
+def _sha256(value: object) -> str:
     _require(isinstance(value, str) and re.fullmatch(r"[0-9a-f]{64}", value) is not None)
     return str(value)
 
 
-def _object(value: Any) -> dict[str, Any]:
-    _require(isinstance(value, dict))
+def _object(value: object) -> dict[str, object]:
+    if not isinstance(value, dict):
+        raise ValueError
     return dict(value)
 
 
-def _choice(*choices: str) -> Callable[[Any], str]:
-    def parse(value: Any) -> str:
+def _choice(*choices: str) -> Callable[[object], str]:
+    def parse(value: object) -> str:
         _require(isinstance(value, str) and value in choices)
         return str(value)
 
@@ -256,30 +258,32 @@ def _choice(*choices: str) -> Callable[[Any], str]:
 _MODES = get_args(NormMode)
 
 
-def _normalization(value: Any) -> Normalization:
+def _normalization(value: object) -> Normalization:
     mode = _choice(*_MODES)
     if isinstance(value, str):
         return Normalization(mode(value), mode(value))  # type: ignore[arg-type]
-    _require(isinstance(value, dict) and set(value) == {"state", "actions"})
+    if not isinstance(value, dict) or set(value) != {"state", "actions"}:
+        raise ValueError
     return Normalization(mode(value["state"]), mode(value["actions"]))  # type: ignore[arg-type]
 
 
 _ALPHAS = (1e-6, 1e6)  # in use are 8 to 128
 
 
-def _number(value: Any) -> float:
-    _require(is_finite(value) and _ALPHAS[0] <= value <= _ALPHAS[1])
+def _number(value: object) -> float:
+    if not is_finite(value) or not _ALPHAS[0] <= value <= _ALPHAS[1]:
+        raise ValueError
     return float(value)
 
 
-def _lora_alpha(value: Any) -> dict[str, float]:
+def _lora_alpha(value: object) -> dict[str, float]:
     if not isinstance(value, dict):
         return {"vlm": _number(value), "expert": _number(value)}
     _require(bool(value) and set(value) <= {"vlm", "expert"})
     return {key: _number(alpha) for key, alpha in value.items()}
 
 
-_SCHEMA: dict[str, tuple[str, Callable[[Any], Any]]] = {
+_SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "preset": (f"one of {', '.join(PRESETS)}", _choice(*PRESETS)),
     "name": ("a text on one line", _name),
     "robot": ("a robot's name or a path to its .json", _name),

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from msgspec.structs import replace
@@ -24,9 +24,11 @@ from turbopi.reading import plain_document, shown
 if TYPE_CHECKING:
     import torch
 
+    from turbopi.backends import Precision
     from turbopi.bench.document import BenchDocument, Profile, Ready, Result, StageKernels
     from turbopi.bench.run import BenchPlan, BenchProgress
     from turbopi.checkpoint import Checkpoint
+    from turbopi.robots import Robot
 
 RESULTS = "results.json"
 _ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps": "10"}
@@ -60,7 +62,7 @@ def _axis(option: str, given: str | None, table: bool) -> list[int]:
 
 
 def _robots_own(
-    axes: dict[str, str | None], table: bool, checkpoint: "Checkpoint", robot: Any, tokenizer: str | None
+    axes: dict[str, str | None], table: bool, checkpoint: "Checkpoint", robot: "str | Robot", tokenizer: str | None
 ) -> dict[str, str | None]:
     """The axes of a benchmark with a robot's own observations: these have its cameras and its prompt."""
     from turbopi.bench.measure import robots_job
@@ -83,7 +85,7 @@ def _names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
 
 
-def _backends(names: list[str], precisions: list[Any], device: "torch.device") -> list[str]:
+def _backends(names: list[str], precisions: "list[Precision]", device: "torch.device") -> list[str]:
     """The same with "auto" as what it stands for in each precision. Raises what `backends.check` raises for that."""
     from turbopi import backends
 
@@ -168,7 +170,7 @@ def bench(
         opened = options.open(checkpoint)
         options.tell_if_random(opened, output)
         resolved = registry.resolve_device(device)
-        tiers = _names(precisions)
+        tiers: list[Precision] = _names(precisions)  # type: ignore[assignment]  # checked when a backend is created
         names = _backends(_names(backends), tiers, resolved)
         robot = options.make_robot()
         axes = {"--cameras": cameras, "--prompt-tokens": prompt_tokens, "--horizons": horizons, "--steps": steps}
@@ -176,7 +178,7 @@ def bench(
             axes = _robots_own(axes, table, opened, robot, tokenizer)
         plan = BenchPlan(
             names,
-            tiers,  # type: ignore[arg-type]  # checked when a backend is created
+            tiers,
             cameras=_axis("--cameras", axes["--cameras"], table),
             prompt_tokens=_axis("--prompt-tokens", axes["--prompt-tokens"], table),
             horizons=_axis("--horizons", axes["--horizons"], table),

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -163,7 +163,7 @@ def calibration_observations(policy: "UnifiedPolicy", path: Path | None) -> "tup
     return [Observation.stack([policy.prepare(one)]) for one in given], source
 
 
-def given_observations(policy: "UnifiedPolicy", path: Path | None) -> tuple[list[dict[str, Any]], str]:
+def given_observations(policy: "UnifiedPolicy", path: Path | None) -> tuple[list[dict[str, object]], str]:
     """Observations under the robot's keys, and where they are from; None: the pictures that come with Turbo-Pi."""
     if path is None:
         from turbopi.shipped import load_frames, observations

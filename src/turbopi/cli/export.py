@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -15,7 +15,7 @@ PRECISIONS = ("f32", "fp8")
 
 
 class _ExportCommand(CheckpointThen):
-    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+    def collect_usage_pieces(self, ctx: object) -> list[str]:
         return ["[OPTIONS]", "|".join(FORMATS), "[CHECKPOINT]", "FOLDER"]
 
 

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import rich
 import typer
@@ -123,7 +123,7 @@ class CheckpointThen(TyperCommand):
 
     other = "PATH"
 
-    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+    def collect_usage_pieces(self, ctx: object) -> list[str]:
         return ["[OPTIONS]", "[CHECKPOINT]", self.other]
 
 
@@ -140,7 +140,7 @@ def command(
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(function)
-        def run(*, debug: bool, **values: Any) -> None:
+        def run(*, debug: bool, **values: object) -> None:
             given = dict(values)
             if shared is not None:
                 values["options"] = shared(**{field.name: values.pop(field.name) for field in shared_fields})
@@ -167,7 +167,7 @@ def command(
     return decorate
 
 
-def _refuse_nan(values: Mapping[str, Any]) -> None:
+def _refuse_nan(values: Mapping[str, object]) -> None:
     """NaN passes every min and max, as it compares with nothing."""
     for name, value in values.items():
         if isinstance(value, float) and math.isnan(value):

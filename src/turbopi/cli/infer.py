@@ -122,7 +122,7 @@ def infer(
 class _Answer:
     """One call. The observation is kept only while a plot may show it."""
 
-    observation: dict[str, Any] | None
+    observation: dict[str, object] | None
     noise: "np.ndarray"
     actions: "np.ndarray"
     timing: dict[str, float]

@@ -117,7 +117,7 @@ def _leave_at_once(*_: object) -> None:
     os._exit(INTERRUPTED)
 
 
-def _flush(code: Any) -> Any:
+def _flush(code: object) -> object:
     """Write what is left in stdout; the exit code, which says so if that fails."""
     try:
         if sys.stdout is not None:

@@ -134,8 +134,8 @@ class _Cold:
     def pipelined(self) -> bool:
         return self._policy.pipelined
 
-    def infer(self, obs: dict[str, Any], /) -> dict[str, Any]:
+    def infer(self, obs: dict[str, object], /) -> dict[str, object]:
         return self._policy.infer(obs)
 
-    def submit(self, obs: dict[str, Any], /) -> "Future[dict[str, Any]]":
+    def submit(self, obs: dict[str, object], /) -> "Future[dict[str, object]]":
         return self._policy.submit(obs)

@@ -2,9 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from msgspec.structs import replace
 from rich.table import Table
 
 from turbopi.cli.framework import JsonFlag, Output, command
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from turbopi.checkpoint import Checkpoint
     from turbopi.policy import UnifiedPolicy
+    from turbopi.studies.tensorrt import BackendOff, CacheOff, StudyDocument, StyleOff, Throughput
 
 MASK_STEPS = (1, 10)
 STUDIES = ("precision", "mask", "actions", "throughput")
@@ -85,36 +87,39 @@ def study(
     from turbopi.cli.build import given_observations
     from turbopi.policy import UnifiedPolicy
     from turbopi.provenance import provenance
+    from turbopi.studies.tensorrt import StudyDocument
 
     policy = UnifiedPolicy(opened, backend="pytorch", precision="f32", device=resolved, progress=output.shows_progress)
     given, source = given_observations(policy, observation)
-    document: dict[str, Any] = {
-        "provenance": plain_document(provenance(resolved)),
-        "model": policy.config.name,
-        "random_weights": opened.format == "random",
-        "observations": source,
-        "seed": seed,
-        "steps": steps,
-    }
+    document = StudyDocument(
+        provenance=provenance(resolved),
+        model=policy.config.name,
+        random_weights=opened.format == "random",
+        observations=source,
+        seed=seed,
+        steps=steps,
+    )
     if "precision" in chosen or "mask" in chosen:
-        _errors(policy, given[0], chosen, document, output)
+        document = _errors(policy, given[0], chosen, document, output)
     if "actions" in chosen:
-        document["actions"] = _actions(opened, policy, {source: given}, steps)
-        output.table(_actions_table(document["actions"]))
+        judged = _actions(opened, policy, {source: given}, steps)
+        document = replace(document, actions=judged)
+        output.table(_actions_table(judged))
     del policy
     if "throughput" in chosen:
-        document["throughput"] = _throughput(opened, given, resolved, steps, calls)
-        output.table(_throughput_table(document["throughput"]))
+        measured = _throughput(opened, given, resolved, steps, calls)
+        document = replace(document, throughput=measured)
+        output.table(_throughput_table(measured))
     if out is not None:
-        write_whole(out, json.dumps(document, indent=1) + "\n")
+        write_whole(out, json.dumps(plain_document(document), indent=1) + "\n")
         output.line(f"wrote {out}")
     output.document(document)
 
 
 def _errors(
-    policy: "UnifiedPolicy", given: dict[str, Any], chosen: list[str], document: dict[str, Any], output: Output
-) -> None:
-    """The precision and mask studies on one observation."""
+    policy: "UnifiedPolicy", given: dict[str, object], chosen: list[str], document: "StudyDocument", output: Output
+) -> "StudyDocument":
+    """The document with the precision and mask studies on one observation."""
     import numpy as np
     import torch
 
@@ -127,24 +132,26 @@ def _errors(
     config = policy.config.model
     one = Observation.stack([policy.prepare(given)]).to(model.device)
     shape = (1, config.action_horizon, config.action_dim)
-    drawn = np.random.default_rng(document["seed"]).standard_normal(shape, dtype=np.float32)
+    drawn = np.random.default_rng(document.seed).standard_normal(shape, dtype=np.float32)
     noise = torch.from_numpy(drawn).to(model.device)
     tokens = int(one.image_mask.sum()) * config.vision.num_tokens + int(one.token_mask.sum())
-    document["prefix_tokens"] = tokens
+    document = replace(document, prefix_tokens=tokens)
     if "precision" in chosen:
         found = library()
-        document["library"] = f"{found.name} {found.version}"
-        load = studies.builder(found)
-        document["precision"] = studies.attention_study(model, one, noise, document["steps"], load)
-        output.table(_precision_table(document["precision"], document["library"]))
+        named = f"{found.name} {found.version}"
+        styles = studies.attention_study(model, one, noise, document.steps, studies.builder(found))
+        document = replace(document, library=named, precision=styles)
+        output.table(_precision_table(styles, named))
     if "mask" in chosen:
-        document["mask"] = studies.mask_study(model, one, noise, MASK_STEPS)
-        output.table(_mask_table(document["mask"]))
+        caches = studies.mask_study(model, one, noise, MASK_STEPS)
+        document = replace(document, mask=caches)
+        output.table(_mask_table(caches))
+    return document
 
 
 def _actions(
-    checkpoint: "Checkpoint", exact: "UnifiedPolicy", observations: dict[str, list[Any]], steps: int
-) -> list[dict[str, Any]]:
+    checkpoint: "Checkpoint", exact: "UnifiedPolicy", observations: dict[str, list[dict[str, object]]], steps: int
+) -> "list[BackendOff]":
     from turbopi.policy import UnifiedPolicy
     from turbopi.studies import tensorrt as studies
 
@@ -157,21 +164,21 @@ def _actions(
     return results
 
 
-def _actions_table(results: list[dict[str, Any]]) -> Table:
+def _actions_table(results: "list[BackendOff]") -> Table:
     table = Table(title="actions against the float32 reference", title_justify="left")
     for column in ("backend", "observations"):
         table.add_column(column)
     for column in ("count", "worst cosine", "worst relative error"):
         table.add_column(column, justify="right")
     for one in results:
-        errors = (_cosine(one["worst_cosine"]), significant(one["worst_relative"]))
-        table.add_row(one["backend"], one["observations"], str(one["count"]), *errors)
+        errors = (_cosine(one.worst_cosine), significant(one.worst_relative))
+        table.add_row(one.backend, one.observations, str(one.count), *errors)
     return table
 
 
 def _throughput(
-    checkpoint: "Checkpoint", given: list[dict[str, Any]], device: "torch.device", steps: int, calls: int
-) -> dict[str, Any]:
+    checkpoint: "Checkpoint", given: list[dict[str, object]], device: "torch.device", steps: int, calls: int
+) -> "Throughput":
     from turbopi.policy import UnifiedPolicy
     from turbopi.studies import tensorrt as studies
 
@@ -182,15 +189,15 @@ def _throughput(
     return studies.throughput_study(policies[0], policies[1], given, calls)
 
 
-def _throughput_table(result: dict[str, Any]) -> Table:
+def _throughput_table(result: "Throughput") -> Table:
     table = Table(title="two observations in flight", title_justify="left")
     table.add_column("how")
     for column in ("latency, ms, median", "observations a second"):
         table.add_column(column, justify="right")
-    rows = {f"{name}, one at a time": one for name, one in result["one at a time"].items()}
-    for name, one in {**rows, "in flight": result["in flight"]}.items():
+    rows = {f"{name}, one at a time": one for name, one in result.one_at_a_time.items()}
+    for name, one in {**rows, "in flight": result.in_flight}.items():
         table.add_row(name, f"{one['total_ms']:.2f}", f"{one['per_second']:.1f}")
-    equal = "equal" if result["actions_equal_bit_for_bit"] else "NOT equal"
+    equal = "equal" if result.actions_equal_bit_for_bit else "NOT equal"
     table.caption = f"actions of all three: {equal}, bit for bit"
     return table
 
@@ -199,30 +206,30 @@ def _cosine(value: float | None) -> str:
     return "not finite" if value is None else f"{value:.6f}"
 
 
-def _precision_table(results: list[dict[str, Any]], library: str) -> Table:
+def _precision_table(results: "list[StyleOff]", library: str) -> Table:
     table = Table(title=f"{library} against the float32 reference", title_justify="left")
     for column in ("attention", "precision"):
         table.add_column(column)
     for column in ("K, layer 0", "K, last", "V, last", "V, last, max", "actions", "actions, max", "cosine"):
         table.add_column(column, justify="right")
     for one in results:
-        first, last, actions = one["layers"][0], one["layers"][-1], one["actions"]
+        first, last, actions = one.layers[0], one.layers[-1], one.actions
         table.add_row(
-            one["attention"],
-            one["precision"],
-            *map(significant, (first["k_relative"], last["k_relative"], last["v_relative"], last["v_max"])),
-            *map(significant, (actions["relative"], actions["max"])),
-            _cosine(actions["cosine"]),
+            one.attention,
+            one.precision,
+            *map(significant, (first.k_relative, last.k_relative, last.v_relative, last.v_max)),
+            *map(significant, (actions.relative, actions.max)),
+            _cosine(actions.cosine),
         )
     return table
 
 
-def _mask_table(results: list[dict[str, Any]]) -> Table:
+def _mask_table(results: "list[CacheOff]") -> Table:
     table = Table(title="the suffix's cache, against the compacted one, float32", title_justify="left")
     table.add_column("cache")
     for column in ("slots", "steps", "cosine of actions", "relative error"):
         table.add_column(column, justify="right")
     for one in results:
-        numbers = (_cosine(one["cosine"]), significant(one["relative"]))
-        table.add_row(one["cache"], str(one["slots"]), str(one["steps"]), *numbers)
+        numbers = (_cosine(one.cosine), significant(one.relative))
+        table.add_row(one.cache, str(one.slots), str(one.steps), *numbers)
     return table

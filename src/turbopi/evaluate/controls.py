@@ -49,7 +49,7 @@ class Controlled:
     def close(self) -> None:
         self._source.close()
 
-    def _wrong(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+    def _wrong(self, observation: Mapping[str, object]) -> dict[str, object]:
         prompt = observation["prompt"]
         if prompt not in self._order:  # the example that is asked before the run
             return dict(observation)

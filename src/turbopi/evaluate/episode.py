@@ -3,17 +3,17 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from turbopi.evaluate.frames import Frame
 from turbopi.evaluate.plan import Job
-from turbopi.sim import Environment
+from turbopi.sim import Environment, SimSettings
 
 # Asks the policy at a step: observation -> actions float64[H, d]. Raises NoActions if it has none that can be used
-Ask = Callable[[int, dict[str, Any]], np.ndarray]
+Ask = Callable[[int, dict[str, object]], np.ndarray]
 
 
 @dataclass
@@ -86,7 +86,7 @@ class Worker:
                    ("unavailable", text)   nothing can be simulated here at all
     """
 
-    def __init__(self, connection: Any, setup: "WorkerSetup") -> None:
+    def __init__(self, connection: Connection, setup: "WorkerSetup") -> None:
         from turbopi.sim import create
 
         self.connection, self.setup = connection, setup
@@ -140,7 +140,7 @@ class Worker:
             self.task = task
         return self.environment
 
-    def _ask(self, step: int, observation: dict[str, Any]) -> np.ndarray:
+    def _ask(self, step: int, observation: dict[str, object]) -> np.ndarray:
         self.connection.send(("observation", step, observation))
         answer = self.connection.recv()
         if answer[0] == "stop":
@@ -164,7 +164,7 @@ class WorkerSetup:
 
     simulator: str
     suite: str
-    sim: Any
+    sim: SimSettings
     replan: int
     max_steps: int | None
     smooth: bool

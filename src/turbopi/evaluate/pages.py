@@ -6,14 +6,13 @@ ever marked as safe, and attributes in templates are quoted.
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import jinja2
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def render(template: str, **values: Any) -> str:
+def render(template: str, **values: object) -> str:
     """The page of a template. A value that the template needs and isn't given is an error."""
     return _environment().get_template(template).render(**values) + "\n"
 

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from turbopi.evaluate.results import Results, rate
@@ -44,7 +44,7 @@ def _success(results: Results, path: Path) -> Path:
     return path
 
 
-def _rate_bar(axes: Any, place: int, one: Rate, color: str) -> None:
+def _rate_bar(axes: Axes, place: int, one: Rate, color: str) -> None:
     if one.value is None:
         axes.text(1, place, "no verdict", va="center", fontsize=8, color=MUTED)
         return

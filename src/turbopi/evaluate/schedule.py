@@ -30,7 +30,7 @@ _POLL_S = 1.0
 
 OnEpisode = Callable[[Episode, Job], None]
 # Is told of every answered request: job, step, the observation as the policy got it, the noise's seed, the answer
-OnAnswer = Callable[[Job, int, dict[str, Any], int, Answer], None]
+OnAnswer = Callable[[Job, int, dict[str, object], int, Answer], None]
 
 
 class TooManyCrashes(TurboPiError):
@@ -51,7 +51,7 @@ class _Request:
     worker: WorkerHandle
     job: Job
     step: int
-    observation: dict[str, Any]
+    observation: dict[str, object]
     seed: int
 
 
@@ -206,7 +206,7 @@ class Scheduler:
 
     # --- the policy ---------------------------------------------------------------------------------------------------
 
-    def _request(self, worker: WorkerHandle, job: Job, step: int, observation: dict[str, Any]) -> _Request:
+    def _request(self, worker: WorkerHandle, job: Job, step: int, observation: dict[str, object]) -> _Request:
         px = self._protocol.image_px
         resized = {key: resize_with_pad(np.asarray(observation[key]), px, px) for key in self._image_keys}
         seed = noise_seed(self._protocol.sim.seed, *job.key, step)
@@ -226,7 +226,7 @@ class Scheduler:
                 told.infer_ms.append(answer.infer_ms)
             request.worker.heard = time.monotonic()
             if answer.problem is not None:
-                reply: tuple[str, Any] = ("problem", answer.problem)
+                reply: tuple[str, object] = ("problem", answer.problem)
             else:
                 self._check_shape(answer.actions)
                 reply = ("actions", answer.actions)

@@ -53,10 +53,10 @@ class PolicySource(Protocol):
 
     max_batch: int | None
     label: str
-    identity: dict[str, Any]
-    about: dict[str, Any]
+    identity: dict[str, object]
+    about: dict[str, object]
 
-    def infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Answer]:
+    def infer(self, observations: Sequence[Mapping[str, object]], seeds: Sequence[int]) -> list[Answer]:
         """One answer for each observation; `seeds` draw the noise, where the source lets them."""
 
     def close(self) -> None:
@@ -70,15 +70,15 @@ class LocalPolicy:
 
     def __init__(self, policy: Any, weights: str | None = None, label: str | None = None) -> None:
         """`weights`: the checkpoint's fingerprint, which tells policies apart when a run is continued."""
-        about = dict(policy.metadata)
+        about: dict[str, object] = dict(policy.metadata)
         names = ("config", "backend", "precision", "num_denoising_steps", "robot", "device")
         self._policy, self.about = policy, about
-        self.identity = {"weights": weights, "calibration": calibration_of(about)}
+        self.identity: dict[str, object] = {"weights": weights, "calibration": calibration_of(about)}
         self.identity |= {name: about.get(name) for name in names}
         default = f"{about.get('backend')} {about.get('precision')} {about.get('num_denoising_steps')} steps"
         self.label = label or default
 
-    def infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Answer]:
+    def infer(self, observations: Sequence[Mapping[str, object]], seeds: Sequence[int]) -> list[Answer]:
         try:
             results = self._policy.infer_batch(list(observations), seed=list(seeds))
         except ActionError as error:
@@ -92,7 +92,7 @@ class LocalPolicy:
         self._policy = None
 
 
-def calibration_of(metadata: Mapping[str, Any]) -> str | None:
+def calibration_of(metadata: Mapping[str, object]) -> str | None:
     """Which calibration a policy runs with (`Quantization.identity`), where its metadata tells; None: not in FP8."""
     details = metadata.get("backend_details")
     fp8 = details.get("fp8") if isinstance(details, Mapping) else None
@@ -147,21 +147,21 @@ class RemotePolicy:
             self.close()
             raise
         volatile = ("load_seconds", "backend_details", "backend_reason")
-        self.about = {"server": self._where, "metadata": metadata}
+        self.about: dict[str, object] = {"server": self._where, "metadata": metadata}
         server = {name: value for name, value in metadata.items() if name not in volatile}
-        self.identity = {"server": server, "calibration": calibration_of(metadata)}
+        self.identity: dict[str, object] = {"server": server, "calibration": calibration_of(metadata)}
         names = [name for name in ("config", "backend", "precision") if name in metadata]
         described = " ".join(_printable(str(metadata[name])[:80]) for name in names)
         self.label = f"{self._where} {described}".strip()
 
-    def infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Answer]:
+    def infer(self, observations: Sequence[Mapping[str, object]], seeds: Sequence[int]) -> list[Answer]:
         return [self._one(observation) for observation in observations]
 
     def close(self) -> None:
         with contextlib.suppress(Exception):  # it may be gone already
             self._open.close()
 
-    def _one(self, observation: Mapping[str, Any]) -> Answer:
+    def _one(self, observation: Mapping[str, object]) -> Answer:
         from websockets.exceptions import WebSocketException
 
         try:
@@ -206,7 +206,7 @@ def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings,
     return answer
 
 
-def _answer(result: Any, *timings: str) -> Answer:
+def _answer(result: object, *timings: str) -> Answer:
     """The actions, which may still be NaN, and the time. Raises PolicyRefused for whatever else this is."""
     if not isinstance(result, Mapping) or "actions" not in result:
         found = f"the keys {shown(list(result))}" if isinstance(result, Mapping) else f"a {type(result).__name__}"
@@ -223,7 +223,7 @@ def _answer(result: Any, *timings: str) -> Answer:
     return Answer(actions.astype(np.float64), infer_ms)
 
 
-def _milliseconds(result: Mapping[str, Any], timing: str) -> float | None:
+def _milliseconds(result: Mapping[str, object], timing: str) -> float | None:
     """How long the model took, as a part of the answer tells it; None if it doesn't."""
     told = result.get(timing)
     if told is None or not isinstance(told, Mapping) or told.get("infer_ms") is None:
@@ -249,7 +249,7 @@ def _told(value: Any, where: str, key: str = "metadata") -> Any:
     )
 
 
-def _unpacked(data: Any, where: str) -> dict[str, Any]:
+def _unpacked(data: str | bytes, where: str) -> dict[str, object]:
     if isinstance(data, str):
         raise PolicyRefused(f"the server at {where} sent text where a message should be: {_printable(data.strip())}")
     try:

@@ -1,6 +1,6 @@
 """Observations that a policy met on its way, kept to ask another policy about them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ class Visited:
         self._found = self.seen
         self._rng = np.random.default_rng(self.seen)
 
-    def __call__(self, job: Job, step: int, observation: dict[str, Any], seed: int, answer: Answer) -> None:
+    def __call__(self, job: Job, step: int, observation: dict[str, object], seed: int, answer: Answer) -> None:
         self.seen += 1
         entry = {key: np.asarray(value) for key, value in observation.items()}
         entry |= {"seed": np.asarray(seed, np.uint64), "actions": answer.actions}
@@ -60,7 +60,7 @@ class Recording:
         """Into a new folder below `folder`. Raises ConfigError if it can't be made."""
         self._recorder = Recorder(folder, {"label": source.label, "identity": source.identity})
 
-    def __call__(self, job: Job, step: int, observation: dict[str, Any], seed: int, answer: Answer) -> None:
+    def __call__(self, job: Job, step: int, observation: dict[str, object], seed: int, answer: Answer) -> None:
         size = sum(value.nbytes for value in observation.values() if isinstance(value, np.ndarray))
         where = {"task": job.task.index, "initial_state": job.initial_state, "step": step, "seed": str(seed)}
         self._recorder.put(observation, {"actions": answer.actions, "episode": where}, size=size)
@@ -81,7 +81,7 @@ class ActionDifference(Struct, frozen=True):
     observations: int
 
 
-def action_error(entries: Sequence[dict[str, Any]], reference: PolicySource) -> ActionDifference | None:
+def action_error(entries: Sequence[Mapping[str, np.ndarray]], reference: PolicySource) -> ActionDifference | None:
     """How far the entries' actions are from the reference's, given the same observations and noise.
 
     None without entries.
@@ -90,8 +90,11 @@ def action_error(entries: Sequence[dict[str, Any]], reference: PolicySource) -> 
         return None
     exact = []
     for entry in entries:
-        observation = {key: value for key, value in entry.items() if key not in ("seed", "actions")}
-        observation = {key: str(value) if value.dtype.kind == "U" else value for key, value in observation.items()}
+        observation = {
+            key: str(value) if value.dtype.kind == "U" else value
+            for key, value in entry.items()
+            if key not in ("seed", "actions")
+        }
         exact.append(reference.infer([observation], [int(entry["seed"])])[0].actions)
     truth, given = np.stack(exact), np.stack([entry["actions"] for entry in entries])
     spread = truth.std(axis=(0, 1))

@@ -49,7 +49,7 @@ class Incoming:
     model_state     float32[action_dim]  what fits of it, as the model reads it
     """
 
-    observation: Mapping[str, Any]
+    observation: Mapping[str, object]
     robot: RobotInputs = field(init=False)
     prompt: str = field(init=False)
     pictures: list[np.ndarray] = field(init=False)
@@ -118,7 +118,7 @@ class Pipeline:
             self._write_actions,
         )
 
-    def before(self, observation: Mapping[str, Any]) -> tuple[ModelInputs, np.ndarray]:
+    def before(self, observation: Mapping[str, object]) -> tuple[ModelInputs, np.ndarray]:
         """The model's inputs, and the state float64[s] that `after` needs (normalised and padded, see `Incoming`).
 
         The observation isn't changed, and nothing returned shares memory with it. Raises ObservationError if it can't
@@ -134,7 +134,7 @@ class Pipeline:
             image[:] = next(pictures) if valid else black
         return ModelInputs(images, one.image_mask, one.tokens, one.token_mask, one.model_state), one.state
 
-    def see(self, observation: Mapping[str, Any]) -> Incoming:
+    def see(self, observation: Mapping[str, object]) -> Incoming:
         """The first half of `before`: all that vision needs. `read` is the other."""
         if not isinstance(observation, Mapping):
             raise ObservationError(f"an observation is a dict, got {type(observation).__name__}")
@@ -187,7 +187,7 @@ class Pipeline:
     @property
     def metadata(self) -> dict[str, Any]:
         """What a client may want to know of the robot, in plain values; `reset_pose` only if the robot has one."""
-        described: dict[str, Any] = {
+        described: dict[str, object] = {
             "robot": self.robot.name,
             "robot_state_dim": self.robot.state_dim,
             "robot_action_dim": self._action_width,
@@ -222,7 +222,7 @@ class Pipeline:
         sample.image_mask = np.array(valid, np.bool_)
         sample.pictures = [self._fitted(pictures.get(camera), camera) for camera in itertools.compress(cameras, valid)]
 
-    def _fitted(self, picture: Any, camera: str) -> np.ndarray:
+    def _fitted(self, picture: object, camera: str) -> np.ndarray:
         picture, size = check_hwc(picture, camera), self.config.model.vision.image_size
         padding, dtype, resize = _RESIZING[self.config.image_resize]
         if dtype == np.uint8:

@@ -10,7 +10,7 @@ from turbopi.preprocess.normalize import Normalizer
 from turbopi.robots.base import Robot, RobotInputs
 
 
-def read_observation(robot: Robot, observation: Mapping[str, Any]) -> RobotInputs:
+def read_observation(robot: Robot, observation: Mapping[str, object]) -> RobotInputs:
     """The robot's `inputs`. Raises ObservationError also for errors of a robot's own code, which are no fault of ours:
     most often a key that its client doesn't send.
     """

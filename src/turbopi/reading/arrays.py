@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Literal
 
 import numpy as np
 
@@ -145,7 +145,9 @@ def _read_array(stream: IO[bytes], size: int, limit: int, where: str, error: Err
     return np.ndarray(shape, dtype, bytearray(data), order=order)  # a bytearray: the array can be written to
 
 
-def _read_header(stream: IO[bytes], where: str, error: Error) -> tuple[np.dtype, Any, tuple[int, ...], int]:
+def _read_header(
+    stream: IO[bytes], where: str, error: Error
+) -> tuple[np.dtype, Literal["C", "F"], tuple[int, ...], int]:
     """dtype, order ("C" or "F"), shape, and where the data begins. NumPy's format 1.0 and 2.0; what both mean is in
     numpy/lib/format.py.
     """

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn, TypeGuard, cast
 
 from turbopi.errors import CheckpointError
 from turbopi.reading.files import Error, shown
@@ -79,7 +79,7 @@ class Fields:
             self.refuse(key, "a list")
         return value
 
-    def object(self, key: str, default: Mapping[str, Any] | None = None) -> "Fields":
+    def object(self, key: str, default: Mapping[str, object] | None = None) -> "Fields":
         """An object, to be read in the same way."""
         value = self.values.get(key, default)
         if not isinstance(value, Mapping):
@@ -87,12 +87,12 @@ class Fields:
         return Fields(value, f"{self.where}: {key}", self.error)
 
 
-def is_integer(value: Any) -> bool:
+def is_integer(value: object) -> TypeGuard[int]:
     """Whether a value of JSON is a whole number: 1 is, 1.0 and true aren't."""
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-def is_finite(value: Any) -> bool:
+def is_finite(value: object) -> TypeGuard[float]:
     """Whether a value of JSON is a number that float64 holds: true isn't."""
     try:
         return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -7,7 +7,7 @@ import stat
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from turbopi.errors import CheckpointError, TurboPiError
 
@@ -20,7 +20,7 @@ class _Short(reprlib.Repr):
     maxstring = maxother = 80
     maxlevel = 3
 
-    def repr_dict(self, value: dict[Any, Any], level: int) -> str:
+    def repr_dict(self, value: dict[object, object], level: int) -> str:
         """As it is ordered: `Repr` sorts the keys."""
         if level <= 0:
             return "{...}"
@@ -75,7 +75,7 @@ def open_file(file: str | Path, error: Error = CheckpointError, *, hint: str = "
     raise error(f"{file} can't be read: it is {kind}{hint}")
 
 
-def file_inside(folder: Path, name: Any, where: object, error: Error = CheckpointError) -> Path:
+def file_inside(folder: Path, name: object, where: object, error: Error = CheckpointError) -> Path:
     """The file `name` in `folder` or below it, as a text in `where` names it; it needn't exist.
 
     Raises `error` for what is no name, is absolute, or leads out of the folder by "..". Links are followed: whoever

@@ -75,7 +75,7 @@ def _finite(digits: str) -> float:
     return value
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
     found = dict(pairs)
     if len(found) < len(pairs):
         keys = [key for key, _ in pairs]
@@ -83,7 +83,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _levels(value: Any) -> Iterator[list[Any]]:
+def _levels(value: object) -> Iterator[list[object]]:
     """The values at depth 0, 1, 2, ..."""
     level = [value]
     while level:
@@ -96,13 +96,13 @@ def _levels(value: Any) -> Iterator[list[Any]]:
         ]
 
 
-def _check_depth(value: Any, depth: int, where: object, error: Error) -> None:
+def _check_depth(value: object, depth: int, where: object, error: Error) -> None:
     for number, _ in enumerate(_levels(value)):
         if number > depth:
             raise error(f"{where} holds objects and lists more than {depth} deep")
 
 
-def _check_constants(value: Any, where: object, error: Error) -> None:
+def _check_constants(value: object, where: object, error: Error) -> None:
     """Python reads and writes NaN, Infinity and -Infinity; JSON has none of them."""
     found = next(_constants(value, ""), None)
     if found is not None:
@@ -110,7 +110,7 @@ def _check_constants(value: Any, where: object, error: Error) -> None:
         raise error(f"{where}: {path[1:] or 'its value'} is {number}, which no JSON has; expected a finite number")
 
 
-def _constants(value: Any, path: str) -> Iterator[tuple[str, float]]:
+def _constants(value: object, path: str) -> Iterator[tuple[str, float]]:
     if isinstance(value, float) and not math.isfinite(value):
         yield path, value
     elif isinstance(value, dict):
@@ -126,7 +126,7 @@ def key_path(key: str) -> str:
     return f".{key if key.isidentifier() else shown(key)}"
 
 
-def _check_text(value: Any, where: object, error: Error) -> None:
+def _check_text(value: object, where: object, error: Error) -> None:
     """JSON can name halves of characters, which can be neither printed nor encoded."""
     for level in _levels(value):
         for item in level:

@@ -91,7 +91,7 @@ def _to_call(members: Npz, path: str | Path, *, result: bool = True) -> Recorded
         raise ObservationError(f"{path} has a damaged index: {type(error).__name__} {reason}") from error
 
 
-def _to_node(value: Any, name: str, members: dict[str, np.ndarray]) -> dict[str, Any]:
+def _to_node(value: object, name: str, members: dict[str, np.ndarray]) -> dict[str, object]:
     if isinstance(value, dict):
         for key in value:
             if not isinstance(key, str):

@@ -30,7 +30,7 @@ def load_folder(folder: Path) -> dict[str, Any]:
     return {key: _from_json(item, key, folder) for key, item in described.items()}
 
 
-def _from_json(value: Any, name: str, folder: Path) -> Any:
+def _from_json(value: object, name: str, folder: Path) -> object:
     if isinstance(value, dict) and "file" in value:
         return _load_file(value, name, folder)
     if isinstance(value, dict):
@@ -46,7 +46,7 @@ def _from_json(value: Any, name: str, folder: Path) -> Any:
     return value
 
 
-def _leaves(value: Any) -> Iterator[Any]:
+def _leaves(value: object) -> Iterator[object]:
     if isinstance(value, list):
         for item in value:
             yield from _leaves(item)
@@ -54,7 +54,7 @@ def _leaves(value: Any) -> Iterator[Any]:
         yield value
 
 
-def _load_file(value: dict[str, Any], name: str, folder: Path) -> np.ndarray:
+def _load_file(value: dict[str, object], name: str, folder: Path) -> np.ndarray:
     layout, named = value.get("layout", "hwc"), str(value["file"])
     is_array = named.endswith(".npy")
     if set(value) - {"file", "layout"} or layout not in ("hwc", "chw") or (is_array and "layout" in value):

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from turbopi.errors import ConfigError, OutputError
 from turbopi.files import append_line, write_whole
@@ -31,7 +30,7 @@ class Recorder:
     def __init__(
         self,
         record_dir: str | Path,
-        metadata: dict[str, Any],
+        metadata: dict[str, object],
         *,
         queue_calls: int = 256,
         queue_bytes: int = 256 * 2**20,
@@ -53,7 +52,7 @@ class Recorder:
         self._thread = threading.Thread(target=self._write_all, name="turbopi-recorder", daemon=True)
         self._thread.start()
 
-    def put(self, observation: dict[str, Any], result: dict[str, Any], *, size: int) -> None:
+    def put(self, observation: dict[str, object], result: dict[str, object], *, size: int) -> None:
         """Record a call, or drop it if the disk is behind. Never waits, never raises.
 
         The values are written later: hand over what nobody changes. `size` is about how many bytes they hold.
@@ -145,7 +144,7 @@ def _new_folder(parent: Path) -> Path:
     raise FileExistsError(f"{parent / name} and 999 names like it are taken")
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """Metadata for JSON: numpy arrays as lists, anything else as its text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 

@@ -41,7 +41,7 @@ __all__ = [
 ROBOTS: dict[str, type] = {"libero": Libero, "droid": Droid, "aloha": Aloha, "lerobot": LeRobot, "plain": Plain}
 
 
-def create_robot(robot: str | Path | Robot, options: Mapping[str, Any] | None = None) -> Robot:
+def create_robot(robot: str | Path | Robot, options: Mapping[str, object] | None = None) -> Robot:
     """A robot from its name, from the path of its description (.json), or the robot itself.
 
     options   of a built-in robot: its class's fields
@@ -108,7 +108,7 @@ def _what(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}{where}"
 
 
-def _refuse_options(options: Mapping[str, Any], what: str) -> None:
+def _refuse_options(options: Mapping[str, object], what: str) -> None:
     if options:
         raise ConfigError(f"{what} takes no robot_options, got {', '.join(options)}")
 

@@ -73,7 +73,7 @@ class Aloha(Robot):
         """Six joints of either arm, from openpi's policy metadata; the simulator has none."""
         return [0.0, -1.5, 1.5, 0.0, 0.0, 0.0] if self.adapt_to_pi else None
 
-    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+    def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         sent = names_in(observation, "images")
         unexpected = sorted(set(sent) - {*CAMERA_OF, IGNORED})
         if unexpected:

@@ -59,7 +59,7 @@ class Robot(Protocol):
     camera_counts: tuple[int, ...] | None = None
 
     @abstractmethod
-    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+    def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         """An observation as its client sends it, in the model's words. Raises ObservationError."""
         ...
 
@@ -79,7 +79,7 @@ def action_mask(dims: Sequence[int]) -> tuple[bool, ...]:
     return tuple(flag for n in dims for flag in [n > 0] * abs(n))
 
 
-def find(observation: Mapping[str, Any], key: str) -> Any:
+def find(observation: Mapping[str, object], key: str) -> Any:
     """The value at `key`, flat (`{"a/b": x}`) or nested (`{"a": {"b": x}}`); KeyError if there is none.
 
     openpi's clients nest some keys and flatten others, and an .npz file can only be flat, so both are read everywhere.
@@ -93,7 +93,7 @@ def find(observation: Mapping[str, Any], key: str) -> Any:
     return find(inner, rest)
 
 
-def has(observation: Mapping[str, Any], key: str) -> bool:
+def has(observation: Mapping[str, object], key: str) -> bool:
     """Whether `find` would find it."""
     try:
         find(observation, key)
@@ -102,7 +102,7 @@ def has(observation: Mapping[str, Any], key: str) -> bool:
     return True
 
 
-def require(observation: Mapping[str, Any], key: str, expected: tuple[str, ...]) -> Any:
+def require(observation: Mapping[str, object], key: str, expected: tuple[str, ...]) -> Any:
     """The value at `key`. Raises ObservationError, listing the keys given and the `expected` ones, if absent."""
     try:
         return find(observation, key)
@@ -113,7 +113,7 @@ def require(observation: Mapping[str, Any], key: str, expected: tuple[str, ...])
         ) from None
 
 
-def keys_of(observation: Mapping[str, Any], depth: int = 3) -> Iterator[str]:
+def keys_of(observation: Mapping[str, object], depth: int = 3) -> Iterator[str]:
     """All keys, those of nested mappings joined with "/", down to `depth`."""
     for key, value in observation.items():
         if isinstance(value, Mapping) and value and depth > 1:
@@ -122,10 +122,10 @@ def keys_of(observation: Mapping[str, Any], depth: int = 3) -> Iterator[str]:
             yield str(key)
 
 
-def described(observation: Mapping[str, Any]) -> dict[str, str]:
+def described(observation: Mapping[str, object]) -> dict[str, str]:
     """Each key of an observation, nested ones joined with "/", and what is there: "uint8[224, 224, 3]", "text"."""
 
-    def what(value: Any) -> str:
+    def what(value: object) -> str:
         array = np.asarray(value)
         if array.dtype.kind in "USO":
             return "text" if array.ndim == 0 else "list of text"
@@ -140,7 +140,7 @@ def listed(names: Iterable[str]) -> str:
     return ", ".join(shown[:20]) + (", …" if len(shown) > 20 else "") or "nothing"
 
 
-def names_in(observation: Mapping[str, Any], folder: str) -> list[str]:
+def names_in(observation: Mapping[str, object], folder: str) -> list[str]:
     """The names directly below `folder`, nested or flat: ["cam_high"] for either form of "images/cam_high"."""
     nested = observation.get(folder, {})
     if not isinstance(nested, Mapping):
@@ -149,12 +149,12 @@ def names_in(observation: Mapping[str, Any], folder: str) -> list[str]:
     return [*map(str, nested), *flat]
 
 
-def names_in_prefix(observation: Mapping[str, Any], prefix: str) -> list[str]:
+def names_in_prefix(observation: Mapping[str, object], prefix: str) -> list[str]:
     """The keys, as they are, that begin with `prefix`."""
     return [str(key) for key in observation if str(key).startswith(prefix)]
 
 
-def read_state(value: Any, key: str, width: int | None) -> np.ndarray:
+def read_state(value: object, key: str, width: int | None) -> np.ndarray:
     """A float[width] vector of finite numbers, any length if `width` is None.
 
     Integers become float64; a plain number is a vector of width 1. Raises ObservationError for anything else.
@@ -179,7 +179,7 @@ def read_state(value: Any, key: str, width: int | None) -> np.ndarray:
     return state
 
 
-def read_prompt(value: Any, key: str = "prompt") -> str:
+def read_prompt(value: object, key: str = "prompt") -> str:
     """A prompt as text: str, numpy's str_, UTF-8 bytes, or an array that holds one of them."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.item()
@@ -195,7 +195,7 @@ def read_prompt(value: Any, key: str = "prompt") -> str:
     raise ObservationError(f"{key} is a {type(value).__name__}, expected text")
 
 
-def optional_prompt(observation: Mapping[str, Any], key: str = "prompt") -> str | None:
+def optional_prompt(observation: Mapping[str, object], key: str = "prompt") -> str | None:
     """The prompt at `key`; None if the observation has no such key."""
     return read_prompt(find(observation, key), key) if has(observation, key) else None
 

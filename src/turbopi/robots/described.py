@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -57,7 +57,7 @@ class Described(Robot):
     def _keys(self) -> tuple[str, ...]:
         return (*self.cameras, *self.state, self.prompt_key)
 
-    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+    def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         pictures = {
             camera: parse_image(require(observation, key, self._keys), key) for key, camera in self.cameras.items()
         }
@@ -139,10 +139,10 @@ def _delta_mask(dims: Any, described: dict[str, Any]) -> tuple[bool, ...] | None
     return action_mask(dims)
 
 
-def _is_count(value: Any) -> bool:
+def _is_count(value: object) -> TypeGuard[int]:
     return is_integer(value) and 1 <= value <= _MOST
 
 
-def _expect(right: bool, name: str, expected: str, got: Any) -> None:
+def _expect(right: bool, name: str, expected: str, got: object) -> None:
     if not right:
         raise ConfigError(f"{name} must be {expected}, got {shown(got)}")

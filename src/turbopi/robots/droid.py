@@ -41,7 +41,7 @@ class Droid(Robot):
     action_dim = 8
     camera_counts = (2,)
 
-    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+    def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         base, wrist = (parse_image(require(observation, key, KEYS), key) for key in KEYS[:2])
         images, mask = with_missing_cameras({"base_0_rgb": base, "left_wrist_0_rgb": wrist}, like="base_0_rgb")
         joints = read_state(require(observation, KEYS[2], KEYS), KEYS[2], 7)

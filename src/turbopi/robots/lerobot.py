@@ -86,7 +86,7 @@ class LeRobot(Robot):
     def camera_counts(self) -> tuple[int, ...]:  # type: ignore[override]
         return tuple(range(1, len(self.image_keys) + 1))
 
-    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+    def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         named = self._renamed(observation)
         spare = [f"{IMAGES}empty_camera_{i}" for i in range(self.num_missing_cameras)]
         present = [key for key in (*self.image_keys, *spare) if has(named, key)]
@@ -112,7 +112,7 @@ class LeRobot(Robot):
             in_order=True,
         )
 
-    def _renamed(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _renamed(self, observation: Mapping[str, object]) -> Mapping[str, object]:
         if not self.rename_map:
             return observation
         return {self.rename_map.get(key, key): value for key, value in observation.items()}
@@ -121,7 +121,7 @@ class LeRobot(Robot):
         """What observations call a key of the checkpoint's."""
         return next((old for old, new in (self.rename_map or {}).items() if new == key), key)
 
-    def _prompt(self, observation: Mapping[str, Any]) -> str | None:
+    def _prompt(self, observation: Mapping[str, object]) -> str | None:
         if TASK not in observation:
             return None
         task = observation[TASK]

@@ -47,7 +47,7 @@ class Libero(Robot):
     def delta_mask(self) -> tuple[bool, ...] | None:  # type: ignore[override]
         return action_mask((6, -1)) if self.delta_actions else None
 
-    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+    def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         base, wrist = (parse_image(require(observation, key, KEYS), key) for key in KEYS[:2])
         images, mask = with_missing_cameras({"base_0_rgb": base, "left_wrist_0_rgb": wrist}, like="base_0_rgb")
         state = read_state(require(observation, KEYS[2], KEYS), KEYS[2], self.state_dim)

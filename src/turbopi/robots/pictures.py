@@ -1,13 +1,11 @@
 """Pictures as robots send them, checked: what their observations' readers use."""
 
-from typing import Any
-
 import numpy as np
 
 from turbopi.errors import ObservationError
 
 
-def parse_image(value: Any, name: str) -> np.ndarray:
+def parse_image(value: object, name: str) -> np.ndarray:
     """One picture as openpi's LIBERO and DROID robots take it: uint8[h, w, 3].
 
     `value` is uint8 in [0, 255] or float in [0, 1], HWC or CHW; it counts as CHW when its first axis is 3.
@@ -19,7 +17,7 @@ def parse_image(value: Any, name: str) -> np.ndarray:
     return to_uint8(_check_rgb(image, name), name)
 
 
-def parse_chw_image(value: Any, name: str) -> np.ndarray:
+def parse_chw_image(value: object, name: str) -> np.ndarray:
     """One picture that must be CHW, as openpi's ALOHA clients send it: uint8[h, w, 3]."""
     image = check_image(value, name)
     if image.shape[0] != 3:
@@ -30,7 +28,7 @@ def parse_chw_image(value: Any, name: str) -> np.ndarray:
     return to_uint8(image.transpose(1, 2, 0), name)
 
 
-def parse_unit_image(value: Any, name: str) -> np.ndarray:
+def parse_unit_image(value: object, name: str) -> np.ndarray:
     """One picture as LeRobot takes it: (uint8|float32)[h, w, 3], float32 in [0, 1]; CHW or HWC as `parse_image`."""
     image = check_image(value, name)
     if image.shape[0] == 3:
@@ -42,7 +40,7 @@ def parse_unit_image(value: Any, name: str) -> np.ndarray:
     return image
 
 
-def check_image(value: Any, name: str) -> np.ndarray:
+def check_image(value: object, name: str) -> np.ndarray:
     """`value` as a non-empty array with three axes, uint8 or float; raises ObservationError otherwise."""
     try:
         image = np.asarray(value)
@@ -60,7 +58,7 @@ def check_image(value: Any, name: str) -> np.ndarray:
     return image
 
 
-def check_hwc(value: Any, name: str) -> np.ndarray:
+def check_hwc(value: object, name: str) -> np.ndarray:
     """`check_image`, and the last axis is RGB's; raises ObservationError otherwise."""
     return _check_rgb(check_image(value, name), name)
 

@@ -38,7 +38,7 @@ class Plain(Robot):
     name = "plain"
     camera_counts = tuple(range(1, len(CAMERAS) + 1))
 
-    def inputs(self, observation: Mapping[str, Any]) -> RobotInputs:
+    def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         folder, sent = self._sent(observation)
         keys = (*(f"{folder}/{camera}" for camera in CAMERAS), "state", "prompt")
         unexpected = sorted(set(sent) - set(CAMERAS))
@@ -54,7 +54,7 @@ class Plain(Robot):
         return RobotInputs(images, mask, state, optional_prompt(observation))
 
     def _unmasked(
-        self, observation: Mapping[str, Any], folder: str, pictures: dict[str, np.ndarray]
+        self, observation: Mapping[str, object], folder: str, pictures: dict[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
         """Those that `image_mask` doesn't leave out."""
         masks = {}
@@ -75,7 +75,7 @@ class Plain(Robot):
             raise ObservationError(f"image_mask leaves out all of {', '.join(pictures)}; the model needs one camera")
         return left
 
-    def _sent(self, observation: Mapping[str, Any]) -> tuple[str, list[str]]:
+    def _sent(self, observation: Mapping[str, object]) -> tuple[str, list[str]]:
         """The folder that the pictures are in, and their names."""
         images, image = names_in(observation, "images"), names_in(observation, "image")
         if images and image:

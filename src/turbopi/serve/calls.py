@@ -62,15 +62,15 @@ class PolicyCalls:
         if warmup is not None:
             await self._worker.call(lambda _: warmup(), None)
 
-    async def run(self, observation: dict[str, Any]) -> Outcome:
+    async def run(self, observation: dict[str, object]) -> Outcome:
         """Run the policy when it is this request's turn. Raises Busy and Stopping, as the worker does."""
         asked = time.perf_counter()
 
-        def call(observation: dict[str, Any]) -> Outcome:
+        def call(observation: dict[str, object]) -> Outcome:
             self._metrics.queue_seconds.observe(time.perf_counter() - asked)
             return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation))
 
-        def submit(observation: dict[str, Any]) -> Future[Outcome]:
+        def submit(observation: dict[str, object]) -> Future[Outcome]:
             self._metrics.queue_seconds.observe(time.perf_counter() - asked)
             return self._submit(observation)
 
@@ -78,7 +78,7 @@ class PolicyCalls:
             return await self._worker.begin(submit, observation)
         return await self._worker.call(call, observation)
 
-    def _submit(self, observation: dict[str, Any]) -> "Future[Outcome]":
+    def _submit(self, observation: dict[str, object]) -> "Future[Outcome]":
         """Hand the observation to a pipelined policy. The Future never holds an exception."""
         started = time.perf_counter()
         outcome: Future[Outcome] = Future()

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import CloseCode
@@ -289,7 +289,7 @@ class GuardedConnection(ServerConnection):
 
     # --- deadlines ----------------------------------------------------------------------------------------------------
 
-    def _once(self, name: str, seconds: float, call: Callable[[], Any]) -> None:
+    def _once(self, name: str, seconds: float, call: Callable[[], object]) -> None:
         """Call after `seconds`, unless a timer of that name runs already or it is cancelled."""
 
         def due() -> None:

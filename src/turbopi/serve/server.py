@@ -286,7 +286,7 @@ class PolicyServer:
 
     async def _reply(
         self, connection: GuardedConnection, message: str | bytes, previous_total: float | None
-    ) -> dict[str, Any] | _Refusal:
+    ) -> dict[str, object] | _Refusal:
         """The result to send, or what to tell the client instead. Raises _PolicyFailed and _ClientGone."""
         if self.lost is not None:
             return self._refuse("lost", _REFUSALS["lost"].format(self.lost))
@@ -316,7 +316,7 @@ class PolicyServer:
         self._log.warning(text, kind)
         return _Refusal(kind, text)
 
-    async def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, Any]:
+    async def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, object]:
         """One request as the policy gets it. Raises WireError."""
         limit, started = self._limits.message_bytes, time.perf_counter()
         try:
@@ -326,7 +326,7 @@ class PolicyServer:
         finally:
             connection.took(time.perf_counter() - started)
 
-    async def _infer(self, connection: GuardedConnection, observation: dict[str, Any]) -> Outcome:
+    async def _infer(self, connection: GuardedConnection, observation: dict[str, object]) -> Outcome:
         """Run the policy when it is this request's turn, unless the client leaves first."""
         work = asyncio.ensure_future(self._calls.run(observation))
         gone = asyncio.ensure_future(connection.wait_closed())
@@ -340,7 +340,7 @@ class PolicyServer:
             work.cancel()
 
 
-def _decode(message: str | bytes, max_bytes: int) -> dict[str, Any]:
+def _decode(message: str | bytes, max_bytes: int) -> dict[str, object]:
     """One request as the policy gets it. Raises WireError."""
     if isinstance(message, str):
         raise WireError("a request is a binary frame with a msgpack map, not a text frame")

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from msgspec import Struct, field
 from torch import Tensor
 
 from turbopi.model.kv_cache import EmbeddedPrefix, KVCache
@@ -24,6 +25,7 @@ from turbopi.model.layers import rope_tables
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
+from turbopi.provenance import Provenance
 from turbopi.tensorrt import Library
 from turbopi.tensorrt.call import Part
 from turbopi.tensorrt.engine import Engine, Input, Specification, build
@@ -35,9 +37,85 @@ CACHES = ("compacted", "padded, masked", "padded, not masked")
 Load = Callable[[Specification], Part]
 
 
+class Off(Struct, frozen=True):
+    """How far actions are from the exact ones; None: not finite."""
+
+    max: float | None
+    relative: float | None
+    cosine: float | None
+
+
+class LayerOff(Struct, frozen=True):
+    """How far K and V of one layer of the language model are from the reference's; None: not finite."""
+
+    k_max: float | None
+    k_relative: float | None
+    k_cosine: float | None
+    v_max: float | None
+    v_relative: float | None
+    v_cosine: float | None
+
+
+class StyleOff(Struct, frozen=True):
+    """One way to compute the language model's layers."""
+
+    attention: str  # "fused", "written out"
+    precision: str
+    layers: list[LayerOff]  # from the first
+    actions: Off
+
+
+class CacheOff(Struct, frozen=True):
+    """The actions made from one kind of cache."""
+
+    cache: str  # one of CACHES
+    slots: int
+    steps: int  # of denoising
+    max: float | None
+    relative: float | None
+    cosine: float | None
+
+
+class BackendOff(Struct, frozen=True):
+    """A backend's actions on a group of observations."""
+
+    backend: str
+    observations: str
+    count: int
+    worst_cosine: float | None  # None: not finite
+    worst_relative: float | None
+
+
+Timings = dict[str, float]  # medians, e.g. "total_ms", and "per_second": observations
+
+
+class Throughput(Struct, frozen=True):
+    calls: int
+    one_at_a_time: dict[str, Timings] = field(name="one at a time")  # by backend
+    in_flight: Timings = field(name="in flight")
+    actions_equal_bit_for_bit: bool
+
+
+class StudyDocument(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """What `turbopi study` writes; a part that wasn't asked for is left out."""
+
+    provenance: Provenance
+    model: str
+    random_weights: bool
+    observations: str  # where they come from
+    seed: int
+    steps: int
+    prefix_tokens: int | None = None
+    library: str | None = None
+    precision: list[StyleOff] | None = None
+    mask: list[CacheOff] | None = None
+    actions: list[BackendOff] | None = None
+    throughput: Throughput | None = None
+
+
 def attention_study(
     model: Pi0Model, observation: Observation, noise: Tensor, num_steps: int, load: Load
-) -> list[dict[str, Any]]:
+) -> list[StyleOff]:
     """Errors of every style for one observation (batch 1) and a float32 model, which denoises all of them."""
     embedded = model.embed(observation)
     exact = model.keys_values(embedded)
@@ -45,16 +123,14 @@ def attention_study(
     results = []
     for fused in (True, False):
         for dtype in DTYPES:
-            result: dict[str, Any] = {"attention": "fused" if fused else "written out", "precision": dtype}
             k, v = _keys_values(model, embedded, LayerStyle(fused, dtype), load)
             actions = model.denoise(replace(exact, k=k, v=v), noise, num_steps)
-            result["layers"] = [_layer_errors(k[i], v[i], exact.k[i], exact.v[i]) for i in range(len(k))]
-            result["actions"] = _errors(actions, truth)
-            results.append(result)
+            layers = [_layer_errors(k[i], v[i], exact.k[i], exact.v[i]) for i in range(len(k))]
+            results.append(StyleOff("fused" if fused else "written out", dtype, layers, _errors(actions, truth)))
     return results
 
 
-def mask_study(model: Pi0Model, observation: Observation, noise: Tensor, steps: Sequence[int]) -> list[dict[str, Any]]:
+def mask_study(model: Pi0Model, observation: Observation, noise: Tensor, steps: Sequence[int]) -> list[CacheOff]:
     """Actions from three kinds of cache against those of the compacted one, by number of steps.
 
     The padded cache has all slots: masked cameras and padding too. Without a mask the suffix attends to them.
@@ -66,13 +142,13 @@ def mask_study(model: Pi0Model, observation: Observation, noise: Tensor, steps: 
         for count in steps:
             truth = model.denoise(compacted, noise, count)
             errors = _errors(model.denoise(cache, noise, count), truth)
-            results.append({"cache": name, "slots": cache.k.shape[3], "steps": count, **errors})
+            results.append(CacheOff(name, cache.k.shape[3], count, errors.max, errors.relative, errors.cosine))
     return results
 
 
 def actions_study(
     exact: UnifiedPolicy, judged: UnifiedPolicy, observations: Mapping[str, Sequence[Any]], num_steps: int
-) -> list[dict[str, Any]]:
+) -> list[BackendOff]:
     """The model's actions (all of its dimensions, before the robot's units) through one policy against another's.
 
     One result for each group of observations, with the worst observation's cosine and relative error; the i-th one of
@@ -87,18 +163,17 @@ def actions_study(
             noise = torch.from_numpy(np.random.default_rng(seed).standard_normal(shape, dtype=np.float32))
             ours, truth = (policy.backend.sample(one, noise, num_steps).actions for policy in (judged, exact))
             errors.append(_errors(ours.cpu(), truth.cpu()))
-        finite = all(one["cosine"] is not None for one in errors)
-        worst = {
-            "worst_cosine": min(one["cosine"] for one in errors) if finite else None,  # type: ignore[type-var]
-            "worst_relative": max(one["relative"] for one in errors) if finite else None,  # type: ignore[type-var]
-        }
-        results.append({"backend": judged.backend.name, "observations": group, "count": len(errors), **worst})
+        cosines = [one.cosine for one in errors if one.cosine is not None]
+        relative = [one.relative for one in errors if one.relative is not None]
+        finite = len(cosines) == len(relative) == len(errors)
+        worst = (min(cosines), max(relative)) if finite else (None, None)
+        results.append(BackendOff(judged.backend.name, group, len(errors), *worst))
     return results
 
 
 def throughput_study(
     plain: UnifiedPolicy, pipelined: UnifiedPolicy, observations: Sequence[Any], calls: int
-) -> dict[str, Any]:
+) -> Throughput:
     """Latency of one call at a time through both, throughput of calls in flight, and whether the actions are the same.
 
     Both run the same observations and noise in turn; the pipelined policy's backend has `submit`. Milliseconds are
@@ -106,7 +181,7 @@ def throughput_study(
     """
     seeds = range(len(observations))
 
-    def one_at_a_time(policy: UnifiedPolicy) -> tuple[list[np.ndarray], dict[str, Any]]:
+    def one_at_a_time(policy: UnifiedPolicy) -> tuple[list[np.ndarray], Timings]:
         for obs, seed in zip(observations, seeds, strict=True):  # warm, and the actions to compare with
             policy.infer(obs, seed=seed)
         results, start = [], time.perf_counter()
@@ -124,12 +199,12 @@ def throughput_study(
     equal = all(
         np.array_equal(a, b) and np.array_equal(a, c["actions"]) for a, b, c in zip(expected, again, flown, strict=True)
     )
-    return {
-        "calls": calls,
-        "one at a time": {plain.backend.name: alone, pipelined.backend.name: pipelined_alone},
-        "in flight": {**_medians(flown), "per_second": calls / seconds},
-        "actions_equal_bit_for_bit": equal,
-    }
+    return Throughput(
+        calls,
+        {plain.backend.name: alone, pipelined.backend.name: pipelined_alone},
+        {**_medians(flown), "per_second": calls / seconds},
+        equal,
+    )
 
 
 def _medians(results: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -185,25 +260,19 @@ def _layers(model: Pi0Model) -> Any:
         yield {"matrices": matrices, "norms": {name: (1 + norm.weight.float())[None] for name, norm in norms.items()}}
 
 
-def _layer_errors(k: Tensor, v: Tensor, exact_k: Tensor, exact_v: Tensor) -> dict[str, float | None]:
-    return {
-        f"{name}_{kind}": value
-        for name, ours, exact in (("k", k, exact_k), ("v", v, exact_v))
-        for kind, value in _errors(ours, exact).items()
-    }
+def _layer_errors(k: Tensor, v: Tensor, exact_k: Tensor, exact_v: Tensor) -> LayerOff:
+    keys, values = _errors(k, exact_k), _errors(v, exact_v)
+    return LayerOff(keys.max, keys.relative, keys.cosine, values.max, values.relative, values.cosine)
 
 
-def _errors(ours: Tensor, exact: Tensor) -> dict[str, float | None]:
-    """Largest and relative (2-norm) difference and cosine; None for what isn't finite."""
+def _errors(ours: Tensor, exact: Tensor) -> Off:
+    """Largest and relative (2-norm) difference and cosine."""
     ours, exact = ours.double().flatten(), exact.double().flatten()
     if not bool(ours.isfinite().all()):
-        return {"max": None, "relative": None, "cosine": None}
+        return Off(None, None, None)
     difference = ours - exact
-    return {
-        "max": float(difference.abs().max()),
-        "relative": float(difference.norm() / exact.norm()),
-        "cosine": float(F.cosine_similarity(ours, exact, dim=0)),
-    }
+    relative = float(difference.norm() / exact.norm())
+    return Off(float(difference.abs().max()), relative, float(F.cosine_similarity(ours, exact, dim=0)))
 
 
 def builder(library: Library) -> Load:

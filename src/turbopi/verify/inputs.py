@@ -42,7 +42,7 @@ def read_examples(policy: UnifiedPolicy, plan: VerifyPlan) -> Iterator[Example]:
     return prepared(policy, _observations(policy, plan))
 
 
-def _observations(policy: UnifiedPolicy, plan: VerifyPlan) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def _observations(policy: UnifiedPolicy, plan: VerifyPlan) -> Iterator[tuple[str, Mapping[str, object]]]:
     if plan.observations is not None:
         for name, file in chosen_files(plan.observations, plan.count):
             yield name, load_observation(file)
