@@ -35,9 +35,10 @@ class Ran:
         if at_once:  # as a capture does
             run(lambda stage: None)
 
-    def launch(self) -> None:
+    def launch(self, first: Callable[[], None] = lambda: None) -> None:
         self._stages.clear()
         self._tell(self._name)
+        first()
         self._run(self._stages.append)
 
     replay = launch
@@ -54,14 +55,14 @@ class OnCpu(CudaGraphBackend):
         self.told: list[str] = []
         return PLAIN
 
-    def _capture(self, run: Any, after: Any) -> Any:
+    def _capture(self, run: Any, after: Any, like: Any = None) -> Any:
         return Ran(run, after, self.told.append)
 
 
 class Unrun(OnCpu):
     """Whose captures don't run what they capture, for tests of which there are."""
 
-    def _capture(self, run: Any, after: Any) -> Any:
+    def _capture(self, run: Any, after: Any, like: Any = None) -> Any:
         return Ran(run, after, self.told.append, at_once=False)
 
 

@@ -90,6 +90,16 @@ def test_every_observation_is_new_and_has_the_cameras_asked_for(policy: UnifiedP
     assert policy.prepare(first).image_mask.tolist() == [True, False, False]
 
 
+def test_pictures_have_the_size_asked_for(policy: UnifiedPolicy) -> None:
+    observations = Observations(policy, Job(cameras=2, image_width=64, image_height=48))
+    assert {picture.shape for picture in next(observations)["images"].values()} == {(48, 64, 3)}
+    plan = BenchPlan(["pytorch"], ["f32"], image_sizes=[(64, 48), (224, 224)], steps=[1, 2])
+    assert [str(job) for job in plan.jobs()] == [
+        f"2 cameras{of}, 48 tokens, H=10, {steps} steps" for of in (" of 64x48", "") for steps in (1, 2)
+    ]
+    assert plan.main == Job(steps=2)
+
+
 def test_an_impossible_number_of_cameras_is_refused(policy: UnifiedPolicy) -> None:
     with pytest.raises(ConfigError, match="1 to 3 cameras, not 4"):
         Observations(policy, Job(cameras=4))
@@ -298,7 +308,9 @@ def test_a_robots_own_observations_are_measured(monkeypatch: pytest.MonkeyPatch)
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
     assert document["robot"] == "libero"
-    assert {**document["main_job"], "prompt_tokens": 0} == {"cameras": 2, "prompt_tokens": 0, "horizon": 10, "steps": 1}
+    height, width = seen[0]["observation/image"].shape[:2]
+    expected = {"cameras": 2, "horizon": 10, "steps": 1, "image_width": width, "image_height": height}
+    assert {**document["main_job"], "prompt_tokens": 0} == {**expected, "prompt_tokens": 0}
     assert document["main_job"]["prompt_tokens"] > 20
     assert all("observation/wrist_image" in observation for observation in seen)
     assert len({observation["observation/state"].tobytes() for observation in seen}) == len(seen)

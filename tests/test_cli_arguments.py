@@ -32,6 +32,7 @@ NUMBERS: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
     (("bench", *TINY, "--steps"), ("0", "-1", "1001", HUGE, "", "x", "1,,2", "9" * 5000)),
     (("bench", *TINY, "--cameras"), ("0", "4", HUGE)),
     (("bench", *TINY, "--prompt-tokens"), ("0", "8193", HUGE)),
+    (("bench", *TINY, "--image-size"), ("0x3", "640", "640x", "8193x1", "640x480,", "-1x3", HUGE)),
     (("bench", *TINY, "--horizons"), ("0", "1001", HUGE)),
     (("bench", *TINY, "--calls"), ("0", HUGE, "nan")),
     (("bench", *TINY, "--main-calls"), ("0", HUGE)),

@@ -46,7 +46,7 @@ def static_call(kind: Kind, shape: CallShape, precision: FloatPrecision = "f32",
 
 
 def answer(call: StaticCall, observation: Observation, noise: Tensor, row: int = 0) -> Tensor:
-    call.pictures.write(observation.images[row][observation.image_mask[row]].numpy())
+    call.pictures.upload(list(observation.images[row][observation.image_mask[row]].numpy()))
     call.write_inputs(
         noise[row].numpy(),
         observation.state[row].numpy(),
@@ -149,7 +149,7 @@ def test_every_valid_picture_must_be_given() -> None:
     observation, noise = made_up("pi05", 2, 5)
     call = static_call("pi05", shape_of(observation, noise, 1))
     with pytest.raises(ValueError, match="shorter"):
-        call.pictures.write(observation.images[0, :1].numpy())
+        call.pictures.upload(list(observation.images[0, :1].numpy()))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

@@ -71,7 +71,7 @@ class OnCpu(FusedBackend):
     def _make_ops(self) -> Ops:
         return PLAIN
 
-    def _capture(self, run: Any, after: Any) -> Any:
+    def _capture(self, run: Any, after: Any, like: Any = None) -> Any:
         return Ran(run, after, lambda name: None)
 
 

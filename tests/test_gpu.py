@@ -1,6 +1,7 @@
 """The backends on a real GPU: openpi's numbers, determinism, buckets. Run by scripts/gpu_check."""
 
 import dataclasses
+import itertools
 import time
 from functools import lru_cache
 from typing import Any
@@ -12,12 +13,13 @@ from conftest import GOLDEN, golden_cases, golden_folder
 from test_engine import made_up, shape_of
 
 from turbopi import backends
-from turbopi.config import Kind
+from turbopi.config import ImageResize, Kind
 from turbopi.engine.call import StaticCall
 from turbopi.engine.graph import Graph
 from turbopi.engine.runner import HostRow
 from turbopi.model.reference import FloatPrecision
 from turbopi.observation import Observation
+from turbopi.preprocess.images import RESIZES, fitted
 from turbopi.verify.check_golden import check_case
 
 pytestmark = [
@@ -139,7 +141,7 @@ def test_vision_apart_and_the_rest_equal_one_graph_of_the_whole_call(name: str) 
         call = next(c for s, c in runner._calls.items() if s == shape_of(observation, noise, 3))
         if call not in whole:
             whole[call] = Graph(call.run, runner._pool, runner._stream)
-        call.pictures.write(row.images)
+        call.pictures.upload(row.images)
         call.write_inputs(noise[0].numpy(), row.state, row.tokens)
         whole[call].replay()
         return call.actions.clone()
@@ -156,6 +158,29 @@ def test_vision_apart_and_the_rest_equal_one_graph_of_the_whole_call(name: str) 
             runner.begin(row.images[:1])  # and given up
         if turn == 0:
             runner.warmup(made_up("pi05", 2, 5)[0], 3)
+
+
+@pytest.mark.parametrize("way", RESIZES)
+@pytest.mark.parametrize("name", GRAPHS)
+def test_pictures_of_any_size_give_the_actions_of_pictures_resized_on_the_host(name: str, way: ImageResize) -> None:
+    """Bit for bit, in whatever order sizes come, without a capture or an allocation that grows."""
+    runner: Any = backend(name, "pi05", "bf16")
+    side, rng = runner.config.vision.image_size, np.random.default_rng(0)
+    floats = RESIZES[way].float_images
+    observation, noise = made_up("pi05", 2, 20)
+    if floats:
+        observation = dataclasses.replace(observation, images=observation.images.float() / 127.5 - 1)
+    runner.warmup(observation, 3)
+    row, graphs = HostRow.of(observation, 0), len(runner._graphs)
+    sizes = ((480, 640), (37, 53), (side, side), (720, 1280), (480, 640))
+    for first, second in itertools.pairwise((*sizes, *sizes)):
+        pictures = [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in (first, second)]
+        on_host = runner.begin([fitted(one, side, way) for one in pictures])
+        expected = on_host.finish(row.tokens, row.state, noise[0].numpy(), 3).actions
+        found = runner.begin(pictures, way).finish(row.tokens, row.state, noise[0].numpy(), 3)
+        assert torch.equal(found.actions, expected), (first, second)
+        assert all(milliseconds > 0 for milliseconds in found.stage_ms.values()), found.stage_ms
+    assert len(runner._graphs) == graphs
 
 
 def test_time_in_which_the_device_waits_for_the_host_is_the_prefixs() -> None:

@@ -37,6 +37,9 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
 }
 
 
+ImageResize = Literal["openpi", "lerobot", "lerobot_0.4"]  # how, see preprocess/images.py
+
+
 @dataclass(frozen=True)
 class VisionConfig:
     """SigLIP. Defaults: So400m/14 at 224 px."""
@@ -136,7 +139,7 @@ class PolicyConfig:
     asset_id: str | None = None  # folder of norm_stats.json below assets/; None: the only one there
     robot_options: Mapping[str, Any] = field(default_factory=dict)
     default_prompt: str | None = None
-    image_resize: Literal["openpi", "lerobot", "lerobot_0.4"] = "openpi"
+    image_resize: ImageResize = "openpi"
     prompt_state_dim: int | None = None  # zeros fill the state up to it in the prompt, as in LeRobot 0.4; None: nothing
     prompt_as_is: bool = False  # without a state, blanks, underscores and newlines stay in the prompt: LeRobot's Pi0
     num_denoising_steps: int = 10  # unless whoever runs the policy says otherwise

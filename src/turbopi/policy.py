@@ -185,11 +185,11 @@ class UnifiedPolicy:
             raise ObservationError("infer_batch was given no observation")
         steps, actions = self._loop(num_steps, horizon)
         if len(observations) == 1 and isinstance(self.backend, backends.Begins):
-            seen = self._pipeline.see(observations[0])
+            seen = self._pipeline.see(observations[0], resize=False)
             asked = time.perf_counter()
             with self._lock, self._guard:
                 infer_start = time.perf_counter()
-                begun = self.backend.begin(seen.pictures)
+                begun = self.backend.begin(seen.pictures, self._pipeline.config.image_resize)
                 self._pipeline.read(seen)  # while the device is at the pictures
                 x_1 = self._noise(1, actions, noise, seed)[0]
                 sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.config import ModelConfig
+from turbopi.config import ImageResize, ModelConfig
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import FloatPrecision, Trace
 from turbopi.model.sample import Sample
@@ -93,8 +93,11 @@ class Backend(Protocol):
 class Begins(Protocol):
     """A backend that can start on an observation's pictures before its prompt is known."""
 
-    def begin(self, pictures: Sequence[np.ndarray]) -> Begun:
-        """Start on the valid pictures (uint8|float32)[224, 224, 3], on the host.
+    def begin(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> Begun:
+        """Start on the valid pictures, on the host.
+
+        pictures  (uint8|float32)[224, 224, 3], or of any size uint8[h, w, 3], then with
+        resize    how the device is to resize them: to the last bit what `preprocess.images.fitted` makes of them
 
         They are copied, and `begin` returns without waiting for the device, so that the host can tokenise meanwhile. An
         observation that never gets to `finish` is given up by the next `begin`, `sample` or `prefix`.

@@ -64,8 +64,8 @@ def bench_policy(
     )
 
 
-def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None = None) -> tuple[int, int]:
-    """How many cameras and prompt tokens an example observation of the robot has, for a `Job`."""
+def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None = None) -> Job:
+    """The robot's example: its cameras, prompt tokens and first picture's size. The checkpoint's horizon and steps."""
     found = load_tokenizer(
         TINY_TOKENIZER if tokenizer is None and checkpoint.format == "random" else tokenizer,
         checkpoint_dir=checkpoint.path,
@@ -73,8 +73,13 @@ def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None
         vocab_size=checkpoint.config.model.vocab_size,
     )
     pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, found, robot=robot)
-    inputs, _ = pipeline.before(pipeline.example())
-    return int(inputs.image_mask.sum()), int(inputs.token_mask.sum())
+    one, config = pipeline.see(pipeline.example(), resize=False), checkpoint.config
+    pipeline.read(one)
+    height, width = one.pictures[0].shape[:2] if one.pictures else (224, 224)
+    tokens = int(one.token_mask.sum())
+    return Job(
+        int(one.image_mask.sum()), tokens, config.model.action_horizon, config.num_denoising_steps, width, height
+    )
 
 
 def at_horizon(policy: UnifiedPolicy, horizon: int) -> UnifiedPolicy:
@@ -98,7 +103,7 @@ class Observations:
         if not 1 <= job.prompt_tokens <= most:
             raise ConfigError(f"this model reads 1 to {most} prompt tokens; a job can't have {job.prompt_tokens}")
         self._rng = np.random.default_rng(seed)
-        self._cameras = CAMERAS[: job.cameras]
+        self._cameras, self._size = CAMERAS[: job.cameras], (job.image_height, job.image_width, 3)
         self._policy = policy
         self._prompts = [self._prompt(job.prompt_tokens) for _ in range(PROMPTS)] if self._own is None else []
         self._next = 0
@@ -110,7 +115,7 @@ class Observations:
         return self._observation(self._prompts[self._next % PROMPTS])
 
     def _observation(self, prompt: str) -> dict[str, Any]:
-        pictures = {camera: self._rng.integers(0, 256, (224, 224, 3), dtype=np.uint8) for camera in self._cameras}
+        pictures = {camera: self._rng.integers(0, 256, self._size, dtype=np.uint8) for camera in self._cameras}
         return {"images": pictures, "state": self._rng.uniform(-1, 1, 7), "prompt": prompt}
 
     def _prompt(self, tokens: int) -> str:

@@ -38,6 +38,7 @@ class BenchPlan:
     prompt_tokens: Sequence[int] = (48,)
     horizons: Sequence[int] = (10,)
     steps: Sequence[int] = (10,)
+    image_sizes: Sequence[tuple[int, int]] = ((224, 224),)  # width, height
     calls: int = 100
     error: bool = True  # also against the float32 reference
     tokenizer: str | None = None
@@ -61,6 +62,7 @@ class BenchPlan:
             pick(self.prompt_tokens, usual.prompt_tokens),
             pick(self.horizons, usual.horizon),
             usual.steps if usual.steps in self.steps else max(self.steps),
+            *((224, 224) if (224, 224) in self.image_sizes else self.image_sizes[0]),
         )
 
     def check(self, device: torch.device) -> None:
@@ -78,9 +80,11 @@ class BenchPlan:
                 backends.check(name, device, precision)
 
     def jobs(self) -> Iterator[Job]:
-        for horizon, cameras, tokens in itertools.product(self.horizons, self.cameras, self.prompt_tokens):
+        for horizon, cameras, size, tokens in itertools.product(
+            self.horizons, self.cameras, self.image_sizes, self.prompt_tokens
+        ):
             for steps in self.steps:
-                yield Job(cameras, tokens, horizon, steps)
+                yield Job(cameras, tokens, horizon, steps, *size)
 
     def policies(self) -> Iterator[tuple[Precision, str, list[Job]]]:
         """Precision, backend, and the jobs it runs. A backend without one of several precisions is left out there."""

@@ -10,10 +10,12 @@ _Key = tuple[str, str, int, int, int]
 
 
 def linear_models(results: Sequence[Result]) -> list[Line]:
-    """A line for all jobs that differ in steps alone."""
+    """A line for all jobs that differ in steps alone, with pictures of the model's size."""
     groups: dict[_Key, dict[int, float]] = {}
     for result in results:
         job = result.job
+        if job.of_size:
+            continue
         key = (result.backend, result.precision, job.cameras, job.prompt_tokens, job.horizon)
         groups.setdefault(key, {})[job.steps] = result.milliseconds["total"].p50
     return [_line(key, medians) for key, medians in groups.items() if len(medians) > 1]

@@ -20,9 +20,18 @@ class Job(Struct, frozen=True):
     prompt_tokens: _Count = 48
     horizon: _Count = 10
     steps: _Count = 10
+    image_width: _Count = 224  # of what the cameras send
+    image_height: _Count = 224
 
     def __str__(self) -> str:
-        return f"{self.cameras} cameras, {self.prompt_tokens} tokens, H={self.horizon}, {self.steps} steps"
+        pictures = f"{self.cameras} cameras{self.of_size}"
+        return f"{pictures}, {self.prompt_tokens} tokens, H={self.horizon}, {self.steps} steps"
+
+    @property
+    def of_size(self) -> str:
+        """`of 640x480` behind a space, where pictures have another size than the model's; else nothing."""
+        usual = (self.image_width, self.image_height) == (224, 224)
+        return "" if usual else f" of {self.image_width}x{self.image_height}"
 
 
 class Work(Struct, frozen=True):

@@ -35,6 +35,7 @@ _ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps"
 _TABLE = {"--cameras": "1,2,3", "--prompt-tokens": "48,200", "--horizons": "10,50", "--steps": "1,2,3,5,10"}
 
 
+MOST_PIXELS = 8192  # of a camera's width or height
 _MOST = {
     "--cameras": len(CAMERAS),
     "--prompt-tokens": LIMITS["max_prompt_tokens"],
@@ -56,6 +57,20 @@ def _numbers(option: str, text: str) -> list[int]:
     return list(dict.fromkeys(values))
 
 
+def _image_sizes(text: str) -> list[tuple[int, int]]:
+    """Width and height of each, in order, each once."""
+    sizes = []
+    for part in text.split(","):
+        width, _, height = part.strip().partition("x")
+        if not (width.isdecimal() and height.isdecimal() and all(1 <= int(n) <= MOST_PIXELS for n in (width, height))):
+            raise ConfigError(
+                f"--image-size has {shown(part)}; expected width x height, each from 1 to {MOST_PIXELS}, with commas "
+                "between, such as 640x480,1280x720"
+            )
+        sizes.append((int(width), int(height)))
+    return list(dict.fromkeys(sizes))
+
+
 def _axis(option: str, given: str | None, table: bool) -> list[int]:
     """What was given, else the table's numbers or the usual one."""
     return _numbers(option, (_TABLE if table else _ONE)[option] if given is None else given)
@@ -64,20 +79,20 @@ def _axis(option: str, given: str | None, table: bool) -> list[int]:
 def _robots_own(
     axes: dict[str, str | None], table: bool, checkpoint: "Checkpoint", robot: "str | Robot", tokenizer: str | None
 ) -> dict[str, str | None]:
-    """The axes of a benchmark with a robot's own observations: these have its cameras and its prompt."""
+    """The axes of a benchmark with a robot's own observations: these have its cameras, pictures and prompt."""
     from turbopi.bench.measure import robots_job
 
-    clash = [option for option in ("--cameras", "--prompt-tokens") if axes[option] is not None]
+    clash = [option for option in ("--cameras", "--image-size", "--prompt-tokens") if axes[option] is not None]
     clash += ["--table"] if table else []
     if clash:
         raise ConfigError(f"--robot brings its own cameras and prompt: leave out {', '.join(clash)}, or --robot")
-    cameras, tokens = robots_job(checkpoint, robot, tokenizer)
-    config = checkpoint.config
+    job = robots_job(checkpoint, robot, tokenizer)
     return {
-        "--cameras": str(cameras),
-        "--prompt-tokens": str(tokens),
-        "--horizons": axes["--horizons"] or str(config.model.action_horizon),
-        "--steps": axes["--steps"] or str(config.num_denoising_steps),
+        "--cameras": str(job.cameras),
+        "--image-size": f"{job.image_width}x{job.image_height}",
+        "--prompt-tokens": str(job.prompt_tokens),
+        "--horizons": axes["--horizons"] or str(job.horizon),
+        "--steps": axes["--steps"] or str(job.steps),
     }
 
 
@@ -106,6 +121,7 @@ def _backends(names: list[str], precisions: "list[Precision]", device: "torch.de
         "turbopi bench --random-weights pi05_libero --backends pytorch,cuda_graph --steps 1,3,10",
         "turbopi bench checkpoints/pi05_libero --table --main-calls 2000 --ready --profile --report bench-report",
         "turbopi bench checkpoints/pi05_libero --backends fused --precisions bf16,fp8 --quantization fp8.json",
+        "turbopi bench checkpoints/pi05_libero --image-size 224x224,640x480,1280x720",
         "turbopi bench checkpoints/my_arm --config pi05_base --robot my_arm.json",
     ),
 )
@@ -124,6 +140,9 @@ def bench(
     prompt_tokens: Annotated[str | None, typer.Option(metavar="N,N,…", help="Valid prompt tokens; else 48.")] = None,
     horizons: Annotated[str | None, typer.Option(metavar="N,N,…", help="Actions in a chunk; else 10.")] = None,
     steps: Annotated[str | None, typer.Option(metavar="N,N,…", help="Denoising steps; else 10.")] = None,
+    image_size: Annotated[
+        str | None, typer.Option(metavar="WxH,WxH,…", help="Of the cameras' pictures; else 224x224, the model's.")
+    ] = None,
     calls: Annotated[
         int, typer.Option(min=1, max=MOST_CALLS, help="Calls of each measurement, after three for warm-up.")
     ] = 100,
@@ -174,6 +193,7 @@ def bench(
         names = _backends(_names(backends), tiers, resolved)
         robot = options.make_robot()
         axes = {"--cameras": cameras, "--prompt-tokens": prompt_tokens, "--horizons": horizons, "--steps": steps}
+        axes["--image-size"] = image_size
         if robot is not None:
             axes = _robots_own(axes, table, opened, robot, tokenizer)
         plan = BenchPlan(
@@ -183,6 +203,7 @@ def bench(
             prompt_tokens=_axis("--prompt-tokens", axes["--prompt-tokens"], table),
             horizons=_axis("--horizons", axes["--horizons"], table),
             steps=_axis("--steps", axes["--steps"], table),
+            image_sizes=_image_sizes(axes["--image-size"] or "224x224"),
             robot=robot,
             calls=calls,
             error=error,
@@ -306,7 +327,7 @@ def _row(result: "Result") -> list[str]:
         return times[stage].text() if stage in times else "-"
 
     return [
-        f"{label(result)}: {job.cameras} cam, {job.prompt_tokens} tok, H={job.horizon}, {job.steps} steps",
+        f"{label(result)}: {job.cameras} cam{job.of_size}, {job.prompt_tokens} tok, H={job.horizon}, {job.steps} steps",
         *(median(stage) for stage in ("vision", "prefix", "denoise", "device", "total")),
         *(times["total"].text(percentile) for percentile in PERCENTILES),
         f"{result.floor_ms['total']:.2f}",

@@ -2,11 +2,12 @@
 
 `StaticCall.run` is that sequence of kernels on fixed buffers; on a GPU it is captured in two parts and replayed:
 `Pictures.run`, which needs nothing but pictures and so starts while the host still tokenises, and `StaticCall.answer`.
-Each part's inputs travel in one copy out of one pinned buffer, actions come back in one.
+Pictures come before the first part, as cameras differ in their sizes; the second's inputs travel in one copy out of one
+pinned buffer, and actions come back in one.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,12 +15,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.config import ModelConfig
+from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine import forward
 from turbopi.engine.graph import Mark
+from turbopi.engine.resize import Resizer
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
+from turbopi.preprocess.images import fitted
 
 
 @dataclass(frozen=True)
@@ -116,18 +119,45 @@ class Pictures:
         self.host = torch.zeros(dims, dtype=dtype, pin_memory=table.is_cuda)
         self._array = self.host.numpy()
         self.images = torch.zeros(dims, dtype=dtype, device=table.device)
+        self._resizer = Resizer(self.images)
         size = (self.rows + prompt_slots, config.vlm.width)
         self.embs = torch.full(size, torch.nan, device=table.device, dtype=table.dtype)  # as in `Cache`
 
-    def write(self, images: Iterable[np.ndarray]) -> None:
-        """Put the valid pictures (uint8|float32)[224, 224, 3], one by one, into the host buffer."""
-        for target, picture in zip(self._array, images, strict=True):
-            target[:] = picture
+    def resizes(self, pictures: Sequence[np.ndarray]) -> bool:
+        """Whether `run_resized` is needed: some picture hasn't the size and dtype of `images`."""
+        return not all(self._fits(picture) for picture in pictures)
+
+    def upload(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> None:
+        """Valid pictures from the host, in place of those of the call before, without waiting.
+
+        Each is as `images`, or uint8[h, w, 3]: then the device resizes it, or the host if the device can't.
+        """
+        if resize is not None and self.ops.resize_pictures is None:
+            side = self._array.shape[1]
+            pictures = [one if self._fits(one) else fitted(one, side, resize) for one in pictures]
+        if resize is not None and self.resizes(pictures):
+            self._resizer.upload([None if self._fits(one) else one for one in pictures], resize)
+            for camera, picture in enumerate(pictures):
+                if self._fits(picture):
+                    self._array[camera] = picture
+                    self.images[camera].copy_(self.host[camera], non_blocking=True)
+        elif pictures:
+            for target, picture in zip(self._array, pictures, strict=True):
+                target[:] = picture
+            self.images.copy_(self.host, non_blocking=True)
+
+    def _fits(self, picture: np.ndarray) -> bool:
+        return picture.dtype == self._array.dtype and picture.shape == self._array.shape[1:]
+
+    def run_resized(self, mark: Mark = lambda stage: None) -> None:
+        """`run`, once `images` has been made of pictures of other sizes."""
+        if self.ops.resize_pictures is not None and self.cameras:
+            self.ops.resize_pictures(self._resizer.table, self.images)
+        self.run(mark)
 
     def run(self, mark: Mark = lambda stage: None) -> None:
-        """Pictures to the first rows of `embs`."""
+        """`images` to the first rows of `embs`."""
         if self.cameras:
-            self.images.copy_(self.host, non_blocking=True)
             forward.vision_tokens(self.config, self.weights, self.ops, self.images, self.embs[: self.rows])
         mark("vision")
 

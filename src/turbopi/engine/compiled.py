@@ -38,6 +38,12 @@ _DYNAMIC_AXES: dict[Callable[..., Any], dict[str, tuple[int, ...]]] = {
 _RECOMPILE_LIMIT = 64  # one compilation per width and per set of optional arguments; PyTorch's default is 8
 
 
+def _resize_pictures(table: Tensor, images: Tensor) -> None:
+    from turbopi.kernels.portable.resize import resize_pictures  # Triton is there where Inductor is
+
+    resize_pictures(table, images)
+
+
 def compiled() -> Ops:
     """The same operations with torch.compile between the matrix products, for any number of tokens and keys.
 
@@ -53,6 +59,7 @@ def compiled() -> Ops:
         return attention(*args, softmax=softmax)
 
     return Ops(
+        resize_pictures=_resize_pictures if torch.cuda.is_available() else None,
         embed_patches=embed_patches,
         embed_prompt=embed_prompt,
         residual_rms_norm=_compiled(residual_rms_norm),

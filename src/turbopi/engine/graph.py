@@ -72,16 +72,28 @@ class Graph:
     """A sequence of kernels captured once, with timing events at its start and at every mark.
 
     after   the graph that is launched before each time this one is: its stages are this one's first, and the next one
-            begins where they end, so that it has in it whatever time the device waits in between for this launch
+            begins where they end, so that it has in it whatever time the device waits in between for this launch.
+            Without one the first stage begins with what `launch` is given
+    like    a graph in whose place this one may be launched: others that are `after` that one are after both
 
     Replays go to the current stream that the calling thread has on the graph's device, whichever its current device is.
     """
 
     def __init__(
-        self, run: Callable[[Mark], None], pool: Any, stream: torch.cuda.Stream, after: "Graph | None" = None
+        self,
+        run: Callable[[Mark], None],
+        pool: Any,
+        stream: torch.cuda.Stream,
+        after: "Graph | None" = None,
+        like: "Graph | None" = None,
     ) -> None:
         self._device = stream.device
         self._events: dict[str, torch.cuda.Event] = {} if after is None else dict(after._events)
+        self._start: torch.cuda.Event | None = None
+        if like is not None:
+            self._start, self._events = like._start, like._events
+        elif after is None:
+            self._start = self._events["start"] = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
         self._graph = torch.cuda.CUDAGraph()
         with building(stream.device):
             stream.wait_stream(torch.cuda.current_stream(stream.device))
@@ -93,12 +105,16 @@ class Graph:
                 uncollected(),
                 torch.cuda.graph(self._graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
             ):
-                if after is None:
-                    self._mark("start")
                 run(self._mark)
 
-    def launch(self) -> None:
-        """Run the kernels again on what their input buffers hold now, on the current stream, without waiting."""
+    def launch(self, first: Callable[[], None] = lambda: None) -> None:
+        """Do `first`, which may launch kernels, then run the graph's again on what their input buffers hold now.
+
+        On the current stream, without waiting for it.
+        """
+        if self._start is not None:
+            self._start.record(torch.cuda.current_stream(self._device))
+        first()
         self._graph.replay()
 
     def replay(self) -> None:
@@ -112,6 +128,6 @@ class Graph:
         return {name: start.elapsed_time(end) for (_, start), (name, end) in pairs}
 
     def _mark(self, stage: str) -> None:
-        event = torch.cuda.Event(enable_timing=True, external=True)  # type: ignore[no-untyped-call]
-        event.record(torch.cuda.current_stream(self._device))
-        self._events[stage] = event
+        if stage not in self._events:
+            self._events[stage] = torch.cuda.Event(enable_timing=True, external=True)  # type: ignore[no-untyped-call]
+        self._events[stage].record(torch.cuda.current_stream(self._device))

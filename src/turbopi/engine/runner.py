@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.config import ModelConfig
+from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.graph import Graph, Mark, building
 from turbopi.engine.limits import not_warm
@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 
 BUCKET = 16  # prompt tokens: at most 15 padded rows beside 256 a camera
 MAX_CAMERAS = 4  # the cache is allocated for them
+RESIZED = "vision of other sizes"  # the graph that begins with pictures of any size
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,8 @@ class GraphRunner:
             self._check_cameras(cameras)
             for slots in range(BUCKET, bucket(self.config.max_prompt_tokens) + 1, BUCKET):
                 self._graph(CallShape(cameras, slots, actions, num_steps, floats), "answer")
+            if self._ops.resize_pictures is not None:
+                self._graph(self._pictures_of(cameras, floats), RESIZED)
         finally:
             self._warming = False
 
@@ -145,15 +148,17 @@ class GraphRunner:
         graph.replay()
         return call.x_t[-1:].clone()
 
-    def begin(self, pictures: Sequence[np.ndarray]) -> Begun:
+    def begin(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> Begun:
         """See `turbopi.backends.base.Begins`. One observation at a time: this ends the turn of the one before."""
         self._check_cameras(len(pictures))
-        begun = Begun(self, len(pictures), bool(pictures) and pictures[0].dtype == np.float32)
+        floats = pictures[0].dtype == np.float32 if resize is None and pictures else resize not in (None, "openpi")
+        begun = Begun(self, len(pictures), floats and bool(pictures))
         buffers = self._pictures_of(begun.cameras, begun.float_images)
         self._begun = None  # one given up may still be read from the buffers, but nobody gets what becomes of it
-        buffers.write(pictures)
         try:
-            self._graph(buffers, "vision").launch()
+            resized = resize is not None and self._ops.resize_pictures is not None and buffers.resizes(pictures)
+            vision = self._graph(buffers, RESIZED if resized else "vision")
+            vision.launch(lambda: buffers.upload(pictures, resize))
         except RuntimeError as error:
             self._explain(error)
             raise
@@ -219,7 +224,7 @@ class GraphRunner:
         """A subclass that knows why the GPU failed for good raises a DeviceLost that says so."""
 
     def _graph(self, of: CallShape | Pictures, part: str) -> Graph:
-        """The "vision" of pictures; of a shape the "answer" behind it, or its "prefix" or "denoise" alone.
+        """Of pictures "vision" or `RESIZED`; of a shape the "answer" behind it, or its "prefix" or "denoise" alone.
 
         Captured on first use; ObservationError if that isn't allowed.
         """
@@ -240,6 +245,8 @@ class GraphRunner:
 
     def _captured(self, of: CallShape | Pictures, part: str) -> Graph:
         if isinstance(of, Pictures):
+            if part == RESIZED:
+                return self._capture(of.run_resized, None, like=self._graph(of, "vision"))
             return self._capture(of.run, None)
         call = self._call(of)
         if part != "prefix" and call.denoiser is None:
@@ -281,12 +288,12 @@ class GraphRunner:
         if loop[0] not in {steps for steps, _ in self._recent}:
             self._tables.pop(loop[0], None)
 
-    def _capture(self, run: Callable[[Mark], None], after: Graph | None) -> Graph:
+    def _capture(self, run: Callable[[Mark], None], after: Graph | None, like: Graph | None = None) -> Graph:
         """All graphs share memory, as they run one after the other."""
         if self._stream is None:
             self._pool = torch.cuda.graph_pool_handle()
             self._stream = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
-        return Graph(run, self._pool, self._stream, after)
+        return Graph(run, self._pool, self._stream, after, like)
 
     def _pictures_of(self, cameras: int, float_images: bool) -> Pictures:
         key, slots = (cameras, float_images), bucket(self.config.max_prompt_tokens)

@@ -17,6 +17,31 @@ AffineMatrix = tuple[Matrix, Tensor]
 AnyMatrix = TypeVar("AnyMatrix", bound=Matrix)
 
 
+PILLOW_BITS = 22  # of the fraction of its weights: 32 less 8 of a pixel and 2 to spare
+
+
+@dataclass(frozen=True)
+class Taps:
+    """One axis of a picture resized: number i of the result is made of `weights[i]` times those from `first[i]` on.
+
+    first      int32[n]
+    weights    int32[n, taps], in units of 2^-22 (Pillow), or float32[n, 2]. Beyond the picture its last number counts,
+               with a weight of 0 but for float32
+    """
+
+    first: Tensor
+    weights: Tensor
+
+
+# What `resize_pictures` is told of each camera's picture: int64[len(SOURCE)] in the device's memory, so that a captured
+# graph takes pictures of any size. Addresses of the picture uint8[height, width, 3] and of its `Taps`; sizes; where in
+# the result it begins, and how much of it it fills (no rows: the result stays as it is); `kernels.plain`'s `low`.
+SOURCE = (
+    *("picture", "x_first", "x_weights", "y_first", "y_weights"),
+    *("width", "height", "x_taps", "y_taps", "top", "left", "rows", "columns", "low"),
+)
+
+
 @dataclass(frozen=True)
 class VisionLayer:
     norm1: Affine
@@ -59,6 +84,7 @@ class Ops:
     vision_attention: Callable[..., Tensor]
     attention: Callable[..., Tensor]
     prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
+    resize_pictures: Callable[[Tensor, Tensor], None] | None = None  # as `SOURCE` says; None: the host resizes them
     origin: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -15,10 +15,44 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.kernels.interface import Ops
+from turbopi.kernels.interface import PILLOW_BITS, Ops, Taps
 from turbopi.model.layers import apply_rope, rms_normalize
 from turbopi.model.vision import normalize_images
 from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
+
+
+def resize_picture(picture: Tensor, out: Tensor, rows: Taps, columns: Taps, top: int, left: int, low: float) -> None:
+    """Picture uint8[h, w, 3] into `out` [S, S, 3], from row `top` and column `left` on; around it is padding.
+
+    out uint8     as Pillow: sums of whole numbers across, rounded to 8 bits, then down; padding 0
+    out float32   as LeRobot, in [-1, 1]: two neighbours across, then down, of numbers in [0, 1], each pair with one
+                  fused multiply-add, as PyTorch does it on a CPU. What is below `low` becomes it, and so does padding
+    """
+    out.fill_(0 if out.dtype == torch.uint8 else 2 * low - 1)
+    place = out[top : top + len(rows.first), left : left + len(columns.first)]
+    if out.dtype == torch.uint8:
+        across = _pillow_sum(picture.transpose(0, 1), columns).transpose(0, 1)
+        place.copy_(_pillow_sum(across, rows))
+    else:
+        across = _linear_sum((picture.float() / 255).transpose(0, 1), columns).transpose(0, 1)
+        place.copy_(_linear_sum(across, rows).clamp(low, 1) * 2 - 1)
+
+
+def _tapped(x: Tensor, taps: Taps) -> Tensor:
+    """Numbers x [m, ...] that make the result's: [n, taps, ...]."""
+    places = taps.first[:, None] + torch.arange(taps.weights.shape[1], device=x.device)
+    return x[places.clamp(max=len(x) - 1).long()]
+
+
+def _pillow_sum(x: Tensor, taps: Taps) -> Tensor:
+    products = _tapped(x, taps).int() * taps.weights[..., None, None]
+    return ((products.sum(1) + (1 << PILLOW_BITS - 1)) >> PILLOW_BITS).clamp(0, 255).byte()
+
+
+def _linear_sum(x: Tensor, taps: Taps) -> Tensor:
+    first, second = _tapped(x, taps).unbind(1)
+    weights = taps.weights[..., None, None]
+    return (first.double() * weights[:, 0].double() + (second * weights[:, 1]).double()).float()
 
 
 def patch_rows(images: Tensor, patch: int) -> Tensor:

@@ -10,11 +10,48 @@ Both keep the aspect ratio and centre the picture. Sources: openpi's `image_tool
 `vla_utils.resize_with_pad_torch` and `PI05Policy._preprocess_images` (0.6.1).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from PIL import Image
 
+from turbopi.config import ImageResize
 from turbopi.errors import ObservationError
+
+
+@dataclass(frozen=True)
+class _Way:
+    """float_images: the model gets float32 in [-1, 1], else uint8. padding: around a picture, as the model gets it."""
+
+    float_images: bool
+    padding: int
+    low: float  # of a picture in [0, 1]: what is below becomes it
+
+
+RESIZES: dict[ImageResize, _Way] = {
+    "openpi": _Way(False, 0, 0.0),
+    "lerobot": _Way(True, -1, 0.0),
+    "lerobot_0.4": _Way(True, -3, -1.0),
+}
+
+
+def fitted(picture: np.ndarray, size: int, resize: ImageResize) -> np.ndarray:
+    """Picture (uint8|float32)[h, w, 3] as the model gets it, [size, size, 3]; the same array if it is that already.
+
+    float32 is in [0, 1], and LeRobot's ways alone take it. Raises ObservationError if the picture is too narrow.
+    """
+    way = RESIZES[resize]
+    if not way.float_images and picture.shape == (size, size, 3) and picture.flags.c_contiguous:
+        return picture
+    out: np.ndarray = np.empty((size, size, 3), np.float32 if way.float_images else np.uint8)
+    if picture.shape != out.shape:
+        out.fill(way.padding)  # what stays of it
+    if way.float_images:
+        resize_unit_into(picture, out, low=way.low)
+    else:
+        resize_into(picture, out)
+    return out
 
 
 def resize_with_pad(images: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -34,19 +71,19 @@ def resize_with_pad(images: np.ndarray, height: int, width: int) -> np.ndarray:
 def resize_into(image: np.ndarray, out: np.ndarray) -> None:
     """`resize_with_pad` of one uint8[h, w, 3] into `out` uint8[height, width, 3], which holds the padding's zeros."""
     if image.shape == out.shape:
-        _copy(image, out)
+        copy_picture(image, out)
         return
-    rows, columns = _placement(image.shape, out.shape)
+    rows, columns = placement(image.shape, out.shape)
     if not image.flags.c_contiguous:
         packed = np.empty(image.shape, np.uint8)
-        _copy(image, packed)
+        copy_picture(image, packed)
         image = packed
     size = (columns.stop - columns.start, rows.stop - rows.start)
     out[rows, columns] = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR))
 
 
-def _copy(image: np.ndarray, out: np.ndarray) -> None:
-    """Copy by channel, which is four times faster than all at once where `image` is a transposed CHW picture."""
+def copy_picture(image: np.ndarray, out: np.ndarray) -> None:
+    """Copy a picture: by channel, which is four times faster than all at once where it is a transposed CHW one."""
     if image.flags.c_contiguous:
         out[:] = image
         return
@@ -67,7 +104,7 @@ def resize_unit_into(image: np.ndarray, out: np.ndarray, *, low: float = 0.0) ->
         else:
             planes[channel] = image[..., channel]
     if image.shape != out.shape:
-        rows, columns = _placement(image.shape, out.shape)
+        rows, columns = placement(image.shape, out.shape)
         out = out[rows, columns]
         tensor = torch.from_numpy(planes)[None]
         resized = torch.nn.functional.interpolate(tensor, size=out.shape[:2], mode="bilinear", align_corners=False)
@@ -76,8 +113,11 @@ def resize_unit_into(image: np.ndarray, out: np.ndarray, *, low: float = 0.0) ->
         out[..., channel] = planes[channel] * np.float32(2) - np.float32(1)
 
 
-def _placement(shape: tuple[int, ...], target: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of a `target`-sized frame that a picture of `shape` fills, its aspect ratio kept."""
+def placement(shape: tuple[int, ...], target: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of a `target`-sized frame that a picture of `shape` fills, its aspect ratio kept.
+
+    Raises ObservationError if nothing of it would be left.
+    """
     ratio = max(shape[1] / target[1], shape[0] / target[0])
     h, w = int(shape[0] / ratio), int(shape[1] / ratio)
     if h < 1 or w < 1:

@@ -5,7 +5,6 @@ state goes into the prompt normalised but not padded (but by LeRobot 0.4), and r
 un-normalised: openpi un-normalises what it has normalised, LeRobot has kept what came.
 """
 
-import functools
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.config import CAMERAS, PolicyConfig
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.observation import ModelInputs
-from turbopi.preprocess.images import resize_into, resize_unit_into
+from turbopi.preprocess.images import RESIZES, fitted, placement
 from turbopi.preprocess.normalize import Normalizer, absolute_actions, pad_last
 from turbopi.preprocess.robot_checks import (
     check_shape,
@@ -31,18 +30,12 @@ from turbopi.robots.base import read_prompt, read_state
 from turbopi.robots.pictures import check_hwc, to_uint8
 from turbopi.robots.plain import Plain
 
-# image_resize: what pictures are padded with, the dtype that the model gets, and how
-_RESIZING: dict[str, tuple[int, type, Callable[[np.ndarray, np.ndarray], None]]] = {
-    "openpi": (0, np.uint8, resize_into),
-    "lerobot": (-1, np.float32, resize_unit_into),
-    "lerobot_0.4": (-3, np.float32, functools.partial(resize_unit_into, low=-1.0)),
-}
-
 
 @dataclass
 class Incoming:
     """One observation on its way in: `Pipeline.see` fills the first half, `Pipeline.read` the rest.
 
+    resize          False: pictures in uint8 keep their size, for a backend that resizes them
     pictures        (uint8|float32)[224, 224, 3] of each camera that `image_mask` has; some may be the observation's own
     state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt.
                                 In the end what `Pipeline.after` needs: as it came, where LeRobot adds it to actions
@@ -50,6 +43,7 @@ class Incoming:
     """
 
     observation: Mapping[str, object]
+    resize: bool = True
     robot: RobotInputs = field(init=False)
     prompt: str = field(init=False)
     pictures: list[np.ndarray] = field(init=False)
@@ -127,18 +121,18 @@ class Pipeline:
         one = self.see(observation)
         self.read(one)
         size = self.config.model.vision.image_size
-        black, dtype = (0, np.uint8) if self.config.image_resize == "openpi" else (-1, np.float32)
+        black, dtype = (-1, np.float32) if RESIZES[self.config.image_resize].float_images else (0, np.uint8)
         images: np.ndarray = np.empty((len(one.image_mask), size, size, 3), dtype)
         pictures = iter(one.pictures)
         for valid, image in zip(one.image_mask, images, strict=True):
             image[:] = next(pictures) if valid else black
         return ModelInputs(images, one.image_mask, one.tokens, one.token_mask, one.model_state), one.state
 
-    def see(self, observation: Mapping[str, object]) -> Incoming:
-        """The first half of `before`: all that vision needs. `read` is the other."""
+    def see(self, observation: Mapping[str, object], *, resize: bool = True) -> Incoming:
+        """The first half of `before`: all that vision needs. `read` is the other. `resize`: see `Incoming`."""
         if not isinstance(observation, Mapping):
             raise ObservationError(f"an observation is a dict, got {type(observation).__name__}")
-        one = Incoming(observation)
+        one = Incoming(observation, resize)
         for step in self.before_vision:
             step(one)
         return one
@@ -220,20 +214,18 @@ class Pipeline:
         cameras = list(pictures) if final else list(CAMERAS)
         valid = [present.get(camera, camera in pictures) for camera in cameras]
         sample.image_mask = np.array(valid, np.bool_)
-        sample.pictures = [self._fitted(pictures.get(camera), camera) for camera in itertools.compress(cameras, valid)]
+        sample.pictures = [
+            self._picture(pictures.get(camera), camera, sample.resize) for camera in itertools.compress(cameras, valid)
+        ]
 
-    def _fitted(self, picture: object, camera: str) -> np.ndarray:
+    def _picture(self, picture: object, camera: str, resize: bool) -> np.ndarray:
         picture, size = check_hwc(picture, camera), self.config.model.vision.image_size
-        padding, dtype, resize = _RESIZING[self.config.image_resize]
-        if dtype == np.uint8:
+        if not RESIZES[self.config.image_resize].float_images:
             picture = to_uint8(picture, camera)
-            if picture.shape == (size, size, 3) and picture.flags.c_contiguous:
-                return picture
-        out: np.ndarray = np.empty((size, size, 3), dtype)
-        if picture.shape != out.shape:
-            out.fill(padding)  # what stays of it
-        resize(picture, out)
-        return out
+        if resize or picture.dtype != np.uint8:
+            return fitted(picture, size, self.config.image_resize)
+        placement(picture.shape, (size, size))  # refuses one that is too narrow before anything starts
+        return picture
 
     def _tokenize(self, sample: Incoming) -> None:
         state = None
@@ -295,7 +287,7 @@ class Pipeline:
         config, robot, limit = self.config, self.robot, self.config.model.action_dim
         if config.discrete_state_input and config.model.kind != "pi05":
             raise ConfigError(f"{config.name}: only Pi0.5 reads the state from the prompt; Pi0 needs it set to false")
-        if config.image_resize not in _RESIZING:
+        if config.image_resize not in RESIZES:
             raise ConfigError(
                 f"{config.name}: image_resize is openpi or lerobot or lerobot_0.4, not {config.image_resize!r}"
             )

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
-from turbopi.kernels.portable import attention, embedding, norms, products, rope
+from turbopi.kernels.portable import attention, embedding, norms, products, resize, rope
 
 
 def portable_ops() -> Ops:
@@ -24,6 +24,7 @@ def portable_ops() -> Ops:
         rope_split=rope.rope_split,
         vision_attention=attention.vision_attention,
         attention=attend,
+        resize_pictures=resize.resize_pictures,
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
             "vision products": "cuBLAS",
@@ -32,7 +33,7 @@ def portable_ops() -> Ops:
             "vision and prefix attention": "Triton",
             "suffix attention": "cuBLAS and Triton's softmax",
             "LayerNorm": "Triton",
-            "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding": "Triton",
+            "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding, pictures' sizes": "Triton",
         },
     )
 
