@@ -77,7 +77,7 @@ def test_wrong_values_are_refused_by_key(change: dict[str, Any], why: str, tmp_p
         ({"steps": True}, "steps is True"),
         ({"call_ms": [1, "2"]}, r"episodes\[1\]\.call_ms\[1\] is '2'; expected a finite number from 0 to 1e\+12"),
         ({"call_ms": [1e300]}, r"call_ms\[0\] is 1e\+300; expected a finite number from 0 to 1e\+12"),
-        ({"batch": [0]}, r"batch\[0\] is 0; expected a whole number from 1 to 1e\+09"),
+        ({"batch": [0]}, r"batch\[0\] is 0; expected a whole number from 1 to 1000000000"),
         ({"task": 5}, "task is 5; expected the index of a task: 0"),
         ({"initial_state": 0}, "initial_state is 0; expected another one: task 0 has this one twice"),
         ({"video": 3}, "video is 3; expected a text or null"),

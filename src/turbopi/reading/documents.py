@@ -29,7 +29,6 @@ def read_document(
     error: Error = CheckpointError,
     *,
     limit: int = MAX_JSON_BYTES,
-    nan: bool = False,
     hint: str = "",
 ) -> D:
     """The document of a kind that a JSON file holds, under the rules of `read_json`.
@@ -37,7 +36,7 @@ def read_document(
     Keys that the kind hasn't are ignored. Raises `error`, naming the file, the way to the value, the value and what was
     expected, then `hint`.
     """
-    return as_document(read_json(file, error, limit=limit, nan=nan, hint=hint), kind, file, error, hint=hint)
+    return as_document(read_json(file, error, limit=limit, hint=hint), kind, file, error, hint=hint)
 
 
 def as_document(
@@ -50,8 +49,7 @@ def as_document(
         path, found, expected = _misfit(value, kind, "")
         path = path.removeprefix(".") or "its value"
         told = "missing" if found is _MISSING else shown(found)
-        wanted = said(expected) if not _fits(found, expected) else str(reason)
-        raise error(f"{where}: {path} is {told}; expected {wanted}{hint}") from reason
+        raise error(f"{where}: {path} is {told}; expected {said(expected)}{hint}") from reason
 
 
 def plain_document(document: msgspec.Struct) -> dict[str, object]:
@@ -147,6 +145,10 @@ def _said_with(kind: object, limits: list[msgspec.Meta]) -> str:
         if meta.pattern is not None or meta.min_length is not None:
             text = f"{text} that isn't {'blank' if kind is str else 'empty'}"
         low, above, high = meta.ge, meta.gt, meta.le
-        text += f" above {above:g}" if above is not None else f" from {low:g}" if low is not None else ""
-        text += f" to {high:g}" if high is not None else ""
+        text += f" above {_bound(above)}" if above is not None else f" from {_bound(low)}" if low is not None else ""
+        text += f" to {_bound(high)}" if high is not None else ""
     return text
+
+
+def _bound(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:g}"
