@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from cli_helpers import turbopi
 from conftest import golden_cases, golden_folder, golden_model
 from torch import Tensor
-from typer.testing import CliRunner
 
 from turbopi import backends
-from turbopi.cli import app
+from turbopi.config import Kind
 from turbopi.engine.emulate import RoundedWeights, rounded
 from turbopi.errors import ConfigError
 from turbopi.evaluate.sources import LocalPolicy
@@ -19,6 +19,7 @@ from turbopi.quantization.artifact import Quantization
 from turbopi.quantization.plan import TIERS, Fp8Tier
 from turbopi.quantization.sites import sites
 from turbopi.verify.check_golden import check_folder, golden_calibration
+from turbopi.verify.golden import GoldenFolder
 
 CPU = torch.device("cpu")
 CASE = "b_third_masked"
@@ -62,7 +63,11 @@ def test_it_rounds_what_the_plan_says_and_nothing_else(calibration: Quantization
     assert 1e-3 < float((ours[0] - exact).norm() / exact.norm()) < 0.1
 
 
-def test_golden_cases_hold() -> None:
+def test_golden_cases_hold(calibration: Quantization, monkeypatch: pytest.MonkeyPatch) -> None:
+    def calibrated(folder: GoldenFolder, kind: Kind, device: torch.device) -> Quantization:
+        return calibration if kind == "pi05" else golden_calibration(folder, kind, device)  # measured once
+
+    monkeypatch.setattr("turbopi.verify.check_golden.golden_calibration", calibrated)
     compared = [one for many in check_folder(golden_folder(), "emulated_fp8", ("fp8",), CPU) for one in many]
     judged = [one for one in compared if one.ok is not None]
     assert len(judged) >= 7 and {one.tensor for one in judged} == {"actions"}
@@ -109,22 +114,16 @@ def test_auto_never_takes_it() -> None:
 def test_verify_and_bench_run_it(calibration: Quantization, tmp_path: Path) -> None:
     small = "src/turbopi/data/small_policy"
     file = tmp_path / "fp8.json"
-    run = CliRunner().invoke
-    made = run(app, ["calibrate", small, "--observations", "random-noise", "--count", "4", "--out", str(file)])
+    made = turbopi("calibrate", small, "--observations", "random-noise", "--count", 2, "--steps", 2, "--out", file)
     assert made.exit_code == 0, made.output
-    options = ["--quantization", str(file), "--device", "cpu", "--json"]
-    few = ["--count", "1", "--noises", "1"]
-    verified = run(
-        app,
-        ["verify", small, "--backend", "emulated_fp8", "--precision", "fp8", *few, *options],
-    )
+    options = ("--precisions", "fp8", "--quantization", file, "--device", "cpu", "--json")
+    few = ("--count", 1, "--noises", 1, "--steps", 2)
+    verified = turbopi("verify", small, "--backend", "emulated_fp8", "--precision", "fp8", *few, *options[2:])
     document = json.loads(verified.stdout)
     assert verified.exit_code == (0 if document["ok"] else 1), verified.output
     assert (document["backend"], document["precision"]) == ("emulated_fp8", "fp8")
     assert document["actions"]["relative_rms"] > 0, "nothing was rounded"
-    benched = run(
-        app,
-        ["bench", small, "--backends", "emulated_fp8", "--precisions", "fp8", "--calls", "1", "--steps", "1", *options],
-    )
+    quick = ("--calls", 1, "--main-calls", 1, "--steps", 1)
+    benched = turbopi("bench", small, "--backends", "emulated_fp8", *quick, *options)
     assert benched.exit_code == 0, benched.output
     assert json.loads(benched.stdout)["results"][0]["precision"] == "fp8"

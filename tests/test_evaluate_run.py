@@ -27,6 +27,12 @@ from turbopi.sim import SimulatorUnavailable
 TROUBLED = "evaluate_fakes:TroubledSimulator"
 
 
+@pytest.fixture(autouse=True)
+def _no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes longer than a run here, and is test_evaluate_output's."""
+    monkeypatch.setattr("turbopi.evaluate.report.write_plots", lambda results: [])
+
+
 def outcomes(results: Results) -> dict[tuple[int, int], tuple[str, int]]:
     return {key: (episode.status, episode.steps) for key, episode in results.episodes.items()}
 

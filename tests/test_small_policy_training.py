@@ -100,8 +100,8 @@ def trainer(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
 def test_a_few_steps_on_a_few_frames_lower_the_loss_and_the_export_is_what_was_trained(
     trainer: Trainer, tmp_path: Path
 ) -> None:
-    memory = toy_memory(4, trainer.device)
-    batch = memory.batch(torch.arange(4))
+    memory = toy_memory(2, trainer.device)
+    batch = memory.batch(torch.arange(2))
     losses = []
     for _ in range(12):
         torch.manual_seed(1)  # the same noise, times and changes of the pictures: only learning is left
