@@ -6,21 +6,26 @@ not counted: the floor is what no implementation in that precision gets under, n
 
 from typing import Annotated
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from turbopi.config import GemmaConfig, ModelConfig
 
 _Count = Annotated[int, Meta(ge=1)]
 
 
-class Job(Struct, frozen=True):
+def _written(usual: int) -> int:
+    """A field with a default that isn't left out of files: msgspec leaves out none that a function makes."""
+    return field(default_factory=lambda: usual)
+
+
+class Job(Struct, frozen=True, omit_defaults=True):
     """One benchmark point. `prompt_tokens` counts valid tokens, the state's among them."""
 
-    cameras: _Count = 2
-    prompt_tokens: _Count = 48
-    horizon: _Count = 10
-    steps: _Count = 10
-    image_width: _Count = 224  # of what the cameras send
+    cameras: _Count = _written(2)
+    prompt_tokens: _Count = _written(48)
+    horizon: _Count = _written(10)
+    steps: _Count = _written(10)
+    image_width: _Count = 224  # of what the cameras send; left out of files where it is the model's, as in older ones
     image_height: _Count = 224
 
     def __str__(self) -> str:
