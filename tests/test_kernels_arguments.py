@@ -47,15 +47,20 @@ def test_a_struct_is_written_with_its_sizes_checked() -> None:
     assert enumeration("What", ("A", "B")) == "enum What { A, B };"
 
 
+def denoising_source() -> str:
+    """All files of both forms, without what is generated."""
+    return "\n".join(path.read_text() for path in sorted((denoise.FOLDER / "denoise").glob("**/*.cu")))
+
+
 def test_the_denoising_kernel_names_no_wait_that_is_not_declared_and_declares_none_twice() -> None:
-    text = "\n".join((denoise.FOLDER / part).read_text() for part in denoise.PARTS)
+    text = denoising_source()
     named = set(re.findall(r"\bWAIT_[A-Z0-9]+\b", text)) | {"FINISHED"}
     assert named == set(denoise.WAITS)
     assert len(set(denoise.WAITS.values())) == len(denoise.WAITS)
 
 
 def test_the_denoising_kernels_struct_has_what_its_source_reads() -> None:
-    text = "\n".join((denoise.FOLDER / part).read_text() for part in denoise.PARTS)
+    text = denoising_source()
     read = set(re.findall(r"\ba(?:rgs)?\.([a-z_]\w+)", text))
     declared = {one.name for one in denoise.ARGS.fields}
     assert read <= declared, read - declared
