@@ -170,7 +170,7 @@ def test_pictures_of_any_size_give_the_actions_of_pictures_resized_on_the_host(n
     observation, noise = made_up("pi05", 2, 20)
     if floats:
         observation = dataclasses.replace(observation, images=observation.images.float() / 127.5 - 1)
-    runner.warmup(observation, 3)
+    runner.warmup(observation, 3, noise.shape[1])
     row, graphs = HostRow.of(observation, 0), len(runner._graphs)
     sizes = ((480, 640), (37, 53), (side, side), (720, 1280), (480, 640))
     for first, second in itertools.pairwise((*sizes, *sizes)):
