@@ -3,7 +3,6 @@
 Sources: Pillow's `Resample.c` (precompute_coeffs, normalize_coeffs_8bpc), PyTorch's `UpSampleKernel.cpp`.
 """
 
-import ctypes
 from collections import OrderedDict
 from collections.abc import Sequence
 
@@ -45,7 +44,7 @@ class Resizer:
         """A row of the table."""
         rows, columns, top, left = self._place(picture.shape[0], picture.shape[1])
         host, device = self._stage(camera, picture.size)
-        _copy_to(host, picture)
+        copy_picture(picture, host.numpy().reshape(picture.shape))
         device.copy_(host, non_blocking=True)
         taps = (columns.first, columns.weights, rows.first, rows.weights)
         sizes = (picture.shape[1], picture.shape[0], columns.weights.shape[1], rows.weights.shape[1])
@@ -78,15 +77,6 @@ def taps_of(had: int, wanted: slice, pillow: bool) -> Taps:
     """Of an axis of `had` numbers that is to fill `wanted` ones; on the host."""
     first, weights = (pillow_taps if pillow else linear_taps)(had, wanted.stop - wanted.start)
     return Taps(torch.from_numpy(first), torch.from_numpy(weights))
-
-
-def _copy_to(host: Tensor, picture: np.ndarray) -> None:
-    """By PyTorch's threads where the picture is in one piece: one thread alone takes longer than all that follows."""
-    if picture.flags.c_contiguous:
-        address = (ctypes.c_uint8 * picture.size).from_address(picture.ctypes.data)  # PyTorch warns of read-only arrays
-        host.copy_(torch.frombuffer(address, dtype=torch.uint8))
-    else:
-        copy_picture(picture, host.numpy().reshape(picture.shape))
 
 
 def pillow_taps(had: int, wanted: int) -> tuple[np.ndarray, np.ndarray]:
