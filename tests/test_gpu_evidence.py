@@ -6,7 +6,9 @@ from pathlib import Path
 import gpu_evidence
 import machine_code
 import pytest
+import torch
 
+from turbopi import backends as registry
 from turbopi.kernels import nvrtc
 
 SOURCE = '''"""A module."""
@@ -88,6 +90,18 @@ def test_kernels_comments_do_not_count_and_their_strings_do(tmp_path: Path) -> N
 )
 def test_what_runs_on_the_gpu_is_in_the_fingerprint(file: str) -> None:
     assert f"src/turbopi/{file}" in gpu_evidence.fingerprint()
+
+
+def test_a_backend_that_is_not_in_the_fingerprint_refuses_every_gpu() -> None:
+    backends = {spec.module: spec.name for spec in registry.BACKENDS.values()}
+    spared = [name for module, name in backends.items() if module in gpu_evidence.HOST_ONLY]
+    assert spared == ["onnx"]
+    for name in spared:
+        assert f"src/turbopi/backends/{name}.py" not in gpu_evidence.fingerprint()
+        assert "use device 'cpu'" in str(registry.availability(name, torch.device("cuda")))
+    recorded = gpu_evidence.fingerprint()
+    assert gpu_evidence.changed_since(recorded | {"src/turbopi/backends/onnx.py": "other"}) == []
+    assert gpu_evidence.changed_since(recorded | {"src/turbopi/backends/fused.py": "other"}) != []
 
 
 def test_whatever_those_files_import_is_in_the_fingerprint_or_runs_on_the_host_alone() -> None:

@@ -5,6 +5,7 @@ import importlib.util
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,15 @@ from typer.testing import Result
 from turbopi import backends
 from turbopi.backends.onnx import OnnxBackend, Sessions
 from turbopi.checkpoint import convert
+from turbopi.cli.compare import parse_variant
+from turbopi.cli.evaluate import EvalOptions
+from turbopi.cli.options import PolicyOptions
 from turbopi.config import Kind
-from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError
+from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError, ObservationError, OutputError
+from turbopi.export import kept
 from turbopi.export import onnx as exporting
 from turbopi.export.graphs import graphs
-from turbopi.export.onnx import MANIFEST, export_onnx, open_export
+from turbopi.export.onnx import MANIFEST, Export, export_onnx, open_export
 from turbopi.installation import install_command
 from turbopi.verify.check_golden import check_case
 
@@ -31,6 +36,16 @@ for library in ("onnx", "onnxscript", "onnxruntime"):
     pytest.importorskip(library)
 
 CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def exports(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What the backend keeps is kept for these tests alone."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv(kept.FOLDER_VARIABLE, str(tmp_path_factory.mktemp("exports")))
+        yield
+
+
 KINDS: tuple[Kind, ...] = ("pi05", "pi0")
 
 
@@ -152,25 +167,67 @@ def test_exported_folders_equal_openpi(exported: dict[Kind, Path], name: str) ->
     assert not [c for c in comparisons if not c.ok]
 
 
-def test_the_backend_exports_the_weights_it_is_given_and_leaves_no_files(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, exported: dict[Kind, Path]
-) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    checkpoint, case = golden_folder().checkpoint("pi05"), golden_cases()["b_third_masked"]
-    backend = backends.create(
+def golden_backend() -> backends.Backend:
+    """The backend around the golden Pi0.5's weights."""
+    checkpoint = golden_folder().checkpoint("pi05")
+    return backends.create(
         "onnx",
         checkpoint.config.model,
         lambda to, mode: checkpoint.load(to, mode).state,
         device=CPU,
         precision="f32",
     )
-    assert not list(tmp_path.iterdir())
+
+
+def test_the_backend_exports_the_weights_it_is_given(exported: dict[Kind, Path]) -> None:
+    case = golden_cases()["b_third_masked"]
+    backend = golden_backend()
     sample = backend.sample(case.observation, case.noise, 3)
     assert torch.equal(sample.actions, opened(exported["pi05"]).sample(case.observation, case.noise, 3).actions)
     assert list(sample.stage_ms) == ["vision", "prefix", "denoise"]
     about = backend.describe()
     assert about["runtime"].startswith("ONNX Runtime ")
-    assert about["weights_sha256"] == checkpoint.fingerprint()
+    assert about["weights_sha256"] == golden_folder().checkpoint("pi05").fingerprint()
+
+
+def test_an_export_is_kept_for_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exported: dict[Kind, Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    """And used for what it was made of alone; what isn't whole is made anew. Here exporting is copying one."""
+    made: list[Path] = []
+
+    def copied(model: Any, place: Path, *, weights: str) -> Export:
+        made.append(place)
+        return open_export(shutil.copytree(exported["pi05"], place))
+
+    monkeypatch.setattr(kept, "export_onnx", copied)
+    monkeypatch.setenv(kept.FOLDER_VARIABLE, str(tmp_path / "exports"))
+    golden_backend()
+    golden_backend()
+    (place,) = made
+    assert [place] == list((tmp_path / "exports").iterdir())
+    (place / "vision.onnx").write_bytes(b"")
+    with caplog.at_level("WARNING"):
+        golden_backend()
+    assert made == [place, place] and "a kept ONNX export is made anew: " in caplog.text
+    monkeypatch.setattr(kept, "library_versions", lambda: {"torch": "another"})
+    golden_backend()
+    assert len(made) == 3 and made[2] != place
+
+
+def test_another_model_has_another_export() -> None:
+    """Of other weights, and of other sizes."""
+    model = golden_model("pi05")
+    weights = exporting.weights_sha256(model.state_dict())
+    keys = {kept._key(model, weights), kept._key(model, "0" * 64), kept._key(golden_model("pi0"), weights)}
+    assert len(keys) == 3
+
+
+def test_a_folder_that_keeps_nothing_is_named_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(kept.FOLDER_VARIABLE, str(tmp_path / "file"))
+    with pytest.raises(OutputError, match="TURBOPI_EXPORTS names another folder for ONNX exports"):
+        golden_backend()
 
 
 def test_halves_of_a_batch_with_unlike_rows_equal_the_whole_and_the_reference(exported: dict[Kind, Path]) -> None:
@@ -327,6 +384,21 @@ def test_a_missing_library_is_named_with_what_to_install(monkeypatch: pytest.Mon
     without(monkeypatch, library)
     with pytest.raises(BackendUnavailable, match=re.escape(f"{library} isn't installed; {install_command('onnx')}")):
         backends.check("onnx", CPU, "f32")
+
+
+def test_the_command_line_takes_the_precision_that_the_backend_has(tmp_path: Path) -> None:
+    """bf16 is for all who ask for nothing and have it."""
+    for asked, taken in ((None, "f32"), ("f32", "f32"), ("bf16", "bf16")):
+        assert PolicyOptions(backend="onnx", precision=asked).policy_arguments()["precision"] == taken
+    for backend in ("auto", "pytorch", "fused", "nothing"):
+        assert PolicyOptions(backend=backend).policy_arguments()["precision"] == "bf16"
+    assert parse_variant("onnx", EvalOptions()) == ("onnx", "f32", None)
+    words = ("--random-weights", "pi05_tiny", "--backend", "onnx", "--steps", 1, "--device", "cpu")
+    result = turbopi("demo", *words, "--frames", 1, "--report", tmp_path)
+    assert "precision: f32, as onnx doesn't run in bf16" in result.stdout, result.output
+    assert f"its ONNX export stays for the next start: {kept.default_folder()}" in result.stdout
+    refused = turbopi("demo", *words, "--frames", 1, "--report", tmp_path, "--precision", "bf16")
+    assert refused.exit_code == 2 and "backend 'onnx' runs in f32, not in 'bf16'" in refused.stderr
 
 
 def test_other_devices_and_precisions_are_refused() -> None:

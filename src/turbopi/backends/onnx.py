@@ -4,7 +4,6 @@ The host does what has no weights: it leaves out masked cameras and padding (exa
 Batches run one observation after the other.
 """
 
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,7 +15,8 @@ from turbopi.backends.base import LoadState, Precision, Sample
 from turbopi.backends.timing import StageTimer
 from turbopi.config import ModelConfig
 from turbopi.errors import CheckpointError, ObservationError
-from turbopi.export.onnx import EXPORT_NEEDS, GRAPHS, Export, export_onnx, missing_library, open_export
+from turbopi.export.kept import kept_export
+from turbopi.export.onnx import EXPORT_NEEDS, GRAPHS, Export, missing_library, open_export
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.model.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
 from turbopi.model.reference import FloatPrecision, Pi0Model, Trace
@@ -56,7 +56,7 @@ class Sessions:
 
 
 class OnnxBackend:
-    """Exports the weights into a temporary folder and runs that, or runs a folder exported before (`open`)."""
+    """Runs the export of the weights, which is kept for the next start, or a folder exported before (`open`)."""
 
     name: ClassVar[str] = "onnx"
     precisions: ClassVar[tuple[Precision, ...]] = ("f32",)
@@ -67,8 +67,7 @@ class OnnxBackend:
         self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
     ) -> None:
         model = Pi0Model.from_state(config, load(device, precision))
-        with tempfile.TemporaryDirectory(prefix="turbopi-onnx-") as folder:
-            self._use(export_onnx(model, Path(folder) / "export"))
+        self._use(kept_export(model))
 
     @classmethod
     def open(cls, folder: str | Path) -> "OnnxBackend":
@@ -80,6 +79,7 @@ class OnnxBackend:
     def _use(self, export: Export) -> None:
         self.config, self.device, self.precision = export.config, torch.device("cpu"), self.precisions[0]
         self._about = {name: export.manifest[name] for name in ("opset", "weights_sha256", "versions")}
+        self._about["export"] = str(export.folder)
         self._sessions = Sessions(export)
 
     @classmethod

@@ -100,6 +100,14 @@ def _names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
 
 
+def _own_precision(names: list[str]) -> str:
+    """bf16, unless none of the backends runs in it: then the first one's first."""
+    from turbopi import backends
+
+    own = [backends.precisions(name) if name in backends.BACKENDS else ("bf16",) for name in names]  # auto: bf16
+    return "bf16" if not own or any("bf16" in one for one in own) else own[0][0]
+
+
 def _backends(names: list[str], precisions: "list[Precision]", device: "torch.device") -> list[str]:
     """The same with "auto" as what it stands for in each precision. Raises what `backends.check` raises for that."""
     from turbopi import backends
@@ -132,7 +140,10 @@ def bench(
     beside: Annotated[
         str, typer.Option(metavar="NAME,NAME,…", help="Backends that are measured on the main job alone.")
     ] = "",
-    precisions: Annotated[str, typer.Option(metavar="bf16,f32,fp8,fp8-mlp")] = "bf16",
+    precisions: Annotated[
+        str | None,
+        typer.Option(metavar="bf16,f32,fp8,fp8-mlp", help="Else bf16, or what the backends have instead."),
+    ] = None,
     table: Annotated[
         bool, typer.Option("--table", help="1, 2, 3 cameras × 48, 200 tokens × H 10, 50 × 1, 2, 3, 5, 10 steps.")
     ] = False,
@@ -189,7 +200,8 @@ def bench(
         opened = options.open(checkpoint)
         options.tell_if_random(opened, output)
         resolved = registry.resolve_device(device)
-        tiers: list[Precision] = _names(precisions)  # type: ignore[assignment]  # checked when a backend is created
+        chosen = _names(_own_precision(_names(backends)) if precisions is None else precisions)
+        tiers: list[Precision] = chosen  # type: ignore[assignment]  # checked when a backend is created
         names = _backends(_names(backends), tiers, resolved)
         robot = options.make_robot()
         axes = {"--cameras": cameras, "--prompt-tokens": prompt_tokens, "--horizons": horizons, "--steps": steps}

@@ -169,7 +169,7 @@ def parse_variant(text: str, options: EvalOptions) -> tuple[str, str, int | None
 
     parts = text.split(":")
     backend = parts[0]
-    precision = parts[1] if len(parts) > 1 else options.precision
+    precision = parts[1] if len(parts) > 1 else options.precision_of(backend)
     known = backend in BACKENDS and precision in backends.PRECISIONS
     if not known or len(parts) > 3 or not all(re.fullmatch("[0-9]{1,9}", steps) for steps in parts[2:]):
         raise ConfigError(

@@ -155,14 +155,14 @@ class PolicyOptions(RobotOptions):
         str, _option("--backend", panel=_RUNNING, metavar="NAME", help="One of `turbopi backends`, or auto.")
     ] = "auto"
     precision: Annotated[
-        str,
+        str | None,
         _option(
             "--precision",
             panel=_RUNNING,
             metavar="bf16|f32|fp8|fp8-mlp",
-            help="bf16 as openpi serves it, f32, or calibrated.",
+            help="bf16 as openpi serves it, f32, or calibrated. Unless given, bf16, or what --backend has instead.",
         ),
-    ] = "bf16"
+    ] = None
     quantization: Annotated[
         str | None,
         _option(
@@ -213,7 +213,7 @@ class PolicyOptions(RobotOptions):
         """UnifiedPolicy's arguments besides the checkpoint."""
         return {
             "backend": self.backend,
-            "precision": self.precision,
+            "precision": self.precision_of(self.backend),
             "quantization": self._quantization(),
             "num_denoising_steps": self.steps,
             "device": self.device,
@@ -221,6 +221,15 @@ class PolicyOptions(RobotOptions):
             "default_prompt": self.default_prompt,
             "robot": self.make_robot(),
         }
+
+    def precision_of(self, backend: str) -> str:
+        """The precision that is asked for, or else bf16, or if the backend has none the first that it has."""
+        from turbopi import backends
+
+        if self.precision is not None:
+            return self.precision
+        own = backends.precisions(backend) if backend in backends.BACKENDS else ()
+        return own[0] if own and "bf16" not in own else "bf16"
 
     def make_policy(self, checkpoint: "Checkpoint", output: Output, *, strict: bool = False) -> "UnifiedPolicy":
         """The policy, with what it is printed. `strict` as UnifiedPolicy's."""
@@ -236,7 +245,12 @@ class PolicyOptions(RobotOptions):
             f"({about['device_name']}), {about['num_denoising_steps']} steps; "
             f"weights: {about['weight_bytes'] / 1e6:,.0f} MB in {about['load_seconds']:.1f} s"
         )
+        if self.precision is None and about["precision"] != "bf16":
+            output.line(f"precision: {about['precision']}, as {about['backend']} doesn't run in bf16")
         output.line(f"backend: {about['backend']} ({as_typed(about['backend_reason'])})")
+        export = about["backend_details"].get("export")
+        if export is not None:
+            output.line(f"its ONNX export stays for the next start: {export}")
         return policy
 
     def _quantization(self) -> Any:

@@ -75,8 +75,11 @@ def export_onnx(
     *,
     calibration: Calibration | None = None,
     report: Callable[[str], None] = lambda line: None,
+    weights: str | None = None,
 ) -> Export:
     """Write the four graphs of a float32 model on the CPU into the folder `dst`; `report` hears of each one.
+
+    `weights` is what `weights_sha256` says of the model, if that is known.
 
     With a calibration, the prefix's MLPs are FP8, between standard quantise and dequantise nodes.
 
@@ -104,8 +107,8 @@ def export_onnx(
             "opset": OPSET,
             "sizes": asdict(model.config),
             "graphs": signatures,
-            "weights_sha256": weights_sha256(model.state_dict()),
-            "versions": {name: _version(name) for name in ("turbopi", "torch", "onnx", "onnxscript")},
+            "weights_sha256": weights or weights_sha256(model.state_dict()),
+            "versions": library_versions(),
             "files": {file.name: file.stat().st_size for file in sorted(folder.iterdir())},
         }
         (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
@@ -219,6 +222,11 @@ def _quiet_exporter() -> Iterator[None]:
             yield
     finally:
         logger.setLevel(level)
+
+
+def library_versions() -> dict[str, str]:
+    """Of what an export is made with."""
+    return {name: _version(name) for name in ("turbopi", "torch", "onnx", "onnxscript")}
 
 
 def _version(package: str) -> str:
