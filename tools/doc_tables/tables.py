@@ -1,5 +1,6 @@
 """The tables themselves: each takes what result files hold and returns Markdown lines."""
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -202,6 +203,44 @@ def attacks(*files: list[dict[str, Any]]) -> list[str]:
     return results.markdown([piece for pieces in files for piece in pieces]).splitlines()
 
 
+def image_sizes(document: BenchDocument) -> list[str]:
+    """The main job with pictures as cameras send them: whole call, its median, and what it takes more than 224 x 224."""
+    main, rows = document.main_job, []
+    sizes = list(dict.fromkeys((result.job.image_width, result.job.image_height) for result in document.results))
+    for backend, precision in dict.fromkeys((result.backend, result.precision) for result in document.results):
+        found = [_result(document, backend, precision, image_width=w, image_height=h) for w, h in sizes]
+        first = _result(document, backend, precision)
+        assert first is not None and all(found), f"{backend} {precision} lacks a size of {main}"
+        calls = [one.milliseconds["total"].p50 for one in found if one is not None]
+        more = [call - first.milliseconds["total"].p50 for call in calls]
+        rows.append([f"`{backend}` {precision}", *(f"{c:.2f} (+{m:.2f})" for c, m in zip(calls, more, strict=True))])
+    return _table(["", *(f"{width} × {height}" for width, height in sizes)], rows)
+
+
+def layer_in_cycles(marks: list[dict[str, Any]]) -> list[str]:
+    """Where a warp's cycles of a layer go: the means over ranks, and for each form a bar a phase, drawn of its first run
+    in FP8. Marks that this warp never passes are left out.
+    """
+    from turbopi.kernels.sm90.denoise.kernel import FEW, MARKS
+
+    drawn = [
+        next(one for one in marks if (one["tokens"] > FEW) == many and one["precision"] == "fp8") for many in (0, 1)
+    ]
+    rows = []
+    for mark, about in MARKS.items():
+        means = [sum(one["cycles"][mark]) / len(one["cycles"][mark]) for one in marks]
+        if any(means):
+            bars = ["█" * round(means[marks.index(one)] / 150) for one in drawn]
+            rows.append([about.replace("|", "\\|"), *(f"{mean:,.0f}" for mean in means), *bars])
+    total = [sum(sum(cycles) / len(cycles) for cycles in one["cycles"].values()) for one in marks]
+    rows.append(
+        ["all of a layer, and 1/18 of what lies between steps", *(f"{cycles:,.0f}" for cycles in total), "", ""]
+    )
+    head = [f"{one['tokens']} {one['precision']}" for one in marks]
+    lines = _table(["up to where", *head, *(f"{one['tokens']} {one['precision']}, drawn" for one in drawn)], rows)
+    return [lines[0], lines[1].removesuffix("--:|--:|") + "---|---|", *lines[2:]]
+
+
 @dataclass(frozen=True)
 class Table:
     """A table of one or several result files."""
@@ -216,8 +255,17 @@ def _read_attacks(file: Path) -> list[dict[str, Any]]:
     return results.load(file)
 
 
-_OF_BENCHMARKS = (headline, main_job, whole_calls, lines_over_steps, errors, ready, kernels, machine)
+def _read_marks(file: Path) -> list[dict[str, Any]]:
+    """What `python -m kernel_turns time --marks --json` wrote."""
+    marks: list[dict[str, Any]] = json.loads(file.read_text()).get("marks") or []
+    if not marks:
+        raise ValueError(f"{file} has no marks: expected what kernel_turns wrote with --marks")
+    return marks
+
+
+_OF_BENCHMARKS = (headline, main_job, whole_calls, image_sizes, lines_over_steps, errors, ready, kernels, machine)
 TABLES = {
     **{lines.__name__: Table(read_benchmark, lines) for lines in _OF_BENCHMARKS},
     "attacks": Table(_read_attacks, attacks),
+    "layer_in_cycles": Table(_read_marks, layer_in_cycles),
 }
