@@ -204,7 +204,7 @@ def attacks(*files: list[dict[str, Any]]) -> list[str]:
 
 
 def image_sizes(document: BenchDocument) -> list[str]:
-    """The main job with pictures as cameras send them: whole call, its median, and what it takes more than 224 x 224."""
+    """The main job with pictures as cameras send them: the whole call's median, and how much longer than 224 x 224."""
     main, rows = document.main_job, []
     sizes = list(dict.fromkeys((result.job.image_width, result.job.image_height) for result in document.results))
     for backend, precision in dict.fromkeys((result.backend, result.precision) for result in document.results):
@@ -218,14 +218,14 @@ def image_sizes(document: BenchDocument) -> list[str]:
 
 
 def layer_in_cycles(marks: list[dict[str, Any]]) -> list[str]:
-    """Where a warp's cycles of a layer go: the means over ranks, and for each form a bar a phase, drawn of its first run
-    in FP8. Marks that this warp never passes are left out.
+    """Where a warp's cycles of a layer go: means over ranks, and a bar a phase for each form's first run in FP8.
+
+    Marks that this warp never passes are left out.
     """
     from turbopi.kernels.sm90.denoise.kernel import FEW, MARKS
 
-    drawn = [
-        next(one for one in marks if (one["tokens"] > FEW) == many and one["precision"] == "fp8") for many in (0, 1)
-    ]
+    in_fp8 = [one for one in marks if one["precision"] == "fp8"]
+    drawn = [next(one for one in in_fp8 if (one["tokens"] > FEW) == many) for many in (False, True)]
     rows = []
     for mark, about in MARKS.items():
         means = [sum(one["cycles"][mark]) / len(one["cycles"][mark]) for one in marks]
@@ -233,9 +233,8 @@ def layer_in_cycles(marks: list[dict[str, Any]]) -> list[str]:
             bars = ["█" * round(means[marks.index(one)] / 150) for one in drawn]
             rows.append([about.replace("|", "\\|"), *(f"{mean:,.0f}" for mean in means), *bars])
     total = [sum(sum(cycles) / len(cycles) for cycles in one["cycles"].values()) for one in marks]
-    rows.append(
-        ["all of a layer, and 1/18 of what lies between steps", *(f"{cycles:,.0f}" for cycles in total), "", ""]
-    )
+    whole = "all of a layer, and 1/18 of what lies between steps"
+    rows.append([whole, *(f"{cycles:,.0f}" for cycles in total), "", ""])
     head = [f"{one['tokens']} {one['precision']}" for one in marks]
     lines = _table(["up to where", *head, *(f"{one['tokens']} {one['precision']}, drawn" for one in drawn)], rows)
     return [lines[0], lines[1].removesuffix("--:|--:|") + "---|---|", *lines[2:]]

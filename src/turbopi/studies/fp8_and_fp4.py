@@ -1,6 +1,6 @@
 """What numbers of eight and four bits do to actions: `python -m turbopi.studies.fp8_and_fp4 --out FILE`.
 
-Emulated exactly in float32 (emulate.py, formats.py) on three sets of full-size weights (studied.py).
+Emulated exactly in float32 (emulate.py, formats.py) on three sets of full-size weights (weights.py).
 """
 
 import argparse

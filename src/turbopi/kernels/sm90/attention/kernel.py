@@ -1,7 +1,7 @@
 """Attention without materialised logits through wgmma and TMA, for compute capability 9.0: see kernel.cu.
 
 Twins: `vision_attention` of `kernels.plain`, and its `attention` without a suffix. The kernels for all other GPUs, and
-for heads that this one doesn't take, are in kernels/attention.py.
+for heads that this one doesn't take, are in kernels/portable/attention.py.
 """
 
 from dataclasses import dataclass, replace
