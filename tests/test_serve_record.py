@@ -54,7 +54,12 @@ LEAVES = (
     | st.floats(allow_nan=False)
     | st.text()
     | st.binary()
-    | npst.arrays(st.sampled_from(["<f4", ">f8", "|u1", "|b1", "<U3", "|S2", "<M8[s]"]), npst.array_shapes(min_dims=0))
+    | npst.arrays(st.sampled_from(["<f4", ">f8", "|u1", "|b1", "|S2", "<M8[s]"]), npst.array_shapes(min_dims=0))
+    | npst.arrays(
+        "<U3",
+        npst.array_shapes(min_dims=0),
+        elements=st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=3),
+    )
     | st.sampled_from([np.float32(1.5), np.uint8(3), np.bool_(True)])
 )
 KEYS = st.sampled_from(["a", "b", "a/b", "a.npy", "", "/", "..", "ключ", "x" * 200]) | st.text(max_size=4)
@@ -63,6 +68,13 @@ TREES = st.dictionaries(
     st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=3)),
     max_size=5,
 )
+
+
+def test_text_that_could_not_be_read_again_is_not_recorded(tmp_path: Path) -> None:
+    call = RecordedCall({"note": np.array(["ok", "\ud800"])}, {"actions": np.zeros((1, 1))}, 0.0)
+    with pytest.raises(ObservationError, match=r"can't record .*half a Unicode character"):
+        save_call(tmp_path / "call.npz", call)
+    assert not list(tmp_path.iterdir())
 
 
 @given(TREES)
