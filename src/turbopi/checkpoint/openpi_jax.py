@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from turbopi.checkpoint.jax_layout import VISION_QUERY, Rule, path_of, rules
-from turbopi.checkpoint.lora import Adapter, LoraScale, find_adapters, merged
+from turbopi.checkpoint.openpi_lora import Adapter, LoraScale, find_adapters, merged
 from turbopi.checkpoint.orbax import OrbaxTree
 from turbopi.checkpoint.source import PIECE_BYTES, Piece, Shape, row_ranges
 from turbopi.config import LIMITS

@@ -22,7 +22,7 @@ itself.
     time_grid             "accumulated" (openpi) or "multiplied" (LeRobot)
     num_denoising_steps   1 to 1000, unless whoever runs it says otherwise; else LeRobot's num_inference_steps, or 10
     vision_heads          attention heads of a vision tower of a non-standard width
-    lora_alpha            number, or {"vlm": number, "expert": number}: see lora.py
+    lora_alpha            number, or {"vlm": number, "expert": number}: see openpi_lora.py
     lora_rslora           true if adapters were trained rank-stabilised
     base_model            folder of the weights that a peft adapter is for, relative to this file
     weights_sha256        what `turbopi inspect --hash` shows of these weights: others are refused at loading
@@ -40,7 +40,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from turbopi.checkpoint.lora import LoraScale
+from turbopi.checkpoint.openpi_lora import LoraScale
 from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, PolicyConfig
 from turbopi.errors import ConfigError
 from turbopi.reading import is_finite, is_integer, read_json, shown

@@ -1,12 +1,10 @@
-"""Scaling of states and actions, its exact inverse, and the arithmetic between absolute and relative actions.
+"""Scaling of states and actions, and its exact inverse.
 
 openpi's modes compute in float64 (its statistics are float64) and keep openpi's widths: statistics are cut to a
 narrower input; dimensions past the statistics are left alone when un-normalising by quantiles, and multiplied by
 1 + 1e-6 by z-score (padded with mean 0, std 1). LeRobot's modes compute in float32, as its processors do, and return
 those numbers as float64. Nothing is clipped. Sources: openpi's `transforms.py`; LeRobot's `normalize_processor.py`.
 """
-
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -118,23 +116,6 @@ class Normalizer:
 
 def _nonzero(span: np.ndarray) -> np.ndarray:
     return np.where(span == 0, np.float32(_LEROBOT_EPS), span)
-
-
-def delta_actions(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool]) -> np.ndarray:
-    """Absolute actions [..., H, d] relative to `state` [..., s] where `mask` is True; the dtype is kept."""
-    return _shifted(actions, state, mask, -1)
-
-
-def absolute_actions(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool]) -> np.ndarray:
-    """The inverse of `delta_actions`: `state`, un-normalised, added where `mask` is True; the dtype is kept."""
-    return _shifted(actions, state, mask, 1)
-
-
-def _shifted(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool], sign: int) -> np.ndarray:
-    n = len(mask)
-    out = actions.copy()
-    out[..., :n] += sign * np.where(mask, state[..., :n], 0)[..., None, :]
-    return out
 
 
 def pad_last(x: np.ndarray, width: int) -> np.ndarray:

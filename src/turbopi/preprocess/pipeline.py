@@ -17,7 +17,8 @@ from turbopi.config import CAMERAS, PolicyConfig
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.observation import ModelInputs
 from turbopi.preprocess.images import RESIZES, fitted, placement
-from turbopi.preprocess.normalize import Normalizer, absolute_actions, pad_last
+from turbopi.preprocess.normalize import Normalizer, pad_last
+from turbopi.preprocess.relative_actions import absolute_actions
 from turbopi.preprocess.robot_checks import (
     check_shape,
     notes_on_statistics,
