@@ -33,7 +33,7 @@ from turbopi.bench.summary import linear_models
 from turbopi.bench.work import Job, Work, floor_ms, stage_work
 from turbopi.checkpoint import random_checkpoint
 from turbopi.cli import app
-from turbopi.cli.bench import _own_precision
+from turbopi.cli.options import own_precision
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendError, BackendUnavailable, ConfigError, OutputError
 from turbopi.kernels import grid_barrier as barrier
@@ -326,7 +326,7 @@ def test_a_robots_own_observations_are_measured(monkeypatch: pytest.MonkeyPatch)
     [(["onnx"], "f32"), (["onnx", "pytorch"], "bf16"), (["auto"], "bf16"), (["emulated_fp8"], "fp8"), ([], "bf16")],
 )
 def test_without_precisions_the_backends_own_is_measured(names: list[str], taken: str) -> None:
-    assert _own_precision(names) == taken
+    assert own_precision(names) == taken
 
 
 def test_the_command_writes_a_complete_document(

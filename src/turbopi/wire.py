@@ -21,6 +21,7 @@ import msgpack
 import numpy as np
 
 from turbopi.errors import ObservationError
+from turbopi.reading.arrays import is_unicode
 
 MAX_DEPTH = 32  # containers inside each other; an ALOHA request has 3
 MAX_VALUES = 20_000  # msgpack values, keys included; a request has about 50, so this leaves room for lists of numbers
@@ -241,10 +242,8 @@ def _array(fields: dict[object, object], path: tuple[object, ...]) -> np.ndarray
         )
     if dtype.kind == "b" and data.translate(None, b"\x00\x01"):
         raise WireError(f"{_at(path)}: a bool array's bytes must be 0 or 1")
-    if dtype.kind == "U":
-        codes = np.frombuffer(data, np.dtype(np.uint32).newbyteorder(dtype.byteorder))
-        if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes <= 0xDFFF))).any():
-            raise WireError(f"{_at(path)}: a string array holds a number that is no Unicode character")
+    if not is_unicode(data, dtype):
+        raise WireError(f"{_at(path)}: a string array holds a number that is no Unicode character")
     return np.ndarray(tuple(shape), dtype, data)
 
 

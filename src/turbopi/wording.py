@@ -11,3 +11,8 @@ def significant(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return "not finite"
     return "0" if value == 0 else f"{value:#.3g}".removesuffix(".")
+
+
+def cosine(value: float | None) -> str:
+    """With six decimals, as those near 1 are of interest. None is "not finite"."""
+    return "not finite" if value is None else f"{value:.6f}"

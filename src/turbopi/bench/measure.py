@@ -12,7 +12,7 @@ import torch
 
 from turbopi.backends import Precision
 from turbopi.bench.document import PolicyError, Times
-from turbopi.bench.work import Job
+from turbopi.bench.work import MODEL_SIZE, Job
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import CAMERAS, Normalization
 from turbopi.errors import ConfigError
@@ -75,7 +75,7 @@ def robots_job(checkpoint: Checkpoint, robot: str | Robot, tokenizer: str | None
     pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, found, robot=robot)
     one, config = pipeline.see(pipeline.example(), resize=False), checkpoint.config
     pipeline.read(one)
-    height, width = one.pictures[0].shape[:2] if one.pictures else (224, 224)
+    width, height = one.pictures[0].shape[1::-1] if one.pictures else MODEL_SIZE
     tokens = int(one.token_mask.sum())
     return Job(
         int(one.image_mask.sum()), tokens, config.model.action_horizon, config.num_denoising_steps, width, height

@@ -16,7 +16,7 @@ from turbopi.bench.floors import Floors, measure_floors
 from turbopi.bench.measure import WARMING, Observations, answers, at_horizon, bench_policy, error_against, measure_calls
 from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.summary import linear_models, warnings_on
-from turbopi.bench.work import Job, Work, floor_ms, stage_work
+from turbopi.bench.work import MODEL_SIZE, Job, Work, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.graph import collect_and_empty_cache
 from turbopi.errors import ConfigError, TurboPiError
@@ -38,7 +38,7 @@ class BenchPlan:
     prompt_tokens: Sequence[int] = (48,)
     horizons: Sequence[int] = (10,)
     steps: Sequence[int] = (10,)
-    image_sizes: Sequence[tuple[int, int]] = ((224, 224),)  # width, height
+    image_sizes: Sequence[tuple[int, int]] = (MODEL_SIZE,)  # width, height
     calls: int = 100
     error: bool = True  # also against the float32 reference
     tokenizer: str | None = None
@@ -62,7 +62,7 @@ class BenchPlan:
             pick(self.prompt_tokens, usual.prompt_tokens),
             pick(self.horizons, usual.horizon),
             usual.steps if usual.steps in self.steps else max(self.steps),
-            *((224, 224) if (224, 224) in self.image_sizes else self.image_sizes[0]),
+            *(MODEL_SIZE if MODEL_SIZE in self.image_sizes else self.image_sizes[0]),
         )
 
     def check(self, device: torch.device) -> None:

@@ -11,6 +11,7 @@ from msgspec import Meta, Struct, field
 from turbopi.config import GemmaConfig, ModelConfig
 
 _Count = Annotated[int, Meta(ge=1)]
+MODEL_SIZE = (224, 224)  # width and height of the pictures that the model reads
 
 
 def _written(usual: int) -> int:
@@ -25,8 +26,8 @@ class Job(Struct, frozen=True, omit_defaults=True):
     prompt_tokens: _Count = _written(48)
     horizon: _Count = _written(10)
     steps: _Count = _written(10)
-    image_width: _Count = 224  # of what the cameras send; left out of files where it is the model's, as in older ones
-    image_height: _Count = 224
+    image_width: _Count = MODEL_SIZE[0]  # of what cameras send; not in files where it is the model's, as in older ones
+    image_height: _Count = MODEL_SIZE[1]
 
     def __str__(self) -> str:
         pictures = f"{self.cameras} cameras{self.of_size}"
@@ -35,7 +36,7 @@ class Job(Struct, frozen=True, omit_defaults=True):
     @property
     def of_size(self) -> str:
         """`of 640x480` behind a space, where pictures have another size than the model's; else nothing."""
-        usual = (self.image_width, self.image_height) == (224, 224)
+        usual = (self.image_width, self.image_height) == MODEL_SIZE
         return "" if usual else f" of {self.image_width}x{self.image_height}"
 
 

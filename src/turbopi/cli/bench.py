@@ -15,7 +15,7 @@ from rich.table import Table
 
 from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
-from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions
+from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions, own_precision
 from turbopi.config import CAMERAS, LIMITS
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
@@ -98,14 +98,6 @@ def _robots_own(
 
 def _names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
-
-
-def _own_precision(names: list[str]) -> str:
-    """bf16, unless none of the backends runs in it: then the first one's first."""
-    from turbopi import backends
-
-    own = [backends.precisions(name) if name in backends.BACKENDS else ("bf16",) for name in names]  # auto: bf16
-    return "bf16" if not own or any("bf16" in one for one in own) else own[0][0]
 
 
 def _backends(names: list[str], precisions: "list[Precision]", device: "torch.device") -> list[str]:
@@ -200,7 +192,7 @@ def bench(
         opened = options.open(checkpoint)
         options.tell_if_random(opened, output)
         resolved = registry.resolve_device(device)
-        chosen = _names(_own_precision(_names(backends)) if precisions is None else precisions)
+        chosen = _names(own_precision(_names(backends)) if precisions is None else precisions)
         tiers: list[Precision] = chosen  # type: ignore[assignment]  # checked when a backend is created
         names = _backends(_names(backends), tiers, resolved)
         robot = options.make_robot()

@@ -147,6 +147,14 @@ class RobotOptions(WeightOptions):
         return import_robot(self.robot)
 
 
+def own_precision(names: Sequence[str]) -> str:
+    """bf16, unless none of the backends runs in it: then the first one's first. "auto" and unknown ones run in bf16."""
+    from turbopi import backends
+
+    own = [backends.precisions(name) if name in backends.BACKENDS else ("bf16",) for name in names]
+    return "bf16" if not own or any("bf16" in one for one in own) else own[0][0]
+
+
 @dataclass(frozen=True)
 class PolicyOptions(RobotOptions):
     """Which weights, and everything else that UnifiedPolicy is made of."""
@@ -224,12 +232,7 @@ class PolicyOptions(RobotOptions):
 
     def precision_of(self, backend: str) -> str:
         """The precision that is asked for, or else bf16, or if the backend has none the first that it has."""
-        from turbopi import backends
-
-        if self.precision is not None:
-            return self.precision
-        own = backends.precisions(backend) if backend in backends.BACKENDS else ()
-        return own[0] if own and "bf16" not in own else "bf16"
+        return own_precision([backend]) if self.precision is None else self.precision
 
     def make_policy(self, checkpoint: "Checkpoint", output: Output, *, strict: bool = False) -> "UnifiedPolicy":
         """The policy, with what it is printed. `strict` as UnifiedPolicy's."""

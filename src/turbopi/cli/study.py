@@ -14,7 +14,7 @@ from turbopi.config import LIMITS
 from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.files import write_whole
 from turbopi.reading import plain_document
-from turbopi.wording import significant
+from turbopi.wording import cosine, significant
 
 if TYPE_CHECKING:
     import torch
@@ -171,7 +171,7 @@ def _actions_table(results: "list[BackendOff]") -> Table:
     for column in ("count", "worst cosine", "worst relative error"):
         table.add_column(column, justify="right")
     for one in results:
-        errors = (_cosine(one.worst_cosine), significant(one.worst_relative))
+        errors = (cosine(one.worst_cosine), significant(one.worst_relative))
         table.add_row(one.backend, one.observations, str(one.count), *errors)
     return table
 
@@ -202,10 +202,6 @@ def _throughput_table(result: "Throughput") -> Table:
     return table
 
 
-def _cosine(value: float | None) -> str:
-    return "not finite" if value is None else f"{value:.6f}"
-
-
 def _precision_table(results: "list[StyleOff]", library: str) -> Table:
     table = Table(title=f"{library} against the float32 reference", title_justify="left")
     for column in ("attention", "precision"):
@@ -219,7 +215,7 @@ def _precision_table(results: "list[StyleOff]", library: str) -> Table:
             one.precision,
             *map(significant, (first.k_relative, last.k_relative, last.v_relative, last.v_max)),
             *map(significant, (actions.relative, actions.max)),
-            _cosine(actions.cosine),
+            cosine(actions.cosine),
         )
     return table
 
@@ -230,6 +226,6 @@ def _mask_table(results: "list[CacheOff]") -> Table:
     for column in ("slots", "steps", "cosine of actions", "relative error"):
         table.add_column(column, justify="right")
     for one in results:
-        numbers = (_cosine(one.cosine), significant(one.relative))
+        numbers = (cosine(one.cosine), significant(one.relative))
         table.add_row(one.cache, str(one.slots), str(one.steps), *numbers)
     return table

@@ -13,7 +13,7 @@ from turbopi.cli.options import MOST_NOISES, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
 from turbopi.files import write_whole
 from turbopi.reading import as_document, plain_document
-from turbopi.wording import significant
+from turbopi.wording import cosine, significant
 
 if TYPE_CHECKING:
     from turbopi.verify.document import Certificate, Dimension, Fp8Details, IntermediateDocument
@@ -139,7 +139,7 @@ def _show(document: "Certificate", output: Output) -> None:
     worst = document.actions.worst
     output.line(
         f"worst: {worst.observation}, noise seed {worst.seed}: "
-        f"relative rms {significant(worst.relative_rms)}, cosine {_cosine(worst.cosine)}"
+        f"relative rms {significant(worst.relative_rms)}, cosine {cosine(worst.cosine)}"
     )
     for title, time in ((subject, document.latency_ms.backend), (document.oracle, document.latency_ms.oracle)):
         output.line(f"latency of {title}: median {time.p50:.2f} ms, p95 {time.p95:.2f} ms, {time.calls} calls")
@@ -159,10 +159,6 @@ def _show(document: "Certificate", output: Output) -> None:
     output.line(f"bound{own}: actions' relative rms {significant(bounds.actions_relative_rms)}: {bounds.reason}")
     for check in document.checks:
         output.line(f"{'ok  ' if check.ok else 'FAIL'} {check.text}", None if check.ok else "red")
-
-
-def _cosine(value: float | None) -> str:
-    return "not finite" if value is None else f"{value:.6f}"
 
 
 def _calibration(fp8: "Fp8Details") -> str:
@@ -196,7 +192,7 @@ def _intermediates(document: "Certificate") -> Table:
             "-" if control is None else significant(control.relative_rms),
             significant(row.allowed),
             ("FAIL, decides" if above else "ok, decides") if decides else ("above, informs" if above else ""),
-            _cosine(row.cosine),
+            cosine(row.cosine),
             significant(row.max),
             style=("red" if decides else "yellow") if above else None,
         )

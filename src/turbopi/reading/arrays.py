@@ -138,11 +138,17 @@ def _read_array(stream: IO[bytes], size: int, limit: int, where: str, error: Err
         raise error(f"{where} ends after {len(data)} of its {needed} bytes")
     if dtype.kind == "b" and data.translate(None, b"\0\1"):
         raise error(f"{where} is a bool array with bytes that are neither 0 nor 1")
-    if dtype.kind == "U":
-        codes = np.frombuffer(data, np.dtype(np.uint32).newbyteorder(dtype.byteorder))
-        if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes <= 0xDFFF))).any():
-            raise error(f"{where} is an array of text with a number that is no Unicode character")
+    if not is_unicode(data, dtype):
+        raise error(f"{where} is an array of text with a number that is no Unicode character")
     return np.ndarray(shape, dtype, bytearray(data), order=order)  # a bytearray: the array can be written to
+
+
+def is_unicode(data: bytes, dtype: np.dtype) -> bool:
+    """Whether an array of these bytes has Unicode characters alone, if it is one of text (kind U); halves are none."""
+    if dtype.kind != "U":
+        return True
+    codes = np.frombuffer(data, np.dtype(np.uint32).newbyteorder(dtype.byteorder))
+    return not ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes <= 0xDFFF))).any()
 
 
 def _read_header(

@@ -27,6 +27,7 @@ import numpy as np
 from turbopi.errors import ObservationError
 from turbopi.files import write_whole
 from turbopi.reading import Npz, is_finite, listing, parse_json, shown
+from turbopi.reading.arrays import is_unicode
 from turbopi.recordings.observation_folder import load_folder
 
 FORMAT = "turbopi-recording"
@@ -104,19 +105,12 @@ def _to_node(value: object, name: str, members: dict[str, np.ndarray]) -> dict[s
     if value is None or isinstance(value, str | bool | int | float):
         return {"value": value.item() if isinstance(value, np.generic) else value}
     if isinstance(value, np.ndarray | np.generic) and value.dtype.kind not in "VOc":
-        _check_text(np.asarray(value), name)
-        member = _member_name(name, members)
-        members[member] = np.asarray(value)
+        array, member = np.asarray(value), _member_name(name, members)
+        if array.dtype.kind == "U" and not is_unicode(array.tobytes(), array.dtype):  # reading would refuse it
+            raise ObservationError(f"can't record {name}: its text holds half a Unicode character, or what is none")
+        members[member] = array
         return {"array" if isinstance(value, np.ndarray) else "scalar": member}
     raise ObservationError(f"can't record {name}: it is a {type(value).__name__}")
-
-
-def _check_text(array: np.ndarray, name: str) -> None:
-    """Half a Unicode character in an array of text would be refused when the recording is read."""
-    try:
-        "".join(array.ravel().tolist() if array.dtype.kind == "U" else ()).encode()
-    except UnicodeEncodeError as error:
-        raise ObservationError(f"can't record {name}: its text holds half a Unicode character ({error})") from error
 
 
 def _member_name(name: str, taken: dict[str, np.ndarray]) -> str:
