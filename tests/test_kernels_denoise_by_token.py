@@ -195,9 +195,8 @@ class OnCpu:
         text += [(here / form / "memory.cu").read_text(), CTA, (here / "token_times.cu").read_text(), ENTRIES]
         (folder / "times.cpp").write_text("\n".join(text))
         library = folder / "times.so"
-        defines = [f"-D{key}={value}" for key, value in sizes.items()]
-        command = ["g++", "-std=c++17", "-w", "-O1", "-shared", "-fPIC", *defines, "-o", library, folder / "times.cpp"]
-        subprocess.run(command, check=True)
+        options = ["-std=c++17", "-w", "-O1", "-shared", "-fPIC", *(f"-D{key}={value}" for key, value in sizes.items())]
+        subprocess.run(["g++", *options, "-o", str(library), str(folder / "times.cpp")], check=True)
         self.library = ctypes.CDLL(str(library))
         self.library.euler.restype = ctypes.c_float
         self.p, self.tokens, self.arrangement = p, p.tokens, arrangement
@@ -230,7 +229,8 @@ class OnCpu:
 def on_cpu(request: pytest.FixtureRequest, tmp_path: Path) -> OnCpu:
     if shutil.which("g++") is None:
         pytest.skip("no g++ here")
-    return OnCpu(*request.param, tmp_path)
+    name, suffix = request.param
+    return OnCpu(name, suffix, tmp_path)
 
 
 def test_a_lane_gets_its_tokens_factors_of_its_columns(on_cpu: OnCpu) -> None:
@@ -311,22 +311,21 @@ def packed_of(p: Problem, precision: packing.Precision) -> PackedExpert:
     return PackedExpert.pack(p.config, p.layers, input_scales(p) if precision == "fp8" else None)
 
 
-SHAPES = pytest.mark.parametrize(
+SHAPES = pytest.mark.parametrize(  # the same length where it doesn't matter: fewer kernels to compile
     ("name", "steps", "suffix", "length"),
     [
         ("golden", 3, 10, 37),
-        ("golden", 1, 1, 5),
+        ("golden", 2, 6, 5),
         ("odd", 3, 16, 101),
         ("uneven", 2, 33, 256),
         ("golden", 2, 50, 1100),
-        ("shallow", 3, 10, 571),
-        ("shallow", 2, 16, 968),
-        ("shallow", 2, 17, 77),
-        ("shallow", 2, 24, 968),
+        ("shallow", 3, 10, 560),
+        ("shallow", 2, 16, 560),
+        ("shallow", 2, 24, 560),
         ("shallow", 3, 33, 560),
-        ("shallow", 3, 50, 968),
+        ("shallow", 3, 50, 560),
         ("shallow", 1, 56, 1000),
-        ("full", 10, 10, 559),
+        ("full", 10, 10, 560),
         ("full", 3, 50, 560),
     ],
 )
@@ -366,7 +365,7 @@ def test_by_token_in_fp8_it_is_as_exact_as_its_emulation(name: str, steps: int, 
 
 @on_hopper
 @PRECISIONS
-@pytest.mark.parametrize("suffix", [10, 16, 24, 33, 50])
+@pytest.mark.parametrize("suffix", [10, 24, 50])
 def test_with_the_same_times_it_is_the_kernel_with_one_time_bit_by_bit(
     suffix: int, precision: packing.Precision
 ) -> None:
@@ -382,7 +381,7 @@ def test_with_the_same_times_it_is_the_kernel_with_one_time_bit_by_bit(
 @PRECISIONS
 @pytest.mark.parametrize("suffix", [10, 50])
 def test_held_tokens_stay_to_the_last_bit_and_the_others_see_them(suffix: int, precision: packing.Precision) -> None:
-    p = by_token(problem("shallow", 4, suffix, 300, 8, GPU), "held")
+    p = by_token(problem("shallow", 4, suffix, 560, 8, GPU), "held")
     assert p.tokens is not None
     packed, held = packed_of(p, precision), p.tokens.steps[0] == 0
     kernel = kernel_of(p, packed)
@@ -396,12 +395,12 @@ def test_held_tokens_stay_to_the_last_bit_and_the_others_see_them(suffix: int, p
 @PRECISIONS
 @pytest.mark.parametrize("suffix", [10, 50])
 def test_replays_of_a_captured_graph_read_times_and_targets_anew(suffix: int, precision: packing.Precision) -> None:
-    p = problem("shallow", 3, suffix, 500, 6, GPU)
+    p = problem("shallow", 3, suffix, 560, 6, GPU)
     ways = [by_token(p, "distinct", seed) for seed in (1, 2, 3)]
     for way in ways[1:]:
         way.table = ways[0].table
     (tokens,) = [way.tokens for way in ways[:1] if way.tokens is not None]
-    kernel, length = kernel_of(ways[0], packed_of(ways[0], precision)), torch.tensor([500], device=GPU)
+    kernel, length = kernel_of(ways[0], packed_of(ways[0], precision)), torch.tensor([560], device=GPU)
     x_t, v_t = torch.empty(4, suffix, 32, device=GPU), torch.empty(3, suffix, 32, device=GPU)
     captured = dataclasses.replace(tokens, **{k: v.clone() for k, v in vars(tokens).items()})
     stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
@@ -427,7 +426,7 @@ def test_replays_of_a_captured_graph_read_times_and_targets_anew(suffix: int, pr
 @PRECISIONS
 @pytest.mark.parametrize("suffix", [10, 33, 50])
 def test_by_token_it_repeats_itself_bit_by_bit(suffix: int, precision: packing.Precision) -> None:
-    p = by_token(problem("shallow", 4, suffix, 600, 5, GPU), "distinct")
+    p = by_token(problem("shallow", 4, suffix, 560, 5, GPU), "distinct")
     kernel = kernel_of(p, packed_of(p, precision))
     first = run(p, kernel)
     assert all(torch.equal(a, b) for _ in range(20) for a, b in zip(first, run(p, kernel), strict=True))

@@ -105,17 +105,5 @@ class TokenInputs:
 class Denoiser(Protocol):
     """All denoising steps in one launch, for one number of steps and one horizon."""
 
-    def launch(
-        self,
-        noise: Tensor,
-        cache_k: Tensor,
-        cache_v: Tensor,
-        length: Tensor,
-        x_t: Tensor,
-        v_t: Tensor,
-        tokens: TokenInputs | None = None,
-    ) -> None:
-        """From noise float32[H, A] and the cache's first `length` rows: x_t float32[N + 1, H, A], v_t [N, H, A].
-
-        `tokens` of a loop that was made for them, and of no other; v_t then is the guided v that was integrated.
-        """
+    def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
+        """From noise float32[H, A] and the cache's first `length` rows: x_t float32[N + 1, H, A], v_t [N, H, A]."""

@@ -13,7 +13,9 @@ __device__ __forceinline__ float gelu(float x) {
 
 constexpr int GROUPS_GU = plan_groups(GTL);
 // A lane's first row of a tile of gate|up, which has 8 units' gate rows, then their up rows.
-__device__ __forceinline__ int gate_up_row(const Cta& b, int tile) { return (QTL + KVL + min(tile, GTL - 1)) * 16 + b.g(); }
+__device__ __forceinline__ int gate_up_row(const Cta& b, int tile) {
+  return (QTL + KVL + min(tile, GTL - 1)) * 16 + b.g();
+}
 struct GateUpScales {  // of FP8: of a lane's two rows
   float2 of[GROUPS_GU];
   __device__ __forceinline__ GateUpScales(const Cta& b, const Own<GTL>& own, const float* row_scales) {

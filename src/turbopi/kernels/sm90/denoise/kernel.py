@@ -229,7 +229,7 @@ def stuck(words: list[int]) -> str | None:
 
 def _beside_each_other(shifted: Tensor) -> Tensor:
     """float32[..., 16] with rows i and i + 8 of a tile, which a lane has, beside each other: [..., 8, 2]."""
-    return shifted.unflatten(-1, (2, 8)).mT.contiguous()
+    return shifted.view(*shifted.shape[:-1], 2, 8).mT.contiguous()
 
 
 class DenoiseKernel:

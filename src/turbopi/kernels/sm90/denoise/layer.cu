@@ -1,6 +1,7 @@
 // Half a layer, attention (half 0) or feed-forward (half 1): where its weights' tables and sums lie.
 
-// A lane's columns of the norms' tables, from one place in their rows. Asked for well before `gather`: its polls would queue up behind them.
+// A lane's columns of the norms' tables, from one place in their rows. Asked for well before `gather`: its polls would
+// queue up behind them.
 __device__ __forceinline__ void load_columns(const Cta& b, Factors (&v)[ITEMS_X], const float* row) {
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
