@@ -1,6 +1,7 @@
 """How work is cut into blocks and clusters, and what a launch is given: on a CPU, for every tile that is chosen."""
 
 import ctypes
+import dataclasses
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from kernel_turns.problems import Problem, problem
+from kernel_turns.problems import Problem, by_token, problem
 from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
@@ -229,7 +230,8 @@ def loaded(monkeypatch: pytest.MonkeyPatch) -> type[FakeKernel]:
 
 def made(p: Problem, packed: PackedExpert) -> denoise.DenoiseKernel:
     rows, suffix = p.cache_k.shape[1], p.noise.shape[0]
-    return denoise.DenoiseKernel(p.config, packed, p.small, p.table, cache_rows=rows, suffix=suffix, device=CPU)
+    form: dict[str, Any] = {} if p.tokens is None else {"num_steps": len(p.tokens.rows), "by_token": True}
+    return denoise.DenoiseKernel(p.config, packed, p.small, p.table, cache_rows=rows, suffix=suffix, device=CPU, **form)
 
 
 def memory(address: int, *shape: int, kind: Any = np.float32) -> np.ndarray:
@@ -273,6 +275,41 @@ def test_the_denoising_kernels_struct_points_to_what_its_fields_say(loaded: type
     half = p.config.expert.head_dim // 2
     frequencies = p.config.rope_base ** -(np.arange(half) / half)
     np.testing.assert_allclose(memory(a.inv_freq, half), frequencies, rtol=1e-5)
+
+
+def test_by_token_the_struct_also_points_to_what_the_tokens_are_told(loaded: type[FakeKernel]) -> None:
+    p = by_token(problem("golden", 3, 10, 37, 0, CPU), "distinct")
+    packed = PackedExpert.pack(p.config, p.layers)
+    t, kernel = p.tokens, made(p, packed)
+    assert t is not None
+    call = p.noise, p.cache_k, p.cache_v, torch.tensor([p.length]), torch.zeros(4, 10, 32), torch.zeros(3, 10, 32)
+    kernel.launch(*call, t)
+    a = loaded.launches[-1][3]
+    assert (a.steps, a.noise, a.x_t, a.v_t) == (3, *(call[i].data_ptr() for i in (0, 4, 5)))
+    for address, expected in (
+        *((a.token_steps, t.steps), (a.token_times, t.times), (a.gain, t.gain), (a.target, t.target)),
+        (a.table, p.table),
+        (a.out_shift, p.table[:, -1, 1] @ p.small["action_out_proj.weight"].T + p.small["action_out_proj.bias"]),
+    ):
+        np.testing.assert_allclose(memory(address, *expected.shape), expected.numpy(), rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(memory(a.token_rows, 3, 10, kind=np.int32), t.rows.numpy())
+    shifted = Tables.make(packed, p.table).shifted  # a lane's two rows of a tile, i and i + 8, beside each other
+    found = memory(a.shifted, *shifted.shape).reshape(*shifted.shape[:-1], 8, 2)
+    np.testing.assert_array_equal(found, np.stack((shifted[..., :8], shifted[..., 8:]), axis=-1))
+
+
+def test_a_launch_takes_tokens_if_its_kernel_is_by_token_and_only_then(loaded: type[FakeKernel]) -> None:
+    p = problem("golden", 3, 10, 37, 0, CPU)
+    packed, q = PackedExpert.pack(p.config, p.layers), by_token(p, "held")
+    call = p.noise, p.cache_k, p.cache_v, torch.tensor([p.length]), torch.zeros(4, 10, 32), torch.zeros(3, 10, 32)
+    with pytest.raises(AssertionError, match="by token"):
+        made(p, packed).launch(*call, q.tokens)
+    with pytest.raises(AssertionError, match="by token"):
+        made(q, packed).launch(*call)
+    assert q.tokens is not None
+    for name, wrong in (("rows", q.tokens.rows.long()), ("gain", q.tokens.gain[:2]), ("target", q.tokens.target.T)):
+        with pytest.raises(AssertionError, match=name):
+            made(q, packed).launch(*call, dataclasses.replace(q.tokens, **{name: wrong}))
 
 
 def test_the_host_reads_back_what_the_kernel_writes_for_it(loaded: type[FakeKernel]) -> None:

@@ -8,7 +8,8 @@
     ncu -i samples.ncu-rep --page source --csv > samples.csv
     python -m kernel_turns stalls other.patch --tokens 50 --samples samples.csv     (needs no GPU, but NVRTC and Triton)
 
-A variant is "here", a folder as kernels/sm90 is, or a patch of this tree, and constants: +NAME=VALUE.
+A variant is "here", a folder as kernels/sm90 is, or a patch of this tree, and constants: +NAME=VALUE. Behind it @held,
+@guided, @distinct or @same: the form in which tokens have their own times, as in `time here here@held here@guided`.
 """
 
 import argparse
@@ -97,9 +98,11 @@ def _launch(arguments: argparse.Namespace) -> None:
     from kernel_turns.turns import Job
 
     job = Job(arguments.tokens, arguments.precision, arguments.length)
-    kernel, outputs = job.kernel(Variant(arguments.variant)), job.outputs()
+    variant, outputs = Variant(arguments.variant), job.outputs()
+    p = job.of(variant)
+    kernel = job.kernel(variant, p)
     for _ in range(3):
-        job.launch(kernel, *outputs)
+        job.launch(kernel, p, *outputs)
     torch.cuda.synchronize()
 
 

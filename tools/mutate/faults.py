@@ -11,6 +11,7 @@ EMULATED = "tests/test_kernels_emulated.py::test_a_product_in_bf16_is_right_in_w
 CHOICE = "tests/test_fused_choice.py"
 ARGUMENTS = "tests/test_kernels_arguments.py"
 GEOMETRY = "tests/test_launch_geometry.py"
+BY_TOKEN = "tests/test_kernels_denoise_by_token.py"
 ENGINE = "tests/test_engine.py::test_equals_the_reference_for_odd_prompts_and_cameras"
 PARITY = "tests/test_model_parity.py::test_float32_equals_openpi_within_float32_rounding"
 
@@ -58,6 +59,30 @@ FAULTS = (
         '"x_t": v_t, "v_t": x_t}',
         "velocities leave as actions, and memory behind v_t is overwritten",
         (GEOMETRY,),
+    ),
+    Fault(
+        "times and steps of tokens swapped in the denoising kernel's struct",
+        "turbopi.kernels",
+        '"token_steps": (tokens.steps, by_step),\n            "token_times": (tokens.times, by_step),',
+        '"token_steps": (tokens.times, by_step),\n            "token_times": (tokens.steps, by_step),',
+        "denoising adds noise; actions that are held stay",
+        (GEOMETRY,),
+    ),
+    Fault(
+        "a token's factors given to its neighbour's column",
+        "turbopi.kernels",
+        "make_float4(even.x, odd.x, even.y, odd.y)",
+        "make_float4(even.x, even.y, odd.x, odd.y)",
+        "where tokens have different times every norm is wrong",
+        (BY_TOKEN,),
+    ),
+    Fault(
+        "guidance by identity in the wrong direction",
+        "turbopi.kernels",
+        "__fsub_rn(target, chunk)",
+        "__fsub_rn(chunk, target)",
+        "a new chunk jumps away from the one that runs",
+        (BY_TOKEN,),
     ),
     Fault(
         "the denoising kernel's output projection not transposed",
