@@ -34,14 +34,14 @@ def look_at(number: int, time: float, message: bytes, reply: Mapping[str, object
     )
 
 
-def _chunk(actions: object) -> list[list[float]]:
+def _chunk(actions: object) -> list[list[float | None]]:
     if not isinstance(actions, np.ndarray) or actions.ndim != 2 or actions.dtype.kind != "f" or actions.size > ACTIONS:
         return []
-    rows: list[list[float]] = actions.tolist()
+    rows: list[list[float | None]] = actions.tolist()
     return rows
 
 
-def _numbers(observation: Mapping[str, object]) -> dict[str, list[float]]:
+def _numbers(observation: Mapping[str, object]) -> dict[str, list[float | None]]:
     found = {
         clean(key, 60): value.tolist()
         for key, value in observation.items()

@@ -48,10 +48,10 @@ class Look(Struct, frozen=True):
     number: int
     time: float
     prompt: str
-    actions: list[list[float]]
-    numbers: dict[str, list[float]]
+    actions: list[list[float | None]]
+    numbers: dict[str, list[float | None]]
     pictures: dict[str, Thumbnail]
-    timing: dict[str, float]
+    timing: dict[str, float | None]
     note: str = ""
 
 
