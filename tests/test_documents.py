@@ -102,13 +102,12 @@ def test_plots_of_another_document_are_drawn_anew(tmp_path: Path) -> None:
     assert len(drawn.stale_plots(root)) == 3
 
 
-def test_the_plot_beside_others_is_of_readmes_table_and_of_what_the_documents_say_of_others(tmp_path: Path) -> None:
+def test_the_plot_beside_others_is_of_readmes_table_and_of_what_the_documents_say_of_others() -> None:
     told = peers.read_peers(ROOT)
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert f"<!-- table: headline {told.ours} -->" in readme and peers.PLOT.as_posix() in readme
-    (sentence,) = re.findall(
-        r"Other programs with the same job.*?\n\n", (ROOT / "docs/performance.md").read_text(), re.S
-    )
+    performance = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    (sentence,) = re.findall(r"Other programs with the same job.*?\n\n", performance, re.DOTALL)
     assert sorted(float(ms) for ms in re.findall(r"\d+\.\d", sentence)) == sorted(peer.ms for peer in told.peers)
     drawn = peers.bars(ROOT)
     assert [name for name, _, ours in drawn if ours] == ["Turbo-Pi, FP8", "Turbo-Pi, bf16"]

@@ -91,7 +91,7 @@ def test_gaps_and_damaged_calls_are_told(recording: tuple[Path, dict[int, Record
     (folder / "000001.npz").write_bytes(damaged)
     broken, gap = (one for one in recorded(folder) if isinstance(one, ViewedTrouble))
     assert broken.serious and "000001.npz" in broken.text and broken.time == calls[0].time
-    assert gap == ViewedTrouble(calls[4].time, "1 calls before 000004.npz weren't recorded", serious=False)
+    assert gap == ViewedTrouble(calls[4].time, "1 call is missing before 000004.npz", serious=False)
     assert [one.number for one in recorded(folder) if isinstance(one, ViewedCall)] == [1, 3, 5, 6]
     with pytest.raises(ObservationError, match="000001"):
         list(recorded(folder / "000001.npz"))

@@ -107,13 +107,18 @@ class Drawing:
                 names = rr.SeriesLines(names=list(group.names.values()))
                 self._stream.log(_path(call, "executed", group.title), names, static=True)
         cameras = [rrb.Spatial2DView(origin=origin("cameras", camera), name=camera) for camera in call.pictures]
-        drawn = [rrb.Spatial2DView(origin=origin("chunk", group.title), name=_title(group)) for group in groups]
+        bounds = rrb.VisualBounds2D(x_range=(0, WIDTH), y_range=(-0.05 * HEIGHT, 1.05 * HEIGHT))
+        drawn = [
+            rrb.Spatial2DView(origin=origin("chunk", group.title), name=_title(group), visual_bounds=bounds)
+            for group in groups
+        ]
         series = ["state", "latency", *(["executed"] if self._rate is not None else [])]
         self._views[call.robot] = rrb.Vertical(
             rrb.Horizontal(rrb.TextDocumentView(origin=origin("prompt"), name="prompt"), *cameras),
             rrb.Horizontal(*drawn),
             rrb.Horizontal(*(rrb.TimeSeriesView(origin=origin(name), name=name) for name in series)),
             rrb.TextLogView(origin="errors", name="errors"),
+            row_shares=(4, 3, 3, 1),
             name=call.robot or "robot",
         )
         layout = next(iter(self._views.values())) if len(self._views) == 1 else rrb.Tabs(*self._views.values())

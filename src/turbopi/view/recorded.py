@@ -46,7 +46,8 @@ def recorded(recording: Path) -> Iterator[ViewedCall | ViewedTrouble]:
             yield ViewedTrouble(time or file.stat().st_mtime, str(error))
             continue
         if missing > 0:
-            yield ViewedTrouble(call.time, f"{missing} calls before {file.name} weren't recorded", serious=False)
+            lacks = "1 call is" if missing == 1 else f"{missing} calls are"
+            yield ViewedTrouble(call.time, f"{lacks} missing before {file.name}", serious=False)
         number, time = number + missing + 1, call.time
         yield ViewedCall(
             robot="",
