@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from turbopi.errors import ConfigError
-from turbopi.serve.hosts import AllowedHosts
+from turbopi.serve.hosts import LOOPBACK, AllowedHosts
 from turbopi.serve.limits import Limits
 
 
@@ -21,6 +21,7 @@ class ServerOptions:
     record_dir      if given, every observation and its actions are written below this folder
     allowed_hosts   names, besides its own, by which web pages may address this server (`hosts.AllowedHosts`)
     max_clients     connected at once; more are refused with HTTP 503
+    page            the server's own page and its feed. None: on if only this machine or who has the key can see it
     """
 
     host: str = "127.0.0.1"
@@ -31,6 +32,7 @@ class ServerOptions:
     record_dir: str | Path | None = None
     allowed_hosts: Sequence[str] = ()
     max_clients: int = Limits.clients
+    page: bool | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
@@ -43,6 +45,11 @@ class ServerOptions:
             raise ConfigError(f"max_clients must be 1 or more, not {self.max_clients}")
         check_key(self.api_key)
         AllowedHosts(self.host, self.allowed_hosts)
+
+    @property
+    def has_page(self) -> bool:
+        """Whether the page is on."""
+        return self.page if self.page is not None else self.host in LOOPBACK or self.api_key is not None
 
 
 def check_key(api_key: str | None) -> None:
