@@ -74,6 +74,36 @@ def test_bytes_and_weights_of_every_camera_are_where_the_table_says() -> None:
             np.testing.assert_array_equal(at(row[f"{axis}_first"], ctypes.c_int32, len(taps.first)), taps.first)
 
 
+class Full(Resizer):
+    """Pinned memory holds no picture of more than `room` bytes."""
+
+    room = 1 << 30
+
+    def _stage(self, camera: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+        if size > self.room:
+            raise torch.cuda.OutOfMemoryError("pinned memory")
+        return super()._stage(camera, size)
+
+
+@pytest.mark.parametrize(
+    ("second", "error"), [(picture(90, 160), torch.cuda.OutOfMemoryError), (picture(1, 90), ObservationError)]
+)
+def test_a_call_that_fails_at_its_second_camera_hides_nothing_from_the_next(
+    second: np.ndarray, error: type[Exception]
+) -> None:
+    resizer = Full(torch.zeros((2, 28, 28, 3), dtype=torch.uint8))
+    first, changed = [picture(40, 30), picture(30, 20)], picture(30, 40)
+    resizer.upload(first, "openpi")
+    resizer.room = changed.size
+    with pytest.raises(error):
+        resizer.upload([changed, second], "openpi")
+    resizer.upload([changed, first[1]], "openpi")
+    for row, image in zip(resizer.table.tolist(), (changed, first[1]), strict=True):
+        source = dict(zip(SOURCE, row, strict=True))
+        assert (source["height"], source["width"]) == image.shape[:2]
+        np.testing.assert_array_equal(at(source["picture"], ctypes.c_uint8, image.size).reshape(image.shape), image)
+
+
 def at(address: int, kind: Any, count: int) -> np.ndarray:
     return np.ctypeslib.as_array((kind * count).from_address(address))
 

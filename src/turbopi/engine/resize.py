@@ -34,10 +34,12 @@ class Resizer:
 
         Raises ObservationError for a picture that is too narrow.
         """
-        before = self._rows.copy()
+        rows = np.zeros_like(self._rows)
         for camera, picture in enumerate(pictures):
-            self._rows[camera] = 0 if picture is None else self._send(camera, picture, RESIZES[resize].low)
-        if not np.array_equal(before, self._rows):
+            if picture is not None:
+                rows[camera] = self._send(camera, picture, RESIZES[resize].low)
+        if not np.array_equal(rows, self._rows):  # `_rows` is what `table` has: a call that fails above changes neither
+            self._rows[:] = rows
             self.table.copy_(self._host, non_blocking=True)
 
     def _send(self, camera: int, picture: np.ndarray, low: float) -> tuple[int, ...]:
