@@ -22,7 +22,7 @@ SIDE = 224  # PyTorch sums in another order where a result's height and width ar
 # (height, width): cameras' own, larger and smaller, odd, square, narrow, one axis kept, already of the size
 SIZES = (
     *((480, 640), (720, 1280), (1080, 1920), (640, 480), (240, 320), (37, 53), (53, 37), (300, 300), (1, 40)),
-    *((SIDE, 300), (300, SIDE), (SIDE, SIDE), (SIDE - 1, SIDE), (3, 2), (SIDE * 2, SIDE * 2)),
+    *((SIDE, 300), (300, SIDE), (SIDE, SIDE), (SIDE - 1, SIDE), (3, 2), (SIDE * 2, SIDE * 2), (900, 224)),
 )
 WAYS = tuple(RESIZES)
 
