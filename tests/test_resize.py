@@ -11,7 +11,7 @@ from test_begin import CPU, OnCpu
 
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import ImageResize
-from turbopi.engine.resize import MOST_SIZES, Resizer, taps_of
+from turbopi.engine.resize import MOST_SIZES, SHARED, Resizer, taps_of
 from turbopi.errors import ObservationError
 from turbopi.kernels import plain
 from turbopi.kernels.interface import SOURCE, Ops
@@ -72,6 +72,20 @@ def test_bytes_and_weights_of_every_camera_are_where_the_table_says() -> None:
             weights = at(row[f"{axis}_weights"], ctypes.c_int32, taps.weights.numel())
             np.testing.assert_array_equal(weights, taps.weights.flatten())
             np.testing.assert_array_equal(at(row[f"{axis}_first"], ctypes.c_int32, len(taps.first)), taps.first)
+
+
+@pytest.mark.parametrize("cameras", [1, 2, 3])
+def test_every_byte_of_large_pictures_is_sent_whoever_copies_it(cameras: int) -> None:
+    resizer = Resizer(torch.zeros((cameras, 28, 28, 3), dtype=torch.uint8))
+    for round_ in range(3):
+        sent = [picture(721 + camera % 2, 1280, seed=round_ * 3 + camera) for camera in range(cameras)]
+        sent[-1] = sent[-1].transpose(1, 0, 2)
+        resizer.upload(sent, "openpi")
+        for row, image in zip(resizer.table.tolist(), sent, strict=True):
+            assert image.size > SHARED
+            there = at(dict(zip(SOURCE, row, strict=True))["picture"], ctypes.c_uint8, image.size)
+            np.testing.assert_array_equal(there.reshape(image.shape), image)
+            image[:] = 0  # nobody reads it any more
 
 
 class Full(Resizer):
