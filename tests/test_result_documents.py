@@ -9,6 +9,7 @@ import gpu_evidence
 import numpy as np
 import pytest
 import torch
+from attack.results import AttackDocument
 from kernel_turns.document import read_turns
 from msgspec import Meta, Struct
 
@@ -198,6 +199,13 @@ OF_TURNS = [name for name in EVERY if {"rows", "provenance"} <= set(json.loads((
 def test_checked_in_turns_of_kernels_read_and_come_out_as_they_were(name: str) -> None:
     document = read_turns(RESULTS / name)
     assert document.rows
+    assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if '"turbopi-attack"' in (RESULTS / name).read_text()[:99]])
+def test_checked_in_attacks_read_and_come_out_as_they_were(name: str) -> None:
+    document = read_document(RESULTS / name, AttackDocument, ConfigError)
+    assert len(document.pieces) > 3
     assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
 
 

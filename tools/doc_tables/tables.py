@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kernel_turns.document import MarkedVariant, read_turns
 from msgspec.structs import replace
@@ -11,6 +11,9 @@ from msgspec.structs import replace
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
 from turbopi.provenance import Gpu
 from turbopi.wording import significant
+
+if TYPE_CHECKING:
+    from attack.results import Piece
 
 STAGES = ("vision", "prefix", "denoise")
 
@@ -196,7 +199,7 @@ def machine(document: BenchDocument) -> list[str]:
     ]
 
 
-def attacks(*files: list[dict[str, Any]]) -> list[str]:
+def attacks(*files: "list[Piece]") -> list[str]:
     """What the attack tool found."""
     from attack import results
 
@@ -248,7 +251,7 @@ class Table:
     lines: Callable[..., list[str]]  # of what was read of each file
 
 
-def _read_attacks(file: Path) -> list[dict[str, Any]]:
+def _read_attacks(file: Path) -> "list[Piece]":
     from attack import results
 
     return results.load(file)
