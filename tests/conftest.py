@@ -117,4 +117,4 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     waiting = gpu_evidence.pending()
     if waiting is not None:
         terminalreporter.section("THE GPU TESTS WERE NOT RUN ON THIS CODE", red=True, bold=True)
-        terminalreporter.line(f"since {waiting['date']}: {waiting['reason']}. Run scripts/gpu_check on a Hopper GPU.")
+        terminalreporter.line(f"since {waiting.date}: {waiting.reason}. Run scripts/gpu_check on a Hopper GPU.")

@@ -33,6 +33,7 @@ CONFIGS = {
     "tiny": sized(128, 256, 6, 32),
     "odd": sized(160, 224, 2, 48, 4),
     "uneven": sized(160, 224, 2, 48, 10),  # ten clusters divide nothing
+    "wide": sized(1280, 224, 1, 256, 2),  # more than 8 tiles back into the stream, more than 3 of q|k|v
     "crowd": sized(64, 128, 1, 16, 32),  # more clusters than a GPU holds
     "shallow": sized(1024, 4096, 3, 256),
     "full": FULL,

@@ -4,12 +4,12 @@ Machines, and hours on one machine, differ by more than most changes do, so a ch
 """
 
 import statistics
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from kernel_turns.document import TimedVariant
 from kernel_turns.problems import GPU, Problem, by_token, input_scales, plain, problem, relative
 from kernel_turns.variants import Variant
 from turbopi.backends import resolve_device
@@ -18,20 +18,6 @@ from turbopi.kernels.sm90.denoise.kernel import MARKS, unavailable
 from turbopi.kernels.sm90.denoise.packing import RANKS, PackedExpert
 
 STEPS, CACHE_ROWS, SEED = 10, 976, 1
-
-
-@dataclass
-class Row:
-    """One variant: milliseconds of ten steps, relative rms of the actions' error to its problem in float32, whether
-    they equal the first variant's to the last bit, the clock during the last launch.
-    """
-
-    variant: str
-    milliseconds: float  # the median of the rounds
-    fastest: float
-    error: float
-    same: bool
-    mhz: float
 
 
 class Job:
@@ -48,7 +34,7 @@ class Job:
         p = problem("full", STEPS, tokens, length, SEED, GPU)
         self.problem = p
         self.packed = PackedExpert.pack(p.config, p.layers, input_scales(p) if precision == "fp8" else None)
-        self.tokens, self.length = tokens, torch.tensor([length], device=GPU)
+        self.tokens, self.precision, self.length = tokens, precision, torch.tensor([length], device=GPU)
 
     def of(self, variant: Variant) -> Problem:
         """What this variant is given."""
@@ -76,7 +62,7 @@ class Job:
         kernel.launch(p.noise, p.cache_k, p.cache_v, self.length, x_t, v_t, *by_token)
 
 
-def time_in_turns(job: Job, variants: list[Variant], rounds: int, calls: int = 12) -> list[Row]:
+def time_in_turns(job: Job, variants: list[Variant], rounds: int, calls: int = 12) -> list[TimedVariant]:
     """Every variant's CUDA graph in every round, `calls` times."""
     runs = []
     for variant in variants:
@@ -102,7 +88,10 @@ def time_in_turns(job: Job, variants: list[Variant], rounds: int, calls: int = 1
             taken.append(begin.elapsed_time(end) / calls)
     first = runs[0][3]
     return [
-        Row(
+        TimedVariant(
+            job.tokens,
+            job.precision,
+            job.problem.length,
             variant.spec,
             statistics.median(taken),
             min(taken),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 EMULATED = "tests/test_kernels_emulated.py::test_a_product_in_bf16_is_right_in_whatever_order_its_threads_go"
+PRODUCTS = "tests/test_kernels_denoise_emulated.py"
 CHOICE = "tests/test_fused_choice.py"
 ARGUMENTS = "tests/test_kernels_arguments.py"
 GEOMETRY = "tests/test_launch_geometry.py"
@@ -275,6 +276,38 @@ FAULTS = (
         "x = (FP8 ? twice_gelu(sums[BN / 4 + 4 * j + 2 * half]) : gelu(sums[BN / 4 + 4 * j + 2 * half])) * x;",
         "every second hidden unit is wrong",
         (EMULATED,),
+    ),
+    Fault(
+        "core matrices of packed weights by columns first",
+        "turbopi.kernels",
+        "ordered = tiles.view(count, 2, 8, blocks, 2, per).permute(0, 3, 1, 4, 2, 5)",
+        "ordered = tiles.view(count, 2, 8, blocks, 2, per).permute(0, 3, 4, 1, 2, 5)",
+        "every product of the action expert is wrong",
+        (PRODUCTS,),
+    ),
+    Fault(
+        "ldmatrix's quarters of lanes swapped in the denoising kernel",
+        "turbopi.kernels",
+        "b.lane() / 8 % 2 * 256 + b.lane() / 16 * 128",
+        "b.lane() / 8 % 2 * 128 + b.lane() / 16 * 256",
+        "queries, keys and values of few tokens are wrong",
+        (PRODUCTS,),
+    ),
+    Fault(
+        "parts of the reduction meet each other's activations",
+        "turbopi.kernels",
+        "const int here = min(fragment + my.part, most(blocks, KB) - 1);",
+        "const int here = min(fragment, most(blocks, KB) - 1);",
+        "models whose widths divide nothing get wrong sums",
+        (PRODUCTS,),
+    ),
+    Fault(
+        "weights' slot given back before its products are done",
+        "turbopi.kernels",
+        "await_products<1>();  // the round before is done",
+        "await_products<2>();  // the round before is done",
+        "weights are overwritten while they are multiplied: wrong now and then",
+        (PRODUCTS,),
     ),
     Fault(
         "a graph's replay isn't waited for",

@@ -5,6 +5,7 @@ Sources: Pillow's `Resample.c` (precompute_coeffs, normalize_coeffs_8bpc), PyTor
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from turbopi.kernels.interface import PILLOW_BITS, SOURCE, Taps
 from turbopi.preprocess.images import RESIZES, copy_picture, placement
 
 MOST_SIZES = 16  # of pictures whose weights are kept
+SHARED = 1 << 20  # bytes of a picture: beyond it a second thread copies its lower half
 
 
 class Resizer:
@@ -28,24 +30,46 @@ class Resizer:
         self.table = torch.zeros_like(self._host, device=self._device)
         self._staged: list[tuple[Tensor, Tensor] | None] = [None] * len(images)  # bytes on the host and on the device
         self._taps: OrderedDict[tuple[int, int, bool], tuple[Taps, Taps, int, int]] = OrderedDict()  # see `_place`
+        self._helper = ThreadPoolExecutor(1, "turbopi-pictures")
 
     def upload(self, pictures: Sequence[np.ndarray | None], resize: ImageResize) -> None:
         """Send pictures uint8[h, w, 3], without waiting; None: what `images` holds is kept. All may change afterwards.
 
         Raises ObservationError for a picture that is too narrow.
         """
-        before = self._rows.copy()
+        rows = np.zeros_like(self._rows)
         for camera, picture in enumerate(pictures):
-            self._rows[camera] = 0 if picture is None else self._send(camera, picture, RESIZES[resize].low)
-        if not np.array_equal(before, self._rows):
+            if picture is not None:
+                rows[camera] = self._row(camera, picture, RESIZES[resize].low)
+        self._send(pictures)
+        if not np.array_equal(rows, self._rows):  # `_rows` is what `table` has: a call that fails above changes neither
+            self._rows[:] = rows
             self.table.copy_(self._host, non_blocking=True)
 
-    def _send(self, camera: int, picture: np.ndarray, low: float) -> tuple[int, ...]:
-        """A row of the table."""
+    def _send(self, pictures: Sequence[np.ndarray | None]) -> None:
+        """Bytes to their places on the device, each half of a large picture while the next is copied."""
+        halves: list[tuple[np.ndarray, Tensor, Tensor, Future[None] | None]] = []
+        for camera, picture in enumerate(pictures):
+            if picture is None:
+                continue
+            host, device = self._stage(camera, picture.size)
+            half = len(picture) // 2 if picture.size > SHARED else len(picture)
+            cut = half * picture[0].size
+            halves.append((picture[:half], host[:cut], device[:cut], None))
+            if half < len(picture):
+                lower, to = picture[half:], host[cut:]
+                halves.append((lower, to, device[cut:], self._helper.submit(_copy, lower, to)))
+        for picture, host, device, copied in sorted(halves, key=lambda one: one[3] is not None):
+            if copied is None:
+                _copy(picture, host)
+            else:
+                copied.result()
+            device.copy_(host, non_blocking=True)
+
+    def _row(self, camera: int, picture: np.ndarray, low: float) -> tuple[int, ...]:
+        """Of the table."""
         rows, columns, top, left = self._place(picture.shape[0], picture.shape[1])
-        host, device = self._stage(camera, picture.size)
-        copy_picture(picture, host.numpy().reshape(picture.shape))
-        device.copy_(host, non_blocking=True)
+        _, device = self._stage(camera, picture.size)
         taps = (columns.first, columns.weights, rows.first, rows.weights)
         sizes = (picture.shape[1], picture.shape[0], columns.weights.shape[1], rows.weights.shape[1])
         filled = (len(rows.first), len(columns.first))
@@ -71,6 +95,10 @@ class Resizer:
                 self._taps.popitem(last=False)
         self._taps.move_to_end(key)
         return self._taps[key]
+
+
+def _copy(picture: np.ndarray, host: Tensor) -> None:
+    copy_picture(picture, host.numpy().reshape(picture.shape))
 
 
 def taps_of(had: int, wanted: slice, pillow: bool) -> Taps:

@@ -16,7 +16,7 @@ from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.config import CAMERAS, PolicyConfig
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.observation import ModelInputs
-from turbopi.preprocess.images import RESIZES, fitted, placement
+from turbopi.preprocess.images import RESIZES, all_fitted, fitted, placement
 from turbopi.preprocess.normalize import Normalizer, pad_last
 from turbopi.preprocess.relative_actions import absolute_actions, reanchored
 from turbopi.preprocess.robot_checks import (
@@ -244,18 +244,18 @@ class Pipeline:
         cameras = list(pictures) if final else list(CAMERAS)
         valid = [present.get(camera, camera in pictures) for camera in cameras]
         sample.image_mask = np.array(valid, np.bool_)
-        sample.pictures = [
-            self._picture(pictures.get(camera), camera, sample.resize) for camera in itertools.compress(cameras, valid)
-        ]
+        checked = [self._check_picture(pictures.get(camera), camera) for camera in itertools.compress(cameras, valid)]
+        size, resize = self.config.model.vision.image_size, self.config.image_resize
+        if sample.resize:
+            sample.pictures = all_fitted(checked, size, resize)
+        else:  # the device resizes bytes
+            for picture in checked:
+                placement(picture.shape, (size, size))  # refuses one that is too narrow before anything starts
+            sample.pictures = [one if one.dtype == np.uint8 else fitted(one, size, resize) for one in checked]
 
-    def _picture(self, picture: object, camera: str, resize: bool) -> np.ndarray:
-        picture, size = check_hwc(picture, camera), self.config.model.vision.image_size
-        if not RESIZES[self.config.image_resize].float_images:
-            picture = to_uint8(picture, camera)
-        if resize or picture.dtype != np.uint8:
-            return fitted(picture, size, self.config.image_resize)
-        placement(picture.shape, (size, size))  # refuses one that is too narrow before anything starts
-        return picture
+    def _check_picture(self, picture: object, camera: str) -> np.ndarray:
+        picture = check_hwc(picture, camera)
+        return picture if RESIZES[self.config.image_resize].float_images else to_uint8(picture, camera)
 
     def _tokenize(self, sample: Incoming) -> None:
         state = None
