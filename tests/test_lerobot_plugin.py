@@ -57,6 +57,13 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("name", [name for name in CASES if name != OF_0_4 and "peft" not in name])
+def test_bfloat16_is_as_near_to_float32_as_lerobots(ran: Path, name: str) -> None:
+    found = np.load(ran / name / "plugin.npz")
+    ours, theirs = (rms(found[which], found["seeded"]) for which in ("bf16", "lerobot_bf16"))
+    assert 1e-5 < ours < 2 * theirs
+
+
 @pytest.mark.parametrize("name", [name for name in CASES if name != OF_0_4])
 def test_actions_are_lerobots(ran: Path, name: str) -> None:
     """From the same noise, as whole chunks and one by one, and from the same seed."""
@@ -91,6 +98,11 @@ def test_what_was_saved_computes_the_same_again(ran: Path, name: str) -> None:
     found = np.load(ran / name / "plugin.npz")
     assert np.array_equal(found["loaded_again"], found["0/actions"])
     assert not list((ran / name / "saved").glob("model*"))  # the weights stay where they are
+
+
+def rms(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Relative to the actions' root mean square."""
+    return float(np.sqrt(((ours - theirs) ** 2).mean() / (theirs**2).mean()))
 
 
 def difference(ours: np.ndarray, theirs: np.ndarray) -> float:

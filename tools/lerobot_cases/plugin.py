@@ -10,11 +10,13 @@ It gets plugin.npz, everything by LeRobot's processors, loaded as its commands l
     selected_actions         the plugin's, one by one from select_action, the stored noise for each chunk
     seeded, lerobot_seeded   a chunk with the noise that PyTorch's seed 3 gives, the plugin's and LeRobot's own:
                              the latter not for adapters, nor for cases of other sizes than small.py's (0.4's)
+    bf16, lerobot_bf16       the seeded ones in bfloat16, both or neither
     loaded_again             the first run's, by a policy that was saved and loaded again
 """
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +49,11 @@ def run(folder: Path) -> dict[str, np.ndarray]:
     own = PreTrainedConfig.from_pretrained(checkpoint)
     if not own.use_peft and not case["versions"]["lerobot"].startswith("0.4"):
         own.pretrained_path = checkpoint
-        theirs, pre, post = _load(own)
-        torch.manual_seed(3)
-        found["lerobot_seeded"] = post(theirs.predict_action_chunk(pre(_request(inputs, 0))))[0]
+        config = TurboPiConfig(checkpoint=str(checkpoint), backend="pytorch", device="cpu")
+        for name, one in (("lerobot_seeded", own), ("lerobot_bf16", replace(own, dtype="bfloat16")), ("bf16", config)):
+            other, pre, post = _load(one)
+            torch.manual_seed(3)
+            found[name] = post(other.predict_action_chunk(pre(_request(inputs, 0))))[0]
     policy.save_pretrained(folder / "saved")
     again = PreTrainedConfig.from_pretrained(folder / "saved")
     again.pretrained_path = folder / "saved"

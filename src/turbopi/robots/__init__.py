@@ -36,7 +36,6 @@ __all__ = [
     "read_prompt",
     "read_state",
     "require",
-    "robot_for",
     "robot_from_dict",
 ]
 
