@@ -1,12 +1,9 @@
 """How work is cut into blocks and clusters, and what a launch is given: on a CPU, for every tile that is chosen."""
 
 import ctypes
-<<<<<<< HEAD
 import dataclasses
-=======
 import hashlib
 import itertools
->>>>>>> house
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from types import SimpleNamespace

@@ -132,8 +132,8 @@ class RobotOptions(WeightOptions):
             "--robot",
             panel=_WEIGHTS,
             metavar="NAME|FILE|CLASS",
-            help="Instead of the configuration's robot: a built-in one, a description (.json), or your own class as "
-            "module:Class, whose code is run.",
+            help="Instead of the configuration's robot: a built-in one, a type of LeRobot's (so101_follower), a "
+            "description (.json), or your own class as module:Class, whose code is run.",
         ),
     ] = None
 
