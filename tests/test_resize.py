@@ -11,7 +11,7 @@ from test_begin import CPU, OnCpu
 
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import ImageResize
-from turbopi.engine.resize import MOST_SIZES, SHARED, Resizer, taps_of
+from turbopi.engine.resize import MOST_SIZES, SLAB, Resizer, taps_of
 from turbopi.errors import ObservationError
 from turbopi.kernels import plain
 from turbopi.kernels.interface import SOURCE, Ops
@@ -82,7 +82,7 @@ def test_every_byte_of_large_pictures_is_sent_whoever_copies_it(cameras: int) ->
         sent[-1] = sent[-1].transpose(1, 0, 2)
         resizer.upload(sent, "openpi")
         for row, image in zip(resizer.table.tolist(), sent, strict=True):
-            assert image.size > SHARED
+            assert image.size > 2 * SLAB
             there = at(dict(zip(SOURCE, row, strict=True))["picture"], ctypes.c_uint8, image.size)
             np.testing.assert_array_equal(there.reshape(image.shape), image)
             image[:] = 0  # nobody reads it any more
