@@ -13,7 +13,7 @@ from turbopi.backends.base import Backend, Begins, Begun, LoadState, Precision, 
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.plan import TIERS
 
 __all__ = [
