@@ -14,7 +14,7 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.statistics import collect
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.emulate import rounded
-from turbopi.engine.recent import RecentLoops
+from turbopi.engine.recent_loops import RecentLoops
 from turbopi.engine.weights import modulation, pack
 from turbopi.errors import BackendUnavailable
 from turbopi.kernels.plain import PLAIN

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from turbopi.config import LIMITS
-from turbopi.engine.recent import MOST_LOOPS, MOST_STEPS, Loop, fit
+from turbopi.engine.recent_loops import MOST_LOOPS, MOST_STEPS, Loop, fit
 from turbopi.errors import ConfigError, ObservationError
 
 MAX_STEPS = LIMITS["num_denoising_steps"]  # far beyond any use; a larger number is a mistake, not a wish

@@ -27,14 +27,14 @@ from turbopi.backends.lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import ModelConfig, PolicyConfig
-from turbopi.engine.recent import Loop
+from turbopi.engine.recent_loops import Loop
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.model.conditioning import Conditioning, Form, Guidance
 from turbopi.model.reference import FloatPrecision
 from turbopi.observation import ModelInputs, Observation, with_cameras
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
-from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.calibration_file import Quantization
 from turbopi.robots import Robot
 from turbopi.running_chunk import FORMS, JoinMode, RunningChunk
 
@@ -323,8 +323,8 @@ class UnifiedPolicy:
                         of a conditioning the form and the times count, not what is held or pulls
 
         each a number or several. What earlier warm-ups covered stays covered, as far as backends keep it: loops of
-        engine/recent.py's number, the least recently used ones go. Raises ConfigError for what can't be, and for more
-        loops than are kept.
+        engine/recent_loops.py's number, the least recently used ones go. Raises ConfigError for what can't be, and for
+        more loops than are kept.
         """
         start = time.perf_counter()
         self._guard.refuse_if_lost()

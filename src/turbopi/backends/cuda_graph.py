@@ -15,7 +15,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine import without_compiler
 from turbopi.engine.call import CallShape
 from turbopi.engine.compiled import compiled
-from turbopi.engine.recent import Loop
+from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import GraphRunner
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendError

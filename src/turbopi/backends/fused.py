@@ -18,13 +18,13 @@ from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.lost import ADVICE
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.recent import Loop
+from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import MAX_CAMERAS, bucket
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
 from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.kernels.quantize import quantize
-from turbopi.quantization.artifact import Quantization, check_given
+from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.fp8 import Directions, Matrix
 from turbopi.quantization.plan import TIERS
 from turbopi.toolchain import missing_for_c

@@ -22,8 +22,8 @@ from torch import Tensor
 from turbopi.backends.base import LoadState, Sample
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import Graph, Mark, building
-from turbopi.engine.limits import not_warm
-from turbopi.engine.recent import Loop, RecentLoops
+from turbopi.engine.not_warm import not_warm
+from turbopi.engine.recent_loops import Loop, RecentLoops
 from turbopi.engine.runner import golden_trace
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError

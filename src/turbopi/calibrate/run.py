@@ -28,7 +28,7 @@ from turbopi.errors import CheckpointError
 from turbopi.examples import NoisyExample, with_noises
 from turbopi.model.reference import Pi0Model, parameter_dtype
 from turbopi.policy import UnifiedPolicy
-from turbopi.quantization.artifact import RANDOM_NOISE, Quantization, SiteScale, shapes_of
+from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, SiteScale, shapes_of
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites

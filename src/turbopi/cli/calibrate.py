@@ -16,7 +16,7 @@ from turbopi.wording import significant
 
 if TYPE_CHECKING:
     from turbopi.calibrate.report import ActionsError
-    from turbopi.quantization.artifact import Quantization
+    from turbopi.quantization.calibration_file import Quantization
 
 
 @command(
@@ -118,7 +118,7 @@ def _replaced(out: Path) -> str | None:
     else: it would be lost.
     """
     from turbopi.errors import CalibrationError
-    from turbopi.quantization.artifact import Quantization
+    from turbopi.quantization.calibration_file import Quantization
 
     if not out.exists():
         return None

@@ -262,6 +262,6 @@ class PolicyOptions(RobotOptions):
             return self.quantization
         if self.quantization is None:
             raise ConfigError("--fp8-parts narrows a calibration: name it with --quantization FILE")
-        from turbopi.quantization.artifact import Quantization
+        from turbopi.quantization.calibration_file import Quantization
 
         return Quantization.load(self.quantization).only([part.strip() for part in self.fp8_parts.split(",")])

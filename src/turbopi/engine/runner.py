@@ -4,7 +4,7 @@ A call is two graphs. The first, vision, is for a number of valid cameras; it ca
 second, prefix and all denoising steps, is for a bucket, which rounds the prompt's length up to a multiple of 16, too;
 inside it nothing is captured anew when pictures, prompt, state or noise change. A bucket that warm-up didn't capture is
 captured when first needed, with a log line, or refused if the runner is `strict`. Graphs of the denoising loops (steps,
-horizon) used last are kept, see recent.py. Batches run one observation after the other.
+horizon) used last are kept, see recent_loops.py. Batches run one observation after the other.
 """
 
 import logging
@@ -20,8 +20,8 @@ from torch import Tensor
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.graph import Graph, Mark, building
-from turbopi.engine.limits import not_warm
-from turbopi.engine.recent import Loop, RecentLoops
+from turbopi.engine.not_warm import not_warm
+from turbopi.engine.recent_loops import Loop, RecentLoops
 from turbopi.engine.weights import Weights, modulation
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import Denoiser, Ops

@@ -17,7 +17,7 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
 from turbopi.engine.call import CallShape
-from turbopi.engine.recent import MOST_LOOPS, MOST_STEPS, RecentLoops, fit
+from turbopi.engine.recent_loops import MOST_LOOPS, MOST_STEPS, RecentLoops, fit
 from turbopi.engine.runner import HostRow
 from turbopi.engine.without_compiler import OPS
 from turbopi.errors import BackendUnavailable
