@@ -450,6 +450,8 @@ def test_a_look_never_fails_for_what_a_robot_sends() -> None:
         "empty": np.zeros((0, 4, 3), np.uint8),
         "long": np.zeros(1000),
         "text": np.array(["a", "b"]),
+        "letters": np.full((2, 2, 3), "a"),
+        "flags": np.zeros((2, 2, 3), np.bool_),
         "nested": {"deep": np.zeros((3, 4, 5), np.uint8)},
         **{f"n{i}": np.array([1.5]) for i in range(20)},
     }

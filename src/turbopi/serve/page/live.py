@@ -101,6 +101,7 @@ class Live:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="turbopi-page")
         self._closed = asyncio.Event()
         self._hello = ""
+        self._faulty = False
         self._memory: Callable[[], Memory] = memory_of("cpu")
 
     def start(self, metadata: Mapping[str, Any], queue_limit: int) -> None:
@@ -165,7 +166,9 @@ class Live:
         try:
             robot.look = await loop.run_in_executor(self._thread, look_at, number, last, message, reply, timing)
         except Exception:  # a fault of the page must not cost a robot anything
-            logger.exception("the page can't show a call")
+            if not self._faulty:  # once: it may come with every call
+                logger.exception("the page can't show a call")
+            self._faulty = True
         finally:
             robot.looking = False
 
