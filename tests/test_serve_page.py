@@ -25,7 +25,7 @@ from websockets.typing import Subprotocol
 import turbopi.serve.page
 from turbopi.serve import PolicyServer, ServerOptions
 from turbopi.serve.metrics import Metrics
-from turbopi.serve.page import live, look
+from turbopi.serve.page import live
 from turbopi.serve.page.device import memory_of
 from turbopi.serve.page.live import BINS, Live, stage_times
 from turbopi.serve.page.look import THUMBNAIL, look_at, thumbnail
@@ -450,6 +450,8 @@ def test_a_look_never_fails_for_what_a_robot_sends() -> None:
         "empty": np.zeros((0, 4, 3), np.uint8),
         "long": np.zeros(1000),
         "text": np.array(["a", "b"]),
+        "letters": np.full((2, 2, 3), "a"),
+        "flags": np.zeros((2, 2, 3), np.bool_),
         "nested": {"deep": np.zeros((3, 4, 5), np.uint8)},
         **{f"n{i}": np.array([1.5]) for i in range(20)},
     }
@@ -460,10 +462,15 @@ def test_a_look_never_fails_for_what_a_robot_sends() -> None:
         msgspec.json.encode(made)
 
 
-def test_an_observation_that_is_too_long_is_not_decoded_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(look, "MESSAGE_BYTES", 10)
-    made = look_at(1, 0.0, pack(observation()), {"actions": np.zeros((1, 7))}, {})
-    assert made.pictures == {} and len(made.actions) == 1 and "pictures aren't shown" in made.note
+def test_a_large_observation_is_not_kept_to_be_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "MESSAGE_BYTES", 10)
+
+    async def test(server: PolicyServer) -> None:
+        async with connect(live_url(server)) as watcher, robot(server) as connection:
+            made = await seen(watcher, connection, "")
+            assert made.pictures == {} and len(made.actions) == 2 and "too large to be shown" in made.note
+
+    served(test)
 
 
 def test_memory_is_the_processs_or_what_pytorch_holds_of_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:

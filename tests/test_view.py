@@ -3,7 +3,10 @@
 import base64
 import io
 import json
+import signal
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -25,6 +28,7 @@ from turbopi.serve import PolicyServer, running
 from turbopi.view.calls import ViewedCall, ViewedTrouble
 from turbopi.view.live import LiveServer
 from turbopi.view.recorded import recorded, robot_of
+from turbopi.view.viewer import COMMAND, Viewer, open_viewer
 from turbopi.wire import pack
 
 with_rerun = pytest.mark.skipif(find_spec("rerun") is None, reason="needs rerun: pip install -e '.[view]'")
@@ -212,6 +216,27 @@ def test_a_file_that_no_viewer_would_know_is_refused(tmp_path: Path) -> None:
     assert "no folder" in refusal(turbopi("view", tmp_path, "--save", tmp_path / "b" / "a.rrd"))
 
 
+LISTENS = """
+import socket, sys
+with socket.create_server(("127.0.0.1", int(sys.argv[-1].removeprefix("--port=")))) as here:
+    here.accept()
+"""
+
+
+def test_the_viewer_listens_on_this_machine_alone() -> None:
+    assert "--bind=127.0.0.1" in COMMAND
+    opened = open_viewer([sys.executable, "-c", LISTENS])
+    assert opened.process.wait(60) == 0
+    assert isinstance(opened.process.args, list)
+    port = opened.process.args[-1].removeprefix("--port=")
+    assert opened.address == f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def test_a_viewer_that_cannot_open_says_so() -> None:
+    with pytest.raises(ConfigError, match=r"exit code 3: it needs a screen. --save FILE.rrd"):
+        open_viewer([sys.executable, "-c", "raise SystemExit(3)"])
+
+
 def read_back(file: Path) -> dict[str, list[dict[str, Any]]]:
     """{entity: rows}, in the order of "call", then "time"; what is static has neither."""
     from rerun.chunk import RrdReader
@@ -310,3 +335,33 @@ def test_a_live_server_is_saved_below_each_robots_address(tmp_path: Path) -> Non
     assert len(found[camera]) == told["calls"]
     assert base64.b64encode(bytes(found[camera][0]["EncodedImage:blob"][0])).startswith(b"/9j/")  # a JPEG
     assert len(found["/errors"]) == 1
+
+
+@with_rerun
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # it is still being written
+def test_a_viewer_gets_the_whole_recording(
+    recording: tuple[Path, dict[int, RecordedCall]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over the connection that a viewer has; this one writes what it gets instead of showing it."""
+    from turbopi.view import drawing
+
+    opened: list[Viewer] = []
+
+    def open_writer() -> Viewer:
+        opened.append(open_viewer([*COMMAND, "--save", str(tmp_path / "got.rrd")]))
+        return opened[0]
+
+    monkeypatch.setattr(drawing, "open_viewer", open_writer)
+    ended = turbopi("view", recording[0], "--rate", 20)
+    assert ended.exit_code == 0 and "5 calls, 1 errors and gaps, shown in the viewer" in ended.output
+    try:
+        deadline, executed = time.monotonic() + 60, list[dict[str, Any]]()
+        while len(executed) < 3 * 4 + H and time.monotonic() < deadline:  # the last of what was sent
+            time.sleep(0.2)
+            found = read_back(tmp_path / "got.rrd")
+            executed = [row for row in found.get("/executed/gripper", []) if "time" in row]
+    finally:
+        opened[0].process.send_signal(signal.SIGINT)
+        opened[0].process.wait(60)
+    assert len(executed) == 3 * 4 + H
+    assert len(found["/chunk/values"]) == len(found["/cameras/observation/image"]) == 5

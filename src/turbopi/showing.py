@@ -65,7 +65,7 @@ def pictures_of(observation: Mapping[str, Any], below: str = "") -> dict[str, np
         name = f"{below}/{key}" if below else str(key)
         if isinstance(value, Mapping):
             found |= pictures_of(value, name)
-        elif isinstance(value, np.ndarray) and value.ndim == 3:
+        elif isinstance(value, np.ndarray) and value.ndim == 3 and value.dtype.kind in "fiu":
             picture = value.transpose(1, 2, 0) if value.shape[0] == 3 else value
             if picture.shape[-1] == 3:
                 found[name] = picture if picture.dtype == np.uint8 else np.clip(picture, 0, 1)

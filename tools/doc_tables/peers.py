@@ -11,6 +11,7 @@ from PIL import Image
 
 from turbopi.bench.document import BenchDocument, read_benchmark
 from turbopi.bench.plots import DRAWN_OF, fingerprint
+from turbopi.errors import ConfigError
 from turbopi.plots import MEASURED, MUTED, write_figure
 from turbopi.reading import plain_document, read_document
 
@@ -35,7 +36,7 @@ class Peers(Struct, frozen=True):
 
 
 def read_peers(root: Path) -> Peers:
-    return read_document(root / PEERS, Peers, ValueError)
+    return read_document(root / PEERS, Peers, ConfigError)
 
 
 def bars(root: Path) -> list[tuple[str, float, bool]]:

@@ -229,6 +229,7 @@ class PolicyServer:
         """One client, from its metadata to its close; or one who watches."""
         if self._live is not None:
             if is_feed(connection.request):
+                self._log.info(f"{connection.remote_address} watches", "connections")
                 return await self._live.watch(connection)
             self._live.joined(connection)
         self.metrics.clients.inc()

@@ -4,6 +4,7 @@ calls.py     one call, wherever it comes from
 recorded.py  the calls of a recording
 live.py      the calls of a server's page
 drawing.py   calls as rerun's entities
+viewer.py    opening the viewer
 """
 
 from importlib.util import find_spec

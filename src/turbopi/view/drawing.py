@@ -21,6 +21,7 @@ import rerun.blueprint as rrb
 
 from turbopi.showing import ActionGroup, action_groups
 from turbopi.view.calls import ViewedCall, ViewedTrouble
+from turbopi.view.viewer import open_viewer
 
 WIDTH, HEIGHT = 160.0, 60.0  # of a drawn chunk, in the units of a 2D view
 COLORS = ((59, 111, 182), (221, 132, 82), (85, 168, 104), (196, 78, 82), (129, 114, 179), (176, 127, 79))
@@ -39,7 +40,8 @@ class Drawing:
         self._robot, self._rate = robot, rate
         self._stream = rr.RecordingStream("turbopi")
         if file is None:
-            self._stream.spawn()
+            self._viewer = open_viewer()
+            self._stream.connect_grpc(self._viewer.address)
         else:
             self._stream.save(file)
         self._stream.send_recording_name(name)

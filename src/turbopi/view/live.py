@@ -12,7 +12,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from turbopi.errors import ConfigError
 from turbopi.serve.page.http import FEED
-from turbopi.serve.page.messages import FEED_VERSION, Frame, Hello, Look, RobotFrame, Trouble
+from turbopi.serve.page.messages import FEED_VERSION, Frame, Hello, Look, RobotFrame, Trouble, clean
 from turbopi.view.calls import Picture, ViewedCall, ViewedTrouble
 
 MAX_MESSAGE = 64 * 2**20
@@ -39,7 +39,7 @@ class LiveServer:
             told = (error.response.body or b"").decode(errors="replace").strip()
             if error.response.status_code == 401:
                 told = "it wants its API key: --api-key-file FILE, or TURBOPI_API_KEY"
-            raise ConfigError(f"can't watch {url}: {told or error}") from error
+            raise ConfigError(f"can't watch {url}: {clean(told) or error}") from error
         except (InvalidURI, ValueError) as error:
             raise ConfigError(f"{url} is no address of a server: {error}") from error
         except (OSError, TimeoutError, WebSocketException) as error:
@@ -84,7 +84,7 @@ class LiveServer:
             yield from (_call(robot, robot.look) for robot in frame.robots if robot.look is not None)
             new = [trouble for trouble in frame.troubles if trouble not in told]
             told = set(frame.troubles)
-            yield from (ViewedTrouble(one.time, f"{one.error}: {one.text}") for one in new)
+            yield from (ViewedTrouble(one.time, clean(f"{one.error}: {one.text}")) for one in new)
 
 
 def _call(robot: RobotFrame, look: Look) -> ViewedCall:

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 
 FRAMES_A_SECOND = 4.0  # to each watcher
 LOOKS_A_SECOND = 16.0  # of all robots together
+MESSAGE_BYTES = 16 * 2**20  # of an observation: a longer one isn't kept until it is looked at
 LOOKING = 4  # calls that are looked at or wait for it: others aren't shown
 ROBOTS = 16  # shown, of those that are connected
 CALLS = 512  # whose times are kept
@@ -82,11 +83,6 @@ class _Moment:
     robots: Sequence[RobotFrame]
 
 
-@dataclass
-class _Watcher:
-    had: dict[int, int] = field(default_factory=dict)  # robot -> number of the last look that it was sent
-
-
 class Live:
     """What robots did, for those who watch. `start` it before anybody is let in; `let_go`, then `close` it."""
 
@@ -96,11 +92,12 @@ class Live:
         self._known = 0
         self._timings: deque[Timing] = deque(maxlen=CALLS)
         self._troubles: deque[Trouble] = deque(maxlen=TROUBLES)
-        self._watchers: set[asyncio.Future[Any]] = set()  # what ends each one's wait
+        self._watchers = 0
         self._looks: set[asyncio.Task[None]] = set()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="turbopi-page")
         self._closed = asyncio.Event()
         self._hello = ""
+        self._faulty = False
         self._memory: Callable[[], Memory] = memory_of("cpu")
 
     def start(self, metadata: Mapping[str, Any], queue_limit: int) -> None:
@@ -151,7 +148,8 @@ class Live:
         now = asyncio.get_running_loop().time()
         if now - robot.looked >= max(1 / FRAMES_A_SECOND, len(self._robots) / LOOKS_A_SECOND):
             robot.looked, robot.looking = now, True
-            task = asyncio.ensure_future(self._look(robot, message, reply, timing))
+            kept = message if len(message) <= MESSAGE_BYTES else None
+            task = asyncio.ensure_future(self._look(robot, kept, reply, timing))
             self._looks.add(task)
             task.add_done_callback(self._looks.discard)
 
@@ -159,13 +157,15 @@ class Live:
         """A request got no actions: `text` is what the client was told."""
         self._troubles.append(Trouble(time.time(), kind, clean(text)))
 
-    async def _look(self, robot: _Robot, message: bytes, reply: Mapping[str, object], timing: Timing) -> None:
+    async def _look(self, robot: _Robot, message: bytes | None, reply: Mapping[str, object], timing: Timing) -> None:
         loop, number, last = asyncio.get_running_loop(), robot.calls, robot.last
         assert last is not None
         try:
             robot.look = await loop.run_in_executor(self._thread, look_at, number, last, message, reply, timing)
         except Exception:  # a fault of the page must not cost a robot anything
-            logger.exception("the page can't show a call")
+            if not self._faulty:  # once: it may come with every call
+                logger.exception("the page can't show a call")
+            self._faulty = True
         finally:
             robot.looking = False
 
@@ -173,13 +173,13 @@ class Live:
 
     async def watch(self, connection: GuardedConnection) -> None:
         """Send the feed to one watcher until it leaves or the server stops. It has nothing to say itself."""
-        watcher, says = _Watcher(), asyncio.ensure_future(connection.recv())
-        closed = asyncio.ensure_future(self._closed.wait())
-        self._watchers.add(says)
+        says, closed = asyncio.ensure_future(connection.recv()), asyncio.ensure_future(self._closed.wait())
+        had: dict[int, int] = {}  # robot -> number of the last look that was sent
+        self._watchers += 1
         try:
             await connection.send(self._hello)
             while not (says.done() or closed.done()):
-                await connection.send(await self._frame(watcher))  # who reads slowly is sent fewer
+                await connection.send(await self._frame(had))  # who reads slowly is sent fewer
                 await asyncio.wait({says, closed}, timeout=1 / FRAMES_A_SECOND, return_when=asyncio.FIRST_COMPLETED)
             if says.done():
                 says.result()
@@ -190,20 +190,20 @@ class Live:
         except ConnectionClosed:
             pass
         finally:
-            self._watchers.discard(says)
+            self._watchers -= 1
             for wait in (says, closed):
                 wait.cancel()
                 with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                     await wait
 
-    async def _frame(self, watcher: _Watcher) -> str:
-        moment = self._moment(watcher)
-        watcher.had = {
-            robot.id: robot.look.number if robot.look else watcher.had.get(robot.id, 0) for robot in moment.robots
-        }
+    async def _frame(self, had: dict[int, int]) -> str:
+        moment = self._moment(had)
+        had.update({robot.id: robot.look.number for robot in moment.robots if robot.look is not None})
+        for gone in had.keys() - {robot.id for robot in moment.robots}:
+            del had[gone]
         return await asyncio.get_running_loop().run_in_executor(self._thread, _frame_of, moment, self._memory)
 
-    def _moment(self, watcher: _Watcher) -> _Moment:
+    def _moment(self, had: Mapping[int, int]) -> _Moment:
         latest = sorted(self._robots.values(), key=lambda robot: robot.last or robot.connected)[-ROBOTS:]
         return _Moment(
             time=time.time(),
@@ -215,12 +215,12 @@ class Live:
             errors=self._metrics.errors_so_far(),
             troubles=tuple(self._troubles),
             timings=tuple(self._timings),
-            robots=[_robot_frame(robot, watcher) for robot in sorted(latest, key=lambda robot: robot.id)],
+            robots=[_robot_frame(robot, had) for robot in sorted(latest, key=lambda robot: robot.id)],
         )
 
 
-def _robot_frame(robot: _Robot, watcher: _Watcher) -> RobotFrame:
-    new = robot.look if robot.look is not None and robot.look.number != watcher.had.get(robot.id) else None
+def _robot_frame(robot: _Robot, had: Mapping[int, int]) -> RobotFrame:
+    new = robot.look if robot.look is not None and robot.look.number != had.get(robot.id) else None
     return RobotFrame(robot.id, robot.address, robot.connected, robot.calls, robot.last, new)
 
 

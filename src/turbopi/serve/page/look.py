@@ -14,13 +14,16 @@ THUMBNAIL = 224  # pixels of the longer side
 PICTURES = 4
 ARRAYS, NUMBERS = 4, 64  # of an observation; of one array
 ACTIONS = 16_384  # numbers of a chunk
-MESSAGE_BYTES = 16 * 2**20  # an observation that is longer isn't decoded once more: its pictures aren't shown
 
 
-def look_at(number: int, time: float, message: bytes, reply: Mapping[str, object], timing: Mapping[str, float]) -> Look:
-    """What to show of a call: the `message` that was answered, and its `reply`. Never raises for what is in them."""
-    observation = unpack(message) if len(message) <= MESSAGE_BYTES else {}
-    note = "" if observation else f"an observation of {len(message) / 2**20:.0f} MB: its pictures aren't shown"
+def look_at(
+    number: int, time: float, message: bytes | None, reply: Mapping[str, object], timing: Mapping[str, float]
+) -> Look:
+    """What to show of a call: the `message` that was answered, and its `reply`. Never raises for what is in them.
+
+    Without the message, which was too long to be kept, there is less to show.
+    """
+    observation = {} if message is None else unpack(message)
     prompt = observation.get("prompt", observation.get("task", ""))
     return Look(
         number=number,
@@ -30,7 +33,7 @@ def look_at(number: int, time: float, message: bytes, reply: Mapping[str, object
         numbers=_numbers(observation),
         pictures=_pictures(observation),
         timing=dict(timing),
-        note=note,
+        note="" if message is not None else "the observation is too large to be shown",
     )
 
 
