@@ -1,5 +1,6 @@
 """A clock that is set by hand, a policy whose answers come when a test says so, and the control loop between them."""
 
+import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
@@ -20,7 +21,7 @@ class Clock:
 
 
 class ByHand:
-    """An inference that computes at once and answers when `answer` is called."""
+    """An inference that computes when `answer` is called."""
 
     def __init__(self) -> None:
         self.waiting: list[tuple[Callable[[], Any], Future[Any]]] = []
@@ -31,7 +32,7 @@ class ByHand:
         future: Future[Any] = Future()
         self.waiting.append((call, future))
         if self.at_once:
-            self.answer()
+            threading.Thread(target=self.answer).start()  # for a caller that waits
         return future
 
     def answer(self) -> None:
@@ -79,30 +80,36 @@ class Loop:
         self.executor, self.clock, self.hand = executor, clock, hand
         self.place = 0.0
         self.commands: list[Command] = []
+        self._begun = 0  # the step of the last observation that was used
 
-    def step(self, *, observe: bool = True, answer: bool = False) -> Command:
+    def step(self, *, observe: bool = True, answer: bool = False, delay: int | None = None) -> Command:
+        """A control step. `answer`: the policy answers before it; `delay`: so many steps after its observation."""
         if answer:
             self.hand.answer()
-        if observe:
-            self.executor.observe({"place": self.place})
+        self._answer_after(delay)
+        if observe and self.executor.observe({"place": self.place}):
+            self._begun = len(self.commands)
+        self._answer_after(delay)
         command = self.executor.next_action()
         if command.kind == "fresh":
             assert command.action is not None
-            assert command.action[0] == self.place, "an action was carried out twice, or left out"
+            assert abs(command.action[0] - self.place) < 1e-9, "an action was carried out twice, or left out"
             self.place += 1
         self.commands.append(command)
         self.clock.now += 1 / HZ
         return command
 
+    def _answer_after(self, delay: int | None) -> None:
+        if delay is not None and self.hand.waiting and len(self.commands) - self._begun >= delay:
+            self.hand.answer()
+
     def run(self, steps: int, delay: int) -> None:
         """`steps` control steps in which every answer comes after `delay` of them."""
-        waited = 0
         for _ in range(steps):
-            waited = waited + 1 if self.hand.waiting else 0
-            self.step(answer=bool(self.hand.waiting) and waited > delay)
+            self.step(delay=delay)
 
 
-def started(execution: str = "async", *, warm: bool = True, **options: Any) -> tuple[Loop, LinePolicy]:
+def started(execution: Any = "async", *, warm: bool = True, **options: Any) -> tuple[Loop, LinePolicy]:
     """A loop around a warm executor."""
     clock, hand = Clock(), ByHand()
     modes = options.pop("modes", ("rtc", "rtc_identity", "rtc_trained"))
@@ -113,7 +120,7 @@ def started(execution: str = "async", *, warm: bool = True, **options: Any) -> t
         execution=execution,
         clock=clock,
         inference=hand,
-        **options,  # type: ignore[arg-type]
+        **options,
     )
     if warm:
         hand.at_once = True

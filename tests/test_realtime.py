@@ -191,7 +191,7 @@ def test_holding_commands_what_was_chosen_and_says_that_it_holds(
     loop.run(9, delay=10**6)
     command = loop.commands[-1]
     assert command.kind == "held" and command.chunk is None
-    assert (command.action is None) if expected is None else (list(command.action or []) == expected)
+    assert (None if command.action is None else list(command.action)) == expected
 
 
 def test_slowing_down_makes_the_last_actions_last_twice_as_long() -> None:
@@ -234,9 +234,10 @@ def test_raising_is_patient_with_sync_for_as_long_as_its_answer_would_count() ->
 def test_raising_when_no_observation_comes() -> None:
     loop, _ = started("async", execution_horizon=4, on_empty="raise")
     loop.run(6, delay=0)
+    while loop.executor.remaining:
+        loop.step(observe=False)
     with pytest.raises(OutOfActions, match="no observation came in time"):
-        for _ in range(20):
-            loop.step(observe=False)
+        loop.step(observe=False)
 
 
 def test_a_policy_that_raises_is_asked_again_and_the_running_chunk_goes_on() -> None:
@@ -341,7 +342,7 @@ def test_a_jump_of_the_clock_drops_all_actions(jump: float) -> None:
 
 
 def test_a_new_episode_drops_the_old_ones_chunks() -> None:
-    loop, policy = started("rtc", execution_horizon=4)
+    loop, _ = started("rtc", execution_horizon=4)
     loop.run(4, delay=0)
     loop.step()
     loop.executor.reset()
@@ -434,7 +435,7 @@ def test_the_policy_may_exit_without_ending_the_robot() -> None:
     policy = Gated()
     with RealTimeExecutor(policy, control_hz=50, execution="async", max_pause_s=1e6) as executor:
         executor.warm_up({})
-        policy.infer = lambda obs: sys.exit(3)  # type: ignore[method-assign,assignment]
+        policy.infer = lambda obs: sys.exit(3)  # type: ignore[method-assign]
         executor.observe({})
         assert executor._pending is not None
         with pytest.raises(SystemExit):
@@ -558,7 +559,8 @@ BLOCKED = {"torch", "msgspec", "msgpack", "websockets", "matplotlib", "safetenso
            "sentencepiece", "tensorstore", "jinja2", "psutil", "packaging", "prometheus_client"}
 sys.meta_path.insert(0, Refuse())
 import turbopi.realtime, turbopi.execution
-executor = turbopi.realtime.RealTimeExecutor(type("P", (), {"infer": lambda self, obs: {}})(), control_hz=50, execution="async")
+policy = type("Policy", (), {"infer": lambda self, obs: {}})()
+turbopi.realtime.RealTimeExecutor(policy, control_hz=50, execution="async").close()
 print(sorted(BLOCKED & set(sys.modules)))
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

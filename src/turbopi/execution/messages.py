@@ -10,13 +10,13 @@ from typing import Any, get_args
 
 import numpy as np
 
+from turbopi.config import Schedule
 from turbopi.errors import ObservationError
 from turbopi.running_chunk import JoinMode, RunningChunk
 
 PREFIX = "turbopi/"
 MAX_SESSION = 64  # characters
 MAX_STEP = 2**53
-_SCHEDULES = ("exponential", "linear", "ones", "zeros")
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
     *("session", "step", "reset"),
@@ -59,9 +59,11 @@ def message(
             "previous": np.asarray(previous.left_over, np.float32),
             "delay": int(previous.delay),
             "mode": previous.mode,
-            "schedule": previous.schedule,
-            "max_guidance_weight": float(previous.max_guidance_weight),
         }
+        if previous.schedule is not None:
+            asked["schedule"] = previous.schedule
+        if previous.max_guidance_weight is not None:
+            asked["max_guidance_weight"] = float(previous.max_guidance_weight)
         if previous.execution_horizon is not None:
             asked["execution_horizon"] = int(previous.execution_horizon)
         if previous.anchor is not None:
@@ -130,9 +132,9 @@ def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
     guidance: dict[str, Any] = {}
     if "schedule" in given:
         schedule = given["schedule"]
-        if schedule not in _SCHEDULES:
+        if schedule not in get_args(Schedule):
             raise ObservationError(
-                f"{PREFIX}schedule is {schedule!r:.100}; it should be one of {', '.join(_SCHEDULES)}"
+                f"{PREFIX}schedule is {schedule!r:.100}; it should be one of {', '.join(get_args(Schedule))}"
             )
         guidance["schedule"] = schedule
     if "max_guidance_weight" in given:

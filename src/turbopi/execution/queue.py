@@ -9,10 +9,11 @@ no actions, or its way is "sync") carried out none, and enters at row 0.
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from turbopi.config import Schedule
 from turbopi.errors import ConfigError
 from turbopi.execution.delays import DelayEstimate
 from turbopi.execution.ways import Execution, way_named
@@ -100,7 +101,8 @@ class ChunkQueue:
                          last command to its first action, is refused whole
     old_weight           "ensemble": the running chunk's part of the mean; LeRobot's default
     schedule, max_guidance_weight
-                         of the guided ways, as in RunningChunk
+                         of the guided ways, as in RunningChunk. None: the policy's
+    policys_guidance     where guidance ends is left to the policy's own execution horizon (LeRobot's rtc_config)
 
     A fixed delay d and the horizons must fit: d ≤ s and d ≤ H − s for the "rtc" ways, else ConfigError, at the latest
     when the first chunk shows H. An estimate that is larger for a while is cut to what fits: `cut_delays` counts.
@@ -117,8 +119,9 @@ class ChunkQueue:
         trained_max_delay: int | None = None,
         max_jump: float | np.ndarray | None = None,
         old_weight: float = 0.3,
-        schedule: Literal["exponential", "linear", "ones", "zeros"] = "exponential",
-        max_guidance_weight: float = 5.0,
+        schedule: Schedule | None = None,
+        max_guidance_weight: float | None = None,
+        policys_guidance: bool = False,
     ) -> None:
         self.way = way_named(execution)
         self.dropped: Counter[Reason] = Counter()  # chunks that were never carried out
@@ -142,6 +145,7 @@ class ChunkQueue:
             raise ConfigError(f"old_weight is {old_weight}; the running chunk's part of a mean lies between 0 and 1")
         self._old_weight = old_weight
         self._guidance: dict[str, Any] = {"schedule": schedule, "max_guidance_weight": max_guidance_weight}
+        self._policys_guidance = policys_guidance
         self._requests = 0
         self._running: _Chunk | None = None
         self._row = self._entered = 0  # of the running chunk: the next one, and the first that was carried out
@@ -245,7 +249,8 @@ class ChunkQueue:
         if self.way.holds and self._trained_max is not None:
             most = min(most, self._trained_max)
         left_over = chunk.model_actions[row:].copy()
-        return RunningChunk(left_over, min(expected, most), s, self.way.mode, chunk.anchor, **self._guidance)
+        s_told = None if self._policys_guidance else s
+        return RunningChunk(left_over, min(expected, most), s_told, self.way.mode, chunk.anchor, **self._guidance)
 
     def arrive(self, result: Mapping[str, Any]) -> Reason | None:
         """The chunk in flight is there: what `policy.infer` returned. None if it takes over, else why it is dropped.

@@ -30,7 +30,7 @@ MAX_CONTROL_HZ = 10_000
 class RealTimeExecutor:
     """Runs a policy's chunks at a control rate, by one of the ways to run (docs/real_time.md).
 
-    policy             a UnifiedPolicy, turbopi.client.RealTimeClient, openpi's WebsocketClientPolicy, or any object with
+    policy             a UnifiedPolicy, turbopi.client.RealTimeClient, openpi's WebsocketClientPolicy, or whatever has
                        `infer(observation)`. The executor alone calls it, on a thread of its own
     control_hz         how often the control loop calls `next_action`, times a second
     execution          "sync", "async", "ensemble", "rtc", "rtc_identity" or "rtc_trained"
@@ -100,6 +100,7 @@ class RealTimeExecutor:
             delay=self._delays,
             trained_max_delay=self._offered.get("trained_max_delay"),
             max_jump=max_jump,
+            policys_guidance=execution_horizon is None and self._offered.get("execution_horizon") is not None,
             **joining,
         )
         self._lock = threading.Lock()
@@ -124,7 +125,7 @@ class RealTimeExecutor:
 
         It waits, so call it before the robot moves. Without it the first observation warms up in the background, and
         commands are "waiting" until then. The time that the policy takes here is no measured delay; that of its last
-        calls is the first one to expect. Raises what the policy raises, and ConfigError if delay and horizons can't fit.
+        calls is the first one to expect. Raises what the policy raises, and ConfigError if the delay can't fit.
         """
         with self._lock:
             self._check_usable()
@@ -146,9 +147,9 @@ class RealTimeExecutor:
         logger.info("warming up: %s", metadata.get("config", type(self._policy).__name__))
         warmup = getattr(self._policy, "warmup", None)
         if callable(warmup):
-            warmup()
+            warmup(**({"real_time": self._way.mode} if self._way.mode is not None else {}))
         observation = self._message(observation, reset=True)
-        asked = {"previous": None, "model_actions": True} if self._way.mode is not None else {}
+        asked: dict[str, Any] = {"previous": None, "model_actions": True} if self._way.mode is not None else {}
         result = self._policy.infer(observation, **self._arguments, **asked)
         with self._lock:
             previous = self._queue.learn(result)

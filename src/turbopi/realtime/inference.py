@@ -17,7 +17,9 @@ class Inference(Protocol):
 
 
 class BackgroundThread:
-    """One thread for all calls: a CUDA device is chosen by thread. A daemon: a policy that hangs lets the process end."""
+    """One thread for all calls: a CUDA device is chosen by thread. A daemon: a policy that hangs lets the process
+    end.
+    """
 
     def __init__(self, name: str = "turbopi-realtime") -> None:
         self._calls: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()

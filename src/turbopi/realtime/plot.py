@@ -32,7 +32,7 @@ def plot_run(
     dims = min(width, MOST_DIMS)
     heights = [1.0] * dims + [0.55]
     figure = Figure(figsize=(12, 1.2 + 1.1 * sum(heights)), dpi=110, layout="constrained")
-    axes: Sequence[Axes] = figure.subplots(dims + 1, 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    axes = list(figure.subplots(dims + 1, 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0])
     empty = [step for step, command in commands if command.kind in ("held", "waiting")]
     borders = [step for step, command in commands if command.takes_over]
     slowed = np.array([command.kind == "slowed" for _, command in commands], dtype=bool)

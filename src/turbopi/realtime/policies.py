@@ -27,8 +27,8 @@ def check_policy(policy: Any, way: Way) -> Mapping[str, Any]:
     free = "execution 'sync', 'async' or 'ensemble' need nothing of the policy"
     if not _takes_previous(policy):
         raise ConfigError(
-            f"execution {way.name!r} tells the policy of the running chunk, which {type(policy).__name__}.infer doesn't "
-            f"take: use a UnifiedPolicy, or turbopi.client.RealTimeClient for a server; {free}"
+            f"execution {way.name!r} tells the policy of the running chunk, which {type(policy).__name__}.infer "
+            f"doesn't take: use a UnifiedPolicy, or turbopi.client.RealTimeClient for a server; {free}"
         )
     modes = list(offered.get("modes", ()))
     if not modes:
