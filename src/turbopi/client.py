@@ -9,10 +9,11 @@ It also is a policy for `turbopi.realtime.RealTimeExecutor`, in every way to run
 openpi's own server, too, which offers none of the "rtc" ways.
 """
 
+import contextlib
 import threading
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Any
+from typing import Any, NoReturn
 
 from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
 from websockets.sync.client import ClientConnection, connect
@@ -66,6 +67,7 @@ class RealTimeClient:
         self._connect_s, self._answer_s = connect_s, answer_s
         self._lock = threading.Lock()
         self._socket: ClientConnection | None = None
+        self._open = contextlib.ExitStack()
         with self._lock:
             self.metadata = self._connect()
 
@@ -94,13 +96,19 @@ class RealTimeClient:
                     if isinstance(error, TimeoutError)
                     else f"the policy server at {self.url} went away: {_reason(error)}"
                 ) from error
-        if isinstance(reply, str):
-            for beginning, kind in _REFUSALS.items():
-                if reply.startswith(beginning):
-                    raise kind(_printable(reply.removeprefix(beginning)))
-            last = (reply.strip().splitlines() or ["nothing"])[-1]
-            raise ServerRefused(f"the policy server at {self.url} sent no actions but: {_printable(last)}")
-        return self._unpacked(reply)
+            if isinstance(reply, str):
+                self._raise(reply)
+            return self._unpacked(reply)
+
+    def _raise(self, text: str) -> NoReturn:
+        """What the server says instead of actions."""
+        for beginning, kind in _REFUSALS.items():
+            if text.startswith(beginning):
+                raise kind(_printable(text.removeprefix(beginning)))
+        if not text.startswith("busy: "):
+            self._drop()  # a server that sends a traceback closes the connection
+        last = (text.strip().splitlines() or ["nothing"])[-1]
+        raise ServerRefused(f"the policy server at {self.url} sent no actions but: {_printable(last)}")
 
     def close(self) -> None:
         """Close the connection."""
@@ -129,7 +137,7 @@ class RealTimeClient:
     def _connect(self) -> dict[str, Any]:
         """Connect; the server's metadata."""
         try:
-            self._socket = connect(
+            connecting = connect(
                 self.url,
                 additional_headers=self._headers,
                 compression=None,
@@ -138,6 +146,7 @@ class RealTimeClient:
                 close_timeout=1.0,  # a server that hangs says no goodbye
                 ping_interval=None,  # openpi's server answers no ping while it computes
             )
+            self._socket = self._open.enter_context(connecting)
             greeting = self._socket.recv(timeout=self._connect_s)
         except (InvalidURI, ValueError) as error:
             raise ConfigError(f"{self.url} is no address of a server: {error}") from error
@@ -160,9 +169,9 @@ class RealTimeClient:
         return unpacked
 
     def _drop(self) -> None:
-        socket, self._socket = self._socket, None
-        if socket is not None:
-            socket.close()
+        self._socket = None
+        with contextlib.suppress(Exception):  # it may be gone already
+            self._open.close()
 
 
 def _printable(text: str) -> str:

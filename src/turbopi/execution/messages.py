@@ -99,8 +99,8 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
         left_over = _numbers(given, "previous")
         if left_over.ndim != 2 or not len(left_over):
             raise ObservationError(
-                f"{PREFIX}previous has shape {list(left_over.shape)}; it should be float32 [K, action_dim], the rows of "
-                '"model_actions" that are left when the observation is taken'
+                f"{PREFIX}previous has shape {list(left_over.shape)}; it should be float32 [K, action_dim], the "
+                'rows of "model_actions" that are left when the observation is taken'
             )
         if mode is None or delay is None:
             missing = "mode" if mode is None else "delay"
