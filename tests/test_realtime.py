@@ -152,6 +152,38 @@ def test_a_background_warm_up_that_fails_is_tried_again() -> None:
     assert kinds(loop)[-1] == "f"
 
 
+def test_a_server_that_keeps_the_running_chunk_is_told_what_it_must_know() -> None:
+    loop, policy = started("async", warm=False, execution_horizon=4)
+    policy.metadata["real_time"]["execution"] = "rtc"
+    executor = RealTimeExecutor(
+        policy, control_hz=HZ, execution="async", execution_horizon=4, clock=loop.clock, inference=loop.hand
+    )
+    loop = Loop(executor, loop.clock, loop.hand)
+    loop.hand.at_once = True
+    executor.warm_up({"place": 0})
+    loop.hand.at_once = False
+    assert [call["obs"].get("turbopi/reset") for call in policy.calls] == [True] * 3
+    policy.calls.clear()
+    loop.run(20, delay=1)
+    told = [{key: value for key, value in call["obs"].items() if key != "place"} for call in policy.calls]
+    own = {"turbopi/execution_horizon": 4}
+    assert told[0] == {"turbopi/reset": True, "turbopi/step": 0, "turbopi/delay": 0, **own}
+    assert told[1] == {"turbopi/reset": False, "turbopi/step": 4, "turbopi/delay": 1, **own}
+    loop.run(12, delay=9)  # longer than fits: H − s = 6
+    loop.run(6, delay=0)
+    assert executor.report()["expected_delay"] == 9
+    assert policy.calls[-1]["obs"]["turbopi/delay"] <= 6
+    policy.change = lambda result: {"actions": result["actions"] * np.nan}  # a chunk that the robot never carries out
+    loop.run(9, delay=0)
+    assert policy.calls[-1]["obs"]["turbopi/reset"] is True
+    policy.change = lambda result: result
+    assert all(call["obs"]["place"] == call["obs"]["turbopi/step"] for call in policy.calls)
+    executor.reset()
+    policy.calls.clear()
+    loop.run(1, delay=0)
+    assert policy.calls[-1]["obs"]["turbopi/reset"] is True
+
+
 # --- a policy in trouble ----------------------------------------------------------------------------------------------
 
 

@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -22,10 +22,11 @@ from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.execution.messages import KEYS, message, read_message
 from turbopi.realtime import RealTimeExecutor
 from turbopi.recordings import iter_recording
-from turbopi.running_chunk import RunningChunk
+from turbopi.running_chunk import JoinMode, RunningChunk
 from turbopi.serve import PolicyServer, ServerOptions, running
 from turbopi.serve import real_time as sessions_module
 from turbopi.serve.metrics import Metrics
+from turbopi.serve.options import JOINING
 from turbopi.serve.real_time import RealTime
 from turbopi.wire import pack, unpack
 
@@ -334,6 +335,10 @@ def test_what_the_server_cannot_know_or_join_is_refused(
         call(server, policy, {"place": 0, **{f"turbopi/{key}": value for key, value in second.items()}})
 
 
+def test_a_server_joins_by_the_ways_there_are() -> None:
+    assert get_args(JoinMode) == JOINING
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
@@ -370,7 +375,7 @@ def test_the_greeting_says_what_a_server_offers(served: tuple[PolicyServer, Join
 
 def test_the_server_survives_every_refusal(served: tuple[PolicyServer, Joins]) -> None:
     server, policy = served
-    bad = [
+    bad: list[dict[str, Any]] = [
         {"turbopi/delay": -1},
         {"turbopi/previous": LEFT},
         {"turbopi/speed": 1},
@@ -496,7 +501,8 @@ def tiny() -> UnifiedPolicy:
 
 def drive(executor: RealTimeExecutor, observation: dict[str, Any], chunks: int) -> list[str]:
     """A control loop without a clock of its own, until so many chunks have taken over."""
-    kinds, pause = [], threading.Event()
+    kinds: list[str] = []
+    pause = threading.Event()
     for _ in range(20_000):
         executor.observe(observation)
         command = executor.next_action()

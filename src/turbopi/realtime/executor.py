@@ -115,7 +115,8 @@ class RealTimeExecutor:
         self._called_at: float | None = None  # the last call of next_action
         self._begun_at = 0.0  # when the last call of the policy began
         self._stretched = False  # the last command was "slowed"
-        self._new_episode = True
+        self._anew = True  # a server that keeps the running chunk must forget it
+        self._kept_at: int | None = None  # which one that is: actions before its observation
         self.last_error: BaseException | None = None  # what the policy raised last
 
     # --- the policy ---------------------------------------------------------------------------------------------------
@@ -148,7 +149,7 @@ class RealTimeExecutor:
         warmup = getattr(self._policy, "warmup", None)
         if callable(warmup):
             warmup(**({"real_time": self._way.mode} if self._way.mode is not None else {}))
-        observation = self._message(observation, reset=True)
+        observation = self._message(observation)
         asked: dict[str, Any] = {"previous": None, "model_actions": True} if self._way.mode is not None else {}
         result = self._policy.infer(observation, **self._arguments, **asked)
         with self._lock:
@@ -198,14 +199,22 @@ class RealTimeExecutor:
         most = self._offered.get("trained_max_delay")
         return None if most is None else int(most)
 
-    def _message(self, observation: Mapping[str, Any], *, reset: bool, step: int | None = None) -> Mapping[str, Any]:
-        """The observation, with what a server that keeps the running chunk itself needs to know."""
+    def _message(self, observation: Mapping[str, Any], step: int | None = None) -> Mapping[str, Any]:
+        """The observation, with what a server that keeps the running chunk itself needs to know.
+
+        step  actions before the observation; None: of a warm-up
+        """
         if not self._server_joins:
             return observation
-        message = {**observation, f"{PREFIX}reset": reset}
-        if step is not None:
-            message |= {f"{PREFIX}step": step, f"{PREFIX}delay": self._queue.expected_delay}
-        return message
+        if step is None:
+            return {**observation, f"{PREFIX}reset": True, f"{PREFIX}step": 0}
+        s, delay = self._queue.execution_horizon, self._queue.expected_delay
+        if self._kept_at is not None and self._queue.horizon is not None:
+            delay = max(0, min(delay, self._queue.horizon - max(s, step - self._kept_at)))
+        if self._offered["execution"] == "rtc_trained" and self._trained_max is not None:
+            delay = min(delay, self._trained_max)
+        told = {"reset": self._anew, "step": step, "delay": delay, "execution_horizon": s}
+        return {**observation, **{PREFIX + key: value for key, value in told.items()}}
 
     # --- the robot ----------------------------------------------------------------------------------------------------
 
@@ -239,8 +248,8 @@ class RealTimeExecutor:
                 return False
             seen["used"] += 1
             request = self._queue.observe(ago)
-            message = self._message(observation, reset=self._new_episode, step=request.carried_out)
-            self._new_episode = False
+            message = self._message(observation, request.carried_out)
+            self._anew, self._kept_at = False, request.carried_out
             arguments = {**self._arguments, **request.arguments}
             self._journal.inferred.append(Inferred(request.number, request.step))
             self._begun_at = now
@@ -270,7 +279,7 @@ class RealTimeExecutor:
             self._queue.reset()
             self._called_at = None
             self._stretched = False
-            self._new_episode = True
+            self._anew = True
             self._fresh_at.clear()
 
     @property
@@ -360,6 +369,7 @@ class RealTimeExecutor:
         if before is not None and not 0 <= now - before <= self._max_pause:
             self._journal.clock_jumps += 1
             self._queue.interrupt("clock_jump")
+            self._anew = True
             logger.warning("%.3f s between two control steps: the actions that were left are dropped", now - before)
 
     def _take_answer(self, now: float) -> None:
@@ -382,6 +392,7 @@ class RealTimeExecutor:
             else:
                 result = result if isinstance(result, Mapping) else {}
                 entry.outcome = self._queue.arrive(result) or "used"
+        self._anew = self._anew or entry.outcome != "used"  # the server takes every chunk for carried out
         entry.ended = self._queue.steps
         if entry.outcome not in ("used", "failed"):
             logger.warning("chunk %d was dropped: %s", entry.chunk, self._queue.last_problem)

@@ -4,12 +4,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from turbopi.errors import ConfigError
-from turbopi.execution import WAYS
-from turbopi.running_chunk import JoinMode
 from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limits import Limits
+
+if TYPE_CHECKING:  # `turbopi --help` needs no NumPy
+    from turbopi.running_chunk import JoinMode
+
+JOINING = ("rtc", "rtc_identity", "rtc_trained")
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class ServerOptions:
     record_dir: str | Path | None = None
     allowed_hosts: Sequence[str] = ()
     max_clients: int = Limits.clients
-    execution: JoinMode | None = None
+    execution: "JoinMode | None" = None
     control_hz: float | None = None
     execution_horizon: int | None = None
     delay_steps: int | None = None
@@ -53,10 +57,9 @@ class ServerOptions:
             raise ConfigError(f"queue_limit must be 0 or more, not {self.queue_limit}")
         if self.max_clients < 1:
             raise ConfigError(f"max_clients must be 1 or more, not {self.max_clients}")
-        joining = [name for name, way in WAYS.items() if way.mode is not None]
-        if self.execution is not None and self.execution not in joining:
+        if self.execution is not None and self.execution not in JOINING:
             raise ConfigError(
-                f"execution is {self.execution!r}; a server joins chunks by {', '.join(joining)}. Other ways to run "
+                f"execution is {self.execution!r}; a server joins chunks by {', '.join(JOINING)}. Other ways to run "
                 "need nothing of it"
             )
         if self.execution is not None and self.control_hz is None:

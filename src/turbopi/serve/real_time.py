@@ -117,7 +117,7 @@ class RealTime:
                     f"{PREFIX}step and {PREFIX}reset are for sessions, but here the client keeps its running chunk"
                 )
             arguments = {"previous": asked.previous, "model_actions": asked.model_actions}
-            about = {"joined": asked.previous is not None}
+            about: dict[str, Any] = {"joined": asked.previous is not None}
             if asked.previous is not None:
                 about |= {"mode": asked.previous.mode, "delay": asked.previous.delay}
             return Plan(observation, arguments, asked, received=now, about=about)
