@@ -140,7 +140,7 @@ def test_openpi_client_gets_joined_chunks_and_an_executor_without_pytorch() -> N
     policy = Joins()
     drive = Path(__file__).parent / "openpi_client" / "drive_real_time.py"
     with running(policy, execution="rtc", control_hz=100) as server:
-        command = [python, drive, str(server.port), REPOSITORY / "src"]
+        command = [str(python), str(drive), str(server.port), str(REPOSITORY / "src")]
         client = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert client.returncode == 0, client.stderr
     seen = json.loads(client.stdout)
