@@ -1,22 +1,18 @@
 """The action chunk that a robot carries out while the policy computes the next one: what the next one must join."""
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
 from turbopi.config import LIMITS, RealTime, Schedule
 from turbopi.errors import ObservationError
-from turbopi.model.conditioning import (
-    Conditioning,
-    Form,
-    Guidance,
-    guidance_strength,
-    guidance_weights,
-)
+
+if TYPE_CHECKING:  # a robot's computer joins chunks without PyTorch
+    from turbopi.model.conditioning import Conditioning, Form
 
 JoinMode = Literal["rtc", "rtc_identity", "rtc_trained"]
-FORMS: dict[JoinMode, Form] = {"rtc": "jacobian", "rtc_identity": "tokens", "rtc_trained": "tokens"}
+FORMS: "dict[JoinMode, Form]" = {"rtc": "jacobian", "rtc_identity": "tokens", "rtc_trained": "tokens"}
 
 
 @dataclass(frozen=True)
@@ -99,12 +95,14 @@ class RunningChunk:
             max_guidance_weight=float(most),
         )
 
-    def conditioning(self, left_over: np.ndarray, num_steps: int, horizon: int, time_grid: str) -> Conditioning:
+    def conditioning(self, left_over: np.ndarray, num_steps: int, horizon: int, time_grid: str) -> "Conditioning":
         """What the denoising loop is asked for: of a chunk that is `completed`.
 
         left_over  the chunk's, for relative actions moved to the new state
         time_grid  as `ModelConfig`'s
         """
+        from turbopi.model.conditioning import Conditioning, Guidance, guidance_strength, guidance_weights
+
         assert self.execution_horizon is not None and self.schedule is not None and self.max_guidance_weight is not None
         target = np.zeros((horizon, left_over.shape[1]), np.float32)
         target[: len(left_over)] = left_over
