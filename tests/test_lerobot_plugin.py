@@ -17,6 +17,7 @@ from lerobot_golden import GOLDEN, GoldenCase
 
 from turbopi import UnifiedPolicy
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+from turbopi.robots.raw_keys import ROBOT_TYPES
 
 REPOSITORY = Path(__file__).parents[1]
 PYTHON = Path(os.environ.get("TURBOPI_LEROBOT_PYTHON", REPOSITORY / ".venv-lerobot" / "bin" / "python")).absolute()
@@ -135,6 +136,14 @@ def test_lerobot_eval_runs_episodes_with_the_plugin(ran: Path, tmp_path: Path) -
     )
     assert done.returncode == 0, done.stderr[-4000:]
     assert json.loads((tmp_path / "out" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
+
+
+def test_robot_types_are_lerobots() -> None:
+    """What `--robot so101_follower` expects is what LeRobot's robot of that type gives and takes."""
+    done = in_lerobot("-m", "lerobot_cases.robot_types")
+    assert done.returncode == 0, done.stderr[-4000:]
+    theirs = json.loads(done.stdout.splitlines()[-1])
+    assert theirs == {name: [list(joints), list(joints)] for name, joints in ROBOT_TYPES.items()}
 
 
 def test_rtc_is_refused_by_lerobot_and_says_what_to_use(ran: Path) -> None:

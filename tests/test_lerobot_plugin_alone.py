@@ -159,6 +159,8 @@ def test_checkpoints_and_options_that_cannot_be_are_refused(modeling: Any, check
         modeling.TurboPiPolicy(config())
     with pytest.raises(ConfigError, match="n_action_steps is 11; it should be from 1 to the chunk's 10"):
         config(checkpoint=str(checkpoint), n_action_steps=11)
+    with pytest.raises(ConfigError, match="n_action_steps is 0"):
+        config(checkpoint=str(checkpoint), n_action_steps=0)
     described = json.loads((checkpoint / "config.json").read_text())
     (checkpoint / "config.json").write_text(json.dumps(described | {"type": "act"}))
     with pytest.raises(CheckpointError, match="type 'act'; Turbo-Pi runs 'pi05' and 'pi0'"):

@@ -56,7 +56,7 @@ class TurboPiConfig(PreTrainedConfig):
         self.image_resolution: tuple[int, int] = tuple(described.image_resolution)
         self.action_feature_names: list[str] | None = described.action_feature_names
         for name in ("input_features", "output_features", "num_inference_steps", "n_action_steps"):
-            if not getattr(self, name):
+            if getattr(self, name) in (None, {}):
                 setattr(self, name, getattr(described, name))
         if not self.pretrained_path:  # where LeRobot looks for the processors
             self.pretrained_path: Path | None = Path(self.checkpoint)
