@@ -27,7 +27,6 @@ from turbopi.backends.lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import ModelConfig, PolicyConfig
-from turbopi.engine.recent_loops import Loop
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.model.conditioning import Conditioning, Form, Guidance
 from turbopi.model.reference import FloatPrecision
@@ -356,7 +355,7 @@ class UnifiedPolicy:
         return time.perf_counter() - start
 
     def _conditioned_loops(
-        self, loops: Sequence[Loop], real_time: JoinMode | Sequence[JoinMode], others: Sequence[Conditioning]
+        self, loops: Sequence[tuple[int, int]], real_time: JoinMode | Sequence[JoinMode], others: Sequence[Conditioning]
     ) -> list[tuple[int, int, Conditioning | None]]:
         """Steps, horizon and an example of every conditioned loop that a warm-up is to cover. Raises ConfigError."""
         modes: Sequence[Any] = [real_time] if isinstance(real_time, str) else real_time
@@ -494,7 +493,7 @@ class UnifiedPolicy:
                 raise ActionError(f"observation {row} of {len(states)} (from 0): {error}") from None
         return results
 
-    def _loop(self, num_steps: int | None, horizon: int | None) -> Loop:
+    def _loop(self, num_steps: int | None, horizon: int | None) -> tuple[int, int]:
         """A call's number of steps and horizon. Raises ObservationError."""
         return (
             self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError),
