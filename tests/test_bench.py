@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from file_helpers import no_room
+from msgspec import to_builtins
 from msgspec.structs import asdict, replace
 from typer.testing import CliRunner
 
@@ -30,7 +31,7 @@ from turbopi.bench.ready import Start, empty_caches, measure_ready
 from turbopi.bench.report import report
 from turbopi.bench.run import BenchPlan, stage_floors
 from turbopi.bench.summary import linear_models
-from turbopi.bench.work import Job, Work, floor_ms, stage_work
+from turbopi.bench.work import JOINS, Job, Work, floor_ms, stage_work
 from turbopi.checkpoint import random_checkpoint
 from turbopi.cli import app
 from turbopi.cli.options import own_precision
@@ -81,6 +82,17 @@ def test_prompts_have_exactly_the_tokens_asked_for(policy: UnifiedPolicy, tokens
     observations = Observations(policy, Job(prompt_tokens=tokens))
     for _ in range(3):
         assert policy.prepare(next(observations)).token_mask.sum() == tokens
+
+
+def test_jobs_that_join_a_running_chunk_are_measured_and_judged(policy: UnifiedPolicy) -> None:
+    plain, *joined = (Job(steps=2, join=join) for join in JOINS)
+    alone = answers(policy, plain, observations=1)
+    for job in joined:
+        assert not np.array_equal(answers(policy, job, observations=1), alone)
+        assert measure_calls(policy, job, 1)["total"].calls == 1 and JOINS[job.join] in str(job)
+    plan = BenchPlan(["pytorch"], ["f32"], joins=list(JOINS))
+    assert [job.join for job in plan.jobs()] == list(JOINS) and all(plan.judges(job) for job in plan.jobs())
+    assert "join" not in to_builtins(Job())
 
 
 def test_every_observation_is_new_and_has_the_cameras_asked_for(policy: UnifiedPolicy) -> None:

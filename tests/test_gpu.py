@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import GOLDEN, golden_cases, golden_folder
+from conditioned import BY_TOKEN, conditioned
+from conftest import GOLDEN, golden_cases, golden_folder, golden_model
 from test_engine import made_up, shape_of
 
 from turbopi import backends
@@ -205,3 +206,41 @@ def test_tf32_stays_out_of_the_oracle_whatever_the_caller_has_set() -> None:
         assert torch.equal(oracle.sample(case.observation, case.noise, 3).actions, exact)
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+@pytest.mark.parametrize(("name", "precision"), [mode for mode in MODES if mode[0] in GRAPHS])
+@pytest.mark.parametrize("kind", ["pi05", "pi0"])
+@pytest.mark.parametrize("which", [*BY_TOKEN, "jacobian", "jacobian_and_held"])
+def test_conditioned_calls_are_the_references(name: str, precision: FloatPrecision, kind: Kind, which: str) -> None:
+    """Plain calls beside them keep their bits."""
+    runner: Any = backend(name, kind, precision)
+    observation, noise = made_up(kind, 2, 19)
+    asked = conditioned(which, 10, noise.shape[1], noise.shape[2])
+    plain = runner.sample(observation, noise, 10).actions
+    exact = golden_model(kind).sample(observation, noise, 10, conditioning=asked)
+    found = runner.sample(observation, noise, 10, conditioning=asked).actions
+    if precision == "f32":
+        torch.testing.assert_close(found, exact, atol=5e-5, rtol=5e-5)
+    else:
+        reference = golden_model(kind, "bf16").sample(observation, noise, 10, conditioning=asked)
+        assert 0 < rms(found - exact) <= 2 * rms(reference - exact)
+    if asked.held is not None and asked.values is not None:
+        np.testing.assert_array_equal(found[0].numpy()[asked.held], asked.values[asked.held])
+    assert torch.equal(runner.sample(observation, noise, 10).actions, plain)
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+@pytest.mark.parametrize("forms", [("held", "identity"), ("jacobian", "jacobian_and_held")])
+def test_what_is_held_and_what_pulls_changes_without_a_new_capture(name: str, forms: tuple[str, str]) -> None:
+    runner: Any = backend(name, "pi05", "bf16")
+    observation, noise = made_up("pi05", 1, 7)
+    alone = [runner.sample(observation, noise, 5, conditioning=conditioned(one, 5, 7, 32)).actions for one in forms]
+    graphs = len(runner._graphs)
+    for which, first in [*zip(forms, alone, strict=True)] * 2:
+        again = runner.sample(observation, noise, 5, conditioning=conditioned(which, 5, 7, 32)).actions
+        assert torch.equal(again, first)
+    assert not torch.equal(*alone) and len(runner._graphs) == graphs
+
+
+def rms(x: torch.Tensor) -> float:
+    return float(x.square().mean().sqrt())

@@ -64,13 +64,16 @@ def poison_allocator() -> None:
 
 @pytest.mark.parametrize("width", [32, 96, 1024, 1152, 2048])
 @pytest.mark.parametrize("rows", [1, 10, 51, 563])
-@pytest.mark.parametrize("form", ["first", "residual", "modulated", "split", "rounded parts"])
+@pytest.mark.parametrize("form", ["first", "residual", "modulated", "by token", "split", "rounded parts"])
 def test_residual_rms_norm(width: int, rows: int, form: str) -> None:
     if not ON_GPU and rows > 51:
         rows = 5
     x, scale = random(rows, width, outliers=True), random(width, dtype=torch.float32)
     y = None if form == "first" else random(rows, width)
-    gate, shift = (random(width, dtype=torch.float32) for _ in range(2)) if form == "modulated" else (None, None)
+    gate, shift = None, None
+    if form in ("modulated", "by token"):
+        size = (width,) if form == "modulated" else (rows, width)
+        gate, scale, shift = (random(*size, dtype=torch.float32) for _ in range(3))
     given = y
     if form == "split":
         assert y is not None

@@ -16,6 +16,7 @@ from turbopi.bench.work import MODEL_SIZE, Job
 from turbopi.checkpoint import Checkpoint
 from turbopi.config import CAMERAS, Normalization
 from turbopi.errors import ConfigError
+from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
 from turbopi.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
@@ -87,6 +88,20 @@ def at_horizon(policy: UnifiedPolicy, horizon: int) -> UnifiedPolicy:
     other = copy.copy(policy)
     other.config = policy.config.with_model(action_horizon=horizon)
     return other
+
+
+def conditioning(policy: UnifiedPolicy, job: Job) -> Conditioning | None:
+    """What joins a job's chunks to a random one, as after a delay of a quarter of a chunk."""
+    if job.join == "none":
+        return None
+    horizon, delay = job.horizon, job.horizon // 4
+    model = policy.config.model
+    target = np.random.default_rng(0).standard_normal((horizon, model.action_dim), dtype=np.float32)
+    if job.join == "held":
+        return Conditioning(held=np.arange(horizon) < delay, values=target)
+    times = TokenTimes.plain(job.steps, horizon, model.time_grid).times
+    weights = guidance_weights(horizon, delay, delay)
+    return Conditioning(guidance=Guidance(target, weights, guidance_strength(times, 5.0), job.join))
 
 
 class Observations:
@@ -168,14 +183,15 @@ def measure_calls(
     """
     observations = Observations(policy, job, seed)
     timings: dict[str, list[float]] = {}
+    asked = conditioning(policy, job)
     for _ in range(WARMING):
-        policy.infer(next(observations), num_steps=job.steps)
+        policy.infer(next(observations), num_steps=job.steps, conditioning=asked)
         advance()
     end = time.perf_counter() + seconds
     for i in range(calls):
         if i >= FEWEST and time.perf_counter() > end:
             break
-        timing = policy.infer(next(observations), num_steps=job.steps)["policy_timing"]
+        timing = policy.infer(next(observations), num_steps=job.steps, conditioning=asked)["policy_timing"]
         stages = [timing[f"{stage}_ms"] for stage in ("vision", "prefix", "denoise") if f"{stage}_ms" in timing]
         if stages:
             timing["device_ms"] = sum(stages)
@@ -192,7 +208,8 @@ def answers(policy: UnifiedPolicy, job: Job, *, observations: int = 4) -> np.nda
     chunks = []
     for seed in range(observations):
         noise = np.random.default_rng(seed).standard_normal(shape, dtype=np.float32)
-        chunks.append(policy.infer(next(source), noise=noise, num_steps=job.steps)["actions"])
+        asked = conditioning(policy, job)
+        chunks.append(policy.infer(next(source), noise=noise, num_steps=job.steps, conditioning=asked)["actions"])
     return np.stack(chunks)
 
 

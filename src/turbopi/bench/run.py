@@ -13,10 +13,19 @@ from turbopi import backends
 from turbopi.backends import PRECISIONS, Precision
 from turbopi.bench.document import BenchDocument, BenchProvenance, Failed, Memory, Profile, Result
 from turbopi.bench.machine_limits import Floors, measure_floors
-from turbopi.bench.measure import WARMING, Observations, answers, at_horizon, bench_policy, error_against, measure_calls
+from turbopi.bench.measure import (
+    WARMING,
+    Observations,
+    answers,
+    at_horizon,
+    bench_policy,
+    conditioning,
+    error_against,
+    measure_calls,
+)
 from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.summary import linear_models, warnings_on
-from turbopi.bench.work import MODEL_SIZE, Job, Work, floor_ms, stage_work
+from turbopi.bench.work import MODEL_SIZE, Job, Join, Work, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.graph import collect_and_empty_cache
 from turbopi.errors import ConfigError, TurboPiError
@@ -39,6 +48,7 @@ class BenchPlan:
     horizons: Sequence[int] = (10,)
     steps: Sequence[int] = (10,)
     image_sizes: Sequence[tuple[int, int]] = (MODEL_SIZE,)  # width, height
+    joins: Sequence[Join] = ("none",)
     calls: int = 100
     error: bool = True  # also against the float32 reference
     tokenizer: str | None = None
@@ -63,6 +73,7 @@ class BenchPlan:
             pick(self.horizons, usual.horizon),
             usual.steps if usual.steps in self.steps else max(self.steps),
             *(MODEL_SIZE if MODEL_SIZE in self.image_sizes else self.image_sizes[0]),
+            "none" if "none" in self.joins else self.joins[0],
         )
 
     def check(self, device: torch.device) -> None:
@@ -83,8 +94,8 @@ class BenchPlan:
         for horizon, cameras, size, tokens in itertools.product(
             self.horizons, self.cameras, self.image_sizes, self.prompt_tokens
         ):
-            for steps in self.steps:
-                yield Job(cameras, tokens, horizon, steps, *size)
+            for steps, join in itertools.product(self.steps, self.joins):
+                yield Job(cameras, tokens, horizon, steps, *size, join)
 
     def policies(self) -> Iterator[tuple[Precision, str, list[Job]]]:
         """Precision, backend, and the jobs it runs. A backend without one of several precisions is left out there."""
@@ -98,8 +109,9 @@ class BenchPlan:
         return self.main_calls
 
     def judges(self, job: Job) -> bool:
-        """Whether the error is measured on a job: every number of steps and horizon of the main job."""
-        return self.error and replace(job, steps=self.main.steps, horizon=self.main.horizon) == self.main
+        """Whether the error is measured on a job: every number of steps, horizon and way to join of the main job."""
+        main = self.main
+        return self.error and replace(job, steps=main.steps, horizon=main.horizon, join=main.join) == main
 
     @property
     def total_calls(self) -> int:
@@ -197,7 +209,10 @@ def _measure(
     for job in jobs:
         progress.doing(f"{backend} {precision}: {job}")
         shaped = at_horizon(policy, job.horizon)
-        first = shaped.infer(next(Observations(shaped, job, seed=2)), num_steps=job.steps)["policy_timing"]["total_ms"]
+        asked = conditioning(shaped, job)
+        first = shaped.infer(next(Observations(shaped, job, seed=2)), num_steps=job.steps, conditioning=asked)[
+            "policy_timing"
+        ]["total_ms"]
         latency = measure_calls(
             shaped, job, plan.calls_of(backend, job), seconds=plan.seconds, advance=progress.advance
         )

@@ -14,7 +14,7 @@ def linear_models(results: Sequence[Result]) -> list[Line]:
     groups: dict[_Key, dict[int, float]] = {}
     for result in results:
         job = result.job
-        if job.of_size:
+        if job.of_size or job.joined:
             continue
         key = (result.backend, result.precision, job.cameras, job.prompt_tokens, job.horizon)
         groups.setdefault(key, {})[job.steps] = result.milliseconds["total"].p50

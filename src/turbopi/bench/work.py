@@ -4,13 +4,20 @@ A stage's floor is the larger of operations / matrix rate and bytes / bandwidth.
 not counted: the floor is what no implementation in that precision gets under, not what one should reach.
 """
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, field
 
 from turbopi.config import GemmaConfig, ModelConfig
 
 _Count = Annotated[int, Meta(ge=1)]
+Join = Literal["none", "held", "identity", "jacobian"]
+JOINS: dict[Join, str] = {  # how a chunk joins a running one (docs/real_time.md), and what the table calls it
+    "none": "",
+    "held": "the first actions held",
+    "identity": "guided by the identity",
+    "jacobian": "guided by the Jacobian",
+}
 MODEL_SIZE = (224, 224)  # width and height of the pictures that the model reads
 
 
@@ -28,10 +35,16 @@ class Job(Struct, frozen=True, omit_defaults=True):
     steps: _Count = _written(10)
     image_width: _Count = MODEL_SIZE[0]  # of what cameras send; not in files where it is the model's, as in older ones
     image_height: _Count = MODEL_SIZE[1]
+    join: Join = "none"  # not in files where it is none
 
     def __str__(self) -> str:
         pictures = f"{self.cameras} cameras{self.of_size}"
-        return f"{pictures}, {self.prompt_tokens} tokens, H={self.horizon}, {self.steps} steps"
+        return f"{pictures}, {self.prompt_tokens} tokens, H={self.horizon}, {self.steps} steps{self.joined}"
+
+    @property
+    def joined(self) -> str:
+        """`guided by …` behind a comma, where a chunk joins another; else nothing."""
+        return "" if self.join == "none" else f", {JOINS[self.join]}"
 
     @property
     def of_size(self) -> str:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from turbopi.backends import Precision
     from turbopi.bench.document import BenchDocument, Profile, Ready, Result, StageKernels
     from turbopi.bench.run import BenchPlan, BenchProgress
+    from turbopi.bench.work import Join
     from turbopi.checkpoint import Checkpoint
     from turbopi.robots import Robot
 
@@ -96,6 +97,15 @@ def _robots_own(
     }
 
 
+def _joins(text: str) -> "list[Join]":
+    from turbopi.bench.work import JOINS
+
+    names = _names(text)
+    if not names or (wrong := [name for name in names if name not in JOINS]):
+        raise ConfigError(f"--join has {shown(wrong[0] if names else text)}; expected some of {', '.join(JOINS)}")
+    return list(dict.fromkeys(names))  # type: ignore[arg-type]
+
+
 def _names(text: str) -> list[str]:
     return [name for name in text.split(",") if name]
 
@@ -145,6 +155,13 @@ def bench(
     steps: Annotated[str | None, typer.Option(metavar="N,N,…", help="Denoising steps; else 10.")] = None,
     image_size: Annotated[
         str | None, typer.Option(metavar="WxH,WxH,…", help="Of the cameras' pictures; else 224x224, the model's.")
+    ] = None,
+    join: Annotated[
+        str | None,
+        typer.Option(
+            metavar="none,held,identity,jacobian",
+            help="Chunks that join a running one (docs/real_time.md): a quarter of the actions held, or guidance.",
+        ),
     ] = None,
     calls: Annotated[
         int, typer.Option(min=1, max=MOST_CALLS, help="Calls of each measurement, after three for warm-up.")
@@ -208,6 +225,7 @@ def bench(
             horizons=_axis("--horizons", axes["--horizons"], table),
             steps=_axis("--steps", axes["--steps"], table),
             image_sizes=_image_sizes(axes["--image-size"] or "224x224"),
+            joins=_joins("none" if join is None else join),
             robot=robot,
             calls=calls,
             error=error,
@@ -331,7 +349,8 @@ def _row(result: "Result") -> list[str]:
         return times[stage].text() if stage in times else "-"
 
     return [
-        f"{label(result)}: {job.cameras} cam{job.of_size}, {job.prompt_tokens} tok, H={job.horizon}, {job.steps} steps",
+        f"{label(result)}: {job.cameras} cam{job.of_size}, {job.prompt_tokens} tok, H={job.horizon}, "
+        f"{job.steps} steps{job.joined}",
         *(median(stage) for stage in ("vision", "prefix", "denoise", "device", "total")),
         *(times["total"].text(percentile) for percentile in PERCENTILES),
         f"{result.floor_ms['total']:.2f}",

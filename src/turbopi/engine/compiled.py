@@ -10,7 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.engine import without_compiler
-from turbopi.kernels.interface import Ops
+from turbopi.kernels import backward
+from turbopi.kernels.interface import BackwardOps, Ops
 from turbopi.kernels.plain import (
     PLAIN,
     attention,
@@ -35,6 +36,11 @@ _DYNAMIC_AXES: dict[Callable[..., Any], dict[str, tuple[int, ...]]] = {
     geglu_by_sigmoid: {"gate_up": (0,)},
     rope_split: {"qkv": (0,), "cos": (0,), "sin": (0,), "k_out": (0,), "v_out": (0,)},
     masked_softmax: {"logits": (0, 1)},
+    backward.geglu: {"gate_up": (0,)},
+    backward.rms_norm_vjp: {"d_normed": (0,), "x": (0,), "d_x": (0,)},
+    backward.geglu_vjp: {"d_hidden": (0,), "gate_up": (0,)},
+    backward.softmax_vjp: {"probabilities": (0, 1), "d_probabilities": (0, 1)},
+    backward.rope_vjp: {"d_q": (0,), "d_k": (0,), "d_v": (0,), "cos": (0,), "sin": (0,)},
 }
 _RECOMPILE_LIMIT = 64  # one compilation per width and per set of optional arguments; PyTorch's default is 8
 
@@ -72,13 +78,20 @@ def compiled() -> Ops:
         rope_split=_compiled(rope_split),
         vision_attention=vision_attention,
         attention=compiled_attention,
+        backward=BackwardOps(
+            softmax,
+            *(_compiled(one) for one in (backward.geglu, backward.rms_norm_vjp, backward.geglu_vjp)),
+            *(_compiled(one) for one in (backward.softmax_vjp, backward.rope_vjp)),
+            "Inductor, between cuBLAS's products",
+        ),
         origin={**PLAIN.origin, "all else": "Inductor"},
     )
 
 
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     jitted = torch.compile(function, fullgraph=True)
-    by_token = ("gate", "scale", "shift") if function is residual_rms_norm else ()
+    norms = (residual_rms_norm, backward.rms_norm_vjp)
+    by_token = ("gate", "scale", "shift") if function in norms else ()
     names = list(inspect.signature(function).parameters)
     dynamic_axes = _DYNAMIC_AXES[function]
     # elsewhere a second width would make widths unknown, too, and every index a division

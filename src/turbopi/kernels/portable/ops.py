@@ -8,7 +8,7 @@ from torch import Tensor
 
 from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
-from turbopi.kernels.portable import attention, embedding, norms, products, resize, rope
+from turbopi.kernels.portable import attention, backward, embedding, norms, products, resize, rope
 
 
 def portable_ops() -> Ops:
@@ -25,6 +25,7 @@ def portable_ops() -> Ops:
         vision_attention=attention.vision_attention,
         attention=attend,
         resize_pictures=resize.resize_pictures,
+        backward=backward.BACKWARD,
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
             "vision products": "cuBLAS",
