@@ -322,7 +322,7 @@ def test_a_robots_own_observations_are_measured(monkeypatch: pytest.MonkeyPatch)
     document = json.loads(result.stdout)
     assert document["robot"] == "libero"
     height, width = seen[0]["observation/image"].shape[:2]
-    expected = {"cameras": 2, "horizon": 10, "steps": 1, "image_width": width, "image_height": height}
+    expected = {"cameras": 2, "horizon": 10, "steps": 1, "image_width": width, "image_height": height, "join": "none"}
     job = asdict(as_document(document["main_job"], Job, "stdout"))
     assert {**job, "prompt_tokens": 0} == {**expected, "prompt_tokens": 0}
     assert document["main_job"]["prompt_tokens"] > 20
