@@ -11,7 +11,7 @@ from test_begin import CPU, OnCpu
 
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import ImageResize
-from turbopi.engine.resize import MOST_SIZES, SLAB, Resizer, taps_of
+from turbopi.engine.resize import MOST_SIZES, Resizer, taps_of
 from turbopi.errors import ObservationError
 from turbopi.kernels import plain
 from turbopi.kernels.interface import SOURCE, Ops
@@ -22,7 +22,7 @@ SIDE = 224  # PyTorch sums in another order where a result's height and width ar
 # (height, width): cameras' own, larger and smaller, odd, square, narrow, one axis kept, already of the size
 SIZES = (
     *((480, 640), (720, 1280), (1080, 1920), (640, 480), (240, 320), (37, 53), (53, 37), (300, 300), (1, 40)),
-    *((SIDE, 300), (300, SIDE), (SIDE, SIDE), (SIDE - 1, SIDE), (3, 2), (SIDE * 2, SIDE * 2), (900, 224)),
+    *((SIDE, 300), (300, SIDE), (SIDE, SIDE), (SIDE - 1, SIDE), (3, 2), (SIDE * 2, SIDE * 2)),
 )
 WAYS = tuple(RESIZES)
 
@@ -72,20 +72,6 @@ def test_bytes_and_weights_of_every_camera_are_where_the_table_says() -> None:
             weights = at(row[f"{axis}_weights"], ctypes.c_int32, taps.weights.numel())
             np.testing.assert_array_equal(weights, taps.weights.flatten())
             np.testing.assert_array_equal(at(row[f"{axis}_first"], ctypes.c_int32, len(taps.first)), taps.first)
-
-
-@pytest.mark.parametrize("cameras", [1, 2, 3])
-def test_every_byte_of_large_pictures_is_sent_whoever_copies_it(cameras: int) -> None:
-    resizer = Resizer(torch.zeros((cameras, 28, 28, 3), dtype=torch.uint8))
-    for round_ in range(3):
-        sent = [picture(721 + camera % 2, 1280, seed=round_ * 3 + camera) for camera in range(cameras)]
-        sent[-1] = sent[-1].transpose(1, 0, 2)
-        resizer.upload(sent, "openpi")
-        for row, image in zip(resizer.table.tolist(), sent, strict=True):
-            assert image.size > 2 * SLAB
-            there = at(dict(zip(SOURCE, row, strict=True))["picture"], ctypes.c_uint8, image.size)
-            np.testing.assert_array_equal(there.reshape(image.shape), image)
-            image[:] = 0  # nobody reads it any more
 
 
 class Full(Resizer):

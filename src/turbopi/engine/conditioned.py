@@ -5,6 +5,7 @@ action has which of them in which step, what is held and what pulls differ from 
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -31,14 +32,27 @@ def conditioned_loop(conditioning: Conditioning | None, num_steps: int, horizon:
     form = conditioning.form
     if form == "plain":
         return Loop(num_steps, horizon)
-    own = {*TokenTimes.plain(num_steps, horizon, config.time_grid).distinct().tolist(), 0.0}
-    wanted = {*conditioning.token_times(num_steps, horizon, config.time_grid).distinct().tolist(), 0.0}
-    times = own if wanted <= own else wanted
+    own = _own_times(num_steps, config.time_grid)
+    if conditioning.tokens is None:
+        return Loop(num_steps, horizon, form, own)
+    wanted = {*conditioning.tokens.distinct().tolist(), 0.0}
+    times = own if wanted <= {*own} else tuple(sorted(wanted, reverse=True))
     if len(times) > MOST_TIMES:
         raise ObservationError(
             f"the token times have {len(times)} different values; at most {MOST_TIMES} fit: let actions share times"
         )
-    return Loop(num_steps, horizon, form, tuple(sorted(times, reverse=True)))
+    return Loop(num_steps, horizon, form, times)
+
+
+@lru_cache
+def _own_times(num_steps: int, time_grid: str) -> tuple[float, ...]:
+    """Of openpi's loop, and 0."""
+    return tuple(sorted({*TokenTimes.plain(num_steps, 1, time_grid).distinct().tolist(), 0.0}, reverse=True))
+
+
+@lru_cache
+def _plain(num_steps: int, horizon: int, time_grid: str) -> TokenTimes:
+    return TokenTimes.plain(num_steps, horizon, time_grid)
 
 
 @dataclass(frozen=True)
@@ -72,9 +86,16 @@ class Conditioned:
 
     def write(self, conditioning: Conditioning) -> None:
         """Into the host's buffer."""
-        asked, arrays = conditioning.token_times(self.loop.steps, self.loop.horizon, self.config.time_grid), self.arrays
-        table = np.array(self.loop.times, np.float32)
-        arrays["rows"][:], arrays["steps"][:], arrays["times"][:] = asked.rows(table), asked.steps, asked.times
+        arrays, loop, table = self.arrays, self.loop, np.array(self.loop.times, np.float32)
+        asked = conditioning.tokens or _plain(loop.steps, loop.horizon, self.config.time_grid)
+        arrays["steps"][:], arrays["times"][:] = asked.steps, asked.times
+        if conditioning.tokens is None:
+            arrays["rows"][:] = np.searchsorted(-table, -asked.times[:, :1])  # all actions have a step's time
+        else:
+            arrays["rows"][:] = asked.rows(table)
+        if conditioning.held is not None:
+            arrays["steps"][:, conditioning.held] = arrays["times"][:, conditioning.held] = 0
+            arrays["rows"][:, conditioning.held] = len(table) - 1  # time 0
         guidance = conditioning.guidance
         if guidance is None:
             for name in ("target", "gain", "weights"):

@@ -12,7 +12,7 @@ Both keep the aspect ratio and centre the picture. Sources: openpi's `image_tool
 
 import os
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 
@@ -59,28 +59,16 @@ def fitted(picture: np.ndarray, size: int, resize: ImageResize) -> np.ndarray:
 
 
 LARGE = 1 << 18  # bytes of a picture; of smaller ones handing work to threads costs as much as it saves
-MOST_STRIPS = 4  # of a picture
 
 
 def all_fitted(pictures: Sequence[np.ndarray], size: int, resize: ImageResize) -> list[np.ndarray]:
-    """`fitted` of each, the same bytes. Threads share large pictures in openpi's way; LeRobot's has PyTorch's threads.
-
-    Pillow goes across all rows, rounds to 8 bits, then goes down: strips of rows can go across at the same time.
-    """
-    cores = _cores()
-    if cores == 1 or RESIZES[resize].float_images or max((one.size for one in pictures), default=0) <= LARGE:
+    """`fitted` of each, the same bytes. Large pictures have a thread each in openpi's way; LeRobot's has PyTorch's."""
+    large = max((one.size for one in pictures), default=0) > LARGE
+    if _cores() == 1 or len(pictures) == 1 or RESIZES[resize].float_images or not large:
         return [fitted(one, size, resize) for one in pictures]
-    wanted = [placement(one.shape, (size, size, 3)) for one in pictures]  # refuses before anything starts
-    strips = min(cores // len(pictures), MOST_STRIPS)
-    if strips < 2:
-        return list(_threads().map(lambda one: fitted(one, size, resize), pictures))
-    across = [
-        [_threads().submit(_resized, strip, columns.stop - columns.start, len(strip)) for strip in _split(one, strips)]
-        for one, (_, columns) in zip(pictures, wanted, strict=True)
-    ]
-    # They wait for strips, which have all been taken from the queue before the first of them
-    down = [_threads().submit(_below, *one, size) for one in zip(across, wanted, strict=True)]
-    return [one.result() for one in down]
+    for one in pictures:
+        placement(one.shape, (size, size, 3))  # refuses before anything starts
+    return list(_threads().map(lambda one: fitted(one, size, resize), pictures))
 
 
 @cache
@@ -95,18 +83,6 @@ if hasattr(os, "register_at_fork"):
 def _cores() -> int:
     """Those that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _split(picture: np.ndarray, parts: int) -> list[np.ndarray]:
-    return np.array_split(picture, min(parts, len(picture)))
-
-
-def _below(across: list[Future[np.ndarray]], place: tuple[slice, slice], size: int) -> np.ndarray:
-    """A picture whose strips have gone across, into a black square."""
-    (rows, columns), out = place, np.zeros((size, size, 3), np.uint8)
-    narrow = np.concatenate([strip.result() for strip in across])
-    out[rows, columns] = _resized(narrow, columns.stop - columns.start, rows.stop - rows.start)
-    return out
 
 
 def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
