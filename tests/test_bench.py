@@ -281,7 +281,7 @@ def test_points_above_the_roofline_are_warned_about(
     (warning,) = document["warnings"]
     (one,) = document["results"]
     assert "pytorch bf16, 2 cameras, 48 tokens, H=10, 1 steps is faster than its floor in vision " in warning
-    assert f"prefix {one['milliseconds']['prefix']['p50']:.3g} ms (floor {one['floor_ms']['prefix']:.3g})" in warning
+    assert f"prefix {one['milliseconds']['prefix']['p50']:,.2f} ms (floor {one['floor_ms']['prefix']:,.2f})" in warning
     assert "run again when it is idle" in warning
     assert f"WARNING: {warning}" in result.stdout
     assert f"**Warning:** {warning}" in (tmp_path / "report.md").read_text()

@@ -13,8 +13,8 @@ PERCENTILES: tuple[Percentile, ...] = ("p5", "p95", "p99")
 def floors_line(precision: str, floor: Floors) -> str:
     """The machine's floors in one line."""
     parts = [
-        f"copy {floor.copy_bytes_per_second / 1e12:.3f} TB/s",
-        f"matrix product {floor.matmul_flops_per_second / 1e12:.3f} TFLOP/s",
+        f"copy {significant(floor.copy_bytes_per_second / 1e12)} TB/s",
+        f"matrix product {significant(floor.matmul_flops_per_second / 1e12)} TFLOP/s",
     ]
     for took, what in ((floor.launch_us, "a launch in a graph"), (floor.barrier_us, "a barrier of the whole grid")):
         if took is not None:
