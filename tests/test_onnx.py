@@ -322,7 +322,7 @@ def test_an_export_is_a_checkpoint_of_its_own(tiny: Path, tmp_path: Path) -> Non
         with np.load(out) as loaded:
             chunks.append(loaded["actions"])
     assert chunks[0].shape == (10, 7)
-    np.testing.assert_allclose(*chunks, atol=1e-4)
+    np.testing.assert_allclose(chunks[0], chunks[1], atol=1e-4)
 
 
 def test_an_export_is_measured_and_told_by_its_hash(tiny: Path) -> None:

@@ -1,6 +1,6 @@
 """What other programs on the CPU do to a call, with and without OMP_WAIT_POLICY=PASSIVE, which `import turbopi` sets.
 
-    PYTHONPATH=src python tools/cpu_load.py --out FILE [--loads 0,2,10] [--calls 8] [--seconds 20]
+    PYTHONPATH=src python tools/cpu_load.py --out FILE [--loads 0,2,10] [--calls 8] [--seconds 20] [--commands 3]
 
 The small policy (bf16, 10 steps, CPU) is called in a process of its own beside so many that only compute. Without the
 setting: that process imports torch before turbopi, which leaves OpenMP as it is. The command: `turbopi infer`.
@@ -13,7 +13,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -76,6 +76,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--loads", default="0,2,10")
     parser.add_argument("--calls", type=int, default=8)
+    parser.add_argument("--commands", type=int, default=3, help="calls of `turbopi infer`")
     parser.add_argument("--seconds", type=float, default=20, help="of a way, though not before three calls")
     given = parser.parse_args()
     import torch
@@ -86,10 +87,10 @@ def main() -> None:
         example = create_robot("libero").example(np.random.default_rng(0))
         np.savez(observation, **{key: np.asarray(value) for key, value in example.items()})  # type: ignore[arg-type]
         for load in map(int, given.loads.split(",")):
-            ways = {
+            ways: dict[str, Callable[[], list[float]]] = {
                 "import turbopi": lambda: python_calls("import turbopi", given.calls, given.seconds),
-                "turbopi infer": lambda: command_calls(observation, min(given.calls, 3)),
                 "import torch, turbopi": lambda: python_calls("import torch, turbopi", given.calls, given.seconds),
+                "turbopi infer": lambda: command_calls(observation, given.commands),
             }
             for way, measure in ways.items():
                 before = os.getloadavg()[0]
@@ -99,13 +100,13 @@ def main() -> None:
                 row |= {"minimum_ms": min(times), "median_ms": statistics.median(times), "calls_ms": times}
                 found.append(row)
                 print(json.dumps(row), flush=True)
-    document = {
-        "command": ["python", *sys.argv],
-        "provenance": about,
-        "passive": ["import turbopi", "turbopi infer"],
-        "results": found,
-    }
-    given.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+                document = {
+                    "command": ["python", *sys.argv],
+                    "provenance": about,
+                    "passive": ["import turbopi", "turbopi infer"],
+                    "results": found,
+                }
+                given.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 
@@ -68,15 +68,14 @@ class GraphSource:
         self.weights_sha256: str = export.manifest["weights_sha256"]
         self.notes = ["ONNX graphs: only --backend onnx runs them"]
         if "calibration" in export.manifest:
+            quantized = tuple(f"vlm.layers.{layer}.mlp." for layer in range(export.config.vlm.depth - 1))
+            self.dtypes |= {name: "F8_E4M3" for name in self.shapes if name.startswith(quantized)}
             self.notes.append("the prefix's MLPs are in FP8; the SHA-256 is of the float32 weights before that")
 
     def native_name(self, name: str) -> str:
         return name
 
     def pieces(self, device: torch.device) -> Iterator[Piece]:
-        self._refuse()
-
-    def _refuse(self) -> NoReturn:
         raise GraphsOnly(self.export.folder)
 
 

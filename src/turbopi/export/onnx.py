@@ -80,6 +80,8 @@ def export_onnx(
         raise ConfigError(f"the export takes a float32 model on the CPU, not {model.compute_dtype} on {model.device}")
     signatures = {}
     with new_folder(dst) as folder:
+        if checkpoint is not None:
+            write_beside(checkpoint, folder)  # first, as it may refuse
         for graph in graphs(model):
             report(f"exporting {graph.name}")
             quantize = calibration.scales if calibration is not None and graph.name == "prefix" else None
@@ -94,11 +96,9 @@ def export_onnx(
             "graphs": signatures,
             "weights_sha256": weights or weights_sha256(model.state_dict()),
             "versions": library_versions(),
-            "files": {file.name: file.stat().st_size for file in sorted(folder.iterdir())},
+            "files": {file.name: file.stat().st_size for file in sorted(folder.glob("*.onnx*"))},
         }
         (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
-        if checkpoint is not None:
-            write_beside(checkpoint, folder)
     return Export(dst, model.config, manifest)
 
 
