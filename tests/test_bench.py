@@ -28,7 +28,7 @@ from turbopi.bench.measure import (
     measure_calls,
 )
 from turbopi.bench.ready import Start, empty_caches, measure_ready
-from turbopi.bench.report import report
+from turbopi.bench.report import floors_line, report
 from turbopi.bench.run import BenchPlan, stage_floors
 from turbopi.bench.summary import linear_models
 from turbopi.bench.work import JOINS, Job, Work, floor_ms, stage_work
@@ -281,6 +281,18 @@ def floors_of(monkeypatch: pytest.MonkeyPatch, bytes_per_second: float, flops_pe
     monkeypatch.setattr(running, "measure_floors", lambda *_: Floors(bytes_per_second, flops_per_second))
 
 
+@pytest.mark.parametrize(
+    ("bytes_per_second", "flops_per_second", "line"),
+    [
+        (4.25e12, 1.404e15, "copy 4.25 TB/s, matrix product 1404 TFLOP/s"),
+        (1.5e10, 8.4e10, "copy 15.0 GB/s, matrix product 84.0 GFLOP/s"),
+        (4e9, 3e8, "copy 4.00 GB/s, matrix product 0.300 GFLOP/s"),
+    ],
+)
+def test_floors_are_shown_with_three_digits(bytes_per_second: float, flops_per_second: float, line: str) -> None:
+    assert floors_line("bf16", Floors(bytes_per_second, flops_per_second)) == f"floors, bf16: {line}"
+
+
 def test_points_above_the_roofline_are_warned_about(
     tmp_path: Path, drawn: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -293,9 +305,10 @@ def test_points_above_the_roofline_are_warned_about(
     (warning,) = document["warnings"]
     (one,) = document["results"]
     assert "pytorch bf16, 2 cameras, 48 tokens, H=10, 1 steps is faster than its floor in vision " in warning
-    assert f"prefix {one['milliseconds']['prefix']['p50']:.3g} ms (floor {one['floor_ms']['prefix']:.3g})" in warning
+    assert f"prefix {one['milliseconds']['prefix']['p50']:,.2f} ms (floor {one['floor_ms']['prefix']:,.2f})" in warning
     assert "run again when it is idle" in warning
     assert f"WARNING: {warning}" in result.stdout
+    assert "copy 0.0100 GB/s, matrix product 0.100 GFLOP/s" in result.stdout, "no number is cut to 0.000"
     assert f"**Warning:** {warning}" in (tmp_path / "report.md").read_text()
     roofline = drawn[1].axes[0]
     circled = [line.get_xydata()[0].tolist() for line in roofline.get_lines() if line.get_markersize() == 16]

@@ -118,7 +118,7 @@ def test_a_backend_that_swaps_cameras_fails_with_code_1(tmp_path: Path, monkeypa
     result = turbopi("demo", "--frames", 1, "--report", tmp_path, "--json", "--episodes", 0)
     assert result.exit_code == 1, result.output
     assert "FAIL: pytorch bf16 is" in result.stderr
-    assert "from the oracle, beyond its bound" in result.stderr
+    assert "from the reference, beyond its bound" in result.stderr
     document = json.loads(result.stdout)
     assert document["ok"] is False
     assert max(document["check"]["rms"]) > 2 * document["check"]["bound"]

@@ -194,7 +194,7 @@ INSTALL = "on Debian and Ubuntu: apt-get install g++ python3-dev"
 def test_no_compiler_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     assert checkups.check_compiler() == Row(
-        "WARN", "C compiler", "no C++ compiler", f"{INSTALL}: pytorch_compile and Triton kernels need it"
+        "WARN", "C compiler", "no C++ compiler", f"{INSTALL} (for pytorch_compile and Triton kernels)"
     )
 
 

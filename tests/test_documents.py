@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 from doc_tables import blocks, drawn, peers
 from doc_tables.__main__ import main
+from doc_tables.reference import DOCUMENT, reference, stale_reference, write_reference
 from doc_tables.tables import TABLES, headline, whole_calls
 
+import turbopi
 from turbopi.bench.document import read_benchmark
 
 ROOT = Path(__file__).parents[1]
@@ -47,6 +49,27 @@ def headings(document: Path) -> set[str]:
     text = re.sub(r"```.*?```", "", document.read_text(encoding="utf-8"), flags=re.DOTALL)
     titles = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+# --- the Python reference ---------------------------------------------------------------------------------------------
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    text = reference()
+    for name in set(turbopi.__all__) - {"__version__", "errors"}:
+        assert f"## {name}\n" in text or f"- **`{name}`**: " in text, f"{name} isn't in {DOCUMENT}"
+    assert "infer(\n    obs: Mapping[str, Any]," in text, "a signature"
+    assert "- `total_ms`: " in text, "what infer returns"
+
+
+def test_a_reference_that_is_behind_its_docstrings_is_found_and_written(tmp_path: Path) -> None:
+    (tmp_path / "docs").mkdir()
+    assert stale_reference(tmp_path) != []
+    assert write_reference(tmp_path) == [tmp_path / DOCUMENT]
+    assert stale_reference(tmp_path) == [] and write_reference(tmp_path) == []
+    (tmp_path / DOCUMENT).write_text(reference().replace("total_ms", "all_ms"))
+    (found,) = stale_reference(tmp_path)
+    assert "scripts/tables" in found
 
 
 # --- the tool itself --------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import os
 import re
 import shutil
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from cli_helpers import refusal, turbopi
@@ -19,7 +21,7 @@ from typer.testing import Result
 
 from turbopi import backends
 from turbopi.backends.onnx import OnnxBackend, Sessions
-from turbopi.checkpoint import convert
+from turbopi.checkpoint import convert, open_checkpoint
 from turbopi.cli.compare import parse_variant
 from turbopi.cli.evaluate import EvalOptions
 from turbopi.cli.options import PolicyOptions
@@ -30,6 +32,7 @@ from turbopi.export import onnx as exporting
 from turbopi.export.graphs import graphs
 from turbopi.export.onnx import MANIFEST, Export, export_onnx, open_export
 from turbopi.installation import install_command
+from turbopi.policy import UnifiedPolicy
 from turbopi.verify.check_golden import check_case
 
 for library in ("onnx", "onnxscript", "onnxruntime"):
@@ -230,6 +233,30 @@ def test_a_folder_that_keeps_nothing_is_named_with_what_to_do(tmp_path: Path, mo
         golden_backend()
 
 
+def test_the_exports_that_were_used_last_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exported: dict[Kind, Path]
+) -> None:
+    """And what isn't an export stays."""
+    place, model = tmp_path / "exports", golden_model("pi05")
+    monkeypatch.setenv(kept.FOLDER_VARIABLE, str(place))
+    monkeypatch.setattr(kept, "export_onnx", lambda model, to, **_: open_export(shutil.copytree(exported["pi05"], to)))
+    others = {place / "mine", place / ("0" * 32)}
+    for folder in others:
+        folder.mkdir(parents=True)
+
+    def used(version: int) -> Path:
+        monkeypatch.setattr(kept, "library_versions", lambda: {"torch": str(version)})
+        return kept.kept_export(model).folder
+
+    made = []
+    for version in range(kept.KEPT):
+        made.append(used(version))
+        os.utime(made[-1], (version + 1, version + 1))
+    assert used(0) == made[0]
+    newest = used(kept.KEPT)  # one too many: the second wasn't used for longest
+    assert {*place.iterdir()} == {*made, newest, *others} - {made[1]}
+
+
 def test_halves_of_a_batch_with_unlike_rows_equal_the_whole_and_the_reference(exported: dict[Kind, Path]) -> None:
     case, backend = golden_cases()["b_third_masked"], opened(exported["pi05"])
     one = case.observation
@@ -260,13 +287,99 @@ def test_an_observation_of_nothing_is_refused(exported: dict[Kind, Path]) -> Non
         opened(exported["pi05"]).prefix(dataclasses.replace(case.observation, **masks))
 
 
+# -- the folder as a checkpoint ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The export of a converted checkpoint with a robot of its own, by the command, and an observation beside it."""
+    root = tmp_path_factory.mktemp("tiny")
+    arm = {"name": "my_arm", "cameras": {"front": "base_0_rgb"}, "state": {"joints": 8}, "action_dim": 7}
+    (root / "my_arm.json").write_text(json.dumps(arm))
+    converting = ("convert", "--random-weights", "pi05_tiny", root / "checkpoint", "--robot", root / "my_arm.json")
+    for words in (converting, ("export", "onnx", root / "checkpoint", root / "exported")):
+        result = turbopi(*words)
+        assert result.exit_code == 0, result.output
+    random = np.random.default_rng(0)
+    picture = random.integers(0, 256, (100, 120, 3), dtype=np.uint8)
+    np.savez(root / "seen.npz", front=picture, joints=random.normal(size=8), prompt="fold the towel")
+    (root / "my_arm.json").unlink()  # the export has its own
+    return root
+
+
+def test_an_export_is_a_checkpoint_of_its_own(tiny: Path, tmp_path: Path) -> None:
+    """Robot, statistics, tokenizer and horizon come along; the actions are the checkpoint's."""
+    own = Path(shutil.copytree(tiny / "exported", tmp_path / "elsewhere"))
+    assert turbopi("inspect", own).exit_code == 0
+    chunks = []
+    for words in ((own,), (tiny / "checkpoint", "--precision", "f32", "--device", "cpu")):
+        out = tmp_path / "actions.npz"
+        result = turbopi("infer", words[0], tiny / "seen.npz", *words[1:], "--seed", 1, "--out", out, "--no-plot")
+        assert result.exit_code == 0, result.output
+        if words[0] == own:
+            assert "backend: onnx (auto: the folder holds ONNX graphs)" in result.stdout
+            assert "stays for the next start" not in result.stdout
+        with np.load(out) as loaded:
+            chunks.append(loaded["actions"])
+    assert chunks[0].shape == (10, 7)
+    np.testing.assert_allclose(chunks[0], chunks[1], atol=1e-4)
+
+
+def test_an_export_is_measured_and_told_by_its_hash(tiny: Path) -> None:
+    bench = turbopi("bench", tiny / "exported", "--calls", 1, "--steps", 1, "--json")
+    assert bench.exit_code == 0, bench.output
+    (measured,) = json.loads(bench.stdout)["results"]
+    assert (measured["backend"], measured["precision"]) == ("onnx", "f32") and measured["load_seconds"] > 0
+    assert "no error against the float32 reference" in bench.stderr
+    told = turbopi("inspect", tiny / "exported", "--hash", "--json")
+    assert json.loads(told.stdout)["sha256"] == open_checkpoint(tiny / "checkpoint").fingerprint()
+
+
+def test_the_policy_opens_an_export_and_a_server_tells_about_it(tiny: Path) -> None:
+    policy = UnifiedPolicy(tiny / "exported", backend="onnx", precision="f32", device="cpu")
+    assert policy.metadata["checkpoint_format"] == "onnx" and policy.metadata["robot"] == "my_arm"
+    assert policy.infer(policy.example_observation(), seed=0, num_steps=1)["actions"].shape == (10, 7)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("infer", "SEEN", "--backend", "pytorch", "--device", "cpu"),
+        ("convert", "NEW"),
+        ("export", "onnx", "NEW"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_needs_the_weights_names_the_backend_that_does_not(
+    tiny: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    places = {"SEEN": str(tiny / "seen.npz"), "NEW": str(tmp_path / "new")}
+    command, others = words[0], [places.get(word, word) for word in words[1:]]
+    at = 1 if command == "export" else 0
+    result = turbopi(command, *others[:at], tiny / "exported", *others[at:])
+    assert result.exit_code == 2, result.output
+    assert "holds ONNX graphs, which only backend 'onnx' runs" in result.stderr
+    assert "--backend onnx" in result.stderr and "the checkpoint that it was exported from" in result.stderr
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_export_without_its_description_says_what_is_missing(tiny: Path, tmp_path: Path) -> None:
+    own = Path(shutil.copytree(tiny / "exported", tmp_path / "own"))
+    (own / "turbopi.json").unlink()
+    assert "has no turbopi.json" in refusal(turbopi("infer", own, tiny / "seen.npz"))
+    (own / "turbopi.json").write_text((tiny / "exported" / "turbopi.json").read_text())
+    shutil.rmtree(own / "assets")
+    assert "norm stats are missing" in refusal(turbopi("infer", own, tiny / "seen.npz"))
+
+
 # -- the folder --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_folder_says_what_it_holds(exported: dict[Kind, Path], kind: Kind) -> None:
     names = {f"{graph}.onnx{data}" for graph in exporting.GRAPHS for data in ("", ".data")}
-    assert {file.name for file in exported[kind].iterdir()} == names | {MANIFEST}
+    beside = {"turbopi.json"} if kind == "pi05" else set()  # the command has a checkpoint, without statistics
+    assert {file.name for file in exported[kind].iterdir()} == names | {MANIFEST} | beside
     export, model = open_export(exported[kind]), golden_model(kind)
     assert export.config == model.config
     manifest: dict[str, Any] = dict(export.manifest)
@@ -425,7 +538,9 @@ def test_random_weights_are_exported_with_a_warning(tmp_path: Path, monkeypatch:
     result = turbopi("export", "onnx", "--random-weights", "pi05_tiny", tmp_path / "tiny")
     assert result.exit_code == 0, result.output
     assert "RANDOM WEIGHTS (pi05_tiny, seed 0)" in result.stdout
-    assert {file.name for file in (tmp_path / "tiny").iterdir()} == {"prompt.onnx", "prompt.onnx.data", MANIFEST}
+    beside = {"turbopi.json", "tokenizer.model", "assets"}
+    names = {"prompt.onnx", "prompt.onnx.data", MANIFEST}
+    assert {file.name for file in (tmp_path / "tiny").iterdir()} == names | beside
 
 
 def test_the_command_refuses_before_it_loads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from conftest import golden_cases, golden_folder, golden_model
 from torch import Tensor, nn
 
 from turbopi.backends.onnx import OnnxBackend
+from turbopi.checkpoint.onnx_folder import GraphSource
 from turbopi.errors import ConfigError
 from turbopi.export.onnx import export_onnx, open_export
 from turbopi.model.layers import GeGLU
@@ -103,6 +104,9 @@ def test_each_mlp_has_five_scales_and_its_weights_are_e4m3(folder: Path, calibra
 
 def test_the_folder_says_what_is_fp8_and_on_what_it_was_calibrated(folder: Path) -> None:
     manifest = open_export(folder).manifest
+    source = GraphSource(open_export(folder))
+    assert source.dtypes["vlm.layers.0.mlp.up_proj.weight"] == "F8_E4M3"
+    assert source.dtypes["vlm.layers.0.self_attn.q_proj.weight"] == "F32"
     assert manifest["precision"] == "fp8 (E4M3) in the prefix's MLPs, f32 elsewhere"
     assert manifest["calibration"]["observations"] == 1
 

@@ -155,15 +155,15 @@ class RealTime:
 class PolicyConfig:
     """A model and its robot: everything `UnifiedPolicy` needs besides weights, statistics and a tokenizer."""
 
-    name: str
-    model: ModelConfig
+    name: str  # for people and metadata
+    model: ModelConfig  # the network's sizes, the action horizon, the longest prompt
     robot: str  # "libero", "droid", "aloha", "lerobot", "plain", or a path to a robot's .json
-    normalization: Normalization = Normalization()
+    normalization: Normalization = Normalization()  # how statistics scale state and actions
     discrete_state_input: bool = True  # the state is written into the prompt (Pi0.5 only)
     asset_id: str | None = None  # folder of norm_stats.json below assets/; None: the only one there
-    robot_options: Mapping[str, Any] = field(default_factory=dict)
-    default_prompt: str | None = None
-    image_resize: ImageResize = "openpi"
+    robot_options: Mapping[str, Any] = field(default_factory=dict)  # passed to a built-in robot
+    default_prompt: str | None = None  # for observations without one
+    image_resize: ImageResize = "openpi"  # how pictures become 224 x 224: "openpi", "lerobot" or "lerobot_0.4"
     prompt_state_dim: int | None = None  # zeros fill the state up to it in the prompt, as in LeRobot 0.4; None: nothing
     prompt_as_is: bool = False  # without a state, blanks, underscores and newlines stay in the prompt: LeRobot's Pi0
     num_denoising_steps: int = 10  # unless whoever runs the policy says otherwise

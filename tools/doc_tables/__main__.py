@@ -1,4 +1,5 @@
-"""Write the documents' tables and plots from the result files below benchmarks/results/, or check that they agree.
+"""Write the documents' tables and plots from the result files below benchmarks/results/, and docs/api_reference.md
+from the docstrings, or check that they agree.
 
     scripts/tables           fill them in
     scripts/tables --check   change nothing; exit code 1 and a list if one differs
@@ -21,6 +22,7 @@ from pathlib import Path
 from doc_tables.blocks import differences, fill
 from doc_tables.drawn import draw, stale_plots
 from doc_tables.peers import draw_peers, stale_peers
+from doc_tables.reference import stale_reference, write_reference
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,11 +34,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 if a table or plot differs")
     given = parser.parse_args(arguments)
     if given.check:
-        found = differences(ROOT) + stale_plots(ROOT) + stale_peers(ROOT)
+        found = differences(ROOT) + stale_plots(ROOT) + stale_peers(ROOT) + stale_reference(ROOT)
         for line in found:
             print(line, file=sys.stderr)
         return 1 if found else 0
-    for changed in (*fill(ROOT), *draw(ROOT), *draw_peers(ROOT)):
+    for changed in (*fill(ROOT), *draw(ROOT), *draw_peers(ROOT), *write_reference(ROOT)):
         print(f"wrote {changed.relative_to(ROOT)}")
     return 0
 

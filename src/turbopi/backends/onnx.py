@@ -4,6 +4,7 @@ The host does what has no weights: it leaves out masked cameras and padding (exa
 Batches run one observation after the other.
 """
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,10 +14,11 @@ from torch import Tensor
 
 from turbopi.backends.base import LoadState, Precision, Sample
 from turbopi.backends.timing import StageTimer
+from turbopi.checkpoint.onnx_folder import GRAPHS, Export, GraphsOnly, open_export
 from turbopi.config import ModelConfig
 from turbopi.errors import CheckpointError, ObservationError
 from turbopi.export.kept import kept_export
-from turbopi.export.onnx import EXPORT_NEEDS, GRAPHS, Export, missing_library, open_export
+from turbopi.export.onnx import EXPORT_NEEDS, missing_library
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.model.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
 from turbopi.model.reference import FloatPrecision, Pi0Model, Trace
@@ -56,7 +58,10 @@ class Sessions:
 
 
 class OnnxBackend:
-    """Runs the export of the weights, which is kept for the next start, or a folder exported before (`open`)."""
+    """Runs the export of the weights, which is kept for the next start, or a folder that was exported before.
+
+    That folder is opened as a checkpoint, or with `open`.
+    """
 
     name: ClassVar[str] = "onnx"
     precisions: ClassVar[tuple[Precision, ...]] = ("f32",)
@@ -66,8 +71,16 @@ class OnnxBackend:
     def __init__(
         self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
     ) -> None:
-        model = Pi0Model.from_state(config, load(device, precision))
-        self._use(kept_export(model))
+        began = time.perf_counter()
+        try:
+            model = Pi0Model.from_state(config, load(device, precision))
+        except GraphsOnly as exported:
+            self._use(open_export(exported.folder))
+            self.config = config  # the graphs' sizes; horizon and time grid as the folder's turbopi.json says
+            self._about |= {"load_seconds": round(time.perf_counter() - began, 3), "weight_bytes": self._export.bytes}
+        else:
+            self._use(kept_export(model))
+            self._about["kept"] = True
 
     @classmethod
     def open(cls, folder: str | Path) -> "OnnxBackend":
@@ -80,6 +93,7 @@ class OnnxBackend:
         self.config, self.device, self.precision = export.config, torch.device("cpu"), self.precisions[0]
         self._about = {name: export.manifest[name] for name in ("opset", "weights_sha256", "versions")}
         self._about["export"] = str(export.folder)
+        self._export = export
         self._sessions = Sessions(export)
 
     @classmethod

@@ -13,13 +13,20 @@ PERCENTILES: tuple[Percentile, ...] = ("p5", "p95", "p99")
 def floors_line(precision: str, floor: Floors) -> str:
     """The machine's floors in one line."""
     parts = [
-        f"copy {floor.copy_bytes_per_second / 1e12:.3f} TB/s",
-        f"matrix product {floor.matmul_flops_per_second / 1e12:.3f} TFLOP/s",
+        f"copy {_rate(floor.copy_bytes_per_second)}B/s",
+        f"matrix product {_rate(floor.matmul_flops_per_second)}FLOP/s",
     ]
     for took, what in ((floor.launch_us, "a launch in a graph"), (floor.barrier_us, "a barrier of the whole grid")):
         if took is not None:
             parts.append(f"{what} {took:.2f} us")
     return f"floors, {precision}: {', '.join(parts)}"
+
+
+def _rate(per_second: float) -> str:
+    """In tera, or of a CPU in giga: "1404 T", "15.0 G"."""
+    unit, size = ("T", 1e12) if per_second >= 1e11 else ("G", 1e9)
+    value = per_second / size
+    return f"{significant(value) if value < 100 else format(value, '.0f')} {unit}"
 
 
 def report(document: BenchDocument) -> str:

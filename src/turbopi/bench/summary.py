@@ -26,7 +26,7 @@ def warnings_on(results: Sequence[Result]) -> list[str]:
     found = []
     for result in results:
         stages = [
-            f"{stage} {result.milliseconds[stage].p50:.3g} ms (floor {result.floor_ms[stage]:.3g})"
+            f"{stage} {result.milliseconds[stage].p50:,.2f} ms (floor {result.floor_ms[stage]:,.2f})"
             for stage in below_floor(result)
         ]
         if stages:

@@ -1,4 +1,4 @@
-"""Checkpoints of openpi (PyTorch and JAX) and LeRobot, and random weights, behind one interface.
+"""Checkpoints of openpi (PyTorch and JAX) and LeRobot, ONNX exports and random weights, behind one interface.
 
     checkpoint = open_checkpoint("path/to/checkpoint", config="pi05_libero")
     state = checkpoint.load("cuda", "bf16").state  # canonical names, see model/reference.py
@@ -7,7 +7,7 @@ Every tensor must have its place and every place its tensor: nothing is skipped 
 """
 
 from turbopi.checkpoint.base import Checkpoint, Loaded
-from turbopi.checkpoint.convert import convert, write_random
+from turbopi.checkpoint.convert import convert, write_beside, write_random
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats, load_norm_stats
 from turbopi.checkpoint.opening import inspect_checkpoint, open_checkpoint
 from turbopi.checkpoint.random_weights import random_checkpoint
@@ -24,5 +24,6 @@ __all__ = [
     "load_norm_stats",
     "open_checkpoint",
     "random_checkpoint",
+    "write_beside",
     "write_random",
 ]

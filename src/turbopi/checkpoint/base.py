@@ -49,14 +49,15 @@ class Checkpoint:
 
     @property
     def format(self) -> str:
-        """One of "openpi_torch", "openpi_jax", "lerobot", "random"."""
+        """One of "openpi_torch", "openpi_jax", "lerobot", "onnx", "random"."""
         return self.source.format
 
     def load(self, device: torch.device | str, precision: FloatPrecision, *, progress: bool = False) -> Loaded:
         """Read all weights straight into their final dtype and device, a piece at a time.
 
         Host memory besides the result stays small: safetensors are mapped, Orbax arrays decoded one chunk at a time.
-        Raises CheckpointError if a value is NaN or infinite, as it is stored or in that precision, and as `check_hash`.
+        Raises CheckpointError if a value is NaN or infinite, as it is stored or in that precision, and as `check_hash`;
+        its kind GraphsOnly for an ONNX export.
         """
         self.check_hash()
         device = torch.device(device)
@@ -109,6 +110,9 @@ class Checkpoint:
         recipe = getattr(self.source, "recipe", None)  # random weights
         if recipe is not None:
             return hashlib.sha256(str(recipe).encode()).hexdigest()
+        stored: str | None = getattr(self.source, "weights_sha256", None)  # an ONNX export tells it
+        if stored is not None:
+            return stored
         key = self._files_key()
         hashes = {name: hashlib.sha256() for name in self.source.shapes}
         for piece in self.source.pieces(torch.device("cpu")):

@@ -68,22 +68,10 @@ def convert(
     if dst.exists() and (not dst.is_dir() or any(dst.iterdir())):
         raise CheckpointError(f"{dst} exists and isn't an empty folder; give a new one")
     checkpoint = src if isinstance(src, Checkpoint) else open_checkpoint(src, config)
-    asset_id = checkpoint.asset_id or ("lerobot" if checkpoint.format == "lerobot" else "own")
-    settings, robot_file = _settings(checkpoint.config, asset_id)
     with new_folder(dst) as folder:
-        _write_weights(checkpoint, folder / WEIGHTS, precision, progress)
+        write_beside(checkpoint, folder)
         _write_json(folder / "config.json", _openpi_config(checkpoint.config.model, precision))
-        _write_json(folder / SETTINGS, settings)
-        if robot_file is not None:
-            shutil.copyfile(robot_file, folder / robot_file.name)
-        for file in checkpoint.tokenizer_candidates:
-            copy = folder / (file.relative_to(checkpoint.path) if checkpoint.path else file.name)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, copy)
-        if checkpoint.norm_stats.state is not None or checkpoint.norm_stats.actions is not None:
-            file = folder / "assets" / asset_id / NORM_STATS
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(dump_norm_stats(checkpoint.norm_stats))
+        _write_weights(checkpoint, folder / WEIGHTS, precision, progress)
     return dst
 
 
@@ -151,6 +139,26 @@ def _header(shapes: dict[str, Shape], stored: str, itemsize: int) -> tuple[bytes
 
 
 # -- what goes beside them ---------------------------------------------------------------------------------------------
+
+
+def write_beside(checkpoint: Checkpoint, folder: Path) -> None:
+    """Write what a checkpoint is besides its weights: turbopi.json, the robot's file, statistics and tokenizer.
+
+    Raises ConfigError if some value of a hand-made PolicyConfig has no place in turbopi.json.
+    """
+    asset_id = checkpoint.asset_id or ("lerobot" if checkpoint.format == "lerobot" else "own")
+    settings, robot_file = _settings(checkpoint.config, asset_id)
+    _write_json(folder / SETTINGS, settings)
+    if robot_file is not None:
+        shutil.copyfile(robot_file, folder / robot_file.name)
+    for file in checkpoint.tokenizer_candidates:
+        copy = folder / (file.relative_to(checkpoint.path) if checkpoint.path else file.name)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, copy)
+    if checkpoint.norm_stats.state is not None or checkpoint.norm_stats.actions is not None:
+        file = folder / "assets" / asset_id / NORM_STATS
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(dump_norm_stats(checkpoint.norm_stats))
 
 
 def _openpi_config(model: ModelConfig, precision: FloatPrecision) -> dict[str, object]:

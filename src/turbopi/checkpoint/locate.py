@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from turbopi.checkpoint.lerobot import is_lerobot
+from turbopi.checkpoint.onnx_folder import MANIFEST as ONNX_MANIFEST
 from turbopi.checkpoint.orbax import MANIFEST
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import is_adapter
@@ -15,7 +16,7 @@ from turbopi.config import LIMITS
 from turbopi.errors import CheckpointError
 from turbopi.reading import Fields, read_json
 
-CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "random"]
+CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "onnx", "random"]
 
 _DOWNLOAD = {
     "gs": "gsutil -m cp -r {address} DIR (or openpi's own openpi.shared.download)",
@@ -53,6 +54,8 @@ def locate(path: str | Path) -> Location:
         folder = folder / "pretrained_model"
     if is_lerobot(folder) and is_adapter(folder):
         return Location("lerobot", folder, folder, adapter=True)
+    if (folder / ONNX_MANIFEST).is_file():
+        return Location("onnx", folder, folder)
     _refuse_other_formats(folder)
     if _has_safetensors(folder):  # before params/, as openpi does
         return Location("lerobot" if is_lerobot(folder) else "openpi_torch", folder, folder)

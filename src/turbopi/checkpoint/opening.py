@@ -8,6 +8,7 @@ from turbopi.checkpoint.base import Checkpoint, describe_weights
 from turbopi.checkpoint.lerobot import LeRobotFolder
 from turbopi.checkpoint.locate import Location, locate, recorded_config, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
+from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import PeftSource, base_model
@@ -21,10 +22,10 @@ from turbopi.model.reference import parameter_shapes
 
 
 def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoint:
-    """Open an openpi (PyTorch or JAX) or LeRobot checkpoint; nothing is loaded yet, and everything is checked.
+    """Open an openpi (PyTorch or JAX) or LeRobot checkpoint, or an ONNX export; everything is checked, nothing loaded.
 
     `path` is a checkpoint's folder (openpi's params/ and LeRobot's training output are understood too). `config` says
-    what the folder doesn't record: see `settings.py`. Sizes always come from the tensors.
+    what the folder doesn't record (docs/checkpoints.md). Sizes always come from the tensors.
 
     Raises CheckpointError if the folder can't be read or its tensors or statistics aren't all there, and ConfigError if
     the configuration doesn't fit or isn't known; the message lists the choices.
@@ -104,6 +105,8 @@ def open_weights(location: Location, settings: Settings) -> WeightSource:
         return _open_adapter(location, settings)
     if "base_model" in settings.values:
         raise ConfigError(f"{settings.source}: base_model only applies to adapters, and {location.weights} has weights")
+    if location.format == "onnx":
+        return GraphSource(open_export(location.folder))
     prefix = "model." if location.format == "lerobot" else ""
     source = TorchSource(location.weights, format=location.format, prefix=prefix)
     if (location.weights / ADAPTER).is_file():

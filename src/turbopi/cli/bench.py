@@ -208,6 +208,10 @@ def bench(
         output = Output(as_json)
         opened = options.open(checkpoint)
         options.tell_if_random(opened, output)
+        if opened.format == "onnx":
+            if error:
+                output.line("the folder holds ONNX graphs and no weights: no error against the float32 reference")
+            backends, device, error = backends.replace("auto", "onnx"), device.replace("auto", "cpu"), False
         resolved = registry.resolve_device(device)
         chosen = _names(own_precision(_names(backends)) if precisions is None else precisions)
         tiers: list[Precision] = chosen  # type: ignore[assignment]  # checked when a backend is created

@@ -223,7 +223,7 @@ def convert(
     started = time.perf_counter()
     folder = write(opened, Path(target), precision=precision, progress=output.shows_progress)  # type: ignore[arg-type]
     seconds = time.perf_counter() - started
-    tokenizer = _complete_random(folder, options.weights_seed or 0) if opened.format == "random" else None
+    tokenizer = complete_random(folder, options.weights_seed or 0) if opened.format == "random" else None
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     output.line(f"{opened.format} -> {folder}: {size / 1e9:.3f} GB in {precision}, {seconds:.1f} s")
     output.line(f"Look at it with `turbopi inspect {folder}`.")
@@ -246,7 +246,7 @@ def _for_robot(checkpoint: "Checkpoint", robot: str) -> "Checkpoint":
     return checkpoint
 
 
-def _complete_random(folder: Path, seed: int) -> Path:
+def complete_random(folder: Path, seed: int) -> Path:
     """Make random weights' folder complete with the project's small tokenizer, and have it say what it is, always."""
     from turbopi.checkpoint.settings import FILE_NAME
     from turbopi.preprocess.tokenizer import FILE_NAMES, TINY_TOKENIZER

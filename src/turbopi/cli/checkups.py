@@ -203,7 +203,7 @@ def check_compiler() -> Row:
     if missing is None:
         return Row("OK", "C compiler", ", ".join(found))
     what, _, mend = missing.removesuffix(")").partition(" (")
-    return Row("WARN", "C compiler", what, f"{mend}: pytorch_compile and Triton kernels need it")
+    return Row("WARN", "C compiler", what, f"{mend} (for pytorch_compile and Triton kernels)")
 
 
 def check_cpu() -> Row:

@@ -57,7 +57,7 @@ def demo(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run a policy on real LIBERO pictures, check it against the float32 oracle, and let it act in the simulator.
+    """Run a policy on real LIBERO pictures, check it against the float32 reference, and let it act in the simulator.
 
     Without a checkpoint it is the small policy that comes with Turbo-Pi, trained on these tasks; its chunks are set
     against what the expert did that it learned from. Where the simulator is installed (in a clone: scripts/setup
@@ -109,7 +109,7 @@ class _Run:
         arguments = options.policy_arguments() | {"backend": "pytorch", "precision": "f32"}
         oracle = UnifiedPolicy(opened, progress=output.shows_progress, **arguments)
         with _progress(output) as bar:
-            task = bar.add_task("float32 oracle and its control", total=num_oracle_runs(len(observed)))
+            task = bar.add_task("float32 reference and its control", total=num_oracle_runs(len(observed)))
             self.check: OracleCheck = check(
                 [result["actions"] for result in self.results],
                 oracle,
@@ -178,7 +178,7 @@ class _Run:
 
     def _show_check(self) -> None:
         check, worst = self.check, self.check.worst
-        table = Table(title="against the float32 oracle, same noise", title_justify="left")
+        table = Table(title="against the float32 reference, same noise", title_justify="left")
         for column in ("frame", "rms error", "its bound", "max error", ""):
             table.add_column(column, justify="left" if column == "" else "right")
         for number, difference in enumerate(check.differences):
@@ -191,19 +191,19 @@ class _Run:
         step = "half a bfloat16 step" if precision == "bf16" else "half a float32 step (scaled from bfloat16's)"
         self.output.line(
             "Errors are in units of the model's normalised actions. "
-            f"The bound is {check.factor:g} times the control, {significant(check.control)}: how far the oracle itself "
-            f"moves when every weight moves by up to {step}.",
+            f"The bound is {check.factor:g} times the control, {significant(check.control)}: how far the reference "
+            f"itself moves when every weight moves by up to {step}.",
             "dim",
         )
         backend = self.metadata["backend"]
         error, bound = significant(worst.rms), significant(check.bound)
         if check.ok:
             self.output.line(
-                f"OK: {backend} {precision} is within {error} of the oracle (bound {bound}).", "bold green"
+                f"OK: {backend} {precision} is within {error} of the reference (bound {bound}).", "bold green"
             )
         else:
             self.output.line(
-                f"FAIL: {backend} {precision} is {error} from the oracle, beyond its bound "
+                f"FAIL: {backend} {precision} is {error} from the reference, beyond its bound "
                 f"{bound}: this is more than rounding.",
                 "bold red",
             )

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from turbopi.cli.checkpoints import complete_random
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
 from turbopi.cli.options import EngineCalibration, ScaleMethod, WeightOptions
 from turbopi.errors import BackendUnavailable, ConfigError
@@ -50,8 +51,8 @@ def export(
 ) -> None:
     """Write a model for another runtime: as float32 ONNX graphs of vision, prompt, prefix and denoising step.
 
-    A full-size model needs 14 GB of disk and of memory. With --precision fp8 the prefix's MLPs are FP8 (E4M3), with
-    scales that observations bring about in the model.
+    The folder is a checkpoint, too, for the backend onnx. A full-size model needs 14 GB of disk and of memory. With
+    --precision fp8 the prefix's MLPs are FP8 (E4M3), with scales that observations bring about in the model.
     """
     output = Output(as_json)
     if precision not in PRECISIONS:
@@ -94,7 +95,10 @@ def export(
     loaded = checkpoint.load(maker, "f32", progress=output.shows_progress).state
     state = {name: loaded.pop(name).cpu() for name in list(loaded)}
     model = Pi0Model.from_state(checkpoint.config.model, state)
-    written = export_onnx(model, target, calibration=found, report=output.line)
+    written = export_onnx(model, target, checkpoint=checkpoint, calibration=found, report=output.line)
+    if checkpoint.format == "random":
+        complete_random(written.folder, options.weights_seed or 0)
     seconds = time.perf_counter() - started
     output.line(f"{checkpoint.format} -> {written.folder}: {written.bytes / 1e9:.3f} GB, {precision}, {seconds:.1f} s")
+    output.line(f"Try it with `turbopi infer {written.folder} OBSERVATION`.")
     output.document({"folder": written.folder, "bytes": written.bytes, "seconds": seconds, **written.manifest})

@@ -100,6 +100,8 @@ def infer(
     policy = options.make_policy(opened, output)
     draw = _noise(policy, given_noise, seed, output)
     if warmup:
+        if policy.backend.name == "pytorch_compile":
+            output.line("warm-up: compiling, which takes a minute or more")
         output.line(f"warm-up: {policy.warmup():.2f} s")
     answers = _run(policy, sources, draw, output)
     _show_timings([answer.timing for answer in answers], output)

@@ -1,7 +1,7 @@
 """Options that several commands share: which weights, and how to run them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,7 +22,7 @@ MOST_CALLS, MOST_OBSERVATIONS, MOST_NOISES = 1_000_000, 100_000, 1000  # more is
 SHOW_LOADING_BYTES = 1e9  # smaller weights load before a line about it is read
 
 _WEIGHTS, _RUNNING = "Weights", "How to run them"
-CHECKPOINT_HELP = "A checkpoint's folder: openpi's (PyTorch or JAX) or LeRobot's."
+CHECKPOINT_HELP = "A checkpoint's folder: openpi's (PyTorch or JAX), LeRobot's, or an ONNX export."
 
 CheckpointArgument = Annotated[
     str | None, typer.Argument(metavar="CHECKPOINT", help=CHECKPOINT_HELP, show_default=False)
@@ -230,6 +230,13 @@ class PolicyOptions(RobotOptions):
             "robot": self.make_robot(),
         }
 
+    def for_checkpoint(self, checkpoint: "Checkpoint") -> "PolicyOptions":
+        """The same; for an ONNX export what is left to choose is the one backend that runs it, and its device."""
+        if checkpoint.format != "onnx":
+            return self
+        backend = "onnx" if self.backend == "auto" else self.backend
+        return replace(self, backend=backend, device="cpu" if self.device == "auto" else self.device)
+
     def precision_of(self, backend: str) -> str:
         """The precision that is asked for, or else bf16, or if the backend has none the first that it has."""
         return own_precision([backend]) if self.precision is None else self.precision
@@ -241,8 +248,13 @@ class PolicyOptions(RobotOptions):
 
             if checkpoint.stored_bytes > SHOW_LOADING_BYTES:
                 output.line(f"Loading {checkpoint.stored_bytes / 1e9:.1f} GB of weights …")
-            policy = UnifiedPolicy(checkpoint, progress=output.shows_progress, strict=strict, **self.policy_arguments())
-        about = policy.metadata
+            fitting = self.for_checkpoint(checkpoint)
+            policy = UnifiedPolicy(
+                checkpoint, progress=output.shows_progress, strict=strict, **fitting.policy_arguments()
+            )
+        about = policy.metadata["backend_details"] | policy.metadata
+        if fitting.backend != self.backend:
+            about["backend_reason"] = "auto: the folder holds ONNX graphs"
         output.line(
             f"{about['config']} for {about['robot']}, {about['precision']} on {about['device']} "
             f"({about['device_name']}), {about['num_denoising_steps']} steps; "
@@ -251,9 +263,8 @@ class PolicyOptions(RobotOptions):
         if self.precision is None and about["precision"] != "bf16":
             output.line(f"precision: {about['precision']}, as {about['backend']} doesn't run in bf16")
         output.line(f"backend: {about['backend']} ({as_typed(about['backend_reason'])})")
-        export = about["backend_details"].get("export")
-        if export is not None:
-            output.line(f"its ONNX export stays for the next start: {export}")
+        if about.get("kept"):
+            output.line(f"its ONNX export stays for the next start: {about['export']}")
         return policy
 
     def _quantization(self) -> Any:

@@ -2,34 +2,31 @@
 
 <folder>/<key>/   an export as `export_onnx` writes it; the key is a hash of all that it depends on
 
-The folder is $TURBOPI_EXPORTS, or exports/ in the user's cache. Nothing is ever removed from it but what isn't whole:
-an export may be deleted at any time, and is then made again.
+The folder is $TURBOPI_EXPORTS, or exports/ in the user's cache. The KEPT exports that were used last stay: a new one
+removes the others. What isn't whole is made anew, and an export may be deleted at any time.
 """
 
 import hashlib
 import json
 import logging
 import os
+import re
 import shutil
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
+from turbopi.checkpoint.onnx_folder import FORMAT_VERSION, MANIFEST, Export, open_export
 from turbopi.errors import CheckpointError, OutputError
-from turbopi.export.onnx import (
-    FORMAT_VERSION,
-    OPSET,
-    Export,
-    export_onnx,
-    library_versions,
-    open_export,
-    weights_sha256,
-)
+from turbopi.export.onnx import OPSET, export_onnx, library_versions, weights_sha256
 from turbopi.files import cache_folder
 from turbopi.model.reference import Pi0Model
 
 logger = logging.getLogger(__name__)
 
+KEPT = 3  # exports, of 13 GB each at full size
 FOLDER_VARIABLE = "TURBOPI_EXPORTS"
+_NAME = re.compile(r"[0-9a-f]{32}")  # of a kept export: nothing else in the folder is ours to remove
 _CODE = ("export", "model")  # rooms whose code decides what a graph computes
 
 
@@ -48,12 +45,15 @@ def kept_export(model: Pi0Model) -> Export:
     found = _kept(place)
     if found is not None:
         logger.info("using the ONNX export in %s", place)
+        with suppress(OSError):  # somebody else's folder
+            os.utime(place)
         return found
     try:
         made = export_onnx(model, place, weights=weights)
     except OutputError as error:
         raise OutputError(f"{error}; {FOLDER_VARIABLE} names another folder for ONNX exports") from error
     logger.info("the ONNX export stays in %s for the next start (%.2f GB)", place, made.bytes / 1e9)
+    _remove_old(place.parent)
     return made
 
 
@@ -67,6 +67,14 @@ def _kept(place: Path) -> Export | None:
         logger.warning("a kept ONNX export is made anew: %s", error)
         shutil.rmtree(place, ignore_errors=True)
         return None
+
+
+def _remove_old(folder: Path) -> None:
+    """Remove all but the exports that were used last. A process that has one open goes on reading it."""
+    ours = [place for place in folder.iterdir() if _NAME.fullmatch(place.name) and (place / MANIFEST).is_file()]
+    for place in sorted(ours, key=lambda place: -place.stat().st_mtime)[KEPT:]:
+        logger.info("removing the ONNX export in %s: %d are kept, and it wasn't used for longest", place, KEPT)
+        shutil.rmtree(place, ignore_errors=True)
 
 
 def _key(model: Pi0Model, weights: str) -> str:

@@ -1,20 +1,20 @@
-"""A model as a folder of ONNX files, written at once or not at all, and read back with checks.
+"""A model as a folder of ONNX files, written at once or not at all; turbopi.checkpoint.onnx_folder reads it.
 
 <graph>.onnx         vision, prompt, prefix and denoise_step: the graphs of turbopi.export.graphs, float32, or with a
                      calibration FP8 in the prefix's MLPs
 <graph>.onnx.data    its weights, as a file of protobuf holds 2 GB at most
 turbopi_onnx.json    sizes, inputs and outputs, versions, the weights' hash
+turbopi.json, …      given a checkpoint: its configuration, statistics, robot and tokenizer, as `convert` writes them
 """
 
 import hashlib
 import importlib.util
 import json
 import logging
-import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,45 +22,28 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbopi.config import GemmaConfig, ModelConfig, VisionConfig
+from turbopi.checkpoint import Checkpoint, write_beside
+from turbopi.checkpoint.onnx_folder import FORMAT_VERSION, GRAPHS, MANIFEST, Export, open_export
 from turbopi.errors import BackendUnavailable, CheckpointError, ConfigError
 from turbopi.export.graphs import Graph, graphs
 from turbopi.export.quantized import quantize_mlps
 from turbopi.files import new_folder
 from turbopi.installation import install_command
 from turbopi.model.reference import Pi0Model
-from turbopi.reading import Fields, file_inside, is_integer, read_json, shown
 from turbopi.tensorrt.calibrate import Calibration
 from turbopi.tensorrt.networks import Fp8Scales
 
-MANIFEST = "turbopi_onnx.json"
-GRAPHS = ("vision", "prompt", "prefix", "denoise_step")
+__all__ = ["GRAPHS", "MANIFEST", "Export", "check_target", "export_onnx", "missing_library", "open_export"]
+
 OPSET = 20  # the first with Gelu as one node
-FORMAT_VERSION = 1
-_AXIS = re.compile(r"\w+( \+ \d{1,6})?")  # a free axis: "prompt", "horizon + 1"
 EXPORT_NEEDS = ("onnx", "onnxscript")
-
-
-@dataclass(frozen=True)
-class Export:
-    """An exported folder."""
-
-    folder: Path
-    config: ModelConfig
-    manifest: Mapping[str, Any]
-
-    def graph(self, name: str) -> Path:
-        return self.folder / f"{name}.onnx"
-
-    @property
-    def bytes(self) -> int:
-        return sum(self.manifest["files"].values())
 
 
 def missing_library(needed: tuple[str, ...]) -> str | None:
     """None if all of these packages are installed, else which one isn't and what to do."""
     absent = [name for name in needed if importlib.util.find_spec(name) is None]
-    return f"{' and '.join(absent)} isn't installed; {install_command('onnx')}" if absent else None
+    missing = f"{', '.join(absent)} {'is' if len(absent) == 1 else 'are'}n't installed"
+    return f"{missing}; {install_command('onnx')}" if absent else None
 
 
 def check_target(dst: Path) -> None:
@@ -73,18 +56,20 @@ def export_onnx(
     model: Pi0Model,
     dst: str | Path,
     *,
+    checkpoint: Checkpoint | None = None,
     calibration: Calibration | None = None,
     report: Callable[[str], None] = lambda line: None,
     weights: str | None = None,
 ) -> Export:
     """Write the four graphs of a float32 model on the CPU into the folder `dst`; `report` hears of each one.
 
-    `weights` is what `weights_sha256` says of the model, if that is known.
-
-    With a calibration, the prefix's MLPs are FP8, between standard quantise and dequantise nodes.
+    checkpoint   what the model was loaded from: its configuration, statistics, robot and tokenizer go beside the
+                 graphs, so that the folder can be opened as a checkpoint
+    calibration  the prefix's MLPs are FP8 with it, between standard quantise and dequantise nodes
+    weights      what `weights_sha256` says of the model, if that is known
 
     Raises CheckpointError if `dst` exists and isn't an empty folder, BackendUnavailable if a library is missing,
-    ConfigError for a model in another precision.
+    ConfigError for a model in another precision, and for a checkpoint whose configuration can't be written.
     """
     dst = Path(dst).expanduser()
     check_target(dst)
@@ -95,6 +80,8 @@ def export_onnx(
         raise ConfigError(f"the export takes a float32 model on the CPU, not {model.compute_dtype} on {model.device}")
     signatures = {}
     with new_folder(dst) as folder:
+        if checkpoint is not None:
+            write_beside(checkpoint, folder)  # first, as it may refuse
         for graph in graphs(model):
             report(f"exporting {graph.name}")
             quantize = calibration.scales if calibration is not None and graph.name == "prefix" else None
@@ -109,61 +96,10 @@ def export_onnx(
             "graphs": signatures,
             "weights_sha256": weights or weights_sha256(model.state_dict()),
             "versions": library_versions(),
-            "files": {file.name: file.stat().st_size for file in sorted(folder.iterdir())},
+            "files": {file.name: file.stat().st_size for file in sorted(folder.glob("*.onnx*"))},
         }
         (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n")
     return Export(dst, model.config, manifest)
-
-
-def open_export(folder: str | Path) -> Export:
-    """A folder that `export_onnx` wrote. Raises CheckpointError if it isn't one, or if a file isn't as it was written.
-
-    Files are checked by name and length; contents are read by the runtime.
-    """
-    folder = Path(folder).expanduser()
-    file = folder / MANIFEST
-    if not file.is_file():
-        raise CheckpointError(f"{folder} has no {MANIFEST}: it isn't a folder that `turbopi export onnx` wrote")
-    try:
-        manifest, config = _read_manifest(file)
-    except (CheckpointError, ConfigError) as error:
-        raise CheckpointError(f"{error}; export again") from error
-    files = manifest["files"]
-    for name in (*(f"{graph}.onnx" for graph in GRAPHS), *files):
-        size = (folder / name).stat().st_size if (folder / name).is_file() else None
-        if size is None or size != files.get(name):
-            found = "is missing" if size is None else f"has {size} bytes instead of {shown(files.get(name))}"
-            raise CheckpointError(f"{folder / name} {found}; copy the whole folder or export again")
-    return Export(folder, config, manifest)
-
-
-def _read_manifest(file: Path) -> tuple[dict[str, Any], ModelConfig]:
-    """The manifest, in which everything is there that is used of it, and the model that it describes."""
-    manifest = read_json(file)
-    fields = Fields(manifest, file)
-    version = fields.integer("format_version", 0, 2**31)
-    if version != FORMAT_VERSION:
-        raise CheckpointError(f"{file} has format version {version}, not {FORMAT_VERSION}")
-    for name in fields.object("files").values:
-        file_inside(file.parent, name, file)
-    fields.integer("opset", 1, 1000)
-    fields.text("weights_sha256")
-    fields.object("versions")
-    for graph in GRAPHS:
-        for end in ("inputs", "outputs"):
-            signature = fields.object("graphs").object(graph).object(end)
-            for name in signature.values:
-                one = signature.object(name)
-                one.text("dtype")
-                if not all(is_integer(axis) or _AXIS.fullmatch(str(axis)) for axis in one.list("shape")):
-                    one.refuse("shape", "whole numbers and names of axes")
-    try:
-        sizes = dict(fields.object("sizes").values)
-        vision, vlm = VisionConfig(**sizes.pop("vision")), GemmaConfig(**sizes.pop("vlm"))
-        config = ModelConfig(vision=vision, vlm=vlm, expert=GemmaConfig(**sizes.pop("expert")), **sizes)
-    except (KeyError, TypeError, ConfigError) as error:
-        raise CheckpointError(f"{file}: its sizes aren't those of a model ({error})") from error
-    return manifest, config
 
 
 def weights_sha256(state: Mapping[str, Tensor]) -> str:

@@ -1,7 +1,7 @@
 """Shapes of an exported graph's inputs once its free axes are chosen."""
 
+from turbopi.checkpoint.onnx_folder import Export
 from turbopi.errors import ConfigError
-from turbopi.export.onnx import Export
 
 
 def shapes_of(export: Export, graph: str, **lengths: int) -> dict[str, tuple[int, ...]]:

@@ -1,0 +1,181 @@
+"""docs/api_reference.md, written from the docstrings of the public names (`turbopi.__all__`).
+
+Signatures and docstrings are read from the source, so that they don't depend on the Python that writes them.
+"""
+
+import ast
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import turbopi
+from turbopi import config, errors
+from turbopi.checkpoint import Checkpoint
+
+DOCUMENT = Path("docs") / "api_reference.md"
+_INTRODUCTION = """# Python reference
+
+Written by `scripts/tables` from the docstrings. `from turbopi import …` gives every name here but those of
+[Related classes](#related-classes). What of it stays the same between versions: [api.md](api.md). A server and clients:
+[serving.md](serving.md); your own robot: [robots.md](robots.md).
+
+In shapes: H is the action horizon (actions in a chunk), `action_dim` the model's width of an action, d the robot's, B a
+batch, h and w a picture's height and width.
+"""
+_FIRST = ("UnifiedPolicy", "open_checkpoint", "PolicyConfig", "Robot", "RobotInputs")
+_RELATED = (Checkpoint, config.ModelConfig, config.Normalization)
+_ITEM = re.compile(r"(?P<name>[\w.*]+(?:, [\w.*]+)*)(?:: +| {2,})(?P<text>\S.*)")
+_Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def reference() -> str:
+    """The document's text."""
+    public = [name for name in turbopi.__all__ if not name.startswith("_") and name != "errors"]
+    raised = [name for name in public if issubclass(_class(name), Exception)]
+    rest = [name for name in public if name not in (*_FIRST, *raised)]
+    parts = [_INTRODUCTION]
+    parts += [_described(getattr(turbopi, name), "##") for name in (*_FIRST, *rest)]
+    parts.append("## Related classes\n")
+    parts += [_described(one, "###") for one in _RELATED]
+    parts.append("## Errors\n\n`turbopi.errors` has them, too.\n\n" + _markdown(inspect.getdoc(errors) or "") + "\n")
+    parts += [f"- **`{name}`**: {_line(getattr(turbopi, name).__doc__)}" for name in raised]
+    return "\n".join(part.rstrip("\n") + "\n" if not part.startswith("- ") else part for part in parts) + "\n"
+
+
+def write_reference(root: Path) -> list[Path]:
+    """Write the document anew; returns it if it changed."""
+    if not stale_reference(root):
+        return []
+    (root / DOCUMENT).write_text(reference(), encoding="utf-8")
+    return [root / DOCUMENT]
+
+
+def stale_reference(root: Path) -> list[str]:
+    """A line if the document isn't what the docstrings say."""
+    file = root / DOCUMENT
+    fresh = file.is_file() and file.read_text(encoding="utf-8") == reference()
+    return [] if fresh else [f"{DOCUMENT} isn't what the docstrings say; run scripts/tables"]
+
+
+def _class(name: str) -> type:
+    found = getattr(turbopi, name)
+    return found if isinstance(found, type) else object
+
+
+def _line(docstring: str | None) -> str:
+    return " ".join(inspect.cleandoc(docstring or "").split())
+
+
+def _described(one: Any, heading: str) -> str:
+    """The section of a class or function."""
+    file = Path(inspect.getsourcefile(one) or "")
+    source = file.read_text(encoding="utf-8")
+    (node,) = (n for n in ast.parse(source).body if getattr(n, "name", None) == one.__name__)
+    if isinstance(node, ast.ClassDef):
+        return _class_section(node, source.splitlines(), heading)
+    assert isinstance(node, _Function), one
+    return f"{heading} {node.name}\n\n{_signature(node, node.name)}\n\n{_markdown(ast.get_docstring(node) or '')}\n"
+
+
+def _class_section(node: ast.ClassDef, lines: list[str], heading: str) -> str:
+    methods = [n for n in node.body if isinstance(n, _Function)]
+    made = next((n for n in methods if n.name == "__init__"), None)
+    parts = [f"{heading} {node.name}"]
+    if made is not None:
+        parts.append(_signature(made, node.name))
+    parts.append(_markdown(ast.get_docstring(node) or ""))
+    fields = [n for n in node.body if isinstance(n, ast.AnnAssign) and not ast.unparse(n.target).startswith("_")]
+    if fields:
+        rows = [_field(one, lines) for one in fields]
+        parts.append("\n".join(["| field | type | unless given | |", "|---|---|---|---|", *rows]))
+    for method in methods:
+        text = ast.get_docstring(method)
+        if method.name.startswith("_") or text is None:
+            continue
+        is_property = any("property" in ast.unparse(one) for one in method.decorator_list)
+        signature = "" if is_property else f"{_signature(method, method.name)}\n\n"
+        kind = ", a property" if is_property else ""
+        parts.append(f"{heading}# {node.name}.{method.name}{kind}\n\n{signature}{_markdown(text)}")
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _field(node: ast.AnnAssign, lines: list[str]) -> str:
+    """A row; what it is stands in the comment behind the field."""
+    assert node.end_lineno is not None and node.end_col_offset is not None
+    line = lines[node.end_lineno - 1].encode()[node.end_col_offset :].decode()
+    comment = line.partition("#")[2].strip()
+    value = "" if node.value is None else f"`{ast.unparse(node.value)}`"
+    cells = [f"`{ast.unparse(node.target)}`", f"`{ast.unparse(node.annotation)}`", value, comment]
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _signature(node: _Function, name: str) -> str:
+    """A code block: on one line, or an argument a line."""
+    arguments = list(_arguments(node.args))
+    returns = "" if node.returns is None or node.name == "__init__" else f" -> {ast.unparse(node.returns)}"
+    returns = re.sub(r"^ -> '(.*)'$", r" -> \1", returns)
+    whole = f"{name}({', '.join(arguments)}){returns}"
+    if len(whole) > 100:
+        whole = "\n".join([f"{name}(", *(f"    {one}," for one in arguments), f"){returns}"])
+    return f"```python\n{whole}\n```"
+
+
+def _arguments(given: ast.arguments) -> Iterator[str]:
+    positional = [*given.posonlyargs, *given.args]
+    defaults: list[ast.expr | None] = [None] * (len(positional) - len(given.defaults)) + [*given.defaults]
+    for one, default in zip(positional, defaults, strict=True):
+        if one.arg not in ("self", "cls"):
+            yield _argument(one, default)
+    if given.vararg is not None:
+        yield f"*{given.vararg.arg}"
+    elif given.kwonlyargs:
+        yield "*"
+    for one, default in zip(given.kwonlyargs, given.kw_defaults, strict=True):
+        yield _argument(one, default)
+    if given.kwarg is not None:
+        yield f"**{given.kwarg.arg}"
+
+
+def _argument(one: ast.arg, default: ast.expr | None) -> str:
+    annotation = "" if one.annotation is None else f": {ast.unparse(one.annotation)}"
+    value = "" if default is None else f" = {ast.unparse(default)}"
+    return f"{one.arg}{annotation}{value}"
+
+
+def _markdown(docstring: str) -> str:
+    """A docstring as Markdown: lists of `name: text` or `name   text` as lists, other indented lines as code."""
+    found = []
+    for block in re.split(r"\n\s*\n", docstring):
+        lines = block.split("\n")
+        title = lines[0] if lines[0] == "Args:" else None
+        body = inspect.cleandoc("\n".join(lines[1:] if title else lines)).split("\n")
+        items = _items(body)
+        if items is not None:
+            found.append("\n".join(f"- `{name}`: {text}" for name, text in items))
+        elif lines[0].startswith("    "):
+            found.append("\n".join(["```", *body, "```"]))
+        else:
+            found.append("\n".join(line.strip() for line in lines))
+    return "\n\n".join(found)
+
+
+def _items(lines: list[str]) -> list[tuple[str, str]] | None:
+    """(name, text) of a list whose further lines are indented; None if it isn't one.
+
+    A line with more names than text has its text in the next.
+    """
+    items: list[tuple[str, str]] = []
+    for line in lines:
+        match = _ITEM.fullmatch(line)
+        alone = re.fullmatch(r"[a-z]\w*(, [a-z]\w*)+", line)  # names, whose text follows
+        if match is not None:
+            items.append((match["name"], " ".join(match["text"].split())))
+        elif alone is not None:
+            items.append((line, ""))
+        elif items and line.startswith(" "):
+            items[-1] = (items[-1][0], f"{items[-1][1]} {line.strip()}".strip())
+        else:
+            return None
+    return items
