@@ -189,9 +189,14 @@ class FusedBackend(CudaGraphBackend):
                 self.config, self._weights.expert, inputs=self._expert_inputs(), directions=self._directions
             )
         packed, small = self._packed_expert, self._weights.small
-        by_token = {} if loop.form == "plain" else {"num_steps": loop.steps, "by_token": True}
+        by_token = loop.form != "plain"
         kernel = DenoiseKernel(
-            self.config, packed, small, table, cache_rows=rows, suffix=loop.horizon, device=self.device, **by_token
+            *(self.config, packed, small, table),
+            cache_rows=rows,
+            suffix=loop.horizon,
+            device=self.device,
+            num_steps=loop.steps if by_token else None,
+            by_token=by_token,
         )
         self._put_expert_away()
         return kernel

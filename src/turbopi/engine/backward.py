@@ -104,7 +104,10 @@ class Expert:
 
     def _modulation(self, index: int, plain: Tensor | None) -> tuple[Any, Any, Any]:
         """Scale, shift and gate of norm number `index`; the shift and the gate may be None."""
-        return (plain, None, None) if self.table is None else self.table[index].unbind(0)
+        if self.table is None:
+            return plain, None, None
+        scale, shift, gate = self.table[index].unbind(0)
+        return scale, shift, gate
 
 
 def suffix_vjp(config: ModelConfig, small: State, x_t: Tensor, time: Tensor, d_tokens: Tensor) -> Tensor:

@@ -79,10 +79,13 @@ def compiled() -> Ops:
         vision_attention=vision_attention,
         attention=compiled_attention,
         backward=BackwardOps(
-            softmax,
-            *(_compiled(one) for one in (backward.geglu, backward.rms_norm_vjp, backward.geglu_vjp)),
-            *(_compiled(one) for one in (backward.softmax_vjp, backward.rope_vjp)),
-            "Inductor, between cuBLAS's products",
+            softmax=softmax,
+            geglu=_compiled(backward.geglu),
+            rms_norm_vjp=_compiled(backward.rms_norm_vjp),
+            geglu_vjp=_compiled(backward.geglu_vjp),
+            softmax_vjp=_compiled(backward.softmax_vjp),
+            rope_vjp=_compiled(backward.rope_vjp),
+            origin="Inductor, between cuBLAS's products",
         ),
         origin={**PLAIN.origin, "all else": "Inductor"},
     )
