@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from conditioned import BY_TOKEN, conditioned
 from conftest import golden_cases, golden_model
 from test_begin import CPU, Ran
 from torch import Tensor
@@ -13,7 +14,7 @@ from turbopi.config import Kind, ModelConfig
 from turbopi.engine.call import CallShape
 from turbopi.engine.recent_loops import Loop
 from turbopi.errors import BackendUnavailable, DeviceLost
-from turbopi.kernels.interface import GemmaLayer, Ops
+from turbopi.kernels.interface import GemmaLayer, Ops, TokenInputs
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise import packing as denoise_packing
@@ -40,24 +41,37 @@ class TwinKernel:
         cache_rows: int,
         suffix: int,
         device: torch.device,
+        num_steps: int | None = None,
+        by_token: bool = False,
     ) -> None:
+        assert by_token == (num_steps is not None)
         if self.refuse is not None:
             raise BackendUnavailable(self.refuse)
         self.config, self.packed, self.small, self.table = config, packed, small, table
-        self.cache_rows, self.suffix, self.device = cache_rows, suffix, device
+        self.cache_rows, self.suffix, self.device, self.by_token = cache_rows, suffix, device, by_token
         self.launches = 0
         self.trapped: str | None = None
         self.made.append(self)
 
-    def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
+    def launch(
+        self,
+        noise: Tensor,
+        cache_k: Tensor,
+        cache_v: Tensor,
+        length: Tensor,
+        x_t: Tensor,
+        v_t: Tensor,
+        tokens: TokenInputs | None = None,
+    ) -> None:
+        assert (tokens is not None) == self.by_token
         assert noise.shape[0] == self.suffix and int(length) <= self.cache_rows
         self.launches += 1
         layers: Any = [
             GemmaLayer(**dict(zip(MATRICES, self.packed.matrices(i), strict=True)), norm1=None, norm2=None)
             for i in range(self.config.expert.depth)
         ]
-        made = denoise_plain(self.config, layers, self.small, self.table, noise, cache_k, cache_v, int(length))
-        x_t[:], v_t[:] = made
+        rest = (self.small, self.table, noise, cache_k, cache_v, int(length))
+        x_t[:], v_t[:] = denoise_plain(self.config, layers, *rest, tokens=tokens)
 
     def clock_mhz(self) -> float | None:
         return 1800.4 if self.launches else None
@@ -105,6 +119,33 @@ def test_the_kernel_and_the_operations_give_the_references_actions(kernels: type
     chosen = "operations, as the GPU is too small" if refused else "one CUDA kernel"
     assert backend.describe()["denoising"] == {chosen: ["H=10, 3 steps"]}
     assert [kernel.launches > 0 for kernel in kernels.made] == ([] if refused else [True])
+
+
+@pytest.mark.parametrize("which", BY_TOKEN)
+def test_conditioned_loops_have_a_kernel_of_their_own(kernels: type[TwinKernel], which: str) -> None:
+    backend, case = fused(), golden_cases()["b_third_masked"]
+    asked = conditioned(which, 3, *case.noise.shape[1:])
+    expected = golden_model("pi05").sample(case.observation, case.noise, 3, conditioning=asked)
+    found = backend.sample(case.observation, case.noise, 3, conditioning=asked).actions
+    torch.testing.assert_close(found, expected, rtol=0, atol=3e-4)
+    ((told, (call,)),) = backend.describe()["denoising"].items()
+    assert told == "one CUDA kernel" and call.startswith("H=10, 3 steps, by token, ")
+
+
+def test_the_true_jacobian_takes_operations_beside_the_kernel_and_finds_the_expert_there(
+    kernels: type[TwinKernel],
+) -> None:
+    backend, case = fused(), golden_cases()["b_third_masked"]
+    plain = actions(backend)
+    asked = conditioned("jacobian", 3, *case.noise.shape[1:])
+    expected = golden_model("pi05").sample(case.observation, case.noise, 3, conditioning=asked)
+    found = backend.sample(case.observation, case.noise, 3, conditioning=asked).actions
+    torch.testing.assert_close(found, expected, rtol=0, atol=3e-4)
+    told = backend.describe()["denoising"]
+    assert told["one CUDA kernel"] == ["H=10, 3 steps"]
+    reason = "operations, as the denoising kernel has no way back, which the true Jacobian takes"
+    assert told[reason] == ["H=10, 3 steps, guided by the Jacobian, 4 times"]
+    assert torch.equal(actions(backend), plain)
 
 
 def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[TwinKernel]) -> None:
