@@ -46,8 +46,11 @@ def _rms_norm_kernel(
             shift += row * width
         if HAS_GATE:
             gate += row * width
+    if BY_ROW:  # gathered by the kernel before, perhaps; one for all rows is a constant
+        wait_for_producer(PDL)
     factor = tl.load(scale + cols, mask, 0.0)
-    wait_for_producer(PDL)
+    if not BY_ROW:
+        wait_for_producer(PDL)
     launch_dependents(PDL)
     if HAS_Y:
         a = _add_residual(x, y, gate, out, row, rows, cols, width, mask, SPLITS, HAS_GATE)
