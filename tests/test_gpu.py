@@ -242,5 +242,20 @@ def test_what_is_held_and_what_pulls_changes_without_a_new_capture(name: str, fo
     assert not torch.equal(*alone) and len(runner._graphs) == graphs
 
 
+@pytest.mark.parametrize("which", ["held", "staircase", "identity"])
+def test_conditioned_chunks_that_are_too_long_for_the_kernel_are_right_every_time(which: str) -> None:
+    """Their norms read rows that the kernel before gathers."""
+    runner: Any = backend("fused", "pi05", "bf16")
+    observation, _ = made_up("pi05", 2, 19)
+    noise = torch.randn(1, 60, 32, generator=torch.Generator().manual_seed(0))
+    asked = conditioned(which, 5, 60, 32)
+    exact = golden_model("pi05").sample(observation, noise, 5, conditioning=asked)
+    reference = golden_model("pi05", "bf16").sample(observation, noise, 5, conditioning=asked)
+    first = runner.sample(observation, noise, 5, conditioning=asked).actions
+    assert rms(first - exact) <= 2 * rms(reference - exact)
+    for _ in range(20):
+        assert torch.equal(runner.sample(observation, noise, 5, conditioning=asked).actions, first)
+
+
 def rms(x: torch.Tensor) -> float:
     return float(x.square().mean().sqrt())

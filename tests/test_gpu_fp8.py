@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from conditioned import conditioned
 from conftest import golden_cases, golden_folder, golden_model
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from turbopi.config import Kind
 from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
 from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX
 from turbopi.kernels.sm90.denoise.packing import refusal
+from turbopi.model.conditioning import Conditioning
 from turbopi.model.reference import Pi0Model
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.sites import sites
@@ -56,7 +58,9 @@ def backend(kind: Kind, precision: Precision, target: float = 0.0) -> backends.B
     )
 
 
-def emulated(case: Case, precision: Precision, target: float) -> tuple[Tensor, Tensor]:
+def emulated(
+    case: Case, precision: Precision, target: float, asked: Conditioning | None = None
+) -> tuple[Tensor, Tensor]:
     """(float32, float32 with the plan's sites rounded), on the host."""
     model, chosen = on_gpu(case.kind), quantization(case.kind, target)
     plan = chosen.plan(model.config, precision)
@@ -68,9 +72,9 @@ def emulated(case: Case, precision: Precision, target: float) -> tuple[Tensor, T
     }
     weights = RoundedWeights({site: plan.directions[str(site)] for site in used})
     observation, noise = case.observation.to("cuda"), case.noise.to("cuda")
-    exact = model.sample(observation, noise, STEPS)
+    exact = model.sample(observation, noise, STEPS, conditioning=asked)
     with rounded(model, used, weights):
-        return exact.cpu(), model.sample(observation, noise, STEPS).cpu()
+        return exact.cpu(), model.sample(observation, noise, STEPS, conditioning=asked).cpu()
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -84,6 +88,30 @@ def test_the_engine_is_as_far_from_float32_as_its_emulation(case: str, precision
     )
     assert relative_rms(ours, exact) < 1.3 * relative_rms(expected, exact) + 0.01
     assert relative_rms(ours, expected) < 0.75 * relative_rms(expected, exact) + 0.02
+
+
+@pytest.mark.parametrize("which", ["held", "identity", "staircase"])
+@pytest.mark.parametrize("case", ["b_third_masked", "e_horizon50"])
+def test_conditioned_calls_are_as_far_from_float32_as_their_emulation(case: str, which: str) -> None:
+    one = golden_cases()[case]
+    asked = conditioned(which, STEPS, *one.noise.shape[1:])
+    exact, expected = emulated(one, "fp8", 0.0, asked)
+    runner: Any = backend(one.kind, "fp8")
+    ours = runner.sample(one.observation, one.noise, STEPS, conditioning=asked).actions
+    free = torch.ones(ours.shape[1], dtype=torch.bool) if asked.held is None else ~torch.from_numpy(asked.held)
+    ours, exact, expected = ours[:, free], exact[:, free], expected[:, free]
+    assert relative_rms(ours, exact) < 1.3 * relative_rms(expected, exact) + 0.01
+    assert relative_rms(ours, expected) < 0.75 * relative_rms(expected, exact) + 0.02
+
+
+def test_beside_fp8_the_true_jacobian_goes_through_the_bf16_expert_and_says_so() -> None:
+    one = golden_cases()["b_third_masked"]
+    asked = conditioned("jacobian", STEPS, *one.noise.shape[1:])
+    runner: Any = backend("pi05", "fp8")
+    ours = runner.sample(one.observation, one.noise, STEPS, conditioning=asked).actions
+    exact = on_gpu("pi05").sample(one.observation.to("cuda"), one.noise.to("cuda"), STEPS, conditioning=asked).cpu()
+    assert relative_rms(ours, exact) < 0.1
+    assert any("no way back" in why for why in runner.describe()["denoising"])
 
 
 @pytest.mark.parametrize("case", CASES)
