@@ -26,16 +26,17 @@ from turbopi.backends import Precision
 from turbopi.backends.lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.calibration import for_policy
-from turbopi.config import ModelConfig, PolicyConfig
+from turbopi.config import PolicyConfig
 from turbopi.errors import ActionError, ConfigError, ObservationError
-from turbopi.model.conditioning import Conditioning, Form, Guidance
+from turbopi.joining import Joining
+from turbopi.model.conditioning import Conditioning
 from turbopi.model.reference import FloatPrecision
 from turbopi.observation import ModelInputs, Observation, with_cameras
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.robots import Robot
-from turbopi.running_chunk import FORMS, JoinMode, RunningChunk
+from turbopi.running_chunk import JoinMode, RunningChunk
 
 logger = logging.getLogger(__name__)
 
@@ -123,6 +124,7 @@ class UnifiedPolicy:
                 name, self.config.model, load, device=self._device, precision=precision, quantization=fp8
             )
         self.backend.strict = self._strict = strict
+        self._joining = Joining(self.config, self._pipeline, lambda: self.backend)
         self._generator = np.random.default_rng()
         self._lock = threading.Lock()
         self._backend_reason = why
@@ -213,7 +215,7 @@ class UnifiedPolicy:
         if num_steps is None and conditioning is not None and conditioning.tokens is not None:
             num_steps = len(conditioning.tokens.times)
         steps, actions = self._loop(num_steps, horizon)
-        conditioning, chunk = self._asked(conditioning, previous, steps, actions)
+        conditioning, chunk = self._joining.checked(conditioning, previous, steps, actions)
         if len(observations) == 1 and isinstance(self.backend, backends.Begins):
             seen = self._pipeline.see(observations[0], resize=False)
             asked = time.perf_counter()
@@ -222,7 +224,7 @@ class UnifiedPolicy:
                 begun = self.backend.begin(seen.pictures, self._pipeline.config.image_resize)
                 self._pipeline.read(seen)  # while the device is at the pictures
                 x_1 = self._noise(1, actions, noise, seed)[0]
-                asked_for = self._conditioning(conditioning, chunk, seen.state, steps, actions)
+                asked_for = self._joining.argument(conditioning, chunk, seen.state, steps, actions)
                 sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps, **asked_for)
                 infer_end = time.perf_counter()
             states = [seen.state]
@@ -231,7 +233,7 @@ class UnifiedPolicy:
             inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
             states = [state for _, state in prepared]
             noises = torch.from_numpy(self._noise(len(observations), actions, noise, seed))
-            asked_for = self._conditioning(conditioning, chunk, states[0], steps, actions)
+            asked_for = self._joining.argument(conditioning, chunk, states[0], steps, actions)
             asked = time.perf_counter()
             with self._lock, self._guard:
                 infer_start = time.perf_counter()
@@ -337,7 +339,7 @@ class UnifiedPolicy:
             several("horizons", horizons, [self.config.model.action_horizon], self._checked_horizon),
         )
         asked: list[tuple[int, int, Conditioning | None]] = [(*loop, None) for loop in loops]
-        asked += self._conditioned_loops(loops, real_time, conditioning)
+        asked += self._joining.to_warm(loops, real_time, conditioning, self._num_steps)
         plan = [(count, *one) for count in counts for one in asked]
         with self._lock, self._guard:
             for i, (count, num_steps, horizon, one) in enumerate(plan):
@@ -353,29 +355,6 @@ class UnifiedPolicy:
         if own in counts:
             self._whole_call(example, *loops[0])
         return time.perf_counter() - start
-
-    def _conditioned_loops(
-        self, loops: Sequence[tuple[int, int]], real_time: JoinMode | Sequence[JoinMode], others: Sequence[Conditioning]
-    ) -> list[tuple[int, int, Conditioning | None]]:
-        """Steps, horizon and an example of every conditioned loop that a warm-up is to cover. Raises ConfigError."""
-        modes: Sequence[Any] = [real_time] if isinstance(real_time, str) else real_time
-        asked: list[tuple[int, int, Conditioning | None]] = []
-        for mode in modes:
-            if mode not in self._modes:
-                raise ConfigError(
-                    f"warm-up was asked for real-time mode {mode!r}; this policy has {', '.join(self._modes) or 'none'}"
-                )
-            form = FORMS[mode]
-            asked += [(*loop, _example(form, *loop, self.config.model)) for loop in loops]
-        for one in others:
-            num_steps, horizon = one.size(self._num_steps, self.config.model.action_horizon)
-            try:
-                one.check(num_steps, horizon, self.config.model.action_dim)
-                self._check_form(one.form)
-            except ObservationError as error:
-                raise ConfigError(f"warm-up: {error}") from None
-            asked.append((num_steps, horizon, one))
-        return asked
 
     def _whole_call(self, example: Mapping[str, Any], num_steps: int, horizon: int) -> None:
         try:
@@ -430,56 +409,10 @@ class UnifiedPolicy:
             "random_weights": self._checkpoint.format == "random",
             "tokenizer": self._pipeline.tokenizer.source,
             "torch": torch.__version__,
-            "real_time": {"modes": list(self._modes), **dataclasses.asdict(self.config.real_time)},
+            "real_time": {"modes": list(self._joining.modes), **dataclasses.asdict(self.config.real_time)},
             **self._loading,
             **self._pipeline.metadata,
         }
-
-    @property
-    def _modes(self) -> tuple[JoinMode, ...]:
-        """What `RunningChunk`s may ask of this policy."""
-        able = backends.forms(self.backend)
-        trained = self.config.real_time.trained_max_delay > 0
-        return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
-
-    def _check_form(self, form: Form) -> None:
-        if form != "plain" and form not in backends.forms(self.backend):
-            what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
-            raise ObservationError(
-                f"backend {self.backend.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
-                "leave out conditioning and previous"
-            )
-
-    def _asked(
-        self, conditioning: Conditioning | None, previous: RunningChunk | None, steps: int, horizon: int
-    ) -> tuple[Conditioning | None, RunningChunk | None]:
-        """What a call is to join, checked. Raises ObservationError."""
-        model = self.config.model
-        if conditioning is not None and previous is not None:
-            raise ObservationError("conditioning and previous were both given; give one of them")
-        if conditioning is not None:
-            conditioning.check(steps, horizon, model.action_dim)
-            self._check_form(conditioning.form)
-        if previous is not None:
-            relative = self._pipeline.robot.delta_mask is not None
-            previous = previous.completed(horizon, model.action_dim, relative=relative, options=self.config.real_time)
-            self._check_form(FORMS[previous.mode])
-        return conditioning, previous
-
-    def _conditioning(
-        self,
-        conditioning: Conditioning | None,
-        chunk: RunningChunk | None,
-        state: np.ndarray,
-        steps: int,
-        horizon: int,
-    ) -> dict[str, Conditioning]:
-        """The backend's argument, once the new state is known; {} for an ordinary call."""
-        if chunk is not None:
-            left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
-            conditioning = chunk.conditioning(left_over, steps, horizon, self.config.model.time_grid)
-        plain = conditioning is None or conditioning.form == "plain"
-        return {} if conditioning is None or plain else {"conditioning": conditioning}
 
     def _results(self, sample: backends.Sample, states: Sequence[np.ndarray]) -> list[dict[str, Any]]:
         """The robot's actions of each row. An ActionError names the row, if there are several."""
@@ -518,18 +451,6 @@ class UnifiedPolicy:
     ) -> np.ndarray:
         """float32[B, H, action_dim], given or drawn."""
         return noise_for((batch, horizon, self.config.model.action_dim), noise, seed, self._generator)
-
-
-def _example(form: Form, num_steps: int, horizon: int, model: ModelConfig) -> Conditioning:
-    """A conditioning of a form, for a warm-up."""
-    if form == "tokens":
-        return Conditioning(held=np.arange(horizon) < 1, values=np.zeros((horizon, model.action_dim), np.float32))
-    nothing = Guidance(
-        np.zeros((horizon, model.action_dim), np.float32),
-        np.zeros(horizon, np.float32),
-        np.zeros((num_steps, horizon), np.float32),
-    )
-    return Conditioning(guidance=nothing)
 
 
 def _timing(

@@ -1,0 +1,104 @@
+"""What a policy's calls may join, checked and turned into what the denoising loop is asked for (docs/real_time.md)."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from turbopi import backends
+from turbopi.backends import Backend
+from turbopi.config import ModelConfig, PolicyConfig
+from turbopi.errors import ConfigError, ObservationError
+from turbopi.model.conditioning import Conditioning, Form, Guidance
+from turbopi.preprocess.pipeline import Pipeline
+from turbopi.running_chunk import FORMS, JoinMode, RunningChunk
+
+Loop = tuple[int, int]  # denoising steps, action horizon
+
+
+class Joining:
+    """Of one policy; `backend` tells the one that it holds."""
+
+    def __init__(self, config: PolicyConfig, pipeline: Pipeline, backend: Callable[[], Backend]) -> None:
+        self._config, self._model, self._pipeline, self._backend = config, config.model, pipeline, backend
+
+    @property
+    def modes(self) -> tuple[JoinMode, ...]:
+        """What `RunningChunk`s may ask of this policy."""
+        able = backends.forms(self._backend())
+        trained = self._config.real_time.trained_max_delay > 0
+        return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
+
+    def checked(
+        self, conditioning: Conditioning | None, previous: RunningChunk | None, steps: int, horizon: int
+    ) -> tuple[Conditioning | None, RunningChunk | None]:
+        """What a call is to join; of the two at most one. Raises ObservationError."""
+        if conditioning is not None and previous is not None:
+            raise ObservationError("conditioning and previous were both given; give one of them")
+        if conditioning is not None:
+            conditioning.check(steps, horizon, self._model.action_dim)
+            self._check_form(conditioning.form)
+        if previous is not None:
+            relative, options = self._pipeline.robot.delta_mask is not None, self._config.real_time
+            previous = previous.completed(horizon, self._model.action_dim, relative=relative, options=options)
+            self._check_form(FORMS[previous.mode])
+        return conditioning, previous
+
+    def argument(
+        self,
+        conditioning: Conditioning | None,
+        chunk: RunningChunk | None,
+        state: np.ndarray,
+        steps: int,
+        horizon: int,
+    ) -> dict[str, Conditioning]:
+        """The backend's, once the new state is known, of what is `checked`; {} for an ordinary call."""
+        if chunk is not None:
+            left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
+            conditioning = chunk.conditioning(left_over, steps, horizon, self._model.time_grid)
+        return {} if conditioning is None or conditioning.form == "plain" else {"conditioning": conditioning}
+
+    def to_warm(
+        self,
+        loops: Sequence[Loop],
+        modes: JoinMode | Sequence[JoinMode],
+        others: Sequence[Conditioning],
+        num_steps: int,
+    ) -> list[tuple[int, int, Conditioning | None]]:
+        """Steps, horizon and an example of every conditioned loop that a warm-up is to cover. Raises ConfigError.
+
+        num_steps  of those of `others` that don't say
+        """
+        asked: list[tuple[int, int, Conditioning | None]] = []
+        for mode in [modes] if isinstance(modes, str) else modes:
+            if mode not in self.modes:
+                raise ConfigError(
+                    f"warm-up was asked for real-time mode {mode!r}; this policy has {', '.join(self.modes) or 'none'}"
+                )
+            asked += [(*loop, _example(FORMS[mode], *loop, self._model)) for loop in loops]
+        for one in others:
+            steps, horizon = one.size(num_steps, self._model.action_horizon)
+            try:
+                one.check(steps, horizon, self._model.action_dim)
+                self._check_form(one.form)
+            except ObservationError as error:
+                raise ConfigError(f"warm-up: {error}") from None
+            asked.append((steps, horizon, one))
+        return asked
+
+    def _check_form(self, form: Form) -> None:
+        backend = self._backend()
+        if form != "plain" and form not in backends.forms(backend):
+            what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
+            raise ObservationError(
+                f"backend {backend.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
+                "leave out conditioning and previous"
+            )
+
+
+def _example(form: Form, num_steps: int, horizon: int, model: ModelConfig) -> Conditioning:
+    """A conditioning of a form, for a warm-up."""
+    nothing = np.zeros((horizon, model.action_dim), np.float32)
+    if form == "tokens":
+        return Conditioning(held=np.arange(horizon) < 1, values=nothing)
+    weights, strength = np.zeros(horizon, np.float32), np.zeros((num_steps, horizon), np.float32)
+    return Conditioning(guidance=Guidance(nothing, weights, strength))
