@@ -1,11 +1,12 @@
 """The action chunk that a robot carries out while the policy computes the next one: what the next one must join."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from turbopi.model.conditioning import Schedule
+if TYPE_CHECKING:  # a robot's computer joins chunks without PyTorch
+    from turbopi.model.conditioning import Schedule
 
 JoinMode = Literal["rtc", "rtc_identity", "rtc_trained"]
 
@@ -31,5 +32,5 @@ class RunningChunk:
     execution_horizon: int | None = None
     mode: JoinMode = "rtc"
     anchor: np.ndarray | None = None
-    schedule: Schedule = "exponential"
+    schedule: "Schedule" = "exponential"
     max_guidance_weight: float = 5.0

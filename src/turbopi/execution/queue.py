@@ -1,0 +1,464 @@
+"""The queue of actions: which action is next, what the policy is told of the running chunk, where the new one joins.
+
+Everything is counted in actions that the robot carried out. Row i of a chunk is meant for the i-th action after its
+observation. When the robot has carried out n actions between an observation and the chunk computed from it, the chunk
+is entered at row n: no action is carried out twice, and none is left out. A robot that stood still meanwhile (it had
+no actions, or its way is "sync") carried out none, and enters at row 0.
+"""
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from turbopi.errors import ConfigError
+from turbopi.execution.delays import DelayEstimate
+from turbopi.execution.ways import Execution, way_named
+from turbopi.running_chunk import RunningChunk
+
+KEPT = 10_000  # seams and delays of one queue
+
+# Why a chunk was never carried out:
+#   late        "rtc_trained": more actions were carried out than it was told; it continues those that it was told
+#   used_up     all of its actions belong to the past
+#   not_finite  a number in it is NaN or infinite
+#   jump        the command would move by more than `max_jump` in one step
+#   malformed   it isn't what a policy answers
+#   failed      the policy gave no chunk
+# and what the caller of `fail` and `interrupt` names.
+Reason = str
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to tell the policy with an observation: `policy.infer(observation, **request.arguments)`."""
+
+    number: int  # of the chunk, from 0
+    step: int  # when its observation was taken: actions asked for until then
+    previous: RunningChunk | None  # None: nothing is known of a running chunk, or it doesn't matter
+    model_actions: bool  # the result must have "model_actions" (and "anchor"), for the chunk after it
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Empty for the ways that need nothing of the model, so that any policy takes them."""
+        if not self.model_actions:
+            return {}
+        return {"previous": self.previous, "model_actions": True}
+
+
+class Action(NamedTuple):
+    """One action of a chunk."""
+
+    values: np.ndarray  # float64[d], in the robot's units
+    chunk: int  # the number of its request
+    row: int
+    takes_over: bool  # it is the first that is carried out of its chunk
+
+
+@dataclass(frozen=True)
+class Seam:
+    """Where a chunk takes over from another. In the robot's units; see `Action` for the first of all chunks."""
+
+    step: int  # calls of next_action before it
+    chunk: int
+    delay: int  # control steps from the observation to the chunk
+    carried_out: int  # actions among them: the row at which the chunk is entered
+    told: int | None  # the delay that the policy was told, if it was told of a running chunk
+    jump: np.ndarray  # float64[d]  its first action − the last command
+    gap: np.ndarray | None  # float64[d]  its first action − what the running chunk has for that step, if it has it
+
+
+class _Chunk(NamedTuple):
+    number: int
+    actions: np.ndarray  # float64[H, d]
+    model_actions: np.ndarray | None  # float32[H, A]
+    anchor: np.ndarray | None
+
+
+@dataclass
+class _Flight:
+    """An observation whose chunk isn't there yet."""
+
+    request: Request
+    delay: int  # control steps since
+    carried_out: int  # actions since
+    refused: Reason | None = None
+
+
+class ChunkQueue:
+    """Joins chunks, by one of the ways to run. Deterministic; not for several threads at once.
+
+    execution_horizon    s, actions of a chunk after which the next observation is taken; at most H. None: half of H
+    delay                control steps from an observation to its chunk that the policy is told: fixed, or an estimate,
+                         to which the queue adds what it measures. Only the "rtc" ways use it
+    trained_max_delay    "rtc_trained": the largest delay that the checkpoint was trained with. None: not known
+    max_jump             the most that a command may move in one step, in the robot's units: one number or float[d],
+                         np.inf for what may jump. A chunk that moves by more in the rows not yet passed, or from the
+                         last command to its first action, is refused whole
+    old_weight           "ensemble": the running chunk's part of the mean; LeRobot's default
+    schedule, max_guidance_weight
+                         of the guided ways, as in RunningChunk
+
+    A fixed delay d and the horizons must fit: d ≤ s and d ≤ H − s for the "rtc" ways, else ConfigError, at the latest
+    when the first chunk shows H. An estimate that is larger for a while is cut to what fits: `cut_delays` counts.
+    When more actions were carried out than the policy was told, "rtc_trained" drops the chunk (`dropped["late"]`) and
+    the guided ways enter it that much later (`late`).
+    """
+
+    def __init__(
+        self,
+        execution: Execution | str,
+        *,
+        execution_horizon: int | None = None,
+        delay: int | DelayEstimate = 0,
+        trained_max_delay: int | None = None,
+        max_jump: float | np.ndarray | None = None,
+        old_weight: float = 0.3,
+        schedule: Literal["exponential", "linear", "ones", "zeros"] = "exponential",
+        max_guidance_weight: float = 5.0,
+    ) -> None:
+        self.way = way_named(execution)
+        self.dropped: Counter[Reason] = Counter()  # chunks that were never carried out
+        self.late = 0  # guided chunks that were told a smaller delay than the one they had
+        self.cut_delays = 0  # requests that were told a smaller delay than the estimate, as more doesn't fit
+        self.chunks = 0  # that took over
+        self.empty_steps = 0  # calls of next_action that found no action
+        self.steps = 0  # calls of next_action
+        self.seams: deque[Seam] = deque(maxlen=KEPT)
+        self.delays: deque[int] = deque(maxlen=KEPT)  # measured, of all chunks that came
+        self.last_problem = ""  # about the last chunk that was dropped
+        self.horizon: int | None = None  # H, once a chunk has come
+        self._fixed = not isinstance(delay, DelayEstimate)
+        self._delay = delay if isinstance(delay, DelayEstimate) else DelayEstimate(delay)
+        self._s = None if execution_horizon is None else _horizon(execution_horizon)
+        self._trained_max = trained_max_delay
+        self._max_jump = None if max_jump is None else _jump(max_jump)
+        if not 0 <= old_weight <= 1:
+            raise ConfigError(f"old_weight is {old_weight}; the running chunk's part of a mean lies between 0 and 1")
+        self._old_weight = old_weight
+        self._guidance: dict[str, Any] = {"schedule": schedule, "max_guidance_weight": max_guidance_weight}
+        self._requests = 0
+        self._running: _Chunk | None = None
+        self._row = self._entered = 0  # of the running chunk: the next one, and the first that was carried out
+        self._flight: _Flight | None = None
+        self._last: np.ndarray | None = None  # the last action
+        self._check_told_delay()
+
+    # --- what is going on ---------------------------------------------------------------------------------------------
+
+    @property
+    def wants_observation(self) -> bool:
+        """Whether the next chunk should be begun: s actions of the running one are carried out, or there is none."""
+        if self._flight is not None:
+            return False
+        return self._running is None or self._row >= self.execution_horizon
+
+    @property
+    def execution_horizon(self) -> int:
+        """s; 1 as long as neither it nor H is known."""
+        if self._s is not None:
+            return self._s
+        return 1 if self.horizon is None else max(1, self.horizon // 2)
+
+    @property
+    def in_flight(self) -> Request | None:
+        """The observation whose chunk isn't there yet."""
+        return None if self._flight is None else self._flight.request
+
+    @property
+    def waited(self) -> int:
+        """Control steps since the observation whose chunk isn't there yet; 0 without one."""
+        return 0 if self._flight is None else self._flight.delay
+
+    @property
+    def remaining(self) -> int:
+        """Actions that are left; after so many calls of `next_action` the robot has none, if no chunk comes."""
+        if self._running is None or (self.way.stands_still and self._flight is not None):
+            return 0
+        return len(self._running.actions) - self._row
+
+    @property
+    def oldest_useful(self) -> int:
+        """How many actions ago an observation may have been taken to be of use: not before the running chunk."""
+        if self._running is None or self.way.stands_still:
+            return 0
+        return self._row - self._entered
+
+    @property
+    def expected_delay(self) -> int:
+        """Control steps from an observation to its chunk, as the next request will expect them."""
+        return self._delay.steps
+
+    def check_horizon(self, horizon: int) -> None:
+        """Raise ConfigError if chunks of H actions don't fit the execution horizon and the delay. `arrive` does it."""
+        if self._s is not None and self._s > horizon:
+            raise ConfigError(
+                f"the execution horizon is {self._s}, but the policy's chunks have {horizon} actions: "
+                f"choose an execution horizon from 1 to {horizon}"
+            )
+        s = max(1, horizon // 2) if self._s is None else self._s
+        d = self._delay.steps
+        if self.way.mode is not None and self._fixed and d > min(s, horizon - s):
+            raise ConfigError(
+                f"a delay of {d} control steps doesn't fit an execution horizon of s = {s} and chunks of H = {horizon} "
+                f"actions: {self.way.name} needs delay ≤ s and delay ≤ H − s, so at most {min(s, horizon - s)} here "
+                f"(at most {horizon // 2} with s = {max(1, horizon // 2)}). Choose another execution horizon, "
+                "a lower control rate, or fewer denoising steps"
+            )
+
+    # --- the policy's side --------------------------------------------------------------------------------------------
+
+    def observe(self, ago: int = 0) -> Request:
+        """An observation was taken, `ago` actions before now (at most `oldest_useful`); its chunk is in flight now."""
+        if self._flight is not None:
+            raise RuntimeError(f"chunk {self._flight.request.number} is in flight: arrive() or fail() first")
+        if not 0 <= ago <= self.oldest_useful:
+            raise ValueError(f"the observation was taken {ago} actions ago; at most {self.oldest_useful} are useful")
+        previous = self._previous(ago)
+        request = Request(self._requests, self.steps - ago, previous, self.way.mode is not None)
+        self._requests += 1
+        self._flight = _Flight(request, ago, ago)
+        return request
+
+    def _previous(self, ago: int) -> RunningChunk | None:
+        """What is left of the running chunk at an observation, with the delay to expect, or None if nothing is."""
+        if self.way.mode is None or self._running is None:
+            return None
+        model_actions = self._running.model_actions
+        assert model_actions is not None
+        horizon, row = len(model_actions), self._row - ago
+        left_over = model_actions[row:]
+        if not len(left_over):
+            return None
+        s = max(self.execution_horizon, row)  # the new chunk's last s actions have nothing to follow
+        most = horizon - s
+        if self.way.holds and self._trained_max is not None:
+            most = min(most, self._trained_max)
+        expected = max(self._delay.steps, ago)
+        self.cut_delays += expected > most
+        return RunningChunk(
+            left_over=left_over.copy(),
+            delay=min(expected, most),
+            execution_horizon=s,
+            mode=self.way.mode,
+            anchor=self._running.anchor,
+            **self._guidance,
+        )
+
+    def arrive(self, result: Mapping[str, Any]) -> Reason | None:
+        """The chunk in flight is there: what `policy.infer` returned. None if it takes over, else why it is dropped.
+
+        Raises ConfigError if chunks of its length can't be run in this way at all (`check_horizon`).
+        """
+        flight = self._landed()
+        delay, entry = flight.delay, flight.carried_out
+        self._delay_measured(delay)
+        if flight.refused is not None:
+            return self._drop(flight.refused, "its observation belongs to what was interrupted")
+        chunk = self._read(flight.request.number, result)
+        if isinstance(chunk, str):
+            return self._drop("malformed", chunk)
+        horizon = len(chunk.actions)
+        self.horizon = horizon
+        self.check_horizon(horizon)
+        if not np.isfinite(chunk.actions).all() or not (
+            chunk.model_actions is None or np.isfinite(chunk.model_actions).all()
+        ):
+            return self._drop("not_finite", "a number in it is NaN or infinite")
+        if entry >= horizon:
+            return self._drop("used_up", f"{entry} actions were carried out since its observation; it has {horizon}")
+        previous = flight.request.previous
+        told = None if previous is None else previous.delay
+        if told is not None and entry > told:
+            if self.way.holds:
+                text = f"{entry} actions were carried out since its observation; the policy was told {told}"
+                return self._drop("late", text)
+            self.late += 1
+        next_of_running = self._next_of_running()
+        if self.way.averages and self._running is not None:
+            _mix(chunk.actions[entry:], self._running.actions[self._row :], self._old_weight)
+        if (moved := self._jumps(chunk.actions[entry:])) is not None:
+            return self._drop("jump", moved)
+        first = chunk.actions[entry]
+        if self._last is not None:
+            gap = None if next_of_running is None else first - next_of_running
+            self.seams.append(Seam(self.steps, chunk.number, delay, entry, told, first - self._last, gap))
+        self._running, self._row, self._entered = chunk, entry, entry
+        self.chunks += 1
+        return None
+
+    def fail(self, reason: Reason = "failed", text: str = "the policy gave no chunk") -> None:
+        """The chunk in flight will never be there."""
+        self._drop(self._landed().refused or reason, text)
+
+    def interrupt(self, reason: Reason) -> None:
+        """What is left of the running chunk, and the chunk in flight, belong to the past: drop both."""
+        if self.remaining:
+            self._drop(reason, f"{self.remaining} actions of the running chunk were left")
+        self._running = None
+        if self._flight is not None:
+            self._flight.refused = self._flight.refused or reason
+
+    def reset(self) -> None:
+        """A new episode begins: `interrupt("reset")`, and the last command is forgotten."""
+        self.interrupt("reset")
+        self._last = None
+
+    # --- the robot's side ---------------------------------------------------------------------------------------------
+
+    def next_action(self) -> Action | None:
+        """The action of this control step; None if there is none. Call it once in every control step, exactly."""
+        self.steps += 1
+        if self._flight is not None:
+            self._flight.delay += 1
+        if not self.remaining:
+            self.empty_steps += 1
+            return None
+        assert self._running is not None
+        row = self._row
+        self._row += 1
+        if self._flight is not None:
+            self._flight.carried_out += 1
+        self._last = self._running.actions[row]
+        return Action(self._last.copy(), self._running.number, row, row == self._entered)
+
+    # --- what happened ------------------------------------------------------------------------------------------------
+
+    def report(self) -> dict[str, Any]:
+        """Counts, delays and seams as plain values: a JSON document."""
+        jumps = [float(np.abs(seam.jump).max()) for seam in self.seams]
+        gaps = [float(np.abs(seam.gap).max()) for seam in self.seams if seam.gap is not None]
+        return {
+            "execution": self.way.name,
+            "execution_horizon": self.execution_horizon,
+            "action_horizon": self.horizon,
+            "steps": self.steps,
+            "empty_steps": self.empty_steps,
+            "chunks": self.chunks,
+            "dropped": dict(sorted(self.dropped.items())),
+            "late": self.late,
+            "cut_delays": self.cut_delays,
+            "expected_delay": self._delay.steps,
+            "delays": _summary([float(delay) for delay in self.delays]),
+            "seam_jumps": _summary(jumps),
+            "seam_gaps": _summary(gaps),
+            "last_problem": self.last_problem,
+        }
+
+    # --- inside -------------------------------------------------------------------------------------------------------
+
+    def _check_told_delay(self) -> None:
+        d = self._delay.steps
+        if self.way.holds and self._fixed and self._trained_max is not None and d > self._trained_max:
+            raise ConfigError(
+                f"the delay is {d} control steps, but this checkpoint was trained with delays up to "
+                f"{self._trained_max}: choose execution 'rtc', a lower control rate, or fewer denoising steps"
+            )
+
+    def _landed(self) -> _Flight:
+        if self._flight is None:
+            raise RuntimeError("no chunk is in flight: observe() first")
+        flight, self._flight = self._flight, None
+        return flight
+
+    def _delay_measured(self, delay: int) -> None:
+        self.delays.append(delay)
+        if not self._fixed:
+            self._delay.add(delay)
+
+    def _drop(self, reason: Reason, text: str) -> Reason:
+        self.dropped[reason] += 1
+        self.last_problem = f"{reason}: {text}"
+        return reason
+
+    def _next_of_running(self) -> np.ndarray | None:
+        """What the running chunk has for the next step."""
+        if self._running is None or self._row >= len(self._running.actions):
+            return None
+        return self._running.actions[self._row]
+
+    def _read(self, number: int, result: Mapping[str, Any]) -> _Chunk | str:
+        """The chunk of a policy's result, or what is wrong with it."""
+        actions = _numbers(result.get("actions"), np.float64)
+        if actions is None or actions.ndim != 2 or 0 in actions.shape:
+            return f'"actions" isn\'t an array of numbers [H, d] but {_shape(result.get("actions"))}'
+        if self._last is not None and actions.shape[1] != len(self._last):
+            return f"its actions have {actions.shape[1]} numbers each; those before had {len(self._last)}"
+        if self._max_jump is not None and self._max_jump.ndim == 1 and len(self._max_jump) != actions.shape[1]:
+            raise ConfigError(
+                f"max_jump has {len(self._max_jump)} numbers, but the policy's actions have {actions.shape[1]}"
+            )
+        if self.way.mode is None:
+            return _Chunk(number, actions, None, None)
+        if "model_actions" not in result:
+            return (
+                f'the policy\'s answer has no "model_actions", which {self.way.name} needs for the next chunk: '
+                "take a policy that offers it, or execution 'sync', 'async' or 'ensemble'"
+            )
+        model_actions = _numbers(result["model_actions"], np.float32)
+        if model_actions is None or model_actions.ndim != 2 or len(model_actions) != len(actions):
+            return f'"model_actions" isn\'t float32 [{len(actions)}, A] but {_shape(result["model_actions"])}'
+        anchor = result.get("anchor")
+        return _Chunk(number, actions, model_actions, None if anchor is None else np.array(anchor))
+
+    def _jumps(self, actions: np.ndarray) -> str | None:
+        """Which step of the actions moves the command too far, if one does."""
+        if self._max_jump is None:
+            return None
+        path = actions if self._last is None else np.concatenate((self._last[None], actions))
+        moves = np.abs(np.diff(path, axis=0))
+        beyond = np.argwhere(moves > self._max_jump)
+        if not len(beyond):
+            return None
+        step, dim = beyond[0]
+        limit = np.broadcast_to(self._max_jump, moves.shape[1])[dim]
+        where = "from the last command to its first action" if self._last is not None and step == 0 else "inside it"
+        return f"dimension {dim} moves by {moves[step, dim]:.4g} in one step, {where}; max_jump allows {limit:.4g}"
+
+
+def _horizon(s: int) -> int:
+    if isinstance(s, bool) or not isinstance(s, int | np.integer) or s < 1:
+        raise ConfigError(f"the execution horizon is {s!r}; it should be a whole number of actions, from 1 to H")
+    return int(s)
+
+
+def _jump(limit: float | np.ndarray) -> np.ndarray:
+    limits = _numbers(limit, np.float64)
+    if limits is None or limits.ndim > 1 or not (limits > 0).all():
+        raise ConfigError(f"max_jump is {limit!r}; it should be one number above 0, or one for each dimension")
+    return limits
+
+
+def _numbers(value: object, dtype: type[np.floating[Any]]) -> np.ndarray | None:
+    """`value` as an array of its own, if it is numbers."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        return None
+    return array.astype(dtype) if array.dtype.kind in "fiu" else None
+
+
+def _shape(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{list(value.shape)}"
+    return type(value).__name__
+
+
+def _mix(new: np.ndarray, old: np.ndarray, old_weight: float) -> None:
+    """Replace the rows of `new` that `old` has, too, by their weighted mean."""
+    n = min(len(new), len(old))
+    new[:n] = old_weight * old[:n] + (1 - old_weight) * new[:n]
+
+
+def _summary(values: list[float]) -> dict[str, float] | None:
+    if not values:
+        return None
+    return {
+        "count": len(values),
+        "mean": float(np.mean(values)),
+        "median": float(np.median(values)),
+        "p95": float(np.percentile(values, 95)),
+        "max": max(values),
+    }
