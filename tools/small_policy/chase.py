@@ -9,8 +9,9 @@ the frame's delay in training; with 0 all of the chunk is planned now.
 
 import csv
 import math
+import multiprocessing
 import time
-from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
 from turbopi.config import GemmaConfig, ModelConfig, PolicyConfig, VisionConfig
 from turbopi.model.reference import Pi0Model
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
-from turbopi.sim.chase import INSTRUCTION, MAX_STEPS, SPEED, Chase, cut
+from turbopi.sim.chase import BLOB, INSTRUCTION, MAX_STEPS, POST, SPEED, VIEWS, Chase, cut
 from turbopi.sim.chase_expert import choose_sides, keep_sides, plan
 
 HORIZON = 16
@@ -57,6 +58,7 @@ class Settings:
     out: Path
     seconds: float = 900.0
     seed: int = 0
+    workers: int = 1  # processes that make the demonstrations
     frames: int = 60_000
     batch: int = 128
     repeats: int = 3  # draws of noise and time for each frame
@@ -69,39 +71,48 @@ class Settings:
 
 
 @dataclass
-class Batch:
-    """pictures uint8[B, 2, px, px, 3], chunks float32[B, H, 2], delays int64[B], where float32[B, GUIDED]"""
-
-    pictures: Tensor
-    chunks: Tensor
-    delays: Tensor
-    where: Tensor
-
-
-@dataclass
 class Frames:
-    """N frames of demonstrations. Their pictures are drawn when they are used."""
+    """N frames of demonstrations, whose pictures are drawn when they are used."""
 
-    world: Chase
-    chunks: np.ndarray  # float32[N, H, 2]
-    delays: np.ndarray  # int64[N]
+    places: Tensor  # float32[N, 3, 2]  of the target, of where it was, of the tip
+    chunks: Tensor  # float32[N, H, 2]
+    delays: Tensor  # int64[N]
 
     def __len__(self) -> int:
         return len(self.chunks)
 
-    def batch(self, rows: np.ndarray, px: int, rng: np.random.Generator) -> Batch:
-        """These frames, each turned around the post and perhaps mirrored: it looks the same from everywhere."""
-        turns, mirror = rng.uniform(0, 2 * np.pi, len(rows)), np.where(rng.uniform(size=len(rows)) < 0.5, 1.0, -1.0)
-        cos, sin = np.cos(turns), np.sin(turns)
-        change = np.stack((np.stack((cos, -sin * mirror), -1), np.stack((sin, cos * mirror), -1)), -2)  # [B, 2, 2]
-        world = rows_of(self.world, rows)
-        world.tip = np.einsum("bij,bj->bi", change, world.tip)
-        world.before = np.einsum("bij,bkj->bki", change, world.before)
-        world.angle, world.pace = turns + mirror * world.angle, mirror * world.pace
-        chunks = np.einsum("bij,bkj->bki", change, self.chunks[rows]).astype(np.float32)
-        where = np.concatenate((world.target, world.before[:, 0], world.tip, 2 * (world.target - world.tip)), axis=1)
-        parts = (world.draw(px), chunks, self.delays[rows], where.astype(np.float32))
-        return Batch(*map(torch.from_numpy, parts))
+    def to(self, device: torch.device) -> "Frames":
+        return Frames(self.places.to(device), self.chunks.to(device), self.delays.to(device))
+
+    def draw(self, number: int) -> "Frames":
+        """As many of them, each turned around the post and perhaps mirrored: it looks the same from everywhere."""
+        device = self.places.device
+        rows = torch.randint(len(self), (number,), device=device)
+        turns = 2 * math.pi * torch.rand(number, device=device)
+        mirror = torch.where(torch.rand(number, device=device) < 0.5, 1.0, -1.0)
+        cos, sin = turns.cos(), turns.sin()
+        change = torch.stack((torch.stack((cos, sin), -1), torch.stack((-sin * mirror, cos * mirror), -1)), -2)
+        return Frames(self.places[rows] @ change, self.chunks[rows] @ change, self.delays[rows])
+
+    def pictures(self, px: int) -> Tensor:
+        """float32[N, 2, px, px, 3] in [-1, 1]: as `Chase.draw`, but for the rounding."""
+        tip = self.places[:, 2]
+        return torch.stack((self._view(torch.zeros_like(tip), VIEWS[0], px), self._view(tip, VIEWS[1], px)), dim=1)
+
+    def _view(self, centre: Tensor, half_width: float, px: int) -> Tensor:
+        axis = ((torch.arange(px, device=centre.device) + 0.5) / px * 2 - 1) * half_width
+        at = self.places - centre[:, None]
+        across = (-(((axis - at[..., :1]) / BLOB) ** 2) / 2).exp()
+        down = (-(((axis + at[..., 1:]) / BLOB) ** 2) / 2).exp()
+        blobs = torch.einsum("bcy,bcx->byxc", down, across)
+        x, y = axis + centre[:, :1], axis - centre[:, 1:]
+        post = x[:, None, :] ** 2 + y[:, :, None] ** 2 < POST**2
+        return (blobs * 215 + 40 * post[..., None]) / 255 * 2 - 1
+
+    def guided(self) -> Tensor:
+        """float32[N, GUIDED]"""
+        target, _, tip = self.places.unbind(1)
+        return torch.cat((self.places.flatten(1), 2 * (target - tip)), dim=1)
 
 
 def rows_of(world: Chase, rows: np.ndarray) -> Chase:
@@ -109,22 +120,21 @@ def rows_of(world: Chase, rows: np.ndarray) -> Chase:
     return Chase(**arrays, time=world.time)
 
 
-def demonstrations(number: int, seed: int, at_once: int = 500) -> Frames:
-    """Frames of episodes, none of which is one of the simulator's own."""
-    parts, count = [], 0
-    while count < number:
-        for part in _play(at_once, seed + count):
-            parts.append(part)
-            count += len(part)
-    names = [item.name for item in fields(Chase) if item.name not in ("time", "surprise")]
-    arrays = {name: np.concatenate([getattr(part.world, name) for part in parts])[:number] for name in names}
-    world = Chase(**arrays, surprise=np.zeros((number, 0)))
-    chunks, delays = (np.concatenate([getattr(part, name) for part in parts])[:number] for name in ("chunks", "delays"))
-    return Frames(world, chunks, delays)
+def demonstrations(number: int, seed: int, workers: int = 1, at_once: int = 250) -> Frames:
+    """Frames of episodes, none of which is one of the simulator's own. Of each frame the target's place comes first."""
+    rounds = math.ceil(number / (at_once * MAX_STEPS))
+    jobs = [(at_once, seed + part) for part in range(rounds)]
+    if workers > 1:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+            played = list(pool.map(_play, *zip(*jobs, strict=True)))
+    else:
+        played = [_play(*job) for job in jobs]
+    places, chunks, delays = (np.concatenate(column)[:number] for column in zip(*played, strict=True))
+    return Frames(torch.from_numpy(places), torch.from_numpy(chunks), torch.from_numpy(delays))
 
 
-def _play(number: int, seed: int) -> Iterator[Frames]:
-    """Every step of `number` episodes at once, each with a delay and an execution horizon of its own."""
+def _play(number: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`Frames`' arrays: every step of `number` episodes at once, each with a delay and an execution horizon of its own."""
     rng = np.random.default_rng([2**40, seed])  # the simulator's own episodes have seeds of 32 bits
     world = Chase.start([np.random.default_rng([2**40, seed, row]) for row in range(number)])
     everyone = np.arange(number)
@@ -134,12 +144,12 @@ def _play(number: int, seed: int) -> Iterator[Frames]:
     sides = choose_sides(world, rng)
     running = plan(world, HORIZON + MOST_DELAY, sides)  # [N, more than is ever used, 2]: what is on its way
     since = rng.integers(0, every)
+    frames = []
     for _ in range(MAX_STEPS):
         ahead = np.minimum(rng.integers(0, MOST_DELAY + 1, number), MOST_DELAY)
         ahead[rng.uniform(size=number) < 0.25] = 0
         chunks, _ = _continued(world, running, ahead, sides, rng)
-        arrays = {item.name: getattr(world, item.name) for item in fields(Chase)}
-        yield Frames(Chase(**arrays | {"surprise": np.zeros((number, 0))}), chunks.astype(np.float32), ahead)
+        frames.append((np.stack((world.target, world.before[:, 0], world.tip), axis=1), chunks, ahead))
         asked = since >= every
         if asked.any():
             rows = np.flatnonzero(asked)
@@ -151,6 +161,8 @@ def _play(number: int, seed: int) -> Iterator[Frames]:
         _revive(world, rng)
         running = np.concatenate((running[:, 1:], running[:, -1:]), axis=1)
         since += 1
+    places, chunks, ahead = (np.concatenate(column) for column in zip(*frames, strict=True))
+    return places.astype(np.float32), chunks.astype(np.float32), ahead
 
 
 def _continued(
@@ -188,7 +200,9 @@ class Trainer:
     def __init__(self, settings: Settings) -> None:
         self.settings, self.device = settings, torch.device(settings.device)
         torch.manual_seed(settings.seed)
-        self.model = fresh_model(CONFIG.model, settings.seed).to(self.device)
+        self.model = fresh_model(CONFIG.model, settings.seed)
+        _see_dots(self.model)
+        self.model.to(self.device)
         self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
         self.guide = Guide(CONFIG.model.vlm.width, GUIDED, 1, queries=3).to(self.device)
         self._parameters = [*self.model.parameters(), *self.guide.parameters()]
@@ -197,7 +211,7 @@ class Trainer:
         self._weights = WEIGHTS.to(self.device)
         self.tokens, self.mask = (tensor.to(self.device) for tensor in prompt())
 
-    def step(self, batch: Batch, progress: float) -> tuple[float, float]:
+    def step(self, batch: Frames, progress: float) -> tuple[float, float]:
         """The losses: of the flow, and of the guide."""
         settings = self.settings
         rate = settings.learning_rate * min(1.0, (self.steps + 1) / settings.warmup_steps)
@@ -225,18 +239,26 @@ class Trainer:
         self.average = content["average"]
         self.steps = self.settings.warmup_steps
 
-    def losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        rows, repeats = len(batch.pictures), self.settings.repeats
+    def losses(self, batch: Frames) -> tuple[Tensor, Tensor]:
+        rows, repeats = len(batch), self.settings.repeats
         padded = torch.nn.functional.pad(batch.chunks, (0, CONFIG.model.action_dim - batch.chunks.shape[-1]))
-        actions = padded.to(self.device).repeat_interleave(repeats, 0)
-        held = held_actions(batch.delays.to(self.device).repeat_interleave(repeats, 0), HORIZON)
+        actions = padded.repeat_interleave(repeats, 0)
+        held = held_actions(batch.delays.repeat_interleave(repeats, 0), HORIZON)
         noise, t = torch.randn_like(actions), draw_times(len(actions), self.device)
         tokens, mask = self.tokens.expand(rows, -1), self.mask.expand(rows, -1)
-        x = mixed(actions, noise, t, held)
-        predicted, hidden = velocity(self.model, batch.pictures.to(self.device), tokens, mask, x, t, held=held)
+        x, pictures = mixed(actions, noise, t, held), batch.pictures(CONFIG.model.vision.image_size)
+        predicted, hidden = velocity(self.model, pictures, tokens, mask, x, t, held=held)
         guessed, _ = self.guide(hidden, mask)
-        guide = torch.nn.functional.smooth_l1_loss(guessed, batch.where.to(self.device), beta=0.1)
+        guide = torch.nn.functional.smooth_l1_loss(guessed, batch.guided(), beta=0.1)
         return flow_loss(predicted, noise - actions, self._weights, held), guide
+
+
+def _see_dots(model: Pi0Model) -> None:
+    """Pictures are mostly dark, with small dots: begin with patches that see nothing in the dark, and dots well."""
+    with torch.no_grad():
+        patches = model.vision.patch_embedding
+        patches.weight.mul_(5)
+        patches.bias.copy_(patches.weight.sum(dim=(1, 2, 3)))  # black is -1
 
 
 def prompt() -> tuple[Tensor, Tensor]:
@@ -290,24 +312,25 @@ def train(settings: Settings) -> None:
     """Writes checkpoint/ and curves.csv into `settings.out`."""
     settings.out.mkdir(parents=True, exist_ok=True)
     begun = time.monotonic()
-    frames = demonstrations(settings.frames, settings.seed)
+    frames = demonstrations(settings.frames, settings.seed, settings.workers)
     print(f"{len(frames)} frames in {time.monotonic() - begun:.0f} s", flush=True)
-    trainer, rng = Trainer(settings), np.random.default_rng(settings.seed)
+    trainer = Trainer(settings)
+    frames = frames.to(trainer.device)
     if settings.resume is not None:
         trainer.load(settings.resume)
     started = watched = time.monotonic()
     rows: list[dict[str, float]] = []
     losses: list[tuple[float, float]] = []
     while (progress := min(1.0, (time.monotonic() - started) / settings.seconds)) < 1:
-        chosen = rng.integers(0, len(frames), settings.batch)
-        losses.append(trainer.step(frames.batch(chosen, CONFIG.model.vision.image_size, rng), progress))
+        losses.append(trainer.step(frames.draw(settings.batch), progress))
         if time.monotonic() - watched > settings.watch_every:
             watched = time.monotonic()
             trainer.save(settings.out / "state.pt")
             rows.append(_told(trainer, losses, watched - started))
             losses.clear()
     trainer.save(settings.out / "state.pt")
-    rows.append(_told(trainer, losses, time.monotonic() - started))
+    if losses:
+        rows.append(_told(trainer, losses, time.monotonic() - started))
     with (settings.out / "curves.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()

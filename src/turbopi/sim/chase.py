@@ -33,7 +33,8 @@ TRAIL = 3
 MAX_STEPS = 60
 NUM_INITIAL_STATES = 1000
 INSTRUCTION = "catch the runner"
-BLOB = 0.07  # width of what is drawn, standard deviation
+VIEWS = (1.0, 0.4)  # half the width of what the cameras see
+BLOB = 0.09  # width of what is drawn, standard deviation
 _DRAWN = 4096  # random numbers of an episode; they begin again after that
 
 
@@ -88,7 +89,7 @@ class Chase:
     def draw(self, px: int) -> np.ndarray:
         """uint8[N, 2, px, px, 3]: the table, and the part around the tip."""
         centre = np.zeros_like(self.tip)
-        views = [self._view(centre, 1.0, px), self._view(self.tip, 0.4, px)]
+        views = [self._view(centre, VIEWS[0], px), self._view(self.tip, VIEWS[1], px)]
         return np.stack(views, axis=1)
 
     def _view(self, centre: np.ndarray, half_width: float, px: int) -> np.ndarray:
