@@ -115,6 +115,27 @@ def test_no_warmup_hides_the_policys_warmup_from_the_server(monkeypatch: Any) ->
     assert (served["host"], served["port"], served["api_key"], served["record_dir"]) == ("127.0.0.1", 0, None, None)
 
 
+def test_what_a_server_is_to_join_reaches_it(monkeypatch: Any) -> None:
+    served: dict[str, Any] = {}
+    monkeypatch.setattr(
+        "turbopi.serve.run", lambda policy, options, **_: served.update(policy=policy, **asdict(options))
+    )
+    asked = ["--execution", "rtc_identity", "--control-hz", 50, "--execution-horizon", 6, "--delay-steps", 2]
+    result = turbopi("serve", *TINY, "--port", 0, "--no-warmup", *asked)
+    assert result.exit_code == 0, result.output
+    names = ("execution", "control_hz", "execution_horizon", "delay_steps")
+    assert [served[name] for name in names] == ["rtc_identity", 50.0, 6, 2]
+    policy = served["policy"]
+    answer = policy.infer(policy._policy.example_observation(), previous=None, model_actions=True)
+    assert "model_actions" in answer
+
+
+def test_a_mode_that_the_checkpoint_was_not_trained_for_is_one_line() -> None:
+    result = turbopi("serve", *TINY, "--port", 0, "--execution", "rtc_trained", "--control-hz", 50)
+    assert result.exit_code == 2
+    assert "execution is 'rtc_trained', which this policy can't: it offers ['rtc', " in result.stderr
+
+
 def test_strict_reaches_the_policy_and_needs_a_warm_up(monkeypatch: Any) -> None:
     served: dict[str, Any] = {}
     monkeypatch.setattr("turbopi.serve.run", lambda policy, options, **_: served.update(policy=policy))
@@ -157,6 +178,9 @@ def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
         (["--api-key", "a b"], "the API key must be printable ASCII without spaces"),
         (["--max-message-mb", "0"], "max_message_mb must be more than 0"),
         (["--record", __file__], "is a file"),
+        (["--execution", "async", "--control-hz", "50"], "execution is 'async'; a server joins chunks by rtc"),
+        (["--execution", "rtc"], "needs the robots' control rate"),
+        (["--control-hz", "0"], "control_hz must be more than 0"),
     ],
 )
 def test_bad_options_are_refused_before_weights_are_loaded(options: list[str], message: str) -> None:

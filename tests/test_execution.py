@@ -197,11 +197,11 @@ def test_a_trained_checkpoint_whose_delays_are_all_too_long_goes_on_from_standst
 def test_a_chunk_that_comes_after_its_last_action_is_dropped() -> None:
     queue, line = ChunkQueue("async", execution_horizon=1), Line(4)
     run(queue, line, [0], 1)
-    short = {"actions": line.answer(queue.observe())["actions"][:2]}
+    result = line.answer(queue.observe(ago=1))
     for _ in range(3):
         queue.next_action()
-    assert queue.arrive(short) == "used_up"
-    assert "3 actions were carried out" in queue.last_problem
+    assert queue.arrive(result) == "used_up"
+    assert "4 actions were carried out" in queue.last_problem
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,8 @@ def test_a_chunk_that_comes_after_its_last_action_is_dropped() -> None:
         ({"actions": np.zeros((0, 1))}, "malformed", "[0, 1]"),
         ({"actions": np.zeros(4)}, "malformed", "float64[4]"),
         ({"actions": [[1.0], [1.0, 2.0]]}, "malformed", "list"),
-        ({"actions": np.zeros((4, 2))}, "malformed", "2 numbers each; those before had 1"),
+        ({"actions": np.zeros((4, 2))}, "malformed", "shape [4, 2]; those before had [4, 1]"),
+        ({"actions": np.zeros((5, 1))}, "malformed", "shape [5, 1]; those before had [4, 1]"),
     ],
 )
 def test_what_is_no_chunk_is_refused_and_the_running_one_goes_on(

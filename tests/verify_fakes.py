@@ -21,8 +21,8 @@ class Correct(PyTorchBackend):
 
     name: ClassVar[str] = "faulty"
 
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
-        trace = super().intermediates(observation, noise, num_steps)
+    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int, **options: Any) -> Trace:
+        trace = super().intermediates(observation, noise, num_steps, **options)
         return {name: trace[name] for name in ("kv_k", "kv_v", "x_t", "v_t", "actions")}
 
 
@@ -54,8 +54,8 @@ class EarlySuffix(Correct):
 class WrongTrace(Correct):
     """What it shows of one layer's keys is wrong, and what it does with them right."""
 
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
-        trace = super().intermediates(observation, noise, num_steps)
+    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int, **options: Any) -> Trace:
+        trace = super().intermediates(observation, noise, num_steps, **options)
         trace["kv_k"][FAULTY_LAYER] *= 2
         return trace
 
@@ -63,14 +63,14 @@ class WrongTrace(Correct):
 class NotFinite(Correct):
     """A velocity isn't finite."""
 
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
-        trace = super().intermediates(observation, noise, num_steps)
+    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int, **options: Any) -> Trace:
+        trace = super().intermediates(observation, noise, num_steps, **options)
         trace["v_t"][FAULTY_STEP, 0, 3, 4] = float("nan")
         trace["x_t"][FAULTY_STEP + 1, 0, 3, 4] = float("nan")
         return trace
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
-        actions = super().sample(observation, noise, num_steps).actions
+    def sample(self, observation: Observation, noise: Tensor, num_steps: int, **options: Any) -> Sample:
+        actions = super().sample(observation, noise, num_steps, **options).actions
         actions[0, 3, 4] = float("nan")
         return Sample(actions)
 
@@ -78,22 +78,22 @@ class NotFinite(Correct):
 class Unsteady(Correct):
     """Its last bits change from call to call."""
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
-        actions = super().sample(observation, noise, num_steps).actions
+    def sample(self, observation: Observation, noise: Tensor, num_steps: int, **options: Any) -> Sample:
+        actions = super().sample(observation, noise, num_steps, **options).actions
         return Sample(actions + 1e-6 * torch.rand_like(actions))
 
 
 class FastPathDiffers(Correct):
     """What a policy calls isn't what is shown when the backend is judged."""
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
-        return Sample(super().sample(observation, noise, num_steps).actions * 1.1)
+    def sample(self, observation: Observation, noise: Tensor, num_steps: int, **options: Any) -> Sample:
+        return Sample(super().sample(observation, noise, num_steps, **options).actions * 1.1)
 
 
 class Secretive(Correct):
     """It doesn't show what the protocol demands."""
 
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
-        trace = super().intermediates(observation, noise, num_steps)
+    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int, **options: Any) -> Trace:
+        trace = super().intermediates(observation, noise, num_steps, **options)
         del trace["v_t"]
         return trace

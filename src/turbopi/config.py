@@ -38,6 +38,7 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
 
 
 ImageResize = Literal["openpi", "lerobot", "lerobot_0.4"]  # how, see preprocess/images.py
+Schedule = Literal["exponential", "linear", "ones", "zeros"]  # of guidance's weights: model/conditioning.py
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,29 @@ class Normalization:
 
 
 @dataclass(frozen=True)
+class RealTime:
+    """Real-time execution (docs/real_time.md): how weights were trained, and what a call's `previous` leaves out."""
+
+    trained_max_delay: int = 0  # control steps of delay that training simulated (arXiv 2512.05964); 0: it didn't
+    execution_horizon: int | None = None  # s, as `RunningChunk`'s
+    schedule: Schedule = "exponential"
+    max_guidance_weight: float = 5.0  # β of arXiv 2506.07339, which evaluates with 5
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for what can't be."""
+        limit = LIMITS["action_horizon"]
+        if not (is_integer(self.trained_max_delay) and 0 <= self.trained_max_delay < limit):
+            raise ConfigError(f"trained_max_delay is {shown(self.trained_max_delay)}; expected 0 to {limit - 1}")
+        s = self.execution_horizon
+        if s is not None and not (is_integer(s) and 1 <= s <= limit):
+            raise ConfigError(f"execution_horizon is {shown(s)}; expected a whole number from 1 to {limit}, or null")
+        if self.schedule not in get_args(Schedule):
+            raise ConfigError(f"schedule is {shown(self.schedule)}; expected one of {', '.join(get_args(Schedule))}")
+        if not (is_finite(self.max_guidance_weight) and 0 <= self.max_guidance_weight <= 1e6):
+            raise ConfigError(f"max_guidance_weight is {shown(self.max_guidance_weight)}; expected 0 to 1e6")
+
+
+@dataclass(frozen=True)
 class PolicyConfig:
     """A model and its robot: everything `UnifiedPolicy` needs besides weights, statistics and a tokenizer."""
 
@@ -143,6 +167,7 @@ class PolicyConfig:
     prompt_state_dim: int | None = None  # zeros fill the state up to it in the prompt, as in LeRobot 0.4; None: nothing
     prompt_as_is: bool = False  # without a state, blanks, underscores and newlines stay in the prompt: LeRobot's Pi0
     num_denoising_steps: int = 10  # unless whoever runs the policy says otherwise
+    real_time: RealTime = RealTime()
 
     def with_model(self, **changes: Any) -> "PolicyConfig":
         """The same policy with some of its model's fields replaced."""

@@ -11,6 +11,9 @@
     │   └── DeviceLost         the GPU failed under it: no later call of this process can work
     ├── ActionError            the model computed actions that no robot may be given: NaN, infinite
     ├── OutputError            a file that can't be written: a full disk, no permission        (also an OSError)
+    ├── client.ServerLost                  the policy server can't be reached, went away or took too long
+    ├── client.ServerRefused               it answered with something else than actions
+    ├── realtime.OutOfActions              the policy is late and the robot has no action left
     ├── sim.base.SimulatorUnavailable      a simulator isn't installed or can't draw
     ├── evaluate.sources.PolicyLost        a policy server went away; the run can be continued
     ├── evaluate.sources.PolicyRefused     a policy doesn't fit the simulator

@@ -1,5 +1,6 @@
 """The whole policy on one screen: preprocess → backend → postprocess."""
 
+import dataclasses
 import logging
 import threading
 import time
@@ -25,15 +26,17 @@ from turbopi.backends import Precision
 from turbopi.backends.lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.calibration import for_policy
-from turbopi.config import PolicyConfig
+from turbopi.config import ModelConfig, PolicyConfig
 from turbopi.engine.recent import Loop
 from turbopi.errors import ActionError, ConfigError, ObservationError
+from turbopi.model.conditioning import Conditioning, Form, Guidance
 from turbopi.model.reference import FloatPrecision
 from turbopi.observation import ModelInputs, Observation, with_cameras
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.quantization.artifact import Quantization
 from turbopi.robots import Robot
+from turbopi.running_chunk import FORMS, JoinMode, RunningChunk
 
 logger = logging.getLogger(__name__)
 
@@ -134,6 +137,9 @@ class UnifiedPolicy:
         seed: int | None = None,
         num_steps: int | None = None,
         horizon: int | None = None,
+        conditioning: Conditioning | None = None,
+        previous: RunningChunk | None = None,
+        model_actions: bool = False,
     ) -> dict[str, Any]:
         """One observation to one action chunk.
 
@@ -146,6 +152,11 @@ class UnifiedPolicy:
             horizon: actions of the chunk, H, for this call alone. None: the config's, which the weights were trained
                 for and openpi has no other than. All actions of a chunk attend to each other, so a shorter chunk isn't
                 the beginning of a longer one. Backends with engines for one horizon refuse another.
+            previous: the chunk that the robot is carrying out, which this one is to join (docs/real_time.md). What can
+                be asked for is in `metadata["real_time"]`.
+            conditioning: instead of `previous`, what exactly the denoising loop is to do (model/conditioning.py). One
+                with token times brings its number of steps.
+            model_actions: also return what a later call's `previous` needs, see below.
 
         Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
 
@@ -159,11 +170,14 @@ class UnifiedPolicy:
             postprocess_ms   un-normalising and the robot's own outputs
             total_ms         preprocess_ms + queue_ms + infer_ms + postprocess_ms: the whole call
 
+        With `model_actions` also "model_actions": float32[H, action_dim], in the model's normalised space, and if the
+        policy's actions are relative to the state "anchor": float64[d], that state in their units.
+
         Raises ObservationError for anything wrong with the arguments, naming it; ActionError if an action is NaN or
         infinite; DeviceLost once the GPU has failed for good (`lost`).
         """
         noises = None if noise is None else [noise]
-        return self.infer_batch([obs], noise=noises, seed=seed, num_steps=num_steps, horizon=horizon)[0]
+        return self._infer([obs], noises, seed, num_steps, horizon, conditioning, previous, model_actions)[0]
 
     def infer_batch(
         self,
@@ -179,11 +193,28 @@ class UnifiedPolicy:
         `noise` is [B, H, action_dim]; `seed` one number for the batch's first row, the next row taking the next
         number, or one for each row.
         """
+        return self._infer(observations, noise, seed, num_steps, horizon)
+
+    def _infer(
+        self,
+        observations: Sequence[Mapping[str, Any]],
+        noise: Sequence[np.ndarray] | np.ndarray | None,
+        seed: int | Sequence[int] | None,
+        num_steps: int | None,
+        horizon: int | None,
+        conditioning: Conditioning | None = None,
+        previous: RunningChunk | None = None,
+        model_actions: bool = False,
+    ) -> list[dict[str, Any]]:
+        """`infer_batch`; the last three are for one observation."""
         start = time.perf_counter()
         self._guard.refuse_if_lost()
         if not observations:
             raise ObservationError("infer_batch was given no observation")
+        if num_steps is None and conditioning is not None and conditioning.tokens is not None:
+            num_steps = len(conditioning.tokens.times)
         steps, actions = self._loop(num_steps, horizon)
+        conditioning, chunk = self._asked(conditioning, previous, steps, actions)
         if len(observations) == 1 and isinstance(self.backend, backends.Begins):
             seen = self._pipeline.see(observations[0], resize=False)
             asked = time.perf_counter()
@@ -192,7 +223,8 @@ class UnifiedPolicy:
                 begun = self.backend.begin(seen.pictures, self._pipeline.config.image_resize)
                 self._pipeline.read(seen)  # while the device is at the pictures
                 x_1 = self._noise(1, actions, noise, seed)[0]
-                sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps)
+                asked_for = self._conditioning(conditioning, chunk, seen.state, steps, actions)
+                sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps, **asked_for)
                 infer_end = time.perf_counter()
             states = [seen.state]
         else:
@@ -200,13 +232,18 @@ class UnifiedPolicy:
             inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
             states = [state for _, state in prepared]
             noises = torch.from_numpy(self._noise(len(observations), actions, noise, seed))
+            asked_for = self._conditioning(conditioning, chunk, states[0], steps, actions)
             asked = time.perf_counter()
             with self._lock, self._guard:
                 infer_start = time.perf_counter()
-                sample = self.backend.sample(inputs, noises, steps)
+                sample = self.backend.sample(inputs, noises, steps, **asked_for)
                 infer_end = time.perf_counter()
 
         results = self._results(sample, states)
+        if model_actions:
+            results[0]["model_actions"] = sample.actions[0].numpy().copy()
+            if (anchor := self._pipeline.anchor(states[0])) is not None:
+                results[0]["anchor"] = anchor
         timing = _timing(sample, start, asked, infer_start, infer_end, time.perf_counter())
         return [result | {"policy_timing": dict(timing)} for result in results]
 
@@ -262,7 +299,15 @@ class UnifiedPolicy:
         running.add_done_callback(finish)
         return answer
 
-    def warmup(self, *, cameras: Numbers = None, horizons: Numbers = None, steps: Numbers = None) -> float:
+    def warmup(
+        self,
+        *,
+        cameras: Numbers = None,
+        horizons: Numbers = None,
+        steps: Numbers = None,
+        real_time: JoinMode | Sequence[JoinMode] = (),
+        conditioning: Sequence[Conditioning] = (),
+    ) -> float:
         """Make the first real call as fast as later ones: compile, allocate, capture. Returns the seconds it took.
 
         Every prompt length is covered, for all combinations of:
@@ -272,6 +317,10 @@ class UnifiedPolicy:
                         built yet, but for the example observation's
             horizons    action horizons, see `infer`. None: the config's
             steps       numbers of denoising steps. None: the policy's
+            real_time   modes of `RunningChunk` that calls will have, besides calls without one
+            conditioning
+                        examples of other conditionings that they will have, each for its own steps and horizon alone:
+                        of a conditioning the form and the times count, not what is held or pulls
 
         each a number or several. What earlier warm-ups covered stays covered, as far as backends keep it: loops of
         engine/recent.py's number, the least recently used ones go. Raises ConfigError for what can't be, and for more
@@ -288,9 +337,11 @@ class UnifiedPolicy:
             several("steps", steps, [self._num_steps], checked_steps),
             several("horizons", horizons, [self.config.model.action_horizon], self._checked_horizon),
         )
-        plan = [(count, *loop) for count in counts for loop in loops]
+        asked: list[tuple[int, int, Conditioning | None]] = [(*loop, None) for loop in loops]
+        asked += self._conditioned_loops(loops, real_time, conditioning)
+        plan = [(count, *one) for count in counts for one in asked]
         with self._lock, self._guard:
-            for i, (count, num_steps, horizon) in enumerate(plan):
+            for i, (count, num_steps, horizon, one) in enumerate(plan):
                 seen = inputs if count == own else with_cameras(inputs, count)
                 self.backend.warmup(
                     Observation.stack([seen]),
@@ -298,10 +349,34 @@ class UnifiedPolicy:
                     horizon,
                     required=cameras is not None or count == own,
                     last=i + 1 == len(plan),
+                    **({} if one is None else {"conditioning": one}),
                 )
         if own in counts:
             self._whole_call(example, *loops[0])
         return time.perf_counter() - start
+
+    def _conditioned_loops(
+        self, loops: Sequence[Loop], real_time: JoinMode | Sequence[JoinMode], others: Sequence[Conditioning]
+    ) -> list[tuple[int, int, Conditioning | None]]:
+        """Steps, horizon and an example of every conditioned loop that a warm-up is to cover. Raises ConfigError."""
+        modes: Sequence[Any] = [real_time] if isinstance(real_time, str) else real_time
+        asked: list[tuple[int, int, Conditioning | None]] = []
+        for mode in modes:
+            if mode not in self._modes:
+                raise ConfigError(
+                    f"warm-up was asked for real-time mode {mode!r}; this policy has {', '.join(self._modes) or 'none'}"
+                )
+            form = FORMS[mode]
+            asked += [(*loop, _example(form, *loop, self.config.model)) for loop in loops]
+        for one in others:
+            num_steps, horizon = one.size(self._num_steps, self.config.model.action_horizon)
+            try:
+                one.check(num_steps, horizon, self.config.model.action_dim)
+                self._check_form(one.form)
+            except ObservationError as error:
+                raise ConfigError(f"warm-up: {error}") from None
+            asked.append((num_steps, horizon, one))
+        return asked
 
     def _whole_call(self, example: Mapping[str, Any], num_steps: int, horizon: int) -> None:
         try:
@@ -356,9 +431,56 @@ class UnifiedPolicy:
             "random_weights": self._checkpoint.format == "random",
             "tokenizer": self._pipeline.tokenizer.source,
             "torch": torch.__version__,
+            "real_time": {"modes": list(self._modes), **dataclasses.asdict(self.config.real_time)},
             **self._loading,
             **self._pipeline.metadata,
         }
+
+    @property
+    def _modes(self) -> tuple[JoinMode, ...]:
+        """What `RunningChunk`s may ask of this policy."""
+        able = backends.forms(self.backend)
+        trained = self.config.real_time.trained_max_delay > 0
+        return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
+
+    def _check_form(self, form: Form) -> None:
+        if form != "plain" and form not in backends.forms(self.backend):
+            what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
+            raise ObservationError(
+                f"backend {self.backend.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
+                "leave out conditioning and previous"
+            )
+
+    def _asked(
+        self, conditioning: Conditioning | None, previous: RunningChunk | None, steps: int, horizon: int
+    ) -> tuple[Conditioning | None, RunningChunk | None]:
+        """What a call is to join, checked. Raises ObservationError."""
+        model = self.config.model
+        if conditioning is not None and previous is not None:
+            raise ObservationError("conditioning and previous were both given; give one of them")
+        if conditioning is not None:
+            conditioning.check(steps, horizon, model.action_dim)
+            self._check_form(conditioning.form)
+        if previous is not None:
+            relative = self._pipeline.robot.delta_mask is not None
+            previous = previous.completed(horizon, model.action_dim, relative=relative, options=self.config.real_time)
+            self._check_form(FORMS[previous.mode])
+        return conditioning, previous
+
+    def _conditioning(
+        self,
+        conditioning: Conditioning | None,
+        chunk: RunningChunk | None,
+        state: np.ndarray,
+        steps: int,
+        horizon: int,
+    ) -> dict[str, Conditioning]:
+        """The backend's argument, once the new state is known; {} for an ordinary call."""
+        if chunk is not None:
+            left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
+            conditioning = chunk.conditioning(left_over, steps, horizon, self.config.model.time_grid)
+        plain = conditioning is None or conditioning.form == "plain"
+        return {} if conditioning is None or plain else {"conditioning": conditioning}
 
     def _results(self, sample: backends.Sample, states: Sequence[np.ndarray]) -> list[dict[str, Any]]:
         """The robot's actions of each row. An ActionError names the row, if there are several."""
@@ -397,6 +519,18 @@ class UnifiedPolicy:
     ) -> np.ndarray:
         """float32[B, H, action_dim], given or drawn."""
         return noise_for((batch, horizon, self.config.model.action_dim), noise, seed, self._generator)
+
+
+def _example(form: Form, num_steps: int, horizon: int, model: ModelConfig) -> Conditioning:
+    """A conditioning of a form, for a warm-up."""
+    if form == "tokens":
+        return Conditioning(held=np.arange(horizon) < 1, values=np.zeros((horizon, model.action_dim), np.float32))
+    nothing = Guidance(
+        np.zeros((horizon, model.action_dim), np.float32),
+        np.zeros(horizon, np.float32),
+        np.zeros((num_steps, horizon), np.float32),
+    )
+    return Conditioning(guidance=nothing)
 
 
 def _timing(

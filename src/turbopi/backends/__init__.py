@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi.backends.base import Backend, Begins, Begun, LoadState, Precision, RunsFp8, Sample, Submits
+from turbopi.backends.base import Backend, Begins, Begun, Conditions, LoadState, Precision, RunsFp8, Sample, Submits
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.model.conditioning import Form
 from turbopi.quantization.artifact import Quantization
 from turbopi.quantization.plan import TIERS
 
@@ -21,6 +22,7 @@ __all__ = [
     "Backend",
     "Begins",
     "Begun",
+    "Conditions",
     "LoadState",
     "Precision",
     "RunsFp8",
@@ -29,6 +31,7 @@ __all__ = [
     "availability",
     "choose",
     "create",
+    "forms",
     "resolve_device",
 ]
 
@@ -189,6 +192,11 @@ def create(
     more = {} if quantization is None else {"quantization": quantization}
     with preparing(device):
         return _backend_class(name)(config, load, device=device, precision=precision, **more)
+
+
+def forms(backend: Backend) -> tuple[Form, ...]:
+    """What a backend's denoising loop can be asked for beside openpi's."""
+    return backend.forms if isinstance(backend, Conditions) else ()
 
 
 def precisions(name: str) -> tuple[Precision, ...]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
+from turbopi.model.conditioning import Conditioning, Conditionings, Form
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import FloatPrecision, Trace
 from turbopi.model.sample import Sample
@@ -22,12 +23,20 @@ LoadState = Callable[[torch.device, FloatPrecision], dict[str, Tensor]]
 class Begun(Protocol):
     """One observation whose pictures a backend works on already: what `Begins.begin` returns."""
 
-    def finish(self, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+    def finish(
+        self,
+        tokens: np.ndarray,
+        state: np.ndarray,
+        noise: np.ndarray,
+        num_steps: int,
+        conditioning: Conditioning | None = None,
+    ) -> Sample:
         """What `sample` of this one observation returns.
 
         tokens  int64[valid prompt tokens]
         state   float32[action_dim]
         noise   float32[H, action_dim]
+        conditioning  of a backend that is `Conditions`, too
         """
 
 
@@ -35,7 +44,7 @@ class Backend(Protocol):
     """A way to run the model. All of them compute what `turbopi.model.reference.Pi0Model` computes.
 
     Observations and noise may be on the host or on the device; both are moved where they are needed. What only some
-    can do besides are `Begins`, `Submits` and `RunsFp8`.
+    can do besides are `Begins`, `Submits`, `Conditions` and `RunsFp8`.
 
     any_horizon     whether noise may have another action horizon than the config's
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
@@ -110,6 +119,40 @@ class Submits(Protocol):
 
     def submit(self, observation: Observation, noise: Tensor, num_steps: int) -> "Future[Sample]":
         """`sample` of one observation that returns at once."""
+
+
+@runtime_checkable
+class Conditions(Protocol):
+    """A backend whose denoising loop takes a `Conditioning`, of these `forms`.
+
+    A call without one, or with one of the form "plain", is the backend's ordinary call to the last bit. For a batch:
+    one for all rows, or a list with one, or None, for each. `warmup` with one prepares calls of its form and times.
+    """
+
+    forms: ClassVar[tuple[Form, ...]]
+
+    def warmup(
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None = None,
+        *,
+        required: bool = True,
+        last: bool = True,
+        conditioning: Conditioning | None = None,
+    ) -> None: ...
+
+    def denoise(
+        self, cache: KVCache, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Tensor: ...
+
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample: ...
+
+    def intermediates(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Trace: ...
 
 
 @runtime_checkable

@@ -14,6 +14,7 @@ from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
 from turbopi.engine.emulate import put_into_norm, round_activation, round_weight
+from turbopi.model.conditioning import Form
 from turbopi.model.sites import linears, norm_of
 from turbopi.quantization.artifact import Quantization, check_given
 from turbopi.quantization.plan import TIERS
@@ -25,6 +26,7 @@ class EmulatedFp8Backend(PyTorchBackend):
 
     name: ClassVar[str] = "emulated_fp8"
     precisions: ClassVar[tuple[Precision, ...]] = TIERS
+    forms: ClassVar[tuple[Form, ...]] = ("tokens",)  # E4M3's rounding has no derivative
 
     def __init__(
         self,

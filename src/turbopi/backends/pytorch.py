@@ -9,6 +9,7 @@ from turbopi.backends.base import Backend, LoadState, Precision, Sample
 from turbopi.backends.timing import StageTimer
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendError
+from turbopi.model.conditioning import Conditioning, Conditionings, Form
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import FloatPrecision, Pi0Model, Trace
 from turbopi.observation import Observation
@@ -20,6 +21,7 @@ class PyTorchBackend:
     name: ClassVar[str] = "pytorch"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
     any_horizon: ClassVar[bool] = True
+    forms: ClassVar[tuple[Form, ...]] = ("tokens", "jacobian")
     model_class: ClassVar[type[Pi0Model]] = Pi0Model
     strict = False  # nothing here depends on shapes
 
@@ -44,6 +46,7 @@ class PyTorchBackend:
         *,
         required: bool = True,
         last: bool = True,
+        conditioning: Conditioning | None = None,
     ) -> None:
         """One call: it loads libraries and fills allocators; other shapes need nothing more."""
         if not self._warm:
@@ -57,22 +60,27 @@ class PyTorchBackend:
     def prefix(self, observation: Observation) -> KVCache:
         return self.model.prefix(observation.to(self.device))
 
-    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int) -> Tensor:
-        return self.model.denoise(cache, noise.to(self.device), num_steps)
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None) -> Tensor:
+        return self.model.denoise(cache, noise.to(self.device), num_steps, conditioning=conditioning)
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
         timer = StageTimer(self.device)
         embedded = self.model.embed(observation.to(self.device))
         timer.mark("vision")  # with the prompt's embedding lookup
         cache = self.model.keys_values(embedded)
         timer.mark("prefix")
-        actions = self.model.denoise(cache, noise.to(self.device), num_steps)
+        actions = self.model.denoise(cache, noise.to(self.device), num_steps, conditioning=conditioning)
         timer.mark("denoise")
         return Sample(actions.cpu(), timer.milliseconds())
 
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
+    def intermediates(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Trace:
         trace: Trace = {}
-        self.model.sample(observation.to(self.device), noise.to(self.device), num_steps, trace=trace)
+        on_device = (observation.to(self.device), noise.to(self.device))
+        self.model.sample(*on_device, num_steps, conditioning=conditioning, trace=trace)
         return trace
 
     def describe(self) -> dict[str, Any]:

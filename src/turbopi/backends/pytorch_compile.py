@@ -16,6 +16,7 @@ from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
 from turbopi.engine.limits import not_warm
 from turbopi.errors import ObservationError
+from turbopi.model.conditioning import Conditioning, Conditionings, Form
 from turbopi.model.reference import FloatPrecision, Pi0Model
 from turbopi.observation import Observation
 from turbopi.toolchain import missing_for_c, missing_for_cpp
@@ -78,6 +79,7 @@ class PyTorchCompileBackend(PyTorchBackend):
     """
 
     name: ClassVar[str] = "pytorch_compile"
+    forms: ClassVar[tuple[Form, ...]] = ()  # each would be compiled anew, for a minute
     model_class: ClassVar[type[Pi0Model]] = CompiledModel
 
     def __init__(
@@ -95,6 +97,7 @@ class PyTorchCompileBackend(PyTorchBackend):
         *,
         required: bool = True,
         last: bool = True,
+        conditioning: Conditioning | None = None,
     ) -> None:
         """One call with as many cameras, which compiles for them."""
         self._warming = True
@@ -103,7 +106,10 @@ class PyTorchCompileBackend(PyTorchBackend):
         finally:
             self._warming = False
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
+        assert conditioning is None, "there are no `forms`"
         shape = Compiled.of(observation, noise.shape[1])
         if self.strict and not self._warming and shape not in self._compiled:
             warm = map(str, self._compiled)

@@ -31,7 +31,7 @@ from turbopi.checkpoint.settings import FILE_NAME as SETTINGS
 from turbopi.checkpoint.settings import ConfigSource, Settings, parse_values, policy_config
 from turbopi.checkpoint.source import Shape, check_finite
 from turbopi.checkpoint.torch_files import WEIGHTS
-from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig
+from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig, RealTime
 from turbopi.errors import CheckpointError, ConfigError
 from turbopi.files import new_folder
 from turbopi.model.reference import FloatPrecision
@@ -192,6 +192,8 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], P
         "num_denoising_steps": config.num_denoising_steps,
         "vision_heads": config.model.vision.num_heads,
     }
+    if config.real_time != RealTime():
+        values["real_time"] = asdict(config.real_time)
     for name in ("default_prompt", "prompt_state_dim"):  # null says nothing where the preset has none either
         if values[name] is None and getattr(PRESETS[preset], name) is None:
             del values[name]

@@ -26,7 +26,7 @@ from turbopi.checkpoint.lerobot_pipeline import (
 )
 from turbopi.checkpoint.norm_stats import STATISTICS, FeatureStats, NormStats, feature_stats
 from turbopi.checkpoint.settings import Settings, with_values
-from turbopi.config import LIMITS, Kind, ModelConfig, Normalization, NormMode, PolicyConfig
+from turbopi.config import LIMITS, Kind, ModelConfig, Normalization, NormMode, PolicyConfig, RealTime, Schedule
 from turbopi.errors import CheckpointError, ConfigError
 from turbopi.reading import Fields, file_inside, one_line, read_json, shown
 
@@ -38,6 +38,7 @@ _MODES: dict[str, NormMode] = {
     "MIN_MAX": "lerobot_min_max",
     "IDENTITY": "identity",
 }
+_SCHEDULES: dict[str, Schedule] = {"EXP": "exponential", "LINEAR": "linear", "ONES": "ones", "ZEROS": "zeros"}
 _EPS = 1e-8
 _FEATURE_TYPES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
 # values of config.json that change what the model computes, and the only ones that Turbo-Pi computes
@@ -103,6 +104,7 @@ class LeRobotFolder:
             num_denoising_steps=self.config.integer(
                 "num_inference_steps", 1, LIMITS["num_denoising_steps"], default=10
             ),
+            real_time=self._real_time(),
         )
         if "normalization" not in settings.values:
             described = replace(described, normalization=self._normalization())
@@ -124,9 +126,11 @@ class LeRobotFolder:
         unknown = sorted(self.config.values.keys() - _KNOWN)
         if unknown:
             notes.append(f"{CONFIG} has keys that Turbo-Pi doesn't know or follow: {', '.join(unknown)}")
-        rtc = self.config.values.get("rtc_config")
-        if isinstance(rtc, dict) and rtc.get("enabled"):
-            notes.append(f"{CONFIG} enables rtc_config: Turbo-Pi answers each observation with a chunk of its own")
+        if self._rtc_config is not None:
+            notes.append(
+                f"{CONFIG} enables rtc_config: its schedule, weight and horizon are what `infer(previous=…)` takes "
+                "where it is told nothing else (docs/real_time.md); a call without it is an ordinary one"
+            )
         if self.settings.policy is not None:
             return notes
         if self.settings.values.get("lerobot_semantics", "auto") == "auto" and self.written_by != "0.6":
@@ -181,6 +185,33 @@ class LeRobotFolder:
                     f"{self.file} has {key} = {shown(value)}, which Turbo-Pi doesn't compute; it does {meaning}"
                 )
         return cast(Kind, kind)
+
+    # -- real-time execution -------------------------------------------------------------------------------------------
+
+    @property
+    def _rtc_config(self) -> Fields | None:
+        """config.json's rtc_config, if it is enabled."""
+        if self.config.values.get("rtc_config") is None:
+            return None
+        rtc = self.config.object("rtc_config")
+        return rtc if rtc.flag("enabled", False) else None
+
+    def _real_time(self) -> RealTime:
+        """LeRobot's execution horizon is where its mask ends, e; ours is what is carried out, s = H − e.
+
+        A mask as long as the chunk or longer says nothing: it ends where the left-over does.
+        """
+        trained = self.config.integer("rtc_training_max_delay", 0, LIMITS["action_horizon"] - 1, default=0)
+        if (rtc := self._rtc_config) is None:
+            return RealTime(trained_max_delay=trained)
+        horizon = self.config.integer("chunk_size", 1, LIMITS["action_horizon"], default=50)
+        end = rtc.integer("execution_horizon", 1, LIMITS["action_horizon"], default=10)
+        return RealTime(
+            trained_max_delay=trained,
+            execution_horizon=horizon - end if end < horizon else None,
+            schedule=_SCHEDULES[rtc.choice("prefix_attention_schedule", tuple(_SCHEDULES), default="LINEAR")],
+            max_guidance_weight=rtc.number("max_guidance_weight", 0, 1e6, default=10.0),
+        )
 
     # -- scaling -------------------------------------------------------------------------------------------------------
 

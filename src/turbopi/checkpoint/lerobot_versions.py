@@ -34,6 +34,7 @@ LATER_KEYS = frozenset(
     {
         *("rtc_config", "use_peft", "freeze_vision_encoder", "train_expert_only", "use_relative_actions"),
         *("relative_exclude_joints", "action_feature_names", "pretrained_revision", "optimizer_fused"),
+        *("rtc_training_max_delay",),
     }
 )
 

@@ -21,6 +21,8 @@ itself.
     lerobot_semantics     of LeRobot's checkpoints alone: "0.4", "0.6" (0.5, too), or "auto" for the one that wrote it
     time_grid             "accumulated" (openpi) or "multiplied" (LeRobot)
     num_denoising_steps   1 to 1000, unless whoever runs it says otherwise; else LeRobot's num_inference_steps, or 10
+    real_time             object of trained_max_delay (delays that training simulated, control steps),
+                          execution_horizon, schedule, max_guidance_weight: see turbopi.config.RealTime
     vision_heads          attention heads of a vision tower of a non-standard width
     lora_alpha            number, or {"vlm": number, "expert": number}: see openpi_lora.py
     lora_rslora           true if adapters were trained rank-stabilised
@@ -36,12 +38,12 @@ except for sizes, which always come from the tensors.
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args
 
 from turbopi.checkpoint.openpi_lora import LoraScale
-from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, PolicyConfig
+from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, PolicyConfig, RealTime
 from turbopi.errors import ConfigError
 from turbopi.reading import is_finite, is_integer, read_json, shown
 
@@ -129,6 +131,7 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
         "prompt_state_dim",
         "prompt_as_is",
         "num_denoising_steps",
+        "real_time",
     )
     if values.get("robot", config.robot) != config.robot:  # the options were the other robot's
         config = replace(config, robot_options={})
@@ -267,6 +270,12 @@ def _normalization(value: object) -> Normalization:
     return Normalization(mode(value["state"]), mode(value["actions"]))  # type: ignore[arg-type]
 
 
+def _real_time(value: object) -> RealTime:
+    options = _object(value)
+    _require(set(options) <= {item.name for item in fields(RealTime)})
+    return RealTime(**options)  # type: ignore[arg-type]  # which checks; its ConfigError is a ValueError
+
+
 _ALPHAS = (1e-6, 1e6)  # in use are 8 to 128
 
 
@@ -300,6 +309,11 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "lerobot_semantics": ("'0.4', '0.6' or 'auto'", _choice("0.4", "0.6", "auto")),
     "time_grid": ("'accumulated' or 'multiplied'", _choice("accumulated", "multiplied")),
     "num_denoising_steps": _count(LIMITS["num_denoising_steps"]),
+    "real_time": (
+        "an object with trained_max_delay, execution_horizon (whole numbers of control steps), schedule (exponential, "
+        "linear, ones or zeros) or max_guidance_weight (a number from 0)",
+        _real_time,
+    ),
     "vision_heads": _count(LIMITS["num_heads"]),
     "lora_alpha": ("a number from 1e-6 to 1e6, or an object with vlm and expert", _lora_alpha),
     "lora_rslora": ("true or false", _flag),

@@ -3,7 +3,7 @@
 import logging
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from turbopi.policy import UnifiedPolicy
+    from turbopi.running_chunk import JoinMode
 
 
 @command(
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
         "turbopi serve checkpoints/pi05_libero --config pi05_libero",
         "turbopi serve checkpoints/pi05_droid --host 0.0.0.0 --api-key-file key --record recordings",
         "TURBOPI_API_KEY=… turbopi serve checkpoints/pi05_libero --host 0.0.0.0 --allowed-hosts robot.lab",
+        "turbopi serve checkpoints/pi05_aloha --config pi05_aloha --execution rtc --control-hz 50",
         "turbopi serve --random-weights pi05_tiny --port 8001",
     ),
 )
@@ -68,6 +70,37 @@ def serve(
     record: Annotated[
         Path | None, typer.Option("--record", metavar="DIR", help="Write every observation and its actions below DIR.")
     ] = None,
+    execution: Annotated[
+        str | None,
+        typer.Option(
+            "--execution",
+            metavar="rtc|rtc_identity|rtc_trained",
+            help="Join each client's chunks, without any change of the client (docs/real_time.md). Needs --control-hz.",
+        ),
+    ] = None,
+    control_hz: Annotated[
+        float | None,
+        typer.Option("--control-hz", metavar="HZ", help="Actions that the robots carry out in a second."),
+    ] = None,
+    execution_horizon: Annotated[
+        int | None,
+        typer.Option(
+            "--execution-horizon",
+            min=1,
+            metavar="S",
+            help="Actions of a chunk that the robots carry out before the next takes over. Default: half of a chunk.",
+        ),
+    ] = None,
+    delay_steps: Annotated[
+        int | None,
+        typer.Option(
+            "--delay-steps",
+            min=0,
+            metavar="D",
+            help="Control steps from an observation to its chunk, at the robot; 0 if it stands still meanwhile. "
+            "Default: measured here, without the network.",
+        ),
+    ] = None,
     warmup: Annotated[
         bool,
         typer.Option(
@@ -99,6 +132,10 @@ def serve(
         record_dir=record,
         allowed_hosts=[] if allowed_hosts is None else [name.strip() for name in allowed_hosts.split(",")],
         max_clients=max_clients,
+        execution=cast("JoinMode | None", execution),  # checked there
+        control_hz=control_hz,
+        execution_horizon=execution_horizon,
+        delay_steps=delay_steps,
     )
     if record is not None:
         check_folder(record)
@@ -134,8 +171,8 @@ class _Cold:
     def pipelined(self) -> bool:
         return self._policy.pipelined
 
-    def infer(self, obs: dict[str, object], /) -> dict[str, object]:
-        return self._policy.infer(obs)
+    def infer(self, obs: dict[str, object], /, **arguments: Any) -> dict[str, object]:
+        return self._policy.infer(obs, **arguments)
 
     def submit(self, obs: dict[str, object], /) -> "Future[dict[str, object]]":
         return self._policy.submit(obs)

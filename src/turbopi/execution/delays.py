@@ -24,6 +24,10 @@ class DelayEstimate:
         self._percentile = percentile
         self._initial = _checked(initial)
 
+    def begin(self, steps: int) -> None:
+        """Another initial estimate."""
+        self._initial = _checked(steps)
+
     def add(self, steps: int) -> None:
         self._measured.append(_checked(steps))
 

@@ -9,10 +9,11 @@ no actions, or its way is "sync") carried out none, and enters at row 0.
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from turbopi.config import Schedule
 from turbopi.errors import ConfigError
 from turbopi.execution.delays import DelayEstimate
 from turbopi.execution.ways import Execution, way_named
@@ -36,7 +37,8 @@ class Request:
     """What to tell the policy with an observation: `policy.infer(observation, **request.arguments)`."""
 
     number: int  # of the chunk, from 0
-    step: int  # when its observation was taken: actions asked for until then
+    step: int  # when its observation was taken: control steps before it
+    carried_out: int  # actions before it
     previous: RunningChunk | None  # None: nothing is known of a running chunk, or it doesn't matter
     model_actions: bool  # the result must have "model_actions" (and "anchor"), for the chunk after it
 
@@ -61,7 +63,7 @@ class Action(NamedTuple):
 class Seam:
     """Where a chunk takes over from another. In the robot's units; see `Action` for the first of all chunks."""
 
-    step: int  # calls of next_action before it
+    step: int  # control steps before it
     chunk: int
     delay: int  # control steps from the observation to the chunk
     carried_out: int  # actions among them: the row at which the chunk is entered
@@ -99,7 +101,8 @@ class ChunkQueue:
                          last command to its first action, is refused whole
     old_weight           "ensemble": the running chunk's part of the mean; LeRobot's default
     schedule, max_guidance_weight
-                         of the guided ways, as in RunningChunk
+                         of the guided ways, as in RunningChunk. None: the policy's
+    policys_guidance     where guidance ends is left to the policy's own execution horizon (LeRobot's rtc_config)
 
     A fixed delay d and the horizons must fit: d ≤ s and d ≤ H − s for the "rtc" ways, else ConfigError, at the latest
     when the first chunk shows H. An estimate that is larger for a while is cut to what fits: `cut_delays` counts.
@@ -116,8 +119,9 @@ class ChunkQueue:
         trained_max_delay: int | None = None,
         max_jump: float | np.ndarray | None = None,
         old_weight: float = 0.3,
-        schedule: Literal["exponential", "linear", "ones", "zeros"] = "exponential",
-        max_guidance_weight: float = 5.0,
+        schedule: Schedule | None = None,
+        max_guidance_weight: float | None = None,
+        policys_guidance: bool = False,
     ) -> None:
         self.way = way_named(execution)
         self.dropped: Counter[Reason] = Counter()  # chunks that were never carried out
@@ -125,11 +129,13 @@ class ChunkQueue:
         self.cut_delays = 0  # requests that were told a smaller delay than the estimate, as more doesn't fit
         self.chunks = 0  # that took over
         self.empty_steps = 0  # calls of next_action that found no action
-        self.steps = 0  # calls of next_action
+        self.steps = 0  # control steps: calls of next_action and of skip_step
+        self.carried_out = 0  # actions
         self.seams: deque[Seam] = deque(maxlen=KEPT)
         self.delays: deque[int] = deque(maxlen=KEPT)  # measured, of all chunks that came
         self.last_problem = ""  # about the last chunk that was dropped
         self.horizon: int | None = None  # H, once a chunk has come
+        self.width: int | None = None  # d, once a chunk has come
         self._fixed = not isinstance(delay, DelayEstimate)
         self._delay = delay if isinstance(delay, DelayEstimate) else DelayEstimate(delay)
         self._s = None if execution_horizon is None else _horizon(execution_horizon)
@@ -139,6 +145,7 @@ class ChunkQueue:
             raise ConfigError(f"old_weight is {old_weight}; the running chunk's part of a mean lies between 0 and 1")
         self._old_weight = old_weight
         self._guidance: dict[str, Any] = {"schedule": schedule, "max_guidance_weight": max_guidance_weight}
+        self._policys_guidance = policys_guidance
         self._requests = 0
         self._running: _Chunk | None = None
         self._row = self._entered = 0  # of the running chunk: the next one, and the first that was carried out
@@ -217,35 +224,33 @@ class ChunkQueue:
         if not 0 <= ago <= self.oldest_useful:
             raise ValueError(f"the observation was taken {ago} actions ago; at most {self.oldest_useful} are useful")
         previous = self._previous(ago)
-        request = Request(self._requests, self.steps - ago, previous, self.way.mode is not None)
+        counts = (self._requests, self.steps - ago, self.carried_out - ago)
+        request = Request(*counts, previous, model_actions=self.way.mode is not None)
         self._requests += 1
         self._flight = _Flight(request, ago, ago)
         return request
 
     def _previous(self, ago: int) -> RunningChunk | None:
-        """What is left of the running chunk at an observation, with the delay to expect, or None if nothing is."""
+        """What the policy is told of the running chunk at an observation, or None if nothing of that is left."""
         if self.way.mode is None or self._running is None:
             return None
-        model_actions = self._running.model_actions
-        assert model_actions is not None
-        horizon, row = len(model_actions), self._row - ago
-        left_over = model_actions[row:]
-        if not len(left_over):
+        row, expected = self._row - ago, max(self._delay.steps, ago)
+        previous = self._told(self._running, row, expected)
+        self.cut_delays += previous is not None and previous.delay < expected
+        return previous
+
+    def _told(self, chunk: _Chunk, row: int, expected: int) -> RunningChunk | None:
+        """What the policy is told of a chunk whose next action is `row`; the delay is cut to what fits."""
+        if self.way.mode is None or row >= len(chunk.actions):
             return None
+        assert chunk.model_actions is not None
         s = max(self.execution_horizon, row)  # the new chunk's last s actions have nothing to follow
-        most = horizon - s
+        most = len(chunk.actions) - s
         if self.way.holds and self._trained_max is not None:
             most = min(most, self._trained_max)
-        expected = max(self._delay.steps, ago)
-        self.cut_delays += expected > most
-        return RunningChunk(
-            left_over=left_over.copy(),
-            delay=min(expected, most),
-            execution_horizon=s,
-            mode=self.way.mode,
-            anchor=self._running.anchor,
-            **self._guidance,
-        )
+        left_over = chunk.model_actions[row:].copy()
+        s_told = None if self._policys_guidance else s
+        return RunningChunk(left_over, min(expected, most), s_told, self.way.mode, chunk.anchor, **self._guidance)
 
     def arrive(self, result: Mapping[str, Any]) -> Reason | None:
         """The chunk in flight is there: what `policy.infer` returned. None if it takes over, else why it is dropped.
@@ -261,8 +266,8 @@ class ChunkQueue:
         if isinstance(chunk, str):
             return self._drop("malformed", chunk)
         horizon = len(chunk.actions)
-        self.horizon = horizon
-        self.check_horizon(horizon)
+        if self.horizon is None:
+            self._learn(chunk)
         if not np.isfinite(chunk.actions).all() or not (
             chunk.model_actions is None or np.isfinite(chunk.model_actions).all()
         ):
@@ -289,6 +294,18 @@ class ChunkQueue:
         self.chunks += 1
         return None
 
+    def learn(self, result: Mapping[str, Any]) -> RunningChunk | None:
+        """A chunk that nobody carries out, such as a warm-up's, shows H. Raises ConfigError as `arrive` does.
+
+        Returns what the policy would be told once s actions of it were carried out, for another call of the warm-up;
+        None if nothing would be left, or the policy is never told.
+        """
+        chunk = self._read(-1, result)
+        if isinstance(chunk, str):
+            raise ConfigError(chunk)
+        self._learn(chunk)
+        return self._told(chunk, self.execution_horizon, self._delay.steps)
+
     def fail(self, reason: Reason = "failed", text: str = "the policy gave no chunk") -> None:
         """The chunk in flight will never be there."""
         self._drop(self._landed().refused or reason, text)
@@ -310,19 +327,34 @@ class ChunkQueue:
 
     def next_action(self) -> Action | None:
         """The action of this control step; None if there is none. Call it once in every control step, exactly."""
-        self.steps += 1
-        if self._flight is not None:
-            self._flight.delay += 1
+        self.skip_step()
         if not self.remaining:
             self.empty_steps += 1
             return None
         assert self._running is not None
         row = self._row
         self._row += 1
+        self.carried_out += 1
         if self._flight is not None:
             self._flight.carried_out += 1
         self._last = self._running.actions[row]
         return Action(self._last.copy(), self._running.number, row, row == self._entered)
+
+    def skip_step(self) -> None:
+        """Instead of `next_action`: no action is carried out in this control step, though there are some."""
+        self.steps += 1
+        if self._flight is not None:
+            self._flight.delay += 1
+
+    @property
+    def next_values(self) -> np.ndarray | None:
+        """float64[d], what `next_action` would give; None if there is none."""
+        return self._running.actions[self._row].copy() if self._running is not None and self.remaining else None
+
+    @property
+    def last_values(self) -> np.ndarray | None:
+        """float64[d], what `next_action` gave last; None in a new episode."""
+        return None if self._last is None else self._last.copy()
 
     # --- what happened ------------------------------------------------------------------------------------------------
 
@@ -357,6 +389,13 @@ class ChunkQueue:
                 f"{self._trained_max}: choose execution 'rtc', a lower control rate, or fewer denoising steps"
             )
 
+    def _learn(self, chunk: _Chunk) -> None:
+        horizon, width = chunk.actions.shape
+        if self._max_jump is not None and self._max_jump.ndim == 1 and len(self._max_jump) != width:
+            raise ConfigError(f"max_jump has {len(self._max_jump)} numbers, but the policy's actions have {width}")
+        self.check_horizon(horizon)
+        self.horizon, self.width = horizon, width
+
     def _landed(self) -> _Flight:
         if self._flight is None:
             raise RuntimeError("no chunk is in flight: observe() first")
@@ -384,12 +423,8 @@ class ChunkQueue:
         actions = _numbers(result.get("actions"), np.float64)
         if actions is None or actions.ndim != 2 or 0 in actions.shape:
             return f'"actions" isn\'t an array of numbers [H, d] but {_shape(result.get("actions"))}'
-        if self._last is not None and actions.shape[1] != len(self._last):
-            return f"its actions have {actions.shape[1]} numbers each; those before had {len(self._last)}"
-        if self._max_jump is not None and self._max_jump.ndim == 1 and len(self._max_jump) != actions.shape[1]:
-            raise ConfigError(
-                f"max_jump has {len(self._max_jump)} numbers, but the policy's actions have {actions.shape[1]}"
-            )
+        if self.horizon is not None and actions.shape != (self.horizon, self.width):
+            return f"its actions have shape {list(actions.shape)}; those before had {[self.horizon, self.width]}"
         if self.way.mode is None:
             return _Chunk(number, actions, None, None)
         if "model_actions" not in result:

@@ -88,8 +88,34 @@ class Ops:
     origin: Mapping[str, str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class TokenInputs:
+    """A conditioned loop's inputs by action (model/conditioning.py), on the device, read when its kernels run.
+
+    Identity guidance is v ← v + gain · ((x − times · v) − target), so without guidance gain is 0.
+    """
+
+    rows: Tensor  # int32[N, T]  of the table of modulation, which has one for each distinct time
+    steps: Tensor  # float32[N, T]  what x moves by, times v
+    times: Tensor  # float32[N, T]
+    target: Tensor  # float32[T, A]
+    gain: Tensor  # float32[N, T]  strength times weight
+
+
 class Denoiser(Protocol):
     """All denoising steps in one launch, for one number of steps and one horizon."""
 
-    def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
-        """From noise float32[H, A] and the cache's first `length` rows: x_t float32[N + 1, H, A], v_t [N, H, A]."""
+    def launch(
+        self,
+        noise: Tensor,
+        cache_k: Tensor,
+        cache_v: Tensor,
+        length: Tensor,
+        x_t: Tensor,
+        v_t: Tensor,
+        tokens: TokenInputs | None = None,
+    ) -> None:
+        """From noise float32[H, A] and the cache's first `length` rows: x_t float32[N + 1, H, A], v_t [N, H, A].
+
+        `tokens` of a loop that was made for them, and of no other; v_t then is the guided v that was integrated.
+        """

@@ -10,16 +10,20 @@ noise and t = 0 the action. One call of the loop, for every action i and step s:
 A held action has its given value in x from the start, time 0 and a step of 0: so it stays, and the others attend to it.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
+from turbopi.config import Schedule as Schedule
 from turbopi.errors import ObservationError
 from turbopi.model.denoise import time_grid
 
 GuidanceMode = Literal["jacobian", "identity"]
-Schedule = Literal["exponential", "linear", "ones", "zeros"]
+# What a backend must be able to do: times, steps and values by token, identity guidance among them; the true Jacobian.
+Form = Literal["plain", "tokens", "jacobian"]
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,19 @@ class TokenTimes:
         """The same with the actions of `held` bool[H] at time 0 in every step."""
         return TokenTimes(np.where(held, np.float32(0), self.times), np.where(held, np.float32(0), self.steps))
 
+    def distinct(self) -> np.ndarray:
+        """float32[U]: the times that occur, each once, in the order in which they first do."""
+        times, first = np.unique(self.times, return_index=True)
+        return times[np.argsort(first)]
+
+    def rows(self, table: np.ndarray) -> np.ndarray:
+        """int32[N, H]: where each time is in `table` float32[U], which has them all."""
+        order = np.argsort(table, kind="stable")
+        places = np.minimum(np.searchsorted(table[order], self.times), len(table) - 1)
+        rows = order[places].astype(np.int32)
+        assert (table[rows] == self.times).all(), "a time isn't in the table"
+        return rows
+
 
 @dataclass(frozen=True)
 class Guidance:
@@ -85,6 +102,73 @@ class Conditioning:
     values: np.ndarray | None = None  # float32[H, A]; rows that aren't held are ignored
     guidance: Guidance | None = None
 
+    @property
+    def form(self) -> Form:
+        """What a backend must be able to do. "plain": nothing beside openpi's loop."""
+        if self.guidance is not None and self.guidance.mode == "jacobian":
+            return "jacobian"
+        holds = self.held is not None and bool(np.any(self.held))
+        return "tokens" if holds or self.tokens is not None or self.guidance is not None else "plain"
+
+    def size(self, num_steps: int, horizon: int) -> tuple[int, int]:
+        """Steps and actions of the loop that it is for; what it doesn't fix is as given."""
+        grid = None if self.guidance is None else self.guidance.strength
+        grid = grid if self.tokens is None else self.tokens.times
+        if grid is not None:
+            return int(grid.shape[0]), int(grid.shape[1])
+        return num_steps, horizon if self.held is None else len(self.held)
+
+    def token_times(self, num_steps: int, horizon: int, kind: str = "accumulated") -> TokenTimes:
+        """The loop's times and steps, held actions among them. `kind` as in `time_grid`, if it has none of its own."""
+        tokens = self.tokens or TokenTimes.plain(num_steps, horizon, kind)
+        return tokens if self.held is None else tokens.holding(self.held)
+
+    def started(self, noise: np.ndarray) -> np.ndarray:
+        """x float32[H, A] before the first step: the noise, with the held actions' values in its place."""
+        if self.held is None or self.values is None:
+            return noise
+        return np.where(self.held[:, None], self.values, noise).astype(np.float32)
+
+    def check(self, num_steps: int, horizon: int, action_dim: int) -> None:
+        """Raises ObservationError if any of it doesn't fit a loop of so many steps and actions."""
+        grid, chunk = (num_steps, horizon), (horizon, action_dim)
+        if self.tokens is not None:
+            _check("token times", self.tokens.times, grid)
+            _check("token steps", self.tokens.steps, grid)
+            if not ((self.tokens.times >= 0) & (self.tokens.times <= 1)).all():
+                raise ObservationError("token times should lie between 0 (action) and 1 (noise), in every step")
+        if self.held is not None:
+            held = self.held
+            if not isinstance(held, np.ndarray) or held.dtype != np.bool_ or held.shape != (horizon,):
+                raise ObservationError(f"held is {_described(held)}; it should be bool of shape {[horizon]}")
+            if held.any() and self.values is None:
+                raise ObservationError("held actions need values: float32[H, action_dim], read where held is true")
+            if self.values is not None:
+                _check("held actions' values", self.values, chunk, held)
+        if self.guidance is not None:
+            if self.guidance.mode not in get_args(GuidanceMode):
+                raise ObservationError(f"guidance mode is {self.guidance.mode!r}; it should be jacobian or identity")
+            _check("the guidance's target", self.guidance.target, chunk)
+            _check("the guidance's weights", self.guidance.weights, (horizon,))
+            _check("the guidance's strength", self.guidance.strength, grid)
+
+
+Conditionings = Conditioning | Sequence[Conditioning | None] | None  # for all rows of a batch, or one each
+
+
+def _check(what: str, array: np.ndarray, shape: tuple[int, ...], rows: np.ndarray | None = None) -> None:
+    """float32 of a shape, finite, in `rows` if they are given."""
+    if not isinstance(array, np.ndarray) or array.dtype != np.float32 or array.shape != shape:
+        raise ObservationError(f"{what} are {_described(array)}; they should be float32 of shape {list(shape)}")
+    if not np.isfinite(array if rows is None else array[rows]).all():
+        raise ObservationError(f"{what} have values that aren't finite")
+
+
+def _described(array: object) -> str:
+    if not isinstance(array, np.ndarray):
+        return f"of type {type(array).__name__}"
+    return f"{array.dtype} of shape {list(array.shape)}"
+
 
 def guidance_strength(times: np.ndarray, most: float) -> np.ndarray:
     """float32 of the shape of `times`: min(most, (t / τ) · (t² + τ²) / t²), τ = 1 − t; `most` at τ = 0 and at t = 0.
@@ -96,3 +180,45 @@ def guidance_strength(times: np.ndarray, most: float) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         strength = (t * t + tau * tau) / (tau * t)
     return np.where((tau <= 0) | (t <= 0), most, np.minimum(strength, most)).astype(np.float32)
+
+
+def guidance_weights(
+    horizon: int, delay: int, execution_horizon: int, schedule: Schedule = "exponential"
+) -> np.ndarray:
+    """float32[H], as published (arXiv 2506.07339, equation 5): d delay, s execution horizon, e = H − s.
+
+    1 before d, 0 from e on, and between them, with c = (e − i) / (e − d + 1): "exponential" c (exp(c) − 1) /
+    (exp(1) − 1), "linear" c, "ones" 1, "zeros" 0. Raises ObservationError unless 0 ≤ d ≤ H − s.
+    """
+    end = horizon - execution_horizon
+    if not 0 <= delay <= end:
+        raise ObservationError(
+            f"a delay of {delay} and an execution horizon of {execution_horizon} don't fit a chunk of {horizon} "
+            f"actions: delay + execution horizon should be at most {horizon}"
+        )
+    return _weights(horizon, delay, end, schedule)
+
+
+def lerobot_guidance_weights(
+    horizon: int, delay: int, execution_horizon: int, left_over: int, schedule: Schedule = "linear"
+) -> np.ndarray:
+    """float32[H], as LeRobot 0.6's `get_prefix_weights`: its execution horizon is the end of the mask, not H − s.
+
+    left_over  rows of the previous chunk's left-over; the mask ends there at the latest
+    """
+    end = min(execution_horizon, left_over)
+    return _weights(horizon, min(delay, end), end, schedule)
+
+
+def _weights(horizon: int, start: int, end: int, schedule: Schedule) -> np.ndarray:
+    position = np.arange(horizon)
+    c = (end - position) / (end - start + 1)
+    between = {
+        "exponential": c * np.expm1(c) / math.expm1(1),
+        "linear": c,
+        "ones": np.ones(horizon),
+        "zeros": np.zeros(horizon),
+    }
+    if schedule not in between:
+        raise ObservationError(f"the schedule is {schedule!r}; it should be one of {', '.join(between)}")
+    return np.where(position < start, 1.0, np.where(position < end, between[schedule], 0.0)).astype(np.float32)

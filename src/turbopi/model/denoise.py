@@ -5,6 +5,8 @@ precision.
 """
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -46,6 +48,40 @@ def euler_step(x_t: Tensor, v_t: Tensor, num_steps: int) -> Tensor:
     return x_t + float(np.float32(-1.0 / num_steps)) * v_t
 
 
+@dataclass(frozen=True)
+class Pull:
+    """Guidance of one denoising step (`conditioning.Guidance`), as tensors that broadcast to x_t [B, H, A]."""
+
+    target: Tensor  # float32[H, A]
+    weights: Tensor  # float32[H, 1]
+    strength: Tensor  # float32[H, 1]
+    times: Tensor  # float32[H, 1]
+    through_expert: bool  # the true Jacobian; False: the identity in its place
+
+    def error(self, x_t: Tensor, v_t: Tensor) -> Tensor:
+        """(target − x̂) ⊙ weights, x̂ = x − t v."""
+        return (self.target - (x_t - self.times * v_t)) * self.weights
+
+
+def guided_velocity(
+    velocity: Callable[[Tensor], tuple[Tensor, Tensor]], x_t: Tensor, pull: Pull
+) -> tuple[Tensor, Tensor]:
+    """`velocity`(x_t), which is (the expert's output, v_t), with v_t pulled: v − strength ⊙ Jᵀ error.
+
+    J = ∂x̂/∂x = 1 − t ∂v/∂x, so Jᵀ error = error − (∂v/∂x)ᵀ (t error): one backward pass through `velocity`.
+    """
+    if not pull.through_expert:
+        out, v_t = velocity(x_t)
+        return out, v_t - pull.strength * pull.error(x_t, v_t)
+    with torch.enable_grad():
+        x = x_t.detach().requires_grad_()
+        out, v = velocity(x)
+        v_t = v.detach()
+        error = pull.error(x_t, v_t)
+        (through,) = torch.autograd.grad(v, x, pull.times * error)
+    return out.detach(), v_t - pull.strength * (error - through)
+
+
 def suffix_mask(cache: KVCache, suffix_len: int, has_state_token: bool) -> Tensor | None:
     """bool, broadcastable to [B, 1, suffix, prefix + suffix]; None: everything attends to everything.
 
@@ -74,7 +110,8 @@ def run_expert(
 ) -> Tensor:
     """Suffix tokens [B, S, D] through all layers and the final norm -> [B, S, D].
 
-    `cond` float32[1, D]: the time condition (Pi0.5). `hidden`, if given, receives the residual stream after each layer.
+    `cond` float32[1, D], or [1, S, D] by token: the time condition (Pi0.5). `hidden`, if given, receives the residual
+    stream after each layer.
     """
     for i, layer in enumerate(expert.layers):
         normed, gate = layer.input_layernorm(x, cond)

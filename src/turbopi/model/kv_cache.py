@@ -67,3 +67,9 @@ class KVCache:
     mask: Tensor | None  # bool[B, S]; None: every slot is valid
     lengths: Tensor  # int64[B]  valid prefix tokens; the suffix's positions go on from here
     state: Tensor  # float32[B, action_dim]  Pi0's suffix starts with it; Pi0.5 ignores it
+
+    def row(self, row: int) -> "KVCache":
+        """One observation's alone, masked as before."""
+        one = slice(row, row + 1)
+        mask = None if self.mask is None else self.mask[one]
+        return KVCache(self.k[:, one], self.v[:, one], mask, self.lengths[one], self.state[one])

@@ -31,14 +31,18 @@ class AdaRMSNorm(nn.Module):
         self.eps = eps
 
     def forward(self, x: Tensor, cond: Tensor | None) -> tuple[Tensor, Tensor]:
-        """x [B, S, D], cond float32 [B or 1, D] -> (normalised x, gate [B or 1, 1, D])."""
+        """x [B, S, D], cond float32 [B or 1, D] -> (normalised x, gate [B or 1, 1, D]).
+
+        A cond by token is [B or 1, S, D], and so is its gate.
+        """
         scale, shift, gate = self.modulation(cond)
         return (rms_normalize(x, self.eps) * (1 + scale) + shift).to(x.dtype), gate.to(x.dtype)
 
     def modulation(self, cond: Tensor | None) -> tuple[Tensor, ...]:
-        """Scale, shift and gate, float32 [B or 1, 1, D]."""
+        """Scale, shift and gate, float32 [B or 1, 1 or S, D]."""
         assert cond is not None
-        return self.dense(cond)[:, None].chunk(3, dim=-1)
+        rows = self.dense(cond)
+        return (rows if rows.dim() == 3 else rows[:, None]).chunk(3, dim=-1)
 
 
 def rms_normalize(x: Tensor, eps: float) -> Tensor:

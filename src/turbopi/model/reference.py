@@ -4,20 +4,26 @@
     denoise(cache, noise, N) -> actions the action expert, N times
     sample(observation, noise, N)       both
 
+`conditioning` adds what real-time execution needs (model/conditioning.py). Actions after every single step, for whoever
+streams them, are the trace's x_t: x_t[k] is x after k steps.
+
 Intermediates go into a `trace` dict under the names, and in the layouts, that golden files use; see `Trace`.
 Precisions: float32 (the oracle), and bfloat16 as openpi serves it, except that RoPE stays float32 (as in openpi's JAX).
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from turbopi.config import ModelConfig
 from turbopi.errors import ObservationError
-from turbopi.model.denoise import euler_step, run_expert, suffix_mask, suffix_rope, time_embedding, time_grid
+from turbopi.model.conditioning import Conditioning, Conditionings
+from turbopi.model.denoise import Pull, guided_velocity, run_expert, suffix_mask, suffix_rope, time_embedding
 from turbopi.model.exact import exact_float32
 from turbopi.model.gemma import Gemma
 from turbopi.model.kv_cache import EmbeddedPrefix, KVCache, PrefixLayout
@@ -32,6 +38,7 @@ FloatPrecision = Literal["bf16", "f32"]
 #   prefix_embs [B, S, D]   prefix_pad_mask bool[B, S]   prefix_positions int[B, S]   vision_last_hidden [C, B, 256, W]
 #   kv_k, kv_v [L, B, S, G, K]   times [N]   cond [N, B, D]   x_t [N + 1, B, H, 32]   suffix_out [N, B, H, D]
 #   v_t [N, B, H, 32]   expert_hidden_step0 [L, B, H (Pi0: H + 1), D]   actions [B, H, 32]
+# Conditioned: times [N, B, H]   cond [N, B, H, D], and v_t is the guided one, which was integrated.
 Trace = dict[str, Tensor]
 
 _FLOAT32_ALWAYS = (
@@ -95,11 +102,12 @@ class Pi0Model(nn.Module):
         num_steps: int,
         *,
         compact: bool = True,
+        conditioning: Conditionings = None,
         trace: Trace | None = None,
     ) -> Tensor:
         """Actions float32[B, H, action_dim], normalised, from noise of that shape: deterministic for given noise."""
         cache = self.prefix(observation, compact=compact, trace=trace)
-        return self.denoise(cache, noise, num_steps, trace=trace)
+        return self.denoise(cache, noise, num_steps, conditioning=conditioning, trace=trace)
 
     @torch.no_grad()
     @exact_float32()
@@ -115,37 +123,108 @@ class Pi0Model(nn.Module):
 
     @torch.no_grad()
     @exact_float32()
-    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int, *, trace: Trace | None = None) -> Tensor:
-        """Integrate from noise float32[B, H, action_dim] to actions of the same shape in `num_steps` Euler steps."""
-        config = self.config
-        times = time_grid(num_steps, config.time_grid)
-        time_embs = time_embedding(times, config.expert.width).to(noise.device)  # [N, D]
-        conds = self.time_condition(time_embs) if config.kind == "pi05" else None
-        suffix_len = noise.shape[1] + (config.kind == "pi0")  # Pi0's state token comes first
+    def denoise(
+        self,
+        cache: KVCache,
+        noise: Tensor,
+        num_steps: int,
+        *,
+        conditioning: Conditionings = None,
+        trace: Trace | None = None,
+    ) -> Tensor:
+        """Integrate from noise float32[B, H, action_dim] to actions of the same shape in `num_steps` Euler steps.
+
+        conditioning  of all rows, or a list with one, or None, for each: then rows are computed one by one. None, and
+                      whatever asks for nothing beside openpi's loop, gives its results to the last bit
+
+        Raises ObservationError for a conditioning that doesn't fit.
+        """
+        if isinstance(conditioning, Sequence):
+            return self._denoise_rows(cache, noise, num_steps, conditioning, trace)
+        config, horizon = self.config, noise.shape[1]
+        asked = conditioning or Conditioning()
+        asked.check(num_steps, horizon, config.action_dim)
+        tokens, guidance = asked.token_times(num_steps, horizon, config.time_grid), asked.guidance
+        distinct = tokens.distinct()
+        rows = tokens.rows(distinct)
+        time_embs = time_embedding(distinct, config.expert.width).to(noise.device)  # [U, D]
+        conds = self.time_condition(time_embs) if config.kind == "pi05" else time_embs
+        suffix_len = horizon + (config.kind == "pi0")  # Pi0's state token comes first
         rope = suffix_rope(cache, suffix_len, config.expert.head_dim, config.rope_base)
         mask = suffix_mask(cache, suffix_len, config.kind == "pi0")
 
+        def on_device(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(array).to(noise.device)
+
         x_t, steps = noise, []
+        if asked.held is not None and asked.values is not None:
+            x_t = torch.where(on_device(asked.held)[:, None], on_device(asked.values), noise)
+        by_row = on_device(rows)
+        times, dt = on_device(tokens.times)[..., None], on_device(tokens.steps)[..., None]  # [N, H, 1]
         hidden: list[Tensor] = []
         for i in range(num_steps):
-            time = (time_embs[i] if conds is None else conds[i])[None]
+            one_time = bool((rows[i] == rows[i, 0]).all())
+            time = conds[rows[i, 0]][None] if one_time else conds[by_row[i]][None]  # [1, D] or [1, H, D]
             record = hidden if trace is not None and i == 0 else None
-            suffix_out, v_t = self.velocity(x_t, cache.state, time, cache.k, cache.v, rope, mask, record)
+
+            def velocity(x: Tensor, time: Tensor = time, record: list[Tensor] | None = record) -> tuple[Tensor, Tensor]:
+                return self.velocity(x, cache.state, time, cache.k, cache.v, rope, mask, record)
+
+            if guidance is None:
+                suffix_out, v_t = velocity(x_t)
+            else:
+                pull = Pull(
+                    on_device(guidance.target),
+                    on_device(guidance.weights)[:, None],
+                    on_device(guidance.strength[i])[:, None],
+                    times[i],
+                    guidance.mode == "jacobian",
+                )
+                suffix_out, v_t = guided_velocity(velocity, x_t, pull)
             if trace is not None:
                 steps.append((x_t, suffix_out, v_t))
-            x_t = euler_step(x_t, v_t, num_steps)
+            x_t = x_t + dt[i] * v_t
 
         if trace is not None:
-            trace["times"] = torch.from_numpy(times)
-            if conds is not None:
-                trace["cond"] = conds[:, None].expand(-1, noise.shape[0], -1)
+            batch = noise.shape[0]
+            if conditioning is None:
+                trace["times"] = times[:, 0, 0].cpu()
+            else:
+                trace["times"] = times[:, None, :, 0].expand(-1, batch, -1).cpu()
+            if config.kind == "pi05":
+                cond = conds[by_row[:, 0]][:, None] if conditioning is None else conds[by_row][:, None]
+                trace["cond"] = cond.expand(-1, batch, *cond.shape[2:])
             trace["x_t"] = torch.stack([x for x, _, _ in steps] + [x_t])
             trace["suffix_out"] = torch.stack([out for _, out, _ in steps])
             trace["v_t"] = torch.stack([v for _, _, v in steps])
             if hidden:
-                trace["expert_hidden_step0"] = torch.stack(hidden)
+                trace["expert_hidden_step0"] = torch.stack([layer.detach() for layer in hidden])
             trace["actions"] = x_t
         return x_t
+
+    def _denoise_rows(
+        self,
+        cache: KVCache,
+        noise: Tensor,
+        num_steps: int,
+        conditioning: Sequence[Conditioning | None],
+        trace: Trace | None,
+    ) -> Tensor:
+        """Each row of a batch with a conditioning of its own."""
+        if len(conditioning) != noise.shape[0]:
+            raise ObservationError(f"{len(conditioning)} conditionings were given for {noise.shape[0]} observations")
+        traces: list[Trace] = []
+        for row, asked in enumerate(conditioning):
+            traces.append({})
+            one = Conditioning() if asked is None else asked  # so that all rows' traces have the same shapes
+            self.denoise(cache.row(row), noise[row : row + 1], num_steps, conditioning=one, trace=traces[-1])
+        joined = {
+            name: torch.cat([one[name] for one in traces], dim=int(name != "actions"))
+            for name in (traces[0] if trace is not None else ["actions"])
+        }
+        if trace is not None:
+            trace.update(joined)
+        return joined["actions"]
 
     # -- their parts: each one is a stage that a backend may time, compile or replace ----------------------------------
 
@@ -209,7 +288,7 @@ class Pi0Model(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """One evaluation of the action expert -> (its output float32[B, H, D], v_t float32[B, H, action_dim]).
 
-        `time` float32[1, D] is the adaRMS condition (Pi0.5) or the time embedding (Pi0).
+        `time` float32[1, D], or [1, H, D] by action, is the adaRMS condition (Pi0.5) or the time embedding (Pi0).
         """
         adaptive = self.config.kind == "pi05"
         tokens = self.embed_suffix(x_t, state, time)

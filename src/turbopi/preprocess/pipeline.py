@@ -18,7 +18,7 @@ from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.observation import ModelInputs
 from turbopi.preprocess.images import RESIZES, fitted, placement
 from turbopi.preprocess.normalize import Normalizer, pad_last
-from turbopi.preprocess.relative_actions import absolute_actions
+from turbopi.preprocess.relative_actions import absolute_actions, reanchored
 from turbopi.preprocess.robot_checks import (
     check_shape,
     notes_on_statistics,
@@ -172,6 +172,35 @@ class Pipeline:
             )
         return {"actions": actions}
 
+    def anchor(self, state: np.ndarray) -> np.ndarray | None:
+        """What `after` adds to relative actions, float64[len(delta_mask)] in their units; None for absolute ones.
+
+        state   as `before` returned it
+        """
+        if self.robot.delta_mask is None:
+            return None
+        full = state if self._adds_raw_state else self.state_scale.unnormalize(state)
+        return np.array(full[: len(self.robot.delta_mask)], np.float64)
+
+    def reanchored(self, left_over: np.ndarray, anchor: np.ndarray | None, state: np.ndarray) -> np.ndarray:
+        """Relative actions float32[K, action_dim], normalised, as seen from another state: the same absolute ones.
+
+        anchor  of the state that they are relative to; `state` is the new one, as `before` returned it. Absolute
+                actions are returned as they are
+
+        Raises ObservationError for an anchor of another shape, or one that isn't finite.
+        """
+        mask, new = self.robot.delta_mask, self.anchor(state)
+        if mask is None or new is None:
+            return left_over
+        old = np.asarray(anchor)
+        if old.dtype.kind not in "fiu" or old.shape != new.shape or not np.isfinite(old).all():
+            raise ObservationError(
+                f"the anchor has shape {list(old.shape)} and dtype {old.dtype}; it should be {len(new)} finite "
+                'numbers, what came with the left-over under "anchor"'
+            )
+        return reanchored(left_over, old.astype(np.float64), new, mask, self.action_scale)
+
     def example(self, seed: int = 0) -> dict[str, Any]:
         """A random valid observation in the robot's own keys; the same for the same seed."""
         made = self.robot.example(np.random.default_rng(seed))
@@ -269,7 +298,7 @@ class Pipeline:
             actions, state = result.actions.astype(np.float32), result.state.astype(np.float32)
             result.actions = absolute_actions(actions, state, self.robot.delta_mask or ())
         elif self.robot.delta_mask is not None:
-            state = self.state_scale.unnormalize(result.state)
+            state = self.state_scale.unnormalize(result.state)  # what `anchor` says, too
             result.actions = absolute_actions(result.actions, state, self.robot.delta_mask)
 
     def _write_actions(self, result: _Result) -> None:

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from turbopi.preprocess.normalize import Normalizer
+
 
 def delta_actions(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool]) -> np.ndarray:
     """Absolute actions [..., H, d] relative to `state` [..., s] where `mask` is True; the dtype is kept."""
@@ -17,6 +19,22 @@ def delta_actions(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool]) 
 def absolute_actions(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool]) -> np.ndarray:
     """The inverse of `delta_actions`: `state`, un-normalised, added where `mask` is True; the dtype is kept."""
     return _shifted(actions, state, mask, 1)
+
+
+def reanchored(
+    actions: np.ndarray, old: np.ndarray, new: np.ndarray, mask: Sequence[bool], scale: Normalizer
+) -> np.ndarray:
+    """Normalised actions float32[K, A] relative to the state `old` float[s], relative to `new` instead.
+
+    Where `mask` is True: un-normalised, + old − new, normalised again. The others keep their bits.
+    """
+    moved = delta_actions(absolute_actions(scale.unnormalize(actions), old, mask), new, mask)
+    width = moved.shape[1] if scale.width is None else scale.width
+    moved[:, :width] = scale.normalize(moved[:, :width])
+    out = actions.copy()
+    columns = np.flatnonzero(mask)
+    out[:, columns] = moved[:, columns]
+    return out
 
 
 def _shifted(actions: np.ndarray, state: np.ndarray, mask: Sequence[bool], sign: int) -> np.ndarray:

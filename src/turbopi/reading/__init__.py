@@ -15,15 +15,16 @@ An .npz is checked by its CRC-32, so damage to its numbers is found. Neither an 
 flipped digit in one that still reads well stays unnoticed.
 """
 
+import importlib
 from typing import TYPE_CHECKING
 
-from turbopi.reading.documents import as_document, plain_document, read_document
 from turbopi.reading.fields import Fields, is_finite, is_integer
 from turbopi.reading.files import file_inside, listing, one_line, open_file, read_bytes, shown
 from turbopi.reading.json import MAX_JSON_BYTES, MAX_JSON_DEPTH, parse_json, read_json
 
 if TYPE_CHECKING:
     from turbopi.reading.arrays import MAX_ARRAY_BYTES, Npz, read_npy, read_npz
+    from turbopi.reading.documents import as_document, plain_document, read_document
 
 __all__ = [
     "MAX_ARRAY_BYTES",
@@ -48,13 +49,14 @@ __all__ = [
     "shown",
 ]
 
-_ARRAYS = ("MAX_ARRAY_BYTES", "Npz", "read_npy", "read_npz")
+_MODULES = {  # imported when asked for: `turbopi --help` needs no NumPy, a robot's client no msgspec
+    **dict.fromkeys(("MAX_ARRAY_BYTES", "Npz", "read_npy", "read_npz"), "arrays"),
+    **dict.fromkeys(("as_document", "plain_document", "read_document"), "documents"),
+}
 
 
 def __getattr__(name: str) -> object:
-    if name in _ARRAYS:  # imported when asked for: `turbopi --help` needs no NumPy
-        from turbopi.reading import arrays
-
-        found: object = getattr(arrays, name)
-        return found
-    raise AttributeError(f"module 'turbopi.reading' has no attribute {name!r}")
+    if name not in _MODULES:
+        raise AttributeError(f"module 'turbopi.reading' has no attribute {name!r}")
+    found: object = getattr(importlib.import_module(f"turbopi.reading.{_MODULES[name]}"), name)
+    return found

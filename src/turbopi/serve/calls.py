@@ -27,6 +27,8 @@ class Policy(Protocol):
 
     def infer(self, obs: dict[str, Any], /) -> dict[str, Any]: ...
 
+    # With "real_time" in its metadata, also `previous` and `model_actions`, as `UnifiedPolicy.infer` has them.
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -56,25 +58,28 @@ class PolicyCalls:
         self._metrics = metrics
         self._on_lost = on_lost
 
-    async def warm_up(self) -> None:
+    async def warm_up(self, **arguments: Any) -> None:
         """Call the policy's `warmup`, if it has one, on the thread. Raises what it raises."""
         warmup = getattr(self._policy, "warmup", None)
         if warmup is not None:
-            await self._worker.call(lambda _: warmup(), None)
+            await self._worker.call(lambda _: warmup(**arguments), None)
 
-    async def run(self, observation: dict[str, object]) -> Outcome:
-        """Run the policy when it is this request's turn. Raises Busy and Stopping, as the worker does."""
+    async def run(self, observation: dict[str, object], arguments: dict[str, Any]) -> Outcome:
+        """Run the policy when it is this request's turn. Raises Busy and Stopping, as the worker does.
+
+        arguments  of `infer`, besides the observation; a pipelined policy isn't given any
+        """
         asked = time.perf_counter()
 
         def call(observation: dict[str, object]) -> Outcome:
             self._metrics.queue_seconds.observe(time.perf_counter() - asked)
-            return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation))
+            return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments))
 
         def submit(observation: dict[str, object]) -> Future[Outcome]:
             self._metrics.queue_seconds.observe(time.perf_counter() - asked)
             return self._submit(observation)
 
-        if self._pipelined:
+        if self._pipelined and not arguments:
             return await self._worker.begin(submit, observation)
         return await self._worker.call(call, observation)
 

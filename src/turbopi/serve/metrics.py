@@ -25,6 +25,7 @@ ERROR_KINDS = (
     "disconnected",
     "stopping",
 )
+DROPPED_SESSIONS = ("closed", "idle", "full")
 RECORD_OUTCOMES = ("written", "dropped", "failed")
 
 # Seconds. A policy takes 10 ms to 1 s; a control loop cares about every 5 ms of it.
@@ -51,6 +52,31 @@ class Metrics:
         self._recorded = Counter(
             "turbopi_recorded_calls", "Calls recorded, or not", ["outcome"], registry=self.registry
         )
+        self._joined = Counter(
+            "turbopi_real_time_requests",
+            "Requests that joined a running chunk, or had none",
+            ["joined"],
+            registry=self.registry,
+        )
+        self.delay_steps = Histogram(
+            "turbopi_real_time_delay_steps",
+            "Control steps of delay that the policy was told",
+            buckets=(0, 1, 2, 3, 4, 5, 6, 8, 10, 15, 20, 30, 50),
+            registry=self.registry,
+        )
+        self.seam_gap = Histogram(
+            "turbopi_real_time_seam_gap",
+            "Largest normalised distance of the new chunk from the running one where it takes over",
+            buckets=(0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0),
+            registry=self.registry,
+        )
+        self._sessions_dropped = Counter(
+            "turbopi_real_time_sessions_dropped", "Sessions that ended", ["reason"], registry=self.registry
+        )
+        for joined in ("yes", "no"):
+            self._joined.labels(joined)
+        for reason in DROPPED_SESSIONS:
+            self._sessions_dropped.labels(reason)
         for kind in ERROR_KINDS:  # so that each is there from the start, at 0
             self._errors.labels(kind)
         for outcome in RECORD_OUTCOMES:
@@ -63,6 +89,18 @@ class Metrics:
     def recorded(self, outcome: str) -> None:
         assert outcome in RECORD_OUTCOMES, outcome
         self._recorded.labels(outcome).inc()
+
+    def joined(self, joined: bool) -> None:
+        self._joined.labels("yes" if joined else "no").inc()
+
+    def session_dropped(self, reason: str) -> None:
+        assert reason in DROPPED_SESSIONS, reason
+        self._sessions_dropped.labels(reason).inc()
+
+    def watch_sessions(self, count: Callable[[], int]) -> None:
+        """Read the number of sessions from `count` whenever somebody asks."""
+        sessions = Gauge("turbopi_real_time_sessions", "Sessions with a running chunk", registry=self.registry)
+        sessions.set_function(count)
 
     def watch(self, waiting: Callable[[], int], running: Callable[[], bool]) -> None:
         """Read the queue's state from `waiting` and `running` whenever somebody asks."""

@@ -4,10 +4,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from turbopi.errors import ConfigError
 from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limits import Limits
+
+if TYPE_CHECKING:  # `turbopi --help` needs no NumPy
+    from turbopi.running_chunk import JoinMode
+
+JOINING = ("rtc", "rtc_identity", "rtc_trained")
 
 
 @dataclass(frozen=True)
@@ -21,6 +27,12 @@ class ServerOptions:
     record_dir      if given, every observation and its actions are written below this folder
     allowed_hosts   names, besides its own, by which web pages may address this server (`hosts.AllowedHosts`)
     max_clients     connected at once; more are refused with HTTP 503
+    execution       join each client's chunks here, in a session of each connection: "rtc", "rtc_identity" or
+                    "rtc_trained". None: only for clients that ask for it (docs/serving.md)
+    control_hz      actions that robots carry out in a second; needed with `execution`
+    execution_horizon
+                    s, actions of a chunk that robots carry out before the next takes over. None: half of a chunk
+    delay_steps     control steps from an observation to its chunk at the robot. None: measured here, network apart
     """
 
     host: str = "127.0.0.1"
@@ -31,6 +43,10 @@ class ServerOptions:
     record_dir: str | Path | None = None
     allowed_hosts: Sequence[str] = ()
     max_clients: int = Limits.clients
+    execution: "JoinMode | None" = None
+    control_hz: float | None = None
+    execution_horizon: int | None = None
+    delay_steps: int | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
@@ -41,6 +57,19 @@ class ServerOptions:
             raise ConfigError(f"queue_limit must be 0 or more, not {self.queue_limit}")
         if self.max_clients < 1:
             raise ConfigError(f"max_clients must be 1 or more, not {self.max_clients}")
+        if self.execution is not None and self.execution not in JOINING:
+            raise ConfigError(
+                f"execution is {self.execution!r}; a server joins chunks by {', '.join(JOINING)}. Other ways to run "
+                "need nothing of it"
+            )
+        if self.execution is not None and self.control_hz is None:
+            raise ConfigError(f"execution {self.execution!r} needs the robots' control rate, too: control_hz")
+        if self.control_hz is not None and not 0 < self.control_hz <= 10_000:
+            raise ConfigError(f"control_hz must be more than 0 and at most 10000, not {self.control_hz}")
+        if self.execution_horizon is not None and self.execution_horizon < 1:
+            raise ConfigError(f"execution_horizon must be 1 or more, not {self.execution_horizon}")
+        if self.delay_steps is not None and self.delay_steps < 0:
+            raise ConfigError(f"delay_steps must be 0 or more, not {self.delay_steps}")
         check_key(self.api_key)
         AllowedHosts(self.host, self.allowed_hosts)
 

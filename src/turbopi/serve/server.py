@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
-from turbopi.errors import ConfigError, DeviceLost
+from turbopi.errors import ConfigError, DeviceLost, ObservationError
 from turbopi.recordings import Recorder
 from turbopi.serve.calls import Outcome, Policy, PolicyCalls
 from turbopi.serve.connection import GuardedConnection, Shared
@@ -38,6 +38,7 @@ from turbopi.serve.limits import Limits, limits_for
 from turbopi.serve.listener import Listener
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
+from turbopi.serve.real_time import Plan, RealTime
 from turbopi.serve.signals import stop_signals
 from turbopi.serve.worker import Busy, Stopping, Worker
 from turbopi.wire import WireError, pack, unpack
@@ -95,6 +96,7 @@ class PolicyServer:
         self._recorder: Recorder | None = None
         self._worker = Worker(options.queue_limit)
         self._calls = PolicyCalls(policy, self._worker, self.metrics, on_lost=self._lose)
+        self._real_time = RealTime(policy.metadata, options, self.metrics)
         self._lost: Future[str] = Future()  # set from the worker's thread
         self.metrics.watch(lambda: self._worker.waiting, lambda: self._worker.running)
         self._started = False
@@ -137,8 +139,9 @@ class PolicyServer:
         except OSError as error:
             raise ConfigError(f"can't listen on {self.url}: {error}. Choose another --host or --port.") from error
         try:
-            await self._calls.warm_up()
-            metadata = self._policy.metadata
+            execution = self.options.execution
+            await self._calls.warm_up(**({} if execution is None else {"real_time": execution}))
+            metadata = {**self._policy.metadata, **self._real_time.metadata}
             self._greeting = pack(metadata)
             if self._record_dir is not None:
                 self._recorder = Recorder(self._record_dir, metadata, count=self.metrics.recorded)
@@ -236,6 +239,7 @@ class PolicyServer:
             await self._fail(connection, traceback.format_exc())
         finally:
             self._idle.discard(connection)
+            self._real_time.closed(connection)
             self.metrics.clients.dec()
 
     async def _fail(self, connection: GuardedConnection, text: str) -> None:
@@ -291,10 +295,13 @@ class PolicyServer:
         if self.lost is not None:
             return self._refuse("lost", _REFUSALS["lost"].format(self.lost))
         try:
-            observation = await self._decode(connection, message)
-            outcome = await self._infer(connection, observation)
+            received = await self._decode(connection, message)
+            plan = self._real_time.plan(received, connection)
+            outcome = await self._infer(connection, plan)
         except WireError as error:
             return self._refuse("malformed", f"bad request: {error}")
+        except ObservationError as error:
+            return self._refuse("observation", _REFUSALS["observation"].format(error))
         except Busy:
             limit = self._worker.queue_limit
             return self._refuse("busy", f"busy: {limit} requests wait already (--queue-limit {limit}); try again")
@@ -305,10 +312,11 @@ class PolicyServer:
         if outcome.wrong is not None:
             return self._refuse(outcome.wrong, _REFUSALS[outcome.wrong].format(outcome.text))
         assert outcome.result is not None
+        result = self._real_time.finish(plan, outcome.result)
         timing = {"infer_ms": outcome.seconds * 1e3}
         if previous_total is not None:
             timing["prev_total_ms"] = previous_total * 1e3
-        return {**outcome.result, "server_timing": timing}
+        return {**result, "server_timing": timing}
 
     def _refuse(self, kind: str, text: str) -> _Refusal:
         self.metrics.error(kind)
@@ -326,9 +334,9 @@ class PolicyServer:
         finally:
             connection.took(time.perf_counter() - started)
 
-    async def _infer(self, connection: GuardedConnection, observation: dict[str, object]) -> Outcome:
+    async def _infer(self, connection: GuardedConnection, plan: Plan) -> Outcome:
         """Run the policy when it is this request's turn, unless the client leaves first."""
-        work = asyncio.ensure_future(self._calls.run(observation))
+        work = asyncio.ensure_future(self._calls.run(plan.observation, plan.arguments))
         gone = asyncio.ensure_future(connection.wait_closed())
         try:
             await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
@@ -338,6 +346,7 @@ class PolicyServer:
         finally:
             gone.cancel()
             work.cancel()
+            self._real_time.release(plan)
 
 
 def _decode(message: str | bytes, max_bytes: int) -> dict[str, object]:

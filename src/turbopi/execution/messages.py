@@ -1,0 +1,175 @@
+"""What a message to a policy server says about real-time execution: optional keys beside the observation's own.
+
+docs/serving.md has them as a table. Any client of openpi's protocol can send them; a server of another make refuses or
+ignores them, so a client looks for "real_time" in the server's metadata first.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, get_args
+
+import numpy as np
+
+from turbopi.config import Schedule
+from turbopi.errors import ObservationError
+from turbopi.running_chunk import JoinMode, RunningChunk
+
+PREFIX = "turbopi/"
+MAX_SESSION = 64  # characters
+MAX_STEP = 2**53
+KEYS = (
+    *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
+    *("session", "step", "reset"),
+)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a message asks for beside its observation; None and False: it doesn't say.
+
+    previous           the running chunk, if the client keeps it itself
+    model_actions      the answer shall have "model_actions", and "anchor" for relative actions
+    mode, delay, execution_horizon, schedule, max_guidance_weight
+                       how to join, if the server keeps the running chunk
+    session            its name; None: the connection is the session
+    step               actions that the robot has carried out in this session when the observation was taken
+    reset              a new episode: the session's running chunk is forgotten
+    """
+
+    previous: RunningChunk | None = None
+    model_actions: bool = False
+    mode: JoinMode | None = None
+    delay: int | None = None
+    execution_horizon: int | None = None
+    guidance: Mapping[str, Any] | None = None
+    session: str | None = None
+    step: int | None = None
+    reset: bool = False
+
+
+def message(
+    observation: Mapping[str, Any], previous: RunningChunk | None = None, model_actions: bool = False
+) -> dict[str, Any]:
+    """The observation with what `UnifiedPolicy.infer` would be told beside it."""
+    asked: dict[str, Any] = {}
+    if model_actions:
+        asked["model_actions"] = True
+    if previous is not None:
+        asked |= {
+            "previous": np.asarray(previous.left_over, np.float32),
+            "delay": int(previous.delay),
+            "mode": previous.mode,
+        }
+        if previous.schedule is not None:
+            asked["schedule"] = previous.schedule
+        if previous.max_guidance_weight is not None:
+            asked["max_guidance_weight"] = float(previous.max_guidance_weight)
+        if previous.execution_horizon is not None:
+            asked["execution_horizon"] = int(previous.execution_horizon)
+        if previous.anchor is not None:
+            asked["anchor"] = np.asarray(previous.anchor)
+    return {**observation, **{PREFIX + key: value for key, value in asked.items()}}
+
+
+def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
+    """The observation alone, and what was asked for beside it. Raises ObservationError for what can't be meant."""
+    observation = {key: value for key, value in received.items() if not key.startswith(PREFIX)}
+    if len(observation) == len(received):
+        return observation, Asked()
+    given = {key.removeprefix(PREFIX): value for key, value in received.items() if key.startswith(PREFIX)}
+    unknown = sorted(set(given) - set(KEYS))
+    if unknown:
+        raise ObservationError(
+            f"{PREFIX}{unknown[0]} is no key of this server; keys that begin with {PREFIX!r} are "
+            + ", ".join(PREFIX + key for key in KEYS)
+        )
+    mode = given.get("mode")
+    if mode is not None and mode not in get_args(JoinMode):
+        raise ObservationError(f"{PREFIX}mode is {mode!r}; it should be one of {', '.join(get_args(JoinMode))}")
+    delay = _whole(given, "delay", 0)
+    horizon = _whole(given, "execution_horizon", 1)
+    guidance = _guidance(given)
+    session = given.get("session")
+    if session is not None and not (isinstance(session, str) and 0 < len(session) <= MAX_SESSION):
+        raise ObservationError(
+            f"{PREFIX}session is {session!r:.100}; it should be text of 1 to {MAX_SESSION} characters"
+        )
+    previous = None
+    if "previous" in given:
+        left_over = _numbers(given, "previous")
+        if left_over.ndim != 2 or not len(left_over):
+            raise ObservationError(
+                f"{PREFIX}previous has shape {list(left_over.shape)}; it should be float32 [K, action_dim], the "
+                'rows of "model_actions" that are left when the observation is taken'
+            )
+        if mode is None or delay is None:
+            missing = "mode" if mode is None else "delay"
+            raise ObservationError(f"{PREFIX}previous came without {PREFIX}{missing}: give both mode and delay")
+        if session is not None:
+            raise ObservationError(
+                f"{PREFIX}previous and {PREFIX}session were both given: either the client keeps the running chunk, or "
+                "the server does"
+            )
+        anchor = _numbers(given, "anchor", np.float64) if "anchor" in given else None
+        previous = RunningChunk(left_over, delay, horizon, mode, anchor, **guidance)
+    elif "anchor" in given:
+        raise ObservationError(f"{PREFIX}anchor came without {PREFIX}previous, to which it belongs")
+    asked = Asked(
+        previous=previous,
+        model_actions=_flag(given, "model_actions"),
+        mode=mode,
+        delay=delay,
+        execution_horizon=horizon,
+        guidance=guidance or None,
+        session=session,
+        step=_whole(given, "step", 0),
+        reset=_flag(given, "reset"),
+    )
+    return observation, asked
+
+
+def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
+    guidance: dict[str, Any] = {}
+    if "schedule" in given:
+        schedule = given["schedule"]
+        if schedule not in get_args(Schedule):
+            raise ObservationError(
+                f"{PREFIX}schedule is {schedule!r:.100}; it should be one of {', '.join(get_args(Schedule))}"
+            )
+        guidance["schedule"] = schedule
+    if "max_guidance_weight" in given:
+        weight = given["max_guidance_weight"]
+        good = isinstance(weight, int | float | np.integer | np.floating) and not isinstance(weight, bool)
+        if not good or not 0 <= float(weight) < np.inf:
+            raise ObservationError(f"{PREFIX}max_guidance_weight is {weight!r:.100}; it should be a number from 0")
+        guidance["max_guidance_weight"] = float(weight)
+    return guidance
+
+
+def _whole(given: Mapping[str, Any], key: str, least: int) -> int | None:
+    value = given.get(key)
+    if value is None:
+        return None
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= MAX_STEP:
+        raise ObservationError(f"{PREFIX}{key} is {value!r:.100}; it should be a whole number from {least}")
+    return int(value)
+
+
+def _flag(given: Mapping[str, Any], key: str) -> bool:
+    value = given.get(key, False)
+    if not isinstance(value, bool | np.bool_):
+        raise ObservationError(f"{PREFIX}{key} is {value!r:.100}; it should be true or false")
+    return bool(value)
+
+
+def _numbers(given: Mapping[str, Any], key: str, dtype: type[np.floating[Any]] = np.float32) -> np.ndarray:
+    value = given[key]
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+        raise ObservationError(f"{PREFIX}{key} is {type(value).__name__}; it should be an array of numbers")
+    with np.errstate(over="ignore"):
+        array = value.astype(dtype)
+    if not np.isfinite(array).all():
+        raise ObservationError(f"{PREFIX}{key} has values that aren't finite")
+    return array

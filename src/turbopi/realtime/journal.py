@@ -1,0 +1,63 @@
+"""What the executor commanded, and what became of each observation: the last minutes of it."""
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from turbopi.errors import TurboPiError
+
+KEPT = 20_000  # commands: 400 s at 50 Hz
+
+Kind = Literal["fresh", "slowed", "held", "waiting"]
+
+
+class OutOfActions(TurboPiError):
+    """The robot has no action for this control step, as the policy answers too late or not at all."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the robot is to do in this control step.
+
+    kind        "fresh"    an action of a chunk, carried out now and never before
+                "slowed"   a point half way to the next action: the policy is late, so the motion is stretched
+                "held"     there is no action: `action` is the executor's `hold_action`
+                "waiting"  no chunk has come yet in this episode; `action` is as for "held"
+    action      float64[d], in the robot's units. None: command nothing; the robot's controller keeps its place
+    chunk, row  where a fresh action comes from
+    takes_over  it is the first action of its chunk that is carried out
+    remaining   actions that are left: after so many more steps there is none, if the policy doesn't answer
+    """
+
+    kind: Kind
+    action: np.ndarray | None
+    remaining: int
+    chunk: int | None = None
+    row: int | None = None
+    takes_over: bool = False
+
+
+@dataclass
+class Inferred:
+    """One observation that a chunk was asked for."""
+
+    chunk: int
+    begun: int  # control step
+    ended: int | None = None
+    outcome: str = "in flight"  # "used", or why its chunk was dropped
+
+
+@dataclass
+class Journal:
+    commands: deque[tuple[int, Command]] = field(default_factory=lambda: deque(maxlen=KEPT))  # with their control step
+    inferred: deque[Inferred] = field(default_factory=lambda: deque(maxlen=KEPT))
+    kinds: Counter[str] = field(default_factory=Counter)
+    observations: Counter[str] = field(default_factory=Counter)
+    clock_jumps: int = 0
+    latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
+
+    def command(self, step: int, command: Command) -> None:
+        self.commands.append((step, command))
+        self.kinds[command.kind] += 1

@@ -1,0 +1,54 @@
+"""What the executor needs of a policy: UnifiedPolicy, RealTimeClient, or openpi's WebsocketClientPolicy."""
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from turbopi.errors import ConfigError
+from turbopi.execution import Way
+
+
+def metadata_of(policy: Any) -> Mapping[str, Any]:
+    """What a policy tells of itself; empty if it tells nothing."""
+    told = getattr(policy, "metadata", None)
+    if told is None and hasattr(policy, "get_server_metadata"):  # openpi's client
+        told = policy.get_server_metadata()
+    return told if isinstance(told, Mapping) else {}
+
+
+def check_policy(policy: Any, way: Way) -> Mapping[str, Any]:
+    """What it offers for real-time execution, of its metadata. Raises ConfigError if it can't be run in this way."""
+    if not callable(getattr(policy, "infer", None)):
+        raise ConfigError(f"a {type(policy).__name__} is no policy: it has no infer(observation)")
+    offered = metadata_of(policy).get("real_time")
+    offered = offered if isinstance(offered, Mapping) else {}
+    if way.mode is None:
+        return offered
+    free = "execution 'sync', 'async' or 'ensemble' need nothing of the policy"
+    if not _takes_previous(policy):
+        raise ConfigError(
+            f"execution {way.name!r} tells the policy of the running chunk, which {type(policy).__name__}.infer "
+            f"doesn't take: use a UnifiedPolicy, or turbopi.client.RealTimeClient for a server; {free}"
+        )
+    modes = list(offered.get("modes", ()))
+    if not modes:
+        raise ConfigError(
+            f"execution {way.name!r} needs a policy that joins chunks, and this {type(policy).__name__} offers no "
+            f'real-time modes (its metadata has no "real_time"); {free}'
+        )
+    if way.mode not in modes:
+        raise ConfigError(f"execution {way.name!r} isn't offered by this policy, which offers {modes}; {free}")
+    return offered
+
+
+def server_joins(offered: Mapping[str, Any]) -> bool:
+    """Whether the policy is a server that keeps the running chunk itself (`turbopi serve --execution`)."""
+    return offered.get("execution") is not None
+
+
+def _takes_previous(policy: Any) -> bool:
+    try:
+        parameters = inspect.signature(policy.infer).parameters.values()
+    except (TypeError, ValueError):  # a callable without a signature
+        return False
+    return any(p.name == "previous" or p.kind is p.VAR_KEYWORD for p in parameters)

@@ -1,0 +1,293 @@
+"""Real-time execution over the wire: what a request tells of the running chunk, and sessions that remember it here.
+
+A client may keep the running chunk itself: it asks for "model_actions", and sends what is left of them as
+"turbopi/previous". Or the server keeps it, in a session: then the server must know how many actions the robot has
+carried out since the observation of the chunk before, and how many it will until the new chunk is there.
+docs/serving.md says from what; what isn't known is refused, never guessed.
+"""
+
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from turbopi.errors import ConfigError, ObservationError
+from turbopi.execution import DelayEstimate
+from turbopi.execution.messages import KEYS, PREFIX, Asked, read_message
+from turbopi.running_chunk import JoinMode, RunningChunk
+from turbopi.serve.metrics import Metrics
+from turbopi.serve.options import ServerOptions
+
+MAX_SESSIONS = 256  # named ones; a connection's own ends with it
+IDLE_SECONDS = 300.0  # a named session that nobody used for so long is dropped
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """The chunk that a session's robot carries out."""
+
+    model_actions: np.ndarray  # float32[H, A]
+    anchor: np.ndarray | None
+    step: int | None  # the robot's count of actions at its observation, if the client sends one
+    received: float  # when the observation came, by the server's clock
+
+
+@dataclass
+class _Session:
+    used: float
+    kept: _Kept | None = None
+    delays: DelayEstimate = field(default_factory=DelayEstimate)
+    busy: bool = False
+
+
+@dataclass
+class Plan:
+    """One request: what the policy is given. `release` it when that has answered, `finish` it if it has actions."""
+
+    observation: dict[str, Any]
+    arguments: dict[str, Any] = field(default_factory=dict)  # of `policy.infer`, besides the observation
+    asked: Asked = field(default_factory=Asked)
+    session: _Session | None = None
+    received: float = 0.0
+    about: dict[str, Any] = field(default_factory=dict)  # what the answer says of it, under "real_time"
+
+
+class RealTime:
+    """What a server does of it, for one policy. For the event loop's thread alone.
+
+    Raises ConfigError if the policy doesn't offer the options' `execution`.
+    """
+
+    def __init__(
+        self,
+        metadata: Mapping[str, Any],
+        options: ServerOptions,
+        metrics: Metrics,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        offered = metadata.get("real_time")
+        self._offered: Mapping[str, Any] = offered if isinstance(offered, Mapping) else {}
+        self._modes = list(self._offered.get("modes", ()))
+        self._options, self._metrics, self._clock = options, metrics, clock
+        self._named: OrderedDict[Hashable, _Session] = OrderedDict()  # the one used last at the end
+        self._of_connections: dict[Hashable, _Session] = {}
+        if options.execution is not None and options.execution not in self._modes:
+            what = f"it offers {self._modes}" if self._modes else "it offers none"
+            raise ConfigError(f"execution is {options.execution!r}, which this policy can't: {what}")
+        metrics.watch_sessions(lambda: len(self._named) + len(self._of_connections))
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the greeting says besides the policy's own: {} for a policy that joins no chunks."""
+        if not self._modes:
+            return {}
+        return {
+            "real_time": {
+                **self._offered,
+                "keys": [PREFIX + key for key in KEYS],
+                "execution": self._options.execution,
+                "control_hz": self._options.control_hz,
+                "sessions": {"most": MAX_SESSIONS, "idle_seconds": IDLE_SECONDS},
+            }
+        }
+
+    # --- requests -----------------------------------------------------------------------------------------------------
+
+    def plan(self, received: Mapping[str, Any], connection: Hashable) -> Plan:
+        """What to do with a request that has just come. Raises ObservationError."""
+        now = self._clock()
+        observation, asked = read_message(received)
+        if asked == Asked() and self._options.execution is None:
+            return Plan(observation)
+        if not self._modes:
+            raise ObservationError(
+                f"this server's policy joins no chunks (its metadata offers no real-time modes): leave out "
+                f"the keys that begin with {PREFIX!r}"
+            )
+        mode = asked.mode or self._options.execution
+        if mode is not None and mode not in self._modes:
+            raise ObservationError(f"{PREFIX}mode is {mode!r}, which this policy can't: it offers {self._modes}")
+        if asked.session is None and (asked.previous is not None or asked.model_actions):
+            if asked.step is not None or asked.reset:
+                raise ObservationError(
+                    f"{PREFIX}step and {PREFIX}reset are for sessions, but here the client keeps its running chunk"
+                )
+            arguments = {"previous": asked.previous, "model_actions": asked.model_actions}
+            about: dict[str, Any] = {"joined": asked.previous is not None}
+            if asked.previous is not None:
+                about |= {"mode": asked.previous.mode, "delay": asked.previous.delay}
+            return Plan(observation, arguments, asked, received=now, about=about)
+        if asked.session is None and self._options.execution is None:
+            raise ObservationError(
+                f"the keys {_named(received)} need a session, as the server keeps no running chunk for this "
+                f"connection: give {PREFIX}session, too, or start the server with --execution"
+            )
+        if mode is None:
+            raise ObservationError(
+                f"{PREFIX}session came without {PREFIX}mode; it should be one of {self._modes} "
+                "(or start the server with --execution)"
+            )
+        return self._plan_in_session(observation, asked, mode, connection, now)
+
+    def _plan_in_session(
+        self, observation: dict[str, Any], asked: Asked, mode: JoinMode, connection: Hashable, now: float
+    ) -> Plan:
+        session = self._session(asked, connection, now)
+        if asked.reset:
+            session.kept = None
+        previous, about = None, {"joined": False, "mode": mode}
+        if session.kept is not None:
+            previous, more = self._previous(session, session.kept, asked, mode, now)
+            about |= more
+        elif asked.step is None:
+            self._need_control_hz()
+        session.busy = True
+        arguments = {"previous": previous, "model_actions": True}
+        return Plan(observation, arguments, asked, session, now, about)
+
+    def finish(self, plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
+        """The answer to a request, of the policy's result."""
+        if not plan.arguments:
+            return result
+        session, previous = plan.session, plan.arguments["previous"]
+        self._metrics.joined(bool(plan.about.get("joined")))
+        if session is not None:
+            now = self._clock()
+            model_actions = np.asarray(result["model_actions"], np.float32)
+            session.kept = _Kept(model_actions, result.get("anchor"), plan.asked.step, plan.received)
+            if self._options.control_hz is not None:
+                session.delays.add(math.ceil(round((now - plan.received) * self._options.control_hz, 6)))
+        if previous is not None:
+            self._metrics.delay_steps.observe(previous.delay)
+            if "model_actions" in result and previous.delay < len(previous.left_over):
+                new = np.asarray(result["model_actions"])[previous.delay]
+                self._metrics.seam_gap.observe(float(np.abs(new - previous.left_over[previous.delay]).max()))
+        if not plan.asked.model_actions:
+            result = {key: value for key, value in result.items() if key not in ("model_actions", "anchor")}
+        return {**result, "real_time": plan.about}
+
+    def release(self, plan: Plan) -> None:
+        """The session may have its next request. Without a result its robot goes on with the chunk it has."""
+        if plan.session is not None:
+            plan.session.busy = False
+            plan.session.used = self._clock()
+
+    def closed(self, connection: Hashable) -> None:
+        """A connection has ended, and its own session with it."""
+        if self._of_connections.pop(connection, None) is not None:
+            self._metrics.session_dropped("closed")
+
+    # --- sessions -----------------------------------------------------------------------------------------------------
+
+    def _session(self, asked: Asked, connection: Hashable, now: float) -> _Session:
+        self._drop_idle(now)
+        if asked.session is None:
+            return self._of_connections.setdefault(connection, _Session(now))
+        session = self._named.get(asked.session)
+        if session is None:
+            if len(self._named) >= MAX_SESSIONS:
+                self._drop_oldest()
+            session = self._named[asked.session] = _Session(now)
+        self._named.move_to_end(asked.session)
+        if session.busy:
+            raise ObservationError(
+                f"session {asked.session!r} has a request that isn't answered yet: give each robot its own session"
+            )
+        session.used = now
+        return session
+
+    def _drop_idle(self, now: float) -> None:
+        while self._named:
+            name, oldest = next(iter(self._named.items()))
+            if oldest.busy or now - oldest.used <= IDLE_SECONDS:
+                return
+            del self._named[name]
+            self._metrics.session_dropped("idle")
+
+    def _drop_oldest(self) -> None:
+        for name, session in self._named.items():
+            if not session.busy:
+                del self._named[name]
+                self._metrics.session_dropped("full")
+                return
+        raise ObservationError(f"all {MAX_SESSIONS} sessions have requests that aren't answered yet: try again")
+
+    # --- the running chunk --------------------------------------------------------------------------------------------
+
+    def _previous(
+        self, session: _Session, kept: _Kept, asked: Asked, mode: JoinMode, now: float
+    ) -> tuple[RunningChunk | None, dict[str, Any]]:
+        """What is left of a session's chunk, and what the answer says of it."""
+        horizon = len(kept.model_actions)
+        row, by = self._carried_out(kept, asked, now)
+        about: dict[str, Any] = {"row": row, "row_by": by}
+        if row >= horizon:
+            return None, about
+        s = self._execution_horizon(asked, horizon)
+        longest = horizon - max(s, row)
+        trained = int(self._offered.get("trained_max_delay") or 0)
+        fits = min(longest, trained) if mode == "rtc_trained" else longest
+        if asked.delay is not None:
+            if asked.delay > fits:
+                why = (
+                    f"this checkpoint was trained with delays up to {trained}"
+                    if fits < longest
+                    else (f"with chunks of H = {horizon} actions, s = {max(s, row)} carried out, H − s = {longest}")
+                )
+                raise ObservationError(
+                    f"{PREFIX}delay is {asked.delay} control steps, but {why}: at most {fits} fit. Ask earlier "
+                    f"(a smaller execution horizon), or lower the control rate"
+                )
+            delay, wanted = asked.delay, asked.delay
+        else:
+            wanted = session.delays.steps if self._options.delay_steps is None else self._options.delay_steps
+            if self._options.delay_steps is None:
+                self._need_control_hz()
+            delay = min(wanted, fits)
+        about |= {"joined": True, "delay": delay, "execution_horizon": max(s, row), "delay_cut": delay < wanted}
+        left_over = kept.model_actions[row:]
+        guidance = dict(asked.guidance or {})
+        return RunningChunk(left_over, delay, max(s, row), mode, kept.anchor, **guidance), about
+
+    def _carried_out(self, kept: _Kept, asked: Asked, now: float) -> tuple[int, str]:
+        """How many actions the robot has carried out since the kept chunk's observation, and how that is known."""
+        if (asked.step is None) != (kept.step is None):
+            raise ObservationError(
+                f"{PREFIX}step came in some requests of this session and not in others: send it always or never "
+                f"({PREFIX}reset begins anew)"
+            )
+        if asked.step is not None and kept.step is not None:
+            if asked.step < kept.step:
+                raise ObservationError(
+                    f"{PREFIX}step is {asked.step}, after {kept.step} in the request before: it counts the actions "
+                    f"that the robot has carried out in the session. For a new episode send {PREFIX}reset"
+                )
+            return asked.step - kept.step, "step"
+        return round((now - kept.received) * self._need_control_hz()), "clock"
+
+    def _need_control_hz(self) -> float:
+        if self._options.control_hz is None:
+            raise ObservationError(
+                f"the server doesn't know how fast the robot carries out actions: send {PREFIX}step and {PREFIX}delay "
+                "in every request, or start it with --control-hz"
+            )
+        return self._options.control_hz
+
+    def _execution_horizon(self, asked: Asked, horizon: int) -> int:
+        for s in (asked.execution_horizon, self._options.execution_horizon):
+            if s is not None:
+                if s > horizon:
+                    raise ObservationError(
+                        f"the execution horizon is {s}, but this policy's chunks have {horizon} actions: send "
+                        f"{PREFIX}execution_horizon from 1 to {horizon}"
+                    )
+                return s
+        return max(1, horizon // 2)
+
+
+def _named(received: Mapping[str, Any]) -> str:
+    return ", ".join(key for key in received if key.startswith(PREFIX))

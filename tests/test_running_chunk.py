@@ -1,0 +1,289 @@
+"""Calls that join a running chunk: what `previous` becomes, relative actions re-anchored, and every refusal."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from checkpoint_helpers import lerobot_copy
+from conftest import golden_model
+from test_policy import golden_policy
+
+from turbopi import UnifiedPolicy, open_checkpoint
+from turbopi.checkpoint import Checkpoint, random_checkpoint
+from turbopi.checkpoint.convert import convert
+from turbopi.config import RealTime
+from turbopi.errors import CheckpointError, ConfigError, ObservationError
+from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
+from turbopi.model.denoise import time_grid
+from turbopi.running_chunk import RunningChunk
+
+H, A = 10, 32
+TRAINED = RealTime(trained_max_delay=3)
+
+
+def rows(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((count, A)).astype(np.float32)
+
+
+def completed(chunk: RunningChunk, options: RealTime = TRAINED, relative: bool = False) -> RunningChunk:
+    return chunk.completed(H, A, relative=relative, options=options)
+
+
+def conditioning(chunk: RunningChunk, options: RealTime = TRAINED) -> Conditioning:
+    done = completed(chunk, options)
+    return done.conditioning(done.left_over, 4, H, "accumulated")
+
+
+@pytest.fixture(scope="module")
+def policy() -> UnifiedPolicy:
+    checkpoint = random_checkpoint("pi05_tiny")
+    config = dataclasses.replace(checkpoint.config, real_time=TRAINED)
+    checkpoint = dataclasses.replace(checkpoint, config=config)
+    return UnifiedPolicy(checkpoint, num_denoising_steps=2, precision="f32", device="cpu", backend="pytorch")
+
+
+def test_guided_modes_pull_towards_the_left_over_before_h_minus_s() -> None:
+    left_over = rows(7)
+    for mode, guidance in (("rtc", "jacobian"), ("rtc_identity", "identity")):
+        asked = conditioning(RunningChunk(left_over, 2, 4, mode=mode))  # type: ignore[arg-type]
+        assert asked.guidance is not None and asked.guidance.mode == guidance and asked.held is None
+        np.testing.assert_array_equal(asked.guidance.target[:7], left_over)
+        np.testing.assert_array_equal(asked.guidance.weights, guidance_weights(H, 2, 4))
+        times = np.repeat(time_grid(4)[:, None], H, 1)
+        np.testing.assert_array_equal(asked.guidance.strength, guidance_strength(times, 5.0))
+
+
+def test_nothing_pulls_towards_what_is_not_there() -> None:
+    for s in (None, 2):
+        asked = conditioning(RunningChunk(rows(6), 2, s))
+        assert asked.guidance is not None
+        np.testing.assert_array_equal(asked.guidance.weights, guidance_weights(H, 2, 4))
+    assert completed(RunningChunk(rows(10), 0)).execution_horizon == 1
+    assert completed(RunningChunk(rows(10), 4)).execution_horizon == 4, "as many are carried out meanwhile"
+
+
+def test_the_policys_options_are_taken_where_the_chunk_says_nothing() -> None:
+    options = RealTime(execution_horizon=6, schedule="linear", max_guidance_weight=10.0)
+    asked = conditioning(RunningChunk(rows(8), 2), options).guidance
+    assert asked is not None
+    np.testing.assert_array_equal(asked.weights, guidance_weights(H, 2, 6, "linear"))
+    assert asked.strength.max() == 10
+    assert completed(RunningChunk(rows(8), 7), options).execution_horizon == 3, "a long delay cuts it"
+    own = completed(RunningChunk(rows(8), 2, 3, schedule="ones", max_guidance_weight=1.0), options)
+    assert (own.execution_horizon, own.schedule, own.max_guidance_weight) == (3, "ones", 1.0)
+
+
+def test_trained_mode_holds_what_will_be_carried_out() -> None:
+    left_over = rows(7)
+    asked = conditioning(RunningChunk(left_over, 3, mode="rtc_trained"))
+    assert asked.guidance is None and asked.held is not None and asked.values is not None
+    np.testing.assert_array_equal(asked.held, np.arange(H) < 3)
+    np.testing.assert_array_equal(asked.values[:3], left_over[:3])
+    assert conditioning(RunningChunk(left_over, 0, mode="rtc_trained")).form == "plain"
+
+
+@pytest.mark.parametrize(
+    ("chunk", "message"),
+    [
+        (RunningChunk(rows(7)[:, :7], 1), "actions have 7 values, but this model's have 32: .* model_actions"),
+        (RunningChunk(rows(11), 1), "the left-over has 11 actions; it should be 1 to the chunk's 10"),
+        (RunningChunk(rows(0), 0), "has 0 actions; .* leave `previous` out"),
+        (RunningChunk(rows(7)[0], 1), r"has shape \[32\]"),
+        (RunningChunk(np.full((2, A), np.nan), 1), "aren't finite"),
+        (RunningChunk(np.full((2, A), 1e300), 1), "aren't finite"),
+        (RunningChunk("abc", 1), "it should be numbers"),  # type: ignore[arg-type]
+        (RunningChunk(rows(4), 5), "the delay is 5 control steps, but 4 actions are left over"),
+        (RunningChunk(rows(4), -1), "the delay is -1"),
+        (RunningChunk(rows(4), True), "the delay is True"),
+        (RunningChunk(rows(4), 1.0), "the delay is 1.0"),  # type: ignore[arg-type]
+        (RunningChunk(rows(8), 6), "a delay of 6 and an execution horizon of 6 don't fit a chunk of 10"),
+        (RunningChunk(rows(8), 4, 7), "a delay of 4 and an execution horizon of 7 don't fit a chunk of 10"),
+        (RunningChunk(rows(8), 1, 0), "the execution horizon is 0; .* from 1 on"),
+        (RunningChunk(rows(8), 4, mode="rtc_trained"), "the delay is 4 .* trained with delays up to 3"),
+        (RunningChunk(rows(8), 1, mode="other"), "the mode is 'other'"),  # type: ignore[arg-type]
+        (RunningChunk(rows(8), 1, schedule="cosine"), "the schedule is 'cosine'"),  # type: ignore[arg-type]
+        (RunningChunk(rows(8), 1, max_guidance_weight=-1.0), "max_guidance_weight is -1.0"),
+        (RunningChunk(rows(8), 1, max_guidance_weight=float("nan")), "max_guidance_weight is nan"),
+        (RunningChunk(rows(8), 1, anchor=np.zeros(8)), "aren't relative to the state: leave the anchor out"),
+    ],
+)
+def test_what_cannot_be_joined_is_refused(policy: UnifiedPolicy, chunk: RunningChunk, message: str) -> None:
+    with pytest.raises(ObservationError, match=message):
+        policy.infer(policy.example_observation(), previous=chunk)
+
+
+def test_trained_mode_needs_weights_that_were_trained_so() -> None:
+    with pytest.raises(ObservationError, match=r'trained with simulated delays.*mode "rtc".*trained_max_delay'):
+        completed(RunningChunk(rows(7), 0, mode="rtc_trained"), RealTime())
+
+
+def test_relative_actions_need_their_anchor() -> None:
+    with pytest.raises(ObservationError, match="give the anchor that came with the left-over"):
+        completed(RunningChunk(rows(7), 1), relative=True)
+
+
+# -- the policy --------------------------------------------------------------------------------------------------------
+
+
+def test_a_calls_model_actions_are_the_next_ones_left_over(policy: UnifiedPolicy) -> None:
+    observation = policy.example_observation()
+    first = policy.infer(observation, seed=0, model_actions=True)
+    assert first["model_actions"].dtype == np.float32 and first["model_actions"].shape == (H, A)
+    assert "anchor" not in first and "model_actions" not in policy.infer(observation, seed=0)
+    left_over = first["model_actions"][4:]
+    joined = policy.infer(
+        observation, seed=1, previous=RunningChunk(left_over, 3, mode="rtc_trained"), model_actions=True
+    )
+    np.testing.assert_array_equal(joined["model_actions"][:3], left_over[:3])
+    np.testing.assert_array_equal(joined["actions"][:3], first["actions"][4:7])
+    fresh = policy.infer(observation, seed=1, model_actions=True)["model_actions"]
+    for mode in ("rtc", "rtc_identity"):
+        pulled = policy.infer(
+            observation,
+            seed=1,
+            num_steps=5,
+            previous=RunningChunk(left_over, 3, mode=mode),
+            model_actions=True,
+        )["model_actions"]
+        seams = [np.linalg.norm(chunk[:3] - left_over[:3]) for chunk in (pulled, fresh)]
+        assert seams[0] < 0.5 * seams[1], mode
+
+
+def test_a_plain_call_keeps_its_bits_beside_joined_ones(policy: UnifiedPolicy) -> None:
+    observation = policy.example_observation()
+    before = policy.infer(observation, seed=3)["actions"]
+    policy.infer(observation, seed=3, previous=RunningChunk(rows(8), 2))
+    np.testing.assert_array_equal(policy.infer(observation, seed=3)["actions"], before)
+    np.testing.assert_array_equal(policy.infer(observation, seed=3, conditioning=Conditioning())["actions"], before)
+    nothing_held = RunningChunk(rows(8), 0, mode="rtc_trained")
+    np.testing.assert_array_equal(policy.infer(observation, seed=3, previous=nothing_held)["actions"], before)
+
+
+def test_token_times_bring_their_number_of_steps(policy: UnifiedPolicy) -> None:
+    observation, asked = policy.example_observation(), Conditioning(TokenTimes.plain(5, H))
+    expected = policy.infer(observation, seed=0, num_steps=5)["actions"]
+    np.testing.assert_array_equal(policy.infer(observation, seed=0, conditioning=asked)["actions"], expected)
+    with pytest.raises(ObservationError, match="token times"):
+        policy.infer(observation, conditioning=asked, num_steps=4)
+    with pytest.raises(ObservationError, match="both given"):
+        policy.infer(observation, conditioning=asked, previous=RunningChunk(rows(8), 2))
+
+
+def test_metadata_says_what_can_be_joined(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = policy.metadata["real_time"]
+    assert said["modes"] == ["rtc", "rtc_identity", "rtc_trained"] and said["trained_max_delay"] == 3
+    monkeypatch.setattr(type(policy.backend), "forms", ("tokens",))
+    assert policy.metadata["real_time"]["modes"] == ["rtc_identity", "rtc_trained"]
+
+
+def test_a_backend_that_cannot_says_which_can(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(policy.backend), "forms", ("tokens",))
+    observation = policy.example_observation()
+    policy.infer(observation, previous=RunningChunk(rows(8), 2, mode="rtc_identity"))
+    message = "backend 'pytorch' has no guidance by the true Jacobian; take backend 'fused', 'cuda_graph' or 'pytorch'"
+    with pytest.raises(ObservationError, match=message):
+        policy.infer(observation, previous=RunningChunk(rows(8), 2))
+    with pytest.raises(ConfigError, match="real-time mode 'rtc'; this policy has rtc_identity, rtc_trained"):
+        policy.warmup(real_time="rtc")
+    monkeypatch.setattr(type(policy.backend), "forms", ())
+    with pytest.raises(ObservationError, match="held actions or guidance by token"):
+        policy.infer(observation, conditioning=Conditioning(held=np.ones(H, bool), values=rows(H)))
+    asked = Conditioning(TokenTimes.plain(2, H))
+    with pytest.raises(ConfigError, match="warm-up: backend 'pytorch' has no times"):
+        policy.warmup(conditioning=[asked])
+
+
+def test_warm_up_takes_modes_and_examples(policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(policy.backend, "warmup", lambda *args, **options: asked.append((args[1:], options)))
+    own = Conditioning(TokenTimes.plain(7, H))
+    policy.warmup(cameras=2, steps=[2, 3], real_time=["rtc", "rtc_trained"], conditioning=[own])
+    loops = [(loop, options.get("conditioning")) for loop, options in asked]
+    forms = [(loop, None if one is None else one.form) for loop, one in loops]
+    assert forms == [
+        *(((2, H), None), ((3, H), None), ((2, H), "jacobian"), ((3, H), "jacobian")),
+        *(((2, H), "tokens"), ((3, H), "tokens"), ((7, H), "tokens")),
+    ]
+    assert [options["last"] for _, options in asked] == [False] * 6 + [True]
+
+
+# -- relative actions --------------------------------------------------------------------------------------------------
+
+
+def test_a_left_over_keeps_its_absolute_actions_when_the_state_has_moved() -> None:
+    policy, observation, _ = golden_policy("aloha_pi0", precision="f32")
+    pipeline = policy.pipeline
+    first = policy.infer(observation, seed=0, model_actions=True)
+    old, mask = first["anchor"], np.array(pipeline.robot.delta_mask)
+    assert old.shape == mask.shape and old.dtype == np.float64
+    moved = dict(observation) | {"state": np.asarray(observation["state"]) + np.linspace(0.01, 0.2, 14)}
+    _, state = pipeline.before(moved)
+    left_over = first["model_actions"][3:]
+    again = pipeline.reanchored(left_over, old, state)
+    assert again.dtype == np.float32 and again.shape == left_over.shape
+    _, before = pipeline.before(observation)
+    expected = pipeline.after(left_over, before)["actions"]
+    np.testing.assert_allclose(pipeline.after(again, state)["actions"], expected, atol=1e-5)
+    assert np.abs(pipeline.after(left_over, state)["actions"] - expected).max() > 0.1
+    unchanged = np.ones(A, bool)
+    unchanged[np.flatnonzero(mask)] = False
+    np.testing.assert_array_equal(again[:, unchanged], left_over[:, unchanged])
+    joined = policy.infer(moved, seed=1, previous=RunningChunk(left_over, 2, anchor=old), model_actions=True)
+    np.testing.assert_array_equal(joined["anchor"], np.asarray(pipeline.anchor(state)))
+    for anchor, message in ((old[:3], r"shape \[3\]"), (old * np.nan, "14 finite numbers")):
+        with pytest.raises(ObservationError, match=message):
+            policy.infer(moved, previous=RunningChunk(left_over, 2, anchor=anchor))
+
+
+# -- LeRobot's config --------------------------------------------------------------------------------------------------
+
+
+def lerobot(folder: Path, settings: dict[str, Any] | None = None, **config: Any) -> Checkpoint:
+    lerobot_copy(folder, **config)
+    heads = golden_model("pi05").config.vision.num_heads
+    (folder / "turbopi.json").write_text(json.dumps({"vision_heads": heads, **(settings or {})}))
+    return open_checkpoint(folder)
+
+
+def test_lerobots_rtc_config_is_the_default(tmp_path: Path) -> None:
+    rtc = {"enabled": True, "execution_horizon": 6, "prefix_attention_schedule": "EXP", "max_guidance_weight": 3}
+    asks = lerobot(tmp_path / "a", rtc_config=rtc, rtc_training_max_delay=4)
+    horizon = asks.config.model.action_horizon
+    assert asks.config.real_time == RealTime(4, horizon - 6, "exponential", 3.0)
+    assert "rtc_config" in " ".join(asks.info()["notes"]) and "rtc_training" not in " ".join(asks.info()["notes"])
+    off = lerobot(tmp_path / "b", rtc_config=rtc | {"enabled": False})
+    assert off.config.real_time == RealTime()
+    long = lerobot(tmp_path / "c", rtc_config={"enabled": True, "execution_horizon": 999})
+    assert long.config.real_time == RealTime(0, None, "linear", 10.0)
+    for name, value in (("prefix_attention_schedule", "COS"), ("max_guidance_weight", "x"), ("execution_horizon", 0)):
+        with pytest.raises(CheckpointError, match=name):
+            lerobot(tmp_path / name, rtc_config={"enabled": True, name: value})
+
+
+def test_a_turbopi_json_says_how_the_weights_were_trained(tmp_path: Path) -> None:
+    said = {"trained_max_delay": 6, "schedule": "linear", "execution_horizon": None}
+    mine = lerobot(tmp_path / "a", {"real_time": said}, rtc_training_max_delay=4)
+    assert mine.config.real_time == RealTime(6, None, "linear", 5.0)
+    for wrong in ({"trained_max_delay": -1}, {"trained": 3}, {"schedule": "cosine"}, 3, {"max_guidance_weight": "x"}):
+        with pytest.raises(ConfigError, match=r"real_time is .* expected an object with trained_max_delay"):
+            lerobot(tmp_path / str(wrong), {"real_time": wrong})
+
+
+def test_conversion_keeps_how_the_weights_were_trained(tmp_path: Path) -> None:
+    mine = lerobot(tmp_path / "a", rtc_training_max_delay=4)
+    convert(mine, tmp_path / "b", precision="f32")
+    assert open_checkpoint(tmp_path / "b").config.real_time == RealTime(4)
+
+
+def test_guidance_of_an_unused_dimension_is_the_left_overs_own(policy: UnifiedPolicy) -> None:
+    """Dimensions past the robot's are the model's, too: they are returned, and pulled to what they were."""
+    first = policy.infer(policy.example_observation(), seed=0, model_actions=True)["model_actions"]
+    assert np.abs(first[:, 7:]).max() > 0
+    asked = conditioning(RunningChunk(first[2:], 1))
+    assert isinstance(asked.guidance, Guidance)
+    np.testing.assert_array_equal(asked.guidance.target[: H - 2, 7:], first[2:, 7:])
+    assert torch.from_numpy(asked.guidance.target[H - 2 :]).abs().max() == 0
