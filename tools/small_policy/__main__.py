@@ -5,6 +5,7 @@
     python -m small_policy stats --out work/norm_stats.json          statistics of demonstrations, without pictures
     python -m small_policy train --out work/run --stats work/norm_stats.json --seconds 420 --workers 32
     python -m small_policy card --help                               the model card, from results and curves
+    python -m small_policy chase --out work/chase                    the policy of the dynamic task, see chase.py
     python -m small_policy throughput                                samples a second, before a GPU is rented for long
 
 `train` needs a GPU with 60 GB (fewer with a smaller --capacity) and 2 GB of memory for each worker. It leaves
@@ -45,11 +46,13 @@ def main() -> None:
     card.add_argument("--results", type=Path, required=True, help="summary of evaluations, as in benchmarks/results")
     card.add_argument("--curves", type=Path, required=True, help="the training's curves.csv")
     card.add_argument("--out", type=Path, required=True)
+    _add_chase(commands.add_parser("chase", help="the policy of the dynamic task: demonstrations, training, export"))
     speed = commands.add_parser("throughput", help="time training steps on random data")
     _add_settings(commands.add_parser("train", help="collect and train, by the clock"))
     _add_settings(speed, required=False)
     arguments = parser.parse_args()
     run = {"measure": _measure, "stats": _stats, "train": _train, "throughput": _throughput, "card": _card}
+    run["chase"] = _chase
     run[arguments.command](arguments)
 
 
@@ -65,6 +68,21 @@ def _add_settings(parser: argparse.ArgumentParser, required: bool = True) -> Non
         else:
             default = None if item.name in ("out", "stats") else item.default
             parser.add_argument(name, type=item.type, default=default, required=needed)
+
+
+def _add_chase(parser: argparse.ArgumentParser) -> None:
+    from small_policy.chase import Settings
+
+    for item in fields(Settings):
+        kind = Path if item.name in ("out", "resume") else item.type
+        default = None if item.name == "out" else item.default
+        parser.add_argument("--" + item.name.replace("_", "-"), type=kind, default=default, required=item.name == "out")
+
+
+def _chase(arguments: argparse.Namespace) -> None:
+    from small_policy.chase import Settings, train
+
+    train(Settings(**{item.name: getattr(arguments, item.name) for item in fields(Settings)}))
 
 
 def _settings(arguments: argparse.Namespace) -> Any:

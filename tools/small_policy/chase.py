@@ -23,7 +23,7 @@ from small_policy.export import export
 from small_policy.forward import Guide, draw_times, flow_loss, held_actions, mixed, velocity
 from small_policy.start import fresh_model
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
-from turbopi.config import GemmaConfig, ModelConfig, PolicyConfig, VisionConfig
+from turbopi.config import GemmaConfig, ModelConfig, PolicyConfig, RealTime, VisionConfig
 from turbopi.model.reference import Pi0Model
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 from turbopi.sim.chase import BLOB, INSTRUCTION, MAX_STEPS, POST, SPEED, VIEWS, Chase, cut
@@ -50,6 +50,7 @@ CONFIG = PolicyConfig(
     discrete_state_input=False,
     asset_id="turbopi/chase",
     num_denoising_steps=5,
+    real_time=RealTime(trained_max_delay=MOST_DELAY),
 )
 
 
@@ -134,7 +135,7 @@ def demonstrations(number: int, seed: int, workers: int = 1, at_once: int = 250)
 
 
 def _play(number: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`Frames`' arrays: every step of `number` episodes at once, each with a delay and an execution horizon of its own."""
+    """`Frames`' arrays: all steps of `number` episodes at once, each with a delay and an execution horizon."""
     rng = np.random.default_rng([2**40, seed])  # the simulator's own episodes have seeds of 32 bits
     world = Chase.start([np.random.default_rng([2**40, seed, row]) for row in range(number)])
     everyone = np.arange(number)
@@ -173,9 +174,7 @@ def _continued(
     for step in range(MOST_DELAY):
         tips.append(tips[-1] + SPEED * cut(running[:, step]))
     rows = np.arange(len(delays))
-    later = replace(
-        world, tip=np.stack(tips)[delays, rows], angle=world.angle + world.pace / world.orbit * delays
-    )
+    later = replace(world, tip=np.stack(tips)[delays, rows], angle=world.angle + world.pace / world.orbit * delays)
     new_sides = np.where(delays > 0, keep_sides(later, sides), choose_sides(world, rng))
     planned = plan(later, HORIZON, new_sides)
     places = np.arange(HORIZON)[None] - delays[:, None]
@@ -335,7 +334,12 @@ def train(settings: Settings) -> None:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    export({name: value.cpu() for name, value in trainer.average.items()}, stats(), settings.out / "checkpoint", config=CONFIG)
+    export(
+        {name: value.cpu() for name, value in trainer.average.items()},
+        stats(),
+        settings.out / "checkpoint",
+        config=CONFIG,
+    )
 
 
 def _told(trainer: Trainer, losses: list[tuple[float, float]], seconds: float) -> dict[str, float]:
@@ -355,6 +359,7 @@ def _mean(losses: list[tuple[float, float]]) -> dict[str, float]:
 
 def stats() -> NormStats:
     """Actions as they are, from -1 to 1; the state isn't read."""
+
     def ones(width: int) -> FeatureStats:
         return FeatureStats(mean=np.zeros(width), std=np.ones(width), q01=-np.ones(width), q99=np.ones(width))
 

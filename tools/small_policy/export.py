@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from small_policy.collect import HORIZON
 from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.convert import convert
 from turbopi.checkpoint.norm_stats import NormStats
@@ -19,7 +20,7 @@ ASSET_ID = "turbopi/libero_spatial"
 # As openpi's own pi05_libero, it doesn't read the state: where the hand is, the pictures show
 CONFIG: PolicyConfig = dataclasses.replace(
     preset("pi05_tiny"), name="pi05_tiny", discrete_state_input=False, asset_id=ASSET_ID
-)
+).with_model(action_horizon=HORIZON)
 
 
 class TrainedWeights:

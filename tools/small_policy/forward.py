@@ -4,9 +4,9 @@
 without gradients. Here each row of a batch has its own time, and a layer of the language model and the layer of the
 action expert beside it run together. A test holds both against each other.
 
-Simulated delays, for real-time execution (trained RTC, arXiv 2512.05964): a row with the delay d has its first d actions
-clean and at time 0, as they are when the robot carries them out while it waits for the others; the loss is on the
-others. A row with delay 0 is an ordinary one.
+Simulated delays, for real-time execution (trained RTC, arXiv 2512.05964): a row with the delay d has its first d
+actions clean and at time 0, as they are when the robot carries them out while it waits for the others; the loss is on
+the others. A row with delay 0 is an ordinary one.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ Rope = tuple[Tensor, Tensor]
 
 @dataclass
 class Condition:
-    """What adaRMS is told of time: float32[N, E] of each row's, and of time 0 [1, E] where `held` bool[N, H] says so."""
+    """What adaRMS is told of time: of each row's float32[N, E], and of time 0 [1, E] where held, bool[N, H]."""
 
     own: Tensor
     zero: Tensor | None = None
