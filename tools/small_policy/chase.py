@@ -14,6 +14,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -228,13 +229,14 @@ class Trainer:
         return float(flow.detach()), float(guide.detach())
 
     def save(self, file: Path) -> None:
-        parts = {"model": self.model, "guide": self.guide, "optimizer": self.optimizer}
+        parts: dict[str, Any] = {"model": self.model, "guide": self.guide, "optimizer": self.optimizer}
         torch.save({name: part.state_dict() for name, part in parts.items()} | {"average": self.average}, file)
 
     def load(self, file: Path) -> None:
         content = torch.load(file, map_location=self.device, weights_only=True)
-        for name, part in (("model", self.model), ("guide", self.guide), ("optimizer", self.optimizer)):
-            part.load_state_dict(content[name])  # type: ignore[attr-defined]
+        parts: dict[str, Any] = {"model": self.model, "guide": self.guide, "optimizer": self.optimizer}
+        for name, part in parts.items():
+            part.load_state_dict(content[name])
         self.average = content["average"]
         self.steps = self.settings.warmup_steps
 
@@ -257,6 +259,7 @@ def _see_dots(model: Pi0Model) -> None:
     with torch.no_grad():
         patches = model.vision.patch_embedding
         patches.weight.mul_(5)
+        assert patches.bias is not None
         patches.bias.copy_(patches.weight.sum(dim=(1, 2, 3)))  # black is -1
 
 

@@ -137,7 +137,7 @@ def velocity(
     masks = valid[:, None, None], torch.cat((repeated, suffix), dim=1)[:, None, None]
     with torch.autocast(x.device.type, enabled=False):
         cond = _condition(model, t, held)
-        y = model.embed_suffix(x_t, x_t, cond)
+        y = model.embed_suffix(x_t, x_t, cond.own)
     pairs = list(zip(model.vlm.layers, model.expert.layers, strict=True))
     for vlm, expert in pairs[:-1]:
         x, y = parts.joint_layer(vlm, expert, x, y, cond, ropes, masks)

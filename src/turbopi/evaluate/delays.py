@@ -19,7 +19,7 @@ from turbopi.evaluate.statistics import Paired, PairedDocument, Percentiles, Rat
 from turbopi.execution import WAYS, way_named
 from turbopi.files import write_whole
 from turbopi.plots import write_figure
-from turbopi.reading import plain_document
+from turbopi.reading import plain_document, read_document
 
 FORMAT: Final = 1
 FILE, PAGE, SUCCESS_PLOT, SEAM_PLOT = "delays.json", "delays.html", "success.png", "seams.png"
@@ -157,6 +157,11 @@ def document(cells: Sequence[tuple[Cell, Results]]) -> DelaysDocument:
         cells=summarise(cells),
         outcomes=["".join(_letter(one.episodes.get(key)) for key in keys) for _, one in cells],
     )
+
+
+def load_delays(file: Path) -> DelaysDocument:
+    """A delays.json. Raises ConfigError, naming file and key, if it can't be read."""
+    return read_document(file, DelaysDocument, ConfigError)
 
 
 def _letter(episode: Episode | None) -> str:

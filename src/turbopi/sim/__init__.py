@@ -9,9 +9,9 @@ from turbopi.sim.base import Environment, SimSettings, Simulator, SimulatorUnava
 __all__ = ["SIMULATORS", "Environment", "SimSettings", "Simulator", "SimulatorUnavailable", "Task", "create"]
 
 SIMULATORS: dict[str, str] = {
-    "chase": "turbopi.sim.chase:ChaseSimulator",
     "libero": "turbopi.sim.libero:LiberoSimulator",
     "reacher": "turbopi.sim.reacher:ReacherSimulator",
+    "chase": "turbopi.sim.chase:ChaseSimulator",
 }
 
 _PARTS = (*Simulator.__annotations__, "check", "tasks", "open", "example", "versions")
