@@ -221,3 +221,25 @@ def test_every_action_dimension_is_drawn_once_with_a_unit(robot: str, dims: int)
     assert sorted(index for group in groups for index in group.names) == list(range(dims))
     assert all(group.unit and group.title and len(group.names) <= 8 for group in groups)
     assert (groups[0].unit == "the robot's units") == ((robot, dims) in [("aloha", 7), ("mine", 19)])
+
+
+def test_the_real_time_demo_counts_what_it_played_and_says_it(tmp_path: Path) -> None:
+    result = turbopi("demo", "--real-time", "--episodes", 2, "--report", tmp_path, "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads((tmp_path / "real_time.json").read_text())
+    assert [(way["execution"], way["delay"]) for way in told["ways"]] == [
+        ("async", 0),
+        ("async", 4),
+        ("rtc_trained", 4),
+    ]
+    for way in told["ways"]:
+        assert way["success"]["trials"] == 2 == len(way["outcomes"])
+        assert way["success"]["successes"] == way["outcomes"].count("s")
+        assert f"{way['success']['successes']} of 2 " in result.stderr
+    assert told["delay_costs"]["pairs"] == told["joining_gains"]["pairs"] == 2
+    assert (tmp_path / "real_time.png").exists() and (tmp_path / "commands.png").exists()
+
+
+def test_episodes_of_libero_are_few(tmp_path: Path) -> None:
+    result = turbopi("demo", "--episodes", 21, "--report", tmp_path)
+    assert result.exit_code == 2 and "plays 20 at most" in " ".join(result.stderr.split())

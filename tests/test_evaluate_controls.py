@@ -24,7 +24,7 @@ class Recorder:
         self.about: dict[str, Any] = {}
         self.asked: list[Any] = []
 
-    def infer(self, observations: Any, seeds: Any) -> list[Answer]:
+    def infer(self, observations: Any, seeds: Any, arguments: Any = None) -> list[Answer]:
         self.asked += list(observations)
         return [Answer(np.zeros((10, 7)), None) for _ in observations]
 

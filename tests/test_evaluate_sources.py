@@ -50,7 +50,7 @@ def test_a_server_that_dies_ends_the_run_which_another_continues(tmp_path: Path)
                 source._socket.socket.close()  # what a vanished machine looks like from here
             return ask(observations, seeds)
 
-        source.infer = dying  # type: ignore[method-assign]
+        source.infer = dying  # type: ignore[method-assign, assignment]
         with pytest.raises(PolicyLost, match=r"went away: .*start the server again and give the same command"):
             run(tmp_path, source, states=states)
         kept = load_results(tmp_path)

@@ -101,7 +101,7 @@ def test_the_episodes_seeds_differ_and_are_fixed() -> None:
 
 def test_the_workers_modules_import_neither_torch_nor_matplotlib() -> None:
     code = (
-        "import sys, turbopi.sim.libero, turbopi.sim.reacher, turbopi.evaluate.workers\n"
+        "import sys, turbopi.sim.libero, turbopi.sim.reacher, turbopi.sim.chase, turbopi.evaluate.workers\n"
         "print(sorted({'torch', 'matplotlib', 'PIL', 'mujoco'} & set(sys.modules)))"
     )
     source = Path(__file__).parent.parent / "src"
@@ -110,7 +110,7 @@ def test_the_workers_modules_import_neither_torch_nor_matplotlib() -> None:
 
 
 def test_the_reacher_has_liberos_observations() -> None:
-    assert set(SIMULATORS) == {"libero", "reacher"}
+    assert set(SIMULATORS) == {"libero", "reacher", "chase"}
     reacher, settings = create("reacher"), SimSettings(camera_px=32)
     example, liberos = reacher.example(settings), create("libero").example(settings)
     assert example.keys() == liberos.keys()

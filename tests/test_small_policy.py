@@ -9,7 +9,9 @@ import pytest
 from turbopi.checkpoint import open_checkpoint
 from turbopi.demo import expert_distance
 from turbopi.policy import UnifiedPolicy
-from turbopi.shipped import SMALL_POLICY, load_frames, observations
+from turbopi.shipped import CHASE_POLICY, SMALL_POLICY, load_frames, observations
+from turbopi.sim import SimSettings
+from turbopi.sim.chase import ChaseEnvironment
 
 PICTURES = ("observation/image", "observation/wrist_image")
 FRAMES = load_frames()
@@ -42,6 +44,29 @@ def test_it_is_small_and_describes_itself() -> None:
     assert checkpoint.info()["parameters"]["total"] < 6_000_000
     assert sum(file.stat().st_size for file in SMALL_POLICY.rglob("*") if file.is_file()) < 12 * 2**20
     assert (SMALL_POLICY / "MODEL_CARD.md").is_file()
+
+
+def test_the_dynamic_tasks_policy_is_smaller_and_says_how_it_was_trained() -> None:
+    checkpoint = open_checkpoint(CHASE_POLICY)
+    model = checkpoint.config.model
+    assert checkpoint.config.real_time.trained_max_delay == 6 and model.action_horizon == 16
+    assert sum(file.stat().st_size for file in CHASE_POLICY.rglob("*") if file.is_file()) < 1.5e6
+    assert "beside the small policy" in (CHASE_POLICY / "MODEL_CARD.md").read_text()
+
+
+def test_the_dynamic_tasks_policy_runs_towards_the_target() -> None:
+    policy = UnifiedPolicy(CHASE_POLICY, backend="pytorch", precision="f32")
+    alike = []
+    for state in range(12):
+        environment = ChaseEnvironment(0, SimSettings(camera_px=48))
+        environment.reset(state)
+        environment.world.angle[:] = np.arctan2(*environment.world.tip[0][::-1]) + 0.6  # nothing is between them
+        environment.world.before[:] = environment.world.target
+        environment.step(np.zeros(7), look=True)
+        way = environment.world.target[0] - environment.world.tip[0]
+        first = policy.infer(environment.observation(), seed=state)["actions"][:3, :2].mean(axis=0)
+        alike.append(float(first @ way / np.linalg.norm(first) / np.linalg.norm(way)))
+    assert np.mean(alike) > 0.5
 
 
 def test_on_frames_it_never_saw_it_does_what_the_expert_did(

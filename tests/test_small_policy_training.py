@@ -8,10 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small_policy import chase
 from small_policy.collect import HORIZON, Episode, _Frame
 from small_policy.expert import rotation_between
 from small_policy.export import CONFIG, export
-from small_policy.forward import Guide, draw_times, flow_loss, time_embedding, velocity
+from small_policy.forward import (
+    Guide,
+    draw_delays,
+    draw_times,
+    flow_loss,
+    held_actions,
+    mixed,
+    time_embedding,
+    velocity,
+)
 from small_policy.scenes import INSTRUCTIONS, OTHER_PROMPT, TRAINING_STATES, VALIDATION_STATES, Setting
 from small_policy.start import fresh_model
 from small_policy.train import Settings, Trainer, prompt_table, toy_memory
@@ -23,6 +33,7 @@ from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
 from turbopi.shipped import SMALL_POLICY
+from turbopi.sim.chase import Chase
 
 STATS = SMALL_POLICY / "assets" / "turbopi" / "libero_spatial" / "norm_stats.json"
 
@@ -66,6 +77,73 @@ def test_the_training_forward_is_the_reference_and_so_is_each_repeated_draw() ->
     repeated, _ = velocity(model, images, tokens, masks, both, times)
     torch.testing.assert_close(repeated[::2], expected, rtol=0, atol=1e-4)
     torch.testing.assert_close(repeated[1::2], reference_velocity(model, observation, others, 0.2), rtol=0, atol=1e-4)
+
+
+def test_held_actions_are_at_time_zero_as_in_the_reference() -> None:
+    """And what is held is seen by the others: a row without any held action, in the same batch, is an ordinary one."""
+    torch.manual_seed(0)
+    model, (images, tokens, masks, x_t) = lively_model(), inputs(3)
+    observation = Observation(images, torch.ones(3, 2, dtype=torch.bool), tokens, masks, torch.zeros(3, 32))
+    held = held_actions(torch.tensor([4, 0, 4]), HORIZON)
+    found, _ = velocity(model, images, tokens, masks, x_t, torch.full((3,), 0.7), held=held)
+    torch.testing.assert_close(found[1], reference_velocity(model, observation, x_t, 0.7)[1], rtol=0, atol=1e-4)
+    cache = model.prefix(observation)
+    rope = denoise.suffix_rope(cache, HORIZON, model.config.expert.head_dim, model.config.rope_base)
+    times = np.where(held[0].numpy(), 0.0, 0.7).astype(np.float32)
+    cond = model.time_condition(denoise.time_embedding(times, model.config.expert.width))[None]  # [1, H, E]
+    mask = denoise.suffix_mask(cache, HORIZON, False)
+    expected = model.velocity(x_t, cache.state, cond, cache.k, cache.v, rope, mask)[1]
+    torch.testing.assert_close(found[[0, 2]], expected[[0, 2]], rtol=0, atol=1e-4)
+    assert (found[0] - reference_velocity(model, observation, x_t, 0.7)[0]).abs().max() > 0.01
+
+
+def test_held_actions_are_clean_and_out_of_the_loss() -> None:
+    torch.manual_seed(0)
+    actions, noise, t = torch.randn(4, 16, 3), torch.randn(4, 16, 3), torch.tensor([0.2, 0.5, 0.8, 1.0])
+    delays = torch.tensor([0, 1, 6, 3])
+    held = held_actions(delays, 16)
+    assert held.sum(1).tolist() == delays.tolist() and held[2, :6].all() and not held[2, 6:].any()
+    x = mixed(actions, noise, t, held)
+    torch.testing.assert_close(x[held], actions[held], rtol=0, atol=0)
+    torch.testing.assert_close(x[~held], mixed(actions, noise, t)[~held], rtol=0, atol=0)
+    predicted, weights = torch.randn(4, 16, 3, requires_grad=True), torch.ones(3)
+    loss = flow_loss(predicted, noise - actions, weights, held)
+    loss.backward()  # type: ignore[no-untyped-call]
+    assert predicted.grad is not None
+    assert not predicted.grad[held].any() and predicted.grad[~held].all()
+    assert loss.item() == pytest.approx(float((predicted.detach() - noise + actions)[~held].square().mean()))
+
+
+def test_delays_are_drawn_evenly_and_a_trainer_without_them_holds_nothing(trainer: Trainer, monkeypatch: Any) -> None:
+    drawn = draw_delays(7000, 6, "cpu", torch.Generator().manual_seed(0))
+    assert torch.bincount(drawn, minlength=7).min() > 850 and drawn.max() == 6
+    seen: list[Tensor | None] = []
+
+    def noting(model: Any, *arguments: Any) -> Any:
+        seen.append(arguments[6])
+        return velocity(model, *arguments)
+
+    monkeypatch.setattr("small_policy.train.velocity", noting)
+    batch = toy_memory(2, trainer.device).batch(torch.arange(2))
+    trainer.losses(batch)
+    monkeypatch.setattr(trainer, "settings", dataclasses.replace(trainer.settings, max_delay=6))
+    losses = trainer.losses(batch)
+    assert seen[0] is None and seen[1] is not None and seen[1].shape == (4, HORIZON)
+    assert torch.isfinite(losses["flow"])
+
+
+def test_the_dynamic_tasks_frames_begin_with_what_is_on_its_way() -> None:
+    frames = chase.demonstrations(400, seed=0, at_once=8)
+    assert set(frames.delays.tolist()) == set(range(chase.MOST_DELAY + 1))
+    assert frames.chunks.norm(dim=-1).max() < 1.01
+    turned = frames.draw(64)
+    assert turned.chunks.shape == (64, chase.HORIZON, 2)
+    rows = np.random.default_rng(0).integers(0, 99, 3)
+    world = Chase.start([np.random.default_rng(row) for row in rows])
+    places = torch.from_numpy(np.stack((world.target, world.before[:, 0], world.tip), axis=1)).float()
+    pictures = chase.Frames(places, torch.zeros(3, 1, 2), torch.zeros(3)).pictures(48)
+    as_drawn = torch.from_numpy(world.draw(48)).float() / 255 * 2 - 1
+    torch.testing.assert_close(pictures, as_drawn, rtol=0, atol=0.6 / 255 * 2)
 
 
 def test_the_time_embedding_is_the_models() -> None:
@@ -150,11 +228,11 @@ def episode(by_expert: str, success: bool) -> Episode:
 
 
 def test_only_what_the_expert_followed_up_itself_is_labelled() -> None:
-    turns = episode("llll" + "e" * 12 + "ll" + "e" * 3, success=False)
-    assert [step for step in range(21) if turns._followed(step)] == [4, 5, 6]
+    turns = episode("llll" + "e" * (HORIZON + 2) + "ll" + "e" * 3, success=False)
+    assert [step for step in range(HORIZON + 11) if turns._followed(step)] == [4, 5, 6]
     solved = episode("l" + "e" * 12, success=True)
     assert [step for step in range(13) if solved._followed(step)] == list(range(1, 13))
-    np.testing.assert_array_equal(solved._chunk(9)[:, 0], [9, 10, 11, 12, 12, 12, 12, 12, 12, 12])
+    np.testing.assert_array_equal(solved._chunk(9)[:, 0], [9, 10, 11] + [12] * (HORIZON - 3))
     assert not episode("e" * 160, success=False).useful
 
 

@@ -33,6 +33,8 @@ class Frame:
 FRAMES = Path(__file__).parent / "data" / "libero"
 SMALL_POLICY = Path(__file__).parent / "data" / "small_policy"  # trained; MODEL_CARD.md in it says how
 
+CHASE_POLICY = Path(__file__).parent / "data" / "chase_policy"  # of the dynamic task, trained with simulated delays
+
 
 def load_frames(folder: Path = FRAMES) -> list[Frame]:
     """The pictures that come with Turbo-Pi, or those of another folder of the same form (frames.json names them)."""

@@ -257,6 +257,19 @@ def _read_attacks(file: Path) -> "list[Piece]":
     return results.load(file)
 
 
+def _read_delays(file: Path) -> Any:
+    from turbopi.evaluate.delays import load_delays
+
+    return load_delays(file)
+
+
+def delays(document: Any) -> list[str]:
+    """A policy under delay: `turbopi eval … --delay-steps`."""
+    from turbopi.evaluate.delays import HEADS, row
+
+    return _table(HEADS, [row(cell) for cell in document.cells])
+
+
 def _read_marks(file: Path) -> list[MarkedVariant]:
     """What `python -m kernel_turns time --marks --json` wrote."""
     marks = read_turns(file).marks
@@ -269,5 +282,6 @@ _OF_BENCHMARKS = (headline, main_job, whole_calls, image_sizes, lines_over_steps
 TABLES = {
     **{lines.__name__: Table(read_benchmark, lines) for lines in _OF_BENCHMARKS},
     "attacks": Table(_read_attacks, attacks),
+    "delays": Table(_read_delays, delays),
     "layer_in_cycles": Table(_read_marks, layer_in_cycles),
 }

@@ -26,7 +26,7 @@ from small_policy.scenes import (
 from turbopi.preprocess.images import resize_with_pad
 from turbopi.sim.libero import CAMERAS
 
-HORIZON, REPLAN = 10, 5
+HORIZON, REPLAN = 16, 5  # 16: so that delays of 6 fit beside an execution horizon of up to 10
 IMAGE_PX = 224
 DEMONSTRATION_STEPS = 190  # a demonstration that takes longer isn't kept
 HOPELESS = 150  # steps of the expert without success: it is stuck, and its labels with it

@@ -3,6 +3,10 @@
 `turbopi.model.reference` computes an observation's keys and values first and the velocity at one time after that,
 without gradients. Here each row of a batch has its own time, and a layer of the language model and the layer of the
 action expert beside it run together. A test holds both against each other.
+
+Simulated delays, for real-time execution (trained RTC, arXiv 2512.05964): a row with the delay d has its first d
+actions clean and at time 0, as they are when the robot carries them out while it waits for the others; the loss is on
+the others. A row with delay 0 is an ordinary one.
 """
 
 from collections.abc import Callable
@@ -16,12 +20,30 @@ from torch import Tensor, nn
 from turbopi.config import ModelConfig
 from turbopi.model.denoise import MAX_PERIOD, MIN_PERIOD
 from turbopi.model.gemma import Layer
-from turbopi.model.layers import gated_residual, rope_tables
+from turbopi.model.layers import gated_residual, rms_normalize, rope_tables
 from turbopi.model.prefix import embed_prompt
 from turbopi.model.reference import Pi0Model
 from turbopi.model.vision import EncoderLayer
 
 Rope = tuple[Tensor, Tensor]
+
+
+@dataclass
+class Condition:
+    """What adaRMS is told of time: of each row's float32[N, E], and of time 0 [1, E] where held, bool[N, H]."""
+
+    own: Tensor
+    zero: Tensor | None = None
+    held: Tensor | None = None
+
+
+def modulated(norm: Any, y: Tensor, cond: Condition) -> tuple[Tensor, Tensor]:
+    """An `AdaRMSNorm` of tokens y [N, H, E] under their times: normalised y, and the residual's gate."""
+    modulation = norm.dense(cond.own)[:, None]
+    if cond.zero is not None and cond.held is not None:
+        modulation = torch.where(cond.held[..., None], norm.dense(cond.zero)[:, None], modulation)
+    scale, shift, gate = modulation.chunk(3, dim=-1)
+    return (rms_normalize(y, norm.eps) * (1 + scale) + shift).to(y.dtype), gate.to(y.dtype)
 
 
 def vision_block(block: EncoderLayer, x: Tensor) -> Tensor:
@@ -33,7 +55,7 @@ def joint_layer(
     expert: Layer,
     x: Tensor,
     y: Tensor,
-    cond: Tensor,
+    cond: Condition,
     ropes: tuple[Rope, Rope],
     masks: tuple[Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
@@ -50,7 +72,7 @@ def last_layer(
     expert: Layer,
     x: Tensor,
     y: Tensor,
-    cond: Tensor,
+    cond: Condition,
     ropes: tuple[Rope, Rope],
     masks: tuple[Tensor, Tensor],
 ) -> Tensor:
@@ -60,14 +82,15 @@ def last_layer(
     return _suffix_layer(expert, y, cond, k, v, ropes[1], masks[1])
 
 
-def _suffix_layer(expert: Layer, y: Tensor, cond: Tensor, k: Tensor, v: Tensor, rope: Rope, mask: Tensor) -> Tensor:
-    normed, gate = expert.input_layernorm(y, cond)
+def _suffix_layer(expert: Layer, y: Tensor, cond: Condition, k: Tensor, v: Tensor, rope: Rope, mask: Tensor) -> Tensor:
+    normed, gate = modulated(expert.input_layernorm, y, cond)
     own_k, own_v = expert.keys_values(normed, rope)
     repeats = len(y) // len(k)
     k = torch.cat((k.repeat_interleave(repeats, 0), own_k.to(k.dtype)), dim=2)
     v = torch.cat((v.repeat_interleave(repeats, 0), own_v.to(v.dtype)), dim=2)
     y = gated_residual(y, expert.attend(normed, rope, k, v, mask), gate)
-    return expert.feed_forward(y, cond)
+    normed, gate = modulated(expert.post_attention_layernorm, y, cond)
+    return gated_residual(y, expert.mlp(normed), gate)
 
 
 @dataclass
@@ -92,6 +115,7 @@ def velocity(
     x_t: Tensor,
     t: Tensor,
     regions: Regions | None = None,
+    held: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The predicted velocity float32[B * R, H, action_dim], and the prefix's last hidden states [B, S, D].
 
@@ -99,7 +123,9 @@ def velocity(
 
     images      (uint8|float32)[B, C, 224, 224, 3]: only cameras that are there
     tokens      int64[B, P], token_mask bool[B, P]
-    x_t         float32[B * R, H, action_dim], t float32[B * R] in (0, 1]; an observation's R rows are neighbours
+    x_t         float32[B * R, H, action_dim]; an observation's R rows are neighbours
+    t           float32[B * R] in (0, 1]
+    held        bool[B * R, H]: actions that are clean, and at time 0; what is predicted of them means nothing
     """
     parts, config = regions or Regions(), model.config
     x = torch.cat((_embed_images(model, images, parts), embed_prompt(model.vlm, tokens)), dim=1)
@@ -110,14 +136,21 @@ def velocity(
     suffix = valid.new_ones(len(x_t), x_t.shape[1])
     masks = valid[:, None, None], torch.cat((repeated, suffix), dim=1)[:, None, None]
     with torch.autocast(x.device.type, enabled=False):
-        cond = model.time_condition(time_embedding(t, config.expert.width))
-        y = model.embed_suffix(x_t, x_t, cond)
+        cond = _condition(model, t, held)
+        y = model.embed_suffix(x_t, x_t, cond.own)
     pairs = list(zip(model.vlm.layers, model.expert.layers, strict=True))
     for vlm, expert in pairs[:-1]:
         x, y = parts.joint_layer(vlm, expert, x, y, cond, ropes, masks)
     y = parts.last_layer(*pairs[-1], x, y, cond, ropes, masks)
     with torch.autocast(x.device.type, enabled=False):
-        return model.action_out_proj(model.expert.norm(y.float(), cond)[0]), x
+        return model.action_out_proj(modulated(model.expert.norm, y.float(), cond)[0]), x
+
+
+def _condition(model: Pi0Model, t: Tensor, held: Tensor | None) -> Condition:
+    own = model.time_condition(time_embedding(t, model.config.expert.width))
+    if held is None:
+        return Condition(own)
+    return Condition(own, model.time_condition(time_embedding(t.new_zeros(1), model.config.expert.width)), held)
 
 
 def _embed_images(model: Pi0Model, images: Tensor, parts: Regions) -> Tensor:
@@ -175,9 +208,13 @@ class Guide(nn.Module):
         return out[:, : self.num_values], out[:, self.num_values :]
 
 
-def flow_loss(predicted: Tensor, target: Tensor, weights: Tensor) -> Tensor:
-    """Squared error of velocities [N, H, action_dim], weighted by dimension float32[action_dim] and averaged."""
-    return ((predicted - target).square() * weights).sum(-1).mean() / weights.sum()
+def flow_loss(predicted: Tensor, target: Tensor, weights: Tensor, held: Tensor | None = None) -> Tensor:
+    """Squared error of velocities [N, H, action_dim], weighted by dimension float32[action_dim] and averaged.
+
+    held   bool[N, H]: actions that are given, not predicted; they don't count
+    """
+    errors = ((predicted - target).square() * weights).sum(-1) / weights.sum()
+    return errors.mean() if held is None else errors[~held].mean()
 
 
 def guide_loss(values: Tensor, logits: Tensor, wanted: Tensor, phases: Tensor) -> Tensor:
@@ -188,3 +225,19 @@ def draw_times(batch: int, device: torch.device | str, generator: torch.Generato
     """t ~ Beta(1.5, 1), scaled to [0.001, 1], as Pi0's training: float32[batch]."""
     uniform = torch.rand(batch, device=device, generator=generator)
     return uniform.pow(1 / 1.5) * 0.999 + 0.001  # the distribution function of Beta(1.5, 1) is u^1.5
+
+
+def draw_delays(batch: int, most: int, device: torch.device | str, generator: torch.Generator | None = None) -> Tensor:
+    """Each delay from 0 to `most` as often as any other: int64[batch]."""
+    return torch.randint(most + 1, (batch,), device=device, generator=generator)
+
+
+def held_actions(delays: Tensor, horizon: int) -> Tensor:
+    """bool[N, H]: the actions that are carried out before the delay is over."""
+    return torch.arange(horizon, device=delays.device) < delays[:, None]
+
+
+def mixed(actions: Tensor, noise: Tensor, t: Tensor, held: Tensor | None = None) -> Tensor:
+    """x at time t float32[N] of the way from actions to noise [N, H, action_dim]; the actions where they are held."""
+    x = t[:, None, None] * noise + (1 - t[:, None, None]) * actions
+    return x if held is None else torch.where(held[..., None], actions, x)

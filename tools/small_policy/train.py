@@ -6,6 +6,7 @@ last checkpoint, whose clock it takes over (frames are collected anew).
 """
 
 import csv
+import dataclasses
 import json
 import math
 import time
@@ -23,11 +24,22 @@ from small_policy.collect import AUX_DIM, HORIZON, Mix, Record
 from small_policy.expert import PHASES
 from small_policy.export import CONFIG, export
 from small_policy.fleet import Fleet
-from small_policy.forward import Guide, Regions, draw_times, flow_loss, guide_loss, velocity
+from small_policy.forward import (
+    Guide,
+    Regions,
+    draw_delays,
+    draw_times,
+    flow_loss,
+    guide_loss,
+    held_actions,
+    mixed,
+    velocity,
+)
 from small_policy.memory import Batch, Memory
 from small_policy.scenes import INSTRUCTIONS, NUM_TASKS, Setting
 from small_policy.start import fresh_model
 from turbopi.checkpoint.norm_stats import load_norm_stats
+from turbopi.config import RealTime
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
 
@@ -63,6 +75,7 @@ class Settings:
     save_every: float = 100.0
     compile: bool = True
     resume: bool = False
+    max_delay: int = 0  # control steps of delay that are simulated, for real-time execution; 0: none
     device: str = "cuda"
 
 
@@ -140,13 +153,15 @@ class Trainer:
         tokens, mask = self.tokens[batch.prompts], self.token_mask[batch.prompts]
         actions = self.normalized(batch.chunks).repeat_interleave(self.settings.repeats, 0)
         noise = torch.randn_like(actions)
-        t = draw_times(len(actions), self.device)
-        mixed = t[:, None, None] * noise + (1 - t[:, None, None]) * actions
+        t, held = draw_times(len(actions), self.device), None
+        if self.settings.max_delay:
+            held = held_actions(draw_delays(len(actions), self.settings.max_delay, self.device), HORIZON)
+        x = mixed(actions, noise, t, held)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
-            predicted, hidden = velocity(self.model, pictures, tokens, mask, mixed, t, self.regions)
+            predicted, hidden = velocity(self.model, pictures, tokens, mask, x, t, self.regions, held)
         values, logits = self.guide(hidden, mask)
         return {
-            "flow": flow_loss(predicted, noise - actions, self._weights),
+            "flow": flow_loss(predicted, noise - actions, self._weights, held),
             "guide": guide_loss(values, logits, guide_targets(batch.aux), batch.phases),
         }
 
@@ -309,7 +324,8 @@ def _seconds(settings: Settings) -> float:
 def _export(trainer: Trainer, folder: Path) -> None:
     if folder.exists():
         folder.rename(folder.with_name(f"{folder.name}.{time.time_ns()}"))
-    export({name: value.cpu() for name, value in trainer.average.items()}, trainer.stats, folder)
+    delays = dataclasses.replace(CONFIG, real_time=RealTime(trained_max_delay=trainer.settings.max_delay))
+    export({name: value.cpu() for name, value in trainer.average.items()}, trainer.stats, folder, config=delays)
 
 
 class _Curves:

@@ -12,6 +12,7 @@ from turbopi.cli.files import check_folder
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console, plain
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.timings import timing_columns
+from turbopi.errors import ConfigError
 from turbopi.files import write_whole
 from turbopi.wording import significant
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     examples=(
         "turbopi demo",
         "turbopi demo --episodes 10",
+        "turbopi demo --real-time",
         "turbopi demo --backend pytorch_compile --steps 5 --report report",
         "turbopi demo checkpoints/pi05_libero --config pi05_libero",
         "turbopi demo --random-weights pi05_libero --frames 1",
@@ -49,12 +51,19 @@ def demo(
         typer.Option(
             "--episodes",
             min=0,
-            max=20,
+            max=1000,
             metavar="N",
             help="Let the policy act in LIBERO, too: N episodes.",
             show_default="3 if the simulator is installed",
         ),
     ] = None,
+    real_time: Annotated[
+        bool,
+        typer.Option(
+            "--real-time",
+            help="Instead: a policy under delay in a dynamic task, joining its chunks and not.",
+        ),
+    ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Run a policy on real LIBERO pictures, check it against the float32 reference, and let it act in the simulator.
@@ -63,7 +72,17 @@ def demo(
     against what the expert did that it learned from. Where the simulator is installed (in a clone: scripts/setup
     libero) it acts in a few episodes, with success, latency and videos at the end. The report folder gets demo.png,
     actions.npz, report.json and episodes/. Exit code 1: the check failed.
+
+    With --real-time another small policy catches a runner, under a delay of four control steps: once each chunk simply
+    takes over when it is there, once it continues the running one. real_time.png, commands.png, real_time.json.
     """
+    if real_time:
+        from turbopi.cli.demo_real_time import show_real_time
+
+        show_real_time(options, checkpoint, episodes, seed, report, Output(as_json))
+        return
+    if episodes is not None and episodes > 20:
+        raise ConfigError(f"--episodes is {episodes}; LIBERO's part of the demo plays 20 at most (turbopi eval libero)")
     if checkpoint is None and options.random_weights is None:
         from turbopi.shipped import SMALL_POLICY
 

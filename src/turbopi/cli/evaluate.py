@@ -19,6 +19,7 @@ from turbopi.errors import ConfigError
 from turbopi.reading import plain_document
 
 if TYPE_CHECKING:
+    from turbopi.evaluate.delays import Cell
     from turbopi.evaluate.plan import Job, Protocol, VideoPlan
     from turbopi.evaluate.results import Episode, Results
     from turbopi.evaluate.run import OnEpisode
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from turbopi.sim import Simulator
 
 _EPISODES, _PROTOCOL, _RUNS, _OUTPUT = "Which episodes", "Protocol (openpi's unless given)", "How fast", "Output"
+_DELAY = "Under delay"
 DEFAULT_OUT = Path("turbopi-eval")
 
 
@@ -69,6 +71,28 @@ class EvalOptions(PolicyOptions):
         int,
         _option("--replan", panel=_PROTOCOL, metavar="N", help="Actions carried out before the policy is asked again."),
     ] = 5
+    execution: Annotated[
+        str,
+        _option(
+            "--execution",
+            panel=_DELAY,
+            metavar="WAY,WAY,…",
+            help="How chunks join: sync, async, ensemble, rtc, rtc_identity, rtc_trained (docs/real_time.md).",
+        ),
+    ] = "sync"
+    delay_steps: Annotated[
+        str,
+        _option(
+            "--delay-steps",
+            panel=_DELAY,
+            metavar="N,N,…",
+            help="Control steps from an observation to the chunk computed from it: simulated, exact, repeatable.",
+        ),
+    ] = "0"
+    execution_horizon: Annotated[
+        str | None,
+        _option("--execution-horizon", panel=_DELAY, metavar="N,N,…", help="--replan, for several at once."),
+    ] = None
     max_steps: Annotated[
         int | None,
         _option("--max-steps", panel=_PROTOCOL, metavar="N", help="Limit of an episode; the suite's own unless given."),
@@ -147,6 +171,20 @@ class EvalOptions(PolicyOptions):
         settings = SimSettings(self.seed, self.seeding, self.wait_steps, self.camera_px)  # type: ignore[arg-type]
         return Protocol(name, suite, settings, self.replan, self.image_px, self.max_steps)
 
+    def cells(self) -> "list[Cell]":
+        """The ways to run, delays and execution horizons that are asked for, in all combinations."""
+        from turbopi.evaluate.delays import make_cells
+        from turbopi.evaluate.plan import parse_numbers
+
+        if self.execution_horizon is None:
+            horizons = [self.replan]
+        elif self.replan != type(self).replan:
+            raise ConfigError("--replan and --execution-horizon say the same; give one of them")
+        else:
+            horizons = parse_numbers("--execution-horizon", self.execution_horizon)
+        ways = [name.strip() for name in self.execution.split(",")]
+        return make_cells(ways, parse_numbers("--delay-steps", self.delay_steps), horizons)
+
     def video_plan(self) -> "VideoPlan":
         from turbopi.evaluate.plan import VideoPlan
 
@@ -181,12 +219,14 @@ class EvalOptions(PolicyOptions):
         "turbopi eval libero checkpoints/pi05_libero --config pi05_libero --trials 5 --control prompt",
         "turbopi eval libero --random-weights pi05_tiny --tasks 0,1 --trials 1 --max-steps 20",
         "turbopi eval reacher --random-weights pi05_tiny --trials 2",
+        "turbopi eval chase CKPT --execution async,rtc --delay-steps 0,2,4 --trials 100 --videos none",
     ),
 )
 def evaluate_command(
     options: EvalOptions,
     simulator: Annotated[
-        str, typer.Argument(metavar="SIMULATOR", help="libero; or reacher, a toy to try the evaluation itself with.")
+        str,
+        typer.Argument(metavar="SIMULATOR", help="libero; chase, a task that forgives no delay; or reacher, a toy."),
     ],
     checkpoint: CheckpointArgument = None,
     host: Annotated[
@@ -219,7 +259,9 @@ def evaluate_command(
     The policy runs in this process, from a CHECKPOINT or --random-weights, or behind openpi's websocket protocol
     (--host, --port). The folder gets results.json, report.html, plots and videos; unless --out is given it is
     turbopi-eval/ and a name made of suite and policy. Giving the same command again continues an interrupted run,
-    and retries episodes that crashed. Exit code 1: some episodes crashed, so the result isn't complete.
+    and retries episodes that crashed. With several ways to run (--execution), delays or execution horizons each has
+    a folder of its own in it, and delays.html and delays.json compare them. Exit code 1: some episodes crashed, so the
+    result isn't complete.
     """
     output = Output(as_json)
     remote = host is not None or port is not None
@@ -234,6 +276,8 @@ def evaluate_command(
     chosen = options.simulator(simulator, output)
     protocol = options.protocol(chosen, simulator)
     jobs = options.jobs(chosen, protocol.suite)
+    cells = options.cells()
+    _check_cells(cells, options, remote)
     if remote:
         from turbopi.evaluate.sources import RemotePolicy
 
@@ -247,13 +291,69 @@ def evaluate_command(
             instructions = [job.task.instruction for job in jobs]
             source = Controlled(source, control, instructions, chosen.image_keys)  # type: ignore[arg-type]
         folder = options.out or DEFAULT_OUT / _folder_name(protocol.suite, source.label, source.about)
-        results = run_with_progress(options, protocol, source, chosen, jobs, folder, output)
+        if len(cells) > 1:
+            complete = _run_cells(options, protocol, cells, source, chosen, jobs, folder, output)
+        else:
+            protocol = cells[0].protocol(protocol)
+            results = run_with_progress(options, protocol, source, chosen, jobs, folder, output)
+            _show(results, output)
+            output.document({"folder": results.folder, **plain_document(results.summary())})
+            complete = results.complete
     finally:
         source.close()
-    _show(results, output)
-    output.document({"folder": results.folder, **plain_document(results.summary())})
-    if not results.complete:
+    if not complete:
         raise typer.Exit(CHECK_FAILED)
+
+
+def _check_cells(cells: "list[Cell]", options: EvalOptions, remote: bool) -> None:
+    from turbopi.execution import way_named
+
+    joined = sorted({cell.execution for cell in cells if way_named(cell.execution).mode is not None})
+    if remote and joined:
+        raise ConfigError(
+            f"--execution {', '.join(joined)} tells the model of the running chunk, which isn't done over the network "
+            "here: give the checkpoint instead of a server's address, or --execution sync, async or ensemble"
+        )
+    if options.record is not None and len(cells) > 1:
+        raise ConfigError("--record keeps what one run sees: give one --execution, --delay-steps, --execution-horizon")
+
+
+def _run_cells(
+    options: EvalOptions,
+    protocol: "Protocol",
+    cells: "list[Cell]",
+    source: "PolicySource",
+    simulator: "Simulator",
+    jobs: "list[Job]",
+    folder: Path,
+    output: Output,
+) -> bool:
+    """Each cell in a folder of its own, and the report of all. Returns whether every episode has a verdict."""
+    from turbopi.evaluate.delays import FILE, HEADS, document, row, write_delays
+    from turbopi.evaluate.sources import check_delay, check_fit
+
+    answer = check_fit(source, simulator, protocol.sim, protocol.image_px, min(cell.horizon for cell in cells))
+    for cell in cells:  # what can't be run is better known before the first one is
+        if answer.problem is None:
+            check_delay(cell.protocol(protocol), simulator, len(answer.actions))
+    done: list[tuple[Cell, Results]] = []
+    try:
+        for cell in cells:
+            own = cell.protocol(protocol)
+            done.append((cell, run_with_progress(options, own, source, simulator, jobs, folder / cell.folder, output)))
+    finally:
+        page = write_delays(folder, done) if done else None
+    told = document(done)
+    table = Table(title=escape(f"{protocol.suite} under delay: {source.label}"), title_justify="left")
+    for head in HEADS:
+        table.add_column(head, justify="left" if head == "execution" else "right")
+    for summary in told.cells:
+        table.add_row(*row(summary))
+    output.table(table)
+    output.line(f"report: {page}")
+    cells_told = plain_document(told)["cells"]
+    output.document({"folder": folder, "file": FILE, "first": told.first, "cells": cells_told})
+    return all(results.complete for _, results in done)
 
 
 def _refuse_policy_options(options: EvalOptions) -> None:
@@ -281,10 +381,12 @@ def run_with_progress(
 ) -> "Results":
     """Check that the policy fits, then run with a bar, or a line an episode where nobody watches."""
     from turbopi.evaluate.run import default_workers, evaluate, pending, prepare
-    from turbopi.evaluate.sources import check_fit
+    from turbopi.evaluate.sources import check_delay, check_fit
     from turbopi.evaluate.visited import Recording
 
-    check_fit(source, simulator, protocol.sim, protocol.image_px, protocol.replan)
+    answer = check_fit(source, simulator, protocol.sim, protocol.image_px, protocol.replan)
+    if answer.problem is None:
+        check_delay(protocol, simulator, len(answer.actions))
     results = prepare(folder, protocol, source, simulator, jobs, restart=options.restart)
     left = len(pending(results, jobs))
     recording = None if options.record is None or not left else Recording(options.record, source)

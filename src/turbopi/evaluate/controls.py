@@ -41,10 +41,16 @@ class Controlled:
         self.identity = source.identity | {"control": control}
         self.about = source.about | {"control": control}
 
-    def infer(self, observations: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Answer]:
+    def infer(
+        self,
+        observations: Sequence[Mapping[str, Any]],
+        seeds: Sequence[int],
+        arguments: Sequence[Mapping[str, Any]] | None = None,
+    ) -> list[Answer]:
         for observation in observations:
             self._seen[observation["prompt"]] = {key: observation[key] for key in self._image_keys}
-        return self._source.infer([self._wrong(observation) for observation in observations], seeds)
+        wrong = [self._wrong(observation) for observation in observations]
+        return self._source.infer(wrong, seeds) if arguments is None else self._source.infer(wrong, seeds, arguments)
 
     def close(self) -> None:
         self._source.close()

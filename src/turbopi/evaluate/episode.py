@@ -1,19 +1,25 @@
 """One episode, in a worker process: the simulator is stepped, the policy is asked across a pipe."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from turbopi.evaluate.frames import Frame
+from turbopi.evaluate.motion import Commands, Motion
 from turbopi.evaluate.plan import Job
+from turbopi.execution import ChunkQueue
 from turbopi.sim import Environment, SimSettings
 
-# Asks the policy at a step: observation -> actions float64[H, d]. Raises NoActions if it has none that can be used
-Ask = Callable[[int, dict[str, object]], np.ndarray]
+# Asks the policy at a step: observation, what else it is told (`Request.arguments`) -> what `infer` returns, "actions"
+# float64[H, d] at least. Raises NoActions if it has none that can be used
+Ask = Callable[[int, dict[str, object], Mapping[str, Any]], Mapping[str, Any]]
+# The action with which the robot stands still, after this one
+StandStill = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass
@@ -23,47 +29,115 @@ class Ending:
     status: str
     steps: int
     message: str | None = None
-    frames: list[Frame] = field(default_factory=list)
+    motion: Motion | None = None
+    commands: Commands = field(default_factory=Commands)
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How chunks are carried out.
+
+    way           turbopi.execution.WAYS
+    horizon       actions of a chunk after which the policy is asked again
+    delay         control steps from an observation to the chunk computed from it. The episode's clock starts when the
+                  first chunk is there
+    stand_still   where the way, or the delay, leaves the robot without an action; None: that can't be
+    motion_dims   the first dimensions of an action, which move the robot
+    """
+
+    way: str
+    horizon: int
+    delay: int = 0
+    stand_still: StandStill | None = None
+    motion_dims: int | None = None
 
 
 def run_episode(
     environment: Environment,
     job: Job,
     ask: Ask,
+    execution: Execution,
     *,
-    replan: int,
     max_steps: int,
     image_keys: tuple[str, ...],
     film: Callable[[Frame], None] | None = None,
     smooth: bool = False,
 ) -> Ending:
-    """Reset, then ask and act until the task is solved or the steps are used up."""
+    """Reset, then ask and act until the task is solved or the steps are used up.
+
+    The policy's answer is there at once, and joins the running chunk `delay` steps later: exact, and repeatable.
+    """
     environment.reset(job.initial_state)
-    step, chunk, count = 0, np.zeros((1, 1)), 0
+    queue = ChunkQueue(execution.way, execution_horizon=execution.horizon, delay=execution.delay)
+    commands, reel = Commands(), _Reel(film, smooth, execution.horizon, max_steps)
+    answer: Mapping[str, Any] = {}
+    due, step, status, message = -1, 0, "failure", None
+
     while step < max_steps:
-        observation = environment.observation()
-        try:
-            chunk = ask(step, observation)
-        except NoActions as none:
-            return Ending("aborted", step, f"step {step}: {none}; the episode was aborted")
-        count = min(replan, max_steps - step)
-        if film is not None:
-            film(Frame(step, [observation[key] for key in image_keys], chunk, count, 0))
-        problem = _problem(chunk)
-        if problem is not None:
-            return Ending("aborted", step, f"step {step}: {problem}")
-        for done, action in enumerate(chunk[:count], start=1):
-            success = environment.step(action, look=done == count)
-            step += 1
-            if success:
-                if film is not None:
-                    film(Frame(step, environment.draw(), chunk, count, done))
-                return Ending("success", step)
-            if film is not None and smooth and done < count:
-                film(Frame(step, environment.draw(), chunk, count, done))
-    if film is not None:
-        film(Frame(step, environment.draw(), chunk, count, count))
-    return Ending("failure", step)
+        if queue.in_flight is not None and step == due:
+            queue.arrive(answer)
+        if queue.wants_observation:
+            observation = environment.observation()
+            request = queue.observe()
+            try:
+                answer = ask(step, observation, request.arguments)
+            except NoActions as none:
+                status, message = "aborted", f"step {step}: {none}; the episode was aborted"
+                break
+            reel.look(step, [observation[key] for key in image_keys], answer["actions"])
+            problem = _problem(answer["actions"])
+            if problem is not None:
+                status, message = "aborted", f"step {step}: {problem}"
+                break
+            due = step + (execution.delay if request.number else 0)
+            if due == step:
+                queue.arrive(answer)
+        action = queue.next_action()
+        if action is None:
+            assert execution.stand_still is not None
+            values = execution.stand_still(commands.values[-1])
+        else:
+            values = action.values
+            if action.takes_over and action.chunk:
+                commands.seams.append(step)
+        commands.values.append(values)
+        step += 1
+        arrives = queue.in_flight is not None and due == step
+        look = queue.wants_observation or (arrives and execution.delay >= execution.horizon)
+        if environment.step(values, look=look):
+            status = "success"
+            break
+        reel.step(step, environment)
+    if status != "aborted":
+        reel.end(step, environment)
+    dims = execution.motion_dims or (len(commands.values[0]) if commands.values else 0)
+    return Ending(status, step, message, commands.motion(queue, dims), commands)
+
+
+class _Reel:
+    """Takes the frames of a film, if there is one."""
+
+    def __init__(self, film: Callable[[Frame], None] | None, smooth: bool, horizon: int, max_steps: int) -> None:
+        self._film, self._smooth, self._horizon, self._max_steps = film, smooth, horizon, max_steps
+        self._chunk, self._begun, self._planned = np.zeros((1, 1)), 0, 0
+
+    def look(self, step: int, pictures: list[np.ndarray], chunk: np.ndarray) -> None:
+        self._chunk, self._begun, self._planned = chunk, step, min(self._horizon, self._max_steps - step)
+        if self._film is not None:
+            self._film(Frame(step, pictures, chunk, self._planned, 0))
+
+    def step(self, step: int, environment: Environment) -> None:
+        if self._film is not None and self._smooth and step - self._begun < self._planned:
+            self._draw(step, environment)
+
+    def end(self, step: int, environment: Environment) -> None:
+        if self._film is not None:
+            self._draw(step, environment)
+
+    def _draw(self, step: int, environment: Environment) -> None:
+        assert self._film is not None
+        done = min(step - self._begun, self._planned)
+        self._film(Frame(step, environment.draw(), self._chunk, self._planned, done))
 
 
 def _problem(chunk: np.ndarray) -> str | None:
@@ -80,8 +154,9 @@ def _problem(chunk: np.ndarray) -> str | None:
 class Worker:
     """Runs jobs that come through a connection, holding the environment of the last task.
 
-    Messages out   ("observation", step, observation)   answered with ("actions", chunk), ("problem", text) or ("stop",)
-                   ("finished", status, steps, message, seconds, video)
+    Messages out   ("observation", step, observation, arguments)   answered with ("actions", what infer returned),
+                                                                   ("problem", text) or ("stop",)
+                   ("finished", status, steps, message, seconds, video, motion)
                    ("crashed", traceback, seconds)
                    ("unavailable", text)   nothing can be simulated here at all
     """
@@ -101,7 +176,13 @@ class Worker:
             self._environment(job.task.index),
             job,
             self._ask,
-            replan=setup.replan,
+            Execution(
+                setup.execution,
+                setup.replan,
+                setup.delay,
+                getattr(self.simulator, "standing_still", None),
+                getattr(self.simulator, "motion_dim", None),
+            ),
             max_steps=setup.max_steps or job.task.max_steps,
             image_keys=self.simulator.image_keys,
             film=frames.append if job.video else None,
@@ -114,7 +195,7 @@ class Worker:
                 video = self._write_video(job, frames, ending.status)
             except OSError as error:  # a full disk, no ffmpeg: the verdict stands
                 message = f"{message or ''} the video couldn't be written: {error}".strip()
-        self.connection.send(("finished", ending.status, ending.steps, message, seconds, video))
+        self.connection.send(("finished", ending.status, ending.steps, message, seconds, video, ending.motion))
 
     def _write_video(self, job: Job, frames: list[Frame], status: str) -> str:
         """Its path inside the results' folder."""
@@ -140,14 +221,15 @@ class Worker:
             self.task = task
         return self.environment
 
-    def _ask(self, step: int, observation: dict[str, object]) -> np.ndarray:
-        self.connection.send(("observation", step, observation))
+    def _ask(self, step: int, observation: dict[str, object], arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        self.connection.send(("observation", step, observation, arguments))
         answer = self.connection.recv()
         if answer[0] == "stop":
             raise Stopped
         if answer[0] == "problem":
             raise NoActions(answer[1])
-        return np.asarray(answer[1])
+        result: Mapping[str, Any] = answer[1]
+        return result
 
 
 class NoActions(Exception):
@@ -169,3 +251,5 @@ class WorkerSetup:
     max_steps: int | None
     smooth: bool
     folder: str
+    execution: str = "sync"
+    delay: int = 0

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from turbopi.errors import ConfigError
+from turbopi.execution import way_named
 from turbopi.sim import SimSettings, Simulator, Task
 
 VideoChoice = Literal["sample", "all", "none"]
@@ -17,9 +18,11 @@ VideoChoice = Literal["sample", "all", "none"]
 class Protocol:
     """Everything that decides what happens in an episode, besides the policy. The defaults are openpi's.
 
-    replan       actions of a chunk that are carried out before the policy is asked again
+    replan       actions of a chunk that are carried out before the policy is asked again: the execution horizon
     image_px     pictures are resized to this square with padding before they are sent to the policy
     max_steps    control steps after the wait; None: the suite's own limit
+    execution    how chunks join: one of turbopi.execution.WAYS
+    delay        control steps from an observation to the chunk computed from it
     """
 
     simulator: str
@@ -28,8 +31,13 @@ class Protocol:
     replan: int = 5
     image_px: int = 224
     max_steps: int | None = None
+    execution: str = "sync"
+    delay: int = 0
 
     def __post_init__(self) -> None:
+        way_named(self.execution)
+        if not 0 <= self.delay <= 1000:
+            raise ConfigError(f"the delay is {self.delay} control steps; it should be from 0 to 1000")
         for name, value in (("replan", self.replan), ("image_px", self.image_px), ("max_steps", self.max_steps)):
             if value is not None and value < 1:
                 raise ConfigError(f"{name} is {value}; it should be at least 1")

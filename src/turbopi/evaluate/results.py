@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from turbopi.errors import ConfigError
+from turbopi.evaluate.motion import Motion
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.statistics import Percentiles, Rate, RateDocument, percentiles
 from turbopi.files import write_whole
@@ -41,6 +42,7 @@ class Episode(Struct, frozen=True):
     batch        for each of these calls, the requests that were answered together
     message      what the simulator or the policy said, if it isn't a plain success or failure
     video        the film's path in the run's folder
+    motion       how smooth the commands were; None in files of 0.1
     """
 
     task: Count
@@ -54,6 +56,7 @@ class Episode(Struct, frozen=True):
     batch: list[Annotated[int, Meta(ge=1, le=10**9)]] = []
     message: str | None = None
     video: str | None = None
+    motion: Motion | None = None
 
     @property
     def key(self) -> tuple[int, int]:
@@ -230,8 +233,14 @@ class Results:
 
 
 def protocol_json(protocol: Protocol) -> Plain:
-    """As it looks after a round trip through JSON, so that it compares equal."""
-    return plain_object(asdict(protocol))
+    """As it looks after a round trip through JSON, so that it compares equal.
+
+    What says that nothing is delayed is left out, as in files of 0.1, whose runs can be continued.
+    """
+    values = asdict(protocol)
+    if (protocol.execution, protocol.delay) == ("sync", 0):
+        del values["execution"], values["delay"]
+    return plain_object(values)
 
 
 def plain_object(values: Plain) -> dict[str, object]:

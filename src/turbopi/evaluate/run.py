@@ -96,6 +96,8 @@ def evaluate(
         protocol.max_steps,
         videos.smooth,
         str(results.folder),
+        protocol.execution,
+        protocol.delay,
     )
     scheduler = Scheduler(
         protocol,

@@ -8,7 +8,7 @@ asked together, and a run repeats bit for bit.
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing import connection
 from typing import Any
@@ -17,9 +17,10 @@ import numpy as np
 
 from turbopi.errors import TurboPiError
 from turbopi.evaluate.episode import WorkerSetup
+from turbopi.evaluate.motion import Motion
 from turbopi.evaluate.plan import Job, Protocol, noise_seed
 from turbopi.evaluate.results import Episode, Status, writable
-from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
+from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource, actions_needed
 from turbopi.evaluate.workers import LOG, WorkerHandle
 from turbopi.preprocess.images import resize_with_pad
 from turbopi.sim import Simulator
@@ -53,6 +54,7 @@ class _Request:
     step: int
     observation: dict[str, object]
     seed: int
+    arguments: Mapping[str, Any]  # what else the policy is told
 
 
 class Scheduler:
@@ -144,11 +146,11 @@ class Scheduler:
     def _handle(self, worker: WorkerHandle, message: tuple[Any, ...]) -> None:
         assert worker.job is not None
         match message:
-            case ("observation", step, observation):
-                self._requests.append(self._request(worker, worker.job, step, observation))
-            case ("finished", status, steps, text, seconds, video):
+            case ("observation", step, observation, arguments):
+                self._requests.append(self._request(worker, worker.job, step, observation, arguments))
+            case ("finished", status, steps, text, seconds, video, motion):
                 self._crashes_in_a_row = 0
-                self._end(worker, status, steps, seconds, text, video)
+                self._end(worker, status, steps, seconds, text, video, motion)
                 self._assign(worker)
             case ("crashed", text, seconds):
                 worker.task = None
@@ -183,6 +185,7 @@ class Scheduler:
         seconds: float,
         message: str | None,
         video: str | None = None,
+        motion: Motion | None = None,
     ) -> None:
         job, worker.job = worker.job, None
         assert job is not None
@@ -191,7 +194,7 @@ class Scheduler:
         lists = ([round(ms, 3) for ms in told.call_ms], [round(ms, 3) for ms in told.infer_ms], told.batch)
         text = None if message is None else writable(message)
         episode = Episode(
-            job.task.index, job.initial_state, status, steps, seed, round(seconds, 2), *lists, text, video
+            job.task.index, job.initial_state, status, steps, seed, round(seconds, 2), *lists, text, video, motion
         )
         self._on_episode(episode, job)
         if status != "crash":
@@ -206,17 +209,28 @@ class Scheduler:
 
     # --- the policy ---------------------------------------------------------------------------------------------------
 
-    def _request(self, worker: WorkerHandle, job: Job, step: int, observation: dict[str, object]) -> _Request:
+    def _request(
+        self,
+        worker: WorkerHandle,
+        job: Job,
+        step: int,
+        observation: dict[str, object],
+        arguments: Mapping[str, Any],
+    ) -> _Request:
         px = self._protocol.image_px
         resized = {key: resize_with_pad(np.asarray(observation[key]), px, px) for key in self._image_keys}
         seed = noise_seed(self._protocol.sim.seed, *job.key, step)
-        return _Request(worker, job, step, observation | resized, seed)
+        return _Request(worker, job, step, observation | resized, seed, arguments)
 
     def _answer(self) -> None:
         """One batch of the waiting requests, oldest first."""
         batch, self._requests = self._requests[: self._max_batch], self._requests[self._max_batch :]
         start = time.perf_counter()
-        answers = self._source.infer([request.observation for request in batch], [request.seed for request in batch])
+        observations, seeds = [request.observation for request in batch], [request.seed for request in batch]
+        if any(request.arguments for request in batch):
+            answers = self._source.infer(observations, seeds, [request.arguments for request in batch])
+        else:
+            answers = self._source.infer(observations, seeds)
         call_ms = (time.perf_counter() - start) * 1e3
         for request, answer in zip(batch, answers, strict=True):
             told = self._running[request.worker]
@@ -229,7 +243,7 @@ class Scheduler:
                 reply: tuple[str, object] = ("problem", answer.problem)
             else:
                 self._check_shape(answer.actions)
-                reply = ("actions", answer.actions)
+                reply = ("actions", {"actions": answer.actions, **answer.for_next})
                 if self._on_answer is not None:
                     self._on_answer(request.job, request.step, request.observation, request.seed, answer)
             with contextlib.suppress(OSError):  # it died meanwhile; the next message from it is its end
@@ -238,8 +252,9 @@ class Scheduler:
     def _check_shape(self, actions: np.ndarray) -> None:
         """A policy that fitted at the beginning may answer otherwise later."""
         horizon, width = actions.shape
-        if width != self._action_dim or horizon < self._protocol.replan:
+        least = actions_needed(self._protocol)
+        if width != self._action_dim or horizon < least:
             raise PolicyRefused(
                 f"the policy answered with actions of shape {list(actions.shape)}; expected at least "
-                f"{self._protocol.replan} actions of {self._action_dim} numbers. What was finished is kept"
+                f"{least} actions of {self._action_dim} numbers. What was finished is kept"
             )

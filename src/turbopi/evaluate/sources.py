@@ -2,18 +2,22 @@
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any
+from typing import Protocol as Interface
 
 import numpy as np
 
 from turbopi.errors import ActionError, ConfigError, ObservationError, TurboPiError
+from turbopi.evaluate.plan import Protocol
+from turbopi.execution import way_named
 from turbopi.reading import is_finite, shown
 from turbopi.sim import SimSettings, Simulator
 from turbopi.wire import MAX_BYTES, WireError, pack, unpack
 
 CONNECT_S = 10.0
 ANSWER_S = 600.0  # a server's first call may compile
+_IN_PROCESS = "give its checkpoint instead of its address, or --execution sync, async or ensemble"
 BAD_ACTIONS = "bad actions: "  # begins a Turbo-Pi server's answer where the model computed NaN or infinity
 MAX_MS = 1e12
 MAX_TOLD = 10_000  # numbers of an array in a server's metadata
@@ -32,18 +36,20 @@ class Answer:
     """actions float64[H, d]; infer_ms: the model alone, as the policy itself measured it, if it did.
 
     problem   why the actions can't be used, if the policy found that itself: they weren't finite, and aren't given
+    for_next  what the next chunk is told of this one, if that was asked for: "model_actions", and "anchor"
     """
 
     actions: np.ndarray
     infer_ms: float | None
     problem: str | None = None
+    for_next: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def unusable(cls, problem: str) -> "Answer":
         return cls(np.zeros((0, 0)), None, problem)
 
 
-class PolicySource(Protocol):
+class PolicySource(Interface):
     """Gives action chunks for observations.
 
     max_batch   how many it computes together; None: any number
@@ -56,8 +62,16 @@ class PolicySource(Protocol):
     identity: dict[str, object]
     about: dict[str, object]
 
-    def infer(self, observations: Sequence[Mapping[str, object]], seeds: Sequence[int]) -> list[Answer]:
-        """One answer for each observation; `seeds` draw the noise, where the source lets them."""
+    def infer(
+        self,
+        observations: Sequence[Mapping[str, object]],
+        seeds: Sequence[int],
+        arguments: Sequence[Mapping[str, Any]] | None = None,
+    ) -> list[Answer]:
+        """One answer for each observation; `seeds` draw the noise, where the source lets them.
+
+        arguments   what each request tells the policy of the running chunk (turbopi.execution). None: nothing
+        """
 
     def close(self) -> None:
         """Let go of it."""
@@ -78,7 +92,14 @@ class LocalPolicy:
         default = f"{about.get('backend')} {about.get('precision')} {about.get('num_denoising_steps')} steps"
         self.label = label or default
 
-    def infer(self, observations: Sequence[Mapping[str, object]], seeds: Sequence[int]) -> list[Answer]:
+    def infer(
+        self,
+        observations: Sequence[Mapping[str, object]],
+        seeds: Sequence[int],
+        arguments: Sequence[Mapping[str, Any]] | None = None,
+    ) -> list[Answer]:
+        if arguments is not None:
+            return [self._joined(*request) for request in zip(observations, seeds, arguments, strict=True)]
         try:
             results = self._policy.infer_batch(list(observations), seed=list(seeds))
         except ActionError as error:
@@ -87,6 +108,14 @@ class LocalPolicy:
             pairs = zip(observations, seeds, strict=True)  # the others' actions are good
             return [self.infer([observation], [seed])[0] for observation, seed in pairs]
         return [_answer(result, "policy_timing") for result in results]
+
+    def _joined(self, observation: Mapping[str, object], seed: int, arguments: Mapping[str, Any]) -> Answer:
+        try:
+            result = self._policy.infer(observation, seed=seed, **arguments)
+        except ActionError as error:
+            return Answer.unusable(str(error))
+        told = {name: np.asarray(result[name]) for name in ("model_actions", "anchor") if name in result}
+        return replace(_answer(result, "policy_timing"), for_next=told)
 
     def close(self) -> None:
         self._policy = None
@@ -154,7 +183,14 @@ class RemotePolicy:
         described = " ".join(_printable(str(metadata[name])[:80]) for name in names)
         self.label = f"{self._where} {described}".strip()
 
-    def infer(self, observations: Sequence[Mapping[str, object]], seeds: Sequence[int]) -> list[Answer]:
+    def infer(
+        self,
+        observations: Sequence[Mapping[str, object]],
+        seeds: Sequence[int],
+        arguments: Sequence[Mapping[str, Any]] | None = None,
+    ) -> list[Answer]:
+        if arguments is not None:
+            raise ConfigError(f"the policy at {self._where} can't be told of a running chunk here: {_IN_PROCESS}")
         return [self._one(observation) for observation in observations]
 
     def close(self) -> None:
@@ -204,6 +240,29 @@ def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings,
             f"give --replan {horizon} or less"
         )
     return answer
+
+
+def actions_needed(protocol: Protocol) -> int:
+    """How many actions a chunk must have: those of the delay are skipped, unless the robot stands still meanwhile."""
+    skipped = 0 if way_named(protocol.execution).stands_still else protocol.delay
+    return protocol.replan + skipped
+
+
+def check_delay(protocol: Protocol, simulator: Simulator, horizon: int) -> None:
+    """Raise ConfigError for a delay that chunks of `horizon` actions, or the simulator, can't be run with."""
+    way = way_named(protocol.execution)
+    if horizon < actions_needed(protocol) or (way.mode is not None and protocol.delay > protocol.replan):
+        most = min(protocol.replan, horizon - protocol.replan)
+        raise ConfigError(
+            f"a delay of {protocol.delay} control steps doesn't fit --execution {way.name} with chunks of {horizon} "
+            f"actions and an execution horizon of {protocol.replan}: at most {most} does; give another "
+            "--execution-horizon, or a policy with longer chunks"
+        )
+    if protocol.delay and way.stands_still and not hasattr(simulator, "standing_still"):
+        raise ConfigError(
+            f"the simulator {simulator.name} doesn't say how its robot stands still (`standing_still`), so it can't be "
+            f"run with --execution {way.name} and a delay"
+        )
 
 
 def _answer(result: object, *timings: str) -> Answer:

@@ -11,6 +11,7 @@ __all__ = ["SIMULATORS", "Environment", "SimSettings", "Simulator", "SimulatorUn
 SIMULATORS: dict[str, str] = {
     "libero": "turbopi.sim.libero:LiberoSimulator",
     "reacher": "turbopi.sim.reacher:ReacherSimulator",
+    "chase": "turbopi.sim.chase:ChaseSimulator",
 }
 
 _PARTS = (*Simulator.__annotations__, "check", "tasks", "open", "example", "versions")

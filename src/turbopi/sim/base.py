@@ -92,6 +92,8 @@ class Simulator(Protocol):
     control_hz: float
     image_keys: tuple[str, ...]
     suites: tuple[str, ...]  # the first is the default
+    # Simulators may have, besides: motion_dim, how many of an action's first numbers move the robot (None: all), for
+    # measures of smoothness; and standing_still(last action) -> action, which a way to run needs in which it stands
 
     def check(self) -> list[str]:
         """Raise SimulatorUnavailable if it can't run here. Returns warnings to show."""

@@ -36,6 +36,7 @@ class LiberoSimulator:
     name = "libero"
     robot = "libero"
     action_dim = 7
+    motion_dim = 6  # the seventh is the gripper
     control_hz = 20.0
     image_keys = tuple(CAMERAS)
     suites = tuple(MAX_STEPS)
@@ -76,6 +77,10 @@ class LiberoSimulator:
         state = np.array([-0.2, 0.0, 1.2, 3.14, 0.0, 0.0, 0.039, -0.039])  # as at an episode's start
         prompt = "pick up the black bowl and place it on the plate"
         return dict.fromkeys(CAMERAS, gray) | {"observation/state": state, "prompt": prompt}
+
+    def standing_still(self, last: np.ndarray) -> np.ndarray:
+        """No motion; the gripper as it is."""
+        return np.concatenate((np.zeros(6), last[6:]))
 
     def versions(self) -> dict[str, str]:
         return {name: metadata.version(name) for name in PACKAGES} | {"renderer": choose_renderer()}

@@ -28,6 +28,7 @@ class ReacherSimulator:
     name = "reacher"
     robot = "libero"
     action_dim = 7
+    motion_dim = 2
     control_hz = 20.0
     image_keys = ("observation/image", "observation/wrist_image")
     suites = ("reacher_colors",)
@@ -48,6 +49,9 @@ class ReacherSimulator:
         environment = ReacherEnvironment(COLORS[0], 0, settings)
         environment.reset(0)
         return environment.observation()
+
+    def standing_still(self, last: np.ndarray) -> np.ndarray:
+        return np.zeros_like(last)
 
     def versions(self) -> dict[str, str]:
         return {}

@@ -1,0 +1,209 @@
+"""Evaluation under simulated delay: exact, the same as ever without one, and a report that counts right."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli_helpers import turbopi
+from evaluate_fakes import SeekingPolicy, run
+
+from turbopi.errors import ConfigError
+from turbopi.evaluate.delays import Cell, document, make_cells, write_delays
+from turbopi.evaluate.episode import Execution, run_episode
+from turbopi.evaluate.plan import Job, Protocol
+from turbopi.evaluate.reading import load_results
+from turbopi.evaluate.results import protocol_json
+from turbopi.evaluate.sources import LocalPolicy, check_delay
+from turbopi.execution import WAYS
+from turbopi.sim import create
+from turbopi.sim.base import Task
+
+TASK = Task(0, "count", "count", 10, 30)
+
+
+class Counter:
+    """A world that counts its steps; its state is the count. Solved at no time."""
+
+    def __init__(self) -> None:
+        self.actions: list[float] = []
+        self.looked = True
+
+    def reset(self, initial_state: int) -> None:
+        self.actions = []
+
+    def observation(self) -> dict[str, Any]:
+        assert self.looked
+        return {"picture": np.zeros((2, 2, 3), np.uint8), "count": len(self.actions)}
+
+    def step(self, action: np.ndarray, look: bool) -> bool:
+        self.actions.append(float(action[0]))
+        self.looked = look
+        return False
+
+    def draw(self) -> list[np.ndarray]:
+        return []
+
+    def close(self) -> None:
+        pass
+
+
+def refused(command: str, *more: object) -> str:
+    result = turbopi(*command.split(), *more)
+    assert result.exit_code == 2, result.output
+    return " ".join(result.stderr.split())
+
+
+def ask(step: int, observation: dict[str, Any], arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Chunks whose row i is 100 * (when it was asked) + i."""
+    rows = 100.0 * observation["count"] + np.arange(12.0)
+    chunk = np.stack([rows, np.zeros(12)], axis=1)
+    return {"actions": chunk, "model_actions": chunk.astype(np.float32)}
+
+
+def carried_out(way: str, delay: int, every: int = 4, steps: int = 20) -> list[float]:
+    world = Counter()
+    execution = Execution(way, every, delay, lambda last: np.full(2, -1.0))
+    ending = run_episode(world, Job(TASK, 0), ask, execution, max_steps=steps, image_keys=("picture",))
+    assert ending.steps == steps == len(ending.commands.values)
+    return world.actions
+
+
+def openpis_loop(every: int, steps: int) -> list[float]:
+    done: list[float] = []
+    while len(done) < steps:
+        done += ask(0, {"count": len(done)}, {})["actions"][:every, 0].tolist()
+    return done[:steps]
+
+
+@pytest.mark.parametrize("way", [way for way in WAYS if way != "ensemble"])  # which averages without a delay, too
+def test_without_a_delay_every_way_is_openpis_loop_step_by_step(way: str) -> None:
+    assert carried_out(way, 0) == openpis_loop(4, 20)
+    assert carried_out(way, 1) != openpis_loop(4, 20)  # a delay that is ignored would be seen
+
+
+@pytest.mark.parametrize("way", ["async", "rtc", "rtc_identity", "rtc_trained"])
+def test_a_chunk_takes_over_exactly_so_many_steps_after_its_observation(way: str) -> None:
+    first = [0, 1, 2, 3, 4, 5]  # asked again at step 4, the answer is there at step 6 and entered at its row 2
+    assert carried_out(way, 2, steps=12) == [*first, 402, 403, 404, 405, 802, 803]
+
+
+def test_sync_stands_still_for_the_delay_and_enters_at_the_beginning() -> None:
+    assert carried_out("sync", 2, steps=12) == [0, 1, 2, 3, -1, -1, 400, 401, 402, 403, -1, -1]
+
+
+def test_ensemble_averages_what_both_chunks_have() -> None:
+    found = carried_out("ensemble", 2, steps=8)
+    assert found[6:] == pytest.approx([0.3 * 6 + 0.7 * 402, 0.3 * 7 + 0.7 * 403])
+
+
+def test_seams_and_smoothness_are_measured_where_chunks_take_over() -> None:
+    world, execution = Counter(), Execution("async", 4, 2)
+    motion = run_episode(world, Job(TASK, 0), ask, execution, max_steps=12, image_keys=("picture",)).motion
+    assert motion is not None
+    assert (motion.seams, motion.standing, motion.dropped) == (2, 0, 0)
+    assert motion.seam_jump == pytest.approx(397)  # from 5 to 402, and from 405 to 802
+    assert motion.step_jump == pytest.approx(1)
+    assert motion.seam_gap == pytest.approx(396)  # where the running chunk has 6 (406), and the new one 402 (802)
+    second = np.abs(np.diff(world.actions, n=2)).mean()
+    assert motion.jerk == pytest.approx(second)
+
+
+def test_a_run_under_delay_is_another_run_and_an_old_one_is_still_continued(tmp_path: Path) -> None:
+    assert "delay" not in protocol_json(Protocol("reacher", "reacher_colors"))
+    assert protocol_json(Protocol("reacher", "reacher_colors", delay=1))["delay"] == 1
+    results = run(tmp_path, SeekingPolicy(), states=(0,))
+    file = tmp_path / "results.json"
+    content = json.loads(file.read_text())
+    for episode in content["episodes"]:
+        del episode["motion"]  # as 0.1 wrote it
+    file.write_text(json.dumps(content))
+    assert load_results(tmp_path).episodes[0, 0].motion is None
+    continued = run(tmp_path, SeekingPolicy(), states=(0, 1))
+    assert continued.episodes.keys() == {(0, 0), (0, 1)} and results.episodes.keys() == {(0, 0)}
+    with pytest.raises(ConfigError, match="delay"):
+        run(tmp_path, SeekingPolicy(), states=(0,), execution="async", delay=2)
+
+
+def test_the_report_counts_pairs_and_shows_every_cell(tmp_path: Path) -> None:
+    cells = make_cells(["sync", "async"], [4, 0], [5])
+    assert [cell.delay for cell in cells] == [0, 4, 0, 4]
+    done = []
+    for cell in cells:
+        trouble = {0: "nan"} if cell == Cell("sync", 4, 5) else None
+        policy = SeekingPolicy(trouble)
+        results = run(
+            tmp_path / cell.folder, policy, states=(0, 1, 2), replan=5, execution=cell.execution, delay=cell.delay
+        )
+        done.append((cell, results))
+    page = write_delays(tmp_path, done)
+    told = document(done)
+    assert told.outcomes == ["sss", "ass", "sss", "sss"]
+    sync, delayed, _, other = told.cells
+    assert sync.undelayed is None and sync.against is None
+    assert delayed.undelayed is not None and (delayed.undelayed.only_first, delayed.undelayed.pairs) == (1, 3)
+    assert other.against is not None and (other.against.only_second, other.against.both) == (1, 2)
+    assert delayed.standing is not None and delayed.standing > 0
+    assert json.loads((tmp_path / "delays.json").read_text())["cells"][1]["success"]["successes"] == 2
+    text = page.read_text()
+    assert all(cell.folder in text for cell in cells)
+    assert (tmp_path / "success.png").exists() and (tmp_path / "seams.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("way", "delay", "every"), [("async", 6, 5), ("rtc", 6, 5), ("rtc_trained", 4, 3), ("ensemble", 3, 8)]
+)
+def test_a_delay_that_does_not_fit_is_refused_with_what_would(way: str, delay: int, every: int) -> None:
+    protocol = Protocol("chase", "chase_post", execution=way, delay=delay, replan=every)
+    most = min(every, 10 - every)
+    with pytest.raises(ConfigError, match=rf"a delay of {delay} control steps doesn't fit .* at most {most} does"):
+        check_delay(protocol, create("chase"), 10)
+    check_delay(Protocol("chase", "chase_post", execution="sync", delay=delay, replan=every), create("chase"), 10)
+
+
+def test_ways_that_tell_the_model_ask_the_policy_for_it() -> None:
+    asked: list[dict[str, Any]] = []
+
+    class Policy:
+        def __init__(self) -> None:
+            self.metadata: dict[str, Any] = {}
+
+        def infer(self, observation: Any, seed: int, **arguments: Any) -> dict[str, Any]:
+            asked.append(arguments)
+            return {"actions": np.zeros((10, 7)), "model_actions": np.ones((10, 32), np.float32)}
+
+    (answer,) = LocalPolicy(Policy()).infer([{}], [3], [{"previous": None, "model_actions": True}])
+    assert asked == [{"previous": None, "model_actions": True}]
+    assert answer.for_next["model_actions"].shape == (10, 32)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ("--execution never", "execution is 'never'; choose one of sync, async"),
+        ("--delay-steps x", "--delay-steps is 'x'"),
+        ("--execution-horizon 4 --replan 6", "say the same; give one of them"),
+    ],
+)
+def test_bad_ways_are_refused(options: str, why: str, tmp_path: Path) -> None:
+    assert why in refused(f"eval reacher --random-weights pi05_tiny {options}", "--out", tmp_path / "never")
+
+
+def test_a_server_is_not_asked_to_join_chunks(tmp_path: Path) -> None:
+    assert "isn't done over the network" in refused("eval reacher --port 9 --execution rtc", "--out", tmp_path / "n")
+
+
+def test_the_command_runs_every_cell_and_compares_them(tmp_path: Path) -> None:
+    from turbopi.shipped import CHASE_POLICY
+
+    result = turbopi(
+        "eval", "chase", CHASE_POLICY, "--trials", 1, "--max-steps", 8, "--videos", "none", "--camera-px", 48,
+        "--execution", "async,rtc,rtc_identity,rtc_trained", "--delay-steps", "0,2", "--out", tmp_path, "--json",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    cells = json.loads(result.stdout)["cells"]
+    assert len(cells) == 8 and {cell["execution"] for cell in cells} == {"async", "rtc", "rtc_identity", "rtc_trained"}
+    held = load_results(tmp_path / "rtc_trained_delay2_horizon5").episodes[0, 0].motion
+    assert held is not None and held.dropped == 0 and held.seam_gap is not None
