@@ -73,7 +73,8 @@ def guided_velocity(
     if not pull.through_expert:
         out, v_t = velocity(x_t)
         return out, v_t - pull.strength * pull.error(x_t, v_t)
-    with torch.enable_grad():
+    # in this thread: PyTorch's own for backward passes has no CUDA context at first, and warns of it
+    with torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
         x = x_t.detach().requires_grad_()
         out, v = velocity(x)
         v_t = v.detach()
