@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from serve_fakes import FakePolicy, PipelinedFakePolicy
+from test_serve_real_time import Joins
 
 from turbopi.serve import running
 
@@ -24,9 +25,8 @@ PYTHON = Path(
 API_KEY = "secret-123"
 
 
-@pytest.fixture(scope="module", params=[FakePolicy, PipelinedFakePolicy])
-def seen(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """What openpi-client saw, in one session against one server."""
+def openpi_client() -> Path:
+    """The interpreter that has openpi-client; without it the test is skipped."""
     if not PYTHON.is_file():
         hint = (
             f"openpi-client isn't installed at {PYTHON}; to get it: "
@@ -35,10 +35,17 @@ def seen(request: pytest.FixtureRequest) -> dict[str, Any]:
         if os.environ.get("TURBOPI_REQUIRE_OPENPI_CLIENT"):
             pytest.fail(hint)
         pytest.skip(hint)
+    return PYTHON
+
+
+@pytest.fixture(scope="module", params=[FakePolicy, PipelinedFakePolicy])
+def seen(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """What openpi-client saw, in one session against one server."""
+    python = openpi_client()
     policy: FakePolicy = request.param()
     with running(policy, api_key=API_KEY, max_message_mb=4) as server:
         client = subprocess.run(
-            [PYTHON, Path(__file__).parent / "openpi_client" / "drive.py", str(server.port), API_KEY],
+            [python, Path(__file__).parent / "openpi_client" / "drive.py", str(server.port), API_KEY],
             capture_output=True,
             text=True,
             timeout=300,
@@ -126,3 +133,21 @@ def test_action_chunk_broker_plays_a_chunk_before_it_asks_again(seen: dict[str, 
 @pytest.mark.parametrize("case", ["wrong key", "no key"])
 def test_a_wrong_api_key_is_refused(seen: dict[str, Any], case: str) -> None:
     assert seen[case] == 401
+
+
+def test_openpi_client_gets_joined_chunks_and_an_executor_without_pytorch() -> None:
+    python = openpi_client()
+    policy = Joins()
+    drive = Path(__file__).parent / "openpi_client" / "drive_real_time.py"
+    with running(policy, execution="rtc", control_hz=100) as server:
+        command = [str(python), str(drive), str(server.port), str(REPOSITORY / "src")]
+        client = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert client.returncode == 0, client.stderr
+    seen = json.loads(client.stdout)
+    assert [answer["joined"] for answer in seen["answers"]] == [False, True]
+    assert (seen["answers"][1]["row"], seen["answers"][1]["row_by"], seen["answers"][1]["delay"]) == (3, "step", 1)
+    assert "turbopi/step is 1, after 3" in seen["refused"]
+    assert seen["places"] == [float(i) for i in range(30)]
+    assert seen["torch"] is False
+    told = [previous for previous in policy.calls[5:] if previous is not None]
+    assert told and all(previous.mode == "rtc" for previous in told)

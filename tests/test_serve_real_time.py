@@ -543,3 +543,22 @@ def test_a_plain_client_of_a_joining_server_gets_the_chunk_that_the_policy_compu
             assert isinstance(reply, bytes), reply
             answers.append(unpack(reply)["real_time"])
     assert [answer["joined"] for answer in answers] == [False, True] and answers[1]["row"] == 3
+
+
+def test_what_the_model_cannot_join_is_refused_with_values_and_the_server_goes_on(tiny: UnifiedPolicy) -> None:
+    observation, width = tiny.example_observation(), tiny.config.model.action_dim
+    horizon = tiny.config.model.action_horizon
+    good = np.zeros((horizon - 1, width), np.float32)
+    refused = [
+        (RunningChunk(good[:, 1:], 1, 1), f"have {width - 1} values, but this model's have {width}"),
+        (RunningChunk(np.zeros((horizon + 1, width), np.float32), 1, 1), f"has {horizon + 1} actions"),
+        (RunningChunk(good, 2, horizon - 1), f"delay of 2 and an execution horizon of {horizon - 1} don't fit"),
+    ]
+    with running(tiny) as server, RealTimeClient("127.0.0.1", server.port) as client:
+        for previous, text in refused:
+            with pytest.raises(ObservationError, match=text):
+                client.infer(observation, previous=previous)
+        with pytest.raises(ConfigError, match="doesn't offer 'rtc_trained'"):
+            client.infer(observation, previous=RunningChunk(good, 1, 1, "rtc_trained"))
+        answer = client.infer(observation, previous=RunningChunk(good, 1, 1), model_actions=True)
+        assert answer["model_actions"].shape == (horizon, width) and answer["real_time"]["joined"]

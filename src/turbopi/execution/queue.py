@@ -6,6 +6,7 @@ is entered at row n: no action is carried out twice, and none is left out. A rob
 no actions, or its way is "sync") carried out none, and enters at row 0.
 """
 
+import copy
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ import numpy as np
 
 from turbopi.config import Schedule
 from turbopi.errors import ConfigError
+from turbopi.execution.chunk import Chunk, checked_max_jump, mix, read_chunk, too_far
 from turbopi.execution.delays import DelayEstimate
 from turbopi.execution.ways import Execution, way_named
 from turbopi.running_chunk import RunningChunk
@@ -70,13 +72,6 @@ class Seam:
     told: int | None  # the delay that the policy was told, if it was told of a running chunk
     jump: np.ndarray  # float64[d]  its first action − the last command
     gap: np.ndarray | None  # float64[d]  its first action − what the running chunk has for that step, if it has it
-
-
-class _Chunk(NamedTuple):
-    number: int
-    actions: np.ndarray  # float64[H, d]
-    model_actions: np.ndarray | None  # float32[H, A]
-    anchor: np.ndarray | None
 
 
 @dataclass
@@ -140,14 +135,14 @@ class ChunkQueue:
         self._delay = delay if isinstance(delay, DelayEstimate) else DelayEstimate(delay)
         self._s = None if execution_horizon is None else _horizon(execution_horizon)
         self._trained_max = trained_max_delay
-        self._max_jump = None if max_jump is None else _jump(max_jump)
+        self._max_jump = None if max_jump is None else checked_max_jump(max_jump)
         if not 0 <= old_weight <= 1:
             raise ConfigError(f"old_weight is {old_weight}; the running chunk's part of a mean lies between 0 and 1")
         self._old_weight = old_weight
         self._guidance: dict[str, Any] = {"schedule": schedule, "max_guidance_weight": max_guidance_weight}
         self._policys_guidance = policys_guidance
         self._requests = 0
-        self._running: _Chunk | None = None
+        self._running: Chunk | None = None
         self._row = self._entered = 0  # of the running chunk: the next one, and the first that was carried out
         self._flight: _Flight | None = None
         self._last: np.ndarray | None = None  # the last action
@@ -239,7 +234,7 @@ class ChunkQueue:
         self.cut_delays += previous is not None and previous.delay < expected
         return previous
 
-    def _told(self, chunk: _Chunk, row: int, expected: int) -> RunningChunk | None:
+    def _told(self, chunk: Chunk, row: int, expected: int) -> RunningChunk | None:
         """What the policy is told of a chunk whose next action is `row`; the delay is cut to what fits."""
         if self.way.mode is None or row >= len(chunk.actions):
             return None
@@ -268,9 +263,7 @@ class ChunkQueue:
         horizon = len(chunk.actions)
         if self.horizon is None:
             self._learn(chunk)
-        if not np.isfinite(chunk.actions).all() or not (
-            chunk.model_actions is None or np.isfinite(chunk.model_actions).all()
-        ):
+        if not chunk.finite:
             return self._drop("not_finite", "a number in it is NaN or infinite")
         if entry >= horizon:
             return self._drop("used_up", f"{entry} actions were carried out since its observation; it has {horizon}")
@@ -283,8 +276,9 @@ class ChunkQueue:
             self.late += 1
         next_of_running = self._next_of_running()
         if self.way.averages and self._running is not None:
-            _mix(chunk.actions[entry:], self._running.actions[self._row :], self._old_weight)
-        if (moved := self._jumps(chunk.actions[entry:])) is not None:
+            mix(chunk.actions[entry:], self._running.actions[self._row :], self._old_weight)
+        moved = None if self._max_jump is None else too_far(chunk.actions[entry:], self._last, self._max_jump)
+        if moved is not None:
             return self._drop("jump", moved)
         first = chunk.actions[entry]
         if self._last is not None:
@@ -373,11 +367,17 @@ class ChunkQueue:
             "late": self.late,
             "cut_delays": self.cut_delays,
             "expected_delay": self._delay.steps,
-            "delays": _summary([float(delay) for delay in self.delays]),
-            "seam_jumps": _summary(jumps),
-            "seam_gaps": _summary(gaps),
+            "delays": summary([float(delay) for delay in self.delays]),
+            "seam_jumps": summary(jumps),
+            "seam_gaps": summary(gaps),
             "last_problem": self.last_problem,
         }
+
+    def copy(self) -> "ChunkQueue":
+        """As it is now, for a report beside a queue that goes on."""
+        copied = copy.copy(self)
+        copied.dropped, copied.seams, copied.delays = self.dropped.copy(), self.seams.copy(), self.delays.copy()
+        return copied
 
     # --- inside -------------------------------------------------------------------------------------------------------
 
@@ -389,7 +389,7 @@ class ChunkQueue:
                 f"{self._trained_max}: choose execution 'rtc', a lower control rate, or fewer denoising steps"
             )
 
-    def _learn(self, chunk: _Chunk) -> None:
+    def _learn(self, chunk: Chunk) -> None:
         horizon, width = chunk.actions.shape
         if self._max_jump is not None and self._max_jump.ndim == 1 and len(self._max_jump) != width:
             raise ConfigError(f"max_jump has {len(self._max_jump)} numbers, but the policy's actions have {width}")
@@ -412,45 +412,15 @@ class ChunkQueue:
         self.last_problem = f"{reason}: {text}"
         return reason
 
+    def _read(self, number: int, result: Mapping[str, Any]) -> Chunk | str:
+        shape = None if self.horizon is None or self.width is None else (self.horizon, self.width)
+        return read_chunk(number, result, shape, None if self.way.mode is None else self.way.name)
+
     def _next_of_running(self) -> np.ndarray | None:
         """What the running chunk has for the next step."""
         if self._running is None or self._row >= len(self._running.actions):
             return None
         return self._running.actions[self._row]
-
-    def _read(self, number: int, result: Mapping[str, Any]) -> _Chunk | str:
-        """The chunk of a policy's result, or what is wrong with it."""
-        actions = _numbers(result.get("actions"), np.float64)
-        if actions is None or actions.ndim != 2 or 0 in actions.shape:
-            return f'"actions" isn\'t an array of numbers [H, d] but {_shape(result.get("actions"))}'
-        if self.horizon is not None and actions.shape != (self.horizon, self.width):
-            return f"its actions have shape {list(actions.shape)}; those before had {[self.horizon, self.width]}"
-        if self.way.mode is None:
-            return _Chunk(number, actions, None, None)
-        if "model_actions" not in result:
-            return (
-                f'the policy\'s answer has no "model_actions", which {self.way.name} needs for the next chunk: '
-                "take a policy that offers it, or execution 'sync', 'async' or 'ensemble'"
-            )
-        model_actions = _numbers(result["model_actions"], np.float32)
-        if model_actions is None or model_actions.ndim != 2 or len(model_actions) != len(actions):
-            return f'"model_actions" isn\'t float32 [{len(actions)}, A] but {_shape(result["model_actions"])}'
-        anchor = result.get("anchor")
-        return _Chunk(number, actions, model_actions, None if anchor is None else np.array(anchor))
-
-    def _jumps(self, actions: np.ndarray) -> str | None:
-        """Which step of the actions moves the command too far, if one does."""
-        if self._max_jump is None:
-            return None
-        path = actions if self._last is None else np.concatenate((self._last[None], actions))
-        moves = np.abs(np.diff(path, axis=0))
-        beyond = np.argwhere(moves > self._max_jump)
-        if not len(beyond):
-            return None
-        step, dim = beyond[0]
-        limit = np.broadcast_to(self._max_jump, moves.shape[1])[dim]
-        where = "from the last command to its first action" if self._last is not None and step == 0 else "inside it"
-        return f"dimension {dim} moves by {moves[step, dim]:.4g} in one step, {where}; max_jump allows {limit:.4g}"
 
 
 def _horizon(s: int) -> int:
@@ -459,35 +429,8 @@ def _horizon(s: int) -> int:
     return int(s)
 
 
-def _jump(limit: float | np.ndarray) -> np.ndarray:
-    limits = _numbers(limit, np.float64)
-    if limits is None or limits.ndim > 1 or not (limits > 0).all():
-        raise ConfigError(f"max_jump is {limit!r}; it should be one number above 0, or one for each dimension")
-    return limits
-
-
-def _numbers(value: object, dtype: type[np.floating[Any]]) -> np.ndarray | None:
-    """`value` as an array of its own, if it is numbers."""
-    try:
-        array = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        return None
-    return array.astype(dtype) if array.dtype.kind in "fiu" else None
-
-
-def _shape(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        return f"{value.dtype}{list(value.shape)}"
-    return type(value).__name__
-
-
-def _mix(new: np.ndarray, old: np.ndarray, old_weight: float) -> None:
-    """Replace the rows of `new` that `old` has, too, by their weighted mean."""
-    n = min(len(new), len(old))
-    new[:n] = old_weight * old[:n] + (1 - old_weight) * new[:n]
-
-
-def _summary(values: list[float]) -> dict[str, float] | None:
+def summary(values: list[float]) -> dict[str, float] | None:
+    """Of a list of numbers, for a report; None of an empty one."""
     if not values:
         return None
     return {

@@ -1,7 +1,6 @@
 """The executor: observations in from any thread, one command out in every control step, the policy beside it."""
 
 import logging
-import math
 import threading
 import time
 from collections import deque
@@ -16,14 +15,17 @@ import numpy as np
 from turbopi.errors import ConfigError
 from turbopi.execution import ChunkQueue, DelayEstimate, Execution, way_named
 from turbopi.execution.messages import PREFIX
+from turbopi.execution.queue import summary
 from turbopi.realtime.inference import BackgroundThread, Inference
 from turbopi.realtime.journal import Command, Inferred, Journal, Kind, OutOfActions
-from turbopi.realtime.policies import check_policy, metadata_of, server_joins
+from turbopi.realtime.policies import check_policy, server_joins
+from turbopi.realtime.settings import above_zero, checked_hold_action, held_values
+from turbopi.realtime.warm_up import expected_delay, warm_policy
+from turbopi.running_chunk import RunningChunk
 
 logger = logging.getLogger(__name__)
 
 OnEmpty = Literal["hold", "slow_down", "raise"]
-TIMED_CALLS = 2  # of the warm-up: the slower one is the first delay to expect
 MAX_CONTROL_HZ = 10_000
 
 
@@ -79,14 +81,14 @@ class RealTimeExecutor:
         inference: Inference | None = None,
         **joining: Any,
     ) -> None:
-        self._hz = _above_zero("control_hz", control_hz, MAX_CONTROL_HZ)
+        self._hz = above_zero("control_hz", control_hz, MAX_CONTROL_HZ)
         if on_empty not in get_args(OnEmpty):
             raise ConfigError(f"on_empty is {on_empty!r}; choose one of {', '.join(get_args(OnEmpty))}")
         self._on_empty = on_empty
-        self._hold = _hold_action(hold_action, on_empty)
-        self._max_age = _above_zero("max_observation_age_s", max_observation_age_s)
+        self._hold = checked_hold_action(hold_action, on_empty)
+        self._max_age = above_zero("max_observation_age_s", max_observation_age_s)
         pause = max(0.5, 10 / self._hz) if max_pause_s is None else max_pause_s
-        self._max_pause = _above_zero("max_pause_s", pause)
+        self._max_pause = above_zero("max_pause_s", pause)
         self._way = way_named(execution)
         self._policy = policy
         self._offered = check_policy(policy, self._way)
@@ -144,55 +146,31 @@ class RealTimeExecutor:
     def _warm(self, observation: Mapping[str, Any]) -> None:
         """On the policy's thread."""
         began = self._clock()
-        metadata = metadata_of(self._policy)
-        logger.info("warming up: %s", metadata.get("config", type(self._policy).__name__))
-        warmup = getattr(self._policy, "warmup", None)
-        if callable(warmup):
-            warmup(**({"real_time": self._way.mode} if self._way.mode is not None else {}))
-        observation = self._message(observation)
-        asked: dict[str, Any] = {"previous": None, "model_actions": True} if self._way.mode is not None else {}
-        result = self._policy.infer(observation, **self._arguments, **asked)
+        seconds = warm_policy(
+            self._policy, self._message(observation), self._arguments, self._way, self._learn, self._clock
+        )
         with self._lock:
-            previous = self._queue.learn(result)
-            horizon, s, width = self._queue.horizon, self._queue.execution_horizon, self._queue.width
-        assert horizon is not None and width is not None
-        if isinstance(self._hold, np.ndarray) and len(self._hold) != width:
-            raise ConfigError(f"hold_action has {len(self._hold)} numbers, but the policy's actions have {width}")
-        if previous is not None:
-            asked["previous"] = previous
-            self._policy.infer(observation, **self._arguments, **asked)
-        seconds = 0.0
-        for _ in range(TIMED_CALLS):
-            before = self._clock()
-            self._policy.infer(observation, **self._arguments, **asked)
-            seconds = max(seconds, self._clock() - before)
-        delay = math.ceil(round(seconds * self._hz, 6))
-        self._check_speed(seconds, delay, horizon, s)
-        with self._lock:
+            assert self._queue.horizon is not None
+            delay = expected_delay(
+                seconds,
+                self._hz,
+                way=self._way,
+                horizon=self._queue.horizon,
+                s=self._queue.execution_horizon,
+                trained_max=self._trained_max,
+                max_age_s=self._max_age,
+            )
             self._delays.begin(delay)
             self._warm_seconds = self._clock() - began
 
-    def _check_speed(self, seconds: float, delay: int, horizon: int, s: int) -> None:
-        """Raise ConfigError if a policy that takes so long can't be run in this way at all."""
-        slow = f"one call takes {seconds * 1e3:.0f} ms, {delay} control steps at {self._hz:g} Hz"
-        faster = "lower control_hz, take fewer denoising steps or a faster backend"
-        if seconds > self._max_age:
-            raise ConfigError(
-                f"{slow}: every chunk would be refused, as max_observation_age_s is {self._max_age:g}. Raise it, or "
-                f"{faster}"
-            )
-        if self._way.mode is None:
-            return
-        if self._way.holds and self._trained_max is not None and delay > self._trained_max:
-            raise ConfigError(
-                f"{slow}, but this checkpoint was trained with delays up to {self._trained_max}: {faster}, or use "
-                "execution 'rtc'"
-            )
-        if delay > horizon - max(s, delay):
-            raise ConfigError(
-                f"{slow}: with chunks of {horizon} actions and an execution horizon of {s}, {self._way.name} joins "
-                f"chunks up to a delay of {min(horizon - s, horizon // 2)}: {faster}"
-            )
+    def _learn(self, result: Any) -> RunningChunk | None:
+        """What the first answer of a warm-up shows. Raises ConfigError."""
+        with self._lock:
+            previous = self._queue.learn(result if isinstance(result, Mapping) else {})
+            width = self._queue.width
+        if isinstance(self._hold, np.ndarray) and len(self._hold) != width:
+            raise ConfigError(f"hold_action has {len(self._hold)} numbers, but the policy's actions have {width}")
+        return previous
 
     @property
     def _trained_max(self) -> int | None:
@@ -295,31 +273,25 @@ class RealTimeExecutor:
 
         The picture needs matplotlib. Raises ConfigError for an unknown ending, OutputError if it can't be written.
         """
-        with self._lock:
-            latencies = list(self._journal.latencies_ms)
-            document = {
-                **self._queue.report(),
-                "control_hz": self._hz,
-                "commands": dict(sorted(self._journal.kinds.items())),
-                "observations": dict(sorted(self._journal.observations.items())),
-                "clock_jumps": self._journal.clock_jumps,
-                "remaining": self._queue.remaining,
-                "waited": self._queue.waited,
-                "latency_ms": {
-                    "median": float(np.median(latencies)),
-                    "p95": float(np.percentile(latencies, 95)),
-                    "max": max(latencies),
-                }
-                if latencies
-                else None,
-                "warm_up_seconds": self._warm_seconds,
-                "last_error": None if self.last_error is None else _named(self.last_error),
-            }
-            commands, inferred = list(self._journal.commands), list(self._journal.inferred)
+        with self._lock:  # the control loop may wait for it: only copies are made here
+            queue, journal = self._queue.copy(), self._journal.copy()
+        latencies = journal.latencies_ms
+        document = {
+            **queue.report(),
+            "control_hz": self._hz,
+            "commands": dict(sorted(journal.kinds.items())),
+            "observations": dict(sorted(journal.observations.items())),
+            "clock_jumps": journal.clock_jumps,
+            "remaining": queue.remaining,
+            "waited": queue.waited,
+            "latency_ms": summary(list(latencies)),
+            "warm_up_seconds": self._warm_seconds,
+            "last_error": None if self.last_error is None else _named(self.last_error),
+        }
         if plot is not None:
             from turbopi.realtime.plot import plot_run
 
-            plot_run(Path(plot), commands, inferred, document)
+            plot_run(Path(plot), journal, document)
         return document
 
     def close(self, timeout_s: float = 5.0) -> bool:
@@ -431,7 +403,7 @@ class RealTimeExecutor:
                 step = self._queue.steps - 1
                 text = f"no action for control step {step}: {self._why_empty()}; the robot must stop now"
                 raise OutOfActions(text) from self.last_error
-        return Command(kind, self._hold_values(last), 0)
+        return Command(kind, held_values(self._hold, last), 0)
 
     def _why_empty(self) -> str:
         if self._pending is not None:
@@ -441,35 +413,6 @@ class RealTimeExecutor:
             return f"the last chunk was dropped ({self._queue.last_problem})"
         return "no observation came in time"
 
-    def _hold_values(self, last: np.ndarray | None) -> np.ndarray | None:
-        if self._hold is None or isinstance(self._hold, str):
-            return None if self._hold is None else last
-        unknown = np.isnan(self._hold)
-        if not unknown.any():
-            return self._hold.copy()
-        return None if last is None else np.where(unknown, last, self._hold)
-
 
 def _named(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
-
-
-def _above_zero(name: str, value: float, most: float = math.inf) -> float:
-    number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not number or not 0 < value < math.inf or value > most:
-        limit = "" if most == math.inf else f", at most {most:g}"
-        raise ConfigError(f"{name} is {value!r}; it should be a number above 0{limit}")
-    return float(value)
-
-
-def _hold_action(given: object, on_empty: str) -> Literal["last"] | np.ndarray | None:
-    if given is None:
-        return "last" if on_empty == "slow_down" else None  # which is for absolute positions
-    if isinstance(given, str):
-        if given == "last":
-            return "last"
-    else:
-        array = np.asarray(given)
-        if array.ndim == 1 and array.size and array.dtype.kind in "fiu" and not np.isinf(array).any():
-            return array.astype(np.float64)
-    raise ConfigError(f"hold_action is {given!r}; it should be 'last', numbers [d], or None")

@@ -1,5 +1,6 @@
 """What the executor commanded, and what became of each observation: the last minutes of it."""
 
+import copy
 from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Literal
@@ -51,8 +52,10 @@ class Inferred:
 
 @dataclass
 class Journal:
+    """The last commands, observations and latencies, and counts of all of them."""
+
     commands: deque[tuple[int, Command]] = field(default_factory=lambda: deque(maxlen=KEPT))  # with their control step
-    inferred: deque[Inferred] = field(default_factory=lambda: deque(maxlen=KEPT))
+    inferred: deque[Inferred] = field(default_factory=lambda: deque(maxlen=KEPT // 10))
     kinds: Counter[str] = field(default_factory=Counter)
     observations: Counter[str] = field(default_factory=Counter)
     clock_jumps: int = 0
@@ -61,3 +64,10 @@ class Journal:
     def command(self, step: int, command: Command) -> None:
         self.commands.append((step, command))
         self.kinds[command.kind] += 1
+
+    def copy(self) -> "Journal":
+        copied = copy.copy(self)
+        copied.commands, copied.latencies_ms = self.commands.copy(), self.latencies_ms.copy()
+        copied.inferred = deque(copy.copy(one) for one in self.inferred)
+        copied.kinds, copied.observations = self.kinds.copy(), self.observations.copy()
+        return copied

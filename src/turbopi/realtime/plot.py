@@ -1,6 +1,6 @@
 """A picture of a run: what was commanded, where chunks took over, how long the policy took."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +11,18 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from turbopi.plots import write_figure
-from turbopi.realtime.journal import Command, Inferred
+from turbopi.realtime.journal import Inferred, Journal
 
 SHOWN = 600  # control steps; of a longer run, the last ones
 MOST_DIMS = 16
 _BORDER, _DELAY, _DROPPED, _EMPTY = "0.45", "#4c78a8", "#d62728", "#f2b701"
 
 
-def plot_run(
-    file: Path, commands: Sequence[tuple[int, Command]], inferred: Sequence[Inferred], report: dict[str, Any]
-) -> None:
-    """Write a picture: a row for each dimension of the action, and one for the policy's delays. See `report`."""
-    commands = commands[-SHOWN:]
+def plot_run(file: Path, journal: Journal, report: dict[str, Any]) -> None:
+    """Write a picture: a row for each dimension of the action, and one for the policy's delays. Raises as
+    `write_figure` does.
+    """
+    commands = list(journal.commands)[-SHOWN:]
     steps = np.array([step for step, _ in commands], dtype=float)
     width = max((len(c.action) for _, c in commands if c.action is not None), default=1)
     values = np.full((len(commands), width), np.nan)
@@ -45,7 +45,7 @@ def plot_run(
             ax.axvline(step, color=_BORDER, linewidth=0.7, linestyle=":")
         ax.set_ylabel(f"dim {dim}", fontsize=8)
         ax.tick_params(labelsize=7)
-    _draw_delays(axes[-1], inferred, steps, report)
+    _draw_delays(axes[-1], journal.inferred, steps, report)
     more = f", the first {dims} of {width} dimensions" if width > dims else ""
     figure.suptitle(
         f"{report['execution']} at {report['control_hz']:g} Hz, {report['chunks']} chunks, "
@@ -68,7 +68,7 @@ def plot_run(
     write_figure(file, figure)
 
 
-def _draw_delays(ax: Axes, inferred: Sequence[Inferred], steps: np.ndarray, report: dict[str, Any]) -> None:
+def _draw_delays(ax: Axes, inferred: Iterable[Inferred], steps: np.ndarray, report: dict[str, Any]) -> None:
     first = steps[0] if len(steps) else 0
     for one in inferred:
         ended = report["steps"] if one.ended is None else one.ended

@@ -1,0 +1,63 @@
+"""Bringing a policy to full speed, and whether that is fast enough."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from turbopi.errors import ConfigError
+from turbopi.execution import Way
+from turbopi.running_chunk import RunningChunk
+
+TIMED_CALLS = 2
+
+
+def warm_policy(
+    policy: Any,
+    observation: Mapping[str, Any],
+    arguments: Mapping[str, Any],
+    way: Way,
+    learn: Callable[[Any], RunningChunk | None],
+    clock: Callable[[], float],
+) -> float:
+    """Call a policy until it is warm, with and without a running chunk. The seconds of the slower of its last calls.
+
+    arguments  of every `infer`
+    learn      is given the first answer; returns the running chunk that later calls may have
+    """
+    warmup = getattr(policy, "warmup", None)
+    if callable(warmup):
+        warmup(**({"real_time": way.mode} if way.mode is not None else {}))
+    asked: dict[str, Any] = {"previous": None, "model_actions": True} if way.mode is not None else {}
+    previous = learn(policy.infer(observation, **arguments, **asked))
+    if previous is not None:
+        asked["previous"] = previous
+        policy.infer(observation, **arguments, **asked)
+    seconds = 0.0
+    for _ in range(TIMED_CALLS):
+        before = clock()
+        policy.infer(observation, **arguments, **asked)
+        seconds = max(seconds, clock() - before)
+    return seconds
+
+
+def expected_delay(
+    seconds: float, hz: float, *, way: Way, horizon: int, s: int, trained_max: int | None, max_age_s: float
+) -> int:
+    """Control steps that a call of so many seconds takes. Raises ConfigError if the way can't be run with it at all."""
+    delay = math.ceil(round(seconds * hz, 6))
+    slow = f"one call takes {seconds * 1e3:.0f} ms, {delay} control steps at {hz:g} Hz"
+    faster = "lower control_hz, take fewer denoising steps or a faster backend"
+    if seconds > max_age_s:
+        raise ConfigError(
+            f"{slow}: every chunk would be refused, as max_observation_age_s is {max_age_s:g}. Raise it, or {faster}"
+        )
+    if way.holds and trained_max is not None and delay > trained_max:
+        raise ConfigError(
+            f"{slow}, but this checkpoint was trained with delays up to {trained_max}: {faster}, or use execution 'rtc'"
+        )
+    if way.mode is not None and delay > horizon - max(s, delay):
+        raise ConfigError(
+            f"{slow}: with chunks of {horizon} actions and an execution horizon of {s}, {way.name} joins chunks up to "
+            f"a delay of {min(horizon - s, horizon // 2)}: {faster}"
+        )
+    return delay
