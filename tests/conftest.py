@@ -77,7 +77,7 @@ def _own_fingerprints(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pyt
 # Files about the fast path that take seconds, without a GPU or a compiler: `scripts/test -m quick`.
 QUICK = (
     *("test_backend_choice", "test_capture", "test_fused_choice", "test_kernels_arguments", "test_kernels_launch"),
-    *("test_launch_geometry", "test_recent", "test_tools_mutate"),
+    *("test_launch_geometry", "test_recent_loops", "test_tools_mutate"),
 )
 
 
@@ -117,4 +117,4 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     waiting = gpu_evidence.pending()
     if waiting is not None:
         terminalreporter.section("THE GPU TESTS WERE NOT RUN ON THIS CODE", red=True, bold=True)
-        terminalreporter.line(f"since {waiting['date']}: {waiting['reason']}. Run scripts/gpu_check on a Hopper GPU.")
+        terminalreporter.line(f"since {waiting.date}: {waiting.reason}. Run scripts/gpu_check on a Hopper GPU.")

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from turbopi.bench import profile
 from turbopi.bench import run as running
 from turbopi.bench.document import BenchDocument, Kernel, Memory, Result, Times, read_benchmark
-from turbopi.bench.floors import Floors
+from turbopi.bench.machine_limits import Floors
 from turbopi.bench.measure import (
     FEWEST,
     Latency,

@@ -30,7 +30,7 @@ from turbopi.model.layers import AdaRMSNorm
 from turbopi.model.sites import linears
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
-from turbopi.quantization.artifact import VERSION, Quantization, SiteScale, shapes_of
+from turbopi.quantization.calibration_file import VERSION, Quantization, SiteScale, shapes_of
 from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Directions, to_e4m3
 from turbopi.quantization.sites import PARTS, sites
 from turbopi.recordings import RecordedCall, save_call

@@ -17,7 +17,7 @@ from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_fp8 import TensorRTFp8Backend
 from turbopi.errors import BackendError, ConfigError
 from turbopi.installation import install_command
-from turbopi.quantization.artifact import RANDOM_NOISE, Quantization, SiteScale
+from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, SiteScale
 from turbopi.tensorrt import Library
 from turbopi.tensorrt.cache import EngineCache
 from turbopi.tensorrt.calibrate import Calibration, from_quantization

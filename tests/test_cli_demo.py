@@ -17,8 +17,8 @@ from turbopi.backends.pytorch import PyTorchBackend, reference_model
 from turbopi.checkpoint import random_checkpoint
 from turbopi.errors import BackendError, TurboPiError
 from turbopi.observation import Observation
-from turbopi.plots import action_groups
 from turbopi.policy import UnifiedPolicy
+from turbopi.showing import action_groups
 from turbopi.sim import SimulatorUnavailable
 from turbopi.sim.libero import LiberoSimulator
 from turbopi.verify import control

@@ -24,8 +24,8 @@ from turbopi.errors import ConfigError, ObservationError
 from turbopi.policy import UnifiedPolicy
 
 COMMANDS = (
-    *("demo", "infer", "serve", "inspect", "convert", "calibrate", "build", "export", "verify", "bench", "study"),
-    *("eval", "compare", "backends", "doctor"),
+    *("demo", "infer", "serve", "view", "inspect", "convert", "calibrate", "build", "export", "verify", "bench"),
+    *("study", "eval", "compare", "backends", "doctor"),
 )
 
 

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from doc_tables import blocks, drawn
+from doc_tables import blocks, drawn, peers
 from doc_tables.__main__ import main
 from doc_tables.tables import TABLES, headline, whole_calls
 
@@ -100,6 +100,33 @@ def test_plots_of_another_document_are_drawn_anew(tmp_path: Path) -> None:
     document["results"][0]["milliseconds"]["total"]["p50"] += 1
     file.write_text(json.dumps(document))
     assert len(drawn.stale_plots(root)) == 3
+
+
+def test_the_plot_beside_others_is_of_readmes_table_and_of_what_the_documents_say_of_others() -> None:
+    told = peers.read_peers(ROOT)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"<!-- table: headline {told.ours} -->" in readme and peers.PLOT.as_posix() in readme
+    performance = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    (sentence,) = re.findall(r"Other programs with the same job.*?\n\n", performance, re.DOTALL)
+    assert sorted(float(ms) for ms in re.findall(r"\d+\.\d", sentence)) == sorted(peer.ms for peer in told.peers)
+    drawn = peers.bars(ROOT)
+    assert [name for name, _, ours in drawn if ours] == ["Turbo-Pi, FP8", "Turbo-Pi, bf16"]
+    for _, median, _ in (bar for bar in drawn if bar[2]):
+        assert f"**{median:.1f} ms**" in readme
+    assert (ROOT / peers.PLOT).stat().st_size < 60_000
+
+
+def test_the_plot_beside_others_is_drawn_anew_for_other_figures(tmp_path: Path) -> None:
+    root = project(tmp_path, "headline a/results.json")
+    assert peers.stale_peers(root) == []  # nothing to draw
+    (root / "docs").mkdir()
+    text = (ROOT / peers.PEERS).read_text().replace(peers.read_peers(ROOT).ours, "a/results.json")
+    (root / peers.PEERS).write_text(text)
+    assert len(peers.stale_peers(root)) == 1
+    assert peers.draw_peers(root) == [root / peers.PLOT]
+    assert peers.stale_peers(root) == [] == peers.draw_peers(root)
+    (root / peers.PEERS).write_text(text.replace("17.1", "17.2"))
+    assert len(peers.stale_peers(root)) == 1
 
 
 def test_tables_hold_the_numbers_of_their_job() -> None:

@@ -15,7 +15,7 @@ from turbopi.engine.emulate import RoundedWeights, rounded
 from turbopi.errors import ConfigError
 from turbopi.evaluate.sources import LocalPolicy
 from turbopi.policy import UnifiedPolicy
-from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.plan import TIERS, Fp8Tier
 from turbopi.quantization.sites import sites
 from turbopi.verify.check_golden import check_folder, golden_calibration

@@ -16,6 +16,7 @@ from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.config import Kind
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.compiled import compiled
+from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import HostRow
 from turbopi.engine.weights import modulation, pack
 from turbopi.engine.without_compiler import OPS, Denoiser
@@ -60,7 +61,7 @@ def shape_of(observation: Observation, noise: Tensor, steps: int, row: int = 0) 
     tokens = int(observation.token_mask[row].sum())
     slots = max(16, -(-tokens // 16) * 16)
     floats = observation.images.dtype == torch.float32
-    return CallShape(int(observation.image_mask[row].sum()), slots, noise.shape[1], steps, floats)
+    return CallShape(int(observation.image_mask[row].sum()), slots, Loop(steps, noise.shape[1]), floats)
 
 
 def made_up(kind: Kind, cameras: int, tokens: int, seed: int = 0) -> tuple[Observation, Tensor]:

@@ -14,7 +14,7 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.statistics import collect
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.emulate import rounded
-from turbopi.engine.recent import RecentLoops
+from turbopi.engine.recent_loops import Loop, RecentLoops
 from turbopi.engine.weights import modulation, pack
 from turbopi.errors import BackendUnavailable
 from turbopi.kernels.plain import PLAIN
@@ -114,7 +114,7 @@ def test_the_experts_first_copy_goes_away_unless_operations_read_it() -> None:
     backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
     backend._put_expert_away()
     assert moved == [CPU]
-    backend._refused[10, 60, 968] = "too many"
+    backend._refused[Loop(10, 60), 968] = "too many"
     backend._put_expert_away()
     assert moved == [CPU]
 
@@ -126,14 +126,18 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     backend._quantization, backend._plan = calibration, calibration.plan(golden_model("pi05").config, "fp8")
     backend._calls, backend._ops, backend._denoisers = {}, PLAIN, {}
     backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
-    backend._refused = {(5, 60, 968): "too many", (10, 60, 968): "too many", (10, 60, 1224): "too many"}
+    backend._refused = {
+        (Loop(5, 60), 968): "too many",
+        (Loop(10, 60), 968): "too many",
+        (Loop(10, 60), 1224): "too many",
+    }
     told = backend.describe()
     assert told["denoising"] == {"operations, as too many": ["H=60, 5 steps", "H=60, 10 steps"]}
     plan = told["fp8"]["plan"]
     assert plan["prefix.down"] == "fp8"
     assert plan["expert.qkv"] == plan["expert"] == "bf16, as operations denoise"
     clock: list[float | None] = [None]
-    backend._denoisers = {(10, 10, 968): cast(Any, SimpleNamespace(clock_mhz=lambda: clock[0]))}
+    backend._denoisers = {(Loop(10, 10), 968): cast(Any, SimpleNamespace(clock_mhz=lambda: clock[0]))}
     assert "denoising_clock_mhz" not in backend.describe()  # it hasn't run
     clock[0] = 1795.4
     assert backend.describe()["denoising_clock_mhz"] == {"H=10, 10 steps": 1795}
@@ -151,14 +155,14 @@ def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyP
     backend._packed_expert = None
     monkeypatch.setattr(backend, "_keep_expert_on", lambda device: None)
 
-    def refuse(horizon: int, rows: int, table: Tensor | None) -> NoReturn:
-        tried.append(horizon)
+    def refuse(loop: Loop, rows: int, table: Tensor | None) -> NoReturn:
+        tried.append(loop)
         raise BackendUnavailable("it holds 3 clusters")
 
     monkeypatch.setattr(backend, "_denoising_kernel", refuse)
-    assert all(backend._make_denoiser(CallShape(2, slots, 10, 5), None) is None for slots in (16, 32, 48))
-    assert tried == [10]
-    assert [(key[:2], why) for key, why in backend._refused.items()] == [((5, 10), "it holds 3 clusters")]
+    assert all(backend._make_denoiser(CallShape(2, slots, Loop(5, 10)), None) is None for slots in (16, 32, 48))
+    assert tried == [Loop(5, 10)]
+    assert [(key[0], why) for key, why in backend._refused.items()] == [(Loop(5, 10), "it holds 3 clusters")]
 
 
 def test_what_nothing_reads_of_the_last_prefix_layer_is_not_kept() -> None:

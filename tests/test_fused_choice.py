@@ -11,6 +11,7 @@ from torch import Tensor
 from turbopi.backends.fused import FusedBackend
 from turbopi.config import Kind, ModelConfig
 from turbopi.engine.call import CallShape
+from turbopi.engine.recent_loops import Loop
 from turbopi.errors import BackendUnavailable, DeviceLost
 from turbopi.kernels.interface import GemmaLayer, Ops
 from turbopi.kernels.plain import PLAIN
@@ -122,9 +123,9 @@ def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[
 
 def test_four_cameras_have_a_kernel_with_room_for_them(kernels: type[TwinKernel]) -> None:
     backend = fused()
-    table = backend._call(CallShape(3, 16, 10, 2)).table
+    table = backend._call(CallShape(3, 16, Loop(2, 10))).table
     for cameras in (1, 2, 3, 4):
-        assert backend._make_denoiser(CallShape(cameras, 16, 10, 2), table) is not None
+        assert backend._make_denoiser(CallShape(cameras, 16, Loop(2, 10)), table) is not None
     tokens, most = backend.config.vision.num_tokens, -(-backend.config.max_prompt_tokens // 16) * 16
     assert [kernel.cache_rows for kernel in kernels.made] == [3 * tokens + most, 4 * tokens + most]
 
@@ -136,11 +137,11 @@ def test_a_model_horizon_or_gpu_that_the_kernel_does_not_cover_takes_operations_
     actions(pi0)
     assert list(pi0.describe()["denoising"]) == ["operations, as it covers Pi0.5, this model is pi0"]
     backend = fused()
-    table = backend._call(CallShape(3, 16, 10, 2)).table
-    assert backend._make_denoiser(CallShape(3, 16, denoise.MAX_SUFFIX, 2), table) is not None
-    assert backend._make_denoiser(CallShape(3, 16, denoise.MAX_SUFFIX + 1, 2), table) is None
+    table = backend._call(CallShape(3, 16, Loop(2, 10))).table
+    assert backend._make_denoiser(CallShape(3, 16, Loop(2, denoise.MAX_SUFFIX)), table) is not None
+    assert backend._make_denoiser(CallShape(3, 16, Loop(2, denoise.MAX_SUFFIX + 1)), table) is None
     monkeypatch.setattr(denoise, "unavailable", lambda device: "this GPU has 12.0")
-    assert backend._make_denoiser(CallShape(3, 16, 9, 2), table) is None
+    assert backend._make_denoiser(CallShape(3, 16, Loop(2, 9)), table) is None
     told = backend.describe()["denoising"]
     assert told["one CUDA kernel"] == ["H=56, 2 steps"]
     assert told["operations, as the denoising kernel takes up to 56 actions"] == ["H=57, 2 steps"]
@@ -192,7 +193,7 @@ class OnFakeGpu:
 
     def __init__(self, kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> None:
         self.backend, self.kernels = fused(), kernels
-        self.table = self.backend._call(CallShape(3, 16, 10, 2)).table
+        self.table = self.backend._call(CallShape(3, 16, Loop(2, 10))).table
         self.backend.device = GPU
         layer: Any = GemmaLayer(**{name: Placed(GPU) for name in MATRICES}, norm1=None, norm2=None)
         self.backend._weights.expert[:] = [layer] * 3
@@ -213,8 +214,8 @@ class OnFakeGpu:
     def denoise(self, steps: int, refuse: str | None = None) -> bool:
         """Whether a loop of so many steps has a kernel."""
         self.kernels.refuse = refuse
-        shape = CallShape(3, 16, 10, steps)
-        self.backend._recent.use((steps, 10))
+        shape = CallShape(3, 16, Loop(steps, 10))
+        self.backend._recent.use(Loop(steps, 10))
         return self.backend._make_denoiser(shape, self.table) is not None
 
 
@@ -243,9 +244,9 @@ def test_the_expert_comes_back_from_the_host_for_operations(gpu: OnFakeGpu) -> N
 
 def test_the_expert_leaves_the_device_when_the_last_loop_of_operations_is_forgotten(gpu: OnFakeGpu) -> None:
     assert gpu.denoise(2) and not gpu.denoise(3, refuse="too small") and not gpu.denoise(4, refuse="too small")
-    gpu.backend._forget((3, 10))
+    gpu.backend._forget(Loop(3, 10))
     assert gpu.places == {GPU}, "the loop of 4 steps still takes operations"
-    gpu.backend._forget((4, 10))
+    gpu.backend._forget(Loop(4, 10))
     assert gpu.places == {CPU}
 
 

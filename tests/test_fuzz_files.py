@@ -35,7 +35,7 @@ from turbopi.evaluate.visited import Visited
 from turbopi.export.onnx import GRAPHS, MANIFEST, open_export
 from turbopi.preprocess.normalize import Normalizer
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
-from turbopi.quantization.artifact import Quantization, SiteScale, shapes_of
+from turbopi.quantization.calibration_file import Quantization, SiteScale, shapes_of
 from turbopi.quantization.sites import sites
 from turbopi.recordings import RecordedCall, load_call, load_observation, save_call
 from turbopi.robots.described import load_robot

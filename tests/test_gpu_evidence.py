@@ -1,6 +1,5 @@
 """The checked-in result of the GPU tests belongs to the code as it is."""
 
-import json
 from pathlib import Path
 
 import gpu_evidence
@@ -26,25 +25,25 @@ def code(tmp_path: Path, name: str, text: str) -> str:
 
 
 def test_the_checked_in_gpu_result_is_of_this_code() -> None:
-    result = json.loads(gpu_evidence.RESULT.read_text())
-    assert result["ok"] and result["tests"]["parts_to_go"] == 0
-    changed = gpu_evidence.changed_since(result["fingerprint"])
+    result = gpu_evidence.result()
+    assert result.ok and result.tests.parts_to_go == 0
+    changed = gpu_evidence.changed_since(result.fingerprint)
     waiting = gpu_evidence.pending()
     if waiting is not None and changed:  # conftest.py says so at the end of every run
-        changed = gpu_evidence.changed_since(waiting["fingerprint"])
+        changed = gpu_evidence.changed_since(waiting.fingerprint)
     assert not changed, (
         f"{len(changed)} files differ from those that scripts/gpu_check saw: {', '.join(changed)}. Run it on a Hopper "
         "GPU and check its result in; where none can be had, scripts/gpu_check --pending REASON says so"
     )
-    assert waiting is None or gpu_evidence.changed_since(result["fingerprint"]), "nothing is pending: remove that file"
+    assert waiting is None or gpu_evidence.changed_since(result.fingerprint), "nothing is pending: remove that file"
 
 
 def test_the_kernels_compile_to_the_machine_code_that_was_tested(cubins: Path) -> None:
     here = machine_code.machine_code(cubins)
     if here is None:
         pytest.skip("no NVRTC here: only the source's fingerprint is compared")
-    known = [json.loads(gpu_evidence.RESULT.read_text()), gpu_evidence.pending() or {}]
-    recorded = [one["machine_code"] for one in known if one.get("machine_code")]
+    known = gpu_evidence.result(), gpu_evidence.pending()
+    recorded = [one.machine_code for one in known if one is not None and one.machine_code]
     assert recorded, "no machine code was recorded: run scripts/gpu_check on a Hopper GPU"
     if all(one["NVRTC"] != here["NVRTC"] for one in recorded):
         versions = " and ".join(one["NVRTC"] for one in recorded)

@@ -16,7 +16,7 @@ from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, r
 from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX
 from turbopi.kernels.sm90.denoise.packing import refusal
 from turbopi.model.reference import Pi0Model
-from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.sites import sites
 from turbopi.verify.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
 from turbopi.verify.golden import Case

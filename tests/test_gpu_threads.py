@@ -18,7 +18,7 @@ from conftest import on_hopper
 
 from turbopi import UnifiedPolicy, backends
 from turbopi.checkpoint import random_checkpoint
-from turbopi.engine.recent import MOST_LOOPS
+from turbopi.engine.recent_loops import MOST_LOOPS
 from turbopi.errors import ObservationError
 from turbopi.model import exact
 

@@ -48,7 +48,7 @@ def test_a_struct_is_written_with_its_sizes_checked() -> None:
 
 
 def denoising_source() -> str:
-    """All files of both forms, without what is generated."""
+    """All files of all forms, without what is generated."""
     return "\n".join(path.read_text() for path in sorted((denoise.FOLDER / "denoise").glob("**/*.cu")))
 
 
@@ -59,10 +59,11 @@ def test_the_denoising_kernel_names_no_wait_that_is_not_declared_and_declares_no
     assert len(set(denoise.WAITS.values())) == len(denoise.WAITS)
 
 
-def test_the_denoising_kernels_struct_has_what_its_source_reads() -> None:
-    text = denoising_source()
-    read = set(re.findall(r"\ba(?:rgs)?\.([a-z_]\w+)", text))
-    declared = {one.name for one in denoise.ARGS.fields}
+@pytest.mark.parametrize("by_token", [False, True])
+@pytest.mark.parametrize("suffix", [10, 50])
+def test_the_denoising_kernels_struct_has_what_its_source_reads(suffix: int, by_token: bool) -> None:
+    read = set(re.findall(r"\ba(?:rgs)?\.([a-z_]\w+)", denoise.source(suffix, False, by_token)))
+    declared = {one.name for one in (denoise.ARGS_BY_TOKEN if by_token else denoise.ARGS).fields}
     assert read <= declared, read - declared
 
 

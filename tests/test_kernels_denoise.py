@@ -1,7 +1,6 @@
 """The denoising kernel: its packing on the CPU, its results on a GPU against the loop in plain PyTorch."""
 
 import dataclasses
-import itertools
 import re
 from pathlib import Path
 
@@ -32,7 +31,6 @@ from turbopi.kernels.sm90.denoise.packing import KINDS, PackedExpert
 from turbopi.kernels.sm90.denoise.plain import in_e4m3
 from turbopi.model.denoise import euler_step
 from turbopi.quantization.directions import directions
-from turbopi.quantization.fp8 import E4M3
 
 CPU = torch.device("cpu")
 
@@ -116,60 +114,6 @@ def test_a_fragment_of_fp8_has_two_blocks() -> None:
     assert torch.equal(cores[0, 1, 1], matrix[0, 8:, 16:32])
     assert torch.equal(cores[1, 0, 0], matrix[0, :8, 32:])
     assert (cores[1, :, 1] == -1).all()  # three blocks make two pairs
-
-
-def multiply(stream: Tensor, x: Tensor, tiles: int, max_tiles: int) -> tuple[Tensor, int]:
-    """What a CTA makes of its next product: ([tiles, 16] sums, elements read). Reads as denoise/product.cu does."""
-    per = 2 if stream.dtype == E4M3 else 1  # blocks of a fragment
-    units = -(-len(x) // (16 * per))
-    sums, at = torch.zeros(max_tiles, 16, dtype=torch.float64), 0
-    for first in range(0, tiles, 8):
-        here, parts = min(tiles - first, 8), 2 if max_tiles - first > 4 else 4
-        for unit in range(-(-units // (4 * parts)) * 4 * parts):
-            for tile in range(first, first + here):
-                fragment = stream[at : at + 256 * per].double()
-                at += 256 * per
-                rows = fragment.view(2, 2, 8, 8 * per).permute(0, 2, 1, 3).reshape(16, 16 * per)
-                for block in range(per):  # those that are missing meet the last one's activations
-                    start = min(unit * per + block, len(x) // 16 - 1) * 16
-                    sums[tile] += rows[:, block * 16 : block * 16 + 16] @ x[start : start + 16]
-    return sums[:tiles], at
-
-
-@PRECISIONS
-@pytest.mark.parametrize("name", ["golden", "odd", "uneven"])
-def test_ctas_products_add_up_to_the_layers(name: str, precision: packing.Precision) -> None:
-    p = problem(name, 1, 1, 3, 0, CPU)
-    g, layer = p.config.expert, p.layers[1]
-    packed = PackedExpert.pack(p.config, p.layers, ones(p) if precision == "fp8" else None)
-    a, size = packed.arrangement, packed.weights.element_size()
-    gen = torch.Generator().manual_seed(1)
-    x, attended, hidden = (torch.randn(n, generator=gen).double() for n in (g.width, 4096, g.mlp_dim))
-    attended = attended[: g.num_heads * g.head_dim]
-    queries, keys_values, gates, slice_tiles = a.max_tiles
-    qkv, gate_up = (torch.full((len(m),), torch.nan).double() for m in (layer.qkv, layer.gate_up))
-    out, down = torch.zeros(g.width).double(), torch.zeros(g.width).double()
-    assert packed.starts[-1] == packed.layer_bytes == len(packed.weights[1]) * size
-    for cta, (start, end) in enumerate(itertools.pairwise(packed.starts.tolist())):
-        cluster, rank = divmod(cta, packing.RANKS)
-        stream = packed.weights[1, start // size : end // size]
-        rows, units = a.stream_rows(rank), a.hidden(cluster)
-        mine = torch.cat((a.query_rows(cluster, rank), a.key_value_rows(cluster, rank)))
-        qkv[mine], read = multiply(stream, x, len(mine), queries + keys_values)
-        stream = stream[read:]
-        sums, read = multiply(stream, attended[a.out_columns(cluster)], len(rows), slice_tiles)
-        out[rows] += sums
-        stream = stream[read:]
-        mine = a.gate_up_rows(cluster, rank)
-        gate_up[mine], read = multiply(stream, x, len(mine), gates)
-        stream = stream[read:]
-        sums, read = multiply(stream, hidden[units.start : units.stop], len(rows), slice_tiles)
-        down[rows] += sums
-        assert read == len(stream)
-    results, inputs = (qkv, out, gate_up, down), (x, attended, x, hidden)
-    scales = packed.row_scales(1) if packed.fp8 else (torch.ones(()),) * 4
-    for found, scale, matrix, operand in zip(results, scales, packed.matrices(1), inputs, strict=True):
-        torch.testing.assert_close(found * scale, matrix.double() @ operand, rtol=1e-6, atol=1e-6)
 
 
 def test_shift_table_is_the_shift_through_the_matrices() -> None:

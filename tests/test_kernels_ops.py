@@ -19,7 +19,7 @@ from turbopi.kernels.portable import activations, attention, embedding, norms, r
 from turbopi.kernels.portable import products as portable_products  # noqa: E402
 from turbopi.kernels.portable.ops import EmbedPatches  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
-from turbopi.kernels.sm90.gemm import products  # noqa: E402
+from turbopi.kernels.sm90.gemm import products, tiles  # noqa: E402
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402
 from turbopi.model.layers import rope_tables  # noqa: E402
 
@@ -311,7 +311,7 @@ def test_matmul(m: int, n: int, k: int, epilogue: Epilogue, tile: Tile) -> None:
 
 
 @on_hopper
-@pytest.mark.parametrize("shape", products.VISION_TILES)
+@pytest.mark.parametrize("shape", tiles.VISION_TILES)
 def test_tuned_products_of_the_vision_tower(shape: tuple[int, int, int]) -> None:
     m, n, k = shape
     x, weight, bias = random(m, k, outliers=True), random(n, k), random(n)
@@ -319,7 +319,7 @@ def test_tuned_products_of_the_vision_tower(shape: tuple[int, int, int]) -> None
     ours = products.tuned_residual_linear(x, weight, bias)
     twin, exact = plain.linear(x, weight, bias), plain.linear(x.float(), weight.float(), bias.float())
     assert_as_good((ours.sum(0) if ours.dim() == 3 else ours).to(DTYPE), twin, exact)
-    if products.VISION_TILES[shape].splits == 1:
+    if tiles.VISION_TILES[shape].splits == 1:
         assert_as_good(products.tuned_linear_gelu(x, weight, bias), plain.gelu(twin), plain.gelu(exact))
 
 
@@ -363,7 +363,7 @@ def test_the_product_behind_geglu(rows: int) -> None:
     ours = products.tuned_residual_linear(x, weight)
     twin, exact = plain.linear(x, weight), plain.linear(x.float(), weight.float())
     assert_error_at_most_double(ours.float().sum(0) if ours.dim() == 3 else ours, twin, exact)
-    assert (ours.dim() == 3) == ((-(-rows // 64) * 64, 2048, 16384) in products.PARTS)
+    assert (ours.dim() == 3) == ((-(-rows // 64) * 64, 2048, 16384) in tiles.PARTS_TILES)
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])

@@ -11,7 +11,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from turbopi.evaluate.plots import write_plots
-from turbopi.plots import SOLVED, Row, action_groups, plot_chunks
+from turbopi.plots import SOLVED, Row, plot_chunks
+from turbopi.showing import action_groups
 
 RANDOM = np.random.default_rng(0)
 

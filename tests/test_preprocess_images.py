@@ -1,6 +1,8 @@
 """Pictures: openpi's way bit for bit, LeRobot's against an independent computation, refusals."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbopi.errors import ObservationError
-from turbopi.preprocess.images import resize_into, resize_unit_into, resize_with_pad
+from turbopi.preprocess import images
+from turbopi.preprocess.images import RESIZES, all_fitted, fitted, resize_into, resize_unit_into, resize_with_pad
 from turbopi.robots.pictures import parse_chw_image, parse_image, parse_unit_image, to_uint8
 
 GOLDEN = np.load(Path(__file__).parent / "golden" / "preprocess" / "resize.npz")
@@ -51,6 +54,41 @@ def test_transposed_pictures_resize_as_contiguous_ones() -> None:
     resize_into(np.ascontiguousarray(planes.transpose(1, 2, 0)), target[1])
     np.testing.assert_array_equal(target[0], target[1])
     assert target.any()
+
+
+SIZES = ((480, 640), (720, 1280), (1080, 1920), (640, 480), (211, 1999), (224, 400), (900, 224), (224, 224))
+
+
+@pytest.mark.parametrize("cores", [1, 2, 3, 16])
+@pytest.mark.parametrize("way", RESIZES)
+def test_pictures_that_threads_resize_are_to_the_last_bit_those_of_one(
+    monkeypatch: pytest.MonkeyPatch, way: Any, cores: int
+) -> None:
+    monkeypatch.setattr(images, "_cores", lambda: cores)
+    images._threads.cache_clear()
+    pictures = [noise(h, w, 3, seed=h) for h, w in SIZES]
+    turned = [one.transpose(1, 0, 2) for one in pictures]
+    for given_ in (pictures, turned, [pictures[0]], [pictures[0], noise(30, 40, 3)], [noise(30, 40, 3)], []):
+        for found, one in zip(all_fitted(given_, 224, way), given_, strict=True):
+            np.testing.assert_array_equal(found, fitted(one, 224, way), strict=True)
+    with pytest.raises(ObservationError, match="1x300000 pixels is too narrow"):
+        all_fitted([pictures[0], noise(1, 300000, 3)], 224, way)
+    images._threads.cache_clear()
+
+
+def test_a_forked_child_has_threads_of_its_own() -> None:
+    code = """
+import os, numpy as np
+from turbopi.preprocess import images
+images._cores = lambda: 2
+pictures = [np.ones((480, 640, 3), np.uint8)] * 2
+images.all_fitted(pictures, 224, "openpi")
+child = os.fork()
+images.all_fitted(pictures, 224, "openpi")
+if child:
+    assert os.waitpid(child, 0)[1] == 0
+"""
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=120)
 
 
 @given(h=st.integers(1, 90), w=st.integers(1, 90), height=st.integers(8, 40), width=st.integers(8, 40))

@@ -11,7 +11,7 @@ from test_begin import CPU, OnCpu
 
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import ImageResize
-from turbopi.engine.resize import MOST_SIZES, Resizer, taps_of
+from turbopi.engine.resize import MOST_SIZES, SLAB, Resizer, taps_of
 from turbopi.errors import ObservationError
 from turbopi.kernels import plain
 from turbopi.kernels.interface import SOURCE, Ops
@@ -22,7 +22,7 @@ SIDE = 224  # PyTorch sums in another order where a result's height and width ar
 # (height, width): cameras' own, larger and smaller, odd, square, narrow, one axis kept, already of the size
 SIZES = (
     *((480, 640), (720, 1280), (1080, 1920), (640, 480), (240, 320), (37, 53), (53, 37), (300, 300), (1, 40)),
-    *((SIDE, 300), (300, SIDE), (SIDE, SIDE), (SIDE - 1, SIDE), (3, 2), (SIDE * 2, SIDE * 2)),
+    *((SIDE, 300), (300, SIDE), (SIDE, SIDE), (SIDE - 1, SIDE), (3, 2), (SIDE * 2, SIDE * 2), (900, 224)),
 )
 WAYS = tuple(RESIZES)
 
@@ -72,6 +72,50 @@ def test_bytes_and_weights_of_every_camera_are_where_the_table_says() -> None:
             weights = at(row[f"{axis}_weights"], ctypes.c_int32, taps.weights.numel())
             np.testing.assert_array_equal(weights, taps.weights.flatten())
             np.testing.assert_array_equal(at(row[f"{axis}_first"], ctypes.c_int32, len(taps.first)), taps.first)
+
+
+@pytest.mark.parametrize("cameras", [1, 2, 3])
+def test_every_byte_of_large_pictures_is_sent_whoever_copies_it(cameras: int) -> None:
+    resizer = Resizer(torch.zeros((cameras, 28, 28, 3), dtype=torch.uint8))
+    for round_ in range(3):
+        sent = [picture(721 + camera % 2, 1280, seed=round_ * 3 + camera) for camera in range(cameras)]
+        sent[-1] = sent[-1].transpose(1, 0, 2)
+        resizer.upload(sent, "openpi")
+        for row, image in zip(resizer.table.tolist(), sent, strict=True):
+            assert image.size > 2 * SLAB
+            there = at(dict(zip(SOURCE, row, strict=True))["picture"], ctypes.c_uint8, image.size)
+            np.testing.assert_array_equal(there.reshape(image.shape), image)
+            image[:] = 0  # nobody reads it any more
+
+
+class Full(Resizer):
+    """Pinned memory holds no picture of more than `room` bytes."""
+
+    room = 1 << 30
+
+    def _stage(self, camera: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+        if size > self.room:
+            raise torch.cuda.OutOfMemoryError("pinned memory")
+        return super()._stage(camera, size)
+
+
+@pytest.mark.parametrize(
+    ("second", "error"), [(picture(90, 160), torch.cuda.OutOfMemoryError), (picture(1, 90), ObservationError)]
+)
+def test_a_call_that_fails_at_its_second_camera_hides_nothing_from_the_next(
+    second: np.ndarray, error: type[Exception]
+) -> None:
+    resizer = Full(torch.zeros((2, 28, 28, 3), dtype=torch.uint8))
+    first, changed = [picture(40, 30), picture(30, 20)], picture(30, 40)
+    resizer.upload(first, "openpi")
+    resizer.room = changed.size
+    with pytest.raises(error):
+        resizer.upload([changed, second], "openpi")
+    resizer.upload([changed, first[1]], "openpi")
+    for row, image in zip(resizer.table.tolist(), (changed, first[1]), strict=True):
+        source = dict(zip(SOURCE, row, strict=True))
+        assert (source["height"], source["width"]) == image.shape[:2]
+        np.testing.assert_array_equal(at(source["picture"], ctypes.c_uint8, image.size).reshape(image.shape), image)
 
 
 def at(address: int, kind: Any, count: int) -> np.ndarray:

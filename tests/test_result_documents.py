@@ -5,15 +5,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
+import gpu_evidence
 import numpy as np
 import pytest
 import torch
+from attack.results import AttackDocument
+from kernel_turns.document import read_turns
 from msgspec import Meta, Struct
 
 from turbopi.bench.document import BenchDocument, read_benchmark
 from turbopi.bench.plots import fingerprint
 from turbopi.bench.report import report
-from turbopi.errors import ConfigError
+from turbopi.calibrate.report import read_report
+from turbopi.errors import CalibrationError, ConfigError
 from turbopi.provenance import Provenance
 from turbopi.reading import as_document, plain_document, read_document
 from turbopi.studies.certificates import CondensedDimension, WorstPlace
@@ -186,6 +190,51 @@ def test_a_benchmark_reads_the_same_whichever_way_a_number_is_written() -> None:
 def test_checked_in_research_reads_and_comes_out_as_it_was(name: str) -> None:
     document = read_document(RESULTS / name, Research, ConfigError)
     assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
+
+
+OF_TURNS = [name for name in EVERY if {"rows", "provenance"} <= set(json.loads((RESULTS / name).read_text()))]
+
+
+@pytest.mark.parametrize("name", [name for name in OF_TURNS if "mhz" in (RESULTS / name).read_text()])
+def test_checked_in_turns_of_kernels_read_and_come_out_as_they_were(name: str) -> None:
+    document = read_turns(RESULTS / name)
+    assert document.rows
+    assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if '"turbopi-attack"' in (RESULTS / name).read_text()[:99]])
+def test_checked_in_attacks_read_and_come_out_as_they_were(name: str) -> None:
+    document = read_document(RESULTS / name, AttackDocument, ConfigError)
+    assert len(document.pieces) > 3
+    assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
+
+
+def test_the_checked_in_gpu_result_reads_and_comes_out_as_it_was() -> None:
+    written = plain_document(gpu_evidence.result())
+    assert json.dumps(written, indent=1) + "\n" == gpu_evidence.RESULT.read_text()
+
+
+@pytest.mark.parametrize("key", ["tests", "golden", "fingerprint", "machine_code"])
+def test_a_gpu_result_that_lacks_something_is_refused_by_key(
+    key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = json.loads(gpu_evidence.RESULT.read_text())
+    del content[key]
+    file = tmp_path / "gpu_check.json"
+    file.write_text(json.dumps(content))
+    monkeypatch.setattr(gpu_evidence, "RESULT", file)
+    with pytest.raises(ConfigError, match=f"{file}: {key} is missing"):
+        gpu_evidence.result()
+
+
+def test_the_checked_in_calibrations_report_reads_and_comes_out_as_it_was() -> None:
+    report = json.loads((RESULTS / "h200_2026-11-24_pi05_libero/calibrate.json").read_text())["report"]
+    read = read_report(report)
+    assert json.dumps(plain_document(read)) == json.dumps(report)
+    assert list(read.held_out.errors()) == [name for name in report["held_out"] if name != "worst"]
+    del report["held_out"]["fp8-mlp"]
+    with pytest.raises(CalibrationError, match=r"report: held_out\.'?fp8-mlp'? is missing"):
+        read_report(report)
 
 
 def test_the_tables_of_checked_in_certificates_read_and_come_out_as_they_were() -> None:

@@ -289,7 +289,7 @@ def test_an_answer_recorded_with_another_observation_is_found(tmp_path: Path) ->
 # --- results ----------------------------------------------------------------------------------------------------------
 
 
-def piece(name: str, seed: int, *, ratio: float | None, faults: int = 0, count: int = 10) -> dict[str, Any]:
+def piece(name: str, seed: int, *, ratio: float | None, faults: int = 0, count: int = 10) -> results.Piece:
     found = Found(count=count)
     for number in range(faults):
         found.violate(f"wrong {number}", "do it again")
@@ -303,14 +303,14 @@ def test_pieces_add_up_and_the_worst_bar_counts(tmp_path: Path) -> None:
     for one in (piece("frames", 0, ratio=1.2), piece("frames", 1, ratio=1.4, count=5), piece("churn", 0, ratio=1.0)):
         pieces = results.add(file, one)
     frames, churn = results.totals(results.load(file))
-    assert (frames["attack"], frames["count"], frames["pieces"], churn["count"]) == ("frames", 15, 2, 10)
-    assert frames["bars"]["ratio"]["value"] == 1.4 and frames["outcomes"] == {"refused": 15}
+    assert (frames.attack, frames.count, frames.pieces, churn.count) == ("frames", 15, 2, 10)
+    assert frames.bars["ratio"].value == 1.4 and frames.outcomes == {"refused": 15}
     assert results.held(pieces)
     pieces = results.add(file, piece("frames", 1, ratio=None, faults=2))
     (frames, _) = results.totals(pieces)
-    assert (frames["count"], frames["violations"], frames["broken"]) == (20, 2, ["ratio"])
+    assert (frames.count, frames.violations, frames.broken) == (20, 2, ["ratio"])
     assert not results.held(pieces)
-    assert "commit" in pieces[0]["provenance"] and pieces[0]["prediction"]
+    assert pieces[0].provenance.commit and pieces[0].prediction
 
 
 def test_the_table_fits_eighty_columns() -> None:
@@ -327,7 +327,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path, capsys: pytest.Captur
     file = tmp_path / "a.json"
     file.write_text('{"format": "other"}')
     assert main(["show", str(file)]) == 2
-    assert "is no result of this tool" in capsys.readouterr().err
+    assert "format is 'other'; expected turbopi-attack (no result of this tool)" in capsys.readouterr().err
 
 
 # --- runs -------------------------------------------------------------------------------------------------------------
@@ -377,10 +377,11 @@ def test_a_tiny_run_leaves_its_result(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["run", "frames", "--count", "80", "--seed", "5", "--out", str(file)]) == 0
     assert "held" in capsys.readouterr().out
     (one,) = results.load(file)
-    assert (one["attack"], one["seed"], one["count"], one["verdict"]) == ("frames", 5, 80, "held")
-    assert one["server"]["rss_mb"]["peak"] >= one["server"]["rss_mb"]["before"] > 0
-    assert one["server"]["health"]["failed"] == 0
-    assert one["server"]["good"]["attacked_ms"]["n"] >= 0
+    assert (one.attack, one.seed, one.count, one.verdict) == ("frames", 5, 80, "held")
+    assert one.server is not None
+    assert one.server["rss_mb"]["peak"] >= one.server["rss_mb"]["before"] > 0
+    assert one.server["health"]["failed"] == 0
+    assert one.server["good"]["attacked_ms"]["n"] >= 0
     assert main(["show", str(file)]) == 0
 
 
@@ -393,7 +394,7 @@ def test_pieces_run_side_by_side_and_what_there_is_no_time_for_is_said(
     monkeypatch.setattr("attack.__main__.ATTACKS", {"frames": few, "slow_walk": long})
     file = tmp_path / "a.json"
     assert main(["all", "--jobs", "2", "--small", "--minutes", "1000", "--out", str(file)]) == 3
-    assert [(one["attack"], one["seed"]) for one in results.load(file)] == [("frames", 0)]
+    assert [(one.attack, one.seed) for one in results.load(file)] == [("frames", 0)]
     assert "next: slow_walk, seed 0" in capsys.readouterr().out
     assert main(["all", "--jobs", "0", "--out", str(file)]) == 2
     assert "--jobs must be 1 or more, not 0" in capsys.readouterr().err

@@ -48,11 +48,17 @@ def test_constants_replace_or_join_the_kernels_own() -> None:
     assert sizes == {**own, "TP_ROUND_FRAGMENTS": 4, "MORE": -1, "TP_TRACED_WARP": 13} != own
 
 
+def test_a_way_comes_behind_the_constants() -> None:
+    variant = Variant("here+MORE=2@held")
+    assert (variant.way, variant.constants) == ("held", {"MORE": 2}) and Variant("here").way is None
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
         ("nowhere", "'nowhere': expected 'here', a folder"),
         ("here+TP_ROUND_FRAGMENTS=few", r"\+TP_ROUND_FRAGMENTS=few: expected \+NAME=VALUE"),
+        ("here@times", "@times: expected @ and one of same, held, guided, distinct"),
     ],
 )
 def test_what_is_no_variant_is_refused_by_name(spec: str, message: str) -> None:

@@ -8,11 +8,15 @@ lines don't count.
 import ast
 import hashlib
 import io
-import json
 import re
 import tokenize
 from pathlib import Path
-from typing import Any
+
+from msgspec import UNSET, Struct, UnsetType
+
+from turbopi.errors import ConfigError
+from turbopi.provenance import Provenance
+from turbopi.reading import read_document
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULT = ROOT / "benchmarks/results/gpu_check.json"
@@ -27,6 +31,7 @@ PRODUCT = (
         "src/turbopi/config.py",
         "src/turbopi/observation.py",
         "src/turbopi/policy.py",
+        "src/turbopi/running_chunk.py",
     ),
     "src/turbopi/verify/check_golden.py",
 )
@@ -38,6 +43,50 @@ HOST_ONLY = (
     "turbopi.backends.onnx",  # refuses every device but the CPU
 )
 MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
+
+
+class GpuTests(Struct, frozen=True):
+    """Of the tests marked gpu; `failed` by name, `parts_to_go` not run yet."""
+
+    tests: int
+    failures: int
+    errors: int
+    skipped: int
+    seconds: float
+    failed: list[str]
+    parts_to_go: int
+
+
+class GoldenCheck(Struct, frozen=True):
+    """A backend's verdict by scripts/check_golden: what was compared by precision, or the `error` that ended it."""
+
+    ok: bool
+    error: str | UnsetType = UNSET
+    judged: int | UnsetType = UNSET
+    failed: int | UnsetType = UNSET
+    compared: dict[str, list[str]] | UnsetType = UNSET
+    actions_f32_max: float | UnsetType | None = UNSET  # None: wasn't compared
+    actions_bf16_relative_rms: float | UnsetType | None = UNSET
+
+
+class GpuCheck(Struct, frozen=True):
+    """The result file of scripts/gpu_check. Hashes: by file, by shape; machine_code None without NVRTC."""
+
+    ok: bool
+    provenance: Provenance
+    tests: GpuTests
+    golden: dict[str, GoldenCheck]
+    fingerprint: dict[str, str]
+    machine_code: dict[str, str] | None
+
+
+class GpuCheckPending(Struct, frozen=True):
+    """Code that waits for a GPU, and why."""
+
+    reason: str
+    date: str
+    fingerprint: dict[str, str]
+    machine_code: dict[str, str] | None
 
 
 def gpu_test_files() -> list[Path]:
@@ -129,6 +178,11 @@ def changed_since(recorded: dict[str, str]) -> list[str]:
     return sorted(name for name in {*now, *recorded} - host_only if now.get(name) != recorded.get(name))
 
 
-def pending() -> dict[str, Any] | None:
-    """What `scripts/gpu_check --pending` wrote, if anything: reason, date, fingerprint."""
-    return json.loads(PENDING.read_text()) if PENDING.is_file() else None
+def result() -> GpuCheck:
+    """The checked-in result. Raises ConfigError for a file of another kind, as `pending` does."""
+    return read_document(RESULT, GpuCheck, ConfigError)
+
+
+def pending() -> GpuCheckPending | None:
+    """What `scripts/gpu_check --pending` wrote, if anything."""
+    return read_document(PENDING, GpuCheckPending, ConfigError) if PENDING.is_file() else None

@@ -27,10 +27,15 @@ CACHE_ROWS = 976  # of `fused` with three cameras and prompts of up to 200 token
 SECTIONS = (".text.", ".nv.constant", ".nv.info.", ".nv.shared.")
 
 
-def _denoising(suffix: int, in_fp8: bool, folder: Path | None) -> bytes:
+def _denoising(suffix: int, in_fp8: bool, by_token: bool, folder: Path | None) -> bytes:
     arrangement = Arrangement(preset("pi05_libero").model)
     sizes = denoise.kernel_sizes(
-        arrangement, cache_rows=CACHE_ROWS, suffix=suffix, shared_bytes=SHARED_BYTES, fp8=in_fp8
+        arrangement,
+        cache_rows=CACHE_ROWS,
+        suffix=suffix,
+        shared_bytes=SHARED_BYTES,
+        fp8=in_fp8,
+        by_token=by_token,
     )
     return denoise.compiled(ARCH, sizes, folder=folder)
 
@@ -53,7 +58,10 @@ def _attention(tile: attention.AttentionTile, whole: bool, folder: Path | None) 
 
 SHAPES: dict[str, Callable[[Path | None], bytes]] = {
     **{
-        f"denoising, H={suffix}, {'fp8' if in_fp8 else 'bf16'}": partial(_denoising, suffix, in_fp8)
+        f"denoising{' by token' if by_token else ''}, H={suffix}, {'fp8' if in_fp8 else 'bf16'}": partial(
+            _denoising, suffix, in_fp8, by_token
+        )
+        for by_token in (False, True)
         for suffix in (10, 50)
         for in_fp8 in (False, True)
     },

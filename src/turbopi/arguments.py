@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from turbopi.config import LIMITS
-from turbopi.engine.recent import MOST_LOOPS, MOST_STEPS, Loop, fit
+from turbopi.engine.recent_loops import MOST_LOOPS, MOST_STEPS, Loop, fit
 from turbopi.errors import ConfigError, ObservationError
 
 MAX_STEPS = LIMITS["num_denoising_steps"]  # far beyond any use; a larger number is a mistake, not a wish
@@ -46,10 +46,10 @@ def several(what: str, given: Numbers, default: Sequence[int], check: Callable[[
     return numbers
 
 
-def warm_loops(steps: Sequence[int], horizons: Sequence[int]) -> list[Loop]:
+def warm_loops(steps: Sequence[int], horizons: Sequence[int]) -> list[tuple[int, int]]:
     """All pairs of steps and horizon, for a warm-up. Raises ConfigError if there are more than are kept."""
     loops = [(n, horizon) for n in steps for horizon in horizons]
-    if not fit(loops):
+    if not fit(Loop(*loop) for loop in loops):
         raise ConfigError(
             f"warm-up was given {len(loops)} pairs of steps and horizon, {sum(n for n, _ in loops)} steps together; "
             f"backends keep graphs of {MOST_LOOPS} pairs and {MOST_STEPS} steps, so leave some out"

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import pi
 from pathlib import Path
 from typing import Any
 
@@ -14,61 +13,12 @@ from matplotlib.ticker import MaxNLocator
 
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
+from turbopi.showing import ActionGroup, action_groups
 
 _DPI = 110
 STAGES = {"vision": "#4c72b0", "prefix": "#dd8452", "denoise": "#55a868"}
 MEASURED, SOLVED, BOUND, MUTED = "#3b6fb6", "#2f8f5b", "#b00020", "#9aa0a6"
 _GRIPPERS = {"gripper": "C9", "left": "C9", "right": "C8"}  # as no axis and no joint, which have C0 to C7
-
-
-@dataclass(frozen=True)
-class ActionGroup:
-    """Action dimensions that share one unit, and so one axis.
-
-    limits   what the unit's values range over: the axis shows at least that, so that noise looks as small as it is
-    """
-
-    title: str
-    unit: str
-    names: dict[int, str]  # dimension -> what it moves
-    limits: tuple[float, float] | None = None
-
-
-def _numbered(prefix: str, indices: Sequence[int]) -> dict[int, str]:
-    return {index: f"{prefix} {number}" for number, index in enumerate(indices, start=1)}
-
-
-# LIBERO: inputs of robosuite's OSC_POSE controller, whose output_max is 0.05 m and 0.5 rad
-_GROUPS: dict[str, list[ActionGroup]] = {
-    "libero": [
-        ActionGroup("translation", "1 = 0.05 m a step", {0: "x", 1: "y", 2: "z"}, (-1, 1)),
-        ActionGroup("rotation", "1 = 0.5 rad a step", {3: "about x", 4: "about y", 5: "about z"}, (-1, 1)),
-        ActionGroup("gripper", "−1 open, 1 closed", {6: "gripper"}, (-1, 1)),
-    ],
-    "droid": [
-        ActionGroup("joint velocities", "1 = the fastest command", _numbered("joint", range(7)), (-1, 1)),
-        ActionGroup("gripper", "0 open, 1 closed", {7: "gripper"}, (0, 1)),
-    ],
-    "aloha": [
-        ActionGroup("left arm", "rad", _numbered("joint", range(6)), (-pi, pi)),
-        ActionGroup("right arm", "rad", _numbered("joint", range(7, 13)), (-pi, pi)),
-        ActionGroup("grippers", "0 closed, 1 open", {6: "left", 13: "right"}, (0, 1)),
-    ],
-}
-
-
-def action_groups(robot: str, dims: int) -> list[ActionGroup]:
-    """How the dimensions of a robot's actions belong together; for an unknown robot, groups of eight to be legible."""
-    groups = _GROUPS.get(robot, [])
-    if sum(len(group.names) for group in groups) == dims:
-        return groups
-    eights = [range(start, min(start + 8, dims)) for start in range(0, dims, 8)]
-    return [
-        ActionGroup(
-            f"actions {eight[0]} to {eight[-1]}", "the robot's units", {index: f"dim {index}" for index in eight}
-        )
-        for eight in eights
-    ]
 
 
 @dataclass(frozen=True)
@@ -177,17 +127,3 @@ def _draw_group(ax: Axes, group: ActionGroup, row: Row) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.grid(alpha=0.3)
     ax.legend(handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.02), frameon=False)
-
-
-def pictures_of(observation: Mapping[str, Any], below: str = "") -> dict[str, np.ndarray]:
-    """The pictures in an observation of any robot, by key, as [h, w, 3] to look at."""
-    found: dict[str, np.ndarray] = {}
-    for key, value in observation.items():
-        name = f"{below}/{key}" if below else str(key)
-        if isinstance(value, Mapping):
-            found |= pictures_of(value, name)
-        elif isinstance(value, np.ndarray) and value.ndim == 3:
-            picture = value.transpose(1, 2, 0) if value.shape[0] == 3 else value
-            if picture.shape[-1] == 3:
-                found[name] = picture if picture.dtype == np.uint8 else np.clip(picture, 0, 1)
-    return found

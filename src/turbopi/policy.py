@@ -27,14 +27,13 @@ from turbopi.backends.lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import ModelConfig, PolicyConfig
-from turbopi.engine.recent import Loop
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.model.conditioning import Conditioning, Form, Guidance
 from turbopi.model.reference import FloatPrecision
 from turbopi.observation import ModelInputs, Observation, with_cameras
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
-from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.calibration_file import Quantization
 from turbopi.robots import Robot
 from turbopi.running_chunk import FORMS, JoinMode, RunningChunk
 
@@ -323,8 +322,8 @@ class UnifiedPolicy:
                         of a conditioning the form and the times count, not what is held or pulls
 
         each a number or several. What earlier warm-ups covered stays covered, as far as backends keep it: loops of
-        engine/recent.py's number, the least recently used ones go. Raises ConfigError for what can't be, and for more
-        loops than are kept.
+        engine/recent_loops.py's number, the least recently used ones go. Raises ConfigError for what can't be, and for
+        more loops than are kept.
         """
         start = time.perf_counter()
         self._guard.refuse_if_lost()
@@ -356,7 +355,7 @@ class UnifiedPolicy:
         return time.perf_counter() - start
 
     def _conditioned_loops(
-        self, loops: Sequence[Loop], real_time: JoinMode | Sequence[JoinMode], others: Sequence[Conditioning]
+        self, loops: Sequence[tuple[int, int]], real_time: JoinMode | Sequence[JoinMode], others: Sequence[Conditioning]
     ) -> list[tuple[int, int, Conditioning | None]]:
         """Steps, horizon and an example of every conditioned loop that a warm-up is to cover. Raises ConfigError."""
         modes: Sequence[Any] = [real_time] if isinstance(real_time, str) else real_time
@@ -494,7 +493,7 @@ class UnifiedPolicy:
                 raise ActionError(f"observation {row} of {len(states)} (from 0): {error}") from None
         return results
 
-    def _loop(self, num_steps: int | None, horizon: int | None) -> Loop:
+    def _loop(self, num_steps: int | None, horizon: int | None) -> tuple[int, int]:
         """A call's number of steps and horizon. Raises ObservationError."""
         return (
             self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError),

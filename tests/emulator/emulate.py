@@ -1,6 +1,7 @@
 """Our kernels' CUDA C++, compiled by g++ for machine.h's cluster and launched in the GPU's place.
 
-Only what gemm's source needs is there: an instruction that machine.h doesn't know is an error when it is translated.
+Only what gemm's source and the denoising kernel's products need is there: an instruction that machine.h doesn't know is
+an error when it is translated, or where only a part of a source is to run, when it does.
 Slow (a product of 64 x 16 x 64 takes milliseconds) and not exact to the tensor cores' order of summation.
 """
 
@@ -27,21 +28,27 @@ INSTRUCTIONS = (
     *(("barrier.cluster.arrive", "cluster_sync"), ("bar.sync", "bar_sync"), ("mapa.", "mapa")),
     *(("st.async", "st_async"), ("rcp.approx", "rcp"), ("tanh.approx", "tanh")),
     *(("wgmma.commit_group", "wgmma_commit"), ("wgmma.wait_group", "wgmma_wait")),
-    *(("cvt.rn.bf16x2", "cvt_bf16x2"), ("cvt.rn.satfinite.e4m3x2", "cvt_e4m3x2")),
-    ("cp.async.bulk.tensor.2d", "copy_2d"),
+    *(("cvt.rn.f16x2.e4m3x2", "cvt_e4m3_halves"), ("cvt.rn.bf16x2", "cvt_bf16x2")),
+    *(("cvt.rn.satfinite.e4m3x2", "cvt_e4m3x2"), ("m8n8.x4.shared.b16", "ldmatrix")),
+    *(("m16n8k16.row.col.f32.bf16", "mma_bf16"), ("m16n8k16.row.col.f32.f16", "mma_half")),
+    *(("cp.async.bulk.tensor.2d", "copy_2d"), ("complete_tx::bytes.L2::cache_hint", "copy_bytes")),
 )
 # No effect on what is computed here: kernels run one by one, registers are plenty, and copies are seen at once.
-IGNORED = ("griddepcontrol", "setmaxnreg", "prefetch", "fence")
+IGNORED = ("griddepcontrol", "setmaxnreg", "prefetch", "createpolicy", "fence")
 
 
-def translated(source: str) -> str:
-    """The source with each asm statement as a call, and shared memory that the machine has."""
+def translated(source: str, in_part: bool = False) -> str:
+    """The source with each asm statement as a call, and shared memory that the machine has.
+
+    in_part: only some of the source is to run, so an instruction that machine.h doesn't know is an error when it does.
+    """
     parts, end = [], 0
     for start, statement, stop in _statements(source):
-        parts += [source[end:start], _call(statement)]
+        parts += [source[end:start], _call(statement, in_part)]
         end = stop
     text = "".join((*parts, source[end:]))
-    return re.sub(r"extern __shared__ char (\w+)\[\];", r"char* const \1 = machine::shared();", text)
+    shared = r"extern __shared__ (?:__align__\(\d+\) )?(\w+) (\w+)\[\];"
+    return re.sub(shared, r"\1* const \2 = (\1*)machine::shared();", text)
 
 
 def _statements(source: str) -> Iterator[tuple[int, str, int]]:
@@ -57,7 +64,7 @@ def _statements(source: str) -> Iterator[tuple[int, str, int]]:
         yield found.start(), source[found.end() : at - 1], at
 
 
-def _call(statement: str) -> str:
+def _call(statement: str, in_part: bool) -> str:
     strings = re.match(r'(?:\s*"(?:[^"\\]|\\.)*")*', statement)
     assert strings is not None
     text = "".join(re.findall(r'"((?:[^"\\]|\\.)*)"', strings[0]))
@@ -65,6 +72,8 @@ def _call(statement: str) -> str:
     if not text or any(word in text for word in IGNORED):
         return "ptx_nothing()"
     name = next((name for word, name in INSTRUCTIONS if word in text), None)
+    if name is None and in_part:
+        return f'ptx_unknown("{text}")'
     if name is None:
         raise NotImplementedError(f"machine.h has no instruction for: {text}")
     if name == "bar_sync" and len(operands) == 1:
@@ -86,12 +95,13 @@ def _operands(text: str) -> list[str]:
 
 def wgmma(name: str, columns: int, *, numbers: str = "bf16", from_registers: bool = False, across: bool = False) -> str:
     """In place of `instructions.wgmma`."""
-    if from_registers or across:
-        raise NotImplementedError("machine.h multiplies what is in shared memory, by rows")
+    if across:
+        raise NotImplementedError("machine.h multiplies operands by rows")
     fp8 = str(numbers == "e4m3").lower()
+    takes, a = ("u32 a0, u32 a1, u32 a2, u32 a3", "{a0, a1, a2, a3}") if from_registers else ("u64 a", "a")
     return (
-        f"inline void {name}(float (&sums)[{columns // 2}], u64 a, u64 b, int keep) "
-        f"{{ machine::product<{columns}, {fp8}>(sums, a, b, keep); }}"
+        f"inline void {name}(float (&sums)[{columns // 2}], {takes}, u64 b, int keep) "
+        f"{{ machine::product<{columns}, {fp8}>(sums, {a}, b, keep); }}"
     )
 
 
@@ -118,12 +128,14 @@ def tensor_map(
     return made
 
 
-def compiled(source: str, name: str, takes: Parameters, defines: dict[str, int], folder: Path) -> Path:
-    """A library with the kernel. Raises RuntimeError with the compiler's words."""
+def compiled(
+    source: str, name: str, takes: Parameters, defines: dict[str, int], folder: Path, in_part: bool = False
+) -> Path:
+    """A library with the kernel. in_part: see `translated`. Raises RuntimeError with the compiler's words."""
     kinds = ["TensorMap" if one.type == TENSOR_MAP else one.type for one in takes.all]
     call = ", ".join(f"machine::given<{kind}>(values[{i}])" for i, kind in enumerate(kinds))
     text = f"""#include "{MACHINE}"
-{translated(source)}
+{translated(source, in_part)}
 extern "C" const char* run(int blocks, int threads, int cluster, int seed, void** values) {{
     static std::string why;
     try {{

@@ -8,6 +8,7 @@
 #include <ucontext.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -20,10 +21,13 @@
 #include <vector>
 
 #define __device__
+#define __host__
 #define __global__
 #define __forceinline__ inline
 #define __grid_constant__
 #define __launch_bounds__(...)
+#define __cluster_dims__(...)
+#define __builtin_assume(...) ((void)0)
 
 struct float2 { float x, y; };
 struct float4 { float x, y, z, w; };
@@ -37,7 +41,15 @@ template <typename T> T max(T a, T b) { return a < b ? b : a; }
 template <typename T> T min(T a, T b) { return b < a ? b : a; }
 inline float rsqrtf(float x) { return 1 / std::sqrt(x); }
 using std::fmaf; using std::fmaxf;
+inline float __fdividef(float x, float y) { return x / y; }
+inline float __fadd_rn(float x, float y) { return x + y; }
+inline float __fmul_rn(float x, float y) { return x * y; }
+inline void sincosf(float x, float* sine, float* cosine) { *sine = std::sin(x), *cosine = std::cos(x); }
 inline float __uint_as_float(unsigned x) { float y; memcpy(&y, &x, 4); return y; }
+inline unsigned __float_as_uint(float x) { unsigned y; memcpy(&y, &x, 4); return y; }
+inline float __int_as_float(int x) { return __uint_as_float(x); }
+inline int __float_as_int(float x) { return __float_as_uint(x); }
+template <typename T> T __ldg(const T* p) { return *p; }
 inline unsigned __byte_perm(unsigned x, unsigned y, unsigned s) {
     const uint64_t both = uint64_t(y) << 32 | x;
     unsigned r = 0;
@@ -48,7 +60,23 @@ inline unsigned __byte_perm(unsigned x, unsigned y, unsigned s) {
 namespace machine {
 
 struct Dim { unsigned x; };
-struct Pending { float* sums; uint64_t a, b; bool keep; int group; };
+struct Thread;
+// Operand A of a product: where it lies in shared memory, or what this thread has of it.
+struct OperandA {
+    uint64_t place = 0;
+    unsigned registers[4] = {};
+    bool in_registers = false;
+    OperandA(uint64_t where) : place(where) {}
+    OperandA(unsigned a, unsigned b, unsigned c, unsigned d) : registers{a, b, c, d}, in_registers(true) {}
+};
+struct Pending {
+    float* sums;
+    OperandA a;
+    uint64_t b;
+    bool keep;
+    int group;
+    void (*multiply)(const Thread&, const Pending&);
+};
 struct Thread {
     ucontext_t context;
     std::unique_ptr<char[]> stack;
@@ -59,9 +87,9 @@ struct Thread {
 };
 struct MBarrier { int count, pending, bytes; unsigned phase; };
 struct Barrier { int arrived = 0; unsigned uses = 0; };
-struct Warp { uint64_t values[2][32]; int arrived[2] = {0, 0}; };
+struct Warp { char values[2][32][64]; int arrived[2] = {0, 0}; };
 struct Map { uint64_t address; uint32_t axes, number_bytes; uint64_t sizes[3], strides[2]; uint32_t box[3]; };
-struct Copy { Map map; unsigned to, bar; int at[3]; unsigned mask; };
+struct Copy { Map map; unsigned to, bar; int at[3]; unsigned mask; std::string bytes; };  // of a map, or these
 
 constexpr int SHARED = 256 * 1024, PLACE = 24;  // bits of an address within a CTA; above them its rank
 inline std::vector<Thread> threads;
@@ -102,9 +130,9 @@ inline void changed(MBarrier& b) {
     if (b.pending < 0) throw std::runtime_error("more arrivals than a barrier's phase has");
     if (b.pending == 0 && b.bytes == 0) b.pending = b.count, b.phase ^= 1, ++moved;
 }
-inline void arrive(unsigned bar, int bytes = 0) {
+inline void arrive(unsigned bar, int bytes = 0, int times = 1) {
     MBarrier& b = barrier(bar);
-    b.bytes += bytes, --b.pending, changed(b);
+    b.bytes += bytes, b.pending -= times, changed(b);
 }
 inline void arrived_bytes(unsigned bar, int bytes) { MBarrier& b = barrier(bar); b.bytes -= bytes, changed(b); }
 
@@ -131,9 +159,29 @@ inline unsigned to_e4m3(float x) {
     return best | (std::signbit(x) ? 128 : 0);
 }
 
+inline unsigned half_of_e4m3(unsigned char x) {  // exact: float16 has all of E4M3's numbers
+    unsigned bits; const float value = e4m3(x); memcpy(&bits, &value, 4);
+    if (std::isnan(value)) return 0x7fff;
+    const unsigned exponent = bits >> 23 & 255, sign = bits >> 16 & 0x8000;
+    return exponent ? sign | (exponent - 112) << 10 | (bits >> 13 & 0x3ff) : sign;
+}
+inline float half(unsigned x) {
+    const int exponent = x >> 10 & 31, mantissa = x & 0x3ff;
+    const float value = exponent == 31 ? (mantissa ? NAN : INFINITY)
+                        : exponent     ? std::ldexp(1024 + mantissa, exponent - 25)
+                                       : std::ldexp(mantissa, -24);
+    return x & 0x8000 ? -value : value;
+}
+
 // ---- copies
 inline unsigned swizzled(unsigned address) { return address ^ (address >> 3 & 0x70); }
 inline void make(const Copy& c) {
+    if (!c.bytes.empty()) {
+        memcpy(at(c.to), c.bytes.data(), c.bytes.size());
+        arrived_bytes(c.bar, c.bytes.size());
+        ++moved;
+        return;
+    }
     const Map& m = c.map;
     const int rows = m.box[1] * (m.axes > 2 ? m.box[2] : 1);
     for (int rank = 0; rank < ranks; ++rank) {
@@ -157,35 +205,52 @@ inline void make(const Copy& c) {
 }
 
 // ---- products of a warpgroup: 64 rows of a, `columns` rows of b, 32 bytes of each
-inline float number(unsigned address, int i, bool fp8) {
-    const char* p = at(swizzled(address + i * (fp8 ? 1 : 2)) | now->rank << PLACE);
-    return fp8 ? e4m3(*(unsigned char*)p) : bf16(p);
+inline float number(const char* p, int i, bool fp8) { return fp8 ? e4m3(((const unsigned char*)p)[i]) : bf16(p + 2 * i); }
+// 16 bytes of a row of an operand: the first ones, or the next. Its descriptor as PTX has it (matrix-descriptor): bits 0
+// to 13 where it begins, 16 to 29 how far the next 16 bytes of its rows are, 32 to 45 how far the next 8 rows, all in
+// units of 16 bytes; 62 and 63 its swizzling: none, where 8 rows of 16 bytes lie one after the other, or (1) of rows of
+// 128 bytes.
+inline const char* row_of(uint64_t operand, int row, int next) {
+    auto units = [&](int from) { return unsigned(operand >> from & 0x3fff) * 16; };
+    const unsigned start = units(0) + row / 8 * units(32), swizzling = operand >> 62;
+    if (swizzling > 1) throw std::runtime_error("an operand that is swizzled otherwise than by 128 bytes");
+    const unsigned address = swizzling ? swizzled(start + row % 8 * 128 + next * 16) : start + row % 8 * 16 + next * units(16);
+    return at(address | now->rank << PLACE);
 }
-inline unsigned row_of(uint64_t operand, int row) { return (operand & 0x3fff) * 16 + row / 8 * 1024 + row % 8 * 128; }
+// The same of an operand in registers (PTX: wgmma's register fragments): of 8 rows each lane of a quad has 4 bytes.
+inline std::string row_of(const Thread* warpgroup, int row, int next) {
+    std::string bytes;
+    for (int lane = row % 8 * 4; lane < row % 8 * 4 + 4; ++lane)
+        bytes.append((const char*)&warpgroup[row / 16 * 32 + lane].pending.front().a.registers[next * 2 + row / 8 % 2], 4);
+    return bytes;
+}
+inline Thread* warpgroup() { return now - now->index.x % 128; }
 template <int COLUMNS, bool FP8>
 void multiply(const Thread& thread, const Pending& p) {
-    const int warp = thread.index.x / 32 % 4, lane = thread.index.x % 32, count = FP8 ? 32 : 16;
+    const int warp = thread.index.x / 32 % 4, lane = thread.index.x % 32;
     for (int i = 0; i < COLUMNS / 2; ++i) {
         const int row = warp * 16 + lane / 4 + i / 2 % 2 * 8, column = i / 4 * 8 + lane % 4 * 2 + i % 2;
         float sum = p.keep ? p.sums[i] : 0;
-        for (int k = 0; k < count; ++k)
-            sum += number(row_of(p.a, row), k, FP8) * number(row_of(p.b, column), k, FP8);
+        for (int next = 0; next < 2; ++next) {
+            const std::string held = p.a.in_registers ? row_of(warpgroup(), row, next) : "";
+            const char* const a = p.a.in_registers ? held.data() : row_of(p.a.place, row, next);
+            const char* const b = row_of(p.b, column, next);
+            for (int k = 0; k < (FP8 ? 16 : 8); ++k) sum += number(a, k, FP8) * number(b, k, FP8);
+        }
         p.sums[i] = sum;
     }
 }
-inline std::function<void(const Thread&, const Pending&)> multiplier;
-inline Thread* warpgroup() { return now - now->index.x % 128; }
 inline void finish(int groups) {  // of this warpgroup, whose threads have all committed them
-    for (Thread* t = warpgroup(); t < warpgroup() + 128; ++t) {
-        while (!t->pending.empty() && t->pending.front().group < groups)
-            multiplier(*t, t->pending.front()), t->pending.erase(t->pending.begin());
-        t->done = max(t->done, groups);
+    Thread* const first = warpgroup();
+    for (; !first->pending.empty() && first->pending.front().group < groups;) {
+        for (Thread* t = first; t < first + 128; ++t) t->pending.front().multiply(*t, t->pending.front());
+        for (Thread* t = first; t < first + 128; ++t) t->pending.erase(t->pending.begin());
     }
+    for (Thread* t = first; t < first + 128; ++t) t->done = max(t->done, groups);
 }
 template <int COLUMNS, bool FP8>
-void product(float* sums, uint64_t a, uint64_t b, bool keep) {
-    multiplier = multiply<COLUMNS, FP8>;
-    now->pending.push_back({sums, a, b, keep, now->committed});
+void product(float* sums, OperandA a, uint64_t b, bool keep) {
+    now->pending.push_back({sums, a, b, keep, now->committed, multiply<COLUMNS, FP8>});
 }
 inline void await(int left) {
     const int groups = now->committed - left;
@@ -269,13 +334,19 @@ T given(const void* value) {
 #define blockIdx (machine::now->block)
 #define gridDim (machine::grid)
 #define clock() (unsigned(machine::rounds) * 100)
+inline long long clock64() {  // others go on while somebody looks at it
+    swapcontext(&machine::now->context, &machine::scheduler);
+    return machine::rounds * 100;
+}
 inline unsigned __cvta_generic_to_shared(const void* p) {
     return unsigned((const char*)p - machine::shared()) | machine::now->rank << machine::PLACE;
 }
 inline void __syncthreads() { machine::meet(machine::barriers[machine::now->rank * 16], machine::cta_threads); }
 
-template <typename T>
-T __shfl_sync(unsigned, T value, int from) {
+// What all lanes of the warp have, once all of them are here.
+template <typename T, typename Read>
+auto exchanged(const T& value, Read read) {
+    static_assert(sizeof(T) <= 64, "an exchange's room");
     machine::Thread& t = *machine::now;
     machine::Warp& w = machine::warps[(t.rank * machine::cta_threads + t.index.x) / 32];
     const int lane = t.index.x % 32, turn = t.shuffles++ & 1;
@@ -283,18 +354,34 @@ T __shfl_sync(unsigned, T value, int from) {
     memcpy(&w.values[turn][lane], &value, sizeof(T));
     if (++w.arrived[turn] == 32) ++machine::moved;
     machine::wait_until([&] { return w.arrived[turn] == 32; });
-    memcpy(&value, &w.values[turn][from % 32], sizeof(T));
-    return value;
+    return read([&](int from) {
+        T found;
+        memcpy(&found, &w.values[turn][from % 32], sizeof(T));
+        return found;
+    });
+}
+template <typename T>
+T __shfl_sync(unsigned, T value, int from) {
+    return exchanged(value, [&](auto of_lane) { return of_lane(from); });
 }
 template <typename T>
 T __shfl_xor_sync(unsigned mask, T value, int by) { return __shfl_sync(mask, value, (threadIdx.x % 32) ^ by); }
+inline bool __any_sync(unsigned, bool mine) {
+    return exchanged(mine, [&](auto of_lane) {
+        for (int lane = 0; lane < 32; ++lane)
+            if (of_lane(lane)) return true;
+        return false;
+    });
+}
+inline bool __all_sync(unsigned mask, bool mine) { return !__any_sync(mask, !mine); }
 inline void __syncwarp() { __shfl_sync(~0u, 0, 0); }
 
 // ---- the instructions, by name: first what they write, then what they read
 inline void ptx_nothing() {}
+inline void ptx_unknown(const char* what) { throw std::runtime_error(std::string("machine.h has no instruction for: ") + what); }
 inline void ptx_mbarrier_init(unsigned bar, unsigned count) { machine::mbarriers[bar] = {int(count), int(count), 0, 0}; }
 inline void ptx_mbarrier_expect(unsigned bar, unsigned bytes) { machine::arrive(bar, bytes); }
-inline void ptx_mbarrier_arrive(unsigned bar) { machine::arrive(bar); }
+inline void ptx_mbarrier_arrive(unsigned bar, int times = 1) { machine::arrive(bar, 0, times); }
 inline void ptx_mbarrier_arrive_remote(unsigned bar, unsigned cta) {
     machine::arrive((bar & ((1u << machine::PLACE) - 1)) | cta << machine::PLACE);
 }
@@ -310,11 +397,14 @@ inline void ptx_bar_sync(int number, int count) { machine::meet(machine::barrier
 inline void ptx_mapa(unsigned& there, unsigned address, int rank) {
     there = (address & ((1u << machine::PLACE) - 1)) | rank << machine::PLACE;
 }
-inline void ptx_st_async(unsigned to, float x, float y, float z, float w, unsigned bar) {
-    const float all[4] = {x, y, z, w};
-    memcpy(machine::at(to), all, 16);
-    machine::arrived_bytes(bar, 16);
+template <typename Number>
+void st_async(unsigned to, const std::vector<Number>& all, unsigned bar) {
+    memcpy(machine::at(to), all.data(), all.size() * 4);
+    machine::arrived_bytes(bar, all.size() * 4);
 }
+inline void ptx_st_async(unsigned to, float x, float y, float z, float w, unsigned bar) { st_async<float>(to, {x, y, z, w}, bar); }
+inline void ptx_st_async(unsigned to, unsigned x, unsigned y, unsigned bar) { st_async<unsigned>(to, {x, y}, bar); }
+inline void ptx_st_async(unsigned to, unsigned x, unsigned bar) { st_async<unsigned>(to, {x}, bar); }
 inline void ptx_rcp(float& y, float x) { y = 1 / x; }
 inline void ptx_tanh(float& y, float x) { y = std::tanh(x); }
 inline void ptx_wgmma_commit() { machine::commit(); }
@@ -324,6 +414,51 @@ inline void ptx_cvt_bf16x2(unsigned& both, float high, float low) {
 }
 inline void ptx_cvt_e4m3x2(unsigned short& both, float high, float low) {
     both = machine::to_e4m3(high) << 8 | machine::to_e4m3(low);
+}
+inline void ptx_cvt_e4m3_halves(unsigned& low, unsigned& high, unsigned four) {
+    auto two = [&](int from) {
+        return machine::half_of_e4m3(four >> from & 255) | machine::half_of_e4m3(four >> (from + 8) & 255) << 16;
+    };
+    low = two(0), high = two(16);
+}
+// Four matrices of 8 x 8 numbers of 16 bits: lane 8 i + r tells where row r of matrix i is, lane 4 r + c gets its
+// numbers 2 c and 2 c + 1.
+inline void ptx_ldmatrix(unsigned& v0, unsigned& v1, unsigned& v2, unsigned& v3, unsigned address) {
+    unsigned* const v[4] = {&v0, &v1, &v2, &v3};
+    const int lane = threadIdx.x % 32;
+    exchanged(address, [&](auto of_lane) {
+        for (int i = 0; i < 4; ++i) memcpy(v[i], machine::at(of_lane(i * 8 + lane / 4) + lane % 4 * 4), 4);
+        return 0;
+    });
+}
+// c += a b of mma.m16n8k16, whose fragments PTX draws: lane 4 g + t has of a the columns 2 t, 2 t + 1 of row g, of row g +
+// 8, and the columns 8 further of both; of b the rows 2 t, 2 t + 1 and 8 further of column g; of c the columns 2 t, 2 t + 1
+// of row g and of row g + 8.
+template <typename Number>
+void mma(float* const (&c)[4], const std::array<unsigned, 6>& mine, Number number) {
+    const int g = threadIdx.x % 32 / 4, t = threadIdx.x % 4;
+    exchanged(mine, [&](auto of_lane) {
+        for (int i = 0; i < 4; ++i)
+            for (int k = 0; k < 16; ++k) {
+                const unsigned a = of_lane(g * 4 + k % 8 / 2)[i / 2 + k / 8 * 2];
+                const unsigned b = of_lane((2 * t + i % 2) * 4 + k % 8 / 2)[4 + k / 8];
+                *c[i] += number(a >> k % 2 * 16 & 0xffff) * number(b >> k % 2 * 16 & 0xffff);
+            }
+        return 0;
+    });
+}
+inline void ptx_mma_bf16(float& c0, float& c1, float& c2, float& c3, unsigned a0, unsigned a1, unsigned a2, unsigned a3,
+                         unsigned b0, unsigned b1) {
+    mma({&c0, &c1, &c2, &c3}, {a0, a1, a2, a3, b0, b1}, [](unsigned x) { return __uint_as_float(x << 16); });
+}
+inline void ptx_mma_half(float& c0, float& c1, float& c2, float& c3, unsigned a0, unsigned a1, unsigned a2, unsigned a3,
+                         unsigned b0, unsigned b1) {
+    mma({&c0, &c1, &c2, &c3}, {a0, a1, a2, a3, b0, b1}, machine::half);
+}
+inline void ptx_copy_bytes(unsigned to, const void* from, unsigned bytes, unsigned bar, uint64_t) {
+    machine::Copy c{};
+    c.to = to, c.bar = bar, c.bytes.assign((const char*)from, bytes);
+    machine::copies.push_back(c);
 }
 template <typename Map>
 void ptx_copy_2d(unsigned to, const Map* map, int x, int y, unsigned bar, unsigned mask = 0) {

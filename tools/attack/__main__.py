@@ -26,7 +26,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -98,7 +97,7 @@ def _all(given: argparse.Namespace) -> int:
     if given.jobs < 1:
         raise ValueError(f"--jobs must be 1 or more, not {given.jobs}")
     end = time.monotonic() + given.minutes * 60
-    done = {(one["attack"], one["seed"]) for one in results.load(given.out)}
+    done = {(one.attack, one.seed) for one in results.load(given.out)}
     missing = [
         (attack, seed)
         for attack in ATTACKS.values()
@@ -148,7 +147,7 @@ def _side_by_side(pieces: list[tuple[Attack, int]], given: argparse.Namespace, e
         return [piece for piece, ran in zip(pieces, executor.map(run, pieces), strict=True) if not ran]
 
 
-def _one(attack: Attack, seed: int, size: Size, out: Path) -> dict[str, Any]:
+def _one(attack: Attack, seed: int, size: Size, out: Path) -> results.Piece:
     """Run a piece and write it down."""
     started, console = time.monotonic(), Console(stderr=True)
     with (
@@ -159,14 +158,14 @@ def _one(attack: Attack, seed: int, size: Size, out: Path) -> dict[str, Any]:
         found, seen = attack.run(seed, size, Path(folder), lambda share: bar.update(task, completed=share))
     written = results.piece(attack, seed, size, found, seen, started)
     results.add(out, written)
-    faults = len(written["violations"]) + written["more_violations"]
-    broken = ", ".join(f"{bar['name']} {bar['value']} > {bar['limit']}" for bar in written["bars"] if not bar["held"])
-    said = f"{written['verdict']}{f', {faults} faults' if faults else ''}{f', {broken}' if broken else ''}"
-    print(f"{attack.name} {seed}: {found.count:,} in {written['wall_seconds']:.0f} s: {said}", flush=True)
+    faults = len(written.violations) + written.more_violations
+    broken = ", ".join(f"{bar.name} {bar.value} > {bar.limit}" for bar in written.bars if not bar.held)
+    said = f"{written.verdict}{f', {faults} faults' if faults else ''}{f', {broken}' if broken else ''}"
+    print(f"{attack.name} {seed}: {found.count:,} in {written.wall_seconds:.0f} s: {said}", flush=True)
     return written
 
 
-def _end(out: Path, pieces: list[dict[str, Any]]) -> int:
+def _end(out: Path, pieces: list[results.Piece]) -> int:
     Console().print(results.table(pieces))
     print(f"in {out}; `python -m attack show {out}` says more")
     return 0 if results.held(pieces) else BROKEN
@@ -180,14 +179,10 @@ def _show(given: argparse.Namespace) -> int:
     console = Console()
     console.print(results.table(pieces))
     for row in results.totals(pieces):
-        outcomes = ", ".join(f"{name} {count:,}" for name, count in row["outcomes"].most_common())
-        console.print(
-            f"[bold]{row['attack']}[/] ({', '.join(sorted(row['commits']))}): {escape(outcomes)}", soft_wrap=True
-        )
-        for violation in row["said"]:
-            console.print(
-                f"  [red]{escape(violation['what'])}[/]\n    {escape(violation['reproduce'])}", soft_wrap=True
-            )
+        outcomes = ", ".join(f"{name} {count:,}" for name, count in row.outcomes.most_common())
+        console.print(f"[bold]{row.attack}[/] ({', '.join(sorted(row.commits))}): {escape(outcomes)}", soft_wrap=True)
+        for violation in row.said:
+            console.print(f"  [red]{escape(violation.what)}[/]\n    {escape(violation.reproduce)}", soft_wrap=True)
     return 0 if results.held(pieces) else BROKEN
 
 

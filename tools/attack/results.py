@@ -4,88 +4,149 @@ import json
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import torch
+from msgspec import Struct
 from rich.table import Table
 
 from attack.arena import MAX_VIOLATIONS, Found
 from attack.attacks import ATTACKS, Attack, Size
+from turbopi.errors import ConfigError
+from turbopi.provenance import Provenance, provenance
+from turbopi.reading import plain_document, read_document
 
-FORMAT, VERSION = "turbopi-attack", 1
+MAX_BYTES = 1 << 28
 COLUMNS = 80  # that the table fits into
 
 
-def piece(attack: Attack, seed: int, size: Size, found: Found, seen: dict[str, Any], started: float) -> dict[str, Any]:
-    """One attack as it is written: plain values."""
-    import torch
+class PieceSize(Struct, frozen=True):
+    count: int
+    seconds: float | int
 
-    from turbopi.provenance import provenance
-    from turbopi.reading import plain_document
 
+class Violation(Struct, frozen=True):
+    """What is wrong, and a line that makes it happen again."""
+
+    what: str
+    reproduce: str
+
+
+class JudgedBar(Struct, frozen=True):
+    """value: None if nothing could be measured."""
+
+    name: str
+    value: float | int | None
+    limit: float | int
+    held: bool
+
+
+class Piece(Struct, frozen=True):
+    """One attack with a seed. `server`: what was seen of it meanwhile, None where there was none."""
+
+    attack: str
+    about: str
+    prediction: str
+    seed: int
+    size: PieceSize
+    wall_seconds: float
+    count: int
+    outcomes: dict[str, int]
+    violations: list[Violation]
+    more_violations: int
+    bars: list[JudgedBar]
+    server: dict[str, Any] | None
+    notes: dict[str, Any]
+    verdict: Literal["held", "broken"]
+    provenance: Provenance
+
+
+class AttackDocument(Struct, frozen=True):
+    format: Literal["turbopi-attack"]
+    version: Literal[1]
+    pieces: list[Piece]
+
+
+@dataclass
+class Total:
+    """An attack's pieces added up: the worst of its bars by name, the names of those that broke, some violations."""
+
+    attack: str
+    pieces: int = 0
+    count: int = 0
+    violations: int = 0
+    outcomes: Counter[str] = dataclass_field(default_factory=Counter)
+    bars: dict[str, JudgedBar] = dataclass_field(default_factory=dict)
+    broken: list[str] = dataclass_field(default_factory=list)
+    said: list[Violation] = dataclass_field(default_factory=list)
+    commits: set[str] = dataclass_field(default_factory=set)
+
+    @property
+    def faults(self) -> list[str]:
+        """In words; none: it held."""
+        return [f"{self.violations} faults"] * bool(self.violations) + self.broken
+
+
+def piece(attack: Attack, seed: int, size: Size, found: Found, seen: dict[str, Any], started: float) -> Piece:
+    """One attack as it is written."""
     held = not found.violations and not found.more_violations and all(bar.held for bar in found.bars)
-    return {
-        "attack": attack.name,
-        "about": attack.about,
-        "prediction": attack.prediction,
-        "seed": seed,
-        "size": {"count": size.count, "seconds": size.seconds},
-        "wall_seconds": round(time.monotonic() - started, 1),
-        "count": found.count,
-        "outcomes": dict(found.outcomes.most_common()),
-        "violations": found.violations,
-        "more_violations": found.more_violations,
-        "bars": [{**asdict(bar), "held": bar.held} for bar in found.bars],
-        "server": seen or None,
-        "notes": found.notes,
-        "verdict": "held" if held else "broken",
-        "provenance": plain_document(provenance(torch.device("cpu"))),
-    }
+    return Piece(
+        attack=attack.name,
+        about=attack.about,
+        prediction=attack.prediction,
+        seed=seed,
+        size=PieceSize(size.count, size.seconds),
+        wall_seconds=round(time.monotonic() - started, 1),
+        count=found.count,
+        outcomes=dict(found.outcomes.most_common()),
+        violations=[Violation(**one) for one in found.violations],
+        more_violations=found.more_violations,
+        bars=[JudgedBar(bar.name, bar.value, bar.limit, bar.held) for bar in found.bars],
+        server=seen or None,
+        notes=found.notes,
+        verdict="held" if held else "broken",
+        provenance=provenance(torch.device("cpu")),
+    )
 
 
-def load(file: Path) -> list[dict[str, Any]]:
-    """The pieces in a file; none if it doesn't exist yet. Raises ValueError for a file of another kind."""
+def load(file: Path) -> list[Piece]:
+    """The pieces in a file; none if it doesn't exist yet. Raises ConfigError for a file of another kind."""
     if not file.exists():
         return []
-    content = json.loads(file.read_text(encoding="utf-8"))
-    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
-        raise ValueError(f"{file} is no result of this tool (format {FORMAT}, version {VERSION})")
-    return list(content["pieces"])
+    return read_document(file, AttackDocument, ConfigError, limit=MAX_BYTES, hint=" (no result of this tool)").pieces
 
 
-def add(file: Path, new: dict[str, Any]) -> list[dict[str, Any]]:
+def add(file: Path, new: Piece) -> list[Piece]:
     """Write `new` into the file, in place of an earlier piece of the same attack and seed. Returns all pieces."""
-    same = (new["attack"], new["seed"])
-    pieces = [old for old in load(file) if (old["attack"], old["seed"]) != same] + [new]
+    pieces = [old for old in load(file) if (old.attack, old.seed) != (new.attack, new.seed)] + [new]
     order = list(ATTACKS)
-    pieces.sort(key=lambda one: (order.index(one["attack"]) if one["attack"] in order else len(order), one["seed"]))
+    pieces.sort(key=lambda one: (order.index(one.attack) if one.attack in order else len(order), one.seed))
     part = file.with_name(f".{file.name}.part")
-    part.write_text(json.dumps({"format": FORMAT, "version": VERSION, "pieces": pieces}, indent=1, ensure_ascii=False))
+    document = AttackDocument("turbopi-attack", 1, pieces)
+    part.write_text(json.dumps(plain_document(document), indent=1, ensure_ascii=False))
     part.replace(file)
     return pieces
 
 
-def totals(pieces: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row for each attack: its pieces added up, the worst of their bars, and their violations."""
-    rows: dict[str, dict[str, Any]] = {}
+def totals(pieces: Sequence[Piece]) -> list[Total]:
+    """One for each attack."""
+    rows: dict[str, Total] = {}
     for one in pieces:
-        row = rows.setdefault(
-            one["attack"],
-            {"attack": one["attack"], "pieces": 0, "count": 0, "violations": 0, "outcomes": Counter(), "bars": {}}
-            | {"broken": [], "said": [], "commits": set()},
-        )
-        row["pieces"] += 1
-        row["count"] += one["count"]
-        row["violations"] += len(one["violations"]) + one["more_violations"]
-        row["outcomes"].update(one["outcomes"])
-        row["said"] += one["violations"][: MAX_VIOLATIONS - len(row["said"])]
-        row["commits"].add(one["provenance"]["commit"])
-        for bar in one["bars"]:
-            worst = row["bars"].get(bar["name"])
-            if worst is None or _worse(bar["value"], worst["value"]):
-                row["bars"][bar["name"]] = bar
-        row["broken"] += [name for bar in one["bars"] if not bar["held"] and (name := bar["name"]) not in row["broken"]]
+        row = rows.setdefault(one.attack, Total(one.attack))
+        row.pieces += 1
+        row.count += one.count
+        row.violations += len(one.violations) + one.more_violations
+        row.outcomes.update(one.outcomes)
+        row.said += one.violations[: MAX_VIOLATIONS - len(row.said)]
+        row.commits.add(one.provenance.commit)
+        for bar in one.bars:
+            worst = row.bars.get(bar.name)
+            if worst is None or _worse(bar.value, worst.value):
+                row.bars[bar.name] = bar
+        row.broken += [bar.name for bar in one.bars if not bar.held and bar.name not in row.broken]
     return list(rows.values())
 
 
@@ -93,7 +154,7 @@ def _worse(value: float | None, than: float | None) -> bool:
     return value is None or (than is not None and value > than)
 
 
-def table(pieces: Sequence[dict[str, Any]]) -> Table:
+def table(pieces: Sequence[Piece]) -> Table:
     """The table that fits COLUMNS columns."""
     found = Table(title="attacks", title_justify="left", width=COLUMNS, pad_edge=False)
     found.add_column("attack", no_wrap=True)
@@ -101,19 +162,18 @@ def table(pieces: Sequence[dict[str, Any]]) -> Table:
         found.add_column(name, justify="right", no_wrap=True)
     found.add_column("verdict")
     for row in totals(pieces):
-        bars = row["bars"]
-        broken = [f"{row['violations']} faults"] * bool(row["violations"]) + row["broken"]
+        bars, broken = row.bars, row.faults
         found.add_row(
-            row["attack"],
-            f"{row['count']:,}",
-            str(row["violations"]),
+            row.attack,
+            f"{row.count:,}",
+            str(row.violations),
             *(_shown(bars.get(name)) for name in ("ratio", "growth MB", "log kB/s")),
             f"[red]broken: {', '.join(broken)}[/]" if broken else "[green]held[/]",
         )
     return found
 
 
-def markdown(pieces: Sequence[dict[str, Any]]) -> str:
+def markdown(pieces: Sequence[Piece]) -> str:
     """The table of docs/dev/attack.md: every row with the good client's medians and what was counted."""
     lines = [
         "| attack | what | count | good client, ms | ratio | RSS, MB more | verdict |",
@@ -121,20 +181,19 @@ def markdown(pieces: Sequence[dict[str, Any]]) -> str:
     ]
     servers: dict[str, list[dict[str, Any]]] = {}
     for one in pieces:
-        servers.setdefault(one["attack"], []).append(one["server"] or {})
+        servers.setdefault(one.attack, []).append(one.server or {})
     for row in totals(pieces):
-        bars, good = row["bars"], [seen["good"] for seen in servers[row["attack"]] if "good" in seen]
+        bars, good = row.bars, [seen["good"] for seen in servers[row.attack] if "good" in seen]
         medians = [(_number(one["undisturbed_ms"]["p50"]), _number(one["attacked_ms"]["p50"])) for one in good[:1]]
-        broken = [f"{row['violations']} faults"] * bool(row["violations"]) + row["broken"]
-        about = ATTACKS[row["attack"]].about if row["attack"] in ATTACKS else ""
+        about = ATTACKS[row.attack].about if row.attack in ATTACKS else ""
         cells = [
-            f"`{row['attack']}`",
+            f"`{row.attack}`",
             about,
-            f"{row['count']:,}",
+            f"{row.count:,}",
             "".join(f"{quiet} → {attacked}" for quiet, attacked in medians) if "ratio" in bars else "",
             _shown(bars.get("ratio")),
             _shown(bars.get("growth MB")),
-            f"**broken**: {', '.join(broken)}" if broken else "held",
+            f"**broken**: {', '.join(row.faults)}" if row.faults else "held",
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -144,13 +203,13 @@ def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:.1f}"
 
 
-def _shown(bar: dict[str, Any] | None) -> str:
+def _shown(bar: JudgedBar | None) -> str:
     if bar is None:
         return "–"
-    return (
-        "none" if bar["value"] is None else f"{bar['value']:.2f}" if bar["name"] == "ratio" else f"{bar['value']:.0f}"
-    )
+    if bar.value is None:
+        return "none"
+    return f"{bar.value:.2f}" if bar.name == "ratio" else f"{bar.value:.0f}"
 
 
-def held(pieces: Sequence[dict[str, Any]]) -> bool:
-    return all(one["verdict"] == "held" for one in pieces)
+def held(pieces: Sequence[Piece]) -> bool:
+    return all(one.verdict == "held" for one in pieces)

@@ -204,7 +204,7 @@ def read_recording(folder: str) -> None:
 
 
 def read_calibration(folder: str) -> None:
-    from turbopi.quantization.artifact import Quantization
+    from turbopi.quantization.calibration_file import Quantization
 
     _told(lambda: repr(Quantization.load(f"{folder}/fp8.json")))
 

@@ -1,16 +1,19 @@
 """The tables themselves: each takes what result files hold and returns Markdown lines."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from kernel_turns.document import MarkedVariant, read_turns
 from msgspec.structs import replace
 
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
 from turbopi.provenance import Gpu
 from turbopi.wording import significant
+
+if TYPE_CHECKING:
+    from attack.results import Piece
 
 STAGES = ("vision", "prefix", "denoise")
 
@@ -196,7 +199,7 @@ def machine(document: BenchDocument) -> list[str]:
     ]
 
 
-def attacks(*files: list[dict[str, Any]]) -> list[str]:
+def attacks(*files: "list[Piece]") -> list[str]:
     """What the attack tool found."""
     from attack import results
 
@@ -217,26 +220,26 @@ def image_sizes(document: BenchDocument) -> list[str]:
     return _table(["", *(f"{width} × {height}" for width, height in sizes)], rows)
 
 
-def layer_in_cycles(marks: list[dict[str, Any]]) -> list[str]:
+def layer_in_cycles(marks: list[MarkedVariant]) -> list[str]:
     """Where a warp's cycles of a layer go: means over ranks, and a bar a phase for each form's first run in FP8.
 
     Marks that this warp never passes are left out.
     """
     from turbopi.kernels.sm90.denoise.kernel import FEW, MARKS
 
-    in_fp8 = [one for one in marks if one["precision"] == "fp8"]
-    drawn = [next(one for one in in_fp8 if (one["tokens"] > FEW) == many) for many in (False, True)]
+    in_fp8 = [one for one in marks if one.precision == "fp8"]
+    drawn = [next(one for one in in_fp8 if (one.tokens > FEW) == many) for many in (False, True)]
     rows = []
     for mark, about in MARKS.items():
-        means = [sum(one["cycles"][mark]) / len(one["cycles"][mark]) for one in marks]
+        means = [sum(one.cycles[mark]) / len(one.cycles[mark]) for one in marks]
         if any(means):
             bars = ["█" * round(means[marks.index(one)] / 150) for one in drawn]
             rows.append([about.replace("|", "\\|"), *(f"{mean:,.0f}" for mean in means), *bars])
-    total = [sum(sum(cycles) / len(cycles) for cycles in one["cycles"].values()) for one in marks]
+    total = [sum(sum(cycles) / len(cycles) for cycles in one.cycles.values()) for one in marks]
     whole = "all of a layer, and 1/18 of what lies between steps"
     rows.append([whole, *(f"{cycles:,.0f}" for cycles in total), "", ""])
-    head = [f"{one['tokens']} {one['precision']}" for one in marks]
-    lines = _table(["up to where", *head, *(f"{one['tokens']} {one['precision']}, drawn" for one in drawn)], rows)
+    head = [f"{one.tokens} {one.precision}" for one in marks]
+    lines = _table(["up to where", *head, *(f"{one.tokens} {one.precision}, drawn" for one in drawn)], rows)
     return [lines[0], lines[1].removesuffix("--:|--:|") + "---|---|", *lines[2:]]
 
 
@@ -248,7 +251,7 @@ class Table:
     lines: Callable[..., list[str]]  # of what was read of each file
 
 
-def _read_attacks(file: Path) -> list[dict[str, Any]]:
+def _read_attacks(file: Path) -> "list[Piece]":
     from attack import results
 
     return results.load(file)
@@ -267,9 +270,9 @@ def delays(document: Any) -> list[str]:
     return _table(HEADS, [row(cell) for cell in document.cells])
 
 
-def _read_marks(file: Path) -> list[dict[str, Any]]:
+def _read_marks(file: Path) -> list[MarkedVariant]:
     """What `python -m kernel_turns time --marks --json` wrote."""
-    marks: list[dict[str, Any]] = json.loads(file.read_text()).get("marks") or []
+    marks = read_turns(file).marks
     if not marks:
         raise ValueError(f"{file} has no marks: expected what kernel_turns wrote with --marks")
     return marks

@@ -8,14 +8,14 @@
     ncu -i samples.ncu-rep --page source --csv > samples.csv
     python -m kernel_turns stalls other.patch --tokens 50 --samples samples.csv     (needs no GPU, but NVRTC and Triton)
 
-A variant is "here", a folder as kernels/sm90 is, or a patch of this tree, and constants: +NAME=VALUE.
+A variant is "here", a folder as kernels/sm90 is, or a patch of this tree, and constants: +NAME=VALUE. Behind it @held,
+@guided, @distinct or @same: the form in which tokens have their own times, as in `time here here@held here@guided`.
 """
 
 import argparse
 import json
 import tempfile
 from collections import Counter
-from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
@@ -60,12 +60,13 @@ def main() -> None:
 
 
 def _time(arguments: argparse.Namespace) -> None:
+    from kernel_turns.document import MarkedVariant, TimedVariant, TurnsDocument
     from kernel_turns.turns import GPU, MARKS, RANKS, Job, marks_by_rank, time_in_turns
     from turbopi.provenance import provenance
     from turbopi.reading import plain_document
 
     variants, console = [Variant(spec) for spec in arguments.variants], Console()
-    rows, marks = list[dict[str, object]](), list[dict[str, object]]()
+    rows, marks = list[TimedVariant](), list[MarkedVariant]()
     for tokens in (int(text) for text in arguments.tokens.split(",")):
         for precision in arguments.precisions.split(","):
             job = Job(tokens, precision, arguments.length)
@@ -74,7 +75,7 @@ def _time(arguments: argparse.Namespace) -> None:
             for row in time_in_turns(job, variants, arguments.rounds):
                 numbers = f"{row.milliseconds:.4f}", f"{row.fastest:.4f}", f"{row.error:.5f}"
                 table.add_row(row.variant, *numbers, "same" if row.same else "differ", f"{row.mhz:.0f}")
-                rows.append({"tokens": tokens, "precision": precision, "length": arguments.length, **asdict(row)})
+                rows.append(row)
             console.print(table)
             for variant in variants if arguments.marks else ():
                 title = f"cycles a layer up to each mark, warp {arguments.warp}, {variant.spec}"
@@ -84,11 +85,10 @@ def _time(arguments: argparse.Namespace) -> None:
                     name = f"{mark.removeprefix('MARK_').lower()}: {about}"
                     table.add_row(name, *(f"{count:.0f}" for count in cycles[mark]))
                 console.print(table)
-                what = {"tokens": tokens, "precision": precision, "variant": variant.spec, "warp": arguments.warp}
-                marks.append({**what, "cycles": cycles})
+                marks.append(MarkedVariant(tokens, precision, variant.spec, arguments.warp, cycles))
     if arguments.json is not None:
-        document = {"provenance": plain_document(provenance(GPU)), "rows": rows, "marks": marks}
-        arguments.json.write_text(json.dumps(document, indent=1))
+        document = TurnsDocument(provenance(GPU), rows, marks)
+        arguments.json.write_text(json.dumps(plain_document(document), indent=1))
 
 
 def _launch(arguments: argparse.Namespace) -> None:
@@ -97,9 +97,11 @@ def _launch(arguments: argparse.Namespace) -> None:
     from kernel_turns.turns import Job
 
     job = Job(arguments.tokens, arguments.precision, arguments.length)
-    kernel, outputs = job.kernel(Variant(arguments.variant)), job.outputs()
+    variant, outputs = Variant(arguments.variant), job.outputs()
+    p = job.of(variant)
+    kernel = job.kernel(variant, p)
     for _ in range(3):
-        job.launch(kernel, *outputs)
+        job.launch(kernel, p, *outputs)
     torch.cuda.synchronize()
 
 

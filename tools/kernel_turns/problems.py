@@ -10,9 +10,9 @@ from torch import Tensor
 from turbopi.config import GemmaConfig, ModelConfig, preset
 from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
-from turbopi.kernels.interface import GemmaLayer
+from turbopi.kernels.interface import GemmaLayer, TokenInputs
 from turbopi.kernels.sm90.denoise.packing import KINDS
-from turbopi.kernels.sm90.denoise.plain import Operand, denoise_plain
+from turbopi.kernels.sm90.denoise.plain import Operand, denoise_plain, guided
 from turbopi.model.denoise import euler_step
 from turbopi.model.layers import apply_rope, rms_normalize, rope_tables
 from turbopi.quantization.fp8 import E4M3_MAX
@@ -33,6 +33,7 @@ CONFIGS = {
     "tiny": sized(128, 256, 6, 32),
     "odd": sized(160, 224, 2, 48, 4),
     "uneven": sized(160, 224, 2, 48, 10),  # ten clusters divide nothing
+    "wide": sized(1280, 224, 1, 256, 2),  # more than 8 tiles back into the stream, more than 3 of q|k|v
     "crowd": sized(64, 128, 1, 16, 32),  # more clusters than a GPU holds
     "shallow": sized(1024, 4096, 3, 256),
     "full": FULL,
@@ -50,7 +51,7 @@ def has_nvrtc() -> bool:
 
 @dataclasses.dataclass
 class Problem:
-    """Random weights, modulation and inputs; the cache is NaN beyond the valid length."""
+    """Random weights, modulation and inputs; the cache is NaN beyond the valid length. tokens: see `by_token`."""
 
     config: ModelConfig
     layers: list[GemmaLayer]
@@ -60,6 +61,15 @@ class Problem:
     cache_k: Tensor
     cache_v: Tensor
     length: int
+    tokens: TokenInputs | None = None
+
+
+def modulation(g: GemmaConfig, rows: int, gen: torch.Generator) -> Tensor:
+    """A random table of norms: float32[rows, 2L + 1, 3, D]."""
+    table = torch.randn(rows, 2 * g.depth + 1, 3, g.width, generator=gen, device=gen.device) * 0.3
+    table[:, :, 0] += 1
+    table[:, :, 2] *= 2
+    return table
 
 
 def problem(
@@ -93,9 +103,7 @@ def problem(
         "action_out_proj.weight": random(config.action_dim, g.width, std=g.width**-0.5),
         "action_out_proj.bias": random(config.action_dim, std=0.1),
     }
-    table = random(steps, 2 * g.depth + 1, 3, g.width, std=0.3)
-    table[:, :, 0] += 1
-    table[:, :, 2] *= 2
+    table = modulation(g, steps, gen)
     cache = [random(g.depth, length + 7, g.head_dim, dtype=BF16) for _ in "kv"]
     for part in cache:
         part[:, length:] = torch.nan
@@ -103,9 +111,49 @@ def problem(
     return Problem(config, layers, small, table, noise, cache[0], cache[1], length)
 
 
+WAYS = ("same", "held", "guided", "distinct")
+
+
+def by_token(p: Problem, way: str, seed: int = 0) -> Problem:
+    """The same for the form in which every token has its own time and step, with random numbers for what is new.
+
+    way  "same": the times that they all had; "held": the first quarter, and at least one, stays as it is; "guided": the
+        same times, with guidance; "distinct": each token and step has a row of the table, a step and a gain of its own
+
+    Raises ValueError for another way.
+    """
+    if way not in WAYS:
+        raise ValueError(f"{way!r}: expected one of {', '.join(WAYS)}")
+    steps, (tokens, actions), device = len(p.table), p.noise.shape, p.noise.device
+    gen = torch.Generator(device).manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=gen, device=device)
+
+    def each_token(by_step: Tensor) -> Tensor:
+        return by_step[:, None].repeat(1, tokens)
+
+    table, rows = p.table, each_token(torch.arange(steps, dtype=torch.int32, device=device))
+    times = each_token(1 - torch.arange(steps, device=device) / steps)
+    lengths = torch.full(rows.shape, -1.0 / steps, device=device)
+    target, gain = torch.zeros(tokens, actions, device=device), torch.zeros(rows.shape, device=device)
+    if way == "held":
+        held = max(tokens // 4, 1)
+        table = torch.cat((table, modulation(p.config.expert, 1, gen)))
+        rows[:, :held], times[:, :held], lengths[:, :held] = steps, 0, 0
+    elif way == "distinct":
+        table = modulation(p.config.expert, steps * tokens, gen)
+        rows = torch.randperm(steps * tokens, generator=gen, device=device).int().view(steps, tokens)
+        times, lengths = uniform(steps, tokens), uniform(steps, tokens) * (-2.0 / steps)
+    if way in ("guided", "distinct"):
+        target, gain = uniform(tokens, actions) * 2 - 1, uniform(steps, tokens) * 2
+    return dataclasses.replace(p, table=table, tokens=TokenInputs(rows, lengths, times, target, gain))
+
+
 def plain(p: Problem, dtype: torch.dtype, operand: Operand = lambda x, layer, product: x) -> tuple[Tensor, Tensor]:
     noise = p.noise.to(dtype)
-    return denoise_plain(p.config, p.layers, p.small, p.table, noise, p.cache_k, p.cache_v, p.length, operand)
+    cache = p.cache_k, p.cache_v, p.length
+    return denoise_plain(p.config, p.layers, p.small, p.table, noise, *cache, operand, p.tokens)
 
 
 def input_scales(p: Problem) -> dict[str, float]:
@@ -134,7 +182,8 @@ def ordinary_bf16(p: Problem) -> Tensor:
     def affine(name: str, x: Tensor) -> Tensor:
         return F.linear(x, p.small[f"{name}.weight"], p.small[f"{name}.bias"])
 
-    for modulation in p.table:
+    by_step = p.table[:, :, :, None] if p.tokens is None else p.table[p.tokens.rows.long()].movedim(1, 3)
+    for step, modulation in enumerate(by_step):
         x = affine("action_in_proj", x_t).to(BF16)
         for i, layer in enumerate(p.layers):
             y, gate = normed(x, modulation[2 * i])
@@ -149,7 +198,10 @@ def ordinary_bf16(p: Problem) -> Tensor:
             up_gate, up = F.linear(y, layer.gate_up).chunk(2, dim=-1)
             x = x + F.linear(F.gelu(up_gate, approximate="tanh") * up, layer.down) * gate
         v_t = affine("action_out_proj", normed(x, modulation[2 * g.depth])[0].float())
-        x_t = euler_step(x_t, v_t, p.table.shape[0])
+        if p.tokens is None:
+            x_t = euler_step(x_t, v_t, len(p.table))
+        else:
+            x_t = x_t + p.tokens.steps[step, :, None] * guided(x_t, v_t, p.tokens, step)
     return x_t
 
 

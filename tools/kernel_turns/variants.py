@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from kernel_turns.problems import WAYS
 from turbopi.kernels.sm90.denoise import kernel as denoise
 
 KERNELS = Path("src/turbopi/kernels/sm90")
@@ -18,14 +19,20 @@ KERNELS = Path("src/turbopi/kernels/sm90")
 
 class Variant:
     """What `SPEC` says: "here", a folder as kernels/sm90 is, or a patch of this tree (.patch, or .patch.xz); behind
-    it +NAME=VALUE for constants, as in "rows.patch+TP_ROUND_FRAGMENTS=4".
+    it +NAME=VALUE for constants, as in "rows.patch+TP_ROUND_FRAGMENTS=4", and @WAY for the form by token on a problem
+    of that way (`problems.by_token`), as in "here@held".
 
-    Raises ValueError for a place that doesn't exist, a constant without a whole number, a patch that doesn't fit.
+    Raises ValueError for a place that doesn't exist, a constant without a whole number, a patch that doesn't fit, a
+    way that there isn't.
     """
 
     def __init__(self, spec: str) -> None:
         self.spec = spec
-        place, *constants = spec.split("+")
+        kernel, _, way = spec.partition("@")
+        if "@" in spec and way not in WAYS:
+            raise ValueError(f"@{way}: expected @ and one of {', '.join(WAYS)}")
+        self.way = way or None
+        place, *constants = kernel.split("+")
         self.constants = dict(_constant(text) for text in constants)
         self.module = _load(self._folder(place))
         self._sizes = self.module.kernel_sizes

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 EMULATED = "tests/test_kernels_emulated.py::test_a_product_in_bf16_is_right_in_whatever_order_its_threads_go"
+PRODUCTS = "tests/test_kernels_denoise_emulated.py"
 CHOICE = "tests/test_fused_choice.py"
 ARGUMENTS = "tests/test_kernels_arguments.py"
 GEOMETRY = "tests/test_launch_geometry.py"
+BY_TOKEN = "tests/test_kernels_denoise_by_token.py"
 ENGINE = "tests/test_engine.py::test_equals_the_reference_for_odd_prompts_and_cameras"
 PARITY = "tests/test_model_parity.py::test_float32_equals_openpi_within_float32_rounding"
 
@@ -58,6 +60,30 @@ FAULTS = (
         '"x_t": v_t, "v_t": x_t}',
         "velocities leave as actions, and memory behind v_t is overwritten",
         (GEOMETRY,),
+    ),
+    Fault(
+        "times and steps of tokens swapped in the denoising kernel's struct",
+        "turbopi.kernels",
+        '"token_steps": (tokens.steps, by_step),\n            "token_times": (tokens.times, by_step),',
+        '"token_steps": (tokens.times, by_step),\n            "token_times": (tokens.steps, by_step),',
+        "denoising adds noise; actions that are held stay",
+        (GEOMETRY,),
+    ),
+    Fault(
+        "a token's factors given to its neighbour's column",
+        "turbopi.kernels",
+        "make_float4(even.x, odd.x, even.y, odd.y)",
+        "make_float4(even.x, even.y, odd.x, odd.y)",
+        "where tokens have different times every norm is wrong",
+        (BY_TOKEN,),
+    ),
+    Fault(
+        "guidance by identity in the wrong direction",
+        "turbopi.kernels",
+        "__fsub_rn(target, chunk)",
+        "__fsub_rn(chunk, target)",
+        "a new chunk jumps away from the one that runs",
+        (BY_TOKEN,),
     ),
     Fault(
         "the denoising kernel's output projection not transposed",
@@ -250,6 +276,38 @@ FAULTS = (
         "x = (FP8 ? twice_gelu(sums[BN / 4 + 4 * j + 2 * half]) : gelu(sums[BN / 4 + 4 * j + 2 * half])) * x;",
         "every second hidden unit is wrong",
         (EMULATED,),
+    ),
+    Fault(
+        "core matrices of packed weights by columns first",
+        "turbopi.kernels",
+        "ordered = tiles.view(count, 2, 8, blocks, 2, per).permute(0, 3, 1, 4, 2, 5)",
+        "ordered = tiles.view(count, 2, 8, blocks, 2, per).permute(0, 3, 4, 1, 2, 5)",
+        "every product of the action expert is wrong",
+        (PRODUCTS,),
+    ),
+    Fault(
+        "ldmatrix's quarters of lanes swapped in the denoising kernel",
+        "turbopi.kernels",
+        "b.lane() / 8 % 2 * 256 + b.lane() / 16 * 128",
+        "b.lane() / 8 % 2 * 128 + b.lane() / 16 * 256",
+        "queries, keys and values of few tokens are wrong",
+        (PRODUCTS,),
+    ),
+    Fault(
+        "parts of the reduction meet each other's activations",
+        "turbopi.kernels",
+        "const int here = min(fragment + my.part, most(blocks, KB) - 1);",
+        "const int here = min(fragment, most(blocks, KB) - 1);",
+        "models whose widths divide nothing get wrong sums",
+        (PRODUCTS,),
+    ),
+    Fault(
+        "weights' slot given back before its products are done",
+        "turbopi.kernels",
+        "await_products<1>();  // the round before is done",
+        "await_products<2>();  // the round before is done",
+        "weights are overwritten while they are multiplied: wrong now and then",
+        (PRODUCTS,),
     ),
     Fault(
         "a graph's replay isn't waited for",

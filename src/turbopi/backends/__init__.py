@@ -14,7 +14,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.model.conditioning import Form
-from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.plan import TIERS
 
 __all__ = [

@@ -15,7 +15,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine import without_compiler
 from turbopi.engine.call import CallShape
 from turbopi.engine.compiled import compiled
-from turbopi.engine.recent import Loop
+from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import GraphRunner
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendError
@@ -54,7 +54,7 @@ class CudaGraphBackend(GraphRunner):
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """None: the engine's operations one by one."""
-        if self._ops is not without_compiler.OPS or table is None:
+        if self._ops is not without_compiler.OPS or table is None or shape.loop.form != "plain":
             return None
         if shape.num_steps not in self._loops:
             self._loops[shape.num_steps] = without_compiler.Denoiser.prepare(self.config, self._weights, table)
@@ -62,5 +62,5 @@ class CudaGraphBackend(GraphRunner):
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
-        if loop[0] not in {steps for steps, _ in self._recent}:
-            self._loops.pop(loop[0], None)
+        if loop.steps not in {other.steps for other in self._recent if other.form == "plain"}:
+            self._loops.pop(loop.steps, None)

@@ -16,7 +16,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.emulate import put_into_norm, round_activation, round_weight
 from turbopi.model.conditioning import Form
 from turbopi.model.sites import linears, norm_of
-from turbopi.quantization.artifact import Quantization, check_given
+from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.plan import TIERS
 from turbopi.quantization.sites import sites
 

@@ -18,13 +18,13 @@ from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.lost import ADVICE
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
-from turbopi.engine.recent import Loop
+from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import MAX_CAMERAS, bucket
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
 from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.kernels.quantize import quantize
-from turbopi.quantization.artifact import Quantization, check_given
+from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.fp8 import Directions, Matrix
 from turbopi.quantization.plan import TIERS
 from turbopi.toolchain import missing_for_c
@@ -53,8 +53,8 @@ class FusedBackend(CudaGraphBackend):
         self._quantization = quantization
         self._plan = None if quantization is None else quantization.plan(config, precision)
         self._packed_expert: PackedExpert | None = None
-        self._denoisers: dict[tuple[int, int, int], DenoiseKernel] = {}  # by steps, horizon, cache rows
-        self._refused: dict[tuple[int, int, int], str] = {}  # what operations denoise, and why
+        self._denoisers: dict[tuple[Loop, int], DenoiseKernel] = {}  # by loop and cache rows
+        self._refused: dict[tuple[Loop, int], str] = {}  # what operations denoise, and why
         super().__init__(config, load, device=device, precision=precision)
 
     @classmethod
@@ -94,19 +94,16 @@ class FusedBackend(CudaGraphBackend):
                     plan[name] = expert  # its kernel takes one precision
             plan["expert"] = expert
 
-        def call_of(steps: int, horizon: int, _: int) -> str:
-            return f"H={horizon}, {steps} steps"
-
-        by_kernel = sorted({call_of(*key) for key in list(self._denoisers)})
+        by_kernel = sorted({str(loop) for loop, _ in list(self._denoisers)})
         by_operations: dict[str, list[str]] = {}
-        for key, why in list(self._refused.items()):
+        for (loop, _), why in list(self._refused.items()):
             calls = by_operations.setdefault(f"operations, as {why}", [])
-            if (call := call_of(*key)) not in calls:
-                calls.append(call)
+            if str(loop) not in calls:
+                calls.append(str(loop))
         described["denoising"] = ({"one CUDA kernel": by_kernel} if by_kernel else {}) | by_operations
         clocks = {
-            call_of(*key): round(clock)
-            for key, kernel in list(self._denoisers.items())
+            str(loop): round(clock)
+            for (loop, _), kernel in list(self._denoisers.items())
             if (clock := kernel.clock_mhz()) is not None
         }
         if clocks:
@@ -149,14 +146,13 @@ class FusedBackend(CudaGraphBackend):
         return fused_ops(self.device)
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
-        """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, horizon or GPU."""
-        horizon, steps = shape.horizon, shape.num_steps
+        """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, loop or GPU."""
         cameras = min(max(shape.cameras, 3), MAX_CAMERAS)
         rows = cameras * self.config.vision.num_tokens + bucket(self.config.max_prompt_tokens)
-        key = (steps, horizon, rows)
+        key = (shape.loop, rows)
         if key not in self._denoisers and key not in self._refused:
             try:
-                self._denoisers[key] = self._denoising_kernel(horizon, rows, table)
+                self._denoisers[key] = self._denoising_kernel(shape.loop, rows, table)
             except BackendUnavailable as e:
                 self._refused[key] = str(e)
         if key in self._denoisers:
@@ -168,21 +164,23 @@ class FusedBackend(CudaGraphBackend):
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
-        kept: dict[tuple[int, int, int], Any]
+        kept: dict[tuple[Loop, int], Any]
         for kept in (self._denoisers, self._refused):
-            for key in [key for key in kept if key[:2] == loop]:
+            for key in [key for key in kept if key[0] == loop]:
                 del kept[key]
         if self._denoisers:  # if no graph of operations is left, none points to the matrices on the device
             self._put_expert_away()
 
-    def _denoising_kernel(self, horizon: int, rows: int, table: Tensor | None) -> "DenoiseKernel":
+    def _denoising_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> "DenoiseKernel":
         """Raises BackendUnavailable for what it doesn't cover."""
         from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, DenoiseKernel, unavailable
         from turbopi.kernels.sm90.denoise.packing import PackedExpert, refusal
 
         reason = unavailable(self.device) or refusal(self.config)
-        if reason is None and horizon > MAX_SUFFIX:
+        if reason is None and loop.horizon > MAX_SUFFIX:
             reason = f"the denoising kernel takes up to {MAX_SUFFIX} actions"
+        if reason is None and loop.form == "jacobian":
+            reason = "the denoising kernel has no way back, which the true Jacobian takes"
         if reason is not None or table is None:
             raise BackendUnavailable(reason or "there is no modulation")
         if self._packed_expert is None:
@@ -191,7 +189,10 @@ class FusedBackend(CudaGraphBackend):
                 self.config, self._weights.expert, inputs=self._expert_inputs(), directions=self._directions
             )
         packed, small = self._packed_expert, self._weights.small
-        kernel = DenoiseKernel(self.config, packed, small, table, cache_rows=rows, suffix=horizon, device=self.device)
+        by_token = {} if loop.form == "plain" else {"num_steps": loop.steps, "by_token": True}
+        kernel = DenoiseKernel(
+            self.config, packed, small, table, cache_rows=rows, suffix=loop.horizon, device=self.device, **by_token
+        )
         self._put_expert_away()
         return kernel
 

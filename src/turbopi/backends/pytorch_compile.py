@@ -14,7 +14,7 @@ from torch import Tensor
 from turbopi.backends.base import LoadState, Sample
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
-from turbopi.engine.limits import not_warm
+from turbopi.engine.not_warm import not_warm
 from turbopi.errors import ObservationError
 from turbopi.model.conditioning import Conditioning, Conditionings, Form
 from turbopi.model.reference import FloatPrecision, Pi0Model

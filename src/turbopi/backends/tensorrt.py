@@ -22,8 +22,8 @@ from torch import Tensor
 from turbopi.backends.base import LoadState, Sample
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import Graph, Mark, building
-from turbopi.engine.limits import not_warm
-from turbopi.engine.recent import Loop, RecentLoops
+from turbopi.engine.not_warm import not_warm
+from turbopi.engine.recent_loops import Loop, RecentLoops
 from turbopi.engine.runner import golden_trace
 from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendError
@@ -260,7 +260,7 @@ class TensorRTBackend:
                 raise not_warm(self.name, f"{key.shape}, {key.num_steps} steps", warm, steps=key.num_steps)
             start = time.perf_counter()
             with building(self.device):
-                self._recent.use((key.num_steps, key.shape.horizon))
+                self._recent.use(Loop(key.num_steps, key.shape.horizon))
                 call = self._call(key)
                 run = {"call": call.run, "encode": call.encode, "denoise": call.denoise}[part]
                 before = call.parts.calls()
@@ -268,19 +268,19 @@ class TensorRTBackend:
             self._check_coverage(call, part, before)
             logger.info("captured %s of %s in %.2f s", part, key, time.perf_counter() - start)
         else:
-            self._recent.use((key.num_steps, key.shape.horizon))
+            self._recent.use(Loop(key.num_steps, key.shape.horizon))
         return self._graphs[key, part]
 
     def _forget(self, loop: Loop) -> None:
         """Let go of all that is a denoising loop's alone."""
         self._synchronize()  # one may still run whose call was interrupted
-        gone = {key for key in self._calls if (key.num_steps, key.shape.horizon) == loop}
+        gone = {key for key in self._calls if Loop(key.num_steps, key.shape.horizon) == loop}
         for kept in [key for key in self._graphs if key[0] in gone]:
             del self._graphs[kept]
         for key in gone:
             del self._calls[key]
-        if loop[0] not in {steps for steps, _ in self._recent}:
-            self._tables.pop(loop[0], None)
+        if loop.steps not in {other.steps for other in self._recent}:
+            self._tables.pop(loop.steps, None)
 
     def _check_coverage(self, call: EngineCall, part: str, before: list[int]) -> None:
         """Every engine of a part ran while it was captured, as often as it should: nothing was computed elsewhere."""

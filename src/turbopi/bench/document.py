@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Protocol
 
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from turbopi.bench.floors import Floors
+from turbopi.bench.machine_limits import Floors
 from turbopi.bench.work import Job, Work
 from turbopi.errors import ConfigError
 from turbopi.provenance import Gpu, Provenance

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, label
-from turbopi.bench.floors import Floors
+from turbopi.bench.machine_limits import Floors
 from turbopi.wording import significant
 
 _STAGES = ("vision", "prefix", "denoise")

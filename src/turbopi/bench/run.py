@@ -12,7 +12,7 @@ from msgspec.structs import asdict, replace
 from turbopi import backends
 from turbopi.backends import PRECISIONS, Precision
 from turbopi.bench.document import BenchDocument, BenchProvenance, Failed, Memory, Profile, Result
-from turbopi.bench.floors import Floors, measure_floors
+from turbopi.bench.machine_limits import Floors, measure_floors
 from turbopi.bench.measure import WARMING, Observations, answers, at_horizon, bench_policy, error_against, measure_calls
 from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.summary import linear_models, warnings_on

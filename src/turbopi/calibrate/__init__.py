@@ -5,6 +5,8 @@
 observations.py    what is measured on, and what is held out
 statistics.py      what the float32 reference sees at the sites, and the scales that follow
 product_errors.py  what rounding does to each site's own products
+report.py          what the file says of how it was made
 
-The reference with its sites rounded exactly is engine/emulate.py; the file that is written, quantization/artifact.py.
+The reference with its sites rounded exactly is engine/emulate.py; the file that is written,
+quantization/calibration_file.py.
 """

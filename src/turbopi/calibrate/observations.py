@@ -12,7 +12,7 @@ from turbopi.errors import ConfigError, ObservationError
 from turbopi.examples import Example, NoisyExample, prepared
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
-from turbopi.quantization.artifact import RANDOM_NOISE
+from turbopi.quantization.calibration_file import RANDOM_NOISE
 from turbopi.recordings import load_observation
 from turbopi.recordings.sources import chosen_files, spread
 

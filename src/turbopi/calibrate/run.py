@@ -19,6 +19,7 @@ from turbopi.backends.pytorch import reference_model
 from turbopi.calibrate import observations as observed
 from turbopi.calibrate.observations import Batch
 from turbopi.calibrate.product_errors import product_errors
+from turbopi.calibrate.report import read_report
 from turbopi.calibrate.statistics import METHODS, Histogram, Method, collect
 from turbopi.checkpoint import Checkpoint
 from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
@@ -27,10 +28,11 @@ from turbopi.errors import CheckpointError
 from turbopi.examples import NoisyExample, with_noises
 from turbopi.model.reference import Pi0Model, parameter_dtype
 from turbopi.policy import UnifiedPolicy
-from turbopi.quantization.artifact import RANDOM_NOISE, Quantization, SiteScale, shapes_of
+from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, SiteScale, shapes_of
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites
+from turbopi.reading import plain_document
 
 TARGET = 0.9975  # cosine of the actions' deltas that automatic choice of sites aims at
 ROOM = 0.8  # of the error that the target allows, on the few calls that sites are chosen on: others may be harder
@@ -113,7 +115,7 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     }
     del model, policy
     collect_and_empty_cache()
-    return Quantization(fingerprint, shapes_of(config), result.sites, report)
+    return Quantization(fingerprint, shapes_of(config), result.sites, plain_document(read_report(report)))
 
 
 @dataclass(frozen=True)

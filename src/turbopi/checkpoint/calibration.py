@@ -6,7 +6,7 @@ from pathlib import Path
 
 from turbopi.checkpoint.base import Checkpoint
 from turbopi.errors import ConfigError
-from turbopi.quantization.artifact import Quantization, check_given
+from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.plan import TIERS
 
 logger = logging.getLogger(__name__)

@@ -298,7 +298,16 @@ class LeRobotFolder:
         }
         if self.pipelines.rename_map:
             options["rename_map"] = self.pipelines.rename_map
+        if (names := self._action_names()) is not None:
+            options["action_names"] = names
         return options if mask is None else options | {"relative_dims": mask}
+
+    def _action_names(self) -> list[str] | None:
+        """The recording robot's, where the file has one for each action; LeRobot doesn't read others either."""
+        names = self.config.values.get("action_feature_names")
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            return None
+        return names if len(set(names)) == len(names) == self.action_dim else None
 
     def _check_actions(self, normalization: Normalization) -> None:
         width = self.action_dim if self.stats.actions is None else self.stats.actions.dim

@@ -1,6 +1,6 @@
 """The command line.
 
-turbopi demo | infer | serve | bench | calibrate | verify | eval |
+turbopi demo | infer | serve | view | bench | calibrate | verify | eval |
     compare | inspect | convert | export | build | study | backends | doctor
 """
 
@@ -15,6 +15,7 @@ from turbopi.cli import (  # noqa: F401
     demo,
     infer,
     serve,
+    view,
     bench,
     calibrate,
     verify,

@@ -144,7 +144,7 @@ def measure_scales(policy: "UnifiedPolicy", path: Path | None, method: str, outp
 
     model = reference_model(policy.backend)
     if path is not None and path.suffix == ".json" and path.is_file():
-        from turbopi.quantization.artifact import Quantization
+        from turbopi.quantization.calibration_file import Quantization
 
         quantization = Quantization.load(path)
         quantization.check(policy.config.model, policy._checkpoint.fingerprint())

@@ -15,7 +15,8 @@ from turbopi.errors import ConfigError
 from turbopi.wording import significant
 
 if TYPE_CHECKING:
-    from turbopi.quantization.artifact import Quantization
+    from turbopi.calibrate.report import ActionsError
+    from turbopi.quantization.calibration_file import Quantization
 
 
 @command(
@@ -117,7 +118,7 @@ def _replaced(out: Path) -> str | None:
     else: it would be lost.
     """
     from turbopi.errors import CalibrationError
-    from turbopi.quantization.artifact import Quantization
+    from turbopi.quantization.calibration_file import Quantization
 
     if not out.exists():
         return None
@@ -130,21 +131,21 @@ def _replaced(out: Path) -> str | None:
 
 
 def _show(result: "Quantization", output: Output) -> None:
-    report = result.report
-    seen = report["observations"]
+    from turbopi.calibrate.report import read_report
+
+    report = read_report(result.report)
+    seen, worst = report.observations, report.held_out.worst
     output.line(
-        f"{report['model']}: {len(seen['calibration'])} observations ({seen['source']}), {len(seen['held_out'])} more "
-        f"held out; {seen['noises']} noises, {report['steps']} steps, on {report['device']}"
+        f"{report.model}: {len(seen.calibration)} observations ({seen.source}), {len(seen.held_out)} more "
+        f"held out; {seen.noises} noises, {report.steps} steps, on {report.device}"
     )
-    methods = ", ".join(f"{name} {significant(error['relative_rms'])}" for name, error in report["methods"].items())
-    output.line(f"scales by {report['method']} (actions' relative rms: {methods})")
-    output.table(_table("one group of sites in FP8 alone, calibration observations", report["groups_alone"]))
-    held = {name: error for name, error in report["held_out"].items() if name != "worst"}
-    output.table(_table("held-out observations, against float32; sites that are kept run in float32 here", held))
-    worst = report["held_out"]["worst"]
+    methods = ", ".join(f"{name} {significant(error.relative_rms)}" for name, error in report.methods.items())
+    output.line(f"scales by {report.method} (actions' relative rms: {methods})")
+    output.table(_table("one group of sites in FP8 alone, calibration observations", report.groups_alone))
+    title = "held-out observations, against float32; sites that are kept run in float32 here"
+    output.table(_table(title, report.held_out.errors()))
     output.line(
-        f"worst: {worst['observation']}, noise seed {worst['seed']}: "
-        f"relative rms {significant(worst['relative_rms'])}; "
+        f"worst: {worst.observation}, noise seed {worst.seed}: relative rms {significant(worst.relative_rms)}; "
         f"largest saturation {significant(max(site.saturated for site in result.sites.values()))}"
     )
     kept: dict[str, list[str]] = {}
@@ -156,16 +157,15 @@ def _show(result: "Quantization", output: Output) -> None:
         output.line(f"stays in bf16: {shown}: {reason}", "yellow")
     for warning in result.warnings:
         output.line(f"WARNING: {warning}", "bold yellow")
-    took = ", ".join(f"{what} {seconds:.1f} s" for what, seconds in report["seconds"].items())
+    took = ", ".join(f"{what} {seconds:.1f} s" for what, seconds in report.seconds.items())
     output.line(took, "dim")
 
 
-def _table(title: str, errors: dict[str, dict[str, float]]) -> Table:
+def _table(title: str, errors: "dict[str, ActionsError]") -> Table:
     table = Table(title=title, title_justify="left")
     table.add_column("")
     for column in ("relative rms of the actions", "cosine of the deltas", "max"):
         table.add_column(column, justify="right")
     for name, error in errors.items():
-        rms, most = significant(error["relative_rms"]), significant(error["max"])
-        table.add_row(name, rms, f"{error['delta_cosine']:.6f}", most)
+        table.add_row(name, significant(error.relative_rms), f"{error.delta_cosine:.6f}", significant(error.max))
     return table

@@ -177,7 +177,7 @@ class _Run:
         self.output.table(table)
 
     def _show_chunk(self, actions: "np.ndarray") -> None:
-        from turbopi.plots import action_groups
+        from turbopi.showing import action_groups
 
         steps, dims = actions.shape
         shown = min(steps, 10, max(3, (self.output.console.width - 42) // 9))

@@ -240,7 +240,8 @@ def _show_timings(timings: list[dict[str, float]], output: Output) -> None:
 
 
 def _plot(file: Path, about: dict[str, Any], answers: list[_Answer]) -> None:
-    from turbopi.plots import Row, pictures_of, plot_chunks
+    from turbopi.plots import Row, plot_chunks
+    from turbopi.showing import pictures_of
 
     rows = [
         Row(_prompt(answer.observation, about), pictures_of(answer.observation), answer.actions)

@@ -132,8 +132,8 @@ class RobotOptions(WeightOptions):
             "--robot",
             panel=_WEIGHTS,
             metavar="NAME|FILE|CLASS",
-            help="Instead of the configuration's robot: a built-in one, a description (.json), or your own class as "
-            "module:Class, whose code is run.",
+            help="Instead of the configuration's robot: a built-in one, a type of LeRobot's (so101_follower), a "
+            "description (.json), or your own class as module:Class, whose code is run.",
         ),
     ] = None
 
@@ -262,6 +262,6 @@ class PolicyOptions(RobotOptions):
             return self.quantization
         if self.quantization is None:
             raise ConfigError("--fp8-parts narrows a calibration: name it with --quantization FILE")
-        from turbopi.quantization.artifact import Quantization
+        from turbopi.quantization.calibration_file import Quantization
 
         return Quantization.load(self.quantization).only([part.strip() for part in self.fp8_parts.split(",")])

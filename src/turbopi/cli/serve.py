@@ -70,6 +70,14 @@ def serve(
     record: Annotated[
         Path | None, typer.Option("--record", metavar="DIR", help="Write every observation and its actions below DIR.")
     ] = None,
+    page: Annotated[
+        bool | None,
+        typer.Option(
+            "--page/--no-page",
+            help="A page for your browser on the same port: robots, pictures, action chunks, latency.",
+            show_default="on, unless others could see it without an API key",
+        ),
+    ] = None,
     execution: Annotated[
         str | None,
         typer.Option(
@@ -115,8 +123,8 @@ def serve(
 ) -> None:
     """Serve a policy to openpi's clients.
 
-    Speaks openpi's websocket protocol; /healthz and /metrics (Prometheus) answer on the same port. Ctrl-C finishes the
-    inference that runs, then stops.
+    Speaks openpi's websocket protocol; /healthz, /metrics (Prometheus) and a page for people answer on the same port.
+    Ctrl-C finishes the inference that runs, then stops.
     """
     output = Output()
     options.check(checkpoint)
@@ -132,6 +140,7 @@ def serve(
         record_dir=record,
         allowed_hosts=[] if allowed_hosts is None else [name.strip() for name in allowed_hosts.split(",")],
         max_clients=max_clients,
+        page=page,
         execution=cast("JoinMode | None", execution),  # checked there
         control_hz=control_hz,
         execution_horizon=execution_horizon,

@@ -6,7 +6,6 @@ Pictures come before the first part, as cameras differ in their sizes; the secon
 pinned buffer, and actions come back in one.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,10 +16,16 @@ from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine import forward
+from turbopi.engine.backward import Expert, suffix_vjp
+from turbopi.engine.conditioned import Conditioned
+from turbopi.engine.flat import allocate
 from turbopi.engine.graph import Mark
+from turbopi.engine.recent_loops import Loop
 from turbopi.engine.resize import Resizer
 from turbopi.engine.weights import Weights
+from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.model.conditioning import Conditioning
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.preprocess.images import fitted
 
@@ -31,9 +36,16 @@ class CallShape:
 
     cameras: int  # valid ones
     prompt_slots: int  # the bucket: valid prompt tokens and padding behind them
-    horizon: int
-    num_steps: int
+    loop: Loop
     float_images: bool = False  # LeRobot's resizing leaves the uint8 grid
+
+    @property
+    def horizon(self) -> int:
+        return self.loop.horizon
+
+    @property
+    def num_steps(self) -> int:
+        return self.loop.steps
 
     def prefix_slots(self, config: ModelConfig) -> int:
         return self.cameras * config.vision.num_tokens + self.prompt_slots
@@ -51,7 +63,7 @@ class CallShape:
 
 @dataclass(frozen=True)
 class Inputs:
-    """All but pictures: views into one flat buffer, on the host or on the device. Offsets are multiples of 16 bytes."""
+    """All but pictures: views into one flat buffer, on the host or on the device."""
 
     flat: Tensor  # uint8
     noise: Tensor  # float32[H, action_dim]
@@ -67,13 +79,7 @@ class Inputs:
             "tokens": ((shape.prompt_slots,), torch.int64),
             "length": ((1,), torch.int64),
         }
-        sizes = {name: math.prod(dims) * dtype.itemsize for name, (dims, dtype) in fields.items()}
-        padded = {name: (count + 15) // 16 * 16 for name, count in sizes.items()}
-        flat = torch.zeros(sum(padded.values()), dtype=torch.uint8, device=device, pin_memory=pinned)
-        views, start = {}, 0
-        for name, (dims, dtype) in fields.items():
-            views[name] = flat[start : start + sizes[name]].view(dtype).view(dims)
-            start += padded[name]
+        flat, views = allocate(fields, device, pinned=pinned)
         return cls(flat, **views)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -173,7 +179,7 @@ class StaticCall:
         shape: CallShape,
         pictures: Pictures,
         cache: Cache,
-        table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation
+        table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation; a conditioned loop's: [U, …]
     ) -> None:
         self.config, self.weights, self.ops, self.shape, self.pictures = config, weights, ops, shape, pictures
         assert (pictures.cameras, pictures.float_images) == (shape.cameras, shape.float_images), shape
@@ -188,8 +194,10 @@ class StaticCall:
         self.rope = forward.rope_of_all_positions(config, rows, device)
         self.suffix_offsets = torch.arange(suffix, device=device)
         self.embs = pictures.embs[: shape.prefix_slots(config)]
-        times = time_grid(shape.num_steps, config.time_grid)
+        plain = shape.loop.form == "plain"
+        times = time_grid(shape.num_steps, config.time_grid) if plain else np.array(shape.loop.times, np.float32)
         self.time_embs = time_embedding(times, config.expert.width).to(device)  # Pi0's
+        self.asked = None if plain else Conditioned.allocate(config, shape.loop, device)
         self.host = Inputs.allocate(config, shape, torch.device("cpu"), pinned=on_gpu)
         self._arrays = self.host.arrays()
         self.inputs = Inputs.allocate(config, shape, device, pinned=False)
@@ -199,15 +207,31 @@ class StaticCall:
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
         self.actions_array = self.actions.numpy()
 
-    def write_inputs(self, noise: np.ndarray, state: np.ndarray, tokens: np.ndarray) -> None:
-        """Put what an observation has beside its pictures into the host buffer: of the tokens the valid ones only."""
+    def write_inputs(
+        self,
+        noise: np.ndarray,
+        state: np.ndarray,
+        tokens: np.ndarray,
+        conditioning: Conditioning | None = None,
+    ) -> None:
+        """Put what a call has beside its pictures into the host buffer: of the tokens the valid ones only.
+
+        `conditioning` is one of the shape's loop.
+        """
         arrays = self._arrays
-        arrays["noise"][:] = noise
+        arrays["noise"][:] = self.started(noise, conditioning)
         arrays["state"][:] = state
         padded = arrays["tokens"]
         padded[: len(tokens)] = tokens
         padded[len(tokens) :] = 0
         arrays["length"][0] = self.pictures.rows + len(tokens)
+
+    def started(self, noise: np.ndarray, conditioning: Conditioning | None) -> np.ndarray:
+        """x float32[H, A] before the first step; what else the conditioning asks for goes into the host's buffer."""
+        if self.asked is None or conditioning is None:
+            return noise
+        self.asked.write(conditioning)
+        return conditioning.started(noise)
 
     def run(self, mark: Mark = lambda stage: None) -> None:
         """All kernels of the call, in order. `mark` is told the end of each stage."""
@@ -232,11 +256,13 @@ class StaticCall:
 
     def denoise(self, mark: Mark = lambda stage: None) -> None:
         """Noise to actions on the host, all steps, from the cache's first rows."""
+        if self.asked is not None:
+            self.asked.upload()
         if self.denoiser is None:
             self._denoise_by_operations()
         else:
-            inputs = self.inputs
-            self.denoiser.launch(inputs.noise, self.cache_k, self.cache_v, inputs.length, self.x_t, self.v_t)
+            inputs, by_token = self.inputs, () if self.asked is None else (self.asked.tokens,)
+            self.denoiser.launch(inputs.noise, self.cache_k, self.cache_v, inputs.length, self.x_t, self.v_t, *by_token)
         self.actions.copy_(self.x_t[-1], non_blocking=True)
         mark("denoise")
 
@@ -247,19 +273,57 @@ class StaticCall:
         rope = (self.rope[0][positions], self.rope[1][positions])
         self.x_t[0] = self.inputs.noise
         for step in range(self.shape.num_steps):
-            out = forward.expert_output(
-                self.config,
-                self.weights,
-                self.ops,
-                self._suffix_tokens(step),
-                None if self.table is None else self.table[step],
-                self.inputs.length,
-                self.cache_k,
-                self.cache_v,
-                rope,
-            )
-            self.v_t[step] = self._project("action_out_proj", out[-self.shape.horizon :])
-            self.x_t[step + 1] = euler_step(self.x_t[step], self.v_t[step], self.shape.num_steps)
+            x_t = self.x_t[step]
+            if self.asked is None:
+                v_t = self._velocity(step, rope)
+                self.x_t[step + 1] = euler_step(x_t, v_t, self.shape.num_steps)
+            else:
+                v_t = self._guided_velocity(self.asked, step, rope)
+                self.x_t[step + 1] = self.asked.next_x(step, x_t, v_t)
+            self.v_t[step] = v_t
+
+    def _velocity(self, step: int, rope: forward.Rope) -> Tensor:
+        """v_t float32[H, A] of x_t, without guidance."""
+        out = forward.expert_output(
+            self.config,
+            self.weights,
+            self.ops,
+            self._suffix_tokens(step),
+            self._modulation(step),
+            self.inputs.length,
+            self.cache_k,
+            self.cache_v,
+            rope,
+        )
+        return self._project("action_out_proj", out[-self.shape.horizon :])
+
+    def _guided_velocity(self, asked: Conditioned, step: int, rope: forward.Rope) -> Tensor:
+        """v_t float32[H, A], pulled as `model.conditioning` says."""
+        x_t, gain, horizon = self.x_t[step], asked.tokens.gain[step, :, None], self.shape.horizon
+        if self.shape.loop.form == "tokens":
+            v_t = self._velocity(step, rope)
+            return v_t - gain * asked.error(step, x_t, v_t)
+        back, cache = self.ops.backward or PLAIN_BACKWARD, (self.cache_k, self.cache_v)
+        table, length = self._modulation(step), self.inputs.length
+        expert = Expert(self.config, self.weights, self.ops, back, table, length, *cache, rope)
+        out, kept, last = expert.forward(self._suffix_tokens(step))
+        v_t = self._project("action_out_proj", out[-horizon:])
+        error = asked.error(step, x_t, v_t) * asked.weights
+        d_out = torch.zeros_like(out)  # Pi0's state token has no velocity
+        d_out[-horizon:] = (asked.tokens.times[step, :, None] * error) @ self.weights.small["action_out_proj.weight"]
+        d_tokens = expert.vjp(kept, last, d_out)[-horizon:]
+        through = suffix_vjp(self.config, self.weights.small, x_t, self._time(step), d_tokens)
+        return v_t - gain * (error - through)
+
+    def _time(self, step: int) -> Tensor:
+        """The time embedding float32[D], or [H, D] by token."""
+        return self.time_embs[step if self.asked is None else self.asked.tokens.rows[step]]
+
+    def _modulation(self, step: int) -> Tensor | None:
+        """float32[2 * layers + 1, 3, D], or [2 * layers + 1, 3, H, D] by token."""
+        if self.table is None:
+            return None
+        return self.table[step] if self.asked is None else self.asked.modulation(self.table, step)
 
     def _suffix_tokens(self, step: int) -> Tensor:
         """The suffix [H, D] of a step: actions, and for Pi0 the state token before them and the time mixed in."""
@@ -267,7 +331,7 @@ class StaticCall:
         dtype = self.weights.embed_tokens.dtype
         if self.config.kind == "pi05":
             return actions.to(dtype)
-        mixed = torch.cat((actions, self.time_embs[step].expand_as(actions)), dim=-1)
+        mixed = torch.cat((actions, self._time(step).expand_as(actions)), dim=-1)
         actions = self._project("action_time_mlp_out", F.silu(self._project("action_time_mlp_in", mixed)))
         return torch.cat((self._project("state_proj", self.inputs.state[None]), actions)).to(dtype)
 

@@ -26,7 +26,8 @@ from turbopi.kernels.plain import (
     vision_attention,
 )
 
-# Axes that differ from call to call (tokens, keys), by argument; all others are fixed by the model's sizes.
+# Axes that differ from call to call (tokens, keys), by argument; all others are fixed by the model's sizes. A norm's
+# gate, scale and shift are [width], or [tokens, width] in a conditioned loop.
 _DYNAMIC_AXES: dict[Callable[..., Any], dict[str, tuple[int, ...]]] = {
     residual_rms_norm: {"x": (0,), "y": (0,)},
     residual_layer_norm: {"x": (0,), "y": (0,)},
@@ -77,6 +78,7 @@ def compiled() -> Ops:
 
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     jitted = torch.compile(function, fullgraph=True)
+    by_token = ("gate", "scale", "shift") if function is residual_rms_norm else ()
     names = list(inspect.signature(function).parameters)
     dynamic_axes = _DYNAMIC_AXES[function]
     # elsewhere a second width would make widths unknown, too, and every index a division
@@ -84,7 +86,8 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def call(*args: Any) -> Any:
         for name, arg in zip(names, args, strict=False):
-            for axis in dynamic_axes.get(name, ()) if arg is not None else ():
+            axes = (0,) if name in by_token and arg is not None and arg.dim() == 2 else dynamic_axes.get(name, ())
+            for axis in axes if arg is not None else ():
                 torch._dynamo.maybe_mark_dynamic(arg, axis)
         with torch._dynamo.config.patch(recompile_limit=_RECOMPILE_LIMIT, automatic_dynamic_shapes=unknown_numbers):
             return jitted(*args)

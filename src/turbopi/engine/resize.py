@@ -4,7 +4,8 @@ Sources: Pillow's `Resample.c` (precompute_coeffs, normalize_coeffs_8bpc), PyTor
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ from turbopi.kernels.interface import PILLOW_BITS, SOURCE, Taps
 from turbopi.preprocess.images import RESIZES, copy_picture, placement
 
 MOST_SIZES = 16  # of pictures whose weights are kept
+COPIERS = 4  # threads that copy a call's pictures, the caller's among them
+SLAB = 1 << 18  # bytes that are worth waking a thread for
 
 
 class Resizer:
@@ -28,24 +31,43 @@ class Resizer:
         self.table = torch.zeros_like(self._host, device=self._device)
         self._staged: list[tuple[Tensor, Tensor] | None] = [None] * len(images)  # bytes on the host and on the device
         self._taps: OrderedDict[tuple[int, int, bool], tuple[Taps, Taps, int, int]] = OrderedDict()  # see `_place`
+        self._helpers = ThreadPoolExecutor(COPIERS - 1, "turbopi-pictures")
 
     def upload(self, pictures: Sequence[np.ndarray | None], resize: ImageResize) -> None:
         """Send pictures uint8[h, w, 3], without waiting; None: what `images` holds is kept. All may change afterwards.
 
         Raises ObservationError for a picture that is too narrow.
         """
-        before = self._rows.copy()
+        rows = np.zeros_like(self._rows)
         for camera, picture in enumerate(pictures):
-            self._rows[camera] = 0 if picture is None else self._send(camera, picture, RESIZES[resize].low)
-        if not np.array_equal(before, self._rows):
+            if picture is not None:
+                rows[camera] = self._row(camera, picture, RESIZES[resize].low)
+        self._send(pictures)
+        if not np.array_equal(rows, self._rows):  # `_rows` is what `table` has: a call that fails above changes neither
+            self._rows[:] = rows
             self.table.copy_(self._host, non_blocking=True)
 
-    def _send(self, camera: int, picture: np.ndarray, low: float) -> tuple[int, ...]:
-        """A row of the table."""
+    def _send(self, pictures: Sequence[np.ndarray | None]) -> None:
+        """Bytes to their places on the device: threads copy slabs of rows, and each leaves as soon as it is copied."""
+        size = max(SLAB, -(-sum(one.size for one in pictures if one is not None) // COPIERS))
+        slabs = [
+            slab
+            for camera, picture in enumerate(pictures)
+            if picture is not None
+            for slab in _slabs(picture, *self._stage(camera, picture.size), size)
+        ]
+        others = [self._helpers.submit(_copy, picture, host) for picture, host, _ in slabs[1:]]
+        for (picture, host, device), copying in zip(slabs, [None, *others], strict=False):
+            if copying is None or copying.cancel():  # cancelled: no thread has come to it yet
+                _copy(picture, host)
+            else:
+                copying.result()
+            device.copy_(host, non_blocking=True)
+
+    def _row(self, camera: int, picture: np.ndarray, low: float) -> tuple[int, ...]:
+        """Of the table."""
         rows, columns, top, left = self._place(picture.shape[0], picture.shape[1])
-        host, device = self._stage(camera, picture.size)
-        copy_picture(picture, host.numpy().reshape(picture.shape))
-        device.copy_(host, non_blocking=True)
+        _, device = self._stage(camera, picture.size)
         taps = (columns.first, columns.weights, rows.first, rows.weights)
         sizes = (picture.shape[1], picture.shape[0], columns.weights.shape[1], rows.weights.shape[1])
         filled = (len(rows.first), len(columns.first))
@@ -71,6 +93,20 @@ class Resizer:
                 self._taps.popitem(last=False)
         self._taps.move_to_end(key)
         return self._taps[key]
+
+
+def _slabs(picture: np.ndarray, host: Tensor, device: Tensor, size: int) -> Iterator[tuple[np.ndarray, Tensor, Tensor]]:
+    """Rows of a picture, about `size` bytes of them, with their places on the host and the device."""
+    count = -(-picture.size // size)
+    rows = -(-len(picture) // count)
+    for top in range(0, len(picture), rows):
+        part = picture[top : top + rows]
+        begin = top * picture[0].size
+        yield part, host[begin : begin + part.size], device[begin : begin + part.size]
+
+
+def _copy(picture: np.ndarray, host: Tensor) -> None:
+    copy_picture(picture, host.numpy().reshape(picture.shape))
 
 
 def taps_of(had: int, wanted: slice, pillow: bool) -> Taps:

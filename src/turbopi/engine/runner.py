@@ -2,9 +2,10 @@
 
 A call is two graphs. The first, vision, is for a number of valid cameras; it can start before the prompt is known. The
 second, prefix and all denoising steps, is for a bucket, which rounds the prompt's length up to a multiple of 16, too;
-inside it nothing is captured anew when pictures, prompt, state or noise change. A bucket that warm-up didn't capture is
-captured when first needed, with a log line, or refused if the runner is `strict`. Graphs of the denoising loops (steps,
-horizon) used last are kept, see recent.py. Batches run one observation after the other.
+inside it nothing is captured anew when pictures, prompt, state or noise change. That of a conditioned call is for its
+form and the times that its actions may have, whatever is held or pulls. A bucket that warm-up didn't capture is
+captured when first needed, with a log line, or refused if the runner is `strict`. Graphs of the denoising loops used
+last are kept, see recent_loops.py. Batches run one observation after the other.
 """
 
 import logging
@@ -19,12 +20,14 @@ from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
+from turbopi.engine.conditioned import conditioned_loop
 from turbopi.engine.graph import Graph, Mark, building
-from turbopi.engine.limits import not_warm
-from turbopi.engine.recent import Loop, RecentLoops
-from turbopi.engine.weights import Weights, modulation
+from turbopi.engine.not_warm import not_warm
+from turbopi.engine.recent_loops import Loop, RecentLoops
+from turbopi.engine.weights import Weights, modulation, modulation_at
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.model.conditioning import Conditioning, Conditionings, Form, of_rows
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import Trace
 from turbopi.model.sample import Sample
@@ -61,9 +64,16 @@ class Begun:
     def __init__(self, runner: "GraphRunner", cameras: int, float_images: bool) -> None:
         self._runner, self.cameras, self.float_images = runner, cameras, float_images
 
-    def finish(self, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+    def finish(
+        self,
+        tokens: np.ndarray,
+        state: np.ndarray,
+        noise: np.ndarray,
+        num_steps: int,
+        conditioning: Conditioning | None = None,
+    ) -> Sample:
         """See `turbopi.backends.base.Begins`."""
-        call, graph = self._runner._continue(self, "answer", tokens, state, noise, num_steps)
+        call, graph = self._runner._continue(self, "answer", tokens, state, noise, num_steps, conditioning)
         return Sample(torch.from_numpy(call.actions_array[None].copy()), graph.stage_ms())
 
 
@@ -74,6 +84,7 @@ class GraphRunner:
     """
 
     name: ClassVar[str]
+    forms: ClassVar[tuple[Form, ...]] = ("tokens", "jacobian")
     strict = False
 
     def __init__(
@@ -84,7 +95,7 @@ class GraphRunner:
         rows = MAX_CAMERAS * config.vision.num_tokens + bucket(config.max_prompt_tokens) + config.action_horizon + 64
         self._cache = Cache.allocate(config, rows, device, weights.embed_tokens.dtype, joint)
         self._recent = RecentLoops(self._forget)
-        self._tables: dict[int, Tensor | None] = {}  # by number of steps
+        self._tables: dict[tuple[int, tuple[float, ...]], Tensor | None] = {}  # by `Loop.table`
         self._calls: dict[CallShape, StaticCall] = {}
         self._pictures: dict[tuple[int, bool], Pictures] = {}  # by cameras, and whether they are float
         self._graphs: dict[tuple[CallShape | Pictures, str], Graph] = {}
@@ -101,6 +112,7 @@ class GraphRunner:
         *,
         required: bool = True,
         last: bool = True,
+        conditioning: Conditioning | None = None,
     ) -> None:
         """Capture the whole call for every prompt length, with this observation's number of cameras."""
         cameras, floats = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
@@ -110,8 +122,9 @@ class GraphRunner:
         self._warming = True
         try:
             self._check_cameras(cameras)
+            loop = conditioned_loop(conditioning, num_steps, actions, self.config)
             for slots in range(BUCKET, bucket(self.config.max_prompt_tokens) + 1, BUCKET):
-                self._graph(CallShape(cameras, slots, actions, num_steps, floats), "answer")
+                self._graph(CallShape(cameras, slots, loop, floats), "answer")
             if self._ops.resize_pictures is not None:
                 self._graph(self._pictures_of(cameras, floats), RESIZED)
         finally:
@@ -131,18 +144,20 @@ class GraphRunner:
             observation.state.to(self.device),
         )
 
-    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int) -> Tensor:
+    def denoise(self, cache: KVCache, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None) -> Tensor:
         if cache.k.shape[1] != 1 or cache.mask is not None:
             raise BackendError(
                 f"{self.name} denoises one unpadded observation's cache, not a batch of {cache.k.shape[1]}"
             )
         length, per_image = cache.k.shape[3], self.config.vision.num_tokens
         cameras = min(length // per_image, MAX_CAMERAS)
-        shape = CallShape(cameras, bucket(length - cameras * per_image), noise.shape[1], num_steps)
+        asked = of_rows(conditioning, 1)[0]
+        loop = conditioned_loop(asked, num_steps, noise.shape[1], self.config)
+        shape = CallShape(cameras, bucket(length - cameras * per_image), loop)
         graph, call = self._graph(shape, "denoise"), self._calls[shape]
         call.cache_k[:, :length], call.cache_v[:, :length] = cache.k[:, 0, 0], cache.v[:, 0, 0]
         call.inputs.length.fill_(length)
-        call.inputs.noise.copy_(noise[0])
+        call.inputs.noise.copy_(torch.from_numpy(call.started(noise[0].cpu().numpy(), asked)))
         call.inputs.state.copy_(cache.state[0])
         torch.cuda.current_stream(self.device).synchronize()
         graph.replay()
@@ -165,22 +180,32 @@ class GraphRunner:
         self._begun = begun
         return begun
 
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
         x_1, rows = noise.cpu().numpy(), [HostRow.of(observation, row) for row in range(observation.batch_size)]
-        ran = [self.begin(row.images).finish(row.tokens, row.state, x_1[i], num_steps) for i, row in enumerate(rows)]
+        ran = [
+            self.begin(row.images).finish(row.tokens, row.state, x_1[i], num_steps, asked)
+            for i, (row, asked) in enumerate(zip(rows, of_rows(conditioning, len(rows)), strict=True))
+        ]
         stages = {name: sum(one.stage_ms[name] for one in ran) for name in ran[0].stage_ms}
         return Sample(torch.cat([one.actions for one in ran]), stages)
 
-    def intermediates(self, observation: Observation, noise: Tensor, num_steps: int) -> Trace:
-        rows = [self._trace_row(observation, noise, row, num_steps) for row in range(observation.batch_size)]
+    def intermediates(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Trace:
+        rows = [
+            self._trace_row(observation, noise, row, num_steps, asked)
+            for row, asked in enumerate(of_rows(conditioning, observation.batch_size))
+        ]
         return {name: torch.cat([row[name] for row in rows], dim=int(name != "actions")) for name in rows[0]}
 
     def describe(self) -> dict[str, Any]:
         captured = sorted(
-            {(s.cameras, s.prompt_slots, s.horizon, s.num_steps) for s in list(self._calls)}
+            {(s.cameras, s.prompt_slots, s.loop) for s in list(self._calls)}
         )  # a call of another thread may add some
         return {
-            "captured": [f"{c} cameras + {p} tokens, H={h}, {n} steps" for c, p, h, n in captured],
+            "captured": [f"{cameras} cameras + {tokens} tokens, {loop}" for cameras, tokens, loop in captured],
             "graphs": {"kept": len(self._graphs), **self._recent.describe()},
             "operations": dict(self._ops.origin),
         }
@@ -193,12 +218,21 @@ class GraphRunner:
         """All denoising steps at once; None: the engine's operations one by one."""
         return None
 
-    def _run(self, part: str, row: HostRow, noise: np.ndarray, num_steps: int) -> tuple[StaticCall, Graph]:
+    def _run(
+        self, part: str, row: HostRow, noise: np.ndarray, num_steps: int, conditioning: Conditioning | None = None
+    ) -> tuple[StaticCall, Graph]:
         """Replay the call up to a part's end on one row and noise float32[H, action_dim]."""
-        return self._continue(self.begin(row.images), part, row.tokens, row.state, noise, num_steps)
+        return self._continue(self.begin(row.images), part, row.tokens, row.state, noise, num_steps, conditioning)
 
     def _continue(
-        self, begun: Begun, part: str, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int
+        self,
+        begun: Begun,
+        part: str,
+        tokens: np.ndarray,
+        state: np.ndarray,
+        noise: np.ndarray,
+        num_steps: int,
+        conditioning: Conditioning | None = None,
     ) -> tuple[StaticCall, Graph]:
         """Replay a part behind vision, "prefix" or the whole "answer"."""
         if self._begun is not begun:
@@ -209,10 +243,11 @@ class GraphRunner:
                 f"{self.name} takes up to {MAX_CAMERAS} cameras and {most} prompt tokens, this observation has "
                 f"{cameras} and {len(tokens)}"
             )
-        shape = CallShape(cameras, bucket(len(tokens)), len(noise), num_steps, begun.float_images)
+        loop = conditioned_loop(conditioning, num_steps, len(noise), self.config)
+        shape = CallShape(cameras, bucket(len(tokens)), loop, begun.float_images)
         try:
             graph, call = self._graph(shape, part), self._calls[shape]
-            call.write_inputs(noise, state, tokens)
+            call.write_inputs(noise, state, tokens, conditioning)
             graph.replay()
         except RuntimeError as error:
             self._explain(error)
@@ -234,7 +269,7 @@ class GraphRunner:
                 self._check_rows(of)
             if graph is None and part == "answer":
                 self._refuse_if_cold(of)
-            self._recent.use((of.num_steps, of.horizon))
+            self._recent.use(of.loop)
         if graph is None:
             start = time.perf_counter()
             with building(self.device):
@@ -269,8 +304,8 @@ class GraphRunner:
             warm = [s for s, part in self._graphs if isinstance(s, CallShape) and part == "answer"]
             raise not_warm(
                 self.name,
-                f"{shape.cameras} cameras, H={shape.horizon}, {shape.num_steps} steps",
-                (f"{s.cameras} cameras, H={s.horizon}, {s.num_steps} steps" for s in warm),
+                f"{shape.cameras} cameras, {shape.loop}",
+                (f"{s.cameras} cameras, {s.loop}" for s in warm),
                 cameras=shape.cameras,
                 horizons=shape.horizon,
                 steps=shape.num_steps,
@@ -280,13 +315,13 @@ class GraphRunner:
         """Let go of all that is a denoising loop's alone. Vision's graphs are every loop's."""
         if self.device.type == "cuda":  # one may still run whose call was interrupted
             torch.cuda.current_stream(self.device).synchronize()
-        gone = {shape for shape in self._calls if (shape.num_steps, shape.horizon) == loop}
+        gone = {shape for shape in self._calls if shape.loop == loop}
         for kept in [key for key in self._graphs if key[0] in gone]:
             del self._graphs[kept]
         for shape in gone:
             del self._calls[shape]
-        if loop[0] not in {steps for steps, _ in self._recent}:
-            self._tables.pop(loop[0], None)
+        if loop.table not in {other.table for other in self._recent}:
+            self._tables.pop(loop.table, None)
 
     def _capture(self, run: Callable[[Mark], None], after: Graph | None, like: Graph | None = None) -> Graph:
         """All graphs share memory, as they run one after the other."""
@@ -305,18 +340,25 @@ class GraphRunner:
         return self._pictures[key]
 
     def _call(self, shape: CallShape) -> StaticCall:
-        if shape.num_steps not in self._tables:
-            table = modulation(self.config, self._weights.conditioning, shape.num_steps)
-            self._tables[shape.num_steps] = None if table is None else table.to(self.device)
+        loop = shape.loop
+        if loop.table not in self._tables:
+            table = (
+                modulation_at(self.config, self._weights.conditioning, np.array(loop.times, np.float32))
+                if loop.times
+                else modulation(self.config, self._weights.conditioning, loop.steps)
+            )
+            self._tables[loop.table] = None if table is None else table.to(self.device)
         if shape not in self._calls:
-            pictures, table = self._pictures_of(shape.cameras, shape.float_images), self._tables[shape.num_steps]
+            pictures, table = self._pictures_of(shape.cameras, shape.float_images), self._tables[loop.table]
             self._calls[shape] = StaticCall(self.config, self._weights, self._ops, shape, pictures, self._cache, table)
         return self._calls[shape]
 
-    def _trace_row(self, observation: Observation, noise: Tensor, row: int, num_steps: int) -> Trace:
+    def _trace_row(
+        self, observation: Observation, noise: Tensor, row: int, num_steps: int, conditioning: Conditioning | None
+    ) -> Trace:
         """One row's intermediates in golden layouts: the cache goes back to its padded slots."""
         one, x_1 = HostRow.of(observation, row), noise[row].cpu().numpy()
-        call, _ = self._run("answer", one, x_1, num_steps)
+        call, _ = self._run("answer", one, x_1, num_steps, conditioning)
         length, per_image = int(call.host.length[0]), self.config.vision.num_tokens
         cameras = observation.image_mask[row].repeat_interleave(per_image)
         valid = torch.cat((cameras, observation.token_mask[row])).cpu()

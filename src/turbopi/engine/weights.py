@@ -6,6 +6,7 @@ Packing takes tensors out of the state as it goes, so that the device never hold
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -122,9 +123,14 @@ def _scale(state: State, name: str) -> Tensor | None:
 
 
 def modulation(config: ModelConfig, conditioning: State, num_steps: int) -> Tensor | None:
-    """adaRMS of a whole denoising loop, on the host: float32[N, 2 * layers + 1, 3, D].
+    """adaRMS of a whole denoising loop, on the host: `modulation_at` the times at which its steps begin."""
+    return modulation_at(config, conditioning, time_grid(num_steps, config.time_grid))
 
-    It depends on nothing but the number of steps. Norms in order of use: two a layer, then the final one; each has
+
+def modulation_at(config: ModelConfig, conditioning: State, times: np.ndarray) -> Tensor | None:
+    """adaRMS at times float32[U], on the host: float32[U, 2 * layers + 1, 3, D].
+
+    It depends on nothing but the time. Norms in order of use: two a layer, then the final one; each has
     1 + scale, shift and gate. None for Pi0, which has no adaRMS.
     """
     if config.kind == "pi0":
@@ -133,11 +139,11 @@ def modulation(config: ModelConfig, conditioning: State, num_steps: int) -> Tens
     def linear(name: str, x: Tensor) -> Tensor:
         return F.linear(x, conditioning[f"{name}.weight"], conditioning[f"{name}.bias"])
 
-    times = time_embedding(time_grid(num_steps, config.time_grid), config.expert.width)
-    cond = F.silu(linear("time_mlp_out", F.silu(linear("time_mlp_in", times))))
+    embedded = time_embedding(times, config.expert.width)
+    cond = F.silu(linear("time_mlp_out", F.silu(linear("time_mlp_in", embedded))))
     layers = [f"expert.layers.{i}" for i in range(config.expert.depth)]
     norms = [f"{layer}.{norm}" for layer in layers for norm in ("input_layernorm", "post_attention_layernorm")]
-    rows = [linear(f"{norm}.dense", cond).view(num_steps, 3, -1) for norm in (*norms, "expert.norm")]
+    rows = [linear(f"{norm}.dense", cond).view(len(times), 3, -1) for norm in (*norms, "expert.norm")]
     table = torch.stack(rows, dim=1)
     table[:, :, 0] += 1
     return table

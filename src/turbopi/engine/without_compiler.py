@@ -19,7 +19,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine import forward
 from turbopi.engine.weights import Weights
 from turbopi.kernels import plain
-from turbopi.kernels.interface import GemmaLayer, Ops
+from turbopi.kernels.interface import GemmaLayer, Ops, TokenInputs
 from turbopi.kernels.plain import PLAIN
 
 FEW = 64  # rows whose GeGLU is launches, not bytes
@@ -133,7 +133,7 @@ def prefix_cache(
 
 @dataclass(frozen=True)
 class Denoiser:
-    """A `call.Denoiser` for Pi0.5 and any horizon. What an adaRMS's shift becomes in a product is a constant of it."""
+    """A `Denoiser` for Pi0.5, any horizon, one time a step; what an adaRMS's shift becomes in a product is constant."""
 
     config: ModelConfig
     weights: Weights
@@ -152,7 +152,17 @@ class Denoiser:
         dtype = weights.embed_tokens.dtype
         return cls(config, weights, table, torch.stack(qkv, 1), torch.stack(gate_up, 1).to(dtype), velocity)
 
-    def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
+    def launch(
+        self,
+        noise: Tensor,
+        cache_k: Tensor,
+        cache_v: Tensor,
+        length: Tensor,
+        x_t: Tensor,
+        v_t: Tensor,
+        tokens: TokenInputs | None = None,
+    ) -> None:
+        assert tokens is None
         horizon, rows, small, g = len(noise), cache_k.shape[1], self.weights.small, self.config.expert
         for cache in (cache_k, cache_v):
             cache[:, self.slots : rows - horizon] = 0  # masked, but 0 * NaN is NaN

@@ -14,7 +14,7 @@ from turbopi.evaluate.results import Plain, Results
 from turbopi.evaluate.statistics import Paired, PairedDocument, Percentiles, Rate, RateDocument, percentiles
 from turbopi.evaluate.visited import ActionDifference
 from turbopi.files import write_whole
-from turbopi.quantization.artifact import RANDOM_NOISE
+from turbopi.quantization.calibration_file import RANDOM_NOISE
 from turbopi.reading import plain_document
 from turbopi.wording import significant
 

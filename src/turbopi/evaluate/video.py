@@ -78,7 +78,7 @@ def _is_finished(film: Path) -> bool:
 
 def chunk_groups(robot: str, width: int) -> list[tuple[str, dict[int, str]]]:
     """How the action's numbers belong together: (title, {index: name})."""
-    from turbopi.plots import action_groups
+    from turbopi.showing import action_groups
 
     return [(group.title, dict(list(group.names.items())[: len(LINES)])) for group in action_groups(robot, width)]
 

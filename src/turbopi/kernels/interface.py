@@ -85,7 +85,24 @@ class Ops:
     attention: Callable[..., Tensor]
     prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
     resize_pictures: Callable[[Tensor, Tensor], None] | None = None  # as `SOURCE` says; None: the host resizes them
+    backward: "BackwardOps | None" = None  # None: `kernels.backward.PLAIN_BACKWARD`
     origin: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class BackwardOps:
+    """What guidance by the true Jacobian takes beside `Ops`, between products: see `kernels.backward` for the twins.
+
+    The first two are forward, apart from their products, since what lies between is needed on the way back.
+    """
+
+    softmax: Callable[..., Tensor]
+    geglu: Callable[[Tensor], Tensor]
+    rms_norm_vjp: Callable[..., tuple[Tensor, Tensor | None]]
+    geglu_vjp: Callable[[Tensor, Tensor], Tensor]
+    softmax_vjp: Callable[[Tensor, Tensor, float], Tensor]
+    rope_vjp: Callable[..., Tensor]
+    origin: str
 
 
 @dataclass(frozen=True)

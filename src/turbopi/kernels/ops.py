@@ -2,8 +2,8 @@
 
 import torch
 
+from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.interface import Ops
-from turbopi.kernels.launch import capability
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90.ops import hopper_ops
 

@@ -85,9 +85,10 @@ def residual_rms_norm(
     eps: float,
     inverse: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """(x + y * gate, its RMSNorm * scale + shift). x, y [tokens, D]; gate, scale, shift float32[D]; None: left out.
+    """(x + y * gate, its RMSNorm * scale + shift). x, y [tokens, D].
 
-    The gate is rounded to x's dtype first, as in the reference.
+    gate, scale, shift are float32[D], or by token all [tokens, D]; None: left out. The gate is rounded to x's dtype
+    first, as in the reference.
     """
     if y is not None:
         x = x + (y if gate is None else y * gate.to(x.dtype))

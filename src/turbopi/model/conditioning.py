@@ -156,6 +156,15 @@ class Conditioning:
 Conditionings = Conditioning | Sequence[Conditioning | None] | None  # for all rows of a batch, or one each
 
 
+def of_rows(conditionings: Conditionings, rows: int) -> Sequence[Conditioning | None]:
+    """One, or None, for each row of a batch. Raises ObservationError for another number of them."""
+    if not isinstance(conditionings, Sequence):
+        return [conditionings] * rows
+    if len(conditionings) != rows:
+        raise ObservationError(f"{len(conditionings)} conditionings were given for {rows} observations")
+    return conditionings
+
+
 def _check(what: str, array: np.ndarray, shape: tuple[int, ...], rows: np.ndarray | None = None) -> None:
     """float32 of a shape, finite, in `rows` if they are given."""
     if not isinstance(array, np.ndarray) or array.dtype != np.float32 or array.shape != shape:

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from turbopi.config import ModelConfig
 from turbopi.errors import ObservationError
-from turbopi.model.conditioning import Conditioning, Conditionings
+from turbopi.model.conditioning import Conditioning, Conditionings, of_rows
 from turbopi.model.denoise import Pull, guided_velocity, run_expert, suffix_mask, suffix_rope, time_embedding
 from turbopi.model.exact import exact_float32
 from turbopi.model.gemma import Gemma
@@ -211,10 +211,8 @@ class Pi0Model(nn.Module):
         trace: Trace | None,
     ) -> Tensor:
         """Each row of a batch with a conditioning of its own."""
-        if len(conditioning) != noise.shape[0]:
-            raise ObservationError(f"{len(conditioning)} conditionings were given for {noise.shape[0]} observations")
         traces: list[Trace] = []
-        for row, asked in enumerate(conditioning):
+        for row, asked in enumerate(of_rows(conditioning, noise.shape[0])):
             traces.append({})
             one = Conditioning() if asked is None else asked  # so that all rows' traces have the same shapes
             self.denoise(cache.row(row), noise[row : row + 1], num_steps, conditioning=one, trace=traces[-1])

@@ -16,7 +16,7 @@ from turbopi.checkpoint.norm_stats import NormStats
 from turbopi.config import CAMERAS, PolicyConfig
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.observation import ModelInputs
-from turbopi.preprocess.images import RESIZES, fitted, placement
+from turbopi.preprocess.images import RESIZES, all_fitted, fitted, placement
 from turbopi.preprocess.normalize import Normalizer, pad_last
 from turbopi.preprocess.relative_actions import absolute_actions, reanchored
 from turbopi.preprocess.robot_checks import (
@@ -26,7 +26,7 @@ from turbopi.preprocess.robot_checks import (
     width_of_outputs,
 )
 from turbopi.preprocess.tokenizer import PromptTokenizer
-from turbopi.robots import Robot, RobotInputs, create_robot
+from turbopi.robots import Robot, RobotInputs, robot_for
 from turbopi.robots.base import read_prompt, read_state
 from turbopi.robots.pictures import check_hwc, to_uint8
 from turbopi.robots.plain import Plain
@@ -87,8 +87,7 @@ class Pipeline:
         robot: str | Robot | None = None,
     ) -> None:
         self.config, self.tokenizer = config, tokenizer
-        chosen = config.robot if robot is None else robot
-        self.robot = create_robot(chosen, config.robot_options if chosen == config.robot else None)
+        self.robot = robot_for(config.robot if robot is None else robot, config.robot, config.robot_options)
         prompts = (default_prompt, config.default_prompt, self.robot.default_prompt)
         self.default_prompt = next((prompt for prompt in prompts if prompt is not None), None)
         self.state_scale = Normalizer(config.normalization.state, stats.state, "state")
@@ -143,8 +142,10 @@ class Pipeline:
         for step in self.before_prefix:
             step(one)
 
-    def after(self, model_actions: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
+    def after(self, model_actions: np.ndarray, state: np.ndarray) -> dict[str, Any]:
         """{"actions": float64[H, d]} in the robot's units, all finite.
+
+        For a robot with `action_keys` also "named_actions": {key: float64[H]}, the same numbers.
 
         model_actions  float32[H, action_dim]
         state          as `before` returned it
@@ -170,7 +171,9 @@ class Pipeline:
                 "numbers are finite. Look at the checkpoint's statistics of actions, and of the state if actions are "
                 "relative to it, and at the robot's `outputs`"
             )
-        return {"actions": actions}
+        keys = getattr(self.robot, "action_keys", None)
+        named = {} if keys is None else {"named_actions": dict(zip(keys, np.ascontiguousarray(actions.T), strict=True))}
+        return {"actions": actions, **named}
 
     def anchor(self, state: np.ndarray) -> np.ndarray | None:
         """What `after` adds to relative actions, float64[len(delta_mask)] in their units; None for absolute ones.
@@ -244,18 +247,18 @@ class Pipeline:
         cameras = list(pictures) if final else list(CAMERAS)
         valid = [present.get(camera, camera in pictures) for camera in cameras]
         sample.image_mask = np.array(valid, np.bool_)
-        sample.pictures = [
-            self._picture(pictures.get(camera), camera, sample.resize) for camera in itertools.compress(cameras, valid)
-        ]
+        checked = [self._check_picture(pictures.get(camera), camera) for camera in itertools.compress(cameras, valid)]
+        size, resize = self.config.model.vision.image_size, self.config.image_resize
+        if sample.resize:
+            sample.pictures = all_fitted(checked, size, resize)
+        else:  # the device resizes bytes
+            for picture in checked:
+                placement(picture.shape, (size, size))  # refuses one that is too narrow before anything starts
+            sample.pictures = [one if one.dtype == np.uint8 else fitted(one, size, resize) for one in checked]
 
-    def _picture(self, picture: object, camera: str, resize: bool) -> np.ndarray:
-        picture, size = check_hwc(picture, camera), self.config.model.vision.image_size
-        if not RESIZES[self.config.image_resize].float_images:
-            picture = to_uint8(picture, camera)
-        if resize or picture.dtype != np.uint8:
-            return fitted(picture, size, self.config.image_resize)
-        placement(picture.shape, (size, size))  # refuses one that is too narrow before anything starts
-        return picture
+    def _check_picture(self, picture: object, camera: str) -> np.ndarray:
+        picture = check_hwc(picture, camera)
+        return picture if RESIZES[self.config.image_resize].float_images else to_uint8(picture, camera)
 
     def _tokenize(self, sample: Incoming) -> None:
         state = None

@@ -16,6 +16,7 @@ from turbopi.robots.lerobot import LeRobot
 from turbopi.robots.libero import Libero
 from turbopi.robots.pictures import parse_chw_image, parse_image, parse_unit_image
 from turbopi.robots.plain import Plain
+from turbopi.robots.raw_keys import ROBOT_TYPES, raw_description
 
 __all__ = [
     "ROBOTS",
@@ -41,6 +42,26 @@ __all__ = [
 ROBOTS: dict[str, type] = {"libero": Libero, "droid": Droid, "aloha": Aloha, "lerobot": LeRobot, "plain": Plain}
 
 
+def robot_for(robot: str | Path | Robot, own: str, own_options: Mapping[str, object]) -> Robot:
+    """A policy's robot: its config's `own` one with the options there, or another one that is asked for.
+
+    A robot that sends LeRobot's raw keys stands on a LeRobot checkpoint's own. Raises ConfigError as `create_robot`.
+    """
+    if robot == own:
+        return create_robot(robot, own_options)
+    raw = raw_description(robot)
+    if raw is None:
+        return create_robot(robot)
+    if own != "lerobot":
+        raise ConfigError(
+            f"robot {robot} puts LeRobot's raw keys into a LeRobot checkpoint's, but this one is for robot {own}. "
+            "Describe its cameras and state in a .json (docs/robots.md): the keys there may be raw ones, too"
+        )
+    checkpoint = create_robot(own, own_options)
+    assert isinstance(checkpoint, LeRobot)
+    return raw.on(checkpoint)
+
+
 def create_robot(robot: str | Path | Robot, options: Mapping[str, object] | None = None) -> Robot:
     """A robot from its name, from the path of its description (.json), or the robot itself.
 
@@ -53,14 +74,22 @@ def create_robot(robot: str | Path | Robot, options: Mapping[str, object] | None
     if not isinstance(robot, str | Path):
         _refuse_options(options, "a robot given as an object")
         return _checked(robot)
-    if str(robot).endswith(".json"):
+    described = str(robot).endswith(".json")
+    if described:
         _refuse_options(options, "a robot described by a file")
+    if raw_description(robot) is not None:
+        raise ConfigError(
+            f"robot {robot} sends LeRobot's raw keys, which only a LeRobot checkpoint's own description can place: "
+            "name it with --robot, or robot=, for such a checkpoint, and not in a turbopi.json"
+        )
+    if described:
         return load_robot(robot)
     cls = ROBOTS.get(str(robot))
     if cls is None:
         hint = "; robots in Python code are given as objects" if ":" in str(robot) else ""
         raise ConfigError(
-            f"unknown robot {str(robot)!r}; choose one of {', '.join(ROBOTS)}, or a .json description{hint}"
+            f"unknown robot {str(robot)!r}; choose one of {', '.join((*ROBOTS, *ROBOT_TYPES))}, or a .json description"
+            f"{hint}"
         )
     fields = [field.name for field in dataclasses.fields(cls)]
     required = [field.name for field in dataclasses.fields(cls) if field.default is dataclasses.MISSING]

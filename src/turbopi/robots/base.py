@@ -48,6 +48,7 @@ class Robot(Protocol):
     reset_pose      joint positions to start from, for clients that ask for them; part of the policy's metadata
     default_prompt  for observations without one
     camera_counts   how many cameras an observation may have, for warm-up; None: as many as `example` has
+    action_keys     the robot's name of each action: answers then hold the actions under these, too; None: they don't
     """
 
     name: str = "custom"
@@ -57,6 +58,7 @@ class Robot(Protocol):
     reset_pose: list[float] | None = None
     default_prompt: str | None = None
     camera_counts: tuple[int, ...] | None = None
+    action_keys: tuple[str, ...] | None = None
 
     @abstractmethod
     def inputs(self, observation: Mapping[str, object]) -> RobotInputs:

@@ -24,7 +24,7 @@ from turbopi.robots.pictures import parse_image
 
 REQUIRED = ("name", "cameras", "state", "action_dim")
 _MOST = LIMITS["action_dim"]  # numbers in a state or an action: no model takes more
-OPTIONAL = ("delta_action_dims", "prompt_key", "default_prompt", "reset_pose")
+OPTIONAL = ("delta_action_dims", "prompt_key", "default_prompt", "reset_pose", "action_keys")
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Described(Robot):
 
     cameras   observation key -> the model's camera; pictures (uint8|float)[h, w, 3] or [3, h, w], all required
     state     observation key -> its width, concatenated in this order; a scalar counts as width 1
-    action_dim, delta_mask, prompt_key, default_prompt, reset_pose   see `Robot` and docs/robots.md
+    action_dim, delta_mask, prompt_key, default_prompt, reset_pose, action_keys   see `Robot` and docs/robots.md
     """
 
     name: str = field()  # field(): no default, where the protocol has one
@@ -44,6 +44,7 @@ class Described(Robot):
     prompt_key: str = "prompt"
     default_prompt: str | None = None
     reset_pose: list[float] | None = None
+    action_keys: tuple[str, ...] | None = None
 
     @property
     def state_dim(self) -> int:  # type: ignore[override]
@@ -108,8 +109,16 @@ def robot_from_dict(described: Any) -> Described:
     _expect(prompt is None or isinstance(prompt, str), "default_prompt", "text", prompt)
     pose_is_right = isinstance(pose, list) and all(map(is_finite, pose))
     _expect(pose is None or pose_is_right, "reset_pose", "a list of numbers", pose)
-    fields = {name: value for name, value in described.items() if name != "delta_action_dims"}
-    return Described(**fields, delta_mask=_delta_mask(described.get("delta_action_dims"), described))
+    keys = described.get("action_keys")
+    keys_are_right = isinstance(keys, list) and all(isinstance(key, str) for key in keys)
+    right = keys is None or (keys_are_right and len(set(keys)) == len(keys) == action_dim)
+    _expect(right, "action_keys", f"a list of {action_dim} different names, one for each action", keys)
+    fields = {name: value for name, value in described.items() if name not in ("delta_action_dims", "action_keys")}
+    return Described(
+        **fields,
+        delta_mask=_delta_mask(described.get("delta_action_dims"), described),
+        action_keys=None if keys is None else tuple(keys),
+    )
 
 
 def _check_cameras(cameras: Any) -> None:

@@ -46,6 +46,7 @@ class LeRobot(Robot):
                          camera_0, ...
     rename_map           observations' keys -> the checkpoint's; where an observation has both, the later one is read
     relative_dims        per action, whether the model's is relative to the state
+    action_names         the recording robot's key of each action, where the checkpoint has them
     """
 
     image_keys: Sequence[str]
@@ -54,6 +55,7 @@ class LeRobot(Robot):
     num_missing_cameras: int = 0
     rename_map: Mapping[str, str] | None = None
     relative_dims: Sequence[bool] | None = None
+    action_names: Sequence[str] | None = None
 
     name = "lerobot"
 
@@ -77,6 +79,13 @@ class LeRobot(Robot):
                 f"relative_dims has {len(relative)} dimensions, but there are {self.action_dim} of actions and "
                 f"{self.state_dim} of the state"
             )
+        names = self.action_names
+        if names is not None and not (
+            isinstance(names, list | tuple)
+            and all(isinstance(name, str) for name in names)
+            and len({*names}) == len(names) == self.action_dim
+        ):
+            raise ConfigError(f"action_names must be a list of {self.action_dim} different names, got {names!r}")
 
     @property
     def delta_mask(self) -> tuple[bool, ...] | None:  # type: ignore[override]
@@ -95,15 +104,15 @@ class LeRobot(Robot):
         if not present:
             raise ObservationError(
                 f"the observation's cameras are {listed(others)}; this checkpoint's are "
-                f"{', '.join(map(self._sent_as, self.image_keys))}. Rename them; a camera that the robot doesn't have "
+                f"{', '.join(map(self.sent_as, self.image_keys))}. Rename them; a camera that the robot doesn't have "
                 "can be left out"
             )
         if absent and others:
-            _warn_once(others, [self._sent_as(key) for key in absent])
+            _warn_once(others, [self.sent_as(key) for key in absent])
         images = {key: parse_unit_image(find(named, key), key) for key in present}
         black = black_like(next(iter(images.values())))
         masked = [*absent, *(f"missing_{i}" for i, key in enumerate(spare) if key not in present)]
-        expected = (*map(self._sent_as, self.image_keys), self._sent_as(STATE), TASK)
+        expected = (*map(self.sent_as, self.image_keys), self.sent_as(STATE), TASK)
         return RobotInputs(
             images | dict.fromkeys(masked, black),
             dict.fromkeys(present, True) | dict.fromkeys(masked, False),
@@ -117,7 +126,7 @@ class LeRobot(Robot):
             return observation
         return {self.rename_map.get(key, key): value for key, value in observation.items()}
 
-    def _sent_as(self, key: str) -> str:
+    def sent_as(self, key: str) -> str:
         """What observations call a key of the checkpoint's."""
         return next((old for old, new in (self.rename_map or {}).items() if new == key), key)
 
@@ -133,11 +142,11 @@ class LeRobot(Robot):
         return actions[:, : self.action_dim]
 
     def example(self, rng: np.random.Generator) -> dict[str, Any]:
-        pictures = {self._sent_as(key): rng.random((3, 224, 224), dtype=np.float32) for key in self.image_keys}
+        pictures = {self.sent_as(key): rng.random((3, 224, 224), dtype=np.float32) for key in self.image_keys}
         state = rng.uniform(-1, 1, self.state_dim).astype(np.float32)
         return {
             **pictures,
-            self._sent_as(STATE): state,
+            self.sent_as(STATE): state,
             TASK: "pick up the black bowl and place it on the plate",
         }
 

@@ -1,4 +1,4 @@
-"""The HTTP side of the port: health, metrics, and who may become a websocket client."""
+"""The HTTP side of the port: health, metrics, the page, and who may become a websocket client."""
 
 import hmac
 import logging
@@ -12,6 +12,7 @@ from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limited_log import LimitedLog
 from turbopi.serve.metrics import CONTENT_TYPE, Metrics
 from turbopi.serve.options import check_key
+from turbopi.serve.page.http import document, is_feed, is_page, page_key
 
 logger = logging.getLogger(__name__)
 
@@ -19,8 +20,10 @@ logger = logging.getLogger(__name__)
 class Gate:
     """Decides about each HTTP request on the server's port.
 
-    api_key   with it, everything but `/healthz` needs `Authorization: Api-Key <api_key>`; load balancers carry no key
-    hosts     the names by which web pages may address the server; without a key, `/metrics` too
+    api_key   with it, everything but `/healthz` and the page's document needs `Authorization: Api-Key <api_key>`; load
+              balancers carry no key. The page asks for it, and sends it with the request for its feed
+    hosts     the names by which web pages may address the server; the page and, without a key, `/metrics`, too
+    has_page  whether the page and its feed are served
     why_lost  why no request can be served any more (the GPU failed for good), None while all is well: until the
               process ends, `/healthz` answers 503 with it, and so does every new client
 
@@ -33,10 +36,12 @@ class Gate:
         metrics: Metrics,
         hosts: AllowedHosts,
         why_lost: Callable[[], str | None] = lambda: None,
+        *,
+        has_page: bool = False,
     ) -> None:
         check_key(api_key)
         self._key = None if api_key is None else api_key.encode()
-        self._metrics, self._hosts, self._why_lost = metrics, hosts, why_lost
+        self._metrics, self._hosts, self._why_lost, self._has_page = metrics, hosts, why_lost, has_page
         self._log = LimitedLog(logger)
 
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
@@ -48,6 +53,11 @@ class Gate:
             if lost is None:
                 return connection.respond(HTTPStatus.OK, "OK\n")
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"the device is lost: {lost}\n")
+        if is_page(request) or is_feed(request):
+            if not self._has_page:
+                return connection.respond(HTTPStatus.NOT_FOUND, "The page is off; --page or an API key turns it on.\n")
+            if is_page(request):
+                return self._page(connection, request)
         if not self._authorized(request):
             return self._unauthorized(connection, request)
         if path == "/metrics":
@@ -71,6 +81,16 @@ class Gate:
         response.headers["Content-Type"] = CONTENT_TYPE
         return response
 
+    def _page(self, connection: ServerConnection, request: Request) -> Response:
+        host = _only(request, "Host")
+        if host is None or not self._hosts.has(host):
+            return self._forbidden(connection, f"the page is not for {_short(host)}")
+        headers, text = document(needs_key=self._key is not None)
+        response = connection.respond(HTTPStatus.OK, text)
+        del response.headers["Content-Type"]
+        response.headers.update(headers)
+        return response
+
     def _forbidden(self, connection: ServerConnection, why: str) -> Response:
         self._metrics.error("origin")
         self._log.warning(f"{_peer(connection)} refused: {why}")
@@ -78,7 +98,8 @@ class Gate:
 
     def _unauthorized(self, connection: ServerConnection, request: Request) -> Response:
         self._metrics.error("unauthorized")
-        what = "a wrong API key" if request.headers.get_all("Authorization") else "no API key"
+        sent = request.headers.get_all("Authorization") or (is_feed(request) and page_key(request))
+        what = "a wrong API key" if sent else "no API key"
         self._log.warning(f"{_peer(connection)} refused: it sent {what}")
         response = connection.respond(HTTPStatus.UNAUTHORIZED, "Send the header `Authorization: Api-Key <key>`.\n")
         response.headers["WWW-Authenticate"] = "Api-Key"
@@ -89,6 +110,8 @@ class Gate:
             return True
         headers = request.headers.get_all("Authorization")
         scheme, _, key = headers[0].partition(" ") if len(headers) == 1 else ("", "", "")
+        if is_feed(request) and not headers:
+            scheme, key = "api-key", page_key(request) or ""
         given = key.strip().encode(errors="replace")
         return scheme.lower() == "api-key" and hmac.compare_digest(given, self._key)  # in constant time
 

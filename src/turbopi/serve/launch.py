@@ -40,6 +40,8 @@ def run(policy: Policy, options: ServerOptions | None = None, *, console: Consol
     def ready(server: PolicyServer) -> None:
         http = escape(server.url.replace("ws://", "http://"))
         tell(f"Serving at [bold]{escape(server.url)}[/]   health {http}/healthz   metrics {http}/metrics")
+        if server.options.has_page:
+            tell(f"Page {http}/")
         if server.recording is not None:
             tell(f"Recording to {escape(str(server.recording))}")
         tell("Ctrl-C stops.")

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-SPARE_CONNECTIONS = 32  # beyond the clients: health checks, metrics, and who is told that the server is full
+SPARE_CONNECTIONS = 32  # beyond the clients: health checks, metrics, watchers, who is told that the server is full
 SPARE_DESCRIPTORS = 64  # for everything else that the process opens
 
 
@@ -35,6 +35,7 @@ class Limits:
     work_total_rate    the same for all connections that are slowed, together
     bad_messages       in a row, after which a connection is closed
     connections_rate   new connections a second
+    watchers           of the server's page and its feed at once; they take no client's place
     """
 
     clients: int = 256
@@ -52,6 +53,7 @@ class Limits:
     work_total_rate: float = 800.0
     bad_messages: int = 1000
     connections_rate: float = 50.0
+    watchers: int = 4
 
 
 def limits_for(max_message_mb: float, max_clients: int, others: Limits | None) -> Limits:

@@ -15,6 +15,7 @@ from websockets.server import ServerProtocol
 
 from turbopi.serve.connection import GuardedConnection, Shared
 from turbopi.serve.limits import SPARE_CONNECTIONS, AtMost, room_for_connections, trim_memory
+from turbopi.serve.page.http import is_feed, select_subprotocol
 
 logger = logging.getLogger(__name__)
 # The websockets library reports each port scan and health check as a failed handshake; what matters is logged here.
@@ -46,6 +47,7 @@ class Listener:
         self._tasks: set[asyncio.Task[None]] = set()
         self._opening: dict[GuardedConnection, None] = {}  # in the order in which they came
         self._clients: set[GuardedConnection] = set()
+        self._watchers: set[GuardedConnection] = set()  # of the page; they are no clients
         self._connected: set[GuardedConnection] = set()
         self._trimming: asyncio.TimerHandle | None = None
         self._pace = AtMost(shared.limits.connections_rate)
@@ -156,7 +158,9 @@ class Listener:
 
     def _new_connection(self) -> GuardedConnection:
         # No compression: pictures don't get smaller, only later.
-        protocol = ServerProtocol(max_size=self._shared.limits.message_bytes, logger=_protocol_logger)
+        protocol = ServerProtocol(
+            max_size=self._shared.limits.message_bytes, select_subprotocol=select_subprotocol, logger=_protocol_logger
+        )
         return GuardedConnection(protocol, self, self._shared)
 
     def connected(self, connection: GuardedConnection) -> None:
@@ -187,6 +191,7 @@ class Listener:
             connection.transport.abort()
             await connection.wait_closed()
             self._connected.discard(connection)
+            self._watchers.discard(connection)
             if connection in self._clients:
                 self._clients.remove(connection)
                 if not self._clients and self._trimming is None:
@@ -197,6 +202,12 @@ class Listener:
         response = self._gate(connection, request)
         if response is not None:
             return response
+        if is_feed(request):
+            if len(self._watchers) >= self._shared.limits.watchers:
+                text = f"The page is open {len(self._watchers)} times already, which is the limit: close one of them.\n"
+                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, text)
+            self._watchers.add(connection)
+            return None
         if len(self._clients) >= self._clients_limit:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, self._refusal())
         self._clients.add(connection)

@@ -109,6 +109,19 @@ class Metrics:
         busy = Gauge("turbopi_inference_in_progress", "1 while the policy runs", registry=self.registry)
         busy.set_function(running)
 
+    def requests_so_far(self) -> int:
+        return int(sum(_totals(self.requests).values()))
+
+    def errors_so_far(self) -> dict[str, int]:
+        """How many of each kind that there were."""
+        return {kind: int(count) for kind, count in _totals(self._errors).items() if count}
+
     def text(self) -> str:
         """Prometheus' text format."""
         return generate_latest(self.registry).decode()
+
+
+def _totals(counter: Counter) -> dict[str, float]:
+    """A counter's values by label; its only one under ""."""
+    samples = (sample for family in counter.collect() for sample in family.samples)
+    return {"".join(s.labels.values()): s.value for s in samples if s.name.endswith("_total")}

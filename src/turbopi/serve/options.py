@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from turbopi.errors import ConfigError
-from turbopi.serve.hosts import AllowedHosts
+from turbopi.serve.hosts import LOOPBACK, AllowedHosts
 from turbopi.serve.limits import Limits
 
 if TYPE_CHECKING:  # `turbopi --help` needs no NumPy
@@ -27,6 +27,7 @@ class ServerOptions:
     record_dir      if given, every observation and its actions are written below this folder
     allowed_hosts   names, besides its own, by which web pages may address this server (`hosts.AllowedHosts`)
     max_clients     connected at once; more are refused with HTTP 503
+    page            the server's own page and its feed. None: on if only this machine or who has the key can see it
     execution       join each client's chunks here, in a session of each connection: "rtc", "rtc_identity" or
                     "rtc_trained". None: only for clients that ask for it (docs/serving.md)
     control_hz      actions that robots carry out in a second; needed with `execution`
@@ -43,6 +44,7 @@ class ServerOptions:
     record_dir: str | Path | None = None
     allowed_hosts: Sequence[str] = ()
     max_clients: int = Limits.clients
+    page: bool | None = None
     execution: "JoinMode | None" = None
     control_hz: float | None = None
     execution_horizon: int | None = None
@@ -72,6 +74,11 @@ class ServerOptions:
             raise ConfigError(f"delay_steps must be 0 or more, not {self.delay_steps}")
         check_key(self.api_key)
         AllowedHosts(self.host, self.allowed_hosts)
+
+    @property
+    def has_page(self) -> bool:
+        """Whether the page is on."""
+        return self.page if self.page is not None else self.host in LOOPBACK or self.api_key is not None
 
 
 def check_key(api_key: str | None) -> None:

@@ -38,6 +38,8 @@ from turbopi.serve.limits import Limits, limits_for
 from turbopi.serve.listener import Listener
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
+from turbopi.serve.page.http import is_feed
+from turbopi.serve.page.live import Live
 from turbopi.serve.real_time import Plan, RealTime
 from turbopi.serve.signals import stop_signals
 from turbopi.serve.worker import Busy, Stopping, Worker
@@ -89,7 +91,8 @@ class PolicyServer:
         self._policy = policy
         self._limits = limits_for(options.max_message_mb, options.max_clients, limits)
         self._log = LimitedLog(logger)
-        gate = Gate(options.api_key, self.metrics, AllowedHosts(options.host, options.allowed_hosts), lambda: self.lost)
+        hosts = AllowedHosts(options.host, options.allowed_hosts)
+        gate = Gate(options.api_key, self.metrics, hosts, lambda: self.lost, has_page=options.has_page)
         self._listener = Listener(gate, self._handle, Shared(self._limits, self.metrics, self._log))
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
@@ -99,6 +102,7 @@ class PolicyServer:
         self._real_time = RealTime(policy.metadata, options, self.metrics)
         self._lost: Future[str] = Future()  # set from the worker's thread
         self.metrics.watch(lambda: self._worker.waiting, lambda: self._worker.running)
+        self._live = Live(self.metrics, self._worker, lambda: self.lost) if options.has_page else None
         self._started = False
         self._idle: set[GuardedConnection] = set()  # connections that wait for a request
         self._stopping = False
@@ -145,6 +149,8 @@ class PolicyServer:
             self._greeting = pack(metadata)
             if self._record_dir is not None:
                 self._recorder = Recorder(self._record_dir, metadata, count=self.metrics.recorded)
+            if self._live is not None:
+                self._live.start(metadata, self._worker.queue_limit)
             self._listener.start()
         except BaseException:
             self._listener.close()
@@ -160,11 +166,15 @@ class PolicyServer:
         self._stopping = True
         self._worker.stop()
         self._listener.close()
+        if self._live is not None:
+            self._live.let_go()
         goodbyes = [asyncio.create_task(self._say_goodbye(connection)) for connection in tuple(self._idle)]
         await self._worker.drain()
         await self._listener.ended(self._limits.close_seconds)
         await asyncio.gather(*goodbyes)
         self._worker.close()
+        if self._live is not None:
+            await self._live.close()
         self._decoder.shutdown(wait=False)
         self._log.flush()
         if self._recorder is not None:
@@ -219,7 +229,12 @@ class PolicyServer:
     # --- the protocol -------------------------------------------------------------------------------------------------
 
     async def _handle(self, connection: GuardedConnection) -> None:
-        """One client, from its metadata to its close."""
+        """One client, from its metadata to its close; or one who watches."""
+        if self._live is not None:
+            if is_feed(connection.request):
+                self._log.info(f"{connection.remote_address} watches", "connections")
+                return await self._live.watch(connection)
+            self._live.joined(connection)
         self.metrics.clients.inc()
         self._log.info(f"{connection.remote_address} connected", "connections")
         try:
@@ -241,10 +256,14 @@ class PolicyServer:
             self._idle.discard(connection)
             self._real_time.closed(connection)
             self.metrics.clients.dec()
+            if self._live is not None:
+                self._live.left(connection)
 
     async def _fail(self, connection: GuardedConnection, text: str) -> None:
         """Send a traceback and close, as openpi does."""
         self.metrics.error("policy")
+        if self._live is not None:
+            self._live.failed("policy", text.strip().rpartition("\n")[2])  # what was raised
         with contextlib.suppress(ConnectionClosed):
             await connection.send(text)
             await connection.close(CloseCode.INTERNAL_ERROR, "internal server error: the last frame has the traceback")
@@ -271,6 +290,9 @@ class PolicyServer:
             finished = time.perf_counter()
             self.metrics.request_seconds.observe(finished - received)
             previous_total = finished - started  # with the wait for the request, as openpi counts it
+            if self._live is not None:
+                assert isinstance(message, bytes)
+                self._live.answered(connection, message, reply, finished - received)
             if self._recorder is not None:  # decoded anew: the policy may have changed the dict it was given
                 assert isinstance(message, bytes)
                 size = len(message)
@@ -322,6 +344,8 @@ class PolicyServer:
         self.metrics.error(kind)
         text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
         self._log.warning(text, kind)
+        if self._live is not None:
+            self._live.failed(kind, text)
         return _Refusal(kind, text)
 
     async def _decode(self, connection: GuardedConnection, message: str | bytes) -> dict[str, object]:

@@ -21,7 +21,7 @@ from turbopi.backends import Precision
 from turbopi.calibrate.run import Settings, calibrate
 from turbopi.checkpoint import Checkpoint
 from turbopi.files import write_whole
-from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.plan import TIERS
 from turbopi.reading import plain_document
 from turbopi.recordings import RecordedCall, save_call

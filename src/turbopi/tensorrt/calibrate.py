@@ -21,7 +21,7 @@ from turbopi.files import write_whole
 from turbopi.installation import install_command
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
-from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.calibration_file import Quantization
 from turbopi.reading import Fields, read_json
 from turbopi.tensorrt.networks import Fp8Scales
 from turbopi.tensorrt.ops import FP8_MAX

@@ -27,7 +27,7 @@ from turbopi.config import Kind
 from turbopi.examples import Example, NoisyExample
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
-from turbopi.quantization.artifact import Quantization, shapes_of
+from turbopi.quantization.calibration_file import Quantization, shapes_of
 from turbopi.quantization.plan import TIERS
 from turbopi.verify.golden import Arrays, Case, GoldenFolder, Run
 

@@ -26,7 +26,7 @@ from turbopi.examples import NoisyExample
 from turbopi.model import exact
 from turbopi.policy import UnifiedPolicy
 from turbopi.provenance import provenance
-from turbopi.quantization.artifact import Quantization
+from turbopi.quantization.calibration_file import Quantization
 from turbopi.verify import control
 from turbopi.verify.document import Certificate, Latencies, Latency, ObservationsDocument, WeightsDocument
 from turbopi.verify.inputs import VerifyPlan, check_observations, make_calls, read_examples

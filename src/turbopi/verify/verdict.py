@@ -8,8 +8,8 @@ from msgspec.structs import asdict
 
 from turbopi.errors import BackendError, ConfigError
 from turbopi.examples import NoisyExample
-from turbopi.plots import action_groups
 from turbopi.quantization.plan import TIERS
+from turbopi.showing import action_groups
 from turbopi.verify.bounds import (
     BF16_FACTOR,
     BOUND_FACTORS,

@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 
 LOG2_E = 1.4426950408889634
 

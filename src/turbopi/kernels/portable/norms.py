@@ -10,12 +10,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 
 
 @triton.jit
 def _add_residual(x, y, gate, out, row, rows, cols, width, mask, SPLITS, HAS_GATE):
-    """x + y * gate, stored and rounded as stored; y is one matrix or SPLITS partial sums of one."""
+    """x + y * gate, stored and rounded as stored; y is one matrix or SPLITS partial sums; the gate is this row's."""
     dtype = out.dtype.element_ty
     a = tl.load(x + row * width + cols, mask, 0.0).to(tl.float32)
     if SPLITS == 0:
@@ -35,13 +35,22 @@ def _add_residual(x, y, gate, out, row, rows, cols, width, mask, SPLITS, HAS_GAT
 def _rms_norm_kernel(
     x, y, gate, scale, shift, out, normed, rows, width, eps, inverse,
     HAS_Y: tl.constexpr, SPLITS: tl.constexpr, HAS_GATE: tl.constexpr, HAS_SHIFT: tl.constexpr,
-    SCALED: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
+    BY_ROW: tl.constexpr, SCALED: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     row = tl.program_id(0)
     cols = tl.arange(0, BLOCK)
     mask = cols < width
+    if BY_ROW:
+        scale += row * width
+        if HAS_SHIFT:
+            shift += row * width
+        if HAS_GATE:
+            gate += row * width
+    if BY_ROW:  # gathered by the kernel before, perhaps; one for all rows is a constant
+        wait_for_producer(PDL)
     factor = tl.load(scale + cols, mask, 0.0)
-    wait_for_producer(PDL)
+    if not BY_ROW:
+        wait_for_producer(PDL)
     launch_dependents(PDL)
     if HAS_Y:
         a = _add_residual(x, y, gate, out, row, rows, cols, width, mask, SPLITS, HAS_GATE)
@@ -87,15 +96,16 @@ def residual_rms_norm(
     eps: float,
     inverse: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """(x + y * gate, its RMSNorm * scale + shift). x [tokens, D] contiguous."""
+    """(x + y * gate, its RMSNorm * scale + shift). x [tokens, D] contiguous; the others [D], or all [tokens, D]."""
     rows, width = _checked(x, y)
+    assert all(one is None or (one.dim() == scale.dim() and one.is_contiguous()) for one in (gate, scale, shift))
     out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x, dtype=result_dtype(x, inverse))
     block = triton.next_power_of_2(width)
     warps = _warps(2 * block)  # twice LayerNorm's, for parts to add up
     _rms_norm_kernel[(rows,)](
         x, _or(y, x), _or(gate, scale), scale, _or(shift, scale), out, normed, rows, width, eps, inverse or 1.0,
         HAS_Y=y is not None, SPLITS=_splits(y), HAS_GATE=gate is not None,
-        HAS_SHIFT=shift is not None, SCALED=inverse is not None, BLOCK=block, num_warps=warps,
+        HAS_SHIFT=shift is not None, BY_ROW=scale.dim() == 2, SCALED=inverse is not None, BLOCK=block, num_warps=warps,
         **dependent_launch(x),
     )  # fmt: skip
     return out, normed

@@ -4,7 +4,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.launch import dependent_launch, launch_dependents, wait_for_producer
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
 
 
 @triton.jit

@@ -5,7 +5,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.launch import result_dtype
+from turbopi.kernels.dependent_launch import result_dtype
 
 ROWS = 16  # of a program, one warp: a row's columns depend on each other, so rows are all there is to share
 

@@ -15,16 +15,17 @@ from turbopi.kernels.sm90.attention import kernel as attention
 from turbopi.kernels.sm90.gemm import products
 from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
-from turbopi.kernels.sm90.gemm.vision_products import RESIDUAL_TILES, VisionProducts
+from turbopi.kernels.sm90.gemm.tiles import PARTS_TILES, RESIDUAL_TILES, VISION_TILES
+from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
 
 
 def hopper_ops(device: torch.device) -> Ops:
     portable, vision = portable_ops(), VisionProducts()
     origin = {
-        "vision products": f"CUDA for {_rows(products.VISION_TILES)} rows, else cuBLAS",
+        "vision products": f"CUDA for {_rows(VISION_TILES)} rows, else cuBLAS",
         "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS",
         "product behind the prefix's GeGLU": "in parts that the norm behind it adds up: "
-        f"CUDA for {_rows(products.PARTS, Tile)} rows, cuBLAS for {_rows(products.PARTS, int)}, in whole 64; else "
+        f"CUDA for {_rows(PARTS_TILES, Tile)} rows, cuBLAS for {_rows(PARTS_TILES, int)}, in whole 64; else "
         "cuBLAS at once",
         "vision and prefix attention": "CUDA; Triton where head_dim isn't a multiple of 8 from 16 to 256",
     }

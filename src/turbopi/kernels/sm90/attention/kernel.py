@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
-from turbopi.kernels.launch import result_dtype
+from turbopi.kernels.dependent_launch import result_dtype
 from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.sm90 import instructions

@@ -58,6 +58,11 @@ struct Cta {
   __device__ __forceinline__ int kvn() const { return share(KVT, NH * S, cluster() * S + rank() + 1) - kv0(); }
 };
 
+// A CTA's rows of all tiles of a layer.
+__device__ __forceinline__ const float* of_tiles(const Cta& b, const float* all, u32 layer) {
+  return all + (settled(layer) * (NC * S) + b.cta) * (TILES * 16);
+}
+
 // A warp's cycles up to each mark, summed up over the loop: see MARKS of kernel.py. TP_TRACED_WARP: which warp's, from 1.
 #ifdef TP_TRACED_WARP
 #define MARK(i)                                    \

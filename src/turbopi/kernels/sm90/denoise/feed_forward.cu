@@ -12,16 +12,19 @@ __device__ __forceinline__ float gelu(float x) {
 }
 
 constexpr int GROUPS_GU = plan_groups(GTL);
-// Shift and scale of a lane's rows of gate|up; a tile has 8 units' gate rows, then their up rows.
-struct GateUpRows {
-  float2 shift[GROUPS_GU], scale[GROUPS_GU];
-  __device__ __forceinline__ GateUpRows(const Own<GTL>& own, const Cta& b, const float* shifted, const float* row_scales) {
+// A lane's first row of a tile of gate|up, which has 8 units' gate rows, then their up rows.
+__device__ __forceinline__ int gate_up_row(const Cta& b, int tile) {
+  return (QTL + KVL + min(tile, GTL - 1)) * 16 + b.g();
+}
+struct GateUpScales {  // of FP8: of a lane's two rows
+  float2 of[GROUPS_GU];
+  __device__ __forceinline__ GateUpScales(const Cta& b, const Own<GTL>& own, const float* row_scales) {
 #pragma unroll
-    for (int i = 0; i < GROUPS_GU; ++i) {
-      const int row = (QTL + KVL + min(own.tile[i], GTL - 1)) * 16 + b.g();
-      shift[i] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
-      if (FP8) scale[i] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
-    }
+    for (int i = 0; i < GROUPS_GU; ++i)
+      if (FP8) {
+        const int row = gate_up_row(b, own.tile[i]);
+        of[i] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
+      }
   }
 };
 // Where the hidden units of token `token` of 8 tokens n begin, of gate|up tile `tile`, at any rank.
@@ -30,9 +33,10 @@ __device__ __forceinline__ u32 units_place(const Cta& b, int tile, int n, int to
   return b.base + M_HID + ((at >> 1) * NT + n) * OPERAND + (at & 1) * (FP8 ? 8 : 128) + token * 16;
 }
 // Two units of token 2 t + g % 2, of a lane's sums for two tokens.
-__device__ __forceinline__ u32 two_units(const Cta& b, float4 c, float2 r, float2 shift) {
-  const float h0 = gelu(c.x * r.x + shift.x) * (c.z * r.x + shift.y),
-              h1 = gelu(c.y * r.y + shift.x) * (c.w * r.y + shift.y);
+__device__ __forceinline__ u32 two_units(const Cta& b, float4 c, float2 r, Factors of_rows) {
+  const float4 shift = of_item(of_rows);
+  const float h0 = gelu(c.x * r.x + shift.x) * (c.z * r.x + shift.z),
+              h1 = gelu(c.y * r.y + shift.y) * (c.w * r.y + shift.w);
   const float got = exchange(b.g() & 1 ? h0 : h1, 4);
   return b.g() & 1 ? pack_operand(got, h1) : pack_operand(h0, got);
 }

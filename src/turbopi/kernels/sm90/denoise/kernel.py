@@ -17,7 +17,7 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct, enumeration
-from turbopi.kernels.interface import State
+from turbopi.kernels.interface import State, TokenInputs
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.denoise.packing import (
@@ -32,11 +32,11 @@ from turbopi.kernels.sm90.denoise.packing import (
 from turbopi.kernels.sm90.denoise.small import affine, inverse_frequencies
 
 FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
-PARTS = (  # of the kernel, in their order; {form}: "few" or "many" tokens
+PARTS = (  # of the kernel, in their order; {form}: "few" or "many" tokens; {times}: "one_time" or "token_times"
     *("sizes", "{form}/memory", "cta", "primitives", "wgmma", "producer", "product"),
-    *("stream", "{form}/stream", "residual", "project", "{form}/project", "feed_forward", "{form}/feed_forward"),
-    *("score", "attention", "{form}/attention", "combine", "step", "{form}/step"),
-    *("layer", "watch", "{form}/loop", "kernel"),
+    *("stream", "{form}/stream", "residual", "project", "feed_forward", "{times}"),
+    *("{form}/project", "{form}/feed_forward", "score", "attention", "{form}/attention", "combine"),
+    *("layer", "step", "{form}/step", "watch", "{form}/loop", "kernel"),
 )
 THREADS = (WARPS + 4) * 32
 WAITS = {  # what a CTA waits for: the kernel's enum, and what users are told
@@ -84,6 +84,8 @@ MARKS = {  # up to where the tracer counts cycles, in the order in which a layer
 FEW = 16  # tokens: up to so many take the form in few/
 MAX_SUFFIX = 56  # beyond it too little shared memory is left for weights on their way
 
+MAX_ROWS = 1 << 16  # of the table, by token: 16 bits say which one a token takes
+
 
 def unavailable(device: torch.device) -> str | None:
     """Why the kernel can't run on this device, or None if it can."""
@@ -129,11 +131,29 @@ ARGS = Struct(
     ),
 )
 
+ARGS_BY_TOKEN = Struct(
+    "Args",
+    (
+        *ARGS.fields,
+        Parameter("const int*", "token_rows", "[N][T]: which row of `table`, `shifted` and `out_shift`"),
+        Parameter("const float*", "token_steps", "[N][T]: in place of dt"),
+        Parameter("const float*", "token_times", "[N][T]"),
+        Parameter("const float*", "target", "[T][A]: of guidance"),
+        Parameter("const float*", "gain", "[N][T]"),
+    ),
+)
+
 
 def kernel_sizes(
-    arrangement: Arrangement, *, cache_rows: int, suffix: int, shared_bytes: int, fp8: bool = False
+    arrangement: Arrangement,
+    *,
+    cache_rows: int,
+    suffix: int,
+    shared_bytes: int,
+    fp8: bool = False,
+    by_token: bool = False,
 ) -> dict[str, int]:
-    """The kernel's compile-time constants."""
+    """The kernel's compile-time constants. by_token: every token has its own time (token_times.cu)."""
     config, g = arrangement.config, arrangement.config.expert
     groups = most(suffix, 8)
     stream = arrangement.clusters // 2 * (g.width // BLOCK) * groups * 32
@@ -158,10 +178,11 @@ def kernel_sizes(
         "TP_ROUND_FRAGMENTS": 4 if suffix <= (40 if cache_rows <= 1024 else 24) else 2,
         "TP_SHARED_BYTES": shared_bytes,
         "TP_SCRATCH_WORDS": scratch,
+        **({"TP_BY_TOKEN": 1} if by_token else {}),
     }
 
 
-def source(suffix: int, fp8: bool) -> str:
+def source(suffix: int, fp8: bool, by_token: bool = False) -> str:
     columns = most(suffix, 8) * 8
     numbers: instructions.Numbers = "e4m3" if fp8 else "bf16"
     products = (
@@ -170,16 +191,19 @@ def source(suffix: int, fp8: bool) -> str:
         instructions.wgmma("add_rows", columns, from_registers=True),
         instructions.wgmma("add_keys", 2 * 8),
     )
-    generated = (*products, enumeration("What", tuple(WAITS)), enumeration("Mark", tuple(MARKS)), ARGS.source)
-    form = "few" if suffix <= FEW else "many"
-    files = (f"denoise/{part.format(form=form)}.cu" for part in PARTS)
+    args = ARGS_BY_TOKEN if by_token else ARGS
+    generated = (*products, enumeration("What", tuple(WAITS)), enumeration("Mark", tuple(MARKS)), args.source)
+    which = {"form": "few" if suffix <= FEW else "many", "times": "token_times" if by_token else "one_time"}
+    files = (f"denoise/{part.format(**which)}.cu" for part in PARTS)
     return instructions.source(*files, generated="\n".join(generated) + "\n", folder=FOLDER)
 
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
     """The kernel's machine code. Raises BackendUnavailable if a block has too little shared memory for these sizes."""
     try:
-        return compile_cubin(source(sizes["TP_TOKENS"], bool(sizes["TP_FP8"])), arch, sizes, folder=folder)
+        return compile_cubin(
+            source(sizes["TP_TOKENS"], bool(sizes["TP_FP8"]), "TP_BY_TOKEN" in sizes), arch, sizes, folder=folder
+        )
     except BackendError as e:
         if "too little shared memory" not in str(e):
             raise
@@ -203,12 +227,20 @@ def stuck(words: list[int]) -> str | None:
     return f"blocks of the denoising kernel waited for seconds (counted over all steps): {where}" if waits else None
 
 
+def _beside_each_other(shifted: Tensor) -> Tensor:
+    """float32[..., 16] with rows i and i + 8 of a tile, which a lane has, beside each other: [..., 8, 2]."""
+    return shifted.view(*shifted.shape[:-1], 2, 8).mT.contiguous()
+
+
 class DenoiseKernel:
     """The loop for a fixed number of steps and suffix tokens; capturable in a CUDA graph.
 
     `table` float32[N, 2L + 1, 3, D] is the modulation (`engine.weights.modulation`), `small` holds action_in_proj and
     action_out_proj, `cache_rows` is an upper bound of the valid cache rows. Raises BackendError for a model or suffix
     that it doesn't cover, BackendUnavailable for a GPU, or more cache rows than fit.
+
+    by_token  every token has a time of its own in each of `num_steps` steps: a launch then takes `TokenInputs`, and
+        `table` float32[U, 2L + 1, 3, D] has a row for each time that occurs
     """
 
     def __init__(
@@ -221,7 +253,11 @@ class DenoiseKernel:
         cache_rows: int,
         suffix: int,
         device: torch.device,
+        num_steps: int | None = None,
+        by_token: bool = False,
     ) -> None:
+        assert by_token == (num_steps is not None), "by token the table doesn't tell the number of steps"
+        assert not by_token or len(table) <= MAX_ROWS, len(table)
         reason = unavailable(device)
         if reason is not None:
             raise BackendUnavailable(reason)
@@ -238,6 +274,7 @@ class DenoiseKernel:
             suffix=suffix,
             fp8=self._packed.fp8,
             shared_bytes=properties.shared_memory_per_block_optin,  # type: ignore[attr-defined]
+            by_token=by_token,
         )
         with torch.cuda.device(device):
             arch = f"sm_{properties.major}{properties.minor}a"
@@ -251,7 +288,8 @@ class DenoiseKernel:
                     f"the denoising kernel needs {arrangement.clusters} clusters of {RANKS} multiprocessors at once, "
                     f"{torch.cuda.get_device_name(device)} holds {fitting}"
                 )
-        self._suffix, self._blocks = suffix, arrangement.blocks
+        self._suffix, self._blocks, self._by_token = suffix, arrangement.blocks, by_token
+        self._steps = len(table) if num_steps is None else num_steps
         self._table = table.to(device).float().contiguous()
         tables = Tables.make(self._packed, self._table)
         self._tensors = {
@@ -259,7 +297,7 @@ class DenoiseKernel:
             "starts": self._packed.starts,
             "table": tables.modulation,
             "row_scales": tables.row_scales,
-            "shifted": tables.shifted,
+            "shifted": _beside_each_other(tables.shifted) if by_token else tables.shifted,
             "values_times": tables.values_times,
             "out_w": small["action_out_proj.weight"].float().T.contiguous(),
             "out_shift": affine(small, "action_out_proj", self._table[:, -1, 1].double()).float().contiguous(),
@@ -275,13 +313,22 @@ class DenoiseKernel:
             "trace": torch.zeros(self._blocks, 64, dtype=torch.int32, device=device),
         }
 
-    def launch(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor) -> None:
+    def launch(
+        self,
+        noise: Tensor,
+        cache_k: Tensor,
+        cache_v: Tensor,
+        length: Tensor,
+        x_t: Tensor,
+        v_t: Tensor,
+        tokens: TokenInputs | None = None,
+    ) -> None:
         """Denoise on the current stream.
 
         noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], the first `length` (int64[1], on the device) rows
-        valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A].
+        valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A]. `tokens`: by token.
         """
-        steps, g, chunk = self._table.shape[0], self._config.expert, (self._suffix, self._config.action_dim)
+        steps, g, chunk = self._steps, self._config.expert, (self._suffix, self._config.action_dim)
         assert noise.shape == chunk and x_t.shape == (steps + 1, *chunk) and v_t.shape == (steps, *chunk)
         assert cache_k.stride() == cache_v.stride() and cache_k.stride()[1:] == (g.head_dim, 1), cache_k.stride()
         assert cache_k.dtype == cache_v.dtype == torch.bfloat16 and length.dtype == torch.int64
@@ -296,9 +343,28 @@ class DenoiseKernel:
             "eps": self._config.rms_norm_eps,
             "zero": 0,
         }
-        args = ARGS.value(pointers | numbers)
+        assert (tokens is not None) == self._by_token, "a kernel by token takes `tokens`, another doesn't"
+        if tokens is None:
+            args = ARGS.value(pointers | numbers)
+        else:
+            args = ARGS_BY_TOKEN.value(pointers | numbers | self._token_pointers(tokens))
         self._prepare.launch(self._tiles, 256, args)
         self._kernel.launch_cooperative(self._blocks, THREADS, args)  # clusters wait for one another
+
+    def _token_pointers(self, tokens: TokenInputs) -> dict[str, int]:
+        by_step = self._steps, self._suffix
+        given = {
+            "token_rows": (tokens.rows, by_step),
+            "token_steps": (tokens.steps, by_step),
+            "token_times": (tokens.times, by_step),
+            "target": (tokens.target, (self._suffix, self._config.action_dim)),
+            "gain": (tokens.gain, by_step),
+        }
+        for name, (t, shape) in given.items():
+            dtype = torch.int32 if name == "token_rows" else torch.float32
+            assert t.shape == shape and t.dtype == dtype and t.is_contiguous(), (name, t.shape, t.dtype)
+            assert t.device == self._table.device, (name, t.device)
+        return {name: t.data_ptr() for name, (t, _) in given.items()}
 
     def clock_mhz(self) -> float | None:
         """The multiprocessors' clock during the last launch that has ended, in MHz, which may be lower than what

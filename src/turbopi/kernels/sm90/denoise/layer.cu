@@ -1,12 +1,17 @@
 // Half a layer, attention (half 0) or feed-forward (half 1): where its weights' tables and sums lie.
 
-// A CTA's rows of all tiles.
-__device__ __forceinline__ const float* of_tiles(const Cta& b, const float* all, u32 layer) {
-  return all + (settled(layer) * (NC * S) + b.cta) * (TILES * 16);
+// A lane's columns of the norms' tables, from one place in their rows. Asked for well before `gather`: its polls would
+// queue up behind them.
+__device__ __forceinline__ void load_columns(const Cta& b, Factors (&v)[ITEMS_X], const float* row) {
+#pragma unroll
+  for (int j = 0; j < ITEMS_X; ++j) {
+    const Item item = stream_item(b, j);
+    v[j] = factors(row, (b.x0() + item.tile) * 16 + 2 * b.g(), rows_of(b, item.token));
+  }
 }
 // The gates of this half, and the scales of the next norm: the final one behind the last layer.
-__device__ __forceinline__ void load_norm(const Cta& b, int step, int half, float2 (&gates)[ITEMS_X], float2 (&scales)[ITEMS_X]) {
-  const float* const table = b.a.table + (2 * settled(b.n) + step) * (3 * D);
+__device__ __forceinline__ void load_norm(const Cta& b, int step, int half, Factors (&gates)[ITEMS_X], Factors (&scales)[ITEMS_X]) {
+  const float* const table = layer_table(b, step);
   load_columns(b, gates, table + (half ? 5 : 2) * D);
   load_columns(b, scales, table + (half ? 6 : 3) * D);
 }

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.kernels.interface import GemmaLayer, State
+from turbopi.kernels.interface import GemmaLayer, State, TokenInputs
 from turbopi.kernels.sm90.denoise.small import affine
 from turbopi.model.denoise import euler_step
 from turbopi.model.layers import rope_tables
@@ -26,18 +26,22 @@ def denoise_plain(
     cache_v: Tensor,
     length: int,
     operand: Operand = lambda x, layer, product: x,
+    tokens: TokenInputs | None = None,
 ) -> tuple[Tensor, Tensor]:
     """What the kernel computes, in PyTorch and in `noise`'s dtype throughout: (x_t [N + 1, T, A], v_t [N, T, A]).
 
     operand  what becomes of the activations that meet a layer's weights: (x, layer, which of `KINDS`) -> x. The
         stream comes without its 1 / rms and the norm's shift, as the kernel adds both behind the product.
+    tokens  every token's time in each step; `table` [U, 2L + 1, 3, D] then has a row for each time that occurs
     """
     g, dtype, suffix = config.expert, noise.dtype, noise.shape[0]
     positions = length + torch.arange(suffix, device=noise.device)
     cos, sin = (t[0].to(dtype) for t in rope_tables(positions[None], g.head_dim, config.rope_base))
     cos, sin = cos[0][:, None], sin[0][:, None]  # [T, 1, K/2]
     x_t, v_t = [noise], []
-    for modulation in table.to(dtype):
+    table = table.to(dtype)
+    by_step = table[:, :, :, None] if tokens is None else table[tokens.rows.long()].movedim(1, 3)
+    for step, modulation in enumerate(by_step):  # [2L + 1, 3, T or 1, D]
 
         def normed(x: Tensor, index: int, modulation: Tensor = modulation) -> tuple[Tensor, Tensor]:
             scale, shift, gate = modulation[index]
@@ -59,8 +63,18 @@ def denoise_plain(
             up_gate, up = (y @ layer.gate_up.to(dtype).T).chunk(2, dim=-1)
             x = x + operand(F.gelu(up_gate, approximate="tanh") * up, i, 3) @ layer.down.to(dtype).T * gate
         v_t.append(affine(small, "action_out_proj", normed(x, 2 * g.depth)[0]))
-        x_t.append(euler_step(x_t[-1], v_t[-1], table.shape[0]))
+        if tokens is None:
+            x_t.append(euler_step(x_t[-1], v_t[-1], len(table)))
+        else:
+            v_t[-1] = guided(x_t[-1], v_t[-1], tokens, step)
+            x_t.append(x_t[-1] + tokens.steps[step, :, None] * v_t[-1])
     return torch.stack(x_t), torch.stack(v_t)
+
+
+def guided(x: Tensor, v: Tensor, tokens: TokenInputs, step: int) -> Tensor:
+    """v [T, A] pulled so that the chunk it points to comes nearer to the target: guidance with the identity."""
+    chunk = x - tokens.times[step, :, None] * v
+    return v - tokens.gain[step, :, None] * (tokens.target - chunk)
 
 
 def in_e4m3(inputs: Tensor) -> Operand:

@@ -191,6 +191,12 @@ __device__ __forceinline__ void clear(float (&c)[N][4]) {
 __device__ __forceinline__ float4 scaled(float4 v, float2 by) {
   return make_float4(v.x * by.x, v.y * by.x, v.z * by.y, v.w * by.y);
 }
+__device__ __forceinline__ float4 scaled(float4 v, float4 by) {  // each token by its own
+  return make_float4(v.x * by.x, v.y * by.y, v.z * by.z, v.w * by.w);
+}
+// What is added to an item, of two columns (rows), or of each token's.
+__device__ __forceinline__ float4 of_item(float2 two) { return make_float4(two.x, two.x, two.y, two.y); }
+__device__ __forceinline__ float4 of_item(float4 each) { return each; }
 __device__ __forceinline__ float exp2_approx(float x) {
   float y;
   asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));

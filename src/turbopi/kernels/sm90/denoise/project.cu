@@ -35,12 +35,13 @@ __device__ __forceinline__ int ordered(float v) { return ordered(__float_as_int(
 // An item's sums times scale and 1 / rms, shifted, turned: a query to `staged`, its other half OTHER_HALF numbers behind;
 // keys and values to all clusters as float32 with their flags.
 template <int OTHER_HALF>
-__device__ __forceinline__ void finish_item(const Cta& b, QkvItem item, float4 c, float2 shift, float4 turn, byte* staged,
+__device__ __forceinline__ void finish_item(const Cta& b, QkvItem item, float4 c, Factors of_rows, float4 turn, byte* staged,
                                             float* kv, u32 bit) {
   const int token = item.n * 8 + 2 * b.t();
   const float2 r = inverse_rms(b, token, 0);
   const float2 u = make_float2(turn.x, turn.y), v = make_float2(turn.z, turn.w);
-  const float a0 = c.x * r.x + shift.x, a1 = c.z * r.x + shift.y, c0 = c.y * r.y + shift.x, c1 = c.w * r.y + shift.y;
+  const float4 shift = of_item(of_rows);
+  const float a0 = c.x * r.x + shift.x, a1 = c.z * r.x + shift.z, c0 = c.y * r.y + shift.y, c1 = c.w * r.y + shift.w;
   const float f0 = a0 * u.x - a1 * u.y, s0 = a1 * u.x + a0 * u.y, f1 = c0 * v.x - c1 * v.y, s1 = c1 * v.x + c0 * v.y;
   if (item.k < 0) {
     const u32 f = pack(f0, f1), s = pack(s0, s1);

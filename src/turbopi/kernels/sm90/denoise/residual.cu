@@ -22,13 +22,6 @@ __device__ __forceinline__ void make_inverse_rms(const Cta& b) {
   }
 }
 
-// A lane's columns of a row of the table. Asked for well before `gather`: its polls would queue up behind them.
-__device__ __forceinline__ void load_columns(const Cta& b, float2 (&v)[ITEMS_X], const float* row) {
-#pragma unroll
-  for (int j = 0; j < ITEMS_X; ++j)
-    v[j] = __ldg((const float2*)(row + (b.x0() + stream_item(b, j).tile) * 16 + 2 * b.g()));
-}
-
 // A product back into the stream: this cluster's partial sums of the slice, for the CTAs of equal rank. Its partial
 // sums lie over its own operand, region H, unless they have a place of their own. Nothing for region H can arrive
 // before it is read: a peer sends queries or hidden units only when it has this rank's whole slice of the stream, which

@@ -44,6 +44,16 @@ constexpr int GTL = most(2 * HC, S);       // gate|up tiles of a CTA: 8 hidden u
 constexpr int QTL = most(QT, S);           // query tiles of a CTA: 8 RoPE pairs each
 constexpr int KVL = most(KVT, NH* S);      // key and value tiles of a CTA
 constexpr int TILES = QTL + KVL + GTL;     // of a CTA with rows of their own in `shifted`
+#ifdef TP_BY_TOKEN
+typedef float4 Factors;  // of a lane's two columns (or rows) for its two tokens, as an item has them: see stream.cu
+#else
+typedef float2 Factors;  // of a lane's two columns (or rows): tokens have one time
+#endif
+#if defined(TP_BY_TOKEN) && defined(TP_TRACED_WARP)
+#define BESIDE_TRACE 128  // the trace lies where else tokens' rows of the table do
+#else
+#define BESIDE_TRACE 0
+#endif
 constexpr bool MANY = NT > 2;  // tokens: the form of many/. Without it registers and shared memory are to spare
 static_assert(D % 16 == 0 && F % 16 == 0 && HD % 16 == 0 && HD <= 256 && T <= 64 && NH % 2 == 0 && A <= CONSUMERS,
               "sizes");

@@ -8,9 +8,6 @@ __device__ __forceinline__ void add_actions(float4& c, float4 w0, float4 w1, flo
       c.w += w1.x * y1.x + w1.y * y1.y + w1.z * y1.z + w1.w * y1.w;
 }
 
-__device__ __forceinline__ float euler_step(const Cta& b, float x, float v) {
-  return __fadd_rn(x, __fmul_rn(b.a.dt, v));
-}
 // What the caller gets to see of a step.
 __device__ __forceinline__ void put_out(const Cta& b, int step, int at, float v, float next) {
   b.a.v_t[size_t(step) * T * A + at] = v;

@@ -56,7 +56,9 @@ __device__ __forceinline__ float rms_from(const Cta& b, float squares) {  // 1 /
 }
 
 // What a product adds to an item of the stream: the sum over all clusters times the gate.
-__device__ __forceinline__ void add_gated(float4& x, float4 sum, float2 gate, bool real) {
-  const float2 by = make_float2(gate.x / PARTIAL_SCALE, gate.y / PARTIAL_SCALE);
-  if (real) x.x += by.x * sum.x, x.y += by.x * sum.y, x.z += by.y * sum.z, x.w += by.y * sum.w;
+__device__ __forceinline__ void add_gated(float4& x, float4 sum, Factors gate, bool real) {
+  const float4 of = of_item(gate);
+  const float4 by =
+      make_float4(of.x / PARTIAL_SCALE, of.y / PARTIAL_SCALE, of.z / PARTIAL_SCALE, of.w / PARTIAL_SCALE);
+  if (real) x.x += by.x * sum.x, x.y += by.y * sum.y, x.z += by.z * sum.z, x.w += by.w * sum.w;
 }

@@ -18,20 +18,6 @@ __device__ __forceinline__ void rest(const Cta& b) {
   for (int i = 0; i < 5; ++i) stay_awake(c, zero);
   pretend_to_need(b, c);
 }
-// What the norms of layer n need, to L2: it is read once, by everybody at the same time, while memory is busy with
-// weights.
-__device__ __forceinline__ void prefetch(const Cta& b, int n) {
-  const int step = n / L, l = n % L;
-  if (step >= b.a.steps) return;
-  auto lines = [&](const float* from, int floats) {
-#pragma unroll 1
-    for (int i = b.lane() * 32; i < floats; i += 32 * 32) prefetch_line(from + i);
-  };
-  const float* table = b.a.table + (size_t(step) * (2 * L + 1) + 2 * l) * 3 * D + b.x0() * 16;
-  lines(b.a.shifted + (size_t(n) * (NC * S) + b.cluster() * S + b.rank()) * TILES * 16, TILES * 16);
-  lines(table + 2 * D, b.xn() * 16), lines(table + 3 * D, b.xn() * 16);
-  lines(table + 5 * D, b.xn() * 16), lines(table + 6 * D, b.xn() * 16);
-}
 __device__ __forceinline__ long long nanoseconds() {
   long long v;
   asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(v));

@@ -28,6 +28,7 @@ from turbopi.kernels.sm90.gemm.bf16 import (
     size_arguments,
     tile_constants,
 )
+from turbopi.kernels.sm90.gemm.tiles import TILES_FP8
 from turbopi.kernels.sm90.instructions import DependentKernel
 from turbopi.quantization.fp8 import ALIGNMENT, E4M3, Fp8Matrix
 
@@ -167,28 +168,6 @@ FIXED, WRITING, STEP, LOADING, ADDING = 2300, 0.098, 205, 0.013, 0.00042
 
 GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that gather sums may not all fit at once
 
-# The fastest of some 25 tiles each, by [rows, out, in]. Rows count in whole 64, the least that a tile has: so fewer
-# kernels are compiled for all the prompt lengths.
-MEASURED = {
-    (256, 3456, 1152): Tile(1, 112, cluster_m=2),
-    (256, 4304, 1152): Tile(2, 72),
-    (512, 3456, 1152): Tile(2, 112, cluster_m=2),
-    (512, 1152, 1152): Tile(1, 96),
-    (512, 4304, 1152): Tile(2, 136, ring=5),
-    (768, 3456, 1152): Tile(2, 160, cluster_m=2),
-    (768, 4304, 1152): Tile(3, 136),
-    (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
-    (320, 2560, 2048): Tile(1, 112),
-    (576, 2560, 2048): Tile(3, 64),
-    (576, 2048, 2048): Tile(1, 160),
-    **{(rows, 16384, 2048): Tile(3, 128, cluster_n=2, overlap=True) for rows in (320, 576, 704, 768, 960)},
-    (832, 16384, 2048): Tile(2, 176, cluster_n=2, overlap=True),
-    (576, 2048, 16384): Tile(3, 96, splits=2),
-    (832, 2048, 16384): Tile(2, 128, cluster_n=2),
-    (576, 512, 2048): Tile(1, 80),
-    (832, 512, 2048): Tile(1, 64),
-}
-
 
 def candidates(epilogue: Epilogue) -> list[Tile]:
     """All that may be worth trying."""
@@ -218,7 +197,7 @@ def cost(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> fl
 def best_tile(m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> Tile:
     """The measured tile for a @ weightᵀ of [m, k] and [n, k] (GeGLU: [2n, k]), else that of least estimated cost."""
     m = -(-m // 64) * 64
-    measured = MEASURED.get((m, n, k))
+    measured = TILES_FP8.get((m, n, k))
     if measured is not None and (sms >= GATHERING_SMS or not measured.gather):
         return measured
     fitting = [tile for tile in candidates(epilogue) if tile.splits <= -(-k // DEPTH)]

@@ -8,39 +8,10 @@ from torch import Tensor
 from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
 from turbopi.kernels.sm90.gemm.bf16 import DEPTH, SPLIT, Epilogue, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import best_tile, matmul_fp8
+from turbopi.kernels.sm90.gemm.tiles import GEGLU_TILES, PARTS_TILES, VISION_TILES
 from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
 
-GEGLU_TILES = (Tile(3, 128, 1, 2, overlap=True), Tile(3, 192), Tile(2, 256), Tile(2, 160, 1, 2, overlap=True))
 GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
-
-# SigLIP So400m's products that beat cuBLAS on an H200, by [rows, out, in]: the tiles fill its SMs just once.
-VISION_TILES = {
-    (256, 3456, 1152): Tile(1, 112, cluster_m=2),
-    (256, 1152, 1152): Tile(2, 40, splits=2),
-    (256, 4304, 1152): Tile(2, 72),
-    (256, 1152, 4304): Tile(2, 72, cluster_n=2, splits=4),
-    (256, 2048, 1152): Tile(1, 64),
-    (512, 3456, 1152): Tile(2, 112, cluster_m=2, ring=5),
-    (512, 1152, 1152): Tile(2, 40),
-    (512, 4304, 1152): Tile(2, 144, cluster_m=2, ring=5),
-    (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2),
-    (512, 2048, 1152): Tile(2, 64),
-    (768, 3456, 1152): Tile(2, 160, ring=5),
-    (768, 1152, 1152): Tile(2, 64, cluster_m=2),
-    (768, 4304, 1152): Tile(3, 136),
-    (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2),
-    (768, 2048, 1152): Tile(2, 96),
-}
-
-# The prefix's products that leave as bfloat16 parts and so beat cuBLAS and its pass that adds parts up, by [rows in
-# whole 64, out, in]: in our tiles, or as so many products over parts of the inner axis that cuBLAS makes at once.
-PARTS: dict[tuple[int, int, int], Tile | int] = {
-    (320, 2048, 16384): 4,
-    (512, 2048, 16384): 2,
-    (576, 2048, 16384): Tile(3, 192, splits=4),
-    (768, 2048, 16384): Tile(3, 192, splits=3),
-    (832, 2048, 16384): 2,
-}
 
 
 def vision_tile(x: Tensor, weight: Tensor) -> Tile | None:
@@ -61,7 +32,7 @@ def tuned_residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None,
     if isinstance(weight, Fp8Matrix):
         return _fp8(x, weight, "parts" if bias is None else "partial", bias, ahead=ahead)
     if bias is None:
-        cut = PARTS.get((-(-x.shape[0] // 64) * 64, weight.shape[0], weight.shape[1]))
+        cut = PARTS_TILES.get((-(-x.shape[0] // 64) * 64, weight.shape[0], weight.shape[1]))
         if isinstance(cut, Tile):
             return matmul(x, weight, cut, "parts", ahead=ahead)
         return linear(x, weight) if cut is None else parts_at_once(x, weight, cut)

@@ -16,22 +16,8 @@ from turbopi.kernels.sm90.gemm.products import (
     tuned_residual_linear,
     vision_tile,
 )
+from turbopi.kernels.sm90.gemm.tiles import RESIDUAL_TILES, RESIDUAL_TILES_FP8
 from turbopi.quantization.fp8 import E4M3, Fp8Matrix, Matrix
-
-# As `products.VISION_TILES`, for products that add their result to the residual stream. Where sums are gathered, all
-# clusters must be on the GPU at once: an H200 takes 15 of eight blocks and 30 of four.
-RESIDUAL_TILES = {
-    (256, 1152, 1152): Tile(1, 64),
-    (256, 1152, 4304): Tile(1, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
-    (512, 1152, 1152): Tile(1, 72),
-    (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True, ring=6),
-    (768, 1152, 1152): Tile(2, 64),
-    (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2, gather=True),
-}
-RESIDUAL_TILES_FP8 = RESIDUAL_TILES | {
-    (512, 1152, 1152): Tile(1, 80, cluster_m=2),
-    (768, 1152, 1152): Tile(1, 128, ring=5),
-}
 
 
 @dataclass(frozen=True)

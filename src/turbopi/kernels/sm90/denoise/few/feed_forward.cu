@@ -1,9 +1,10 @@
 // Few tokens: gate|up and GeGLU. Awaits the stream. The next slice of the stream arrives in region X only when a peer has
 // all of this rank's hidden units.
-__device__ __forceinline__ void gate_up(Cta& b, const float* shifted, const float* row_scales, Sent& sent) {
+__device__ __forceinline__ void gate_up(Cta& b, const Shifts& shifts, const float* row_scales, Sent& sent) {
   const int gn = b.gn(), token = 2 * b.t() + (b.g() & 1);
   Own<GTL> own(b, gn);
-  const GateUpRows rows(own, b, shifted, row_scales);
+  GateUpShifts shift(b, shifts, own);
+  const GateUpScales scale(b, own, row_scales);
   u32 place[GROUPS_GU][OWN<GTL>];
 #pragma unroll
   for (int i = 0; i < GROUPS_GU; ++i)
@@ -16,6 +17,7 @@ __device__ __forceinline__ void gate_up(Cta& b, const float* shifted, const floa
   show_to_products();
   multiply<GTL, D16>(b, M_X, D16, gn, sums, ahead);
   MARK(MARK_GATE_UP_MULTIPLIED)
+  shift.behind_product(b, shifts, own);
   own.add_up(b, M_X, gn, sums);
 #pragma unroll
   for (int i = 0; i < GROUPS_GU; ++i)
@@ -23,8 +25,8 @@ __device__ __forceinline__ void gate_up(Cta& b, const float* shifted, const floa
     for (int k = 0; k < OWN<GTL>; ++k)
       if (own.mine[i][k]) {
         const int n = own.n[i][k];
-        const float4 c = FP8 ? scaled(own.sums[i][k], rows.scale[i]) : own.sums[i][k];
-        const uint4 units = eight_units(b, two_units(b, c, inverse_rms(b, n * 8 + 2 * b.t(), 1), rows.shift[i]));
+        const float4 c = FP8 ? scaled(own.sums[i][k], scale.of[i]) : own.sums[i][k];
+        const uint4 units = eight_units(b, two_units(b, c, inverse_rms(b, n * 8 + 2 * b.t(), 1), shift(i, k)));
         if (n * 8 + token < T) {
           u32 data[QUARTER], bars[QUARTER];
 #pragma unroll

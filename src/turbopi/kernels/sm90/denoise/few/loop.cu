@@ -16,12 +16,13 @@ __device__ __forceinline__ void consume(Cta& b) {
   float4 x[ITEMS_X];
   const u32 expect_hidden = hidden_bytes(b);
   begin_trace(b);
-  const Embedding first(b, a.table);
+  KeptRow(b, 0).keep(b);
+  const Embedding first(b, a.table, 0);
   consumers_sync();
   first.multiply(b, x), first.send(b, x);
 #pragma unroll 1
   for (int step = 0; step < a.steps; ++step) {
-    const float* const table = a.table + size_t(step) * (2 * L + 1) * 3 * D;
+    const float* const table = step_table(b, step);
     MARK(MARK_EMBEDDED)
 #pragma unroll 1
     for (; b.n < u32(step + 1) * L; ++b.n) {
@@ -30,15 +31,15 @@ __device__ __forceinline__ void consume(Cta& b) {
       for (int half = 0; half < 2; ++half) {  // attention, feed-forward
         b.forget();
         const u32 bit = flag(b.n), layer = b.n - step * L;
-        float2 gates[ITEMS_X], scales[ITEMS_X];
+        Factors gates[ITEMS_X], scales[ITEMS_X];
         Sent sent = {};
         if (half) {
-          gate_up(b, of_tiles(b, a.shifted, b.n), of_tiles(b, a.row_scales, layer), sent);
+          gate_up(b, Shifts(b, step), of_tiles(b, a.row_scales, layer), sent);
           MARK(MARK_HIDDEN_SENT)
           load_norm(b, step, half, gates, scales);
         } else {
           float* const kv = suffix_buffer(b);
-          project(b, of_tiles(b, a.shifted, b.n), of_tiles(b, a.row_scales, layer), kv, bit);
+          project(b, Shifts(b, step), of_tiles(b, a.row_scales, layer), kv, bit);
           MARK(MARK_QKV_SENT)
           attend(b, kv, bit, prefix);
         }
@@ -56,7 +57,7 @@ __device__ __forceinline__ void consume(Cta& b) {
         MARK(half ? MARK_SLICE_AFTER_FEED_FORWARD : MARK_SLICE_AFTER_ATTENTION)
       }
     }
-    advance(b, x, step + 1 < a.steps ? table + (2 * L + 1) * 3 * D : table, step);
+    advance(b, x, step + 1 < a.steps ? next_table(table) : table, step);
   }
   note(b, FINISHED);
   end_trace(b);

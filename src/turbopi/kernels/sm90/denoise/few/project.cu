@@ -127,13 +127,15 @@ __device__ __forceinline__ void keep_rope(const Cta& b, int prefix) {
 
 // Awaits the stream. q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream; queries are sent when all of those have been read, so what a peer sends after it has them may lie there too.
-__device__ __forceinline__ void project(Cta& b, const float* shifted, const float* row_scales, float* kv, u32 bit) {
+__device__ __forceinline__ void project(Cta& b, const Shifts& shifts, const float* row_scales, float* kv, u32 bit) {
   const int tiles = b.qn() + b.kvn();
-  float2 shift[ITEMS_Q], scale[ITEMS_Q];
+  Factors shift[ITEMS_Q];
+  float2 scale[ITEMS_Q];
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
-    const int row = QkvItem(b, j).row(b);
-    shift[j] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
+    const QkvItem item(b, j);
+    const int row = item.row(b);
+    shift[j] = shifts(b, row, item.mine ? item.n : 0);
     if (FP8) scale[j] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
   }
   auto await_stream = [&] {

@@ -6,7 +6,8 @@ constexpr u32 V_EXPECT = S * T * A * 4 + SQUARES_EXPECT;
 struct Embedding {
   static constexpr bool EARLY = ITEMS_X == 1 && A <= 32;
   float4 weights[EARLY ? A / 4 : 1][2];
-  float2 bias[ITEMS_X], scale[ITEMS_X];
+  float2 bias[ITEMS_X];
+  Factors scale[ITEMS_X];
 
   static __device__ __forceinline__ int column(const Cta& b, int j) {
     return (b.x0() + stream_item(b, j).tile) * 16 + 2 * b.g();
@@ -14,11 +15,11 @@ struct Embedding {
   static __device__ __forceinline__ float4 weight(const Cta& b, int column, int k, int odd) {
     return __ldg((const float4*)(b.a.in_w + size_t(column + odd) * A) + k);
   }
-  __device__ __forceinline__ Embedding(const Cta& b, const float* scales) {
+  __device__ __forceinline__ Embedding(const Cta& b, const float* scales, int step) {
 #pragma unroll
     for (int j = 0; j < ITEMS_X; ++j) {
       bias[j] = __ldg((const float2*)(b.a.in_b + column(b, j)));
-      scale[j] = __ldg((const float2*)(scales + column(b, j)));
+      scale[j] = factors(scales, column(b, j), asked_rows(b, step, stream_item(b, j).token));
     }
     if (EARLY)
 #pragma unroll
@@ -105,13 +106,15 @@ __device__ __forceinline__ void send_v(const Cta& b) {
 
 // From the step's end to the next one's stream, whose norm has these scales: v_t, the Euler step, action_in_proj.
 __device__ __forceinline__ void advance(Cta& b, float4 (&x)[ITEMS_X], const float* scales, int step) {
+  const KeptRow later(b, step + 1);
   send_squares(b, x, BAR_V);
   __syncwarp();
   send_v(b);
   const int token = b.warp();
-  const Embedding embedding(b, scales);
-  const float* const shifts = b.a.out_shift + step * A;
+  const Embedding embedding(b, scales, imin(step + 1, b.a.steps - 1));
+  const float* const shifts = action_shifts(b, step, token);
   const float shift = __ldg(shifts + min(b.lane(), A - 1));
+  const EulerStep first(b, step, token, b.lane());
   receive(b, BAR_V, step, V_EXPECT, WAIT_V);
   if (token < T) {
     const float* const parts = (const float*)(b.smem + M_X + X_VPART) + token * A;
@@ -131,11 +134,12 @@ __device__ __forceinline__ void advance(Cta& b, float4 (&x)[ITEMS_X], const floa
       v = v * inverse + (number < 32 ? shift : __ldg(shifts + number));
       const int at = token * A + number;
       float* const xt = (float*)(b.smem + M_XT) + at;
-      const float next = euler_step(b, *xt, v);
+      const float next = (number < 32 ? first : EulerStep(b, step, token, number))(b, *xt, v);
       *xt = next;
       if (b.cta == 0) put_out(b, step, at, v, next);
     }
   }
+  later.keep(b);
   MARK(MARK_STEP_DONE)
   if (step + 1 == b.a.steps) return;
   consumers_sync();

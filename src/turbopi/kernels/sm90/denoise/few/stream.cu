@@ -85,7 +85,7 @@ constexpr u32 PATIENCE = 500;  // clock cycles before sums are asked for: polls 
 // Fetch the clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, send the
 // slice times the next norm's scale to all ranks, if `last` keep it. buffer: [D16][NT][PAIRS][32] 16-byte words.
 __device__ __forceinline__ void gather(Cta& b, float4 (&x)[ITEMS_X], const uint4* buffer, u32 bit,
-                                       const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
+                                       const Factors (&gates)[ITEMS_X], const Factors (&scales)[ITEMS_X], bool send_on,
                                        int half, bool last) {
   const u32 since = u32(clock64());
   const uint4* words[ITEMS_X];  // addresses are made while there is nothing else to do

@@ -1,8 +1,9 @@
 // Many tokens: gate|up and GeGLU. Awaits the stream. Hidden units land over it when all ranks have multiplied it.
-__device__ __forceinline__ void gate_up(Cta& b, const float* shifted, const float* row_scales, Sent&) {
+__device__ __forceinline__ void gate_up(Cta& b, const Shifts& shifts, const float* row_scales, Sent&) {
   const int gn = b.gn(), token = 2 * b.t() + (b.g() & 1);
   Own<GTL> own(b, gn);
-  const GateUpRows rows(own, b, shifted, row_scales);
+  GateUpShifts shift(b, shifts, own);
+  const GateUpScales scale(b, own, row_scales);
   u32 place[GROUPS_GU][OWN<GTL>];
 #pragma unroll
   for (int i = 0; i < GROUPS_GU; ++i)
@@ -17,6 +18,7 @@ __device__ __forceinline__ void gate_up(Cta& b, const float* shifted, const floa
   float sums[GROUPS_GU][NT * 4];
   multiply<GTL, D16>(b, M_X, D16, gn, sums, ahead);  // what the copy engine wrote needs no `show_to_products`
   MARK(MARK_GATE_UP_MULTIPLIED)
+  shift.behind_product(b, shifts, own);
   consumers_sync(), give_room(b);
   own.add_up(b, M_X + X_FF_SUMS, gn, sums);
   u32 window[QUARTER], hidden_bars[QUARTER];  // this CTA's shared memory as the receivers'
@@ -32,8 +34,8 @@ __device__ __forceinline__ void gate_up(Cta& b, const float* shifted, const floa
     for (int k = 0; k < OWN<GTL>; ++k)
       if (own.mine[i][k]) {
         const int n = own.n[i][k];
-        const float4 c = FP8 ? scaled(own.sums[i][k], rows.scale[i]) : own.sums[i][k];
-        const u32 two = two_units(b, c, known_rms(b, n * 8 + 2 * b.t()), rows.shift[i]);
+        const float4 c = FP8 ? scaled(own.sums[i][k], scale.of[i]) : own.sums[i][k];
+        const u32 two = two_units(b, c, known_rms(b, n * 8 + 2 * b.t()), shift(i, k));
         if constexpr (COPY_HIDDEN) {  // of a token that doesn't exist any
           byte* const p = b.smem + (place[i][k] - b.base) + (b.g() >> 1) * (FP8 ? 2 : 4);
           if (FP8)

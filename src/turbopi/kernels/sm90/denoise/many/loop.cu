@@ -14,10 +14,11 @@ __device__ __forceinline__ void consume(Cta& b) {
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) rope[j] = rope_of(b, prefix, QkvItem(b, j));
   const u32 expect_hidden = hidden_bytes(b);
+  KeptRow(b, 0).keep(b);
   begin_trace(b);
 #pragma unroll 1
   for (int step = 0; step < a.steps; ++step) {
-    const float* const table = a.table + size_t(step) * (2 * L + 1) * 3 * D;
+    const float* const table = step_table(b, step);
     embed_own(b, actions, x, table);
     MARK(MARK_EMBEDDED)
 #pragma unroll 1
@@ -27,15 +28,15 @@ __device__ __forceinline__ void consume(Cta& b) {
       for (int half = 0; half < 2; ++half) {  // attention, feed-forward
         b.forget();
         const u32 bit = flag(b.n), layer = b.n - step * L;
-        float2 gates[ITEMS_X], scales[ITEMS_X];
+        Factors gates[ITEMS_X], scales[ITEMS_X];
         Sent sent = {};
         if (half) {
-          gate_up(b, of_tiles(b, a.shifted, b.n), of_tiles(b, a.row_scales, layer), sent);
+          gate_up(b, Shifts(b, step), of_tiles(b, a.row_scales, layer), sent);
           MARK(MARK_HIDDEN_SENT)
           load_norm(b, step, half, gates, scales);
         } else {
           float* const kv = suffix_buffer(b);
-          project(b, of_tiles(b, a.shifted, b.n), of_tiles(b, a.row_scales, layer), kv, bit, rope);
+          project(b, Shifts(b, step), of_tiles(b, a.row_scales, layer), kv, bit, rope);
           MARK(MARK_QKV_SENT)
           attend(b, kv, bit, prefix);
         }

@@ -26,7 +26,7 @@ constexpr int X_SIZE = up128(imax(imax(X_BYTES, imax(X_Q + QT * NT * 256, X_OWN_
 // ---- all of it. The ring comes second, for what is read beyond its end lies behind it.
 
 constexpr int SQ = S;  // sums of squares of the stream, float32[SQ][NT * 8]: by slice
-constexpr int SIZE_SSQ = up128(SQ * NT * 32), SIZE_PART = up128(imax(DX * OWN_N, NT) * 32), SIZE_BAR = 384,
+constexpr int SIZE_SSQ = up128(SQ * NT * 32), SIZE_PART = up128(imax(DX * OWN_N, NT) * 32), SIZE_BAR = 384 + BESIDE_TRACE,
               SIZE_LIST = up128(MAX_SLOTS * 8);
 constexpr int BEHIND = imax(SIZE_SSQ + SIZE_PART + up128(NT * 32) + SIZE_BAR + SIZE_LIST, BEYOND);
 constexpr int STAGES = imin((TP_SHARED_BYTES - X_SIZE - BEHIND) / SLOT, 7);

@@ -21,14 +21,16 @@ __device__ __forceinline__ void copy_queries(const Cta& b) {
 
 // Awaits the stream. q to all ranks, k and v to all clusters as float32 with their flags. The partial sums lie over the
 // stream.
-__device__ __forceinline__ void project(Cta& b, const float* shifted, const float* row_scales, float* kv, u32 bit,
+__device__ __forceinline__ void project(Cta& b, const Shifts& shifts, const float* row_scales, float* kv, u32 bit,
                                         const float4 (&rope)[ITEMS_Q]) {
   const int tiles = b.qn() + b.kvn();
-  float2 shift[ITEMS_Q], scale[ITEMS_Q];
+  Factors shift[ITEMS_Q];
+  float2 scale[ITEMS_Q];
 #pragma unroll
   for (int j = 0; j < ITEMS_Q; ++j) {
-    const int row = QkvItem(b, j).row(b);
-    shift[j] = make_float2(__ldg(shifted + row), __ldg(shifted + row + 8));
+    const QkvItem item(b, j);
+    const int row = item.row(b);
+    shift[j] = shifts(b, row, item.mine ? item.n : 0);
     if (FP8) scale[j] = make_float2(__ldg(row_scales + row), __ldg(row_scales + row + 8));
   }
   Ahead<group_tiles(QKV), 0> ahead(b);

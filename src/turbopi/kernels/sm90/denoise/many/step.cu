@@ -57,7 +57,7 @@ __device__ __forceinline__ void embed_own(Cta& b, const Actions& actions, float4
     }
     __syncwarp();
   }
-  float2 scales[ITEMS_X];
+  Factors scales[ITEMS_X];
   load_columns(b, scales, scale);
   done_with_x(b);
   publish_stream(b, x, scales);
@@ -67,13 +67,14 @@ __device__ __forceinline__ void embed_own(Cta& b, const Actions& actions, float4
 __device__ __forceinline__ void advance_own(Cta& b, Actions& actions, const float4 (&x)[ITEMS_X], const float* scale,
                                             int step) {
   float* const xs = (float*)(b.smem + M_X + X_OWN_XS);
+  const KeptRow later(b, step + 1);
 #pragma unroll
   for (int j = 0; j < ITEMS_X; ++j) {
     const Item item = stream_item(b, j);
-    const float2 s = __ldg((const float2*)(scale + (b.x0() + item.tile) * 16 + 2 * b.g()));
+    const float4 y = scaled(x[j], factors(scale, (b.x0() + item.tile) * 16 + 2 * b.g(), rows_of(b, item.token)));
     float* p = xs + (item.tile * 16 + 2 * b.g()) * OWN_T + item.n / NC * 8 + 2 * b.t();
-    if (item.real) p[0] = x[j].x * s.x, p[OWN_T] = x[j].z * s.y;
-    if (item.real && item.token + 1 < T) p[1] = x[j].y * s.x, p[OWN_T + 1] = x[j].w * s.y;
+    if (item.real) p[0] = y.x, p[OWN_T] = y.z;
+    if (item.real && item.token + 1 < T) p[1] = y.y, p[OWN_T + 1] = y.w;
     keep_squares(b, x[j], j, item.real);
   }
   consumers_sync();
@@ -103,7 +104,9 @@ __device__ __forceinline__ void advance_own(Cta& b, Actions& actions, const floa
   receive(b, BAR_V, step, V_EXPECT, WAIT_V);
   const float* const parts = (const float*)(b.smem + M_X + X_OWN_V);
   const float* const squares = (const float*)(b.smem + M_SSQ);
-  const float shift = __ldg(b.a.out_shift + step * A + Actions::number(b));
+  float shift[HELD];
+#pragma unroll
+  for (int i = 0; i < HELD; ++i) shift[i] = __ldg(action_shifts(b, step, Actions::token(b, i)) + Actions::number(b));
 #pragma unroll
   for (int i = 0; i < HELD; ++i)
     if (Actions::exists(b, i)) {
@@ -113,9 +116,10 @@ __device__ __forceinline__ void advance_own(Cta& b, Actions& actions, const floa
       for (int s = 0; s < S * V_PARTS; ++s) v += parts[(s * OWN_T + own) * A + Actions::number(b)];
 #pragma unroll
       for (int s = 0; s < S; ++s) q += squares[s * OWN_T + own];
-      v = v * rms_from(b, q) + shift;
-      actions.kept[i] = euler_step(b, actions.kept[i], v);
+      v = v * rms_from(b, q) + shift[i];
+      actions.kept[i] = EulerStep(b, step, Actions::token(b, i), Actions::number(b))(b, actions.kept[i], v);
       if (b.rank() == 0) put_out(b, step, at, v, actions.kept[i]);
     }
+  later.keep(b);
   MARK(MARK_STEP_DONE)
 }

@@ -49,7 +49,7 @@ __device__ __forceinline__ float slice_squares(const Cta& b, int token) {
 // of squares, with flags in their lowest bits. A flag for the stream would need a fence before it, of 1,100 to 1,800
 // cycles: instead its words themselves say whether they are there. Those of the turn before are ABSENT again, as all
 // clusters have read them: what was published now follows sums that they made of them.
-__device__ __forceinline__ void publish_stream(Cta& b, const float4 (&x)[ITEMS_X], const float2 (&scales)[ITEMS_X]) {
+__device__ __forceinline__ void publish_stream(Cta& b, const float4 (&x)[ITEMS_X], const Factors (&scales)[ITEMS_X]) {
   auto stage = [&](u32 turn) { return (byte*)(b.a.scratch + B_STAGE + turn % STAGED * N_STAGE); };
   byte *const to = stage(b.turn), *const last = stage(b.turn + STAGED - 1);
 #pragma unroll
@@ -213,7 +213,7 @@ constexpr u32 PATIENCE = FP8 ? 300 : 400;  // clock cycles before sums are asked
 // Fetch the clusters' partial sums of a product, add them times the gate to the stream and, if `send_on`, publish the
 // slice times the next norm's scale. buffer: [D16][NT][NC][32] 8-byte words.
 __device__ __forceinline__ void gather(Cta& b, float4 (&x)[ITEMS_X], const uint4* buffer, u32 bit,
-                                       const float2 (&gates)[ITEMS_X], const float2 (&scales)[ITEMS_X], bool send_on,
+                                       const Factors (&gates)[ITEMS_X], const Factors (&scales)[ITEMS_X], bool send_on,
                                        int half) {
   const u32 since = u32(clock64());
   const uint2* words[ITEMS_X];  // addresses are made while there is nothing else to do

@@ -17,7 +17,7 @@ from turbopi.backends.fused import FusedBackend
 from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
 from turbopi.engine.call import CallShape
-from turbopi.engine.recent import MOST_LOOPS, MOST_STEPS, RecentLoops, fit
+from turbopi.engine.recent_loops import MOST_LOOPS, MOST_STEPS, Loop, RecentLoops, fit
 from turbopi.engine.runner import HostRow
 from turbopi.engine.without_compiler import OPS
 from turbopi.errors import BackendUnavailable
@@ -26,29 +26,29 @@ STEPS = range(1, 41)
 
 
 def test_the_least_recently_used_loop_goes() -> None:
-    gone: list[tuple[int, int]] = []
+    gone: list[Loop] = []
     recent = RecentLoops(gone.append)
     for steps in range(1, MOST_LOOPS + 1):
-        recent.use((steps, 10))
-    recent.use((1, 10))
+        recent.use(Loop(steps, 10))
+    recent.use(Loop(1, 10))
     assert gone == []
-    recent.use((MOST_LOOPS + 1, 10))
-    recent.use((2, 50))
-    assert gone == [(2, 10), (3, 10)]
-    assert list(recent)[-2:] == [(MOST_LOOPS + 1, 10), (2, 50)] and (1, 10) in list(recent)
-    assert recent.describe()["forgotten"] == 2 and recent.describe()["denoising_loops"][-1] == "2 steps, H=50"
+    recent.use(Loop(MOST_LOOPS + 1, 10))
+    recent.use(Loop(2, 50))
+    assert gone == [Loop(2, 10), Loop(3, 10)]
+    assert list(recent)[-2:] == [Loop(MOST_LOOPS + 1, 10), Loop(2, 50)] and Loop(1, 10) in list(recent)
+    assert recent.describe()["forgotten"] == 2 and recent.describe()["denoising_loops"][-1] == "H=50, 2 steps"
 
 
 def test_many_steps_leave_room_for_few_loops() -> None:
     """1.27 MB a step: all together stay at some 1.3 GB."""
-    gone: list[tuple[int, int]] = []
+    gone: list[Loop] = []
     recent = RecentLoops(gone.append)
     for steps in (10, 5, 1000, 20, 500):
-        recent.use((steps, 10))
-    assert gone == [(10, 10), (5, 10), (1000, 10)]
-    assert fit(recent) and sum(steps for steps, _ in recent) <= MOST_STEPS
-    recent.use((1000, 10))
-    assert (1000, 10) in list(recent)
+        recent.use(Loop(steps, 10))
+    assert gone == [Loop(10, 10), Loop(5, 10), Loop(1000, 10)]
+    assert fit(recent) and sum(loop.steps for loop in recent) <= MOST_STEPS
+    recent.use(Loop(1000, 10))
+    assert Loop(1000, 10) in list(recent)
 
 
 def test_forty_numbers_of_steps_leave_few_graphs_and_every_answer_is_right() -> None:
@@ -58,7 +58,7 @@ def test_forty_numbers_of_steps_leave_few_graphs_and_every_answer_is_right() -> 
     details = backend.describe()["graphs"]
     assert details["kept"] == MOST_LOOPS + 1 == len(backend._graphs)  # and vision's, which is every loop's
     assert details["forgotten"] == len(STEPS) - MOST_LOOPS and details["most_loops"] == MOST_LOOPS
-    assert details["denoising_loops"] == [f"{steps} steps, H=7" for steps in STEPS[-MOST_LOOPS:]]
+    assert details["denoising_loops"] == [f"H=7, {steps} steps" for steps in STEPS[-MOST_LOOPS:]]
     assert len(backend._calls) == len(backend._tables) == MOST_LOOPS
     for steps in (1, 20, 40, 39):
         assert torch.equal(backend.sample(observation, noise, steps).actions, first[steps])
@@ -69,7 +69,7 @@ def test_horizons_are_bounded_too_and_steps_they_share_stay() -> None:
     observation, _ = made_up("pi05", 2, 5)
     for horizon in range(1, 21):
         backend.sample(observation, torch.zeros(1, horizon, 32), 2)
-    assert len(backend._calls) == MOST_LOOPS and list(backend._tables) == [2]
+    assert len(backend._calls) == MOST_LOOPS and list(backend._tables) == [Loop(2, 7).table]
 
 
 def test_a_loop_without_a_compiler_is_let_go_as_well() -> None:
@@ -120,8 +120,8 @@ class Fused(FusedBackend):
         self._recent = RecentLoops(self._forget)
         self.expert_on = "device"
 
-    def _denoising_kernel(self, horizon: int, rows: int, table: Tensor | None) -> Any:
-        if horizon >= 50:
+    def _denoising_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Any:
+        if loop.horizon >= 50:
             raise BackendUnavailable("too many")
         self._put_expert_away()
         return SimpleNamespace()
@@ -137,8 +137,8 @@ class Fused(FusedBackend):
     _away = False
 
     def call(self, steps: int, horizon: int) -> Any:
-        self._recent.use((steps, horizon))
-        return self._make_denoiser(CallShape(2, 16, horizon, steps), None)
+        self._recent.use(Loop(steps, horizon))
+        return self._make_denoiser(CallShape(2, 16, Loop(steps, horizon)), None)
 
 
 def test_fuseds_kernels_go_with_their_loops_and_the_expert_goes_away_with_the_last_graph_that_reads_it() -> None:
@@ -163,7 +163,7 @@ def test_graphs_around_engines_are_bounded(cls: type[TensorRTBackend], tmp_path:
         backend.sample(case.observation, case.noise, steps)
     parts = 1 if cls is TensorRTBackend else 2
     details = backend.describe()["graphs"]
-    assert details["denoising_loops"] == [f"{steps} steps, H={case.noise.shape[1]}" for steps in range(5, 13)]
+    assert details["denoising_loops"] == [f"H={case.noise.shape[1]}, {steps} steps" for steps in range(5, 13)]
     assert len({key.num_steps for key in backend._calls}) == len(backend._tables) == MOST_LOOPS
     assert details["kept"] == parts * len(backend._calls)
     assert torch.equal(backend.sample(case.observation, case.noise, 1).actions, expected)

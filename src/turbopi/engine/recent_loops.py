@@ -2,14 +2,41 @@
 
 import logging
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
+
+from turbopi.model.conditioning import Form
 
 logger = logging.getLogger(__name__)
 
-Loop = tuple[int, int]  # number of denoising steps, action horizon
+
+class Loop(NamedTuple):
+    """What a denoising loop is captured for."""
+
+    steps: int
+    horizon: int
+    form: Form = "plain"
+    times: tuple[float, ...] = ()  # of a conditioned loop: all that an action's t may be, so many rows has its table
+
+    def __str__(self) -> str:
+        said = f"H={self.horizon}, {self.steps} steps"
+        return said if self.form == "plain" else f"{said}, {FORMS[self.form]}, {len(self.times)} times"
+
+    @property
+    def rows(self) -> int:
+        """Of its modulation table."""
+        return len(self.times) or self.steps
+
+    @property
+    def table(self) -> tuple[int, tuple[float, ...]]:
+        """Loops with the same one share a modulation table."""
+        return (0, self.times) if self.times else (self.steps, ())
+
+
+FORMS: dict[Form, str] = {"tokens": "by token", "jacobian": "guided by the Jacobian"}
 
 # A policy has one loop, a study a handful. What is kept of each step is up to 1.27 MB: Pi0.5's modulation (0.45 MB) and
-# what the denoising kernel makes of it. So all loops together keep 1.3 GB at most, and eight of ten steps 0.1 GB.
+# what the denoising kernel makes of it. So all loops together keep 1.3 GB at most, and eight of ten steps 0.1 GB. Of a
+# conditioned loop it is kept of each time that an action may have.
 MOST_LOOPS = 8
 MOST_STEPS = 1024  # of all loops together; one loop may always have as many as the policy takes
 
@@ -38,14 +65,14 @@ class RecentLoops:
             oldest = next(iter(self._loops))
             del self._loops[oldest]
             self.forgotten += 1
-            logger.info("denoising in %d steps, H=%d, makes room for other loops: its graphs are forgotten", *oldest)
+            logger.info("denoising in %s, makes room for other loops: its graphs are forgotten", oldest)
             self._forget(oldest)
         self._loops[loop] = None
         self._last = loop
 
     def describe(self) -> dict[str, Any]:
         return {
-            "denoising_loops": [f"{steps} steps, H={horizon}" for steps, horizon in list(self._loops)],
+            "denoising_loops": [str(loop) for loop in list(self._loops)],
             "most_loops": MOST_LOOPS,
             "most_steps_together": MOST_STEPS,
             "forgotten": self.forgotten,
@@ -55,4 +82,4 @@ class RecentLoops:
 def fit(loops: Iterable[Loop]) -> bool:
     """Whether so many loops are kept at once."""
     loops = list(loops)
-    return len(loops) <= MOST_LOOPS and sum(steps for steps, _ in loops) <= MOST_STEPS
+    return len(loops) <= MOST_LOOPS and sum(loop.rows for loop in loops) <= MOST_STEPS

@@ -1,0 +1,101 @@
+"""The options of `--policy.type=turbopi`; whatever else LeRobot asks a policy's config is read from the checkpoint."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs.policies import PreTrainedConfig
+
+from turbopi.errors import CheckpointError, ConfigError
+
+KINDS = ("pi05", "pi0")
+NO_TRAINING = (
+    "Turbo-Pi runs policies, it doesn't train them: train with --policy.type=pi05 or pi0, and run the checkpoint with "
+    "--policy.type=turbopi --policy.checkpoint=…"
+)
+
+
+@PreTrainedConfig.register_subclass("turbopi")
+@dataclass
+class TurboPiConfig(PreTrainedConfig):
+    """How Turbo-Pi runs a LeRobot checkpoint of type pi05 or pi0.
+
+    checkpoint           its folder, or its name on the Hugging Face hub (owner/name, with `pretrained_revision`)
+    backend              a name from `turbopi backends`; "auto" takes the fastest one available
+    precision            "bf16", "f32", or with a calibration "fp8" or "fp8-mlp"
+    quantization         what `turbopi calibrate` wrote for this checkpoint; None: the turbopi_fp8.json in its folder
+    num_inference_steps  denoising steps a chunk; None: the checkpoint's
+    n_action_steps       actions of a chunk that are executed before the next one; None: the checkpoint's
+    warmup               compile and capture everything when the policy is made, not during the first calls
+
+    The fields of PreTrainedConfig are as in LeRobot: `device` says where it runs. The features are the checkpoint's,
+    unless they are given, and so are
+
+    chunk_size, max_action_dim  the model's action chunk [H, D]
+    image_resolution            (height, width) that pictures are resized to
+    action_feature_names        of the robot's actions, in the model's order, if the checkpoint has them
+
+    Raises CheckpointError if the checkpoint is of another type, and ConfigError for options that don't fit it.
+    """
+
+    checkpoint: str | None = None
+    backend: str = "auto"
+    precision: str = "bf16"
+    quantization: str | None = None
+    num_inference_steps: int | None = None
+    n_action_steps: int | None = None
+    warmup: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.checkpoint is None:
+            return  # LeRobot also makes configs that it never runs; the policy refuses it
+        described = self._described()
+        self.chunk_size: int = described.chunk_size
+        self.max_action_dim: int = described.max_action_dim
+        self.image_resolution: tuple[int, int] = tuple(described.image_resolution)
+        self.action_feature_names: list[str] | None = described.action_feature_names
+        for name in ("input_features", "output_features", "num_inference_steps", "n_action_steps"):
+            if getattr(self, name) in (None, {}):
+                setattr(self, name, getattr(described, name))
+        if not self.pretrained_path:  # where LeRobot looks for the processors
+            self.pretrained_path: Path | None = Path(self.checkpoint)
+        if self.n_action_steps is None or not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ConfigError(
+                f"n_action_steps is {self.n_action_steps}; it should be from 1 to the chunk's {self.chunk_size} actions"
+            )
+
+    def _described(self) -> Any:
+        """The checkpoint's own config."""
+        import lerobot.policies  # noqa: F401 - registers pi05 and pi0
+
+        described = PreTrainedConfig.from_pretrained(self.checkpoint, revision=self.pretrained_revision)
+        if described.type not in KINDS:
+            raise CheckpointError(
+                f"{self.checkpoint} is a LeRobot checkpoint of type {described.type!r}; Turbo-Pi runs 'pi05' and 'pi0'"
+            )
+        described.validate_features()  # adds the empty cameras, and features that the file leaves to defaults
+        return described
+
+    # what LeRobot's training asks
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+    def get_optimizer_preset(self) -> Any:
+        raise NotImplementedError(NO_TRAINING)
+
+    def get_scheduler_preset(self) -> Any:
+        raise NotImplementedError(NO_TRAINING)
+
+    def validate_features(self) -> None:
+        """The checkpoint's features are valid already."""

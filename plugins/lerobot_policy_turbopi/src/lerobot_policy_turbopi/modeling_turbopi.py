@@ -1,0 +1,201 @@
+"""LeRobot's policy interface over Turbo-Pi's model: preprocessed batch in, normalised action chunk out.
+
+LeRobot's processors stand before and behind it, as with LeRobot's own Pi0.5. Of Turbo-Pi the model alone runs: what
+`PI05Policy.predict_action_chunk` does between the processors is done here, with LeRobot's own resizing.
+"""
+
+import logging
+import re
+import shutil
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NoReturn, cast
+
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.common.vla_utils import resize_with_pad_torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+from torch import Tensor
+
+from lerobot_policy_turbopi.configuration_turbopi import NO_TRAINING, TurboPiConfig
+from turbopi import UnifiedPolicy, open_checkpoint
+from turbopi.arguments import checked_steps
+from turbopi.errors import ActionError, CheckpointError, ConfigError, ObservationError
+from turbopi.observation import Observation
+from turbopi.preprocess.tokenizer import TINY_TOKENIZER
+
+logger = logging.getLogger(__name__)
+
+
+class TurboPiPolicy(PreTrainedPolicy):
+    """A LeRobot checkpoint of type pi05 or pi0 on Turbo-Pi's fastest backend. It has no parameters of PyTorch.
+
+    turbopi   the policy that runs the model; None: made from `config`. Its robot, statistics and tokenizer aren't used
+
+    Raises what `turbopi.UnifiedPolicy` raises, and ConfigError without a checkpoint.
+    """
+
+    config_class = TurboPiConfig
+    name = "turbopi"
+
+    def __init__(self, config: TurboPiConfig, turbopi: UnifiedPolicy | None = None, **unused: Any) -> None:
+        super().__init__(config)  # unused: LeRobot hands statistics of data sets to every policy
+        self.config = config
+        self.turbopi = load(config) if turbopi is None else turbopi
+        self._actions: deque[Tensor] = deque()
+        self.eval()
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: PreTrainedConfig | None = None,
+        revision: str | None = None,
+        **unused: Any,
+    ) -> "TurboPiPolicy":
+        """A policy from a checkpoint of type pi05 or pi0, or from what `save_pretrained` left, with its options."""
+        if config is None:
+            config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, revision=revision)
+        if not isinstance(config, TurboPiConfig):
+            config = TurboPiConfig(checkpoint=str(pretrained_name_or_path), pretrained_revision=revision)
+        return cls(config)
+
+    @torch.no_grad()
+    def predict_action_chunk(
+        self, batch: dict[str, Tensor], noise: Tensor | None = None, num_steps: int | None = None
+    ) -> Tensor:
+        """A preprocessed batch to normalised actions float32[B, chunk_size, actions], on the batch's device.
+
+        noise      float32[B, chunk_size, max_action_dim]; None: drawn as LeRobot's own policy draws it, so that the
+                   same seed of PyTorch gives the same noise
+        num_steps  denoising steps; None: the config's num_inference_steps
+
+        Raises ObservationError for a batch without pictures or tokens, noise of another shape and steps that can't be;
+        ActionError for actions that aren't finite.
+        """
+        inputs = self._inputs(batch)
+        device = inputs.tokens.device
+        shape = (inputs.batch_size, self.config.chunk_size, self.config.max_action_dim)
+        if noise is None:
+            noise = torch.normal(mean=0.0, std=1.0, size=shape, dtype=torch.float32, device=device)
+        if noise.shape != shape:
+            raise ObservationError(f"noise has shape {list(noise.shape)}, but this policy needs {list(shape)}")
+        steps = cast(int, self.config.num_inference_steps) if num_steps is None else num_steps
+        with torch.inference_mode(False):  # buffers made inside it would be of no use outside
+            actions = self.turbopi.backend.sample(inputs, noise, checked_steps(steps, ObservationError)).actions
+        if not actions.isfinite().all():
+            raise ActionError("the model computed actions that aren't finite; `turbopi verify` compares backends")
+        return actions[..., : self.config.output_features[ACTION].shape[0]].to(device)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **options: Any) -> Tensor:
+        """One action [B, actions]: the next of the chunk, or the first one of a new one once n_action_steps are used.
+
+        `options` are `predict_action_chunk`'s.
+        """
+        if not self._actions:
+            chunk = self.predict_action_chunk(batch, **options)[:, : self.config.n_action_steps]
+            self._actions.extend(chunk.transpose(0, 1))
+        return self._actions.popleft()
+
+    def reset(self) -> None:
+        """Forget the rest of the chunk: the next `select_action` looks at its observation."""
+        self._actions.clear()
+
+    def forward(self, batch: dict[str, Tensor], **unused: Any) -> NoReturn:
+        raise NotImplementedError(NO_TRAINING)
+
+    def get_optim_params(self) -> NoReturn:
+        raise NotImplementedError(NO_TRAINING)
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        """The options and the processors, for --policy.path; the weights stay where they are."""
+        assert self.config.checkpoint is not None
+        folder = local_folder(self.config)
+        named = self.config.checkpoint if not Path(self.config.checkpoint).is_dir() else str(folder.absolute())
+        replace(self.config, checkpoint=named)._save_pretrained(save_directory)
+        for file in folder.glob("policy_*processor*"):
+            shutil.copy(file, save_directory)
+
+    # -- a batch in the model's words ----------------------------------------------------------------------------------
+
+    def _inputs(self, batch: dict[str, Tensor]) -> Observation:
+        for key in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK):
+            if key not in batch:
+                raise ObservationError(f"the batch has no {key!r}; it has {', '.join(batch)}. Preprocess it first")
+        tokens, pictures = batch[OBS_LANGUAGE_TOKENS], self._pictures(batch)
+        return Observation(
+            images=pictures,
+            image_mask=torch.ones(pictures.shape[:2], dtype=torch.bool),  # what is missing isn't sent at all
+            tokens=tokens,
+            token_mask=batch[OBS_LANGUAGE_ATTENTION_MASK].bool(),
+            state=self._state(batch, len(tokens)),
+        )
+
+    def _pictures(self, batch: dict[str, Tensor]) -> Tensor:
+        """float32[B, C, 224, 224, 3] in [-1, 1] of the cameras that the batch has, in the checkpoint's order."""
+        present = [key for key in self.config.image_features if key in batch]
+        if not present:
+            wanted = ", ".join(self.config.image_features)
+            raise ObservationError(
+                f"the batch has none of the checkpoint's cameras, {wanted}; it has {', '.join(batch)}"
+            )
+        size = self.config.image_resolution
+        pictures = []
+        for key in present:
+            picture = batch[key].to(torch.float32)
+            if picture.shape[1] == 3:
+                picture = picture.permute(0, 2, 3, 1)
+            pictures.append(picture if picture.shape[1:3] == size else resize_with_pad_torch(picture, *size))
+        return torch.stack(pictures, dim=1).mul_(2).sub_(1)
+
+    def _state(self, batch: dict[str, Tensor], rows: int) -> Tensor:
+        """float32[B, max_action_dim]: Pi0's, padded. Pi0.5 has it in the prompt."""
+        state = torch.zeros(rows, self.config.max_action_dim)
+        if self.turbopi.config.model.kind == "pi0":
+            given = batch[OBS_STATE]
+            state[:, : given.shape[-1]] = given
+        return state
+
+
+def load(config: TurboPiConfig) -> UnifiedPolicy:
+    """Turbo-Pi's policy for a config, warm if it says so."""
+    if config.checkpoint is None:
+        raise ConfigError(
+            "no checkpoint: --policy.type=turbopi needs --policy.checkpoint=FOLDER, or a hub's owner/name"
+        )
+    checkpoint = open_checkpoint(local_folder(config))
+    # the edges are those of the LeRobot that runs, whichever wrote the checkpoint, and so is its time grid
+    ours = replace(checkpoint.config, image_resize="lerobot").with_model(time_grid="multiplied")
+    policy = UnifiedPolicy(
+        replace(checkpoint, config=ours),
+        backend=config.backend,
+        precision=cast(Any, config.precision),
+        quantization=config.quantization,
+        num_denoising_steps=config.num_inference_steps,
+        device=config.device or "auto",
+        tokenizer=TINY_TOKENIZER,  # LeRobot's processors tokenise; warm-up alone reads a prompt with this one
+    )
+    described = policy.metadata
+    logger.info(
+        "Turbo-Pi runs %s: backend %s (%s)", config.checkpoint, described["backend"], described["backend_reason"]
+    )
+    if config.warmup:
+        seconds = policy.warmup(horizons=config.chunk_size)
+        logger.info("warm after %.1f s", seconds)
+    return policy
+
+
+def local_folder(config: TurboPiConfig) -> Path:
+    """The checkpoint's folder, downloaded if it is a name on the hub. CheckpointError if it is neither."""
+    checkpoint = cast(str, config.checkpoint)
+    if Path(checkpoint).is_dir():
+        return Path(checkpoint)
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+", checkpoint):
+        raise CheckpointError(f"{checkpoint!r} is neither a folder nor a name on the hub (owner/name)")
+    from huggingface_hub import snapshot_download
+
+    return Path(snapshot_download(checkpoint, revision=config.pretrained_revision))

@@ -1,0 +1,121 @@
+"""The vector-Jacobian product through the action expert, the prefix's keys and values fixed: exact, as operations.
+
+Forward as `forward.expert_output`, but that what the way back needs is kept; then back, layer by layer. Per layer five
+tensors are kept, for one evaluation. The suffix's own keys and values depend on its tokens, so gradients go through the
+cache's last rows, too.
+
+Shapes: T suffix tokens, D width, K head_dim, n query heads, R cache rows.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.engine.forward import Rope
+from turbopi.engine.weights import Weights
+from turbopi.kernels.interface import BackwardOps, Ops, State
+from turbopi.kernels.plain import matmul_f32
+
+
+@dataclass(frozen=True)
+class KeptLayer:
+    """What one layer's way back needs."""
+
+    x: Tensor  # [T, D]  the residual stream as attention's norm reads it
+    q: Tensor  # [T * n, K], turned
+    probabilities: Tensor  # [T * n, R]
+    middle: Tensor  # [T, D]  the residual stream as the MLP's norm reads it
+    gate_up: Tensor  # [T, 2F]
+
+
+@dataclass(frozen=True)
+class Expert:
+    """The expert on one cache with one modulation, forward and back."""
+
+    config: ModelConfig
+    weights: Weights
+    ops: Ops
+    back: BackwardOps
+    table: Tensor | None  # float32[2 * layers + 1, 3, T or none, D]; None: Pi0
+    length: Tensor
+    cache_k: Tensor  # [layer, R, K]
+    cache_v: Tensor
+    rope: Rope
+
+    def forward(self, tokens: Tensor) -> tuple[Tensor, list[KeptLayer], Tensor]:
+        """Suffix tokens [T, D] -> (the final norm's result float32[T, D], what each layer keeps, the last stream)."""
+        config, ops, g = self.config, self.ops, self.config.expert
+        slots, pi0, kept = self._slots(tokens), config.kind == "pi0", []
+        x: Tensor = tokens
+        y: Any = None
+        gate: Tensor | None = None
+        for i, layer in enumerate(self.weights.expert):
+            scale, shift, next_gate = self._modulation(2 * i, layer.norm1)
+            x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
+            start, gate = x, next_gate
+            k, v = self.cache_k[i], self.cache_v[i]
+            q = ops.rope_split(ops.linear(normed, layer.qkv), *self.rope, k[slots:], v[slots:])
+            heads = (g.num_heads, pi0, g.head_dim**-0.5, v.dtype)
+            probabilities = self.back.softmax(matmul_f32(q, k.t()), self.length, slots, *heads)
+            attended = (probabilities @ v).view(len(tokens), -1)
+            scale, shift, next_gate = self._modulation(2 * i + 1, layer.norm2)
+            y = ops.residual_linear(attended, layer.out)
+            x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
+            gate_up = ops.linear(normed, layer.gate_up)
+            y, gate = ops.residual_linear(self.back.geglu(gate_up), layer.down), next_gate
+            kept.append(KeptLayer(start, q, probabilities, x, gate_up))
+        scale, shift, _ = self._modulation(2 * g.depth, self.weights.expert_norm)
+        x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
+        return normed.float(), kept, x
+
+    def vjp(self, kept: list[KeptLayer], last: Tensor, d_out: Tensor) -> Tensor:
+        """What comes back to the tokens, float32[T, D], of d_out float32[T, D] at the final norm's result."""
+        back, eps, g, layers = self.back, self.config.rms_norm_eps, self.config.expert, self.weights.expert
+        slots = self._slots(last)
+
+        def norm(d: Tensor, x: Tensor, index: int, plain: Tensor | None, d_x: Tensor | None) -> tuple[Tensor, Any]:
+            """Back through norm number `index` and the addition before it: to the stream, and to what was added."""
+            scale = self._modulation(index, plain)[0]
+            if index == 0:
+                return back.rms_norm_vjp(d, x, scale, eps, d_x, None)
+            gate = self._modulation(index - 1, None)[2]
+            d_x, d_y = back.rms_norm_vjp(d, x, scale, eps, d_x, gate)
+            return d_x, d_x.to(x.dtype) if gate is None else d_y
+
+        d_x, d_y = norm(d_out.to(last.dtype), last, 2 * g.depth, self.weights.expert_norm, None)
+        for i in reversed(range(g.depth)):
+            layer, had, k, v = layers[i], kept[i], self.cache_k[i], self.cache_v[i]
+            d_normed = back.geglu_vjp(d_y @ layer.down, had.gate_up) @ layer.gate_up
+            d_x, d_y = norm(d_normed, had.middle, 2 * i + 1, layer.norm2, d_x)
+            d_attended = (d_y @ layer.out).view(-1, g.head_dim)  # [T * n, K]
+            d_logits = back.softmax_vjp(had.probabilities, matmul_f32(d_attended, v.t()), g.head_dim**-0.5)
+            d_k = d_logits[:, slots:].t() @ had.q
+            d_v = had.probabilities[:, slots:].t() @ d_attended
+            d_qkv = back.rope_vjp(d_logits @ k, d_k, d_v, *self.rope)
+            d_x, d_y = norm(d_qkv @ layer.qkv, had.x, 2 * i, layer.norm1, d_x)
+        return d_x
+
+    def _slots(self, tokens: Tensor) -> int:
+        return self.cache_k.shape[1] - len(tokens)
+
+    def _modulation(self, index: int, plain: Tensor | None) -> tuple[Any, Any, Any]:
+        """Scale, shift and gate of norm number `index`; the shift and the gate may be None."""
+        return (plain, None, None) if self.table is None else self.table[index].unbind(0)
+
+
+def suffix_vjp(config: ModelConfig, small: State, x_t: Tensor, time: Tensor, d_tokens: Tensor) -> Tensor:
+    """Back from the actions' tokens float32[H, D] to x_t float32[H, A]. `time` float32[D] or [H, D] is Pi0's."""
+    d = d_tokens.float()
+    if config.kind == "pi0":
+        actions = F.linear(x_t, small["action_in_proj.weight"], small["action_in_proj.bias"])
+        mixed = torch.cat((actions, time.expand_as(actions)), dim=-1)
+        inner = F.linear(mixed, small["action_time_mlp_in.weight"], small["action_time_mlp_in.bias"])
+        sigmoid = inner.sigmoid()
+        slope = sigmoid * (1 + inner * (1 - sigmoid))
+        d = (d @ small["action_time_mlp_out.weight"] * slope) @ small["action_time_mlp_in.weight"]
+        d = d[:, : actions.shape[1]]
+    return d @ small["action_in_proj.weight"]

@@ -1,0 +1,100 @@
+"""What a conditioned denoising loop is told besides noise: buffers that a captured graph reads, written for each call.
+
+Which times may occur is fixed when the loop is captured (`Loop.times`): the modulation table has a row for each. Which
+action has which of them in which step, what is held and what pulls differ from call to call.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.engine.flat import allocate
+from turbopi.engine.recent_loops import Loop
+from turbopi.errors import ObservationError
+from turbopi.kernels.interface import TokenInputs
+from turbopi.model.conditioning import Conditioning, TokenTimes
+
+MOST_TIMES = 1024  # of a loop: 2.9 MB each, on the device
+
+
+def conditioned_loop(conditioning: Conditioning | None, num_steps: int, horizon: int, config: ModelConfig) -> Loop:
+    """The loop that a call needs. Raises ObservationError for a conditioning that doesn't fit it.
+
+    One with the config's own grid of times serves all calls that have no others, and 0, whatever they hold.
+    """
+    if conditioning is None:
+        return Loop(num_steps, horizon)
+    conditioning.check(num_steps, horizon, config.action_dim)
+    form = conditioning.form
+    if form == "plain":
+        return Loop(num_steps, horizon)
+    own = {*TokenTimes.plain(num_steps, horizon, config.time_grid).distinct().tolist(), 0.0}
+    wanted = {*conditioning.token_times(num_steps, horizon, config.time_grid).distinct().tolist(), 0.0}
+    times = own if wanted <= own else wanted
+    if len(times) > MOST_TIMES:
+        raise ObservationError(
+            f"the token times have {len(times)} different values; at most {MOST_TIMES} fit: let actions share times"
+        )
+    return Loop(num_steps, horizon, form, tuple(sorted(times, reverse=True)))
+
+
+@dataclass(frozen=True)
+class Conditioned:
+    """A conditioned loop's inputs, on the host and on the device. N steps, H actions, A action_dim."""
+
+    loop: Loop
+    config: ModelConfig
+    host: Tensor  # uint8: all of them, pinned
+    device: Tensor
+    arrays: dict[str, np.ndarray]  # views into `host`
+    tokens: TokenInputs  # views into `device`; gain is the strength alone where the Jacobian is true
+    weights: Tensor  # float32[H, 1], of guidance
+
+    @classmethod
+    def allocate(cls, config: ModelConfig, loop: Loop, device: torch.device) -> "Conditioned":
+        grid, chunk = (loop.steps, loop.horizon), (loop.horizon, config.action_dim)
+        fields = {
+            "rows": (grid, torch.int32),
+            "steps": (grid, torch.float32),
+            "times": (grid, torch.float32),
+            "target": (chunk, torch.float32),
+            "gain": (grid, torch.float32),
+            "weights": ((loop.horizon, 1), torch.float32),
+        }
+        host, views = allocate(fields, torch.device("cpu"), pinned=device.type == "cuda")
+        flat, on_device = allocate(fields, device, pinned=False)
+        weights = on_device.pop("weights")
+        arrays = {name: view.numpy() for name, view in views.items()}
+        return cls(loop, config, host, flat, arrays, TokenInputs(**on_device), weights)
+
+    def write(self, conditioning: Conditioning) -> None:
+        """Into the host's buffer."""
+        asked, arrays = conditioning.token_times(self.loop.steps, self.loop.horizon, self.config.time_grid), self.arrays
+        table = np.array(self.loop.times, np.float32)
+        arrays["rows"][:], arrays["steps"][:], arrays["times"][:] = asked.rows(table), asked.steps, asked.times
+        guidance = conditioning.guidance
+        if guidance is None:
+            for name in ("target", "gain", "weights"):
+                arrays[name][:] = 0
+            return
+        arrays["target"][:] = guidance.target
+        arrays["weights"][:, 0] = guidance.weights
+        through = guidance.mode == "jacobian"
+        arrays["gain"][:] = guidance.strength if through else guidance.strength * guidance.weights
+
+    def upload(self) -> None:
+        self.device.copy_(self.host, non_blocking=True)
+
+    def modulation(self, table: Tensor, step: int) -> Tensor:
+        """Of every action's own time: of a table float32[U, norms, 3, D] float32[norms, 3, H, D]."""
+        return table.permute(1, 2, 0, 3).index_select(2, self.tokens.rows[step])
+
+    def error(self, step: int, x_t: Tensor, v_t: Tensor) -> Tensor:
+        """target − x̂, x̂ = x − t v: float32[H, A]."""
+        return self.tokens.target - (x_t - self.tokens.times[step, :, None] * v_t)
+
+    def next_x(self, step: int, x_t: Tensor, v_t: Tensor) -> Tensor:
+        return x_t + self.tokens.steps[step, :, None] * v_t

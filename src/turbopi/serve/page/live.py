@@ -1,0 +1,284 @@
+"""What the server has seen of its robots, and the watchers who see it live.
+
+All of `Live` runs in the event loop, in a few microseconds a call; what takes longer is on its thread.
+"""
+
+import asyncio
+import contextlib
+import json
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+
+from turbopi.serve.connection import GuardedConnection
+from turbopi.serve.metrics import Metrics
+from turbopi.serve.page.device import memory_of
+from turbopi.serve.page.look import look_at
+from turbopi.serve.page.messages import (
+    FEED_VERSION,
+    Frame,
+    Hello,
+    Look,
+    Memory,
+    RobotFrame,
+    StageTimes,
+    Trouble,
+    clean,
+)
+from turbopi.serve.worker import Worker
+from turbopi.showing import action_groups
+from turbopi.version import turbopi_version
+
+logger = logging.getLogger(__name__)
+
+FRAMES_A_SECOND = 4.0  # to each watcher
+LOOKS_A_SECOND = 16.0  # of all robots together
+MESSAGE_BYTES = 16 * 2**20  # of an observation: a longer one isn't kept until it is looked at
+LOOKING = 4  # calls that are looked at or wait for it: others aren't shown
+ROBOTS = 16  # shown, of those that are connected
+CALLS = 512  # whose times are kept
+TROUBLES = 20
+BINS = 60
+STAGES = ("preprocess", "queue", "vision", "prefix", "denoise", "infer", "postprocess", "total", "request")
+
+Timing = Mapping[str, float]
+
+
+@dataclass
+class _Robot:
+    """A connected client, as long as it is one."""
+
+    id: int
+    address: str
+    connected: float
+    calls: int = 0
+    last: float | None = None
+    look: Look | None = None
+    looked: float = -np.inf  # the event loop's time
+    looking: bool = False
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """The server's state, for a frame that is put together on the thread."""
+
+    time: float
+    requests: int
+    clients: int
+    waiting: int
+    running: bool
+    lost: str | None
+    errors: dict[str, int]
+    troubles: Sequence[Trouble]
+    timings: Sequence[Timing]
+    robots: Sequence[RobotFrame]
+
+
+class Live:
+    """What robots did, for those who watch. `start` it before anybody is let in; `let_go`, then `close` it."""
+
+    def __init__(self, metrics: Metrics, worker: Worker, why_lost: Callable[[], str | None]) -> None:
+        self._metrics, self._worker, self._why_lost = metrics, worker, why_lost
+        self._robots: dict[GuardedConnection, _Robot] = {}
+        self._known = 0
+        self._timings: deque[Timing] = deque(maxlen=CALLS)
+        self._troubles: deque[Trouble] = deque(maxlen=TROUBLES)
+        self._watchers = 0
+        self._looks: set[asyncio.Task[None]] = set()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="turbopi-page")
+        self._closed = asyncio.Event()
+        self._hello = ""
+        self._faulty = False
+        self._memory: Callable[[], Memory] = memory_of("cpu")
+
+    def start(self, metadata: Mapping[str, Any], queue_limit: int) -> None:
+        """The policy is ready; `metadata` is what clients are sent of it."""
+        robot, dims = metadata.get("robot", ""), metadata.get("robot_action_dim", 0)
+        self._memory = memory_of(str(metadata.get("device", "cpu")))
+        hello = Hello(
+            feed=FEED_VERSION,
+            turbopi=turbopi_version(),
+            started=time.time(),
+            queue_limit=queue_limit,
+            policy=json.loads(json.dumps(metadata, default=_plain, skipkeys=True)),
+            actions=list(action_groups(robot, dims)) if isinstance(robot, str) and isinstance(dims, int) else [],
+        )
+        self._hello = _json(hello)
+
+    def let_go(self) -> None:
+        """The server stops: say so to the watchers, and look at nothing more."""
+        self._closed.set()
+
+    async def close(self) -> None:
+        """End the thread. No watcher may be left."""
+        await asyncio.gather(*self._looks)
+        self._thread.shutdown(wait=False)
+
+    # --- what robots do -----------------------------------------------------------------------------------------------
+
+    def joined(self, connection: GuardedConnection) -> None:
+        self._known += 1
+        peer = connection.remote_address
+        address = f"{peer[0]}:{peer[1]}" if isinstance(peer, tuple) else str(peer)
+        self._robots[connection] = _Robot(self._known, address, time.time())
+
+    def left(self, connection: GuardedConnection) -> None:
+        self._robots.pop(connection, None)
+
+    def answered(
+        self, connection: GuardedConnection, message: bytes, reply: Mapping[str, object], seconds: float
+    ) -> None:
+        """`reply` was sent, `seconds` after `message` had come. Nobody may change them any more."""
+        robot = self._robots[connection]
+        robot.calls += 1
+        robot.last = time.time()
+        timing = _timing(reply, seconds)
+        self._timings.append(timing)
+        if not self._watchers or robot.looking or len(self._looks) >= LOOKING or self._closed.is_set():
+            return
+        now = asyncio.get_running_loop().time()
+        if now - robot.looked >= max(1 / FRAMES_A_SECOND, len(self._robots) / LOOKS_A_SECOND):
+            robot.looked, robot.looking = now, True
+            kept = message if len(message) <= MESSAGE_BYTES else None
+            task = asyncio.ensure_future(self._look(robot, kept, reply, timing))
+            self._looks.add(task)
+            task.add_done_callback(self._looks.discard)
+
+    def failed(self, kind: str, text: str) -> None:
+        """A request got no actions: `text` is what the client was told."""
+        self._troubles.append(Trouble(time.time(), kind, clean(text)))
+
+    async def _look(self, robot: _Robot, message: bytes | None, reply: Mapping[str, object], timing: Timing) -> None:
+        loop, number, last = asyncio.get_running_loop(), robot.calls, robot.last
+        assert last is not None
+        try:
+            robot.look = await loop.run_in_executor(self._thread, look_at, number, last, message, reply, timing)
+        except Exception:  # a fault of the page must not cost a robot anything
+            if not self._faulty:  # once: it may come with every call
+                logger.exception("the page can't show a call")
+            self._faulty = True
+        finally:
+            robot.looking = False
+
+    # --- those who watch ----------------------------------------------------------------------------------------------
+
+    async def watch(self, connection: GuardedConnection) -> None:
+        """Send the feed to one watcher until it leaves or the server stops. It has nothing to say itself."""
+        says, closed = asyncio.ensure_future(connection.recv()), asyncio.ensure_future(self._closed.wait())
+        had: dict[int, int] = {}  # robot -> number of the last look that was sent
+        self._watchers += 1
+        try:
+            await connection.send(self._hello)
+            while not (says.done() or closed.done()):
+                await connection.send(await self._frame(had))  # who reads slowly is sent fewer
+                await asyncio.wait({says, closed}, timeout=1 / FRAMES_A_SECOND, return_when=asyncio.FIRST_COMPLETED)
+            if says.done():
+                says.result()
+                connection.answered("bad")
+                await connection.close(CloseCode.POLICY_VIOLATION, "the feed takes no messages")
+            else:
+                await connection.close(CloseCode.GOING_AWAY, "the server is shutting down")
+        except ConnectionClosed:
+            pass
+        finally:
+            self._watchers -= 1
+            for wait in (says, closed):
+                wait.cancel()
+                with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
+                    await wait
+
+    async def _frame(self, had: dict[int, int]) -> str:
+        moment = self._moment(had)
+        had.update({robot.id: robot.look.number for robot in moment.robots if robot.look is not None})
+        for gone in had.keys() - {robot.id for robot in moment.robots}:
+            del had[gone]
+        return await asyncio.get_running_loop().run_in_executor(self._thread, _frame_of, moment, self._memory)
+
+    def _moment(self, had: Mapping[int, int]) -> _Moment:
+        latest = sorted(self._robots.values(), key=lambda robot: robot.last or robot.connected)[-ROBOTS:]
+        return _Moment(
+            time=time.time(),
+            requests=self._metrics.requests_so_far(),
+            clients=len(self._robots),
+            waiting=self._worker.waiting,
+            running=self._worker.running,
+            lost=self._why_lost(),
+            errors=self._metrics.errors_so_far(),
+            troubles=tuple(self._troubles),
+            timings=tuple(self._timings),
+            robots=[_robot_frame(robot, had) for robot in sorted(latest, key=lambda robot: robot.id)],
+        )
+
+
+def _robot_frame(robot: _Robot, had: Mapping[int, int]) -> RobotFrame:
+    new = robot.look if robot.look is not None and robot.look.number != had.get(robot.id) else None
+    return RobotFrame(robot.id, robot.address, robot.connected, robot.calls, robot.last, new)
+
+
+def _timing(reply: Mapping[str, object], seconds: float) -> Timing:
+    """{stage: milliseconds} of STAGES, as far as the policy tells them."""
+    told = reply.get("policy_timing")
+    told = told if isinstance(told, Mapping) else {}
+    found = {stage: told.get(f"{stage}_ms") for stage in STAGES}
+    numbers = {stage: float(value) for stage, value in found.items() if isinstance(value, int | float)}
+    return numbers | {"request": seconds * 1e3}
+
+
+def _frame_of(moment: _Moment, memory: Callable[[], Memory]) -> str:
+    width, latency = stage_times(moment.timings)
+    return _json(
+        Frame(
+            time=moment.time,
+            requests=moment.requests,
+            clients=moment.clients,
+            waiting=moment.waiting,
+            running=moment.running,
+            lost=moment.lost,
+            memory=memory(),
+            errors=moment.errors,
+            troubles=list(moment.troubles),
+            latency_bin_ms=width,
+            latency=latency,
+            robots=list(moment.robots),
+        )
+    )
+
+
+def stage_times(timings: Sequence[Timing]) -> tuple[float, list[StageTimes]]:
+    """Width of a bin in milliseconds, and the times of each stage that was told: all stages share the bins.
+
+    They reach somewhat beyond the longest stage's 99th percentile, so that one slow call doesn't squeeze all others.
+    """
+    of_stage = {stage: _finite(timing[stage] for timing in timings if stage in timing) for stage in STAGES}
+    of_stage = {stage: values for stage, values in of_stage.items() if len(values)}
+    longest = max((float(np.percentile(values, 99)) for values in of_stage.values()), default=0.0)
+    width = max(1.2 * longest, 1e-3) / BINS
+    found = []
+    for stage, values in of_stage.items():
+        bins = np.bincount(np.clip(values // width, 0, BINS - 1).astype(np.int64), minlength=BINS)
+        p50, p95 = np.percentile(values, (50, 95))
+        found.append(StageTimes(stage, len(values), float(p50), float(p95), float(values.max()), bins.tolist()))
+    return width, found
+
+
+def _finite(values: Iterable[float]) -> np.ndarray:
+    array = np.array(list(values), np.float64)
+    return array[np.isfinite(array)]
+
+
+def _json(message: Hello | Frame) -> str:
+    return msgspec.json.encode(message).decode()
+
+
+def _plain(value: object) -> object:
+    """Metadata that JSON doesn't know: NumPy's as lists and numbers, all else as its text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)

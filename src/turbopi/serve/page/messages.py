@@ -1,0 +1,117 @@
+"""What the feed says. Each message is a text frame of JSON with a "kind": first a Hello, then Frames.
+
+Numbers that aren't finite become null; bytes are base64. Texts of clients are cut and escaped (`clean`): they are shown
+as text, never as markup.
+"""
+
+from typing import Any
+
+from msgspec import Struct
+
+from turbopi.showing import ActionGroup
+
+FEED_VERSION = 1
+
+
+class Hello(Struct, frozen=True, tag="hello", tag_field="kind"):
+    """What doesn't change while the server runs.
+
+    policy   its metadata, as clients get it
+    actions  how the dimensions of its actions belong together; empty if the metadata doesn't say
+    """
+
+    feed: int
+    turbopi: str
+    started: float  # seconds since 1970
+    queue_limit: int
+    policy: dict[str, Any]
+    actions: list[ActionGroup]
+
+
+class Thumbnail(Struct, frozen=True):
+    jpeg: bytes
+    width: int  # of the picture that the robot sent
+    height: int
+
+
+class Look(Struct, frozen=True):
+    """One answered call.
+
+    number   of the robot's calls, from 1. Some are left out: a robot may ask more often than the feed tells
+    time     when its answer had been sent, in seconds since 1970
+    actions  [H, d] in the robot's units; empty if they are too many to show
+    numbers  the observation's arrays of few numbers, such as its state
+    timing   milliseconds of each stage
+    note     what isn't shown, and why
+    """
+
+    number: int
+    time: float
+    prompt: str
+    actions: list[list[float | None]]
+    numbers: dict[str, list[float | None]]
+    pictures: dict[str, Thumbnail]
+    timing: dict[str, float | None]
+    note: str = ""
+
+
+class RobotFrame(Struct, frozen=True):
+    """A connected robot. `look` is its last look if this watcher hasn't had it yet."""
+
+    id: int
+    address: str
+    connected: float  # seconds since 1970, as `last`
+    calls: int
+    last: float | None
+    look: Look | None = None
+
+
+class StageTimes(Struct, frozen=True):
+    """Milliseconds of a stage in the last calls, and how many of these fell into each bin of `Frame.latency_bin_ms`.
+
+    What is longer than all bins is in the last one.
+    """
+
+    stage: str
+    calls: int
+    p50: float
+    p95: float
+    max: float
+    bins: list[int]
+
+
+class Trouble(Struct, frozen=True):
+    """A request that got no actions."""
+
+    time: float
+    error: str  # its kind, as in turbopi_errors_total
+    text: str
+
+
+class Memory(Struct, frozen=True):
+    what: str
+    used: int
+    total: int
+
+
+class Frame(Struct, frozen=True, tag="frame", tag_field="kind"):
+    """The server at one moment."""
+
+    time: float
+    requests: int
+    clients: int
+    waiting: int
+    running: bool
+    lost: str | None
+    memory: Memory
+    errors: dict[str, int]
+    troubles: list[Trouble]  # the last ones
+    latency_bin_ms: float
+    latency: list[StageTimes]
+    robots: list[RobotFrame]  # those that asked last, in the order in which they came
+
+
+def clean(text: str, limit: int = 300) -> str:
+    """`text` of a client: cut, and with escapes for what isn't printable, such as marks that turn the line around."""
+    cut = text if len(text) <= limit else text[: limit - 1] + "…"
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in cut)

@@ -1,0 +1,84 @@
+"""Each example runs, with nothing for hardware; it says what it shows and how to run it."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_serve_openpi_client import PYTHON as CLIENT
+
+from turbopi import UnifiedPolicy
+from turbopi.checkpoint import random_checkpoint
+from turbopi.serve import running
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+STAND_IN = ROOT / "tests" / "openpi_stand_in"
+
+
+def run(name: str, *arguments: str, python: Path = Path(sys.executable), cwd: Path | None = None) -> str:
+    """What an example prints. Another `python` is that of openpi's client, and has nothing of Turbo-Pi's."""
+    ours = {"PYTHONPATH": os.pathsep.join((str(ROOT / "src"), str(STAND_IN))), "PYTHONWARNINGS": "error"}
+    done = subprocess.run(
+        [python, EXAMPLES / name, *arguments],
+        env=os.environ | (ours if python == Path(sys.executable) else {"PYTHONPATH": ""}),
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def policy() -> UnifiedPolicy:
+    return UnifiedPolicy(random_checkpoint("pi05_tiny"), device="cpu")
+
+
+@pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_every_example_says_how_to_run_it_and_is_run_here(example: Path) -> None:
+    shown = ast.get_docstring(ast.parse(example.read_text(encoding="utf-8")))
+    assert shown and f"python examples/{example.name}" in shown
+    assert f'run("{example.name}"' in Path(__file__).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("client", ["openpi's", "a stand-in"])
+def test_the_robot_loop_moves_an_arm(policy: UnifiedPolicy, client: str) -> None:
+    if client == "openpi's" and not CLIENT.is_file():
+        pytest.skip(f"openpi-client isn't installed at {CLIENT}")
+    python = CLIENT if client == "openpi's" else Path(sys.executable)
+    with running(policy) as server:
+        shown = run("robot_loop.py", "--port", str(server.port), "--chunks", "2", python=python)
+    assert shown.startswith("connected to a policy for libero\n") and shown.count("10 actions after") == 2
+
+
+def test_the_so101_moves_by_its_own_keys() -> None:
+    policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), device="cpu", robot=str(EXAMPLES / "so101.json"))
+    with running(policy) as server:
+        shown = run("lerobot_so101.py", "--server", server.url, "--chunks", "2")
+    assert "the arm is at {'shoulder_pan.pos': " in shown
+
+
+def test_the_so101_says_why_it_got_no_actions(policy: UnifiedPolicy) -> None:
+    """A server for another robot."""
+    with running(policy) as server, pytest.raises(AssertionError, match=r"no 'observation/image'.*shoulder_pan\.pos"):
+        run("lerobot_so101.py", "--server", server.url, "--chunks", "1")
+
+
+def test_a_robot_of_ones_own_is_a_file_or_a_class() -> None:
+    assert run("own_robot.py") == "my_arm.json: (10, 7)\nDegreeArm: (10, 7)\n"
+
+
+def test_recordings_become_fp8(tmp_path: Path) -> None:
+    shown = run("fp8_from_recordings.py", "--folder", "here", "--frames", "4", cwd=tmp_path)
+    assert "PASS" in shown and "in FP8 answers with actions [10, 7]" in shown
+    assert (tmp_path / "here" / "fp8.json").is_file()
+
+
+def test_the_python_api_shows_what_a_call_can_be_asked_for() -> None:
+    shown = run("python_api.py")
+    assert "warm after" in shown and "a batch of 2 chunks" in shown and "refused: the observation has no" in shown
