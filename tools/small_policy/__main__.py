@@ -30,7 +30,7 @@ norm_stats.json --seconds 560 --workers 30 --max-delay 6
 The policy of the dynamic task (`python -m small_policy chase`) takes minutes on a GPU, and a quarter of an hour on a
 CPU core of its own:
 
-    python -m small_policy chase --out work/chase --seconds 170 --device cuda --batch 1024 --frames 300000 --workers 16
+    python -m small_policy chase --out work/chase --seconds 300 --device cuda --batch 1024 --frames 300000 --workers 5
     turbopi eval chase work/chase/checkpoint --trials 200 --videos none --camera-px 48 --image-px 48 \
         --execution async,sync,ensemble,rtc,rtc_identity,rtc_trained --delay-steps 0,2,4 --out work/chase_delays
 
