@@ -9,6 +9,7 @@ from kernel_turns.document import MarkedVariant, read_turns
 from msgspec.structs import replace
 
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
+from turbopi.bench.work import JOINS
 from turbopi.provenance import Gpu
 from turbopi.wording import significant
 
@@ -120,6 +121,23 @@ def whole_calls(document: BenchDocument) -> list[str]:
         head += [f"H = {horizon}: {some} steps" for horizon in sorted({job.horizon for job in jobs})]
         lines += [*_table(head, rows), ""]
     return lines[:-1]
+
+
+def joins(document: BenchDocument) -> list[str]:
+    """`fused`: calls whose chunk joins a running one (`turbopi bench --join`) beside plain calls."""
+    rows = []
+    for one in document.results:
+        job = one.job
+        plain = next(
+            other.milliseconds["total"].p50
+            for other in document.results
+            if (other.backend, other.precision) == (one.backend, one.precision)
+            and other.job == replace(job, join="none")
+        )
+        times = f"{one.milliseconds['total'].p50 / plain:.3f}"
+        rows.append([f"{one.precision}, H = {job.horizon}", JOINS[job.join] or "plain", _ms(one), times])
+        rows[-1] += [_ms(one, "denoise"), _error(one)]
+    return _table(["", "a chunk is", "whole call, ms", "× plain", "denoise", "error"], rows, numbers_from=2)
 
 
 def lines_over_steps(document: BenchDocument) -> list[str]:
@@ -278,7 +296,10 @@ def _read_marks(file: Path) -> list[MarkedVariant]:
     return marks
 
 
-_OF_BENCHMARKS = (headline, main_job, whole_calls, image_sizes, lines_over_steps, errors, ready, kernels, machine)
+_OF_BENCHMARKS = (
+    *(headline, main_job, whole_calls, image_sizes, lines_over_steps, joins),
+    *(errors, ready, kernels, machine),
+)
 TABLES = {
     **{lines.__name__: Table(read_benchmark, lines) for lines in _OF_BENCHMARKS},
     "attacks": Table(_read_attacks, attacks),
