@@ -206,7 +206,8 @@ def arm_json(tmp_path: Path) -> Path:
 def test_the_option_is_the_same_text_everywhere(command: str) -> None:
     shown = text_of(turbopi(command, "--help").stdout)
     assert "--robot NAME|FILE|CLASS" in shown
-    assert "Instead of the configuration's robot: a built-in one, a description (.json), or your own class" in shown
+    told = "Instead of the configuration's robot: a built-in one, a type of LeRobot's (so101_follower), a description"
+    assert told in shown
 
 
 def test_inspect_shows_the_robots_keys_and_what_to_look_at(arm_json: Path) -> None:

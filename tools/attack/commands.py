@@ -42,13 +42,14 @@ BASES: dict[str, tuple[str, ...]] = {
     "build": _TINY,
     "study": ("mask", *_TINY),
     "demo": (*_QUICK, "--frames", "1", "--episodes", "0", "--report", "{here}/report"),
+    "view": ("{here}/nothing", "--save", "{here}/view.rrd"),
     "backends": (),
     "doctor": ("--port", "1"),
 }
 _RARE = ("eval", "compare", "demo", "bench")  # seconds each: a fifth as often
 # Values of these could reach other machines, or files outside the folder.
 _NEVER = ("--host", "--help", "-h", "--install-completion", "--show-completion", "--debug", "--version")
-_OUTPUTS = ("--out", "--record", "--report", "--plot", "--cache")
+_OUTPUTS = ("--out", "--save", "--record", "--report", "--plot", "--cache")
 
 # fmt: off
 NUMBERS = (
@@ -118,7 +119,8 @@ def _arguments(draw: random.Random, name: str, options: Sequence[Parameter]) -> 
     if base and draw.random() < 0.08:  # without one of its arguments
         del base[draw.randrange(len(base))]
     if draw.random() < 0.08:  # a stray one, or a word where a path was
-        base.insert(draw.randrange(len(base) + 1), draw.choice(("{here}", "x", "", "--", "-x", "--nothing", "🤖")))
+        places = [i for i in range(len(base) + 1) if not i or base[i - 1] not in (*_OUTPUTS, "-o")]  # not as an output
+        base.insert(draw.choice(places), draw.choice(("{here}", "x", "", "--", "-x", "--nothing", "🤖")))
     for parameter in draw.sample(options, min(len(options), draw.randrange(1, 4))):
         base.append(parameter.name)
         if not parameter.flag:

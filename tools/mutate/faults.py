@@ -120,8 +120,8 @@ FAULTS = (
     Fault(
         "a horizon's bound off by one",
         "turbopi.backends",
-        "if reason is None and horizon > MAX_SUFFIX:",
-        "if reason is None and horizon > MAX_SUFFIX + 1:",
+        "if reason is None and loop.horizon > MAX_SUFFIX:",
+        "if reason is None and loop.horizon > MAX_SUFFIX + 1:",
         "a horizon of 57 stops the server instead of taking operations",
         (CHOICE,),
     ),

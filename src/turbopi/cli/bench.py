@@ -103,7 +103,10 @@ def _joins(text: str) -> "list[Join]":
     names = _names(text)
     if not names or (wrong := [name for name in names if name not in JOINS]):
         raise ConfigError(f"--join has {shown(wrong[0] if names else text)}; expected some of {', '.join(JOINS)}")
-    return list(dict.fromkeys(names))  # type: ignore[arg-type]
+    known: dict[str, Join] = {
+        name: name for name in JOINS
+    }  # the very strings: msgspec leaves out a default if it is the same object
+    return list(dict.fromkeys(known[name] for name in names))
 
 
 def _names(text: str) -> list[str]:
