@@ -1,6 +1,7 @@
 """Back through the action expert: each twin equals autograd, each Triton kernel its twin."""
 
 from collections.abc import Callable
+from types import ModuleType
 
 import pytest
 import torch
@@ -59,6 +60,16 @@ def test_a_norm(tokens: int, width: int, by_row: bool, more: bool) -> None:
     close(through, expected)
     if gated is not None:
         close(gated, expected * gate)
+
+
+@pytest.mark.parametrize("back", [twins, backward], ids=["twin", "triton"])
+@pytest.mark.parametrize("by_row", [False, True])
+def test_a_gate_is_rounded_on_the_way_back_as_on_the_way_there(by_row: bool, back: ModuleType) -> None:
+    """In bfloat16 1.003 is 1: it changes no bit."""
+    ones = torch.ones((5, 64) if by_row else (64,), device=DEVICE)
+    d_normed, x = random(5, 64, dtype=torch.bfloat16), random(5, 64, dtype=torch.bfloat16)
+    ours, expected = (back.rms_norm_vjp(d_normed, x, ones, 1e-6, None, ones * gate)[1] for gate in (1.003, 1.0))
+    assert ours.dtype == torch.bfloat16 and torch.equal(ours, expected)
 
 
 @pytest.mark.parametrize(("tokens", "hidden"), [(1, 8), (10, 4096), (3, 100)])
