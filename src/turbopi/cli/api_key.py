@@ -10,6 +10,14 @@ from turbopi.errors import ConfigError
 
 # hidden from --help: `ps` shows a key on the command line to everyone on the machine
 ApiKey = Annotated[str | None, typer.Option("--api-key", envvar="TURBOPI_API_KEY", metavar="KEY", hidden=True)]
+ApiKeyFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--api-key-file",
+        metavar="FILE",
+        help="The file's one line is the key that the server wants. The variable TURBOPI_API_KEY does the same.",
+    ),
+]
 
 
 def chosen_key(given: str | None, file: Path | None) -> str | None:

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from turbopi.cli.api_key import ApiKey, chosen_key
+from turbopi.cli.api_key import ApiKey, ApiKeyFile, chosen_key
 from turbopi.cli.files import check_folder, let_import_from_here
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
@@ -236,14 +236,7 @@ def evaluate_command(
         int | None, typer.Option("--port", "-p", min=1, max=65535, metavar="N", help="Its port; 8000 unless given.")
     ] = None,
     api_key: ApiKey = None,
-    api_key_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--api-key-file",
-            metavar="FILE",
-            help="The file's one line is the key that the server wants. The variable TURBOPI_API_KEY does the same.",
-        ),
-    ] = None,
+    api_key_file: ApiKeyFile = None,
     control: Annotated[
         str | None,
         typer.Option(

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from turbopi.cli.api_key import ApiKey, chosen_key
+from turbopi.cli.api_key import ApiKey, ApiKeyFile, chosen_key
 from turbopi.cli.files import check_writable
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.errors import ConfigError
@@ -56,14 +56,7 @@ def view(
         ),
     ] = None,
     api_key: ApiKey = None,
-    api_key_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--api-key-file",
-            metavar="FILE",
-            help="The file's one line is the key that the server wants. The variable TURBOPI_API_KEY does the same.",
-        ),
-    ] = None,
+    api_key_file: ApiKeyFile = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Look at a recording, or at a live server, in the rerun viewer: pictures, state, chunks, latency, errors.
