@@ -86,7 +86,8 @@ def _add_settings(parser: argparse.ArgumentParser, required: bool = True) -> Non
             parser.add_argument(name, action=argparse.BooleanOptionalAction, default=item.default)
         else:
             default = None if item.name in ("out", "stats") else item.default
-            parser.add_argument(name, type=item.type, default=default, required=needed)
+            kind = Path if item.name in ("out", "stats", "start") else item.type
+            parser.add_argument(name, type=kind, default=default, required=needed)
 
 
 def _add_chase(parser: argparse.ArgumentParser) -> None:

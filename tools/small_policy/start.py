@@ -1,10 +1,12 @@
 """Weights to start training from."""
 
 import math
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from turbopi.checkpoint import open_checkpoint
 from turbopi.config import ModelConfig
 from turbopi.model.reference import Pi0Model
 
@@ -21,6 +23,16 @@ def fresh_model(config: ModelConfig, seed: int) -> Pi0Model:
     with torch.no_grad():
         for name, parameter in model.named_parameters():
             parameter.copy_(_initial(name, parameter, config, generator))
+    return model.requires_grad_(True)
+
+
+def trained_model(config: ModelConfig, folder: Path) -> Pi0Model:
+    """A checkpoint's weights as a model to train on, float32 on the CPU.
+
+    The checkpoint's action horizon may be another: no weight of the model depends on it.
+    """
+    model = Pi0Model(config)
+    model.load_state_dict(open_checkpoint(folder).load(torch.device("cpu"), "f32").state)
     return model.requires_grad_(True)
 
 

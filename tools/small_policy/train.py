@@ -37,7 +37,7 @@ from small_policy.forward import (
 )
 from small_policy.memory import Batch, Memory
 from small_policy.scenes import INSTRUCTIONS, NUM_TASKS, Setting
-from small_policy.start import fresh_model
+from small_policy.start import fresh_model, trained_model
 from turbopi.checkpoint.norm_stats import load_norm_stats
 from turbopi.config import RealTime
 from turbopi.preprocess.normalize import Normalizer
@@ -75,6 +75,7 @@ class Settings:
     save_every: float = 100.0
     compile: bool = True
     resume: bool = False
+    start: Path | None = None  # a checkpoint whose weights to start from, instead of fresh ones
     max_delay: int = 0  # control steps of delay that are simulated, for real-time execution; 0: none
     device: str = "cuda"
 
@@ -105,7 +106,12 @@ class Trainer:
         torch.backends.cuda.matmul.allow_tf32 = True
         self.stats = load_norm_stats(settings.stats)
         self.scale = Normalizer("quantile", self.stats.actions, "actions")
-        self.model = fresh_model(CONFIG.model, settings.seed).to(self.device)
+        first = (
+            fresh_model(CONFIG.model, settings.seed)
+            if settings.start is None
+            else trained_model(CONFIG.model, settings.start)
+        )
+        self.model = first.to(self.device)
         self.guide = Guide(CONFIG.model.vlm.width, GUIDE_VALUES, len(PHASES)).to(self.device)
         self.tokens, self.token_mask = (tensor.to(self.device) for tensor in prompt_table())
         self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
