@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 from small_policy import chase
-from small_policy.collect import HORIZON, Episode, _Frame
-from small_policy.expert import rotation_between
+from small_policy.actor import Actor
+from small_policy.collect import REPLAN, Player
+from small_policy.episodes import HORIZON, Episode, Frame, load_tapes, save_tapes
+from small_policy.expert import Expert, Sight, rotation_between
 from small_policy.export import CONFIG, export
 from small_policy.forward import (
     Guide,
@@ -115,8 +117,10 @@ def test_held_actions_are_clean_and_out_of_the_loss() -> None:
 
 
 def test_delays_are_drawn_evenly_and_a_trainer_without_them_holds_nothing(trainer: Trainer, monkeypatch: Any) -> None:
-    drawn = draw_delays(7000, 6, "cpu", torch.Generator().manual_seed(0))
-    assert torch.bincount(drawn, minlength=7).min() > 850 and drawn.max() == 6
+    leads = torch.tensor([0, 4]).repeat_interleave(7000)
+    drawn = draw_delays(leads, 6, torch.Generator().manual_seed(0))
+    assert torch.bincount(drawn[:7000], minlength=7).min() > 850 and drawn.max() == 6
+    assert torch.bincount(drawn[7000:], minlength=7)[4:].min() > 2100 and drawn[7000:].min() == 4
     seen: list[Tensor | None] = []
 
     def noting(model: Any, *arguments: Any) -> Any:
@@ -217,23 +221,124 @@ def test_the_guide_reads_the_prefix_and_not_the_padding() -> None:
     assert not torch.allclose(guide(hidden, mask)[0], values)
 
 
-def episode(by_expert: str, success: bool) -> Episode:
-    """One character a step: e for the expert, l for the learner; a frame at every step; labels count up."""
-    made: Any = Episode(Setting(0, 0))
-    made.labels = [np.full(7, float(step)) for step in range(len(by_expert))]
-    made.by_expert = [who == "e" for who in by_expert]
-    made.success = success
-    made.frames = [_Frame(step, np.zeros(0), None, "reach", np.zeros(8)) for step in range(len(by_expert))]  # type: ignore[arg-type]
+def episode(by_expert: str, success: bool, lead: int = 0) -> Episode:
+    """One character a step: e for the expert, l for the learner; a frame at every step; labels count up from 0, what
+    was carried out from 1000."""
+    steps = range(len(by_expert))
+    made = Episode(Setting(0, 0), success=success, by_expert=[who == "e" for who in by_expert])
+    made.labels = [np.full(7, float(step)) for step in steps]
+    made.executed = [np.full(7, 1000.0 + step) for step in steps]
+    sight = Sight(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3), opening=0.0, held=False)
+    made.frames = [Frame(step, lead, None, sight, "reach", np.zeros(8), np.full(5, float(step))) for step in steps]
     return made
 
 
 def test_only_what_the_expert_followed_up_itself_is_labelled() -> None:
     turns = episode("llll" + "e" * (HORIZON + 2) + "ll" + "e" * 3, success=False)
-    assert [step for step in range(HORIZON + 11) if turns._followed(step)] == [4, 5, 6]
+    assert [frame.step for frame in turns.labelled] == [4, 5, 6]
     solved = episode("l" + "e" * 12, success=True)
-    assert [step for step in range(13) if solved._followed(step)] == list(range(1, 13))
-    np.testing.assert_array_equal(solved._chunk(9)[:, 0], [9, 10, 11] + [12] * (HORIZON - 3))
+    assert [frame.step for frame in solved.labelled] == list(range(1, 13))
+    np.testing.assert_array_equal(solved.chunk(solved.labels, 9)[:, 0], [9, 10, 11] + [12] * (HORIZON - 3))
     assert not episode("e" * 160, success=False).useful
+
+
+def test_first_actions_of_the_learner_are_kept_as_carried_out_and_never_as_labels() -> None:
+    turns = episode("llll" + "e" * HORIZON, success=False, lead=2)
+    assert [frame.step for frame in turns.labelled] == [2, 3, 4]
+    record = turns.record("dagger")
+    assert record.leads.tolist() == [2, 2, 2]
+    np.testing.assert_array_equal(record.chunks[0, :, 0], np.arange(2, HORIZON + 2))
+    np.testing.assert_array_equal(record.executed[0, :, 0], np.arange(1002, HORIZON + 1002))
+
+
+def test_a_tape_is_read_as_it_was_written(tmp_path: Path) -> None:
+    first, none = episode("e" * (HORIZON + 3), success=False), episode("lll", success=False)
+    bodies = np.random.default_rng(0).normal(size=(4, 7))
+    save_tapes(tmp_path / "some.npz", [first.tape("demonstration", bodies), none.tape("dagger", bodies + 1)])
+    found = list(load_tapes([tmp_path / "some.npz"]))
+    assert [len(tape.joints) for tape in found] == [4, 0]
+    assert (found[0].record.kind, found[0].record.setting) == ("demonstration", Setting(0, 0))
+    np.testing.assert_array_equal(found[0].record.chunks, first.record("demonstration").chunks)
+    np.testing.assert_array_equal(found[0].joints[:, 0], [0, 1, 2, 3])
+    np.testing.assert_array_equal(found[1].bodies, bodies + 1)
+
+
+class CountingWorld:
+    """A scene in which nothing happens but steps."""
+
+    def __init__(self) -> None:
+        self._pictures: dict[str, Any] = {"drawn": True}
+        self.asked_to_look: list[bool] = []
+
+    def step(self, action: np.ndarray, look: bool) -> bool:
+        self.asked_to_look.append(look)
+        return False
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_a_late_chunk_of_the_learner_takes_over_where_what_it_was_told_to_hold_ends(
+    delay: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Chunk k is k * 100 + its row. What is held goes on from the chunk before."""
+    told: list[list[float]] = []
+
+    def ask(pictures: Any, prompt: int, held: np.ndarray) -> np.ndarray:
+        told.append(held[:, 0].tolist())
+        return np.repeat(np.arange(HORIZON)[:, None] + 100.0 * (len(told) - 1), 7, axis=1)
+
+    player = Player.__new__(Player)
+    player.ask, player.draws, player.episode = ask, True, Episode(Setting(0, 0))
+    world: Any = CountingWorld()
+    player.world, player.expert = world, Expert.__new__(Expert)
+    sight = Sight(np.zeros(3), np.zeros(3), np.zeros(3), np.eye(3), opening=0.0, held=False)
+    monkeypatch.setattr(player.expert, "look", lambda: sight)
+    monkeypatch.setattr(player.expert, "act", lambda seen: np.zeros(7))
+    monkeypatch.setattr(player, "_pictures", lambda: np.zeros(0))
+    kept: list[int] = []
+    monkeypatch.setattr(player, "_keep_frame", lambda seen, lead: kept.append(len(player.episode.labels)))
+    player._let_learner(3 * REPLAN, delay, lead=2)
+    driven = [float(action[0]) for action in player.episode.executed]
+    if delay == 0:
+        assert driven == [*range(5), *range(100, 105), *range(200, 205)] and told == [[], [], []]
+    else:
+        assert driven == [*range(8), *range(103, 108), *range(203, 205)] and told == [[], [5, 6, 7], [105, 106, 107]]
+    assert kept == [3 * REPLAN - 2]  # where what is left of the learner's steps is the lead
+    assert [step for step, look in enumerate(world.asked_to_look, start=1) if look] == [5, 10, 13, 15]
+
+
+def test_what_an_actor_is_told_to_hold_begins_its_chunk_and_changes_the_rest() -> None:
+    torch.manual_seed(0)
+    actor = Actor(CONFIG.model, 2, *prompt_table(), torch.device("cpu"))
+    actor.take(lively_model().state_dict())
+    pictures = np.random.default_rng(0).integers(0, 256, (2, 2, 224, 224, 3), np.uint8)
+    held = np.random.default_rng(1).uniform(-1, 1, (4, 7))
+    torch.manual_seed(1)
+    free = actor.act(pictures, [2, 2])
+    torch.manual_seed(1)
+    found = actor.act(pictures, [2, 2], [held, held[:0]])
+    np.testing.assert_array_equal(found[0, :4, :7], held.astype(np.float32))
+    np.testing.assert_array_equal(found[0, :4, 7:], 0)
+    assert np.abs(found[0, 4:] - free[0, 4:]).max() > 1e-3
+    np.testing.assert_allclose(found[1], free[1], rtol=0, atol=1e-5)  # a row that holds nothing
+
+
+def test_held_actions_are_those_that_were_carried_out(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The state that the rest of a chunk is for came of them, and not of what the expert would have done."""
+    seen: list[Tensor] = []
+
+    def noting(model: Any, images: Any, tokens: Any, mask: Any, x_t: Tensor, *rest: Any) -> Any:
+        seen.extend((x_t, rest[2]))
+        return velocity(model, images, tokens, mask, x_t, *rest)
+
+    monkeypatch.setattr("small_policy.train.velocity", noting)
+    monkeypatch.setattr(trainer, "settings", dataclasses.replace(trainer.settings, max_delay=6))
+    batch = dataclasses.replace(toy_memory(2, trainer.device).batch(torch.arange(2)), leads=torch.tensor([6, 6]))
+    trainer.losses(batch)
+    x, held = seen
+    assert held[:, :6].all() and not held[:, 6:].any()
+    executed = trainer.normalized(batch.executed).repeat_interleave(trainer.settings.repeats, 0)
+    torch.testing.assert_close(x[:, :6], executed[:, :6], rtol=0, atol=0)
+    assert (x[:, :6] - trainer.normalized(batch.chunks).repeat_interleave(2, 0)[:, :6]).abs().max() > 0.1
 
 
 def test_the_states_that_results_are_measured_on_are_never_trained_on() -> None:

@@ -4,6 +4,7 @@
     python -m small_policy measure --initial-states 0-49             how good the expert is
     python -m small_policy stats --out work/norm_stats.json          statistics of demonstrations, without pictures
     python -m small_policy train --out work/run --stats work/norm_stats.json --seconds 420 --workers 32
+    python -m small_policy play --help                               episodes from machines without a GPU, for `train`
     python -m small_policy card --help                               the model card, from results and curves
     python -m small_policy chase --out work/chase                    the policy of the dynamic task, see chase.py
     python -m small_policy throughput                                samples a second, before a GPU is rented for long
@@ -16,14 +17,17 @@
     state.pt         to go on from, with --resume
 
 For real-time execution the policy learns with simulated delays (trained RTC, see forward.py): --max-delay 6, with
-chunks of collect.py's HORIZON. Retraining the shipped policy, on a machine with one H200 and 32 cores, and judging it:
+chunks of episodes.py's HORIZON. Retraining the shipped policy, starting from its weights, and judging it:
 
+    python -m small_policy play --out work/tapes --seconds 3600 --seed 1 \\
+        --learner src/turbopi/data/small_policy                              on CPUs, several at once
     python -m small_policy train --out work/run --stats src/turbopi/data/small_policy/assets/turbopi/libero_spatial/\
-norm_stats.json --seconds 560 --workers 30 --max-delay 6
-    turbopi eval libero work/run/checkpoint --initial-states 30-49 --backend pytorch --precision f32 --workers 16 \
+norm_stats.json --start src/turbopi/data/small_policy --tapes work/tapes --seconds 560 --workers 15 --max-delay 6 \\
+        --learning-rate 0.0007 --trial 0.06
+    turbopi eval libero work/run/checkpoint --initial-states 30-49 --backend pytorch --precision f32 --workers 16 \\
         --videos none --out work/ordinary                                   delay 0: the bar is 92 %
-    turbopi eval libero work/run/checkpoint --initial-states 30-49 --backend fused --workers 16 --videos none \
-        --execution async,sync,ensemble,rtc,rtc_identity,rtc_trained --delay-steps 0,1,2,4 --execution-horizon 5 \
+    turbopi eval libero work/run/checkpoint --initial-states 30-49 --backend fused --workers 16 --videos none \\
+        --execution async,sync,ensemble,rtc,rtc_identity,rtc_trained --delay-steps 0,1,2,4 --execution-horizon 5 \\
         --out work/delays                                                   200 paired episodes a cell
     python -m small_policy train … --seconds 1100 --resume                  if it isn't good enough yet
 
@@ -31,7 +35,7 @@ The policy of the dynamic task (`python -m small_policy chase`) takes minutes on
 CPU core of its own:
 
     python -m small_policy chase --out work/chase --seconds 300 --device cuda --batch 1024 --frames 300000 --workers 5
-    turbopi eval chase work/chase/checkpoint --trials 200 --videos none --camera-px 48 --image-px 48 \
+    turbopi eval chase work/chase/checkpoint --trials 200 --videos none --camera-px 48 --image-px 48 \\
         --execution async,sync,ensemble,rtc,rtc_identity,rtc_trained --delay-steps 0,2,4 --out work/chase_delays
 
 The data are in expert.py, scenes.py and collect.py, the learning in forward.py and train.py.
@@ -67,11 +71,17 @@ def main() -> None:
     card.add_argument("--out", type=Path, required=True)
     _add_chase(commands.add_parser("chase", help="the policy of the dynamic task: demonstrations, training, export"))
     speed = commands.add_parser("throughput", help="time training steps on random data")
+    playing = commands.add_parser("play", help="play episodes and keep them without pictures, for train --tapes")
+    playing.add_argument("--out", type=Path, required=True, help="a folder; several runs may share it")
+    playing.add_argument("--seconds", type=float, required=True)
+    playing.add_argument("--seed", type=int, required=True, help="another one for each run")
+    playing.add_argument("--learner", type=Path, help="a checkpoint that drives in half of the episodes (DAgger)")
+    playing.add_argument("--max-delay", type=int, default=6, help="as in train")
     _add_settings(commands.add_parser("train", help="collect and train, by the clock"))
     _add_settings(speed, required=False)
     arguments = parser.parse_args()
     run = {"measure": _measure, "stats": _stats, "train": _train, "throughput": _throughput, "card": _card}
-    run["chase"] = _chase
+    run |= {"chase": _chase, "play": _play}
     run[arguments.command](arguments)
 
 
@@ -86,7 +96,7 @@ def _add_settings(parser: argparse.ArgumentParser, required: bool = True) -> Non
             parser.add_argument(name, action=argparse.BooleanOptionalAction, default=item.default)
         else:
             default = None if item.name in ("out", "stats") else item.default
-            kind = Path if item.name in ("out", "stats", "start") else item.type
+            kind = Path if item.name in ("out", "stats", "start", "tapes") else item.type
             parser.add_argument(name, type=kind, default=default, required=needed)
 
 
@@ -115,6 +125,13 @@ def _card(arguments: argparse.Namespace) -> None:
     from small_policy.card import write_card
 
     write_card(arguments.results, arguments.curves, arguments.out)
+
+
+def _play(arguments: argparse.Namespace) -> None:
+    from small_policy.play import learner_of, play
+
+    learner = None if arguments.learner is None else learner_of(arguments.learner)
+    play(arguments.out, arguments.seconds, arguments.seed, learner, arguments.max_delay)
 
 
 def _train(arguments: argparse.Namespace) -> None:

@@ -1,10 +1,12 @@
 """The learner at the wheel: chunks for a few pictures at once, with the newest averaged weights, in bfloat16."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from small_policy.collect import HORIZON, IMAGE_PX
+from small_policy.episodes import HORIZON, IMAGE_PX
 from turbopi.config import ModelConfig
 from turbopi.model.denoise import euler_step, run_expert, time_embedding, time_grid
 from turbopi.model.layers import rope_tables
@@ -16,6 +18,8 @@ NUM_STEPS = 10
 
 class Actor:
     """Rows beyond those asked for are computed and thrown away: on a GPU one captured graph serves every size.
+
+    Actions that are held stay as they are, at time 0 (see forward.py).
 
     tokens, token_mask   int64 and bool [tasks, P]: the prompts by task
     """
@@ -37,8 +41,11 @@ class Actor:
         self.tokens = self._all_tokens[:1].repeat(rows, 1)
         self.token_mask = self._all_masks[:1].repeat(rows, 1)
         self.noise = torch.zeros(rows, HORIZON, config.action_dim, device=device)
+        self.given = torch.zeros(rows, HORIZON, config.action_dim, device=device)
+        self.held = torch.zeros(rows, HORIZON, dtype=torch.bool, device=device)
         times = time_embedding(time_grid(NUM_STEPS), config.expert.width)
         self._time_embeddings = times.to(device)
+        self._time_zero = time_embedding(np.zeros(1, np.float32), config.expert.width).to(device)
         self._stream: torch.cuda.Stream | None = None
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -63,14 +70,23 @@ class Actor:
         with torch.cuda.graph(self._graph, stream=self._stream):
             self._out = self._compute()
 
-    def act(self, pictures: np.ndarray, prompts: list[int]) -> np.ndarray:
-        """uint8[n, 2, 224, 224, 3], n <= rows -> normalised actions float32[n, H, action_dim]."""
+    def act(self, pictures: np.ndarray, prompts: list[int], held: Sequence[np.ndarray] = ()) -> np.ndarray:
+        """uint8[n, 2, 224, 224, 3], n <= rows -> normalised actions float32[n, H, action_dim].
+
+        held   for each row the actions [d, <= action_dim], normalised, that its chunk begins with; none: d is 0
+        """
         n = len(pictures)
+        given, mask = np.zeros(self.given[:n].shape, np.float32), np.zeros((n, HORIZON), bool)
+        for row, actions in enumerate(held):
+            given[row, : len(actions), : actions.shape[-1]] = actions
+            mask[row, : len(actions)] = True
         with torch.cuda.stream(self._stream), torch.no_grad():
             self.pictures[:n].copy_(torch.from_numpy(pictures))
             chosen = torch.tensor(prompts, device=self.device)
             self.tokens[:n] = self._all_tokens[chosen]
             self.token_mask[:n] = self._all_masks[chosen]
+            self.given[:n].copy_(torch.from_numpy(given))
+            self.held[:n].copy_(torch.from_numpy(mask))
             self.noise.normal_()
             if self._graph is not None:
                 self._graph.replay()
@@ -90,11 +106,13 @@ class Actor:
         suffix_rope = rope_tables(valid.sum(1, keepdim=True) + offsets, config.expert.head_dim, config.rope_base)
         suffix = torch.ones(self.rows, HORIZON, dtype=torch.bool, device=self.device)
         mask = torch.cat((valid, suffix), dim=1)[:, None, None]
-        conditions = model.time_condition(self._time_embeddings)
-        x_t = self.noise
+        conditions, held = model.time_condition(self._time_embeddings), self.held[..., None]
+        zero = model.time_condition(self._time_zero)
+        x_t = torch.where(held, self.given, self.noise)
         for step in range(NUM_STEPS):
-            cond = conditions[step : step + 1]
+            cond = torch.where(held, zero, conditions[step])  # [rows, H, E]
             y = model.embed_suffix(x_t, x_t, cond)
             out = run_expert(model.expert, y, cond, keys, values, suffix_rope, mask)
             x_t = euler_step(x_t, model.action_out_proj(out.float()), NUM_STEPS)
+            x_t = torch.where(held, self.given, x_t)
         return x_t

@@ -1,21 +1,24 @@
 """A worker process: plays episodes in one scene and sends what a learner should have done in them.
 
-An expert's chunk is only right if the expert goes on to act as it says. So whenever a frame is labelled, the expert
-drives the next HORIZON steps; the learner drives in between and leads into states of its own making (DAgger). Besides,
-the expert is pushed aside now and then, and its actions are carried out with noise; labels have none.
+Whenever a frame is labelled, the expert drives the steps that follow; the learner drives in between and leads into
+states of its own making (DAgger), at times with the delays of a slow machine. Besides, the expert is pushed aside now
+and then, and its actions are carried out with noise; labels have none.
 
 Messages to the trainer   ("ready",)
-                          ("look", pictures uint8[2, 224, 224, 3], prompt)    answered with a chunk float[H, 7], or None
+                          ("look", pictures uint8[2, 224, 224, 3], prompt, held float[d, 7])
+                              answered with a chunk float[H, 7] that begins with `held`, or None
                           ("frames", Record, pictures as bytes)
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from small_policy.expert import PHASES, Expert, Sight
+from small_policy.episodes import HORIZON, IMAGE_PX, Episode, Frame, Kind, Record, Tape
+from small_policy.expert import Expert, Sight
 from small_policy.scenes import (
     MAX_STEPS,
     TRAINING_STATES,
@@ -24,32 +27,10 @@ from small_policy.scenes import (
     Setting,
 )
 from turbopi.preprocess.images import resize_with_pad
-from turbopi.sim.libero import CAMERAS
+from turbopi.sim.libero import CAMERAS, openpi_state
 
-HORIZON, REPLAN = 16, 5  # 16: so that delays of 6 fit beside an execution horizon of up to 10
-IMAGE_PX = 224
+REPLAN = 5  # steps from one chunk to the next when the learner drives
 DEMONSTRATION_STEPS = 190  # a demonstration that takes longer isn't kept
-HOPELESS = 150  # steps of the expert without success: it is stuck, and its labels with it
-AUX_DIM = 11  # hand 3, bowl 3, plate 3, opening, held
-Kind = Literal["demonstration", "dagger", "trial"]
-
-
-@dataclass
-class Record:
-    """One episode as it is sent: `n` labelled frames, without their pictures.
-
-    chunks float32[n, H, 7]   aux float32[n, AUX_DIM]   phases int64[n]   states float32[n, 8]
-    """
-
-    kind: Kind
-    setting: Setting
-    success: bool
-    steps: int
-    learner_steps: int
-    chunks: np.ndarray
-    aux: np.ndarray
-    phases: np.ndarray
-    states: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -60,68 +41,24 @@ class Mix:
     trial: float = 0.0  # share in which it drives alone, from validation states: nothing is learned from them
     other_bowl: float = 0.3
     moved: float = 0.5
-
-
-@dataclass
-class _Frame:
-    step: int
-    pictures: np.ndarray
-    sight: Sight
-    phase: str
-    state: np.ndarray
-
-
-@dataclass
-class Episode:
-    """The expert's action at each step, and frames at some, of which those are labelled that it followed up itself."""
-
-    setting: Setting
-    labels: list[np.ndarray] = field(default_factory=list)
-    by_expert: list[bool] = field(default_factory=list)
-    frames: list[_Frame] = field(default_factory=list)
-    success: bool = False
-
-    @property
-    def useful(self) -> bool:
-        """Whether the expert knew what it did: it got there, and soon, or has hardly driven."""
-        return self.success or sum(self.by_expert) < HOPELESS
-
-    def record(self, kind: Kind) -> tuple[Record, np.ndarray]:
-        labelled = [frame for frame in self.frames if self.useful and self._followed(frame.step)]
-        chunks = np.array([self._chunk(frame.step) for frame in labelled], np.float32).reshape(-1, HORIZON, 7)
-        aux = np.array([auxiliary(frame.sight) for frame in labelled], np.float32).reshape(-1, AUX_DIM)
-        phases = np.array([PHASES.index(frame.phase) for frame in labelled], np.int64)
-        states = np.array([frame.state for frame in labelled], np.float32).reshape(-1, 8)
-        pictures = np.array([frame.pictures for frame in labelled], np.uint8).reshape(-1, 2, IMAGE_PX, IMAGE_PX, 3)
-        learner_steps = len(self.by_expert) - sum(self.by_expert)
-        record = Record(kind, self.setting, self.success, len(self.labels), learner_steps, chunks, aux, phases, states)
-        return record, pictures
-
-    def _followed(self, step: int) -> bool:
-        """Whether the expert drove on for a whole chunk, or into success."""
-        end = step + HORIZON
-        if end > len(self.labels):
-            return self.success and all(self.by_expert[step:])
-        return all(self.by_expert[step:end])
-
-    def _chunk(self, step: int) -> np.ndarray:
-        chunk = self.labels[step : step + HORIZON]
-        return np.array(chunk + [chunk[-1]] * (HORIZON - len(chunk)))
-
-
-def auxiliary(sight: Sight) -> np.ndarray:
-    return np.concatenate([sight.hand, sight.bowl, sight.plate, [sight.opening, float(sight.held)]])
+    most_lead: int = (
+        0  # of a frame: first actions that may be the learner's, as long as delays are trained that hold them
+    )
+    delayed: float = 0.0  # share of DAgger episodes in which each chunk takes over 1 to REPLAN - 1 steps late
 
 
 class Player:
-    """Plays one scene's episodes; `ask` gives the learner's chunk for pictures and a prompt, or None to stop."""
+    """Plays one scene's episodes; `ask(pictures, prompt, held)` gives the learner's chunk, or None to stop.
 
-    def __init__(self, scene: int, seed: int, ask: Any) -> None:
-        self.scene, self.ask = scene, ask
+    draws   keep frames with their pictures; otherwise cameras are drawn for the learner alone
+    """
+
+    def __init__(self, scene: int, seed: int, ask: Any, *, draws: bool = True) -> None:
+        self.scene, self.ask, self.draws = scene, ask, draws
         self.rng = np.random.default_rng([seed, scene])
         self.world = PracticeScene(scene)
 
-    def play(self, mix: Mix) -> tuple[Record, np.ndarray]:
+    def play(self, mix: Mix) -> tuple[Kind, Episode]:
         drawn = self.rng.random()
         kind: Kind = "trial" if drawn < mix.trial else "dagger" if drawn < mix.trial + mix.dagger else "demonstration"
         setting = self._setting(kind, mix)
@@ -133,8 +70,18 @@ class Player:
         elif kind == "trial":
             self._let_learner(MAX_STEPS)
         else:
-            self._take_turns()
-        return self.episode.record(kind)
+            self._take_turns(mix)
+        return kind, self.episode
+
+    def draw(self, tape: Tape) -> np.ndarray:
+        """The pictures of a tape's frames: uint8[n, 2, 224, 224, 3]."""
+        self.world.place_bodies(tape.bodies)
+        drawn = []
+        for joints in tape.joints:
+            self.world.place_joints(joints)
+            self.world._pictures = dict(zip(CAMERAS, self.world.draw(), strict=True))
+            drawn.append(self._pictures())
+        return np.array(drawn, np.uint8).reshape(-1, 2, IMAGE_PX, IMAGE_PX, 3)
 
     def _setting(self, kind: Kind, mix: Mix) -> Setting:
         rng = self.rng
@@ -145,12 +92,14 @@ class Player:
 
     # --- who drives ---------------------------------------------------------------------------------------------------
 
-    def _take_turns(self) -> None:
+    def _take_turns(self, mix: Mix) -> None:
+        rng = self.rng
+        delay = int(rng.integers(1, REPLAN)) if rng.random() < mix.delayed else 0
         while not self._over():
-            self._let_learner(REPLAN * int(self.rng.integers(1, 11)))
+            steps, lead = REPLAN * int(rng.integers(1, 11)), int(rng.integers(mix.most_lead + 1))
+            self._let_learner(steps, delay, lead=min(lead, steps))
             if not self._over():
-                self._demonstrate(HORIZON + int(self.rng.integers(2, 13)), noise=0.0)
-        # what the expert hasn't followed up isn't labelled
+                self._demonstrate(HORIZON + int(rng.integers(2, 13)), noise=0.0)
 
     def _demonstrate(self, steps: int, noise: float | None = None) -> None:
         """The expert drives; with noise, and pushed aside for a few steps now and then, unless noise is 0."""
@@ -163,7 +112,7 @@ class Player:
             sight = self.expert.look()
             label = self.expert.act(sight)
             step = len(self.episode.labels)
-            if step >= next_frame and self.world._pictures:
+            if step >= next_frame:
                 self._keep_frame(sight)
                 next_frame = step + self._pause()
             executed = label.copy()
@@ -173,7 +122,7 @@ class Player:
                 pushed_for -= 1
                 executed[:6] = push
             executed[:6] = np.clip(executed[:6] + rng.normal(0, level, 6) * [1, 1, 1, 0.3, 0.3, 0.3], -1, 1)
-            self._step(executed, label, by_expert=True, look=step + 1 >= next_frame)
+            self._step(executed, label, by_expert=True, look=self.draws and step + 1 >= next_frame)
 
     def _pause(self) -> int:
         """Steps to the next frame: fewer where precision counts."""
@@ -181,18 +130,34 @@ class Player:
             return int(self.rng.integers(1, 3))
         return int(self.rng.integers(2, 6))
 
-    def _let_learner(self, steps: int) -> None:
-        until = len(self.episode.labels) + steps
+    def _let_learner(self, steps: int, delay: int = 0, lead: int = 0) -> None:
+        """The learner drives, with a new chunk every REPLAN steps, which takes over `delay` steps after its pictures.
+
+        A frame is kept `lead` steps before the end, unless that is 0.
+        """
+        assert delay < REPLAN
+        began = len(self.episode.labels)
+        until, filmed = began + steps, began + steps - lead
+        ahead: np.ndarray = np.zeros((0, 7))  # of the running chunk, from the present step on
+        fresh: np.ndarray | None = None
+        takes_over = began
         self._draw_if_needed()
         while len(self.episode.labels) < until and not self._over():
-            chunk = self.ask(self._pictures(), self.episode.setting.prompt)
-            if chunk is None:
-                raise EOFError
-            for number, action in enumerate(chunk[:REPLAN], start=1):
-                label = self.expert.act()  # keeps its phase up to date, too
-                self._step(action, label, by_expert=False, look=number == REPLAN)
-                if self._over():
-                    break
+            step, sight = len(self.episode.labels), self.expert.look()
+            label = self.expert.act(sight)  # keeps its phase up to date, too
+            if lead and step == filmed:
+                self._keep_frame(sight, lead)
+            if (step - began) % REPLAN == 0:
+                held = ahead[:delay]  # nothing at first: there is no chunk yet, and the world waits
+                fresh, takes_over = self.ask(self._pictures(), self.episode.setting.prompt, held), step + len(held)
+                if fresh is None:
+                    raise EOFError
+                since = step
+            if fresh is not None and step == takes_over:
+                ahead, fresh = fresh[step - since :], None
+            asks, films = (step + 1 - began) % REPLAN == 0, self.draws and lead > 0 and step + 1 == filmed
+            self._step(ahead[0], label, by_expert=False, look=asks or films)
+            ahead = ahead[1:]
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
@@ -200,6 +165,7 @@ class Player:
         episode = self.episode
         success = self.world.step(action, look=look)
         episode.labels.append(label)
+        episode.executed.append(np.array(action))
         episode.by_expert.append(by_expert)
         episode.success = self.world.solved(episode.setting) if episode.setting.other_bowl else success
 
@@ -209,25 +175,31 @@ class Player:
     def _draw_if_needed(self) -> None:
         """When the expert hands over between frames: what the cameras see now, without a step."""
         if not self.world._pictures:
-            drawn = self.world.draw()
-            self.world._pictures = dict(zip(CAMERAS, drawn, strict=True))
+            self.world._pictures = dict(zip(CAMERAS, self.world.draw(), strict=True))
 
     def _pictures(self) -> np.ndarray:
         return np.stack([resize_with_pad(self.world._pictures[key], IMAGE_PX, IMAGE_PX) for key in CAMERAS])
 
-    def _keep_frame(self, sight: Sight) -> None:
-        state = self.world.observation()["observation/state"]
-        step = len(self.episode.labels)
-        self.episode.frames.append(_Frame(step, self._pictures(), sight, self.expert.phase, state))
+    def _keep_frame(self, sight: Sight, lead: int = 0) -> None:
+        """Before the step that it is for. Without pictures there is no frame, where they are kept."""
+        if self.draws and not self.world._pictures:
+            return
+        pictures = self._pictures() if self.draws else None
+        step, state = len(self.episode.labels), openpi_state(self.world._obs)
+        frame = Frame(step, lead, pictures, sight, self.expert.phase, state, self.world.joints())
+        self.episode.frames.append(frame)
 
 
-def run_worker(connection: Connection, scene: int, seed: int) -> None:
-    """The process's main: plays until the pipe closes. The trainer's ("mix", Mix) may come in between."""
+def run_worker(connection: Connection, scene: int, seed: int, tapes: Sequence[Tape] = ()) -> None:
+    """The process's main: draws the tapes' frames, then plays until the pipe closes.
+
+    The trainer's ("mix", Mix) may come in between.
+    """
     mix = Mix()
 
-    def ask(pictures: np.ndarray, prompt: int) -> np.ndarray | None:
+    def ask(pictures: np.ndarray, prompt: int, held: np.ndarray) -> np.ndarray | None:
         nonlocal mix
-        connection.send(("look", pictures, prompt))
+        connection.send(("look", pictures, prompt, held))
         while True:
             answer = connection.recv()
             if answer[0] == "mix":
@@ -235,17 +207,22 @@ def run_worker(connection: Connection, scene: int, seed: int) -> None:
             else:
                 return answer[1] if answer[0] == "chunk" else None
 
+    def send(record: Record, pictures: np.ndarray) -> None:
+        connection.send(("frames", record))
+        connection.send_bytes(pictures.reshape(-1).data if pictures.size else b"")
+
     try:
         player = Player(scene, seed, ask)
         connection.send(("ready",))
+        for tape in tapes:
+            send(tape.record, player.draw(tape))
         while True:
             while connection.poll():
                 answer = connection.recv()
                 if answer[0] == "stop":
                     return
                 mix = answer[1]
-            record, pictures = player.play(mix)
-            connection.send(("frames", record))
-            connection.send_bytes(pictures.reshape(-1).data if pictures.size else b"")
+            kind, episode = player.play(mix)
+            send(episode.record(kind), episode.pictures())
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return

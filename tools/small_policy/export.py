@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from small_policy.collect import HORIZON
+from small_policy.episodes import HORIZON
 from turbopi.checkpoint.base import Checkpoint
 from turbopi.checkpoint.convert import convert
 from turbopi.checkpoint.norm_stats import NormStats

@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from collections import defaultdict, deque
+from collections.abc import Sequence
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from small_policy.actor import Actor
-from small_policy.collect import IMAGE_PX, Mix, Record, run_worker
+from small_policy.collect import Mix, run_worker
+from small_policy.episodes import IMAGE_PX, Record, Tape
 from small_policy.memory import Memory
 from small_policy.scenes import NUM_TASKS
 from turbopi.preprocess.normalize import Normalizer
@@ -28,11 +30,32 @@ def scene_of(worker: int) -> int:
     return index if round_ % 2 == 0 else [*HARDER, *(s for s in range(NUM_TASKS) if s not in HARDER)][index]
 
 
+def shared_out(tapes: Sequence[Tape], scenes: Sequence[int]) -> list[list[Tape]]:
+    """Each worker's tapes: those of its scene, shared with the other workers of that scene."""
+    shares: list[list[Tape]] = [[] for _ in scenes]
+    for number, tape in enumerate(tapes):
+        workers = [worker for worker, scene in enumerate(scenes) if scene == tape.record.setting.scene]
+        if workers:
+            shares[workers[number % len(workers)]].append(tape)
+    return shares
+
+
 class Fleet(threading.Thread):
-    """Runs until `stop`. `log` receives one JSON line for each episode."""
+    """Runs until `stop`. `log` receives one JSON line for each episode.
+
+    tapes   whose frames the workers of their scenes draw before they play
+    """
 
     def __init__(
-        self, workers: int, seed: int, memory: Memory, actor: Actor, scale: Normalizer, log: Path, output: Path
+        self,
+        workers: int,
+        seed: int,
+        memory: Memory,
+        actor: Actor,
+        scale: Normalizer,
+        log: Path,
+        output: Path,
+        tapes: Sequence[Tape] = (),
     ) -> None:
         super().__init__(daemon=True)
         self.memory, self.actor, self.scale, self.log = memory, actor, scale, log
@@ -45,9 +68,10 @@ class Fleet(threading.Thread):
         self._weights_lock = threading.Lock()
         context = multiprocessing.get_context("spawn")
         self._pipes, self._processes = [], []
+        shares = shared_out(tapes, [scene_of(worker) for worker in range(workers)])
         for worker in range(workers):
             ours, theirs = context.Pipe()
-            arguments = (theirs, scene_of(worker), seed * 1000 + worker, str(output))
+            arguments = (theirs, scene_of(worker), seed * 1000 + worker, str(output), shares[worker])
             process = context.Process(target=_main, args=arguments, daemon=True)
             process.start()
             theirs.close()
@@ -83,7 +107,7 @@ class Fleet(threading.Thread):
 
     def _serve(self, log: Any) -> None:
         live = list(self._pipes)
-        asked: list[tuple[Any, np.ndarray, int]] = []
+        asked: list[tuple[Any, np.ndarray, int, np.ndarray]] = []
         since = 0.0
         while not self.stopping and live:
             ready: list[Any] = connection.wait(live, timeout=0.002 if asked else 0.1)
@@ -98,7 +122,7 @@ class Fleet(threading.Thread):
                     continue
                 if message[0] == "look":
                     since = since if asked else time.monotonic()
-                    asked.append((pipe, message[1], message[2]))
+                    asked.append((pipe, *message[1:]))
                 elif message[0] == "ready":
                     self.ready += 1
             full = len(asked) >= self.actor.rows
@@ -106,11 +130,12 @@ class Fleet(threading.Thread):
                 self._answer(asked[: self.actor.rows])
                 asked = asked[self.actor.rows :]
 
-    def _answer(self, asked: list[tuple[Any, np.ndarray, int]]) -> None:
+    def _answer(self, asked: list[tuple[Any, np.ndarray, int, np.ndarray]]) -> None:
+        pipes, pictures, prompts, held = zip(*asked, strict=True)
         with self._weights_lock:
-            actions = self.actor.act(np.stack([one[1] for one in asked]), [one[2] for one in asked])
+            actions = self.actor.act(np.stack(pictures), list(prompts), [self.scale.normalize(one) for one in held])
         chunks = self.scale.unnormalize(actions)[..., :7]
-        for (pipe, _, _), chunk in zip(asked, chunks, strict=True):
+        for pipe, chunk in zip(pipes, chunks, strict=True):
             try:
                 pipe.send(("chunk", chunk))
             except OSError:
@@ -141,9 +166,9 @@ class Fleet(threading.Thread):
         log.flush()
 
 
-def _main(pipe: Any, scene: int, seed: int, output: str) -> None:
+def _main(pipe: Any, scene: int, seed: int, output: str, tapes: list[Tape]) -> None:
     with open(output, "ab") as file:  # simulators print
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     os.environ["OMP_NUM_THREADS"] = "1"
-    run_worker(pipe, scene, seed)
+    run_worker(pipe, scene, seed, tapes)

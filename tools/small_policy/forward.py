@@ -227,9 +227,10 @@ def draw_times(batch: int, device: torch.device | str, generator: torch.Generato
     return uniform.pow(1 / 1.5) * 0.999 + 0.001  # the distribution function of Beta(1.5, 1) is u^1.5
 
 
-def draw_delays(batch: int, most: int, device: torch.device | str, generator: torch.Generator | None = None) -> Tensor:
-    """Each delay from 0 to `most` as often as any other: int64[batch]."""
-    return torch.randint(most + 1, (batch,), device=device, generator=generator)
+def draw_delays(leads: Tensor, most: int, generator: torch.Generator | None = None) -> Tensor:
+    """Of each row any delay from its lead, int64[batch], to `most`, each as often as any other: int64[batch]."""
+    uniform = torch.rand(leads.shape, device=leads.device, generator=generator)
+    return leads + (uniform * (most + 1 - leads)).long()
 
 
 def held_actions(delays: Tensor, horizon: int) -> Tensor:

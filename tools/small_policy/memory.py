@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from small_policy.collect import AUX_DIM, HORIZON, IMAGE_PX, Record
+from small_policy.episodes import AUX_DIM, HORIZON, IMAGE_PX, Record
 from small_policy.expert import PHASES
 from small_policy.scenes import NUM_TASKS
 
@@ -19,10 +19,13 @@ LEARNER_WEIGHT = 1.5  # of frames that the learner led to
 
 @dataclass
 class Batch:
-    """pictures uint8[B, 2, 224, 224, 3], chunks float32[B, H, 7], prompts, phases int64[B], aux float32[B, AUX_DIM]"""
+    """pictures uint8[B, 2, 224, 224, 3], chunks, executed float32[B, H, 7], leads, prompts, phases int64[B],
+    aux float32[B, AUX_DIM]: see episodes.Record."""
 
     pictures: Tensor
     chunks: Tensor
+    executed: Tensor
+    leads: Tensor
     prompts: Tensor
     phases: Tensor
     aux: Tensor
@@ -35,6 +38,8 @@ class Memory:
         self.capacity, self.device, self.count = capacity, device, 0
         self.pictures = torch.empty(capacity, 2, IMAGE_PX, IMAGE_PX, 3, dtype=torch.uint8, device=device)
         self.chunks = torch.empty(capacity, HORIZON, 7, device=device)
+        self.executed = torch.empty(capacity, HORIZON, 7, device=device)
+        self.leads = torch.empty(capacity, dtype=torch.int64, device=device)
         self.prompts = torch.empty(capacity, dtype=torch.int64, device=device)
         self.phases = torch.empty(capacity, dtype=torch.int64, device=device)
         self.aux = torch.empty(capacity, AUX_DIM, device=device)
@@ -52,6 +57,8 @@ class Memory:
             span = slice(start, start + n)
             self.pictures[span] = torch.from_numpy(pictures[:n]).to(self.device)
             self.chunks[span] = torch.from_numpy(record.chunks[:n]).to(self.device)
+            self.executed[span] = torch.from_numpy(record.executed[:n]).to(self.device)
+            self.leads[span] = torch.from_numpy(record.leads[:n]).to(self.device)
             self.phases[span] = torch.from_numpy(record.phases[:n]).to(self.device)
             self.aux[span] = torch.from_numpy(record.aux[:n]).to(self.device)
             self.prompts[span] = record.setting.prompt
@@ -75,6 +82,8 @@ class Memory:
         return Batch(
             self.pictures[indices],
             self.chunks[indices],
+            self.executed[indices],
+            self.leads[indices],
             self.prompts[indices],
             self.phases[indices],
             self.aux[indices],

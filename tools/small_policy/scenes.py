@@ -89,6 +89,25 @@ class PracticeScene(LiberoEnvironment):
         """Whether the bowl that is asked for is on the plate, as LIBERO's own predicate has it."""
         return bool(self.domain._eval_predicate(("on", setting.bowl, PLATE)))
 
+    # What a picture shows: bodies of the scene, which resets place, and joints, which move
+
+    def bodies(self) -> np.ndarray:
+        """float64[bodies, 7]: positions and quaternions within their parents."""
+        model = self.domain.sim.model
+        return np.concatenate((model.body_pos, model.body_quat), axis=1)
+
+    def place_bodies(self, bodies: np.ndarray) -> None:
+        model = self.domain.sim.model
+        model.body_pos[:], model.body_quat[:] = bodies[:, :3], bodies[:, 3:]
+
+    def joints(self) -> np.ndarray:
+        """float64[nq]: everything that moves."""
+        return np.array(self.domain.sim.data.qpos)
+
+    def place_joints(self, joints: np.ndarray) -> None:
+        self.domain.sim.data.qpos[:] = joints
+        self.domain.sim.forward()
+
     def _move_objects(self, rng: np.random.Generator) -> None:
         sim = self.domain.sim
         poses = {

@@ -10,7 +10,7 @@ import dataclasses
 import json
 import math
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ from torch import Tensor
 
 from small_policy.actor import Actor
 from small_policy.augment import augment
-from small_policy.collect import AUX_DIM, HORIZON, Mix, Record
+from small_policy.collect import Mix
+from small_policy.episodes import AUX_DIM, HORIZON, Record, Tape, load_tapes
 from small_policy.expert import PHASES
 from small_policy.export import CONFIG, export
 from small_policy.fleet import Fleet
@@ -76,6 +77,8 @@ class Settings:
     compile: bool = True
     resume: bool = False
     start: Path | None = None  # a checkpoint whose weights to start from, instead of fresh ones
+    tapes: Path | None = None  # a folder of episodes that were played before, whose pictures are drawn at first
+    delayed: float = 0.5  # share of DAgger episodes in which the learner's chunks come late; with max_delay
     max_delay: int = 0  # control steps of delay that are simulated, for real-time execution; 0: none
     device: str = "cuda"
 
@@ -157,11 +160,14 @@ class Trainer:
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         pictures = augment(batch.pictures)
         tokens, mask = self.tokens[batch.prompts], self.token_mask[batch.prompts]
-        actions = self.normalized(batch.chunks).repeat_interleave(self.settings.repeats, 0)
+        repeats, most = self.settings.repeats, self.settings.max_delay
+        actions = self.normalized(batch.chunks).repeat_interleave(repeats, 0)
         noise = torch.randn_like(actions)
         t, held = draw_times(len(actions), self.device), None
-        if self.settings.max_delay:
-            held = held_actions(draw_delays(len(actions), self.settings.max_delay, self.device), HORIZON)
+        if most:
+            held = held_actions(draw_delays(batch.leads.repeat_interleave(repeats, 0), most), HORIZON)
+            executed = self.normalized(batch.executed).repeat_interleave(repeats, 0)
+            actions = torch.where(held[..., None], executed, actions)
         x = mixed(actions, noise, t, held)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             predicted, hidden = velocity(self.model, pictures, tokens, mask, x, t, self.regions, held)
@@ -247,6 +253,8 @@ def toy_memory(capacity: int, device: torch.device, seed: int = 0) -> Memory:
         100,
         0,
         rng.uniform(-1, 1, (capacity, HORIZON, 7)).astype(np.float32),
+        rng.uniform(-1, 1, (capacity, HORIZON, 7)).astype(np.float32),
+        np.zeros(capacity, np.int64),
         rng.uniform(0, 1, (capacity, AUX_DIM)).astype(np.float32),
         rng.integers(0, len(PHASES), capacity),
         np.zeros((capacity, 8), np.float32),
@@ -266,8 +274,16 @@ def train(settings: Settings) -> None:
     rows = min(32, settings.workers)
     actor = Actor(CONFIG.model, rows, *prompt_table(), trainer.device)
     actor.take(trainer.average)
+    tapes = _tapes(settings)
     fleet = Fleet(
-        settings.workers, settings.seed, memory, actor, trainer.scale, out / "episodes.jsonl", out / "workers.log"
+        settings.workers,
+        settings.seed,
+        memory,
+        actor,
+        trainer.scale,
+        out / "episodes.jsonl",
+        out / "workers.log",
+        tapes,
     )
     actor.capture()  # while simulators start
     fleet.start()
@@ -277,6 +293,16 @@ def train(settings: Settings) -> None:
         _loop(settings, trainer, memory, fleet, before)
     finally:
         fleet.stop()
+
+
+def _tapes(settings: Settings) -> list[Tape]:
+    """Frames that need longer delays than are trained can't be learned from."""
+    if settings.tapes is None:
+        return []
+    files = sorted(settings.tapes.glob("*.npz"))
+    if not files:
+        raise FileNotFoundError(f"{settings.tapes} has no tapes (*.npz); `python -m small_policy play` makes them")
+    return [tape for tape in load_tapes(files) if tape.record.leads.max(initial=0) <= settings.max_delay]
 
 
 def _compile(trainer: Trainer) -> None:
@@ -298,7 +324,8 @@ def _loop(settings: Settings, trainer: Trainer, memory: Memory, fleet: Fleet, be
     print(f"first frames after {time.monotonic() - waiting:.1f} s, {fleet.ready} workers", flush=True)
     clock = Clock(settings.seconds, before)
     curves = _Curves(settings.out / "curves.csv", clock)
-    saved, switched, dagger = clock.seconds, False, Mix(dagger=settings.dagger, trial=settings.trial)
+    delays = Mix(most_lead=settings.max_delay, delayed=settings.delayed if settings.max_delay else 0.0)
+    saved, switched, dagger = clock.seconds, False, replace(delays, dagger=settings.dagger, trial=settings.trial)
     while clock.progress < 1:
         clock.total = _seconds(settings)
         indices = memory.draw(settings.batch * 25)
