@@ -53,7 +53,7 @@ _REFUSALS = {
     "lost": "the device is lost: {}",
 }
 LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers look seldom
-LARGE = 2**20  # bytes of a message that is decoded beside the event loop
+LARGE = 4 * 2**20  # bytes of a message that is decoded beside the event loop
 MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
 
 
@@ -361,14 +361,13 @@ class PolicyServer:
     async def _infer(self, connection: GuardedConnection, plan: Plan) -> Outcome:
         """Run the policy when it is this request's turn, unless the client leaves first."""
         work = asyncio.ensure_future(self._calls.run(plan.observation, plan.arguments))
-        gone = asyncio.ensure_future(connection.wait_closed())
+        either: set[asyncio.Future[Any]] = {work, connection.connection_lost_waiter}
         try:
-            await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
             if not work.done():
                 raise _ClientGone
             return work.result()
         finally:
-            gone.cancel()
             work.cancel()
             self._real_time.release(plan)
 
