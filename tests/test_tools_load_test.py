@@ -324,7 +324,9 @@ def test_without_a_robot_or_a_server_it_says_what_to_do(capsys: pytest.CaptureFi
 def test_nothing_answered_is_exit_code_1(capsys: pytest.CaptureFixture[str]) -> None:
     with running(Counting(wrong=1)) as server:
         assert main([server.url, "--robot", "libero", "--seconds", "0.5", "--warmup", "0", "--rate", "4"]) == 1
-    assert "0 of 2 requests answered" in capsys.readouterr().out
+        assert "0 of 2 requests answered" in capsys.readouterr().out
+        assert main([server.url, "--robot", "libero", "--seconds", "0.1", "--warmup", "0.1", "--rate", "1"]) == 1
+        assert "No request was due after the warm-up" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

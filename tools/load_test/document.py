@@ -189,6 +189,8 @@ def tables(document: LoadDocument) -> list[Table | str]:
         f"{document.answers_per_second:.1f} answers a second; {document.answered} of {document.requests} requests "
         "answered"
     ]
+    if not document.requests:
+        lines.append("No request was due after the warm-up: test for more --seconds.")
     lines += [f"errors: {count} {kind}" for kind, count in document.errors.items()]
     if document.unsent:
         lines.append(f"{document.unsent} requests were never sent: the server doesn't keep up with the rate.")
@@ -196,4 +198,4 @@ def tables(document: LoadDocument) -> list[Table | str]:
     lines.append(f"the clients' processes used {max(shares):.0%} of a CPU at most, {sum(shares):.1f} CPUs together")
     if sum(shares) > document.clients.cpus / 2 or max(shares) > 0.9:
         lines.append("The clients were so busy that their own work is in the latency: use another machine for them.")
-    return [table, *lines]
+    return [table, *lines] if table.row_count else lines
