@@ -198,4 +198,4 @@ def tables(document: LoadDocument) -> list[Table | str]:
     lines.append(f"the clients' processes used {max(shares):.0%} of a CPU at most, {sum(shares):.1f} CPUs together")
     if sum(shares) > document.clients.cpus / 2 or max(shares) > 0.9:
         lines.append("The clients were so busy that their own work is in the latency: use another machine for them.")
-    return [table, *lines] if table.row_count else lines
+    return [*([table] if table.row_count else []), *lines]

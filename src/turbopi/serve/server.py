@@ -361,13 +361,14 @@ class PolicyServer:
     async def _infer(self, connection: GuardedConnection, plan: Plan) -> Outcome:
         """Run the policy when it is this request's turn, unless the client leaves first."""
         work = asyncio.ensure_future(self._calls.run(plan.observation, plan.arguments))
-        either: set[asyncio.Future[Any]] = {work, connection.connection_lost_waiter}
+        gone = asyncio.ensure_future(connection.wait_closed())
         try:
-            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
             if not work.done():
                 raise _ClientGone
             return work.result()
         finally:
+            gone.cancel()
             work.cancel()
             self._real_time.release(plan)
 
