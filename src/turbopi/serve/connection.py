@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
 
 from websockets.asyncio.server import ServerConnection
-from websockets.frames import BINARY, CloseCode, Frame
+from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
@@ -292,7 +292,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         if self._straight is not None:
             message, self._straight = self._straight.message(), None
             if self.protocol.state is State.OPEN:  # not after a wrong frame or a close
-                self.process_event(Frame(BINARY, message))
+                self.process_event(Frame(Opcode.BINARY, message))
 
     def _hand_over(self, data: bytes | memoryview) -> None:
         """Give the library what it is to see. It copies that."""

@@ -6,7 +6,7 @@ of such frames here, past the library: the socket writes into a buffer that is u
 off makes the message.
 """
 
-from websockets.frames import BINARY, apply_mask  # the compiled one, if there is one
+from websockets.frames import Opcode, apply_mask  # the compiled one, if there is one
 
 LEAST = 2**16  # bytes of a payload: what is smaller costs little either way
 MOST = 4 * 2**20  # of larger ones the library takes care: the one buffer that is kept stays small
@@ -17,7 +17,7 @@ def goes_straight(first: int, second: int, length: int) -> bool:
 
     first, second  the final bit, no reserved bit, binary; masked: anything else is the library's, which checks it
     """
-    return first == 0x80 | BINARY and second >= 0x80 and LEAST <= length <= MOST
+    return first == 0x80 | Opcode.BINARY and second >= 0x80 and LEAST <= length <= MOST
 
 
 class SpareBuffer:
