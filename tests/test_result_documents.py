@@ -11,6 +11,7 @@ import pytest
 import torch
 from attack.results import AttackDocument
 from kernel_turns.document import read_turns
+from load_test.document import read_load
 from msgspec import Meta, Struct
 
 from turbopi.bench.document import BenchDocument, read_benchmark
@@ -209,6 +210,12 @@ def test_checked_in_attacks_read_and_come_out_as_they_were(name: str) -> None:
     document = read_document(RESULTS / name, AttackDocument, ConfigError)
     assert len(document.pieces) > 3
     assert json.dumps(plain_document(document)) == json.dumps(json.loads((RESULTS / name).read_text()))
+
+
+def test_checked_in_load_tests_read_and_come_out_as_they_were() -> None:
+    for name in EVERY:
+        if '"turbopi-load"' in (text := (RESULTS / name).read_text())[:99]:
+            assert json.dumps(plain_document(read_load(RESULTS / name)), indent=1) + "\n" == text
 
 
 def test_the_checked_in_gpu_result_reads_and_comes_out_as_it_was() -> None:

@@ -26,8 +26,8 @@ BINARY, CONTINUED, PING, PONG = 2, 0, 9, 10
 MIB = 2**20
 
 
-def frame(payload: bytes = b"", opcode: int = BINARY, *, final: bool = True) -> bytes:
-    """A client's frame, masked with zeros."""
+def frame(payload: bytes = b"", opcode: int = BINARY, *, final: bool = True, mask: bytes = bytes(4)) -> bytes:
+    """A client's frame."""
     size = len(payload)
     if size < 126:
         length = bytes([0x80 | size])
@@ -35,7 +35,9 @@ def frame(payload: bytes = b"", opcode: int = BINARY, *, final: bool = True) -> 
         length = b"\xfe" + struct.pack(">H", size)
     else:
         length = b"\xff" + struct.pack(">Q", size)
-    return bytes([(0x80 if final else 0) | opcode]) + length + bytes(4) + payload
+    repeated = itertools.cycle(mask)
+    masked = bytes(a ^ b for a, b in zip(payload, repeated, strict=False)) if any(mask) else payload
+    return bytes([(0x80 if final else 0) | opcode]) + length + mask + masked
 
 
 class Clock:
@@ -151,8 +153,18 @@ class Client:
         self.transport.connection = self.connection
         self.connection.connection_made(self.transport)
 
-    def send(self, data: bytes) -> None:
-        self.connection.data_received(data)
+    def send(self, data: bytes, *, whole: bool = False) -> None:
+        """As an event loop brings it: as much at once as the connection's buffer takes; or, as uvloop does, `whole`."""
+        if whole:
+            self.connection.data_received(data)
+            return
+        rest = memoryview(data)
+        while rest:
+            buffer = self.connection.get_buffer(-1)
+            size = min(len(buffer), len(rest))
+            buffer[:size] = rest[:size]
+            self.connection.buffer_updated(size)
+            rest = rest[size:]
 
     async def shake(self) -> None:
         await self.connection.handshake()
@@ -185,9 +197,9 @@ def run(test: Callable[[Server], Awaitable[None]], **limits: Any) -> None:
 
 
 def test_messages_arrive_whole_however_their_bytes_are_cut() -> None:
-    messages = [b"", b"x", b"y" * 125, b"z" * 126, b"a" * 70_000, b"parts", b"last"]
+    messages = [b"", b"x", b"y" * 125, b"z" * 126, b"a" * 70_000, b"parts", bytes(range(256)) * 300, b"last"]
     parts = frame(b"pa", final=False) + frame(b"", PING) + frame(b"rt", CONTINUED, final=False) + frame(b"s", CONTINUED)
-    stream = b"".join(parts if message == b"parts" else frame(message) for message in messages)
+    stream = b"".join(parts if message == b"parts" else frame(message, mask=b"mask") for message in messages)
     generator = random.Random(0)
 
     async def test(server: Server) -> None:
@@ -197,7 +209,7 @@ def test_messages_arrive_whole_however_their_bytes_are_cut() -> None:
             cuts = sorted(generator.choices(range(len(data)), k=30 if round_ else 0))
             shaken = False
             for begin, end in itertools.pairwise((0, *cuts, len(data))):
-                client.send(data[begin:end])
+                client.send(data[begin:end], whole=round_ % 3 == 2)
                 if not shaken and end >= len(REQUEST):
                     await client.shake()
                     shaken = True
@@ -224,6 +236,98 @@ def test_a_frame_that_is_wrong_is_refused_as_ever() -> None:
         assert client.closed_with[0] == 1009
 
     run(test, message_bytes=100)
+
+
+def pictures(seed: int, size: int = 300_000) -> bytes:
+    return random.Random(seed).randbytes(size)
+
+
+@pytest.mark.parametrize(
+    ("size", "straight"), [(2**16 - 1, False), (2**16, True), (4 * MIB, True), (4 * MIB + 1, False)]
+)
+def test_pictures_are_received_past_the_library(size: int, straight: bool) -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.send(frame(bytes(size))[:-1])
+        assert len(client.connection.protocol.reader.buffer) == (0 if straight else size - 1)
+        client.send(b"\0")
+        assert await client.receive() == bytes(size)
+
+    run(test)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_two_clients_pictures_that_come_at_once_stay_apart(whole: bool) -> None:
+    async def test(server: Server) -> None:
+        clients = [await server.client() for _ in range(3)]
+        for round_ in range(3):
+            messages = [pictures(10 * round_ + i, 300_000 - 1000 * (i + round_)) for i in range(len(clients))]
+            frames = [frame(message, mask=b"\x80abc") for message in messages]
+            for begin in range(0, 301_000, 70_000):
+                for client, data in zip(clients, frames, strict=True):
+                    client.send(data[begin : begin + 70_000], whole=whole)
+            for client, message in zip(clients, messages, strict=True):
+                assert await client.receive() == message
+                client.connection.answered("good")
+
+    run(test)
+
+
+def test_the_buffer_of_one_picture_is_the_next_ones() -> None:
+    async def test(server: Server) -> None:
+        buffers = set()
+        for size in (300_000, 200_000, 300_000):
+            client = await server.client()
+            client.send(frame(bytes(size))[:-1])
+            buffers.add(id(client.connection.get_buffer(-1).obj))
+            client.send(b"\0")
+            assert await served(client, "good") == 1
+        assert len(buffers) == 1
+
+    run(test)
+
+
+LARGE_FRAME = frame(bytes(100_000))
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        (b"\xc2" + LARGE_FRAME[1:], 1002),  # a reserved bit
+        (b"\x82\x7f" + (100_000).to_bytes(8, "big") + bytes(100_000), 1002),  # not masked
+        (frame(bytes(100_000), CONTINUED), 1002),  # of no message
+        (frame(b"begun", final=False) + LARGE_FRAME, 1002),  # in the middle of another message
+        (frame(b"\xff" * 100_000, 1), None),  # text: whether it's UTF-8 is found out by `recv`
+        (b"\x83\x80" + bytes(4) + LARGE_FRAME, 1002),  # behind a wrong one
+    ],
+)
+def test_a_large_frame_that_is_wrong_is_refused_as_ever(data: bytes, code: int | None) -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        client.send(data)
+        assert (None if client.closed_with is None else client.closed_with[0]) == code
+        assert client.waiting() == (code is None)
+
+    run(test)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_pictures_that_are_half_there_when_the_server_closes_end_in_order(whole: bool) -> None:
+    async def test(server: Server) -> None:
+        client = await server.client()
+        data = frame(pictures(0), mask=b"\xff\xfe\xfd\xfc")
+        client.send(data[:200_000], whole=whole)
+        closing = asyncio.create_task(client.connection.close(1001, "the server is shutting down"))
+        await asyncio.sleep(0)
+        client.send(data[200_000:], whole=whole)
+        client.send(frame((1001).to_bytes(2, "big"), 8), whole=whole)
+        received = client.connection.protocol.close_rcvd
+        assert received is not None and received.code == 1001
+        assert not client.waiting()
+        client.transport.abort()
+        await asyncio.wait_for(closing, 30)
+
+    run(test)
 
 
 def test_no_more_than_two_messages_of_a_client_are_read() -> None:

@@ -6,6 +6,8 @@ import re
 import struct
 import sys
 import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -126,9 +128,21 @@ VALUES = st.recursive(
 )
 
 
-@given(VALUES.filter(lambda value: "__ndarray__" not in str(value) and "__npgeneric__" not in str(value)))
+@contextmanager
+def large_from(size: int) -> Iterator[None]:
+    """With arrays of so many bytes and more taken for large ones."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wire, "LARGE", size)
+        yield
+
+
+KEYS_END = len(b"__npgeneric__") + 1  # no key of the format is set aside
+
+
+@pytest.mark.parametrize("large", [wire.LARGE, KEYS_END])
+@given(value=VALUES.filter(lambda value: "__ndarray__" not in str(value) and "__npgeneric__" not in str(value)))
 @settings(deadline=None, max_examples=200)
-def test_whatever_can_be_sent_arrives_unchanged(value: Any) -> None:
+def test_whatever_can_be_sent_arrives_unchanged(large: int, value: Any) -> None:
     def compare(actual: Any, expected: Any) -> None:
         if isinstance(expected, list):
             assert len(actual) == len(expected)
@@ -141,7 +155,56 @@ def test_whatever_can_be_sent_arrives_unchanged(value: Any) -> None:
         else:
             assert_same(actual, expected)
 
-    compare(unpack(pack(value)), value)
+    plain = pack(value)
+    with large_from(large):
+        assert pack(value) == plain
+        compare(unpack(plain), value)
+
+
+@pytest.mark.parametrize("dtype", ["|u1", "|i1", "|b1", "<f4", ">f8", "<i8", "<U4", "|S16", "<M8[s]"])
+@pytest.mark.parametrize("more", [-16, 0])
+def test_large_arrays_of_bytes_are_views_of_the_message_and_others_are_aligned_copies(dtype: str, more: int) -> None:
+    generator = np.random.default_rng(0)
+    numbers = generator.integers(0, 2, (wire.LARGE + more) // np.dtype(dtype).itemsize)
+    sent = {
+        "a": numbers.astype(dtype),
+        "odd": "x" * 7,
+        "nested": [{"b": numbers.astype(dtype)[::-1]}],
+        "raw": b"\1" * 40_000,
+    }
+    message = pack(sent)
+    received = unpack(message)
+    for got, expected in ((received["a"], sent["a"]), (received["nested"][0]["b"], sent["nested"][0]["b"])):  # type: ignore[index]
+        assert_same(got, expected)
+        shares = np.shares_memory(got, np.frombuffer(message, np.uint8))
+        assert shares == (dtype in ("|u1", "|i1") and more == 0)
+        assert got.flags.aligned and not got.flags.writeable
+    assert_same({key: received[key] for key in ("odd", "raw")}, {key: sent[key] for key in ("odd", "raw")})
+
+
+@pytest.mark.parametrize(
+    "array", [np.arange(60_000, dtype=np.uint8).reshape(200, 300)[:, ::2], np.ones((200, 300), order="F")]
+)
+def test_large_arrays_are_sent_in_c_order_however_they_lie_in_memory(array: np.ndarray) -> None:
+    assert_same(unpack(pack(array)), np.ascontiguousarray(array))
+
+
+def test_large_bytes_are_no_array_where_they_stand_alone_and_no_key() -> None:
+    large = b"x" * wire.LARGE
+    for value in (large, [large], {"a": large}):
+        assert unpack(msgpack.packb(value)) == value
+    with pytest.raises(WireError, match="the keys of a map must be str or bin"):
+        unpack(msgpack.packb({large: 1}))
+    with pytest.raises(WireError, match="msgpack extension type at byte 1"):
+        unpack(msgpack.packb([msgpack.ExtType(0, bytes(4)), large]))
+    with pytest.raises(WireError, match="a <f4 scalar can't be made from b'xxx"):
+        unpack(msgpack.packb(scalar_map(data=large)))
+
+
+def test_a_large_array_of_the_wrong_size_is_refused_by_name() -> None:
+    fields = array_map(dtype="|u1", shape=[wire.LARGE + 1], data=bytes(wire.LARGE))
+    with pytest.raises(WireError, match=r"shape \[16385\] of \|u1 needs 16385 bytes of data, but 16384 came"):
+        unpack(msgpack.packb(fields))
 
 
 @pytest.mark.parametrize(
@@ -371,13 +434,15 @@ SCALAR_LIKE = st.fixed_dictionaries(
 
 
 def decodes_or_refuses(data: bytes) -> None:
-    try:
-        value = unpack(data)
-    except WireError as error:
-        assert str(error)  # noqa: PT017
-        assert len(str(error)) < 1000  # noqa: PT017
-    else:
-        repr(value)  # nothing in it is broken
+    for large in (wire.LARGE, KEYS_END):
+        try:
+            with large_from(large):
+                value = unpack(data)
+        except WireError as error:
+            assert str(error)  # noqa: PT017
+            assert len(str(error)) < 1000  # noqa: PT017
+        else:
+            repr(value)  # nothing in it is broken
 
 
 @given(st.binary(max_size=200))

@@ -29,6 +29,7 @@ _REFUSALS: dict[str, type[TurboPiError]] = {
     "bad actions: ": ActionError,
     "the device is lost: ": DeviceLost,
 }
+_KEPT_BYTES = 8 * 2**20
 
 
 class ServerLost(TurboPiError):
@@ -68,6 +69,7 @@ class RealTimeClient:
         self._lock = threading.Lock()
         self._socket: ClientConnection | None = None
         self._open = contextlib.ExitStack()
+        _keep_freed_memory()
         with self._lock:
             self.metadata = self._connect()
 
@@ -172,6 +174,16 @@ class RealTimeClient:
         self._socket = None
         with contextlib.suppress(Exception):  # it may be gone already
             self._open.close()
+
+
+def _keep_freed_memory() -> None:
+    """Have the C library keep up to twice _KEPT_BYTES of freed memory, which it would return to the system.
+
+    An observation is copied a few times on its way out. glibc returns such blocks when they are freed, and fresh memory
+    costs more than the copies (docs/dev/log.md). It stops to return blocks of a size once it has returned one of that
+    size (mallopt(3), M_MMAP_THRESHOLD). This one is never written to, so it takes no memory.
+    """
+    bytearray(_KEPT_BYTES)
 
 
 def _printable(text: str) -> str:

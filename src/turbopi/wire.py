@@ -9,12 +9,13 @@ object and complex don't. Nothing is ever pickled.
 A message is not trusted: its headers are walked before msgpack builds anything (msgpack allocates what an array
 header claims, so a few bytes could ask for gigabytes), and an array must bring exactly the bytes its shape needs.
 Decoding therefore allocates a small multiple of the message's length, whatever the message says, and what it costs
-besides copying bytes is bounded too: a few milliseconds for the worst message.
+besides copying bytes is bounded too: a few milliseconds for the worst message. Pictures aren't copied.
 """
 
 import math
 import re
 import reprlib
+import struct
 from typing import Any
 
 import msgpack
@@ -29,6 +30,7 @@ MAX_STEPS = 4_000  # maps, lists, strings and changes between kinds of numbers: 
 MAX_DIMS = 32  # what NumPy 1 can hold
 MAX_EMPTY = 2**20  # product of an empty array's other dimensions: [0, 2**60] needs no data, but who sums it up pays
 MAX_BYTES = 64 * 2**20
+LARGE = 16384  # bytes of an array from which on it isn't copied, if it needn't be
 
 _REFUSED_KINDS = "VOc"
 _DTYPE = re.compile(r"[<>|=]?([a-zA-Z?])(\d{0,7})(\[\d{0,4}[a-zA-Z]{1,2}\])?")
@@ -75,26 +77,38 @@ def _pack_numpy(value: object) -> dict[bytes, object]:
     if value.dtype.kind in _REFUSED_KINDS:
         raise WireError(f"can't send dtype {value.dtype}: void, object and complex aren't part of the format")
     if isinstance(value, np.ndarray):
-        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+        return {b"__ndarray__": True, b"data": _bytes_of(value), b"dtype": value.dtype.str, b"shape": value.shape}
     item = value.item()
     if not isinstance(item, bool | int | float) or isinstance(item, np.generic):
         raise WireError(f"can't send a {value.dtype} scalar: send it as a 0-dimensional array")
     return {b"__npgeneric__": True, b"data": item, b"dtype": value.dtype.str}
 
 
+def _bytes_of(array: np.ndarray) -> bytes | memoryview:
+    """Its numbers in C order, not copied where that would cost more than it spares."""
+    if array.nbytes < LARGE or not array.flags.c_contiguous:
+        return array.tobytes()
+    return array.reshape(-1).view(np.uint8).data
+
+
 # --- decoding ---------------------------------------------------------------------------------------------------------
 
 
 def unpack(data: bytes, *, max_bytes: int = MAX_BYTES) -> Any:
-    """Decode one message. Arrays are read-only views of `data`'s copy inside the decoded value; never more than that.
+    """Decode one message. Its arrays are read-only.
 
+    Large arrays of int8 and uint8 are views of `data` itself, which lives as long as they do; others are copies.
     Raises WireError, and nothing else, for whatever is wrong; the message names the place and what was expected there.
     """
     if len(data) > max_bytes:
         raise WireError(f"the message has {len(data)} bytes; the limit is {max_bytes}")
-    _check_structure(data)
+    rest, large = _set_aside(data, _check_structure(data))
+
+    def place(kind: int, number: bytes) -> memoryview:
+        return large[int.from_bytes(number, "big")]
+
     try:
-        value = msgpack.unpackb(data, strict_map_key=True, object_pairs_hook=_unique_keys)
+        value = msgpack.unpackb(rest, strict_map_key=True, object_pairs_hook=_unique_keys, ext_hook=place)
     except WireError:
         raise
     except UnicodeDecodeError as error:
@@ -135,6 +149,8 @@ def _head_table() -> tuple[tuple[int, int, int], ...]:
 
 
 _HEADS = _head_table()
+_BINS = (0xC4, 0xC5, 0xC6)
+_EXTENSION = struct.Struct(">BBI")  # head, type and four bytes of data
 # First bytes by the length of what they begin: a run of those is found at once, not value by value.
 _SAME_LENGTH = {
     length: bytes(head for head in range(256) if _HEADS[head] == (_NUMBER, 0, length))
@@ -142,9 +158,13 @@ _SAME_LENGTH = {
 }
 
 
-def _check_structure(data: bytes) -> None:
-    """Walk the headers of `data` without building anything: complete, nothing left over, within the limits."""
+def _check_structure(data: bytes) -> list[tuple[int, int, int]]:
+    """Walk the headers of `data` without building anything: complete, nothing left over, within the limits.
+
+    Returns where bins of LARGE bytes and more are: the places of header, first byte and end.
+    """
     size, position, values, steps = len(data), 0, 1, 0
+    large: list[tuple[int, int, int]] = []
     pending = [1]  # values still to come, in each open container
     while pending:
         if not pending[-1]:
@@ -183,6 +203,8 @@ def _check_structure(data: bytes) -> None:
             raise WireError(_incomplete(start, needed, max(size - position, 0)))
         if kind == _BYTES:
             position += length
+            if length >= LARGE and data[start] in _BINS:
+                large.append((start, position - length, position))
             continue
         values += needed
         if values > MAX_VALUES:
@@ -192,6 +214,20 @@ def _check_structure(data: bytes) -> None:
         pending.append(needed)
     if position != size:
         raise WireError(f"not a msgpack message: {size - position} bytes follow its end at byte {position}")
+    return large
+
+
+def _set_aside(data: bytes, places: list[tuple[int, int, int]]) -> tuple[bytes, list[memoryview]]:
+    """`data` without the bins at `places`, and those. msgpack copies a bin; here it finds the bin's number instead, as
+    an extension value, of which a message has none.
+    """
+    if not places:
+        return data, []
+    whole, parts, at = memoryview(data).toreadonly(), list[bytes | memoryview](), 0
+    for number, (start, _, end) in enumerate(places):
+        parts += (whole[at:start], _EXTENSION.pack(0xD6, 0, number))
+        at = end
+    return b"".join((*parts, whole[at:])), [whole[begin:end] for _, begin, end in places]
 
 
 def _incomplete(start: int, needed: int, there: int) -> str:
@@ -207,11 +243,16 @@ def _unique_keys(pairs: list[tuple[object, object]]) -> dict[object, object]:
     return value
 
 
-_OPEN = frozenset((dict, list))
+_OPEN = frozenset((dict, list, memoryview))
 
 
 def _restore(value: Any, path: tuple[Any, ...]) -> Any:
-    """Turn the maps that stand for arrays and scalars into those. `path` is where `value` is, for the messages."""
+    """Turn the maps that stand for arrays and scalars into those, and what was set aside and is none into bytes.
+
+    `path` is where `value` is, for the messages.
+    """
+    if isinstance(value, memoryview):
+        return bytes(value)
     if isinstance(value, dict):
         if b"__ndarray__" in value:
             return _array(value, path)
@@ -229,7 +270,7 @@ def _array(fields: dict[object, object], path: tuple[object, ...]) -> np.ndarray
     _check_fields(fields, (b"__ndarray__", b"data", b"dtype", b"shape"), path)
     dtype = _dtype(fields[b"dtype"], path)
     data, shape = fields[b"data"], fields[b"shape"]
-    if not isinstance(data, bytes):
+    if not isinstance(data, bytes | memoryview):
         raise WireError(f"{_at(path)}: an array's data must be msgpack bin, not {type(data).__name__}")
     if not isinstance(shape, list) or not all(type(n) is int and n >= 0 for n in shape):
         raise WireError(f"{_at(path)}: shape must be a list of integers from 0 up, not {_shown(shape)}")
@@ -240,6 +281,10 @@ def _array(fields: dict[object, object], path: tuple[object, ...]) -> np.ndarray
         raise WireError(
             f"{_at(path)}: shape {_shown(shape)} of {dtype.str} needs {expected} bytes of data, but {len(data)} came"
         )
+    if isinstance(data, memoryview):
+        if dtype.str[1:] in ("u1", "i1"):
+            return np.ndarray(tuple(shape), dtype, data)
+        data = bytes(data)  # where wider numbers are aligned
     if dtype.kind == "b" and data.translate(None, b"\x00\x01"):
         raise WireError(f"{_at(path)}: a bool array's bytes must be 0 or 1")
     if not is_unicode(data, dtype):
@@ -250,6 +295,8 @@ def _array(fields: dict[object, object], path: tuple[object, ...]) -> np.ndarray
 def _scalar(fields: dict[Any, Any], path: tuple[Any, ...]) -> Any:
     _check_fields(fields, (b"__npgeneric__", b"data", b"dtype"), path)
     dtype, data = _dtype(fields[b"dtype"], path), fields[b"data"]
+    if isinstance(data, memoryview):
+        data = bytes(data)
     if type(data) not in _SCALAR_TYPES.get(dtype.kind, ()):
         raise WireError(f"{_at(path)}: a {dtype.str} scalar can't be made from {_shown(data)}")
     if dtype.kind in "iu" and not np.iinfo(dtype).min <= data <= np.iinfo(dtype).max:

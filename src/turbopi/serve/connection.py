@@ -2,7 +2,8 @@
 
 The websockets library reads all that comes, as fast as it comes. This connection stands between the socket and the
 library: it looks at the frames' headers alone, hands over what may be handled now, holds the rest (at most one read of
-the socket, 256 KiB) and stops reading. TCP then stops the client.
+the socket, 256 KiB) and stops reading. TCP then stops the client. Pictures' messages don't go through the library at
+all: straight.py.
 """
 
 import asyncio
@@ -13,15 +14,17 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
 
 from websockets.asyncio.server import ServerConnection
-from websockets.frames import CloseCode
+from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 from turbopi.serve.limited_log import LimitedLog
 from turbopi.serve.limits import Credit, Limits, MemoryBudget, WorkPool
 from turbopi.serve.metrics import Metrics
+from turbopi.serve.straight import SpareBuffer, StraightFrame, goes_straight
 
 AHEAD = 2  # messages of one client: one that is computed, one that waits
+READ_BYTES = 256 * 1024  # at most, in one read of a socket
 BYTES_OF_ONE_WORK = 65536
 BREATH_SECONDS = 0.002  # 128 MB a second and more: who sent too much shall come to read why it is closed
 WORK_OF_A_SECOND = 4000.0  # that a message keeps the event loop busy: all who are slowed get a fifth of its time
@@ -38,6 +41,9 @@ class Shared:
     clock: Callable[[], float] = time.monotonic
     memory: MemoryBudget = field(init=False)
     pool: WorkPool = field(init=False)
+    spare: SpareBuffer = field(default_factory=SpareBuffer, init=False)
+    # One for all connections: what one read brought is looked at before the next read.
+    scratch: memoryview = field(default_factory=lambda: memoryview(bytearray(READ_BYTES)), init=False)
 
     def __post_init__(self) -> None:
         self.memory = MemoryBudget(max(self.limits.memory_bytes, self.limits.message_bytes))
@@ -59,9 +65,10 @@ class FrameHead(NamedTuple):
     length: int  # bytes of the payload
     opcode: int
     final: bool
+    straight: bool  # its payload may be received past the library, if it begins a message
 
 
-def frame_head(data: bytes, at: int) -> FrameHead | None:
+def frame_head(data: bytes | memoryview, at: int) -> FrameHead | None:
     """The header that begins at `data[at]`; None if its end hasn't come yet. What is wrong in it isn't looked at."""
     if len(data) < at + 2:
         return None
@@ -72,7 +79,7 @@ def frame_head(data: bytes, at: int) -> FrameHead | None:
     if len(data) < at + size:
         return None
     length = int.from_bytes(data[at + 2 : at + 2 + extended], "big") if extended else short
-    return FrameHead(size, length, first & 0x0F, bool(first & 0x80))
+    return FrameHead(size, length, first & 0x0F, bool(first & 0x80), goes_straight(first, second, length))
 
 
 @dataclass
@@ -84,7 +91,7 @@ class _Message:
     memory: int = 0
 
 
-class GuardedConnection(ServerConnection):
+class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
     """One client. `answered` must be called for each message that `recv` gave, once it is dealt with."""
 
     def __init__(self, protocol: ServerProtocol, owner: Owner, shared: Shared) -> None:
@@ -94,10 +101,11 @@ class GuardedConnection(ServerConnection):
         self._owner, self._shared, self._limits = owner, shared, limits
         self._credit = Credit(limits, shared.pool, shared.clock)
         self._head: bytes | None = b""  # the last bytes of the HTTP request as long as that goes on
-        self._held = b""  # received and not handed over
+        self._held: bytes | memoryview = b""  # received and not handed over
         self._left = 0  # bytes of the current frame's payload that are still to come
         self._ends_message = False  # the current frame is the last one of a message
         self._message: _Message | None = None  # begun and not complete
+        self._straight: StraightFrame | None = None  # the current frame, if it isn't the library's
         self._unanswered: deque[_Message] = deque()
         self._handed_over = 0  # bytes of messages
         self._timers: dict[str, asyncio.TimerHandle] = {}
@@ -138,15 +146,38 @@ class GuardedConnection(ServerConnection):
         super(ServerConnection, self).connection_made(transport)  # its own would start the library's server's handler
         self._owner.connected(self)
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> memoryview:
+        return self._shared.scratch if self._straight is None else self._straight.room
+
+    def buffer_updated(self, nbytes: int) -> None:
+        if self._straight is None:
+            self.data_received(self._shared.scratch[:nbytes])
+        else:
+            self._straight.received(nbytes)
+            self._came(nbytes)
+            self._go_on(b"")
+
+    def data_received(self, data: bytes | memoryview) -> None:
+        """What was read elsewhere than into `get_buffer`: uvloop, for one, never asks for it."""
         if self._head is not None:
-            data = self._http(data)
+            data = self._http(bytes(data))
+            if not data:
+                return
+        if self._straight is not None:
+            part = data[: self._left]
+            self._straight.add(part)
+            self._came(len(part))
+            data = data[len(part) :]
+        self._go_on(data)
+
+    def _go_on(self, data: bytes | memoryview) -> None:
         if self.protocol.state is State.CLOSING:
-            super().data_received(data)  # which throws it away
+            self._hand_over(data)  # which throws it away
             self._breathe()
-        elif data:
-            self._held = self._held + data if self._held else data
+        else:
+            self._held = bytes(self._held) + data if self._held else data
             self._feed()
+            self._held = bytes(self._held)  # the next read of any connection writes over the scratch
 
     def eof_received(self) -> None:
         super().eof_received()
@@ -177,7 +208,7 @@ class GuardedConnection(ServerConnection):
             self._shared.memory.give_back(message.memory)
             self._shared.pool.waste(message.work)
         self._unanswered.clear()
-        self._message, self._held = None, b""
+        self._message, self._straight, self._held = None, None, b""
         # This object is part of reference cycles, which may live long: what is large in it must not.
         self.protocol.reader.buffer.clear()
         frames = self.recv_messages.frames
@@ -212,34 +243,61 @@ class GuardedConnection(ServerConnection):
         else:
             self._cancel("retry")
             self._credit.refill()
-            end, holding = self._scan(self._held)
-            data, self._held = self._held[:end], self._held[end:]
-            if data:
-                super().data_received(data)
+            holding = self._scan()
         self._read_on(not holding)
         self._watch_progress(holding)
 
-    def _scan(self, data: bytes) -> tuple[int, bool]:
-        """How much of `data` to hand over, and whether what follows must wait (if not, it is half a header)."""
-        at = 0
+    def _scan(self) -> bool:
+        """Hand over what may be handled now of what is held; whether the rest must wait (if not, it is half a header).
+
+        The library gets it in one piece, but for frames that go straight.
+        """
+        data, at, begun, waits = self._held, 0, 0, False  # the library's next piece begins at `begun`
         while at < len(data):
             if not self._left:
                 head = frame_head(data, at)
                 if head is None:
-                    return at, False
+                    break
+                begins = self._message is None
                 if not self._admit(head):
-                    return at, True
-                at += head.size
+                    waits = True
+                    break
                 self._left = head.length
+                if begins and head.straight and head.length <= self._limits.message_bytes:
+                    self._hand_over(data[begun:at])
+                    begun = at + head.size
+                    self._straight = StraightFrame(self._shared.spare, head.length, bytes(data[begun - 4 : begun]))
+                at += head.size
             part = min(self._left, len(data) - at)
+            if self._straight is not None:
+                self._straight.add(data[at : at + part])
+                begun = at + part
             at += part
-            self._left -= part
-            if self._message is not None:
-                self._handed_over += part
-                if self._ends_message and not self._left:
-                    self._unanswered.append(self._message)
-                    self._message = None
-        return at, False
+            self._came(part)
+        self._held = data[at:]
+        self._hand_over(data[begun:at])
+        return waits
+
+    def _came(self, size: int) -> None:
+        """So many bytes of the current frame's payload have come."""
+        self._left -= size
+        if self._message is None:
+            return
+        self._handed_over += size
+        if self._left:
+            return
+        if self._ends_message:
+            self._unanswered.append(self._message)
+            self._message = None
+        if self._straight is not None:
+            message, self._straight = self._straight.message(), None
+            if self.protocol.state is State.OPEN:  # not after a wrong frame or a close
+                self.process_event(Frame(Opcode.BINARY, message))
+
+    def _hand_over(self, data: bytes | memoryview) -> None:
+        """Give the library what it is to see. It copies that."""
+        if data:
+            super().data_received(data)  # type: ignore[arg-type]  # any object that holds bytes will do
 
     def _admit(self, head: FrameHead) -> bool:
         """Whether the frame may be handled now; if so, it is paid for."""

@@ -216,4 +216,5 @@ class Listener:
     def _trim(self) -> None:
         self._trimming = None
         if not self._clients:
+            self._shared.spare.drop()
             trim_memory()

@@ -53,7 +53,7 @@ _REFUSALS = {
     "lost": "the device is lost: {}",
 }
 LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers look seldom
-LARGE = 2**20  # bytes of a message that is decoded beside the event loop
+LARGE = 4 * 2**20  # bytes of a message that is decoded beside the event loop
 MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
 
 

@@ -1,0 +1,66 @@
+"""Large frames, received straight into one buffer.
+
+The websockets library copies a frame's bytes four times on their way from the socket to the message, mostly into memory
+that the system must provide anew. An observation with pictures is one large frame. connection.py receives the payload
+of such frames here, past the library: the socket writes into a buffer that is used again and again, and taking the mask
+off makes the message.
+"""
+
+from websockets.frames import Opcode, apply_mask  # the compiled one, if there is one
+
+LEAST = 2**16  # bytes of a payload: what is smaller costs little either way
+MOST = 4 * 2**20  # of larger ones the library takes care: the one buffer that is kept stays small
+
+
+def goes_straight(first: int, second: int, length: int) -> bool:
+    """Whether a frame that begins a message, with these first two bytes and a payload of `length`, is received here.
+
+    first, second  the final bit, no reserved bit, binary; masked: anything else is the library's, which checks it
+    """
+    return first == 0x80 | Opcode.BINARY and second >= 0x80 and LEAST <= length <= MOST
+
+
+class SpareBuffer:
+    """Keeps one buffer from one frame for the next: writing into memory that is new costs more than receiving."""
+
+    def __init__(self) -> None:
+        self._spare: bytearray | None = None
+
+    def take(self, size: int) -> bytearray:
+        """A buffer of at least `size` bytes, whatever they are."""
+        spare, self._spare = self._spare, None
+        return spare if spare is not None and len(spare) >= size else bytearray(size)
+
+    def give_back(self, buffer: bytearray) -> None:
+        """Of two, the larger one is kept."""
+        if self._spare is None or len(self._spare) < len(buffer):
+            self._spare = buffer
+
+    def drop(self) -> None:
+        """Keep nothing."""
+        self._spare = None
+
+
+class StraightFrame:
+    """The payload of one frame while it comes. `room` is where the next bytes go; nothing is left of it at the end."""
+
+    def __init__(self, spare: SpareBuffer, length: int, mask: bytes) -> None:
+        self._spare, self._length, self._mask = spare, length, mask
+        self._buffer = spare.take(length)
+        self.room = memoryview(self._buffer)[:length]
+
+    def add(self, data: bytes | memoryview) -> None:
+        """Take bytes that were received elsewhere, no more than there is room for."""
+        self.room[: len(data)] = data
+        self.received(len(data))
+
+    def received(self, size: int) -> None:
+        """So many bytes were written into `room`."""
+        self.room = self.room[size:]
+
+    def message(self) -> bytes:
+        """The payload without its mask. To be called once: then the buffer is the next frame's."""
+        assert not self.room
+        message = apply_mask(memoryview(self._buffer)[: self._length], self._mask)
+        self._spare.give_back(self._buffer)
+        return message

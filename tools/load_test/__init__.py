@@ -1,0 +1,1 @@
+"""A load test of policy servers: `python -m load_test --help`."""
