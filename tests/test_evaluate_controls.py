@@ -22,6 +22,7 @@ class Recorder:
     def __init__(self) -> None:
         self.identity: dict[str, Any] = {"weights": "w"}
         self.about: dict[str, Any] = {}
+        self.real_time: dict[str, Any] = {}
         self.asked: list[Any] = []
 
     def infer(self, observations: Any, seeds: Any, arguments: Any = None) -> list[Answer]:

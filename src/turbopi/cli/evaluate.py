@@ -270,14 +270,18 @@ def evaluate_command(
     protocol = options.protocol(chosen, simulator)
     jobs = options.jobs(chosen, protocol.suite)
     cells = options.cells()
-    _check_cells(cells, options, remote)
-    if remote:
-        from turbopi.evaluate.sources import RemotePolicy
+    if options.record is not None and len(cells) > 1:
+        raise ConfigError("--record keeps what one run sees: give one --execution, --delay-steps, --execution-horizon")
+    from turbopi.evaluate.checks import check_way
+    from turbopi.evaluate.sources import RemotePolicy
 
+    if remote:
         source: PolicySource = RemotePolicy(host or "127.0.0.1", port, chosen_key(api_key, api_key_file))
     else:
         source = options.local_policy(checkpoint, output)
     try:
+        for cell in cells:
+            check_way(source, cell.protocol(protocol))
         if control is not None:
             from turbopi.evaluate.controls import Controlled
 
@@ -298,19 +302,6 @@ def evaluate_command(
         raise typer.Exit(CHECK_FAILED)
 
 
-def _check_cells(cells: "list[Cell]", options: EvalOptions, remote: bool) -> None:
-    from turbopi.execution import way_named
-
-    joined = sorted({cell.execution for cell in cells if way_named(cell.execution).mode is not None})
-    if remote and joined:
-        raise ConfigError(
-            f"--execution {', '.join(joined)} tells the model of the running chunk, which isn't done over the network "
-            "here: give the checkpoint instead of a server's address, or --execution sync, async or ensemble"
-        )
-    if options.record is not None and len(cells) > 1:
-        raise ConfigError("--record keeps what one run sees: give one --execution, --delay-steps, --execution-horizon")
-
-
 def _run_cells(
     options: EvalOptions,
     protocol: "Protocol",
@@ -322,8 +313,8 @@ def _run_cells(
     output: Output,
 ) -> bool:
     """Each cell in a folder of its own, and the report of all. Returns whether every episode has a verdict."""
+    from turbopi.evaluate.checks import check_delay, check_fit
     from turbopi.evaluate.delays import FILE, HEADS, document, row, write_delays
-    from turbopi.evaluate.sources import check_delay, check_fit
 
     answer = check_fit(source, simulator, protocol.sim, protocol.image_px, min(cell.horizon for cell in cells))
     for cell in cells:  # what can't be run is better known before the first one is
@@ -373,8 +364,8 @@ def run_with_progress(
     on_answer: "OnAnswer | None" = None,
 ) -> "Results":
     """Check that the policy fits, then run with a bar, or a line an episode where nobody watches."""
+    from turbopi.evaluate.checks import check_delay, check_fit
     from turbopi.evaluate.run import default_workers, evaluate, pending, prepare
-    from turbopi.evaluate.sources import check_delay, check_fit
     from turbopi.evaluate.visited import Recording
 
     answer = check_fit(source, simulator, protocol.sim, protocol.image_px, protocol.replan)

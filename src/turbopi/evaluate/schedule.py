@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from turbopi.errors import TurboPiError
+from turbopi.evaluate.checks import actions_needed
 from turbopi.evaluate.episode import WorkerSetup
 from turbopi.evaluate.motion import Motion
 from turbopi.evaluate.plan import Job, Protocol, noise_seed
 from turbopi.evaluate.results import Episode, Status, writable
-from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource, actions_needed
+from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
 from turbopi.evaluate.workers import LOG, WorkerHandle
 from turbopi.preprocess.images import resize_with_pad
 from turbopi.sim import Simulator
