@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.evaluate.frames import Frame
+from turbopi.evaluate.frames import Frame, Reel
 from turbopi.evaluate.motion import Commands, Motion
 from turbopi.evaluate.plan import Job
 from turbopi.execution import ChunkQueue
@@ -69,25 +69,31 @@ def run_episode(
     """
     environment.reset(job.initial_state)
     queue = ChunkQueue(execution.way, execution_horizon=execution.horizon, delay=execution.delay)
-    commands, reel = Commands(), _Reel(film, smooth, execution.horizon, max_steps)
+    commands, reel = Commands(), Reel(film, smooth)
     answer: Mapping[str, Any] = {}
     due, step, status, message = -1, 0, "failure", None
+    refused: np.ndarray | None = None
 
     while step < max_steps:
-        if queue.in_flight is not None and step == due:
+        arrives = queue.in_flight is not None and step == due
+        if arrives:
             queue.arrive(answer)
+        if reel.wants(takes_over=arrives) and not queue.wants_observation:
+            reel.picture(step, environment.draw())
         if queue.wants_observation:
             observation = environment.observation()
             request = queue.observe()
+            reel.picture(step, [observation[key] for key in image_keys])
+            reel.asked(step)
             try:
                 answer = ask(step, observation, request.arguments)
             except NoActions as none:
                 status, message = "aborted", f"step {step}: {none}; the episode was aborted"
                 break
-            reel.look(step, [observation[key] for key in image_keys], answer["actions"])
+            reel.answered(request.number, answer["actions"])
             problem = _problem(answer["actions"])
             if problem is not None:
-                status, message = "aborted", f"step {step}: {problem}"
+                status, message, refused = "aborted", f"step {step}: {problem}", answer["actions"]
                 break
             due = step + (execution.delay if request.number else 0)
             if due == step:
@@ -96,8 +102,10 @@ def run_episode(
         if action is None:
             assert execution.stand_still is not None
             values = execution.stand_still(commands.values[-1])
+            reel.act(values)
         else:
             values = action.values
+            reel.act(values, action.chunk, action.row)
             if action.takes_over and action.chunk:
                 commands.seams.append(step)
         commands.values.append(values)
@@ -107,37 +115,11 @@ def run_episode(
         if environment.step(values, look=look):
             status = "success"
             break
-        reel.step(step, environment)
-    if status != "aborted":
-        reel.end(step, environment)
+    if film is not None and status != "aborted":
+        reel.picture(step, environment.draw())
+    reel.end(refused)
     dims = execution.motion_dims or (len(commands.values[0]) if commands.values else 0)
     return Ending(status, step, message, commands.motion(queue, dims), commands)
-
-
-class _Reel:
-    """Takes the frames of a film, if there is one."""
-
-    def __init__(self, film: Callable[[Frame], None] | None, smooth: bool, horizon: int, max_steps: int) -> None:
-        self._film, self._smooth, self._horizon, self._max_steps = film, smooth, horizon, max_steps
-        self._chunk, self._begun, self._planned = np.zeros((1, 1)), 0, 0
-
-    def look(self, step: int, pictures: list[np.ndarray], chunk: np.ndarray) -> None:
-        self._chunk, self._begun, self._planned = chunk, step, min(self._horizon, self._max_steps - step)
-        if self._film is not None:
-            self._film(Frame(step, pictures, chunk, self._planned, 0))
-
-    def step(self, step: int, environment: Environment) -> None:
-        if self._film is not None and self._smooth and step - self._begun < self._planned:
-            self._draw(step, environment)
-
-    def end(self, step: int, environment: Environment) -> None:
-        if self._film is not None:
-            self._draw(step, environment)
-
-    def _draw(self, step: int, environment: Environment) -> None:
-        assert self._film is not None
-        done = min(step - self._begun, self._planned)
-        self._film(Frame(step, environment.draw(), self._chunk, self._planned, done))
 
 
 def _problem(chunk: np.ndarray) -> str | None:
@@ -202,10 +184,11 @@ class Worker:
         from turbopi.evaluate.video import write_video
 
         setup = self.setup
-        fps = self.simulator.control_hz / (1 if setup.smooth else setup.replan)
         video = f"videos/{job.video}_{status}.mp4"
         caption = f"{job.task.instruction}  (task {job.task.index}, initial state {job.initial_state})"
-        write_video(Path(setup.folder) / video, frames, caption, status, self.simulator.robot, fps)
+        write_video(
+            Path(setup.folder) / video, frames, caption, status, self.simulator.robot, self.simulator.control_hz
+        )
         return video
 
     def forget(self) -> None:
