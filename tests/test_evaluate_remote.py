@@ -69,8 +69,8 @@ def test_a_server_gives_the_same_actions_as_the_policy_in_this_process(
         assert np.array_equal(here.actions, there.actions)
         assert here.for_next.keys() == there.for_next.keys() and bool(here.for_next) == (way != "async")
         assert all(np.array_equal(here.for_next[name], there.for_next[name]) for name in here.for_next)
-    here, there = ([(e.status, e.steps, e.motion) for e in one.in_order()] for one in found)
-    assert here == there
+    at_home, abroad = ([(e.status, e.steps, e.motion) for e in one.in_order()] for one in found)
+    assert at_home == abroad
 
 
 def test_the_running_chunk_does_reach_the_server(

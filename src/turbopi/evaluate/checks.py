@@ -52,6 +52,11 @@ def check_delay(protocol: Protocol, simulator: Simulator, horizon: int) -> None:
             f"actions and an execution horizon of {protocol.replan}: at most {most} does; give another "
             "--execution-horizon, or a policy with longer chunks"
         )
+    if protocol.control_hz is not None and not hasattr(simulator, "standing_still"):
+        raise ConfigError(
+            f"the simulator {simulator.name} doesn't say how its robot stands still (`standing_still`), so it can't be "
+            "run in real time, where a policy may be late"
+        )
     if protocol.delay and way.stands_still and not hasattr(simulator, "standing_still"):
         raise ConfigError(
             f"the simulator {simulator.name} doesn't say how its robot stands still (`standing_still`), so it can't be "
@@ -65,11 +70,11 @@ def check_way(source: PolicySource, protocol: Protocol) -> None:
     told, where = source.real_time, source.about.get("server")
     who = "this policy" if where is None else f"the policy server at {where}"
     if way.mode is None:
-        if told.get("execution") is not None:
+        if told.get("execution") is not None and protocol.control_hz is None:  # the executor tells it what it must know
             raise ConfigError(
                 f"{who} joins chunks itself (it was started with --execution {shown(told['execution'])}) and counts "
                 f"actions by its own clock, which a simulated delay doesn't follow: start it without --execution, and "
-                "give that to turbopi eval"
+                "give that to turbopi eval, or take --real-time"
             )
         return
     modes = told.get("modes")

@@ -1,19 +1,17 @@
-"""One episode, in a worker process: the simulator is stepped, the policy is asked across a pipe."""
+"""One episode whose world waits for the policy: exact delays, counted in control steps."""
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from turbopi.evaluate.frames import Frame, Reel
 from turbopi.evaluate.motion import Commands, Motion
+from turbopi.evaluate.pacing import Paced
 from turbopi.evaluate.plan import Job
 from turbopi.execution import ChunkQueue
-from turbopi.sim import Environment, SimSettings
+from turbopi.sim import Environment
 
 # Asks the policy at a step: observation, what else it is told (`Request.arguments`) -> what `infer` returns, "actions"
 # float64[H, d] at least. Raises NoActions if it has none that can be used
@@ -31,6 +29,7 @@ class Ending:
     message: str | None = None
     motion: Motion | None = None
     commands: Commands = field(default_factory=Commands)
+    paced: Paced | None = None  # of an episode in real time
 
 
 @dataclass(frozen=True)
@@ -50,6 +49,10 @@ class Execution:
     delay: int = 0
     stand_still: StandStill | None = None
     motion_dims: int | None = None
+
+    def dims(self, commands: Commands) -> int:
+        """How many dimensions of these commands move the robot."""
+        return self.motion_dims or (len(commands.values[0]) if commands.values else 0)
 
 
 def run_episode(
@@ -118,8 +121,10 @@ def run_episode(
     if film is not None and status != "aborted":
         reel.picture(step, environment.draw())
     reel.end(refused)
-    dims = execution.motion_dims or (len(commands.values[0]) if commands.values else 0)
-    return Ending(status, step, message, commands.motion(queue, dims), commands)
+    motion = commands.motion(
+        execution.dims(commands), queue.seams, standing=queue.empty_steps, dropped=sum(queue.dropped.values())
+    )
+    return Ending(status, step, message, motion, commands)
 
 
 def _problem(chunk: np.ndarray) -> str | None:
@@ -133,106 +138,5 @@ def _problem(chunk: np.ndarray) -> str | None:
     return None
 
 
-class Worker:
-    """Runs jobs that come through a connection, holding the environment of the last task.
-
-    Messages out   ("observation", step, observation, arguments)   answered with ("actions", what infer returned),
-                                                                   ("problem", text) or ("stop",)
-                   ("finished", status, steps, message, seconds, video, motion)
-                   ("crashed", traceback, seconds)
-                   ("unavailable", text)   nothing can be simulated here at all
-    """
-
-    def __init__(self, connection: Connection, setup: "WorkerSetup") -> None:
-        from turbopi.sim import create
-
-        self.connection, self.setup = connection, setup
-        self.simulator = create(setup.simulator)
-        self.environment: Environment | None = None
-        self.task = -1
-
-    def run(self, job: Job) -> None:
-        setup, start = self.setup, time.perf_counter()
-        frames: list[Frame] = []
-        ending = run_episode(
-            self._environment(job.task.index),
-            job,
-            self._ask,
-            Execution(
-                setup.execution,
-                setup.replan,
-                setup.delay,
-                getattr(self.simulator, "standing_still", None),
-                getattr(self.simulator, "motion_dim", None),
-            ),
-            max_steps=setup.max_steps or job.task.max_steps,
-            image_keys=self.simulator.image_keys,
-            film=frames.append if job.video else None,
-            smooth=setup.smooth,
-        )
-        seconds = time.perf_counter() - start
-        message, video = ending.message, None
-        if frames and (ending.status != "success" or job.keep_success):
-            try:
-                video = self._write_video(job, frames, ending.status)
-            except OSError as error:  # a full disk, no ffmpeg: the verdict stands
-                message = f"{message or ''} the video couldn't be written: {error}".strip()
-        self.connection.send(("finished", ending.status, ending.steps, message, seconds, video, ending.motion))
-
-    def _write_video(self, job: Job, frames: list[Frame], status: str) -> str:
-        """Its path inside the results' folder."""
-        from turbopi.evaluate.video import write_video
-
-        setup = self.setup
-        video = f"videos/{job.video}_{status}.mp4"
-        caption = f"{job.task.instruction}  (task {job.task.index}, initial state {job.initial_state})"
-        write_video(
-            Path(setup.folder) / video, frames, caption, status, self.simulator.robot, self.simulator.control_hz
-        )
-        return video
-
-    def forget(self) -> None:
-        """Drop the environment: after an error it may be in any state."""
-        environment, self.environment, self.task = self.environment, None, -1
-        if environment is not None:
-            environment.close()
-
-    def _environment(self, task: int) -> Environment:
-        if self.environment is None or self.task != task:
-            self.forget()
-            self.environment = self.simulator.open(self.setup.suite, task, self.setup.sim)
-            self.task = task
-        return self.environment
-
-    def _ask(self, step: int, observation: dict[str, object], arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        self.connection.send(("observation", step, observation, arguments))
-        answer = self.connection.recv()
-        if answer[0] == "stop":
-            raise Stopped
-        if answer[0] == "problem":
-            raise NoActions(answer[1])
-        result: Mapping[str, Any] = answer[1]
-        return result
-
-
 class NoActions(Exception):
     """The policy found itself that its actions can't be used."""
-
-
-class Stopped(Exception):
-    """The run ended while this episode was under way."""
-
-
-@dataclass(frozen=True)
-class WorkerSetup:
-    """What every worker is told when it starts."""
-
-    simulator: str
-    suite: str
-    sim: SimSettings
-    replan: int
-    max_steps: int | None
-    smooth: bool
-    folder: str
-    execution: str = "sync"
-    delay: int = 0

@@ -147,8 +147,9 @@ class RealTime:
         elif asked.step is None:
             self._need_control_hz()
         session.busy = True
-        arguments = {"previous": previous, "model_actions": True}
-        arguments |= {} if asked.seed is None else {"seed": asked.seed}
+        arguments: dict[str, Any] = {"previous": previous, "model_actions": True}
+        if asked.seed is not None:
+            arguments["seed"] = asked.seed
         return Plan(observation, arguments, asked, session, now, about)
 
     def finish(self, plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
