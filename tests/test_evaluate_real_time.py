@@ -20,7 +20,7 @@ from turbopi.evaluate.frames import Frame
 from turbopi.evaluate.pacing import Paced, Pacer, rate_told, summarise_paced, told_of_lateness
 from turbopi.evaluate.plan import Job, Protocol
 from turbopi.evaluate.reading import load_results
-from turbopi.evaluate.real_time import RealTimeLoop, Unfit
+from turbopi.evaluate.real_time import _STEP, RealTimeLoop, Unfit, _Policy
 from turbopi.evaluate.results import protocol_json
 from turbopi.execution import WAYS
 from turbopi.sim import create
@@ -269,7 +269,7 @@ def test_a_chunk_that_comes_later_than_told_is_dropped_and_counted() -> None:
     ending = setup.run(world, steps=20)
     assert ending.paced is not None
     assert ending.paced.dropped == {"late": 1} and ending.paced.delays == [1, 3, 1, 1, 1]
-    assert world.actions[1:10] == [0, 1, 2, 3, 4, 5, 6, 7, 803]  # the next one is told 3, and is there after 1
+    assert world.actions[1:10] == [0, 1, 2, 3, 4, 5, 6, 7, 801]  # of the chunk that was asked for instead, at step 8
     assert ending.motion is not None and ending.motion.dropped == 1
 
 
@@ -308,6 +308,19 @@ def test_actions_that_cannot_be_used_are_dropped_as_on_a_robot() -> None:
     ending = setup.run(World(setup.clock), steps=12)
     assert ending.status == "failure" and ending.paced is not None and ending.paced.dropped == {"failed": 1}
     assert [step for step, _, _ in setup.asked[3:]] == [0, 5, 6, 10]  # asked again with the next observation
+
+
+def test_latency_is_from_the_observation_to_the_policys_answer() -> None:
+    clock = Clock()
+
+    def ask(step: int | None, observation: dict[str, Any], arguments: Mapping[str, Any]) -> dict[str, Any]:
+        clock.now += 0.25 if step is None else 0.03
+        return {"actions": np.zeros((12, 2))}
+
+    policy = _Policy(ask, {}, clock)
+    for observation in ({}, {_STEP: 0}, {_STEP: 5}):
+        policy.infer(observation)
+    assert policy.latency_ms == pytest.approx([30, 30])  # but for the warm-up
 
 
 def test_a_policy_that_is_gone_ends_the_episode() -> None:
