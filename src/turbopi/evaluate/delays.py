@@ -244,7 +244,7 @@ MEASURED_HEADS = ("latency [ms] p50 / p95", "dropped", "late steps")
 MEASURED_LEGEND = (
     " Measured by the wall clock: delay: median and 95th percentile of the control steps from an observation to its "
     "chunk; latency: from an observation to the policy's answer; dropped: chunks that were never carried out; late "
-    "steps: those for which the simulator wasn't ready in time."
+    "steps: those that began more than a tenth of a control step late."
 )
 
 

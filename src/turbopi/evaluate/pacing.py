@@ -11,14 +11,16 @@ from turbopi.evaluate.statistics import Percentiles, percentiles
 
 _Count = Annotated[int, Meta(ge=0, le=10**9)]
 _Time = Annotated[float, Meta(ge=0, le=1e12)]
+LATE = 0.1  # of a control step: operating systems wake a process a little late
 TOLERATED = 0.01  # of the control steps may begin late in what is called real time
 
 
 class Pacer:
     """Control steps at their rate by the wall clock: step n is due n / hz seconds after the first.
 
-    The clock is never slowed. A step is late if the simulator is still at the one before when it is due: it then begins
-    as soon as it can, and those after it are due when they ever were.
+    The clock is never slowed. A step that can't begin when it is due, as the simulator is still at the one before or
+    the machine is busy elsewhere, begins as soon as it can, and those after it are due when they ever were. It counts
+    as late beyond LATE of a control step.
     """
 
     def __init__(
@@ -43,11 +45,11 @@ class Pacer:
         now = self._clock()
         if self._steps:
             self.step_ms.append((now - self._began) * 1e3)
-            if now > due:
-                self.late_ms.append((now - due) * 1e3)
         while now < due:
             self._sleep(due - now)
             now = self._clock()
+        if now - due > LATE / self._hz:
+            self.late_ms.append((now - due) * 1e3)
         self._began = now
         self._steps += 1
 
@@ -63,7 +65,7 @@ class Paced(Struct, frozen=True):
     delays       control steps from an observation to its chunk, for every chunk that came
     latency_ms   from an observation to the policy's answer, for each of them: with the pipes on the way
     dropped      chunks that were never carried out, by reason (docs/real_time.md)
-    late_ms      of each control step that began late, as the simulator was still at the one before: how late
+    late_ms      of each control step that began late: how late
     step_ms      the simulator's own time for a step, with its pictures: median and longest
     seconds      from the first control step to the beginning of the last one
     """
@@ -124,15 +126,16 @@ def summarise_paced(episodes: Sequence[tuple[int, Paced]], control_hz: float) ->
 
 
 def told_of_lateness(summary: PacedSummary, control_hz: float) -> str | None:
-    """What a reader must know of a simulator that ran late; None if it never did."""
+    """What a reader must know of control steps that began late; None if none did."""
     if summary.late_ms is None:
         return None
     share = 100 * summary.late_steps / max(summary.steps, 1)
     speed = "" if summary.speed is None else f"; the world's time ran at {summary.speed:.3f} of the clock's"
     text = (
-        f"The simulator ran late in {summary.late_steps} of {summary.steps} control steps ({share:.2g} %), by "
-        f"{summary.late_ms.p50:.1f} ms in the median and {summary.late_ms.max:.1f} ms at most: its slowest step took "
-        f"{summary.longest_step_ms:.1f} ms, and {1e3 / control_hz:.1f} ms are one at {control_hz:g} Hz{speed}."
+        f"{summary.late_steps} of {summary.steps} control steps ({share:.2g} %) began late, by "
+        f"{summary.late_ms.p50:.1f} ms in the median and {summary.late_ms.max:.1f} ms at most: the simulator's slowest "
+        f"step took {summary.longest_step_ms:.1f} ms, and {1e3 / control_hz:.1f} ms are one at {control_hz:g} Hz"
+        f"{speed}."
     )
     if summary.is_real_time:
         return text
