@@ -1,5 +1,6 @@
 """The controls hand on what they say: another task's prompt, or another task's pictures."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ class Recorder:
     def __init__(self) -> None:
         self.identity: dict[str, Any] = {"weights": "w"}
         self.about: dict[str, Any] = {}
+        self.real_time: Mapping[str, Any] = {}
         self.asked: list[Any] = []
 
     def infer(self, observations: Any, seeds: Any, arguments: Any = None) -> list[Answer]:

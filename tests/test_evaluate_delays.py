@@ -11,12 +11,13 @@ from cli_helpers import turbopi
 from evaluate_fakes import SeekingPolicy, run
 
 from turbopi.errors import ConfigError
+from turbopi.evaluate.checks import check_delay
 from turbopi.evaluate.delays import Cell, document, make_cells, write_delays
 from turbopi.evaluate.episode import Execution, run_episode
 from turbopi.evaluate.plan import Job, Protocol
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import protocol_json
-from turbopi.evaluate.sources import LocalPolicy, check_delay
+from turbopi.evaluate.sources import LocalPolicy
 from turbopi.execution import WAYS
 from turbopi.sim import create
 from turbopi.sim.base import Task
@@ -189,10 +190,6 @@ def test_ways_that_tell_the_model_ask_the_policy_for_it() -> None:
 )
 def test_bad_ways_are_refused(options: str, why: str, tmp_path: Path) -> None:
     assert why in refused(f"eval reacher --random-weights pi05_tiny {options}", "--out", tmp_path / "never")
-
-
-def test_a_server_is_not_asked_to_join_chunks(tmp_path: Path) -> None:
-    assert "isn't done over the network" in refused("eval reacher --port 9 --execution rtc", "--out", tmp_path / "n")
 
 
 def test_the_command_runs_every_cell_and_compares_them(tmp_path: Path) -> None:

@@ -17,8 +17,9 @@ from websockets.exceptions import ConnectionClosed
 
 from turbopi import serve
 from turbopi.errors import ActionError, ConfigError, ObservationError
+from turbopi.evaluate.checks import check_fit
 from turbopi.evaluate.reading import load_results
-from turbopi.evaluate.sources import Answer, LocalPolicy, PolicyLost, PolicyRefused, RemotePolicy, check_fit
+from turbopi.evaluate.sources import Answer, LocalPolicy, PolicyLost, PolicyRefused, RemotePolicy
 from turbopi.sim import SimSettings, create
 from turbopi.wire import MAX_BYTES, pack
 

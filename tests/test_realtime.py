@@ -46,6 +46,32 @@ def test_the_robot_never_waits_for_a_policy_that_is_as_fast_as_expected(executio
         assert told == [None] * len(told) and not any(call["model_actions"] for call in policy.calls)
 
 
+def test_an_observation_is_wanted_from_the_execution_horizon_until_the_chunk_is_there() -> None:
+    loop, policy = started("async", execution_horizon=4)
+    assert loop.executor.wants_observation
+    wanted = []
+    for _ in range(10):
+        loop.step(delay=2)
+        wanted.append(loop.executor.wants_observation)
+    #                  the first chunk is there after 2 steps; its rows 0 to 3; the second one is computed; rows 2 and 3
+    assert wanted == [True, True, *[False] * 3, True, True, True, False, True]
+    assert len(policy.calls) == 2
+    cold, _ = started("async", warm=False)
+    assert cold.executor.wants_observation  # to warm up with
+
+
+def test_each_chunk_and_each_seam_can_be_looked_up() -> None:
+    loop, _ = started("rtc", execution_horizon=4)
+    loop.run(20, delay=2)
+    inferred, seams = loop.executor.inferred, loop.executor.seams
+    assert [(one.chunk, one.begun, one.ended, one.outcome) for one in inferred[:3]] == [
+        *((0, 0, 2, "used"), (1, 6, 8, "used"), (2, 10, 12, "used")),
+    ]
+    assert [(seam.chunk, seam.step, seam.delay, seam.told) for seam in seams[:2]] == [(1, 8, 2, 2), (2, 12, 2, 2)]
+    inferred[0].outcome = "changed"
+    assert loop.executor.inferred[0].outcome == "used"
+
+
 def test_sync_holds_while_the_policy_thinks() -> None:
     loop, _ = started("sync", execution_horizon=3, hold_action="last")
     loop.run(20, delay=2)

@@ -135,6 +135,8 @@ LEFT = np.zeros((4, A), np.float32)
         ({"step": "5"}, "turbopi/step is '5'"),
         ({"reset": 1}, "turbopi/reset is 1; it should be true or false"),
         ({"model_actions": "yes"}, "turbopi/model_actions is 'yes'"),
+        ({"seed": -1}, "turbopi/seed is -1; it should be a whole number from 0"),
+        ({"seed": 0.5}, "turbopi/seed is 0.5"),
         ({"previous": LEFT}, "turbopi/previous came without turbopi/mode"),
         ({"previous": LEFT, "mode": "rtc"}, "turbopi/previous came without turbopi/delay"),
         ({"previous": LEFT[0], "mode": "rtc", "delay": 1}, r"turbopi/previous has shape \[3\]"),
@@ -157,6 +159,16 @@ def test_a_plain_request_goes_to_the_policy_as_it_came() -> None:
     server, policy, _, _ = real_time()
     answer = call(server, policy, {"place": 3})
     assert set(answer) == {"actions"} and policy.calls == [None] and policy.seen == [{"place"}]
+
+
+@pytest.mark.parametrize("execution", [None, "rtc"])
+def test_a_seed_is_the_policys_whatever_else_is_asked(execution: JoinMode | None) -> None:
+    server, _, _, _ = real_time(execution=execution, control_hz=None if execution is None else 50)
+    seeded = {"place": 0, "turbopi/seed": 2**64 - 1}
+    plans = [server.plan({**seeded, **more}, "c") for more in ({}, {"turbopi/model_actions": True})]
+    assert [plan.arguments["seed"] for plan in plans] == [2**64 - 1] * 2
+    assert all(set(plan.observation) == {"place"} for plan in plans)
+    assert server.plan({"place": 0}, "d").arguments.get("seed") is None
 
 
 def test_a_client_that_keeps_its_chunk_gets_model_actions_and_the_anchor() -> None:
@@ -187,6 +199,8 @@ def test_a_policy_that_joins_nothing_says_so() -> None:
     server, *_ = real_time(policy)
     with pytest.raises(ObservationError, match="joins no chunks"):
         server.plan(message({"place": 0}, None, True), "c")
+    with pytest.raises(ObservationError, match="joins no chunks"):
+        server.plan(message({"place": 0}, seed=3), "c")
     assert server.metadata == {}
     with pytest.raises(ConfigError, match="execution is 'rtc', which this policy can't: it offers none"):
         real_time(policy, execution="rtc", control_hz=50)

@@ -64,6 +64,8 @@ def compare_command(
     from turbopi.evaluate.results import FILE
 
     output = Output(as_json)
+    if given := options.of_delay():
+        raise ConfigError(f"{', '.join(given)}: ways to join chunks are compared by `turbopi eval`, in one report")
     if len(runs) < 2:
         raise ConfigError(f"compare needs two runs or more, but got {len(runs)}: {' '.join(runs)}")
     folders = [(Path(run) / FILE).exists() for run in runs]

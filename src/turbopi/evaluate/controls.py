@@ -36,7 +36,7 @@ class Controlled:
             raise ConfigError(f"the control {control!r} takes another task's, but only one is evaluated; give more")
         self._source, self._control, self._image_keys = source, control, tuple(image_keys)
         self._seen: dict[str, dict[str, np.ndarray]] = {}
-        self.max_batch = source.max_batch
+        self.max_batch, self.real_time = source.max_batch, source.real_time
         self.label = f"{source.label}, {control} of another task"
         self.identity = source.identity | {"control": control}
         self.about = source.about | {"control": control}

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from msgspec import Struct
 
 from turbopi.errors import ConfigError
+from turbopi.evaluate.pacing import PacedSummary, told_of_lateness
 from turbopi.evaluate.pages import render
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.results import Episode, Plain, PolicyTold, Results, plain_object
@@ -26,31 +28,39 @@ FILE, PAGE, SUCCESS_PLOT, SEAM_PLOT = "delays.json", "delays.html", "success.png
 COLORS = dict(zip(WAYS, ("#9aa0a6", "#b00020", "#e08a00", "#3b6fb6", "#7b4fb6", "#2f8f5b"), strict=True))
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True)
 class Cell:
-    """A way to run, the delay and the execution horizon, both in control steps."""
+    """A way to run, the delay and the execution horizon, both in control steps.
+
+    Delay None: in real time, it is measured.
+    """
 
     execution: str
-    delay: int
+    delay: int | None
     horizon: int
 
     @property
     def folder(self) -> str:
+        if self.delay is None:
+            return f"{self.execution}_real_time_horizon{self.horizon}"
         return f"{self.execution}_delay{self.delay}_horizon{self.horizon}"
 
     def protocol(self, base: Protocol) -> Protocol:
-        return replace(base, execution=self.execution, delay=self.delay, replan=self.horizon)
+        """`base` has the wall clock's rate, if it is in real time."""
+        return replace(base, execution=self.execution, delay=self.delay or 0, replan=self.horizon)
 
 
-def make_cells(executions: Sequence[str], delays: Sequence[int], horizons: Sequence[int]) -> list[Cell]:
+def make_cells(executions: Sequence[str], delays: Sequence[int | None], horizons: Sequence[int]) -> list[Cell]:
     """All combinations, delays first. Raises ConfigError for a way that isn't one."""
     ways = [way_named(name).name for name in dict.fromkeys(executions)]
-    return [Cell(*cell) for cell in itertools.product(ways, sorted(set(delays)), sorted(set(horizons)))]
+    ordered = sorted(set(delays), key=lambda delay: -1 if delay is None else delay)
+    return [Cell(*cell) for cell in itertools.product(ways, ordered, sorted(set(horizons)))]
 
 
 class CellSummary(Struct, frozen=True):
     """What a cell's episodes come to. Differences are this cell's rate less the other's, on common episodes.
 
+    delay             simulated, in control steps. None: real time; `real_time` has what was measured
     undelayed         the other is the same way with the smallest delay; None: it is that
     against           the other is the first way in the list, with the same delay and horizon; None: it is that
     seam_jump, …      medians over episodes of `Motion`'s means
@@ -58,7 +68,7 @@ class CellSummary(Struct, frozen=True):
     """
 
     execution: str
-    delay: int
+    delay: int | None
     horizon: int
     success: RateDocument
     undelayed: PairedDocument | None
@@ -71,6 +81,15 @@ class CellSummary(Struct, frozen=True):
     standing: float | None
     dropped: int
     crashes: int
+    real_time: PacedSummary | None = None
+
+    @property
+    def steps_of_delay(self) -> float:
+        """Simulated, or the median of those measured."""
+        if self.delay is not None:
+            return self.delay
+        measured = None if self.real_time is None else self.real_time.delay_steps
+        return float("nan") if measured is None else measured.p50
 
 
 class DelaysDocument(Struct, frozen=True):
@@ -88,7 +107,7 @@ class DelaysDocument(Struct, frozen=True):
 
 def summarise(cells: Sequence[tuple[Cell, Results]]) -> list[CellSummary]:
     found, first = dict(cells), cells[0][0].execution
-    least = min(cell.delay for cell, _ in cells)
+    least = min((cell.delay for cell, _ in cells if cell.delay is not None), default=None)
 
     def paired(results: Results, other: Cell, own: Cell) -> PairedDocument | None:
         return None if other == own else _paired(found[other], results).document
@@ -138,6 +157,7 @@ def _summary(
         standing=float(np.mean([motion.standing for motion in motions])) if motions else None,
         dropped=sum(motion.dropped for motion in motions),
         crashes=len(results.episodes) - len(episodes),
+        real_time=results.real_time(),
     )
 
 
@@ -178,15 +198,19 @@ def write_delays(folder: Path, cells: Sequence[tuple[Cell, Results]]) -> Path:
     plot_success(folder / SUCCESS_PLOT, told.cells)
     plot_seams(folder / SEAM_PLOT, told.cells)
     results = cells[0][1]
+    is_real_time = results.control_hz is not None
     page = render(
         "delays.html",
         title=f"{results.suite} under delay: {results.label}",
         suite=results.suite,
         label=results.label,
         episodes=len(told.episodes),
-        heads=HEADS,
+        heads=heads(told.cells),
+        notes=notes(told.cells, results.control_hz),
         rows=[row(cell) for cell in told.cells],
-        legend=LEGEND.format(first=told.first),
+        legend=LEGEND.format(first=told.first) + (MEASURED_LEGEND if is_real_time else ""),
+        measured=is_real_time,
+        rate=results.rate if is_real_time else "",
         plots=[SUCCESS_PLOT, SEAM_PLOT],
         runs=[(cell.folder, f"{cell.folder}/report.html") for cell, _ in cells],
     )
@@ -216,6 +240,29 @@ LEGEND = (
 )
 
 
+MEASURED_HEADS = ("latency [ms] p50 / p95", "dropped", "late steps")
+MEASURED_LEGEND = (
+    " Measured by the wall clock: delay: median and 95th percentile of the control steps from an observation to its "
+    "chunk; latency: from an observation to the policy's answer; dropped: chunks that were never carried out; late "
+    "steps: those that began more than a tenth of a control step late."
+)
+
+
+def heads(cells: Sequence[CellSummary]) -> tuple[str, ...]:
+    """The table's; more of them where delays were measured."""
+    return HEADS + (MEASURED_HEADS if any(cell.real_time is not None for cell in cells) else ())
+
+
+def notes(cells: Sequence[CellSummary], control_hz: float | None) -> list[str]:
+    """What a reader must know before the numbers: where the simulator couldn't keep up with the clock."""
+    found = [
+        (cell.execution, told_of_lateness(cell.real_time, control_hz))
+        for cell in cells
+        if cell.real_time is not None and control_hz is not None
+    ]
+    return [f"{execution}: {told}" for execution, told in found if told is not None]
+
+
 def row(cell: CellSummary) -> list[str]:
     """A table's row as text."""
     rate = Rate(cell.success.successes, cell.success.trials)
@@ -223,9 +270,23 @@ def row(cell: CellSummary) -> list[str]:
     lengths = ["-" if value is None else f"{value:.2f}" for value in (cell.seam_jump, cell.step_jump, cell.jerk)]
     standing = "-" if cell.standing is None else f"{cell.standing:.1f}"
     differences = [_difference(cell.undelayed), _difference(cell.against)]
+    delay, measured = str(cell.delay), []
+    if cell.real_time is not None:
+        delay, *measured = _measured(cell.real_time)
     return [
-        cell.execution, str(cell.delay), str(cell.horizon), str(rate), *differences, steps, *lengths, standing
+        cell.execution, delay, str(cell.horizon), str(rate), *differences, steps, *lengths, standing, *measured
     ]  # fmt: skip
+
+
+def _measured(paced: PacedSummary) -> list[str]:
+    """The delay's text, and the columns of MEASURED_HEADS."""
+    delay, latency = paced.delay_steps, paced.latency_ms
+    return [
+        "-" if delay is None else f"measured: {delay.p50:.0f} (p95 {delay.p95:.0f})",
+        "-" if latency is None else f"{latency.p50:.1f} / {latency.p95:.1f}",
+        ", ".join(f"{count} {reason}" for reason, count in paced.dropped.items()) or "0",
+        f"{paced.late_steps} of {paced.steps}" + ("" if paced.is_real_time else ": not real time"),
+    ]
 
 
 def _difference(paired: PairedDocument | None) -> str:
@@ -245,7 +306,7 @@ def plot_success(path: Path, cells: Sequence[CellSummary]) -> Path:
         for number, way in enumerate(ways):
             own = [cell for cell in cells if (cell.execution, cell.horizon) == (way, horizon) and cell.success.trials]
             shift = 0.06 * (number - (len(ways) - 1) / 2)  # so that intervals don't hide each other
-            x = [cell.delay + shift for cell in own]
+            x = [cell.steps_of_delay + shift for cell in own]
             y = [100 * (cell.success.rate or 0) for cell in own]
             ends = np.array([[100 * end for end in cell.success.wilson95] for cell in own]).reshape(-1, 2)
             axes.errorbar(
@@ -253,8 +314,7 @@ def plot_success(path: Path, cells: Sequence[CellSummary]) -> Path:
                 markersize=5, capsize=2, linewidth=1.4,
             )  # fmt: skip
         axes.set_title(f"execution horizon {horizon}", fontsize=10)
-        axes.set_xlabel("delay [control steps]")
-        axes.set_xticks(sorted({cell.delay for cell in cells}))
+        _label_delays(axes, cells)
         axes.set_ylim(-2, 103)
         axes.grid(alpha=0.3)
     pictures[0].set_ylabel("success [%], Wilson's 95 % interval")
@@ -271,18 +331,27 @@ def plot_seams(path: Path, cells: Sequence[CellSummary]) -> Path:
     for way in dict.fromkeys(cell.execution for cell in cells):
         for style, horizon in zip(itertools.cycle(("-", "--", ":")), horizons, strict=False):
             own = [
-                (cell.delay, cell.seam_jump)
+                (cell.steps_of_delay, cell.seam_jump)
                 for cell in cells
                 if (cell.execution, cell.horizon) == (way, horizon) and cell.seam_jump is not None
             ]
             if own:
                 label = way if len(horizons) == 1 else f"{way}, horizon {horizon}"
                 axes.plot(*zip(*own, strict=True), style, label=label, color=COLORS[way], marker="o", markersize=5)
-    axes.set_xticks(sorted({cell.delay for cell in cells}))
-    axes.set_xlabel("delay [control steps]")
+    _label_delays(axes, cells)
     axes.set_ylabel("jump of the command at seams, median")
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, frameon=False)
+    if axes.has_data():  # else no chunk took over from another
+        axes.legend(fontsize=8, frameon=False)
     write_figure(path, figure, dpi=120)
     return path
+
+
+def _label_delays(axes: Axes, cells: Sequence[CellSummary]) -> None:
+    delays = sorted({cell.steps_of_delay for cell in cells if np.isfinite(cell.steps_of_delay)})
+    measured = any(cell.delay is None for cell in cells)
+    axes.set_xticks(delays)
+    axes.set_xlabel("delay [control steps]" + (", median of those measured" if measured else ""))
+    if measured and delays:
+        axes.set_xlim(delays[0] - 0.5, delays[-1] + 0.5)

@@ -1,15 +1,21 @@
-"""What a film of an episode is made of."""
+"""What a film of an episode is made of, and how it is taken."""
 
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture of a film: what the cameras see at a step, and the chunk that is being carried out.
+    """One picture of a film: what the cameras see at a step, and the chunk that is carried out there.
 
-    planned, done   how many of its actions will be carried out before the policy is asked again, and have been
+    entered   the row at which the chunk took over. While it was computed, the robot carried out the one before
+    planned   the row behind the last one that was carried out: [entered, planned) were
+    done      the row that comes next
+    before    float64[n, d], n ≤ entered: what the robot was commanded instead of the rows before `entered`
+    note      what the robot waits for, if it does
     """
 
     step: int
@@ -17,3 +23,101 @@ class Frame:
     chunk: np.ndarray  # [H, d]
     planned: int
     done: int
+    entered: int = 0
+    before: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    note: str = ""
+
+
+@dataclass
+class _Carried:
+    """What was carried out of a chunk."""
+
+    step: int  # at which it took over
+    entered: int
+    planned: int
+    before: list[np.ndarray]
+
+
+class Reel:
+    """Takes pictures during an episode. Frames are made when it is over: then it is known what was carried out.
+
+    film    is given the frames. None: there is no film, and nothing is kept
+    smooth  a picture at every step, instead of those at which the policy looks or a chunk takes over
+    """
+
+    def __init__(self, film: Callable[[Frame], None] | None, smooth: bool) -> None:
+        self._film, self._smooth = film, smooth
+        self._pictures: list[tuple[int, list[np.ndarray]]] = []
+        self._asked: list[int] = []  # at which step each chunk was asked for
+        self._chunks: dict[int, np.ndarray] = {}
+        self._rows: list[tuple[int, int] | None] = []  # chunk and row of each step; None: no action
+        self._carried: dict[int, _Carried] = {}
+        self._last: list[np.ndarray] = []  # actions before now
+
+    def wants(self, *, takes_over: bool) -> bool:
+        """Whether a picture is wanted at a step at which nobody looks."""
+        return self._film is not None and (self._smooth or takes_over)
+
+    def picture(self, step: int, pictures: list[np.ndarray]) -> None:
+        if self._film is not None:
+            self._pictures.append((step, pictures))
+
+    def asked(self, step: int) -> None:
+        """The next chunk was asked for, with what is seen at this step."""
+        self._asked.append(step)
+
+    def answered(self, number: int, chunk: np.ndarray) -> None:
+        """float64[H, d], what the policy predicted when it was asked for the chunk of this number."""
+        if self._film is not None:
+            self._chunks[number] = chunk
+
+    def act(self, values: np.ndarray, chunk: int | None = None, row: int = 0) -> None:
+        """This step's command; `chunk` None: there is no action, and the robot stands still."""
+        if self._film is None:
+            return
+        self._rows.append(None if chunk is None else (chunk, row))
+        if chunk is None:
+            return
+        if chunk not in self._carried:
+            before = self._last[len(self._last) - min(row, len(self._last)) :]
+            self._carried[chunk] = _Carried(len(self._rows) - 1, row, row, before)
+        self._carried[chunk].planned = row + 1
+        self._last.append(values)
+
+    def end(self, refused: np.ndarray | None = None) -> None:
+        """Hand the frames on. `refused`: the last chunk, if it ended the episode."""
+        if self._film is not None:
+            for step, pictures in self._pictures:
+                self._film(self._frame(step, pictures, refused))
+
+    def _frame(self, step: int, pictures: list[np.ndarray], refused: np.ndarray | None) -> Frame:
+        now = self._rows[step] if step < len(self._rows) else None
+        if now is None and step == len(self._rows) and refused is not None:
+            return Frame(step, pictures, refused, 0, 0)
+        note = self._note(step)
+        if now is None:
+            earlier = [row for row in self._rows[:step] if row is not None]
+            if not earlier:
+                width = next((chunk.shape[1] for chunk in self._chunks.values()), 1)
+                return Frame(step, pictures, np.full((1, width), np.nan), 0, 0, note=note)
+            now = earlier[-1][0], earlier[-1][1] + 1
+        number, row = now
+        carried = self._carried[number]
+        before = np.array(carried.before).reshape(len(carried.before), self._chunks[number].shape[1])
+        return Frame(step, pictures, self._chunks[number], carried.planned, row, carried.entered, before, note)
+
+    def _note(self, step: int) -> str:
+        """Whether a chunk is computed at this step, and whether the robot stands still meanwhile."""
+        if step >= len(self._rows):
+            return ""
+        if self._rows[step] is None:
+            return "stands still: the policy computes"
+        asked = [number for number, when in enumerate(self._asked) if when <= step]
+        late = asked and (asked[-1] not in self._carried or self._carried[asked[-1]].step > step)
+        return "the next chunk is computed" if late else ""
+
+
+def lengths(frames: Sequence[Frame]) -> list[int]:
+    """How many control steps each frame is shown: until the next one; the last one for as long as the one before."""
+    gaps = [max(1, after.step - frame.step) for frame, after in itertools.pairwise(frames)]
+    return [*gaps, gaps[-1] if gaps else 1]

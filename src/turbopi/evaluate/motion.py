@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from turbopi.execution import ChunkQueue
+from turbopi.execution import Seam
 
 _Count = Annotated[int, Meta(ge=0, le=10**9)]
 _Length = Annotated[float, Meta(ge=0, le=1e12)]
@@ -41,12 +41,13 @@ class Commands:
     values: list[np.ndarray] = field(default_factory=list)  # float64[d] each
     seams: list[int] = field(default_factory=list)  # steps whose action is the first of a chunk, but for the first one
 
-    def motion(self, queue: ChunkQueue, dims: int) -> Motion:
+    def motion(self, dims: int, seams: Sequence[Seam], *, standing: int, dropped: int) -> Motion:
+        """Of the first `dims` dimensions. `seams`: as the queue saw them, which knows what the running chunk had."""
         path = np.array([value[:dims] for value in self.values]).reshape(len(self.values), dims)
         changes = np.linalg.norm(np.diff(path, axis=0), axis=1) if len(path) > 1 else np.zeros(0)
         at_seam = np.zeros(len(changes), np.bool_)
         at_seam[[step - 1 for step in self.seams]] = True
-        gaps = [float(np.linalg.norm(seam.gap[:dims])) for seam in queue.seams if seam.gap is not None]
+        gaps = [float(np.linalg.norm(seam.gap[:dims])) for seam in seams if seam.gap is not None]
         second = np.linalg.norm(np.diff(path, n=2, axis=0), axis=1) if len(path) > 2 else np.zeros(0)
         return Motion(
             seams=len(self.seams),
@@ -54,8 +55,8 @@ class Commands:
             seam_gap=_mean(gaps),
             step_jump=_mean(changes[~at_seam]),
             jerk=_mean(second),
-            standing=queue.empty_steps,
-            dropped=sum(queue.dropped.values()),
+            standing=standing,
+            dropped=dropped,
         )
 
 

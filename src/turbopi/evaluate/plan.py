@@ -11,6 +11,7 @@ from turbopi.errors import ConfigError
 from turbopi.execution import way_named
 from turbopi.sim import SimSettings, Simulator, Task
 
+MAX_CONTROL_HZ = 10_000
 VideoChoice = Literal["sample", "all", "none"]
 
 
@@ -22,7 +23,9 @@ class Protocol:
     image_px     pictures are resized to this square with padding before they are sent to the policy
     max_steps    control steps after the wait; None: the suite's own limit
     execution    how chunks join: one of turbopi.execution.WAYS
-    delay        control steps from an observation to the chunk computed from it
+    delay        control steps from an observation to the chunk computed from it, simulated
+    control_hz   in real time: control steps that the world makes in a second of the wall clock, whatever the policy
+                 does; delays are measured then. None: the world waits for the policy
     """
 
     simulator: str
@@ -33,9 +36,14 @@ class Protocol:
     max_steps: int | None = None
     execution: str = "sync"
     delay: int = 0
+    control_hz: float | None = None
 
     def __post_init__(self) -> None:
         way_named(self.execution)
+        if self.control_hz is not None and not 0 < self.control_hz <= MAX_CONTROL_HZ:
+            raise ConfigError(f"control_hz is {self.control_hz}; it should be above 0, at most {MAX_CONTROL_HZ}")
+        if self.control_hz is not None and self.delay:
+            raise ConfigError(f"a delay of {self.delay} steps can't be simulated in real time, where it is measured")
         if not 0 <= self.delay <= 1000:
             raise ConfigError(f"the delay is {self.delay} control steps; it should be from 0 to 1000")
         for name, value in (("replan", self.replan), ("image_px", self.image_px), ("max_steps", self.max_steps)):

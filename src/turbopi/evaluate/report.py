@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from turbopi.evaluate.pacing import told_of_lateness
 from turbopi.evaluate.pages import render
 from turbopi.evaluate.plots import write_plots
 from turbopi.evaluate.results import Episode, Results, Summary, rate
@@ -44,6 +45,10 @@ def _notes(results: Results, summary: Summary) -> list[str]:
     notes = []
     if results.policy.about.get("random_weights"):
         notes.append("Random weights: the actions mean nothing.")
+    if summary.real_time is not None and results.control_hz is not None:
+        late = told_of_lateness(summary.real_time, results.control_hz)
+        notes.append(f"In real time, {results.rate}: delays are measured by the wall clock.")
+        notes += [] if late is None else [late]
     if not results.complete:
         notes.append("The run isn't complete. The same command continues it.")
     if summary.crashes:
@@ -65,6 +70,11 @@ def _cards(summary: Summary, episodes: Sequence[Episode]) -> list[tuple[str, str
         cards.append(("a call, median", f"{call.p50:.1f} ms", f"p95 {call.p95:.1f}, p99 {call.p99:.1f}{batched}"))
     if (model := summary.infer_ms) is not None:
         cards.append(("the model, median", f"{model.p50:.1f} ms", f"p95 {model.p95:.1f}, p99 {model.p99:.1f}"))
+    if (paced := summary.real_time) is not None and (delay := paced.delay_steps) is not None:
+        more = f"measured by the wall clock; p95 {delay.p95:.0f}, most {delay.max:.0f}"
+        cards.append(("delay, median", f"{delay.p50:.0f} control steps", more))
+        dropped = ", ".join(f"{count} {reason}" for reason, count in paced.dropped.items()) or "none"
+        cards.append(("chunks dropped", str(sum(paced.dropped.values())), f"{dropped}, of {delay.count} that came"))
     if (steps := summary.steps_to_success) is not None:
         cards.append(("steps to success", f"{steps.p50:.0f}", f"median; mean {steps.mean:.0f}, most {steps.max:.0f}"))
     return cards

@@ -14,6 +14,7 @@ from msgspec import Meta, Struct
 
 from turbopi.errors import ConfigError
 from turbopi.evaluate.motion import Motion
+from turbopi.evaluate.pacing import Paced, PacedSummary, rate_told, summarise_paced
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.statistics import Percentiles, Rate, RateDocument, percentiles
 from turbopi.files import write_whole
@@ -22,6 +23,7 @@ from turbopi.sim import Task
 
 FORMAT: Final = 1
 FILE = "results.json"
+OWN_HZ = "simulator_control_hz"  # among a run's options: control steps a second of the simulator's robot
 _SAVE_EVERY_S = 3.0  # episodes of the last seconds are lost by a kill, and run again
 
 Status = Literal["success", "failure", "aborted", "crash"]
@@ -43,6 +45,7 @@ class Episode(Struct, frozen=True):
     message      what the simulator or the policy said, if it isn't a plain success or failure
     video        the film's path in the run's folder
     motion       how smooth the commands were; None in files of 0.1
+    real_time    what the wall clock showed, where the world advanced with it
     """
 
     task: Count
@@ -57,6 +60,7 @@ class Episode(Struct, frozen=True):
     message: str | None = None
     video: str | None = None
     motion: Motion | None = None
+    real_time: Paced | None = None
 
     @property
     def key(self) -> tuple[int, int]:
@@ -105,6 +109,7 @@ class Summary(Struct, frozen=True):
     call_ms: Percentiles | None
     infer_ms: Percentiles | None
     mean_batch: float | None
+    real_time: PacedSummary | None = None
 
 
 class RunDocument(Struct, frozen=True):
@@ -204,7 +209,28 @@ class Results:
             call_ms=percentiles([ms for e in episodes for ms in e.call_ms]),
             infer_ms=percentiles([ms for e in episodes for ms in e.infer_ms]),
             mean_batch=_mean([size for e in episodes for size in e.batch]),
+            real_time=self.real_time(),
         )
+
+    @property
+    def control_hz(self) -> float | None:
+        """Control steps in a second of the wall clock, of a run in real time."""
+        found = self.protocol.get("control_hz")
+        return float(found) if isinstance(found, int | float) else None
+
+    @property
+    def rate(self) -> str:
+        """How fast the world of a run in real time was."""
+        assert self.control_hz is not None
+        own = self.options.get(OWN_HZ)
+        return rate_told(self.control_hz, float(own) if isinstance(own, int | float) else None)
+
+    def real_time(self) -> PacedSummary | None:
+        """What the wall clock showed; None if the world waited for the policy."""
+        if self.control_hz is None:
+            return None
+        paced = [(e.steps, e.real_time) for e in self.episodes.values() if e.real_time is not None]
+        return summarise_paced(paced, self.control_hz)
 
     def document(self) -> RunDocument:
         about = PolicyTold(self.policy.label, plain_object(self.policy.identity), plain_object(self.policy.about))
@@ -238,7 +264,9 @@ def protocol_json(protocol: Protocol) -> Plain:
     What says that nothing is delayed is left out, as in files of 0.1, whose runs can be continued.
     """
     values = asdict(protocol)
-    if (protocol.execution, protocol.delay) == ("sync", 0):
+    if protocol.control_hz is None:
+        del values["control_hz"]
+    if (protocol.execution, protocol.delay, protocol.control_hz) == ("sync", 0, None):
         del values["execution"], values["delay"]
     return plain_object(values)
 

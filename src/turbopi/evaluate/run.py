@@ -11,14 +11,14 @@ from pathlib import Path
 import torch
 
 from turbopi.errors import ConfigError
-from turbopi.evaluate.episode import WorkerSetup
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan
 from turbopi.evaluate.reading import check_is_run, load_results
 from turbopi.evaluate.report import write_report
-from turbopi.evaluate.results import FILE, Episode, PolicyTold, Results, protocol_json
+from turbopi.evaluate.results import FILE, OWN_HZ, Episode, PolicyTold, Results, protocol_json
 from turbopi.evaluate.schedule import OnAnswer, Scheduler
 from turbopi.evaluate.sources import PolicySource
 from turbopi.evaluate.video import check_can_write
+from turbopi.evaluate.worker import WorkerSetup
 from turbopi.evaluate.workers import LOG
 from turbopi.files import alone_in
 from turbopi.provenance import provenance
@@ -98,6 +98,8 @@ def evaluate(
         str(results.folder),
         protocol.execution,
         protocol.delay,
+        protocol.control_hz,
+        dict(source.real_time),
     )
     scheduler = Scheduler(
         protocol,
@@ -115,6 +117,8 @@ def evaluate(
         elif (results.folder / FILE).exists():  # another process may have added to it since `prepare`
             results.continue_from(load_results(results.folder))
         results.options = {"workers": num_workers, "max_batch": max_batch, "videos": asdict(videos)}
+        if protocol.control_hz is not None:
+            results.options = {**results.options, OWN_HZ: simulator.control_hz}
         start = time.monotonic()
         try:
             scheduler.run(pending(results, jobs))

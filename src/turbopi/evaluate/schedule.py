@@ -15,12 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from turbopi.errors import TurboPiError
-from turbopi.evaluate.episode import WorkerSetup
+from turbopi.errors import ConfigError, TurboPiError
+from turbopi.evaluate.checks import actions_needed
 from turbopi.evaluate.motion import Motion
+from turbopi.evaluate.pacing import Paced
 from turbopi.evaluate.plan import Job, Protocol, noise_seed
 from turbopi.evaluate.results import Episode, Status, writable
-from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource, actions_needed
+from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
+from turbopi.evaluate.worker import WorkerSetup
 from turbopi.evaluate.workers import LOG, WorkerHandle
 from turbopi.preprocess.images import resize_with_pad
 from turbopi.sim import Simulator
@@ -51,7 +53,7 @@ class _Running:
 class _Request:
     worker: WorkerHandle
     job: Job
-    step: int
+    step: int | None  # None: a warm-up, which nothing is counted of
     observation: dict[str, object]
     seed: int
     arguments: Mapping[str, Any]  # what else the policy is told
@@ -148,9 +150,9 @@ class Scheduler:
         match message:
             case ("observation", step, observation, arguments):
                 self._requests.append(self._request(worker, worker.job, step, observation, arguments))
-            case ("finished", status, steps, text, seconds, video, motion):
+            case ("finished", status, steps, text, seconds, video, motion, paced):
                 self._crashes_in_a_row = 0
-                self._end(worker, status, steps, seconds, text, video, motion)
+                self._end(worker, status, steps, seconds, text, video, motion, paced)
                 self._assign(worker)
             case ("crashed", text, seconds):
                 worker.task = None
@@ -163,6 +165,9 @@ class Scheduler:
 
                 worker.job = None
                 raise SimulatorUnavailable(text)
+            case ("unfit", text):
+                worker.job = None
+                raise ConfigError(f"--execution {self._protocol.execution} can't be run in real time: {text}")
             case _:
                 raise AssertionError(f"a worker sent {message[:1]}")
 
@@ -186,15 +191,26 @@ class Scheduler:
         message: str | None,
         video: str | None = None,
         motion: Motion | None = None,
+        paced: Paced | None = None,
     ) -> None:
         job, worker.job = worker.job, None
         assert job is not None
         told = self._running[worker]
         seed = self._protocol.sim.episode_seed(job.task.index, job.initial_state)
-        lists = ([round(ms, 3) for ms in told.call_ms], [round(ms, 3) for ms in told.infer_ms], told.batch)
-        text = None if message is None else writable(message)
         episode = Episode(
-            job.task.index, job.initial_state, status, steps, seed, round(seconds, 2), *lists, text, video, motion
+            task=job.task.index,
+            initial_state=job.initial_state,
+            status=status,
+            steps=steps,
+            seed=seed,
+            seconds=round(seconds, 2),
+            call_ms=[round(ms, 3) for ms in told.call_ms],
+            infer_ms=[round(ms, 3) for ms in told.infer_ms],
+            batch=told.batch,
+            message=None if message is None else writable(message),
+            video=video,
+            motion=motion,
+            real_time=paced,
         )
         self._on_episode(episode, job)
         if status != "crash":
@@ -213,13 +229,13 @@ class Scheduler:
         self,
         worker: WorkerHandle,
         job: Job,
-        step: int,
+        step: int | None,
         observation: dict[str, object],
         arguments: Mapping[str, Any],
     ) -> _Request:
         px = self._protocol.image_px
         resized = {key: resize_with_pad(np.asarray(observation[key]), px, px) for key in self._image_keys}
-        seed = noise_seed(self._protocol.sim.seed, *job.key, step)
+        seed = noise_seed(self._protocol.sim.seed, *job.key, step or 0)
         return _Request(worker, job, step, observation | resized, seed, arguments)
 
     def _answer(self) -> None:
@@ -233,18 +249,19 @@ class Scheduler:
             answers = self._source.infer(observations, seeds)
         call_ms = (time.perf_counter() - start) * 1e3
         for request, answer in zip(batch, answers, strict=True):
-            told = self._running[request.worker]
-            told.call_ms.append(call_ms)
-            told.batch.append(len(batch))
-            if answer.infer_ms is not None:
-                told.infer_ms.append(answer.infer_ms)
+            if request.step is not None:
+                told = self._running[request.worker]
+                told.call_ms.append(call_ms)
+                told.batch.append(len(batch))
+                if answer.infer_ms is not None:
+                    told.infer_ms.append(answer.infer_ms)
             request.worker.heard = time.monotonic()
             if answer.problem is not None:
                 reply: tuple[str, object] = ("problem", answer.problem)
             else:
                 self._check_shape(answer.actions)
                 reply = ("actions", {"actions": answer.actions, **answer.for_next})
-                if self._on_answer is not None:
+                if self._on_answer is not None and request.step is not None:
                     self._on_answer(request.job, request.step, request.observation, request.seed, answer)
             with contextlib.suppress(OSError):  # it died meanwhile; the next message from it is its end
                 request.worker.connection.send(reply)

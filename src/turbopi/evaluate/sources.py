@@ -8,16 +8,13 @@ from typing import Protocol as Interface
 
 import numpy as np
 
-from turbopi.errors import ActionError, ConfigError, ObservationError, TurboPiError
-from turbopi.evaluate.plan import Protocol
-from turbopi.execution import way_named
+from turbopi.errors import ActionError, ConfigError, TurboPiError
+from turbopi.execution.messages import PREFIX, message
 from turbopi.reading import is_finite, shown
-from turbopi.sim import SimSettings, Simulator
 from turbopi.wire import MAX_BYTES, WireError, pack, unpack
 
 CONNECT_S = 10.0
 ANSWER_S = 600.0  # a server's first call may compile
-_IN_PROCESS = "give its checkpoint instead of its address, or --execution sync, async or ensemble"
 BAD_ACTIONS = "bad actions: "  # begins a Turbo-Pi server's answer where the model computed NaN or infinity
 MAX_MS = 1e12
 MAX_TOLD = 10_000  # numbers of an array in a server's metadata
@@ -55,12 +52,14 @@ class PolicySource(Interface):
     max_batch   how many it computes together; None: any number
     identity    plain values that make it the same policy when a run is continued
     about       plain values for the report
+    real_time   what it offers for chunks that join: its metadata's "real_time"; empty if it offers nothing
     """
 
     max_batch: int | None
     label: str
     identity: dict[str, object]
     about: dict[str, object]
+    real_time: Mapping[str, Any]
 
     def infer(
         self,
@@ -69,6 +68,8 @@ class PolicySource(Interface):
         arguments: Sequence[Mapping[str, Any]] | None = None,
     ) -> list[Answer]:
         """One answer for each observation; `seeds` draw the noise, where the source lets them.
+
+        Observations may have keys of `turbopi.execution.messages`, too, for a server that keeps the running chunk.
 
         arguments   what each request tells the policy of the running chunk (turbopi.execution). None: nothing
         """
@@ -87,6 +88,7 @@ class LocalPolicy:
         about: dict[str, object] = dict(policy.metadata)
         names = ("config", "backend", "precision", "num_denoising_steps", "robot", "device")
         self._policy, self.about = policy, about
+        self.real_time = offered(about)
         self.identity: dict[str, object] = {"weights": weights, "calibration": calibration_of(about)}
         self.identity |= {name: about.get(name) for name in names}
         default = f"{about.get('backend')} {about.get('precision')} {about.get('num_denoising_steps')} steps"
@@ -114,8 +116,7 @@ class LocalPolicy:
             result = self._policy.infer(observation, seed=seed, **arguments)
         except ActionError as error:
             return Answer.unusable(str(error))
-        told = {name: np.asarray(result[name]) for name in ("model_actions", "anchor") if name in result}
-        return replace(_answer(result, "policy_timing"), for_next=told)
+        return replace(_answer(result, "policy_timing"), for_next=_for_next(result))
 
     def close(self) -> None:
         self._policy = None
@@ -128,8 +129,17 @@ def calibration_of(metadata: Mapping[str, object]) -> str | None:
     return fp8.get("identity") if isinstance(fp8, Mapping) else None
 
 
+def offered(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What a policy's metadata says of chunks that join; empty if it says nothing."""
+    told = metadata.get("real_time")
+    return told if isinstance(told, Mapping) else {}
+
+
 class RemotePolicy:
-    """A server that speaks openpi's websocket protocol: Turbo-Pi's or openpi's own. It draws its own noise."""
+    """A server that speaks openpi's websocket protocol: Turbo-Pi's or openpi's own.
+
+    It draws its own noise, unless it takes seeds: `turbopi/seed` is one of the keys that its metadata lists.
+    """
 
     max_batch: int | None = 1
 
@@ -177,6 +187,9 @@ class RemotePolicy:
             raise
         volatile = ("load_seconds", "backend_details", "backend_reason")
         self.about: dict[str, object] = {"server": self._where, "metadata": metadata}
+        self.real_time = offered(metadata)
+        keys = self.real_time.get("keys")
+        self.takes_seeds = isinstance(keys, list) and f"{PREFIX}seed" in keys
         server = {name: value for name, value in metadata.items() if name not in volatile}
         self.identity: dict[str, object] = {"server": server, "calibration": calibration_of(metadata)}
         names = [name for name in ("config", "backend", "precision") if name in metadata]
@@ -189,19 +202,21 @@ class RemotePolicy:
         seeds: Sequence[int],
         arguments: Sequence[Mapping[str, Any]] | None = None,
     ) -> list[Answer]:
-        if arguments is not None:
-            raise ConfigError(f"the policy at {self._where} can't be told of a running chunk here: {_IN_PROCESS}")
-        return [self._one(observation) for observation in observations]
+        told = arguments if arguments is not None else [{}] * len(observations)
+        return [
+            self._one(message(observation, **more, seed=seed if self.takes_seeds else None))
+            for observation, seed, more in zip(observations, seeds, told, strict=True)
+        ]
 
     def close(self) -> None:
         with contextlib.suppress(Exception):  # it may be gone already
             self._open.close()
 
-    def _one(self, observation: Mapping[str, object]) -> Answer:
+    def _one(self, asked: dict[str, Any]) -> Answer:
         from websockets.exceptions import WebSocketException
 
         try:
-            self._socket.send(pack(dict(observation)))
+            self._socket.send(pack(asked))
             reply = self._socket.recv(timeout=ANSWER_S)
         except (OSError, TimeoutError, WebSocketException) as error:
             raise PolicyLost(
@@ -213,56 +228,17 @@ class RemotePolicy:
                 return Answer.unusable(_printable(reply.removeprefix(BAD_ACTIONS)))
             lines = reply.strip().splitlines() or ["nothing"]
             raise PolicyRefused(f"the policy server at {self._where} sent no actions but: {_printable(lines[-1])}")
-        return _answer(_unpacked(reply, self._where), "policy_timing", "server_timing")
+        result = _unpacked(reply, self._where)
+        return replace(_answer(result, "policy_timing", "server_timing"), for_next=_for_next(result))
 
 
-def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings, image_px: int, replan: int) -> Answer:
-    """Ask once, with an example. Raises ConfigError for a policy that can't act in this simulator."""
-    from turbopi.preprocess.images import resize_with_pad
-
-    example = simulator.example(settings)
-    example |= {key: resize_with_pad(example[key], image_px, image_px) for key in simulator.image_keys}
-    robot = f"use one for the robot {simulator.robot}, such as config pi05_{simulator.robot}"
-    try:
-        answer = source.infer([example], [0])[0]
-    except (ObservationError, PolicyRefused) as error:
-        raise ConfigError(f"the policy doesn't take the observations of {simulator.name}: {error}; {robot}") from error
-    if answer.problem is not None:
-        return answer  # of an example that no robot ever sees: episodes will show it
-    horizon, width = answer.actions.shape
-    if width != simulator.action_dim:
-        raise ConfigError(
-            f"the policy's actions have {width} numbers, but {simulator.name} needs {simulator.action_dim}; {robot}"
-        )
-    if horizon < replan:
-        raise ConfigError(
-            f"the policy's chunks have {horizon} actions, so it can't act {replan} steps before it is asked again: "
-            f"give --replan {horizon} or less"
-        )
-    return answer
-
-
-def actions_needed(protocol: Protocol) -> int:
-    """How many actions a chunk must have: those of the delay are skipped, unless the robot stands still meanwhile."""
-    skipped = 0 if way_named(protocol.execution).stands_still else protocol.delay
-    return protocol.replan + skipped
-
-
-def check_delay(protocol: Protocol, simulator: Simulator, horizon: int) -> None:
-    """Raise ConfigError for a delay that chunks of `horizon` actions, or the simulator, can't be run with."""
-    way = way_named(protocol.execution)
-    if horizon < actions_needed(protocol) or (way.mode is not None and protocol.delay > protocol.replan):
-        most = min(protocol.replan, horizon - protocol.replan)
-        raise ConfigError(
-            f"a delay of {protocol.delay} control steps doesn't fit --execution {way.name} with chunks of {horizon} "
-            f"actions and an execution horizon of {protocol.replan}: at most {most} does; give another "
-            "--execution-horizon, or a policy with longer chunks"
-        )
-    if protocol.delay and way.stands_still and not hasattr(simulator, "standing_still"):
-        raise ConfigError(
-            f"the simulator {simulator.name} doesn't say how its robot stands still (`standing_still`), so it can't be "
-            f"run with --execution {way.name} and a delay"
-        )
+def _for_next(result: Mapping[str, object]) -> dict[str, np.ndarray]:
+    """What the next chunk is told of this one, where the policy was asked for it. Raises PolicyRefused."""
+    found = {name: np.asarray(result[name]) for name in ("model_actions", "anchor") if result.get(name) is not None}
+    for name, value in found.items():
+        if value.dtype.kind not in "fiu":
+            raise PolicyRefused(f"the policy's {name} aren't numbers but {shown(result[name])}")
+    return found
 
 
 def _answer(result: object, *timings: str) -> Answer:

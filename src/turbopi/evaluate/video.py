@@ -4,6 +4,7 @@ A frame is drawn with Pillow, which is a hundred times faster than a plot of its
 """
 
 import importlib.util
+import math
 import struct
 import textwrap
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from turbopi.errors import OutputError, TurboPiError
-from turbopi.evaluate.frames import Frame
+from turbopi.evaluate.frames import Frame, lengths
 from turbopi.files import new_file
 
 VIEW = 320  # pixels of each camera's square
@@ -27,7 +28,12 @@ INSTALL = "pip install 'imageio[ffmpeg]'"
 
 Color = tuple[int, int, int]
 BACKGROUND, INK, FAINT = (250, 250, 248), (32, 33, 36), (150, 152, 158)
+CARRIED_OUT, MEANWHILE = (226, 231, 243), (252, 232, 196)
+LEGEND = "The chunk that the policy predicted. Blue: carried out. Line: now."
+DELAYED = "Amber: the chunk before was still running, while this one was computed. Rings: what it commanded."
+LEGEND_HEIGHT = 18  # of a line
 LINES: tuple[Color, ...] = ((31, 119, 180), (214, 102, 12), (44, 140, 60), (150, 90, 170))
+NOTE, FAINT_INK = (176, 98, 0), (95, 99, 104)
 ENDINGS: dict[str, Color] = {"success": (24, 128, 56), "failure": (190, 40, 40), "aborted": (190, 40, 40)}
 
 
@@ -37,15 +43,16 @@ def check_can_write() -> None:
         raise TurboPiError(f"videos need imageio and ffmpeg: {INSTALL}, or give --videos none")
 
 
-def write_video(
-    path: Path, frames: Sequence[Frame], caption: str, ending: str, robot: str, frames_per_second: float
-) -> None:
-    """An MP4 at the robot's own speed. `frames_per_second`: of simulated time between two frames."""
+def write_video(path: Path, frames: Sequence[Frame], caption: str, ending: str, robot: str, control_hz: float) -> None:
+    """An MP4 at the robot's own speed, `control_hz` steps of it a second. Frames may be unevenly far apart."""
     import imageio.v2 as imageio
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    repeats = max(1, int(np.ceil(MIN_FPS / frames_per_second)))
-    fps = frames_per_second * repeats
+    shown = lengths(frames)  # control steps
+    unit = math.gcd(*shown[:-2]) if len(shown) > 2 else shown[0]  # the episode ends at any step
+    repeats = max(1, int(np.ceil(MIN_FPS * unit / control_hz)))
+    fps = control_hz / unit * repeats
+    delayed = any(frame.entered for frame in frames)
     groups = chunk_groups(robot, frames[0].chunk.shape[1])
     options: dict[str, Any] = {"fps": fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
     writer: Any  # imageio's own types lack the methods of its writers
@@ -53,8 +60,9 @@ def write_video(
         with imageio.get_writer(temporary, **options) as writer:
             for number, frame in enumerate(frames):
                 last = number == len(frames) - 1
-                picture = draw_frame(frame, caption, groups, ending if last else None)
-                for _ in range(repeats + (round(END_S * fps) if last else 0)):
+                picture = draw_frame(frame, caption, groups, ending if last else None, delayed=delayed)
+                times = 1 if last else math.ceil(shown[number] / unit)
+                for _ in range(times * repeats + (round(END_S * fps) if last else 0)):
                     writer.append_data(picture)
         if not _is_finished(temporary):  # imageio doesn't tell that ffmpeg has failed
             raise OutputError(f"can't write {path}: ffmpeg could not finish it; is there room?")
@@ -84,13 +92,20 @@ def chunk_groups(robot: str, width: int) -> list[tuple[str, dict[int, str]]]:
 
 
 def draw_frame(
-    frame: Frame, caption: str, groups: Sequence[tuple[str, dict[int, str]]], ending: str | None
+    frame: Frame,
+    caption: str,
+    groups: Sequence[tuple[str, dict[int, str]]],
+    ending: str | None,
+    *,
+    delayed: bool = False,
 ) -> np.ndarray:
-    """One frame of a film: uint8[h, w, 3], both even."""
+    """One frame of a film: uint8[h, w, 3], both even. `delayed`: the film's chunks took over after a delay."""
     width = len(frame.pictures) * VIEW + (len(frame.pictures) + 1) * MARGIN
     lines = textwrap.wrap(caption, width=max(20, width // 9))
     top = MARGIN + 22 * len(lines) + 6
-    height = top + VIEW + MARGIN + PANEL + MARGIN
+    legend = [LEGEND, DELAYED] if delayed else [LEGEND]
+    bottom = top + VIEW + MARGIN + PANEL
+    height = bottom + 6 + LEGEND_HEIGHT * len(legend) + 6
     image = Image.new("RGB", (width + width % 2, height + height % 2), BACKGROUND)
     draw = ImageDraw.Draw(image)
     for number, line in enumerate(lines):
@@ -99,13 +114,17 @@ def draw_frame(
         view = Image.fromarray(picture).resize((VIEW, VIEW), Image.Resampling.BILINEAR)
         image.paste(view, (MARGIN + number * (VIEW + MARGIN), top))
     _tag(draw, (MARGIN + 8, top + 8), f"step {frame.step}", INK)
+    if frame.note:
+        _tag(draw, (MARGIN + 8, top + VIEW - 32), frame.note, NOTE)
     if ending is not None:
         _tag(draw, (MARGIN + 8, top + 36), ending, ENDINGS[ending])
     step = (width - MARGIN) / len(groups)
     for number, (title, names) in enumerate(groups):
         left = MARGIN + number * step
-        box = (left, top + VIEW + MARGIN, left + step - MARGIN, height - MARGIN)
+        box = (left, top + VIEW + MARGIN, left + step - MARGIN, bottom)
         _draw_group(draw, box, title, names, frame)
+    for number, line in enumerate(legend):
+        draw.text((MARGIN, bottom + 6 + LEGEND_HEIGHT * number), line, fill=FAINT_INK, font=_font(12))
     return np.asarray(image)
 
 
@@ -116,7 +135,10 @@ def _draw_group(
     names: dict[int, str],
     frame: Frame,
 ) -> None:
-    """The chunk's lines of one group, in [-1, 1] or further; the part that is carried out is shaded."""
+    """The chunk's lines of one group, in [-1, 1] or further; the part that is carried out is shaded.
+
+    So is the part before it, during which the robot carried out the chunk before: that one's commands are rings.
+    """
     x0, y0, x1, y1 = box
     chunk = frame.chunk
     draw.text((x0, y0), title, fill=INK, font=_font(13))
@@ -127,7 +149,8 @@ def _draw_group(
             x += draw.textlength(name, font=_font(12)) + 7
     y0 += 20
     columns = list(names)
-    values = chunk[:, columns]
+    before = frame.before[:, columns] if len(frame.before) else np.zeros((0, len(columns)))
+    values = np.concatenate((chunk[:, columns], before))
     finite = values[np.isfinite(values)]
     limit = max(1.0, float(np.abs(finite).max()) if finite.size else 1.0)
 
@@ -135,20 +158,35 @@ def _draw_group(
         across = row / max(1, len(chunk) - 1)
         return x0 + across * (x1 - x0), (y0 + y1) / 2 - value / limit * (y1 - y0) / 2
 
-    draw.rectangle((x0, y0, place(max(frame.planned - 1, 0), 0)[0], y1), fill=(230, 233, 240))
+    seam = place(max(frame.entered - 0.5, 0), 0)[0]
+    if frame.planned > frame.entered:
+        draw.rectangle((seam, y0, max(place(frame.planned - 1, 0)[0], seam), y1), fill=CARRIED_OUT)
+    if frame.entered:
+        draw.rectangle((x0, y0, seam, y1), fill=MEANWHILE)
     if frame.done:
         now = place(frame.done - 1, 0)[0]
         draw.line((now, y0, now, y1), fill=FAINT, width=2)
     draw.rectangle((x0, y0, x1, y1), outline=(205, 207, 212))
     draw.line((*place(0, 0), *place(len(chunk) - 1, 0)), fill=(215, 217, 222))
     for number, column in enumerate(columns):
-        points = [place(row, value) for row, value in enumerate(chunk[:, column]) if np.isfinite(value)]
-        if len(points) > 1:
-            draw.line(points, fill=LINES[number], width=2)
-        for px, py in points:
-            draw.ellipse((px - 2, py - 2, px + 2, py + 2), fill=LINES[number])
+        rows = [row for row in range(len(chunk)) if np.isfinite(chunk[row, column])]
+        unused = [row for row in rows if row < frame.entered]
+        for part, color in ((unused, _faded(LINES[number])), (rows[len(unused) :], LINES[number])):
+            points = [place(row, chunk[row, column]) for row in part]
+            if len(points) > 1:
+                draw.line(points, fill=color, width=2)
+            for px, py in points:
+                draw.ellipse((px - 2, py - 2, px + 2, py + 2), fill=color)
+        for row, value in enumerate(before[:, number], start=frame.entered - len(before)):
+            px, py = place(row, value)
+            draw.ellipse((px - 4, py - 4, px + 4, py + 4), outline=LINES[number], width=2)
     draw.text((x0 + 4, y0 + 2), f"{limit:.2g}", fill=FAINT, font=_font(11))
     draw.text((x0 + 4, y1 - 16), f"-{limit:.2g}", fill=FAINT, font=_font(11))
+
+
+def _faded(color: Color) -> Color:
+    red, green, blue = (part + (255 - part) * 3 // 5 for part in color)
+    return red, green, blue
 
 
 def _tag(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, color: Color) -> None:

@@ -12,8 +12,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from turbopi.evaluate.episode import Stopped, Worker, WorkerSetup
 from turbopi.evaluate.plan import Job
+from turbopi.evaluate.real_time import Unfit
+from turbopi.evaluate.worker import Stopped, Worker, WorkerSetup
 from turbopi.sim import SimulatorUnavailable
 
 LOG = "workers.log"
@@ -84,6 +85,8 @@ def _run(worker: Worker, connection: Connection, job: Job) -> None:
         raise
     except SimulatorUnavailable as error:
         connection.send(("unavailable", str(error)))
+    except Unfit as unfit:
+        connection.send(("unfit", str(unfit)))
     except Exception:
         text = traceback.format_exc()
         print(text, file=sys.stderr, flush=True)

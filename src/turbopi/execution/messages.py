@@ -17,9 +17,10 @@ from turbopi.running_chunk import JoinMode, RunningChunk
 PREFIX = "turbopi/"
 MAX_SESSION = 64  # characters
 MAX_STEP = 2**53
+MAX_SEED = 2**64 - 1
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
-    *("session", "step", "reset"),
+    *("session", "step", "reset", "seed"),
 )
 
 
@@ -34,6 +35,7 @@ class Asked:
     session            its name; None: the connection is the session
     step               actions that the robot has carried out in this session when the observation was taken
     reset              a new episode: the session's running chunk is forgotten
+    seed               draws the noise of this call, as `UnifiedPolicy.infer`'s: the same request, the same answer
     """
 
     previous: RunningChunk | None = None
@@ -45,13 +47,17 @@ class Asked:
     session: str | None = None
     step: int | None = None
     reset: bool = False
+    seed: int | None = None
 
 
 def message(
-    observation: Mapping[str, Any], previous: RunningChunk | None = None, model_actions: bool = False
+    observation: Mapping[str, Any],
+    previous: RunningChunk | None = None,
+    model_actions: bool = False,
+    seed: int | None = None,
 ) -> dict[str, Any]:
     """The observation with what `UnifiedPolicy.infer` would be told beside it."""
-    asked: dict[str, Any] = {}
+    asked: dict[str, Any] = {} if seed is None else {"seed": seed}
     if model_actions:
         asked["model_actions"] = True
     if previous is not None:
@@ -124,6 +130,7 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
         session=session,
         step=_whole(given, "step", 0),
         reset=_flag(given, "reset"),
+        seed=_whole(given, "seed", 0, MAX_SEED),
     )
     return observation, asked
 
@@ -146,13 +153,13 @@ def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
     return guidance
 
 
-def _whole(given: Mapping[str, Any], key: str, least: int) -> int | None:
+def _whole(given: Mapping[str, Any], key: str, least: int, most: int = MAX_STEP) -> int | None:
     value = given.get(key)
     if value is None:
         return None
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= MAX_STEP:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
         raise ObservationError(f"{PREFIX}{key} is {value!r:.100}; it should be a whole number from {least}")
     return int(value)
 

@@ -13,6 +13,6 @@ Needs NumPy alone, and matplotlib for the plot: docs/real_time.md.
 """
 
 from turbopi.realtime.executor import RealTimeExecutor
-from turbopi.realtime.journal import Command, OutOfActions
+from turbopi.realtime.journal import Command, Inferred, OutOfActions
 
-__all__ = ["Command", "OutOfActions", "RealTimeExecutor"]
+__all__ = ["Command", "Inferred", "OutOfActions", "RealTimeExecutor"]

@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from turbopi.errors import ConfigError
-from turbopi.execution import ChunkQueue, DelayEstimate, Execution, way_named
+from turbopi.execution import ChunkQueue, DelayEstimate, Execution, Seam, way_named
 from turbopi.execution.messages import PREFIX
 from turbopi.execution.queue import summary
 from turbopi.realtime.inference import BackgroundThread, Inference
@@ -261,12 +261,33 @@ class RealTimeExecutor:
             self._fresh_at.clear()
 
     @property
+    def wants_observation(self) -> bool:
+        """Whether an observation may be used at the next control step: pictures need be taken only then.
+
+        Also true while a chunk is computed, as nobody knows when it comes, and whether it can be used.
+        """
+        with self._lock:
+            return self._warm_seconds is None or self._pending is not None or self._queue.wants_observation
+
+    @property
     def remaining(self) -> int:
         """Actions that are left. After so many control steps there is none, if the policy doesn't answer."""
         with self._lock:
             return self._queue.remaining
 
     # --- the end ------------------------------------------------------------------------------------------------------
+
+    @property
+    def seams(self) -> list[Seam]:
+        """Where chunks took over, oldest first: the last thousands of them."""
+        with self._lock:
+            return list(self._queue.seams)
+
+    @property
+    def inferred(self) -> list[Inferred]:
+        """What became of each observation that a chunk was asked for, oldest first: the last thousands of them."""
+        with self._lock:
+            return list(self._journal.copy().inferred)
 
     def report(self, plot: str | Path | None = None) -> dict[str, Any]:
         """What happened, as plain values (a JSON document); with `plot`, a picture of it is written there, too.

@@ -42,12 +42,17 @@ class Command:
 
 @dataclass
 class Inferred:
-    """One observation that a chunk was asked for."""
+    """One observation that a chunk was asked for.
+
+    chunk         its number, from 0
+    begun, ended  control steps before the observation, and before its chunk came; None: it didn't yet
+    outcome       "used", "in flight", or why the chunk was dropped
+    """
 
     chunk: int
-    begun: int  # control step
+    begun: int
     ended: int | None = None
-    outcome: str = "in flight"  # "used", or why its chunk was dropped
+    outcome: str = "in flight"
 
 
 @dataclass

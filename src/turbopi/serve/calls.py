@@ -27,7 +27,7 @@ class Policy(Protocol):
 
     def infer(self, obs: dict[str, Any], /) -> dict[str, Any]: ...
 
-    # With "real_time" in its metadata, also `previous` and `model_actions`, as `UnifiedPolicy.infer` has them.
+    # With "real_time" in its metadata, also `previous`, `model_actions` and `seed`, as `UnifiedPolicy.infer` has them.
 
 
 @dataclass(frozen=True)

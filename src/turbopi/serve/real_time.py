@@ -10,7 +10,7 @@ import math
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -101,8 +101,9 @@ class RealTime:
         """What to do with a request that has just come. Raises ObservationError."""
         now = self._clock()
         observation, asked = read_message(received)
-        if asked == Asked() and self._options.execution is None:
-            return Plan(observation)
+        seeded = {} if asked.seed is None else {"seed": asked.seed}
+        if self._options.execution is None and replace(asked, seed=None) == Asked() and (self._modes or not seeded):
+            return Plan(observation, seeded)
         if not self._modes:
             raise ObservationError(
                 f"this server's policy joins no chunks (its metadata offers no real-time modes): leave out "
@@ -116,7 +117,7 @@ class RealTime:
                 raise ObservationError(
                     f"{PREFIX}step and {PREFIX}reset are for sessions, but here the client keeps its running chunk"
                 )
-            arguments = {"previous": asked.previous, "model_actions": asked.model_actions}
+            arguments = {"previous": asked.previous, "model_actions": asked.model_actions, **seeded}
             about: dict[str, Any] = {"joined": asked.previous is not None}
             if asked.previous is not None:
                 about |= {"mode": asked.previous.mode, "delay": asked.previous.delay}
@@ -146,12 +147,14 @@ class RealTime:
         elif asked.step is None:
             self._need_control_hz()
         session.busy = True
-        arguments = {"previous": previous, "model_actions": True}
+        arguments: dict[str, Any] = {"previous": previous, "model_actions": True}
+        if asked.seed is not None:
+            arguments["seed"] = asked.seed
         return Plan(observation, arguments, asked, session, now, about)
 
     def finish(self, plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
         """The answer to a request, of the policy's result."""
-        if not plan.arguments:
+        if "previous" not in plan.arguments:  # nothing was asked of running chunks
             return result
         session, previous = plan.session, plan.arguments["previous"]
         self._metrics.joined(bool(plan.about.get("joined")))

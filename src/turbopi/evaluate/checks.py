@@ -1,0 +1,94 @@
+"""Whether a policy, a simulator and a protocol fit, asked before the first episode."""
+
+from turbopi.errors import ConfigError, ObservationError
+from turbopi.evaluate.plan import Protocol
+from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
+from turbopi.execution import way_named
+from turbopi.reading import shown
+from turbopi.sim import SimSettings, Simulator
+
+_FREE = "--execution sync, async and ensemble need nothing of the policy"
+
+
+def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings, image_px: int, replan: int) -> Answer:
+    """Ask once, with an example. Raises ConfigError for a policy that can't act in this simulator."""
+    from turbopi.preprocess.images import resize_with_pad
+
+    example = simulator.example(settings)
+    example |= {key: resize_with_pad(example[key], image_px, image_px) for key in simulator.image_keys}
+    robot = f"use one for the robot {simulator.robot}, such as config pi05_{simulator.robot}"
+    try:
+        answer = source.infer([example], [0])[0]
+    except (ObservationError, PolicyRefused) as error:
+        raise ConfigError(f"the policy doesn't take the observations of {simulator.name}: {error}; {robot}") from error
+    if answer.problem is not None:
+        return answer  # of an example that no robot ever sees: episodes will show it
+    horizon, width = answer.actions.shape
+    if width != simulator.action_dim:
+        raise ConfigError(
+            f"the policy's actions have {width} numbers, but {simulator.name} needs {simulator.action_dim}; {robot}"
+        )
+    if horizon < replan:
+        raise ConfigError(
+            f"the policy's chunks have {horizon} actions, so it can't act {replan} steps before it is asked again: "
+            f"give --replan {horizon} or less"
+        )
+    return answer
+
+
+def actions_needed(protocol: Protocol) -> int:
+    """How many actions a chunk must have: those of the delay are skipped, unless the robot stands still meanwhile."""
+    skipped = 0 if way_named(protocol.execution).stands_still else protocol.delay
+    return protocol.replan + skipped
+
+
+def check_delay(protocol: Protocol, simulator: Simulator, horizon: int) -> None:
+    """Raise ConfigError for a delay that chunks of `horizon` actions, or the simulator, can't be run with."""
+    way = way_named(protocol.execution)
+    if horizon < actions_needed(protocol) or (way.mode is not None and protocol.delay > protocol.replan):
+        most = min(protocol.replan, horizon - protocol.replan)
+        raise ConfigError(
+            f"a delay of {protocol.delay} control steps doesn't fit --execution {way.name} with chunks of {horizon} "
+            f"actions and an execution horizon of {protocol.replan}: at most {most} does; give another "
+            "--execution-horizon, or a policy with longer chunks"
+        )
+    if protocol.control_hz is not None and not hasattr(simulator, "standing_still"):
+        raise ConfigError(
+            f"the simulator {simulator.name} doesn't say how its robot stands still (`standing_still`), so it can't be "
+            "run in real time, where a policy may be late"
+        )
+    if protocol.delay and way.stands_still and not hasattr(simulator, "standing_still"):
+        raise ConfigError(
+            f"the simulator {simulator.name} doesn't say how its robot stands still (`standing_still`), so it can't be "
+            f"run with --execution {way.name} and a delay"
+        )
+
+
+def check_way(source: PolicySource, protocol: Protocol) -> None:
+    """Raise ConfigError if the policy doesn't offer the protocol's way to run, or not at that delay."""
+    way = way_named(protocol.execution)
+    told, where = source.real_time, source.about.get("server")
+    who = "this policy" if where is None else f"the policy server at {where}"
+    if way.mode is None:
+        if told.get("execution") is not None and protocol.control_hz is None:  # the executor tells it what it must know
+            raise ConfigError(
+                f"{who} joins chunks itself (it was started with --execution {shown(told['execution'])}) and counts "
+                f"actions by its own clock, which a simulated delay doesn't follow: start it without --execution, and "
+                "give that to turbopi eval, or take --real-time"
+            )
+        return
+    modes = told.get("modes")
+    if not isinstance(modes, list | tuple) or not modes:
+        instead = "take a backend that joins chunks" if where is None else "serve the checkpoint with `turbopi serve`"
+        raise ConfigError(
+            f"--execution {way.name} tells the policy of the running chunk, but {who} joins no chunks (its metadata "
+            f'has no "real_time"): {instead}; {_FREE}'
+        )
+    if way.mode not in modes:
+        raise ConfigError(f"--execution {way.name} isn't offered by {who}, which offers {shown(modes)}; {_FREE}")
+    longest = told.get("trained_max_delay")
+    if way.holds and isinstance(longest, int) and protocol.delay > longest:
+        raise ConfigError(
+            f"a delay of {protocol.delay} control steps doesn't fit --execution {way.name}: {who} was trained with "
+            f"delays up to {longest}; give another --delay-steps, or --execution rtc"
+        )
