@@ -1,5 +1,6 @@
 """What a message to a policy server says about real-time execution: optional keys beside the observation's own.
 
+Others, about the scheduling of the request, are only named here.
 docs/serving.md has them as a table. Any client of openpi's protocol can send them; a server of another make refuses or
 ignores them, so a client looks for "real_time" in the server's metadata first.
 """
@@ -17,9 +18,11 @@ from turbopi.running_chunk import JoinMode, RunningChunk
 PREFIX = "turbopi/"
 MAX_SESSION = 64  # characters
 MAX_STEP = 2**53
+SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch")  # serve/urgency.py reads them
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
     *("session", "step", "reset"),
+    *SCHEDULING_KEYS,
 )
 
 
@@ -85,7 +88,10 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
         )
     mode = given.get("mode")
     if mode is not None and mode not in get_args(JoinMode):
-        raise ObservationError(f"{PREFIX}mode is {mode!r}; it should be one of {', '.join(get_args(JoinMode))}")
+        raise ObservationError(
+            f"{PREFIX}mode is {mode!r}; it should be one of {', '.join(get_args(JoinMode))}, or none in a session that "
+            "joins nothing"
+        )
     delay = _whole(given, "delay", 0)
     horizon = _whole(given, "execution_horizon", 1)
     guidance = _guidance(given)
