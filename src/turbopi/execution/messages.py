@@ -7,7 +7,7 @@ ignores them, so a client looks for "real_time" in the server's metadata first.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -87,10 +87,10 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
             + ", ".join(PREFIX + key for key in KEYS)
         )
     mode = given.get("mode")
-    if mode is not None and mode not in get_args(JoinMode):
+    if mode is not None and (not isinstance(mode, str) or mode not in get_args(JoinMode)):
         raise ObservationError(
-            f"{PREFIX}mode is {mode!r}; it should be one of {', '.join(get_args(JoinMode))}, or none in a session that "
-            "joins nothing"
+            f"{PREFIX}mode is {mode!r:.100}; it should be one of {', '.join(get_args(JoinMode))}, or none in a session "
+            "that joins nothing"
         )
     delay = _whole(given, "delay", 0)
     horizon = _whole(given, "execution_horizon", 1)
@@ -117,13 +117,13 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
                 "the server does"
             )
         anchor = _numbers(given, "anchor", np.float64) if "anchor" in given else None
-        previous = RunningChunk(left_over, delay, horizon, mode, anchor, **guidance)
+        previous = RunningChunk(left_over, delay, horizon, cast("JoinMode", mode), anchor, **guidance)
     elif "anchor" in given:
         raise ObservationError(f"{PREFIX}anchor came without {PREFIX}previous, to which it belongs")
     asked = Asked(
         previous=previous,
         model_actions=_flag(given, "model_actions"),
-        mode=mode,
+        mode=cast("JoinMode | None", mode),
         delay=delay,
         execution_horizon=horizon,
         guidance=guidance or None,
@@ -138,7 +138,7 @@ def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
     guidance: dict[str, Any] = {}
     if "schedule" in given:
         schedule = given["schedule"]
-        if schedule not in get_args(Schedule):
+        if not (isinstance(schedule, str) and schedule in get_args(Schedule)):
             raise ObservationError(
                 f"{PREFIX}schedule is {schedule!r:.100}; it should be one of {', '.join(get_args(Schedule))}"
             )

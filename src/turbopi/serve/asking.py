@@ -1,6 +1,7 @@
 """From a decoded message to what the policy is asked for, and from what became of it to the answer."""
 
 import asyncio
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -61,9 +62,12 @@ class Askings:
         plan, urgency = asking.plan, asking.urgency
 
         def request(rows: int, later: int) -> Request:
+            first = rows + later == (urgency.rows or 1)
+            # without a deadline of its own, a message's later parts line up anew, behind others that came meanwhile
+            since = arrived if first or urgency.firm else time.perf_counter()
             return Request(
                 arrived=arrived,
-                deadline=arrived + urgency.within,
+                deadline=since + urgency.within,
                 firm=urgency.firm,
                 priority=urgency.priority,
                 source=connection.id,

@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 AUTO_LARGEST = 8  # observations of a batch, unless the options say
 MEASURED = 3  # runs of each size at warm-up, after one that may compile or capture
-SIZE_SECONDS = 2.0  # that these may take, unless the options ask for batches
+SIZE_SECONDS = 1.0  # that these may take, unless the options ask for batches
 
 
 class Policy(Protocol):

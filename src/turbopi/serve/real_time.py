@@ -105,7 +105,8 @@ class RealTime:
     def plan(self, received: Mapping[str, Any], connection: Hashable) -> Plan:
         """What to do with a request that has just come. Raises ObservationError."""
         now = self._clock()
-        unjoined = received.get(PREFIX + "mode") == NO_JOINING
+        mode = received.get(PREFIX + "mode")
+        unjoined = isinstance(mode, str) and mode == NO_JOINING
         if unjoined:
             received = {key: value for key, value in received.items() if key != PREFIX + "mode"}
         observation, asked = read_message(received)

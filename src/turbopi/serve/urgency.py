@@ -3,7 +3,6 @@
 docs/serving.md has them as a table.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -46,7 +45,7 @@ def read_urgency(received: Mapping[str, Any], default_ms: float, control_hz: flo
         return Urgency(default_ms / 1e3)
     rows = _whole(given, "batch", 1, MAX_ROWS)
     priority = given.get("priority", "robot" if rows is None else "simulator")
-    if priority not in PRIORITIES:
+    if not isinstance(priority, str) or priority not in PRIORITIES:
         raise ObservationError(f"{PREFIX}priority is {priority!r:.100}; it should be one of {', '.join(PRIORITIES)}")
     within = _deadline(given, control_hz)
     return Urgency(default_ms / 1e3 if within is None else within, within is not None, priority, rows)
@@ -111,7 +110,7 @@ def _number(given: Mapping[str, Any], key: str, most: float) -> float:
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
     good = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not good or not math.isfinite(value) or value > most:
+    if not good or not -MAX_STEP <= value <= most:  # NaN isn't, and no int too large for a float
         raise ObservationError(
             f"{PREFIX}{key} is {value!r:.100}; it should be a number, more than 0 and at most {most:g}"
         )
