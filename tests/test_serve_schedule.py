@@ -311,6 +311,27 @@ def test_without_a_deadline_of_its_own_nothing_is_refused_for_being_late() -> No
     assert begin(schedule, 5.0) == [waits]
 
 
+def test_runs_that_join_a_chunk_have_times_of_their_own() -> None:
+    schedule = Schedule(16, table(PAYING))
+
+    def joining(within: float) -> Request:
+        one = request(within=within, firm=True, alone=True)
+        one.joins = True
+        return one
+
+    for _ in range(3):
+        schedule.add(joining(1.0), 0.0)
+        begin(schedule, 0.0)
+        schedule.freed(0.0, 0.030)
+    assert [one.kind for one in schedule.add(joining(0.029), 0.0)] == ["late"]
+    assert schedule.add(joining(0.031), 0.0) == []
+    (refused,) = schedule.add(request(within=0.035, firm=True), 0.0)  # behind the one that joins
+    assert "(30.0 ms until its turn, 10.0 ms in the policy)" in refused.text
+    begin(schedule, 0.0)
+    assert [one.kind for one in schedule.add(request(within=0.035, firm=True), 0.0)] == ["late"]
+    assert schedule.add(request(within=0.041, firm=True), 0.0) == []
+
+
 def test_before_anything_was_measured_only_the_past_is_too_late() -> None:
     schedule = Schedule(16)
     soon, past = request(within=1e-6, firm=True), request(0.0, within=0.1, firm=True)

@@ -145,7 +145,8 @@ class PolicyCalls:
         arguments  of `infer`, besides the observation; a pipelined policy isn't given any
         """
         request.call = _Call([observation], arguments)
-        request.alone = request.alone or bool(arguments)
+        request.joins = bool(arguments)
+        request.alone = request.alone or request.joins
         answer = self.worker.ask(request)
         if self._pipelined and not arguments:
             answer.add_done_callback(self._learn)
@@ -211,7 +212,7 @@ class PolicyCalls:
             future = self._submit(observation)
             return Ran([future], time.perf_counter() - started)
         outcome = self._infer(observation, call.arguments)
-        return Ran([[outcome]], None if call.arguments else _told([outcome]))
+        return Ran([[outcome]], _told([outcome]))
 
     def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Outcome:
         return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments))

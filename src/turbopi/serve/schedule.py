@@ -45,6 +45,7 @@ class Request:
     rows      observations in it; they run together
     later     observations of the same message that come after these, for whose last one the deadline is
     alone     never in a batch with others
+    joins     it joins a chunk, or is else not as others are: it runs alone, and such runs have times of their own
     call      what to run; not looked at here
     """
 
@@ -57,6 +58,7 @@ class Request:
     rows: int = 1
     later: int = 0
     alone: bool = False
+    joins: bool = False
     continued: bool = False  # of a message that has its place in the line already
     call: Any = None
     number: int = field(default=0, init=False)  # in the order in which they came
@@ -120,6 +122,7 @@ class Schedule:
         self.queue_limit = queue_limit
         self.times = BatchTimes() if times is None else times
         self._turns = self.times if turns is None else turns
+        self._joining = BatchTimes()  # of runs that join a chunk
         self._waiting: list[Request] = []
         self._running: tuple[Request, ...] = ()
         self._until = 0.0  # when the running turn is expected to end
@@ -179,9 +182,9 @@ class Schedule:
 
     def freed(self, now: float, seconds: float | None) -> None:
         """The running turn has ended: the next one may begin. `seconds` that it took; None if they tell nothing."""
-        rows = sum(request.rows for request in self._running)
         if seconds is not None:
-            self._turns.ran(rows, seconds, now)
+            rows = sum(request.rows for request in self._running)
+            (self._joining if any(request.joins for request in self._running) else self._turns).ran(rows, seconds, now)
         self._running, self._free_since = (), now
 
     @property
@@ -219,13 +222,11 @@ class Schedule:
             return None
         before = [one for one in self._waiting if _order(one) < _order(request)]
         together = sum(one.rows for one in before if not one.alone)
-        alone = sum(one.rows for one in before if one.alone)
-        wait = max(0.0, self._until - now) if self._running else 0.0
-        wait += alone * self._turns.total(1, now)
-        own = request.rows + request.later
-        run = self.times.total(own, now)
+        wait = self._until_free(now) + sum(self._turn_seconds(one, now) for one in before if one.alone)
+        run = self._seconds(request, now)
         if self._turns is self.times and not request.alone:  # it may run together with those before it
-            wait += max(0.0, self.times.total(together + own, now) - run)
+            rows = together + request.rows + request.later
+            wait += max(0.0, self.times.total(rows, now) - run)
         else:
             wait += self._turns.total(together, now)
         return self._late(request, now, wait, run) if now + wait + run > request.deadline else None
@@ -236,12 +237,23 @@ class Schedule:
         for request in tuple(self._waiting):
             if not request.firm:
                 continue
-            wait = max(0.0, self._until - now) if self._running else 0.0
-            run = self.times.total(request.rows + request.later, now)
+            wait, run = self._until_free(now), self._seconds(request, now)
             if now + wait + run > request.deadline:
                 self._waiting.remove(request)
                 refused.append(self._late(request, now, wait, run))
         return refused
+
+    def _until_free(self, now: float) -> float:
+        """Seconds until the running turn is expected to end."""
+        return max(0.0, self._until - now) if self._running else 0.0
+
+    def _seconds(self, request: Request, now: float) -> float:
+        """From the beginning of its turn to the actions of all rows of its message, if they run on their own."""
+        return (self._joining if request.joins else self.times).total(request.rows + request.later, now)
+
+    def _turn_seconds(self, request: Request, now: float) -> float:
+        """For how long its turn keeps others from theirs."""
+        return (self._joining if request.joins else self._turns).total(request.rows, now)
 
     def _late(self, request: Request, now: float, wait: float, run: float) -> Refused:
         since, deadline = now - request.arrived, request.deadline - request.arrived
@@ -254,11 +266,7 @@ class Schedule:
 
     def _next_hopeless(self, now: float) -> float | None:
         """When the first of those that wait can't meet its deadline any more, if nothing happens before."""
-        moments = [
-            request.deadline - self.times.total(request.rows + request.later, now) + LATER
-            for request in self._waiting
-            if request.firm
-        ]
+        moments = [request.deadline - self._seconds(request, now) + LATER for request in self._waiting if request.firm]
         return min(moments, default=None)
 
     # --- turns --------------------------------------------------------------------------------------------------------
@@ -282,8 +290,8 @@ class Schedule:
         for request in self._waiting:
             request.overtaken += request.number < last
         self._running, self._exhausted_last = turn, exhausted
-        seconds = self._turns.total(sum(request.rows for request in turn), now)
-        self._until = now + seconds
+        rows = sum(request.rows for request in turn)
+        self._until = now + (self._turns.total(rows, now) if rows > 1 else self._turn_seconds(turn[0], now))
         return Decision(turn, refused, self._next_hopeless(now))
 
     def _head(self) -> tuple[Request, bool]:
