@@ -454,6 +454,27 @@ def test_a_batch_is_no_longer_than_a_robot_with_a_deadline_can_wait() -> None:
     assert len(begin(later, 1.0)) == 8
 
 
+def test_who_is_too_late_by_the_turn_that_begins_is_told_at_once() -> None:
+    schedule = Schedule(16, table({1: T1}))
+    robot = request(within=1.0)
+    simulator = request(within=0.015, firm=True, priority=SIMULATOR)
+    assert schedule.add(simulator, 0.0) == []
+    schedule.add(robot, 0.0)
+    decision = schedule.decide(0.0)
+    assert decision.turn == (robot,)
+    assert [one.request for one in decision.refused] == [simulator]
+    assert "(10.0 ms until its turn, 10.0 ms in the policy)" in decision.refused[0].text
+
+
+def test_a_deadline_that_no_turn_could_leave_room_for_limits_no_batch() -> None:
+    schedule = Schedule(16, table(PAYING))
+    schedule.add(request(0.0, within=0.019, firm=True, source=50), 0.0)
+    begin(schedule, 0.0)
+    schedule.freed(0.01, T1)
+    waiting(schedule, 8)
+    assert len(begin(schedule, 1.0)) == 8
+
+
 def test_one_that_was_in_a_failed_batch_runs_alone_in_its_place() -> None:
     schedule = Schedule(16, table(PAYING))
     made = waiting(schedule, 3)

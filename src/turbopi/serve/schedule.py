@@ -163,6 +163,8 @@ class Schedule:
                 return refused
             self._waiting.remove(gives_way)
         self._waiting.append(request)
+        if request.firm and request.priority == "robot":
+            self._tight.note(request.source, request.deadline - request.arrived, now)
         return refused
 
     def remove(self, request: Request) -> None:
@@ -204,11 +206,9 @@ class Schedule:
         return max(simulators, key=_order) if request.priority == "robot" and simulators else request
 
     def _note(self, request: Request, now: float) -> None:
-        """Learn from an arrival: its number, how soon others follow, what deadlines robots have."""
+        """Give it its number, and learn how soon others follow."""
         self._number += 1
         request.number, request.queued = self._number, now
-        if request.firm and request.priority == "robot":
-            self._tight.note(request.source, request.deadline - request.arrived, now)
         if not (request.alone or request.continued):
             if now - self._last_arrival <= ACTIVE_SECONDS:
                 self._gaps.append(now - self._last_arrival)
@@ -292,6 +292,7 @@ class Schedule:
         self._running, self._exhausted_last = turn, exhausted
         rows = sum(request.rows for request in turn)
         self._until = now + (self._turns.total(rows, now) if rows > 1 else self._turn_seconds(turn[0], now))
+        refused += tuple(self._hopeless(now))  # those for whom this turn takes too long
         return Decision(turn, refused, self._next_hopeless(now))
 
     def _head(self) -> tuple[Request, bool]:
@@ -322,11 +323,16 @@ class Schedule:
         return tuple(turn)
 
     def _longest(self, group: Iterable[Request], now: float) -> float:
-        """Seconds that a batch may take: for its own deadlines, and for a robot that may ask while it runs."""
+        """Seconds that a batch may take: for the deadlines in it, and for a robot that may ask while it runs.
+
+        A robot whose deadline is shorter than two runs has no guarantee, and none is tried for it.
+        """
+        group = tuple(group)
         alone = self.times.seconds(1, now) or 0.0
-        slacks = [request.deadline - now for request in group if request.firm]
-        of_group = {request.source for request in group}
-        slacks += [tight - alone for source, tight in self._tight.values(now).items() if source not in of_group]
+        slacks = [one.deadline - now for one in group if one.firm]
+        sources = {request.source for request in group}
+        tight = (within - alone for source, within in self._tight.values(now).items() if source not in sources)
+        slacks += [slack for slack in tight if slack >= alone]
         return max(alone, min(slacks, default=math.inf))
 
     def part(self, rows: int, now: float) -> int:

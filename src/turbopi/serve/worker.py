@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -113,7 +114,13 @@ class Worker:
             self._follow(self._executor.submit(self._run, decision.turn), partial(self._ended, decision.turn))
 
     def _ended(self, turn: tuple[Request, ...], future: "Future[Ran]") -> None:
-        ran = future.result()
+        if future.cancelled():
+            return
+        if (error := future.exception()) is not None:  # a fault of this server: nobody shall wait for ever
+            text = "".join(traceback.format_exception(error))
+            ran = Ran([[Outcome(0.0, wrong="policy", text=text)] * request.rows for request in turn])
+        else:
+            ran = future.result()
         self.schedule.freed(self._clock(), ran.seconds)
         for request, answer in zip(turn, ran.answers, strict=True):
             if answer is None and request in self._answers:
