@@ -113,6 +113,8 @@ class BatchTimes:
 
     def total(self, rows: int, now: float) -> float:
         """Seconds for `rows` observations in as many runs as they need; 0 as long as nothing was measured."""
+        if rows == 1:  # nearly always
+            return self.seconds(1, now) or 0.0
         seconds = 0.0
         while rows > 0:
             best = self.best(rows, now)

@@ -312,6 +312,8 @@ class Schedule:
 
     def _fitting(self, group: list[Request], now: float) -> tuple[Request, ...]:
         """The first of a group, as many as pay and as keep the deadlines."""
+        if len(group) == 1:
+            return tuple(group)
         rows = sum(request.rows for request in group)
         best = self.times.best(rows, now, self._longest(group, now))
         turn, taken = [group[0]], group[0].rows
@@ -345,17 +347,15 @@ class Schedule:
         Company is waited for if it saves more time than it usually takes to come: as long as the saving, not longer
         than a few usual gaps after the last arrival, and only while all deadlines of the group leave room for T(B).
         """
-        sources = self._active.values(now)
-        expected = len(sources.keys() - {request.source for request in group})
-        most = min(self._places - len(group), expected)
-        alone, together = self.times.seconds(1, now), self.times.total(rows, now)
-        if most < 1 or alone is None or len(self._gaps) < GAPS // 4:
+        expected = len(self._active.values(now).keys() - {request.source for request in group})
+        most = min(self._places - len(group), expected, self.times.measured_largest - rows)
+        if most < 1 or len(self._gaps) < GAPS // 4:
             return -math.inf
-        gap = median(self._gaps)
+        gap, alone, together = median(self._gaps), self.times.total(1, now), self.times.total(rows, now)
         opened = max(self._free_since, min(request.arrived for request in group))
         deadline = min(request.deadline for request in group)
         until = -math.inf
-        for more in range(1, min(most, self.times.measured_largest - rows) + 1):
+        for more in range(1, most + 1):
             saving = together + more * alone - self.times.total(rows + more, now)
             safe = self.times.seconds(rows + more, now, SAFE)
             if saving > more * gap and safe is not None:
