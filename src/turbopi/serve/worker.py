@@ -136,19 +136,23 @@ class Worker:
         self._answer(request, future.result())
 
     def _follow(self, future: Future[R], then: Callable[[Future[R]], None]) -> None:
-        """Call `then` in the event loop when `future` is done."""
+        """Call `then` in the event loop when `future` is done.
+
+        A Future keeps its callbacks: none may refer to it, or what they hold (observations) would wait for the garbage
+        collector.
+        """
         loop = asyncio.get_running_loop()
 
-        def done() -> None:
-            self._going.discard(future)
-            then(future)
-
-        def tell(_: object) -> None:
+        def tell(done: Future[R]) -> None:
             if not loop.is_closed():
-                loop.call_soon_threadsafe(done)
+                loop.call_soon_threadsafe(self._followed, done, then)
 
         self._going.add(future)
         future.add_done_callback(tell)
+
+    def _followed(self, future: Future[R], then: Callable[[Future[R]], None]) -> None:
+        self._going.discard(future)
+        then(future)
 
     def _answer(self, request: Request, outcomes: list[Outcome]) -> None:
         answer = self._answers.pop(request, None)
