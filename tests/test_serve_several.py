@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 from serve_fakes import OBSERVATION, BatchingFakePolicy, FakePolicy, PipelinedFakePolicy, http_get, observation
 from test_serve_real_time import Joins
@@ -19,6 +21,7 @@ from websockets.exceptions import ConnectionClosedError
 
 from turbopi import UnifiedPolicy
 from turbopi.errors import ConfigError, ObservationError
+from turbopi.execution.messages import SCHEDULING_KEYS
 from turbopi.recordings import iter_recording
 from turbopi.serve import PolicyServer, running
 from turbopi.serve.batch_times import BatchTimes
@@ -706,6 +709,40 @@ def test_what_a_request_says_of_its_urgency(keys: dict[str, Any], urgency: Urgen
 def test_an_urgency_that_cannot_be_meant_is_refused(keys: dict[str, Any], text: str) -> None:
     with pytest.raises(ObservationError, match=text):
         read_urgency({"x": 1, **{f"turbopi/{key}": value for key, value in keys.items()}}, 1000.0)
+
+
+anything = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**63), 2**64 - 1),
+    st.floats(),
+    st.text(max_size=5),
+    st.binary(max_size=5),
+    st.lists(st.integers(), max_size=2),
+    st.dictionaries(st.text(max_size=2), st.integers(), max_size=2),
+    st.sampled_from(["robot", "simulator"]),
+    st.builds(
+        lambda dtype, shape: np.zeros(shape, dtype),
+        st.sampled_from(["f4", "f8", "i4", "u8", "?", "U3", "S3", "M8[s]", "m8[s]", "f2"]),
+        st.sampled_from([(), (0,), (1,), (2, 3)]),
+    ),
+    st.sampled_from([np.timedelta64(5, "s"), np.datetime64(5, "s"), np.float16(5), np.uint8(5), np.bool_(True)]),
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.dictionaries(st.sampled_from(SCHEDULING_KEYS), anything), st.dictionaries(st.text(max_size=3), anything))
+def test_whatever_the_keys_hold_it_is_meant_or_refused(keys: dict[str, Any], entries: dict[str, Any]) -> None:
+    received = {**entries, **{f"turbopi/{key}": value for key, value in keys.items()}}
+    try:
+        urgency = read_urgency(received, 1000.0)
+        if urgency.rows is not None:
+            check_rows(entries, urgency.rows)
+            row(entries, urgency.rows - 1)
+    except ObservationError:
+        return
+    assert 0 < urgency.within <= 60 and urgency.priority in ("robot", "simulator")
+    assert urgency.rows is None or 1 <= urgency.rows <= MAX_ROWS
 
 
 def test_such_a_refusal_is_a_text_frame_and_the_connection_stays() -> None:

@@ -144,23 +144,28 @@ def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
             )
         guidance["schedule"] = schedule
     if "max_guidance_weight" in given:
-        weight = given["max_guidance_weight"]
-        good = isinstance(weight, int | float | np.integer | np.floating) and not isinstance(weight, bool)
-        if not good or not 0 <= float(weight) < np.inf:
-            raise ObservationError(f"{PREFIX}max_guidance_weight is {weight!r:.100}; it should be a number from 0")
+        weight = as_number(given["max_guidance_weight"])
+        if weight is None or not 0 <= weight < np.inf:
+            shown = given["max_guidance_weight"]
+            raise ObservationError(f"{PREFIX}max_guidance_weight is {shown!r:.100}; it should be a number from 0")
         guidance["max_guidance_weight"] = float(weight)
     return guidance
 
 
+def as_number(value: object) -> int | float | None:
+    """A number of a message, also one of NumPy or of an array without axes; None for all else, booleans and times too."""
+    if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "iuf":
+        value = value.item()
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
 def _whole(given: Mapping[str, Any], key: str, least: int) -> int | None:
-    value = given.get(key)
-    if value is None:
+    if given.get(key) is None:
         return None
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        value = value[()]
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= MAX_STEP:
-        raise ObservationError(f"{PREFIX}{key} is {value!r:.100}; it should be a whole number from {least}")
-    return int(value)
+    value = as_number(given[key])
+    if not isinstance(value, int) or not least <= value <= MAX_STEP:
+        raise ObservationError(f"{PREFIX}{key} is {given[key]!r:.100}; it should be a whole number from {least}")
+    return value
 
 
 def _flag(given: Mapping[str, Any], key: str) -> bool:

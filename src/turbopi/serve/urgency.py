@@ -7,10 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from turbopi.errors import ObservationError
-from turbopi.execution.messages import MAX_STEP, PREFIX, SCHEDULING_KEYS
+from turbopi.execution.messages import MAX_STEP, PREFIX, SCHEDULING_KEYS, as_number
 from turbopi.serve.options import MAX_DEADLINE_MS
 from turbopi.serve.schedule import PRIORITIES, Priority
 
@@ -106,23 +104,18 @@ def _deadline(given: Mapping[str, Any], control_hz: float | None) -> float | Non
 
 
 def _number(given: Mapping[str, Any], key: str, most: float) -> float:
-    value = given[key]
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        value = value[()]
-    good = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not good or not -MAX_STEP <= value <= most:  # NaN isn't, and no int too large for a float
-        raise ObservationError(
-            f"{PREFIX}{key} is {value!r:.100}; it should be a number, more than 0 and at most {most:g}"
-        )
+    value = as_number(given[key])
+    if value is None or not -MAX_STEP <= value <= most:  # NaN isn't, nor a whole number too large for a float
+        shown = f"{PREFIX}{key} is {given[key]!r:.100}"
+        raise ObservationError(f"{shown}; it should be a number, more than 0 and at most {most:g}")
     return float(value)
 
 
 def _whole(given: Mapping[str, Any], key: str, least: int, most: int) -> int | None:
     if key not in given:
         return None
-    value = given[key]
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        value = value[()]
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
-        raise ObservationError(f"{PREFIX}{key} is {value!r:.100}; it should be a whole number from {least} to {most}")
-    return int(value)
+    value = as_number(given[key])
+    if not isinstance(value, int) or not least <= value <= most:
+        shown = f"{PREFIX}{key} is {given[key]!r:.100}"
+        raise ObservationError(f"{shown}; it should be a whole number from {least} to {most}")
+    return value
