@@ -153,7 +153,7 @@ def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def as_number(value: object) -> int | float | None:
-    """A number of a message, also one of NumPy or of an array without axes; None for all else, booleans and times too."""
+    """A message's number, also one of NumPy or of an array without axes; None for all else: booleans, times."""
     if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "iuf":
         value = value.item()
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
