@@ -26,8 +26,11 @@ from turbopi.recordings import iter_recording
 from turbopi.serve import PolicyServer, running
 from turbopi.serve.batch_times import BatchTimes
 from turbopi.serve.calls import PolicyCalls
+from turbopi.serve.metrics import Metrics
 from turbopi.serve.rows import check_rows, row, stacked
+from turbopi.serve.schedule import Request, Schedule
 from turbopi.serve.urgency import MAX_ROWS, Urgency, read_urgency
+from turbopi.serve.worker import Ran, Worker
 from turbopi.shipped import CHASE_POLICY
 from turbopi.wire import pack, unpack
 
@@ -155,28 +158,35 @@ def test_what_cannot_meet_its_deadline_is_refused_while_the_policy_is_still_busy
     served(test)
 
 
-def test_slack_and_misses_are_counted_for_deadlines_that_were_given() -> None:
+def test_slack_is_counted_for_deadlines_that_were_given() -> None:
     async def test(server: PolicyServer, policy: FakePolicy) -> None:
-        async with client(server) as connection, client(server) as missing:
+        async with client(server) as connection:
             await infer(connection, observation("plain"))
             await connection.send(asks("met", deadline_ms=60_000, priority="simulator"))
             assert await prompt_of(connection) == "met"
-            await missing.send(asks("hold", deadline_ms=300))
-            await eventually(policy.started.is_set)
-            await asyncio.sleep(0.31)  # it was begun in time
-            policy.release.set()
-            assert await prompt_of(missing) == "hold"
-            await eventually(lambda: metric(server, "turbopi_deadline_misses_total", priority="robot") == 1)
-        assert metric(server, "turbopi_deadline_misses_total", priority="simulator") == 0
-        assert metric(server, "turbopi_slack_seconds_count", priority="simulator") == 1
-        assert metric(server, "turbopi_slack_seconds_bucket", priority="simulator", le="2.0") == 0  # 60 s
-        assert metric(server, "turbopi_slack_seconds_bucket", priority="robot", le="0.0") == 1
-        assert metric(server, "turbopi_scheduled_requests_total", priority="robot") == 2
+            await eventually(lambda: metric(server, "turbopi_slack_seconds_count", priority="simulator") == 1)
+        assert metric(server, "turbopi_slack_seconds_bucket", priority="simulator", le="0.0") == 0
+        assert metric(server, "turbopi_slack_seconds_count", priority="robot") == 0
+        for priority in ("robot", "simulator"):
+            assert metric(server, "turbopi_scheduled_requests_total", priority=priority) == 1
+            assert metric(server, "turbopi_deadline_misses_total", priority=priority) == 0
         _, _, body = await http_get(server.port, "/metrics")
         families = {family.name: family for family in text_string_to_metric_families(body)}
         assert families["turbopi_slack_seconds"].type == families["turbopi_batch_size"].type == "histogram"
 
     served(test)
+
+
+def test_an_answer_after_its_deadline_is_a_miss() -> None:
+    metrics = Metrics()
+    metrics.slack(-0.03, "robot")
+    metrics.slack(0.03, "robot")
+
+    def value(name: str, **labels: str) -> float | None:
+        return metrics.registry.get_sample_value(name, {"priority": "robot", **labels})
+
+    assert value("turbopi_deadline_misses_total") == 1
+    assert [value("turbopi_slack_seconds_bucket", le=le) for le in ("-0.05", "0.0", "0.05")] == [0, 1, 2]
 
 
 def test_a_newer_observation_of_a_session_replaces_the_one_that_waits() -> None:
@@ -389,7 +399,10 @@ def test_company_is_waited_for_and_who_waits_for_it_is_served_without_it() -> No
     served(test, policy_class=BatchingFakePolicy)
 
 
-def test_batches_are_measured_at_warm_up_and_no_larger_ones_than_asked_for_are_run() -> None:
+def test_batches_are_measured_at_warm_up_and_no_larger_ones_than_asked_for_are_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("turbopi.serve.calls.SIZE_SECONDS", float("inf"))
     policy = BatchingFakePolicy()
     with running(policy, max_batch=6) as server:
         assert server._calls.times.sizes == [1, 2, 4, 6]
@@ -413,7 +426,11 @@ def test_batches_that_would_take_long_to_measure_are_not_formed() -> None:
         assert server._calls.times.measured_largest == 1 and len(policy.seen) == 1
 
 
-def test_a_size_that_fails_at_warm_up_is_left_out_or_refused_if_it_was_asked_for() -> None:
+def test_a_size_that_fails_at_warm_up_is_left_out_or_refused_if_it_was_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("turbopi.serve.calls.SIZE_SECONDS", float("inf"))
+
     class Small(BatchingFakePolicy):
         def infer_batch(self, observations: list[dict[str, Any]]) -> list[dict[str, Any]]:
             if len(observations) > 2:
@@ -457,6 +474,25 @@ def test_options_that_cannot_be_right_are_refused(policy: Any, options: dict[str
     with pytest.raises(ConfigError, match=text):
         PolicyServer(policy(), **options)
     assert PolicyServer(FakePolicy(), max_batch=1).options.max_batch == 1
+
+
+def test_a_fault_of_the_server_on_the_thread_leaves_nobody_waiting() -> None:
+    def run(turn: tuple[Request, ...]) -> Ran:
+        raise ZeroDivisionError("a fault")
+
+    async def main() -> None:
+        worker = Worker(Schedule(4), run)
+        answers = [worker.ask(Request(0.0, 1.0)) for _ in range(2)]
+        for answer in answers:
+            (outcome,) = await asyncio.wait_for(answer, 60)
+            assert outcome.wrong == "policy" and "ZeroDivisionError: a fault" in outcome.text
+        worker.stop()
+        await worker.drain()
+        (outcome,) = await worker.ask(Request(0.0, 1.0))
+        assert outcome.wrong == "stopping" and not worker.running
+        worker.close()
+
+    asyncio.run(main())
 
 
 # --- batch messages ---------------------------------------------------------------------------------------------------
