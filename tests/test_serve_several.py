@@ -23,10 +23,11 @@ from turbopi import UnifiedPolicy
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.execution.messages import SCHEDULING_KEYS
 from turbopi.recordings import iter_recording
-from turbopi.serve import PolicyServer, running
+from turbopi.serve import PolicyServer, ServerOptions, running
 from turbopi.serve.batch_times import BatchTimes
 from turbopi.serve.calls import PolicyCalls
 from turbopi.serve.metrics import Metrics
+from turbopi.serve.real_time import RealTime
 from turbopi.serve.rows import check_rows, row, stacked
 from turbopi.serve.schedule import Request, Schedule
 from turbopi.serve.urgency import MAX_ROWS, Urgency, read_urgency
@@ -269,6 +270,20 @@ def test_a_session_that_joins_chunks_goes_on_from_the_chunk_that_its_robot_has()
     served(test, policy_class=HoldingJoins)  # type: ignore[arg-type]
 
 
+def test_a_request_that_was_replaced_does_not_free_its_session_for_a_third() -> None:
+    waiting = True
+    options = ServerOptions(execution="rtc", control_hz=50)
+    sessions = RealTime(Joins().metadata, options, Metrics(), waits=lambda name: waiting)
+    asked = {"place": 0, "turbopi/session": "a"}
+    older, newer = sessions.plan(asked, "c"), sessions.plan(asked, "d")
+    waiting = False  # the newer one runs
+    sessions.release(older)
+    with pytest.raises(ObservationError, match="session 'a' has a request that isn't answered yet"):
+        sessions.plan(asked, "e")
+    sessions.release(newer)
+    sessions.plan(asked, "e")
+
+
 def test_a_session_may_be_for_the_order_alone_where_the_policy_joins_chunks() -> None:
     with running(Joins(), execution="rtc", control_hz=50) as server:
         asked = server._real_time.plan({"place": 0, "turbopi/session": "a", "turbopi/mode": "none"}, "c")
@@ -316,6 +331,7 @@ def test_one_that_spoils_a_batch_is_refused_alone(fault: str) -> None:
             assert isinstance(text, str) and text.startswith(expected[fault])
             assert len(policy.batches) == 1
             if fault == "crash":
+                assert server._calls.times.measured_largest == 8  # not the batch's fault
                 with pytest.raises(ConnectionClosedError):
                     await waiting[1].recv()
             policy.started.clear()
@@ -608,17 +624,45 @@ def test_others_have_their_turn_between_the_rows_of_a_message() -> None:
     async def test(server: PolicyServer, policy: FakePolicy) -> None:
         many = batch(20, **{"turbopi/priority": "robot"})
         many["prompt"][0] = "hold"
-        async with client(server) as simulator, client(server) as robot:
+        async with client(server) as simulator, client(server) as robot, client(server) as other:
             await simulator.send(pack(many))
             await eventually(policy.started.is_set)
-            await robot.send(pack(observation("between")))
-            await eventually(lambda: metric(server, "turbopi_queue_depth") == 1)
+            for number, one in enumerate((robot, other)):
+                await one.send(pack(observation(f"between {number}")))
+                await eventually(lambda waits=number + 1: metric(server, "turbopi_queue_depth") == waits)  # type: ignore[misc]
             policy.release.set()
-            assert await prompt_of(robot) == "between"
+            assert [await prompt_of(one) for one in (robot, other)] == ["between 0", "between 1"]
             assert isinstance(await answer(simulator), dict)
-            assert policy.seen.index("between") == 1
+            assert policy.seen[:4] == ["hold", "between 0", "between 1", "row 1"]
 
     served(test)
+
+
+def test_the_parts_of_a_message_keep_its_place_and_know_what_comes_later() -> None:
+    made: list[Request] = []
+
+    def make(rows: int, later: int) -> Request:
+        made.append(Request(0.0, 1.0, rows=rows, later=later))
+        return made[-1]
+
+    async def main() -> None:
+        calls = PolicyCalls(FakePolicy(), ServerOptions(), Metrics(), lambda reason: None)
+        outcomes = await calls.ask_rows(make, lambda index: observation(str(index)), 3)
+        assert [outcome.result["prompt"] for outcome in outcomes if outcome.result] == ["0", "1", "2"]
+        calls.worker.close()
+
+    asyncio.run(main())
+    assert [(part.continued, part.later) for part in made] == [(False, 2), (True, 1), (True, 0)]
+
+
+def test_a_pipelined_policys_times_are_learned_from_its_answers() -> None:
+    async def test(server: PolicyServer, policy: PipelinedFakePolicy) -> None:
+        async with client(server) as connection:
+            reply = await infer(connection, observation("one"))
+        seconds = server._calls.times.seconds(1, time.perf_counter())
+        assert seconds is not None and seconds * 1e3 == pytest.approx(reply["server_timing"]["infer_ms"])
+
+    served(test, policy_class=PipelinedFakePolicy)
 
 
 def test_a_message_whose_client_left_or_whose_server_stops_runs_no_more_rows() -> None:
