@@ -105,6 +105,26 @@ class PipelinedFakePolicy(FakePolicy):
             self.in_flight += change
 
 
+class BatchingFakePolicy(FakePolicy):
+    """Has `infer_batch`; `batches` are the prompts of each. With `no_batch` it fails for batches alone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.batches: list[list[str]] = []
+        self.no_batch = False
+
+    def example_observation(self) -> dict[str, Any]:
+        return observation("example")
+
+    def infer_batch(self, observations: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        self.batches.append([str(obs.get("prompt", "")) for obs in observations])
+        if self.no_batch:
+            raise RuntimeError("out of memory")
+        if "short" in self.batches[-1]:
+            return []
+        return [self.infer(obs) for obs in observations]
+
+
 def observation(prompt: str = "") -> dict[str, Any]:
     return {**OBSERVATION, "prompt": prompt}
 

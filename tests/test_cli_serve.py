@@ -107,11 +107,13 @@ def test_no_warmup_hides_the_policys_warmup_from_the_server(monkeypatch: Any) ->
     monkeypatch.setattr(
         "turbopi.serve.run", lambda policy, options, **_: served.update(policy=policy, **asdict(options))
     )
-    result = turbopi("serve", *TINY, "--port", 0, "--no-warmup", "--queue-limit", 3, "--max-message-mb", 1.5)
+    asked = ["--queue-limit", 3, "--max-message-mb", 1.5, "--max-batch", 1, "--deadline-ms", 200]
+    result = turbopi("serve", *TINY, "--port", 0, "--no-warmup", *asked)
     assert result.exit_code == 0, result.output
     assert not hasattr(served["policy"], "warmup")
     assert served["policy"].metadata["num_denoising_steps"] == 2
     assert (served["queue_limit"], served["max_message_mb"]) == (3, 1.5)
+    assert (served["max_batch"], served["deadline_ms"]) == (1, 200.0)
     assert (served["host"], served["port"], served["api_key"], served["record_dir"]) == ("127.0.0.1", 0, None, None)
 
 
@@ -181,6 +183,9 @@ def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
         (["--execution", "async", "--control-hz", "50"], "execution is 'async'; a server joins chunks by rtc"),
         (["--execution", "rtc"], "needs the robots' control rate"),
         (["--control-hz", "0"], "control_hz must be more than 0"),
+        (["--deadline-ms", "0"], "deadline_ms must be more than 0 and at most 60000"),
+        (["--max-batch", "4", "--no-warmup"], "--max-batch 4 needs the warm-up, which measures batches"),
+        (["--max-batch", "4", "--execution", "rtc", "--control-hz", "50"], "each request joins a chunk and runs alone"),
     ],
 )
 def test_bad_options_are_refused_before_weights_are_loaded(options: list[str], message: str) -> None:

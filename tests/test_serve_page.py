@@ -30,6 +30,7 @@ from turbopi.serve.page.device import memory_of
 from turbopi.serve.page.live import BINS, Live, stage_times
 from turbopi.serve.page.look import THUMBNAIL, look_at, thumbnail
 from turbopi.serve.page.messages import Frame, Hello, Look, clean
+from turbopi.serve.schedule import Schedule
 from turbopi.serve.worker import Worker
 from turbopi.wire import pack, unpack
 
@@ -483,7 +484,7 @@ def test_memory_is_the_processs_or_what_pytorch_holds_of_the_gpu(monkeypatch: py
 
 
 def test_metadata_that_is_no_json_is_told_as_far_as_it_goes() -> None:
-    told = Live(Metrics(), Worker(1), lambda: None)
+    told = Live(Metrics(), Worker(Schedule(1)), lambda: None)
     told.start({"a": np.arange(2), "b": Path("/x"), ("no", "key"): 1, "robot": 3}, queue_limit=16)  # type: ignore[dict-item]
     hello = FEED.decode(told._hello)
     assert isinstance(hello, Hello) and hello.policy == {"a": [0, 1], "b": "/x", "robot": 3} and hello.actions == []

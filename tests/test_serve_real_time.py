@@ -121,6 +121,8 @@ LEFT = np.zeros((4, A), np.float32)
     [
         ({"speed": 1}, "turbopi/speed is no key of this server"),
         ({"mode": "fast"}, "turbopi/mode is 'fast'; it should be one of rtc, rtc_identity, rtc_trained"),
+        ({"mode": np.zeros(2)}, "turbopi/mode is array"),
+        ({"schedule": np.zeros(2)}, "turbopi/schedule is array"),
         ({"delay": -1}, "turbopi/delay is -1"),
         ({"delay": 1.5}, "turbopi/delay is 1.5"),
         ({"delay": True}, "turbopi/delay is True"),

@@ -13,7 +13,7 @@ from turbopi.cli.framework import Output, command, log_to_stderr
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.ports import why_not_free
 from turbopi.errors import ConfigError
-from turbopi.serve.options import ServerOptions
+from turbopi.serve.options import MAX_BATCH, ServerOptions
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         "turbopi serve checkpoints/pi05_droid --host 0.0.0.0 --api-key-file key --record recordings",
         "TURBOPI_API_KEY=… turbopi serve checkpoints/pi05_libero --host 0.0.0.0 --allowed-hosts robot.lab",
         "turbopi serve checkpoints/pi05_aloha --config pi05_aloha --execution rtc --control-hz 50",
+        "turbopi serve checkpoints/pi05_libero --max-batch 16 --deadline-ms 200 --queue-limit 64",
         "turbopi serve --random-weights pi05_tiny --port 8001",
     ),
 )
@@ -64,6 +65,26 @@ def serve(
     queue_limit: Annotated[
         int, typer.Option("--queue-limit", min=0, metavar="N", help="Requests that may wait while one runs.")
     ] = ServerOptions.queue_limit,
+    max_batch: Annotated[
+        int | None,
+        typer.Option(
+            "--max-batch",
+            min=1,
+            max=MAX_BATCH,
+            metavar="N",
+            help="Observations of several robots that may run together, where warm-up has measured that this is "
+            "sooner; 1: never. Default: 8, or fewer if they take seconds to measure.",
+        ),
+    ] = None,
+    deadline_ms: Annotated[
+        float,
+        typer.Option(
+            "--deadline-ms",
+            metavar="MS",
+            help="From a request to its answer, for robots that don't say their own (turbopi/deadline_ms): it sets "
+            "the order alone, nothing is refused for it.",
+        ),
+    ] = ServerOptions.deadline_ms,
     max_clients: Annotated[
         int, typer.Option("--max-clients", min=1, metavar="N", help="Connected at once; more are refused (HTTP 503).")
     ] = ServerOptions.max_clients,
@@ -130,6 +151,8 @@ def serve(
     options.check(checkpoint)
     if strict and not warmup:
         raise ConfigError("--strict refuses what warm-up didn't cover: with --no-warmup that would be everything")
+    if max_batch is not None and max_batch > 1 and not warmup:
+        raise ConfigError(f"--max-batch {max_batch} needs the warm-up, which measures batches: leave out --no-warmup")
     shown = api_key is not None and api_key != os.environ.get("TURBOPI_API_KEY")
     wanted = ServerOptions(
         host=host,
@@ -137,6 +160,8 @@ def serve(
         api_key=chosen_key(api_key, api_key_file),
         max_message_mb=max_message_mb,
         queue_limit=queue_limit,
+        max_batch=max_batch,
+        deadline_ms=deadline_ms,
         record_dir=record,
         allowed_hosts=[] if allowed_hosts is None else [name.strip() for name in allowed_hosts.split(",")],
         max_clients=max_clients,

@@ -1,12 +1,13 @@
 """What a message to a policy server says about real-time execution: optional keys beside the observation's own.
 
+Others, about the scheduling of the request, are only named here.
 docs/serving.md has them as a table. Any client of openpi's protocol can send them; a server of another make refuses or
 ignores them, so a client looks for "real_time" in the server's metadata first.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -18,9 +19,11 @@ PREFIX = "turbopi/"
 MAX_SESSION = 64  # characters
 MAX_STEP = 2**53
 MAX_SEED = 2**64 - 1
+SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch")  # serve/urgency.py reads them
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
     *("session", "step", "reset", "seed"),
+    *SCHEDULING_KEYS,
 )
 
 
@@ -90,8 +93,11 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
             + ", ".join(PREFIX + key for key in KEYS)
         )
     mode = given.get("mode")
-    if mode is not None and mode not in get_args(JoinMode):
-        raise ObservationError(f"{PREFIX}mode is {mode!r}; it should be one of {', '.join(get_args(JoinMode))}")
+    if mode is not None and (not isinstance(mode, str) or mode not in get_args(JoinMode)):
+        raise ObservationError(
+            f"{PREFIX}mode is {mode!r:.100}; it should be one of {', '.join(get_args(JoinMode))}, or none in a session "
+            "that joins nothing"
+        )
     delay = _whole(given, "delay", 0)
     horizon = _whole(given, "execution_horizon", 1)
     guidance = _guidance(given)
@@ -117,13 +123,13 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
                 "the server does"
             )
         anchor = _numbers(given, "anchor", np.float64) if "anchor" in given else None
-        previous = RunningChunk(left_over, delay, horizon, mode, anchor, **guidance)
+        previous = RunningChunk(left_over, delay, horizon, cast("JoinMode", mode), anchor, **guidance)
     elif "anchor" in given:
         raise ObservationError(f"{PREFIX}anchor came without {PREFIX}previous, to which it belongs")
     asked = Asked(
         previous=previous,
         model_actions=_flag(given, "model_actions"),
-        mode=mode,
+        mode=cast("JoinMode | None", mode),
         delay=delay,
         execution_horizon=horizon,
         guidance=guidance or None,
@@ -139,29 +145,34 @@ def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
     guidance: dict[str, Any] = {}
     if "schedule" in given:
         schedule = given["schedule"]
-        if schedule not in get_args(Schedule):
+        if not (isinstance(schedule, str) and schedule in get_args(Schedule)):
             raise ObservationError(
                 f"{PREFIX}schedule is {schedule!r:.100}; it should be one of {', '.join(get_args(Schedule))}"
             )
         guidance["schedule"] = schedule
     if "max_guidance_weight" in given:
-        weight = given["max_guidance_weight"]
-        good = isinstance(weight, int | float | np.integer | np.floating) and not isinstance(weight, bool)
-        if not good or not 0 <= float(weight) < np.inf:
-            raise ObservationError(f"{PREFIX}max_guidance_weight is {weight!r:.100}; it should be a number from 0")
+        weight = as_number(given["max_guidance_weight"])
+        if weight is None or not 0 <= weight < np.inf:
+            shown = given["max_guidance_weight"]
+            raise ObservationError(f"{PREFIX}max_guidance_weight is {shown!r:.100}; it should be a number from 0")
         guidance["max_guidance_weight"] = float(weight)
     return guidance
 
 
+def as_number(value: object) -> int | float | None:
+    """A message's number, also one of NumPy or of an array without axes; None for all else: booleans, times."""
+    if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "iuf":
+        value = value.item()
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
 def _whole(given: Mapping[str, Any], key: str, least: int, most: int = MAX_STEP) -> int | None:
-    value = given.get(key)
-    if value is None:
+    if given.get(key) is None:
         return None
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        value = value[()]
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
-        raise ObservationError(f"{PREFIX}{key} is {value!r:.100}; it should be a whole number from {least}")
-    return int(value)
+    value = as_number(given[key])
+    if not isinstance(value, int) or not least <= value <= most:
+        raise ObservationError(f"{PREFIX}{key} is {given[key]!r:.100}; it should be a whole number from {least}")
+    return value
 
 
 def _flag(given: Mapping[str, Any], key: str) -> bool:

@@ -1,18 +1,28 @@
 """Calls of the policy, and what became of them: whose fault it is when there are no actions."""
 
+import asyncio
+import itertools
 import logging
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
-from turbopi.errors import ActionError, DeviceLost, ObservationError
+from turbopi.errors import ActionError, ConfigError, DeviceLost, ObservationError
+from turbopi.serve.batch_times import BatchTimes
 from turbopi.serve.metrics import Metrics
-from turbopi.serve.worker import Worker
+from turbopi.serve.options import ServerOptions
+from turbopi.serve.outcome import Outcome
+from turbopi.serve.schedule import Request, Schedule
+from turbopi.serve.worker import Ran, Worker
 
 logger = logging.getLogger(__name__)
+
+AUTO_LARGEST = 8  # observations of a batch, unless the options say
+MEASURED = 3  # runs of each size at warm-up, after one that may compile or capture
+SIZE_SECONDS = 1.0  # that these may take, unless the options ask for batches
 
 
 class Policy(Protocol):
@@ -20,6 +30,9 @@ class Policy(Protocol):
 
     With a true `pipelined`, requests go to `submit(obs)` instead, which returns a Future of what `infer` returns: the
     next request is handed over while the one before it is still computed.
+
+    With `infer_batch(list of obs)`, which returns a list of what `infer` returns, and `example_observation()` to
+    measure it on, observations of several clients run together where that is sooner.
     """
 
     @property
@@ -30,69 +43,219 @@ class Policy(Protocol):
     # With "real_time" in its metadata, also `previous`, `model_actions` and `seed`, as `UnifiedPolicy.infer` has them.
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of one call: a `result`, or what is `wrong` and the `text` about it.
+@dataclass
+class _Call:
+    """What a request runs: `infer` for each observation, or all in one `infer_batch`."""
 
-    wrong   "observation": the client's fault; "actions": the model gave none that a robot may get; "lost": the device
-            failed for good; "policy": anything else, and `text` is the traceback
-    seconds in the policy
-    """
-
-    seconds: float
-    result: dict[str, Any] | None = None
-    wrong: Literal["observation", "actions", "lost", "policy"] | None = None
-    text: str = ""
+    observations: Sequence[dict[str, Any]]
+    arguments: Mapping[str, Any] = field(default_factory=dict)
 
 
 class PolicyCalls:
-    """Runs a policy on `worker`'s thread, one request after the other.
+    """Runs a policy in the turns of a schedule, on the thread of `worker`.
 
     `on_lost(reason)` is called on that thread when the device fails for good, whether or not the client still waits.
+    Raises ConfigError for a `max_batch` of the options that this policy can't have.
     """
 
-    def __init__(self, policy: Policy, worker: Worker, metrics: Metrics, on_lost: Callable[[str], None]) -> None:
+    def __init__(
+        self, policy: Policy, options: ServerOptions, metrics: Metrics, on_lost: Callable[[str], None]
+    ) -> None:
         self._policy = policy
         self._pipelined = bool(getattr(policy, "pipelined", False))
-        self._worker = worker
         self._metrics = metrics
         self._on_lost = on_lost
+        self._asked_for = options.max_batch
+        self._numbers = itertools.count()  # of runs
+        self.times = BatchTimes(_largest(policy, self._pipelined, options))
+        turns = BatchTimes() if self._pipelined else None
+        self.worker = Worker(Schedule(options.queue_limit, self.times, turns), self._run)
+
+    # --- warm-up ------------------------------------------------------------------------------------------------------
 
     async def warm_up(self, **arguments: Any) -> None:
-        """Call the policy's `warmup`, if it has one, on the thread. Raises what it raises."""
+        """Call the policy's `warmup`, if it has one, on the thread, and measure its batches.
+
+        Raises what it raises, and ConfigError if batches were asked for and fail.
+        """
         warmup = getattr(self._policy, "warmup", None)
         if warmup is not None:
-            await self._worker.call(lambda _: warmup(**arguments), None)
+            await self.worker.call(lambda: warmup(**arguments))
+        if self.times.largest > 1:
+            await self.worker.call(self._measure)
 
-    async def run(self, observation: dict[str, object], arguments: dict[str, Any]) -> Outcome:
-        """Run the policy when it is this request's turn. Raises Busy and Stopping, as the worker does.
+    def _measure(self) -> None:
+        """Fill the table T(B) for B = 1, 2, 4, 8, … and the largest one, as far as the time for it allows."""
+        largest, asked_for = self.times.largest, self._asked_for
+        for size in [*(2**power for power in range(largest.bit_length()) if 2**power < largest), largest]:
+            try:
+                enough = self._measure_size(size)
+            except DeviceLost:
+                raise
+            except Exception as error:  # out of memory, a size that isn't warm, …
+                if asked_for is not None:
+                    raise ConfigError(
+                        f"batches of {size} fail: {type(error).__name__}: {error}. Choose a smaller --max-batch"
+                    ) from error
+                logger.warning("no batches of %d and more: %s: %s", size, type(error).__name__, error)
+                enough = False
+            if not enough:
+                self.times.failed(size)
+                break
+        measured = self.times.measured_largest
+        table = ", ".join(f"{size}: {self.times.seconds(size, 0.0) or 0:.4f}" for size in self.times.sizes)
+        logger.info("seconds in the policy by size of a batch: %s", table)
+        if asked_for is not None and self.times.best(measured, 0.0) == 1 < measured:
+            logger.warning(
+                "--max-batch is %d, but batches of this policy take as long as their observations one by one, so "
+                "none are formed (seconds by size: %s)",
+                asked_for,
+                table,
+            )
+
+    def _measure_size(self, size: int) -> bool:
+        """Measure one size; False if that would take too long, unless the options ask for batches."""
+        example = self._policy.example_observation()  # type: ignore[attr-defined]
+
+        def run() -> float:
+            started = time.perf_counter()
+            if size == 1:
+                self._policy.infer(example)
+            else:
+                self._policy.infer_batch([example] * size)  # type: ignore[attr-defined]
+            return time.perf_counter() - started
+
+        at_will = self._asked_for is not None
+        if not at_will and (self.times.seconds(1, 0.0) or 0.0) * size * MEASURED > SIZE_SECONDS:
+            return False
+        first = run()
+        if not at_will and size == 1 and first * MEASURED > SIZE_SECONDS:
+            return False
+        for _ in range(MEASURED):
+            self.times.measured(size, run())
+        return True
+
+    # --- requests -----------------------------------------------------------------------------------------------------
+
+    def ask(
+        self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
+    ) -> "asyncio.Future[list[Outcome]]":
+        """Run the policy when it is this request's turn.
 
         arguments  of `infer`, besides the observation; a pipelined policy isn't given any
         """
-        asked = time.perf_counter()
-
-        def call(observation: dict[str, object]) -> Outcome:
-            self._metrics.queue_seconds.observe(time.perf_counter() - asked)
-            return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments))
-
-        def submit(observation: dict[str, object]) -> Future[Outcome]:
-            self._metrics.queue_seconds.observe(time.perf_counter() - asked)
-            return self._submit(observation)
-
+        request.call = _Call([observation], arguments)
+        request.joins = bool(arguments.keys() - {"seed"})
+        request.alone = request.alone or bool(arguments)
+        answer = self.worker.ask(request)
         if self._pipelined and not arguments:
-            return await self._worker.begin(submit, observation)
-        return await self._worker.call(call, observation)
+            answer.add_done_callback(self._learn)
+        return answer
 
-    def _submit(self, observation: dict[str, object]) -> "Future[Outcome]":
+    async def ask_rows(
+        self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
+    ) -> list[Outcome]:
+        """An outcome of each of `rows` observations, up to the first part in which one is wrong.
+
+        They run in parts, each with a turn of its own: others have theirs in between.
+
+        make  the request for a part, of its number of rows and of those that come later
+        row   the observation of a row; called when its part is asked for
+        """
+        outcomes: list[Outcome] = []
+        while len(outcomes) < rows:
+            schedule = self.worker.schedule
+            part = schedule.part(rows - len(outcomes), time.perf_counter())
+            request = make(part, rows - len(outcomes) - part)
+            request.continued = bool(outcomes)
+            request.call = _Call([row(len(outcomes) + index) for index in range(part)])
+            outcomes += await self.worker.ask(request)
+            if any(outcome.wrong is not None for outcome in outcomes):
+                break
+        return outcomes
+
+    def _learn(self, answer: "asyncio.Future[list[Outcome]]") -> None:
+        """How long a pipelined policy takes to its actions; its turns end sooner."""
+        if not answer.cancelled() and (outcome := answer.result()[0]).wrong is None:
+            self.times.ran(1, outcome.seconds, time.perf_counter())
+
+    # --- on the thread ------------------------------------------------------------------------------------------------
+
+    def _run(self, turn: tuple[Request, ...]) -> Ran:
+        now = time.perf_counter()
+        for request in turn:
+            self._metrics.queue_seconds.observe(now - request.queued)
+        calls: list[_Call] = [request.call for request in turn]
+        if len(calls) == 1:
+            return self._run_one(calls[0])
+        observations = [observation for call in calls for observation in call.observations]
+        self._metrics.batch_size.observe(len(observations))
+        outcomes = self._together(observations)
+        if not outcomes:  # one spoils it: the others don't pay for it, nor does who asks meanwhile
+            return Ran([None] * len(turn))
+        answers, at = [], 0
+        for call in calls:
+            answers.append(outcomes[at : at + len(call.observations)])
+            at += len(call.observations)
+        return Ran(answers, _told(outcomes))
+
+    def _run_one(self, call: _Call) -> Ran:
+        if len(call.observations) > 1:
+            self._metrics.batch_size.observe(len(call.observations))
+            if outcomes := self._together(call.observations):
+                return Ran([outcomes], _told(outcomes))
+            return Ran([[self._infer(observation, {}) for observation in call.observations]])
+        self._metrics.batch_size.observe(1)
+        (observation,) = call.observations
+        if self._pipelined and not call.arguments:
+            started = time.perf_counter()
+            future = self._submit(observation)
+            return Ran([future], time.perf_counter() - started)
+        outcome = self._infer(observation, call.arguments)
+        return Ran([[outcome]], _told([outcome]))
+
+    def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Outcome:
+        return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments))
+
+    def _together(self, observations: Sequence[dict[str, Any]]) -> list[Outcome]:
+        """An outcome of each; none if one of them spoiled the batch, so that each shall run for itself."""
+        rows, started = len(observations), time.perf_counter()
+        try:
+            results = self._policy.infer_batch(list(observations))  # type: ignore[attr-defined]
+            if not isinstance(results, list) or len(results) != rows:
+                raise TypeError(f"infer_batch must return a list of {rows} results")
+            seconds = time.perf_counter() - started
+            run = next(self._numbers)
+            return [Outcome(seconds, result=_checked(result), together=rows, run=run) for result in results]
+        except DeviceLost as error:
+            self._on_lost(str(error))
+            return [Outcome(time.perf_counter() - started, wrong="lost", text=str(error))] * rows
+        except (ObservationError, ActionError):
+            return []
+        except BaseException:
+            logger.exception("a batch of %d failed: its observations run one by one", rows)
+        finally:
+            self._metrics.inference_seconds.observe(time.perf_counter() - started)
+        outcomes = [self._infer(observation, {}) for observation in observations]
+        if all(outcome.wrong != "policy" for outcome in outcomes):  # it was the batch's fault, not one observation's
+            logger.warning("batches of %d and more aren't formed any more", rows)
+            self.times.failed(rows)
+        return outcomes
+
+    def _submit(self, observation: dict[str, object]) -> "Future[list[Outcome]]":
         """Hand the observation to a pipelined policy. The Future never holds an exception."""
         started = time.perf_counter()
-        outcome: Future[Outcome] = Future()
+        outcome: Future[list[Outcome]] = Future()
         try:
             answer: Future[dict[str, Any]] = self._policy.submit(observation)  # type: ignore[attr-defined]
         except BaseException as error:
             answer = Future()
             answer.set_exception(error)
-        answer.add_done_callback(lambda done: outcome.set_result(self._outcome(started, done.result)))
+
+        def done(ran: "Future[dict[str, Any]]") -> None:
+            outcome.set_result([self._outcome(started, ran.result)])
+
+        answer.add_done_callback(done)
         return outcome
 
     def _outcome(self, started: float, get: Callable[[], dict[str, Any]]) -> Outcome:
@@ -102,10 +265,8 @@ class PolicyCalls:
             return time.perf_counter() - started
 
         try:
-            result = get()
-            if not isinstance(result, dict) or "actions" not in result:
-                raise TypeError(f'the policy\'s result must be a dict with "actions", not {type(result).__name__}')
-            return Outcome(seconds(), result=result)
+            result = _checked(get())
+            return Outcome(seconds(), result=result, run=next(self._numbers))
         except ObservationError as error:
             return Outcome(seconds(), wrong="observation", text=str(error))
         except ActionError as error:
@@ -118,3 +279,29 @@ class PolicyCalls:
             return Outcome(seconds(), wrong="policy", text=traceback.format_exc())
         finally:
             self._metrics.inference_seconds.observe(seconds())
+
+
+def _largest(policy: Policy, pipelined: bool, options: ServerOptions) -> int:
+    """Observations of a batch, at most, as far as measuring allows. Raises ConfigError."""
+    asked_for = options.max_batch
+    if options.execution is not None:  # all requests join a chunk, and run alone
+        return 1
+    lacking = [name for name in ("infer_batch", "example_observation") if not hasattr(policy, name)]
+    if not pipelined and not lacking:
+        return AUTO_LARGEST if asked_for is None else asked_for
+    if asked_for is not None and asked_for > 1:
+        why = "is pipelined, and takes one observation at a time" if pipelined else f"has no {' and no '.join(lacking)}"
+        raise ConfigError(f"max_batch is {asked_for}, but this policy {why}: leave it out")
+    return 1
+
+
+def _checked(result: Any) -> dict[str, Any]:
+    if not isinstance(result, dict) or "actions" not in result:
+        raise TypeError(f'the policy\'s result must be a dict with "actions", not {type(result).__name__}')
+    return result
+
+
+def _told(outcomes: Sequence[Outcome]) -> float | None:
+    """The seconds of a turn, if all of it was one run with actions."""
+    good = all(outcome.wrong is None and outcome.together == len(outcomes) for outcome in outcomes)
+    return outcomes[0].seconds if good else None

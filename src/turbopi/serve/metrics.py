@@ -5,14 +5,18 @@ from collections.abc import Callable
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
+from turbopi.serve.schedule import PRIORITIES
+
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 
-# Kinds of `turbopi_errors_total`. Those to "origin" are the client's; "policy", "actions" and "lost" are ours; the last
-# two are nobody's.
+# Kinds of `turbopi_errors_total`. Those to "origin" are the client's, and so are "late" and "replaced"; "policy",
+# "actions" and "lost" are ours; the last two are nobody's.
 ERROR_KINDS = (
     "malformed",
     "observation",
     "busy",
+    "late",
+    "replaced",
     "too_large",
     "slow",
     "flood",
@@ -25,11 +29,13 @@ ERROR_KINDS = (
     "disconnected",
     "stopping",
 )
+REFUSALS = ("busy", "late", "replaced")  # of the scheduler
 DROPPED_SESSIONS = ("closed", "idle", "full")
 RECORD_OUTCOMES = ("written", "dropped", "failed")
 
 # Seconds. A policy takes 10 ms to 1 s; a control loop cares about every 5 ms of it.
 _BUCKETS = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
+_SLACKS = (-1.0, -0.3, -0.1, -0.05, -0.02, -0.01, 0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0)
 
 
 class Metrics:
@@ -73,6 +79,7 @@ class Metrics:
         self._sessions_dropped = Counter(
             "turbopi_real_time_sessions_dropped", "Sessions that ended", ["reason"], registry=self.registry
         )
+        self._add_scheduling()
         for joined in ("yes", "no"):
             self._joined.labels(joined)
         for reason in DROPPED_SESSIONS:
@@ -81,6 +88,53 @@ class Metrics:
             self._errors.labels(kind)
         for outcome in RECORD_OUTCOMES:
             self._recorded.labels(outcome)
+
+    def _add_scheduling(self) -> None:
+        self.batch_size = Histogram(
+            "turbopi_batch_size",
+            "Observations in a run of the policy",
+            buckets=(1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64),
+            registry=self.registry,
+        )
+        self._asked = Counter(
+            "turbopi_scheduled_requests", "Requests for the policy", ["priority"], registry=self.registry
+        )
+        self._refused = Counter(
+            "turbopi_refused_requests",
+            "Requests that got no turn",
+            ["kind", "priority"],
+            registry=self.registry,
+        )
+        self._misses = Counter(
+            "turbopi_deadline_misses",
+            "Answers that were sent after the deadline that their requests gave",
+            ["priority"],
+            registry=self.registry,
+        )
+        self._slack = Histogram(
+            "turbopi_slack_seconds",
+            "From an answer sent to the deadline that its request gave; below 0: missed",
+            ["priority"],
+            buckets=_SLACKS,
+            registry=self.registry,
+        )
+        for priority in PRIORITIES:
+            self._asked.labels(priority)
+            self._misses.labels(priority)
+            self._slack.labels(priority)
+            for kind in REFUSALS:
+                self._refused.labels(kind, priority)
+
+    def asked(self, priority: str, wrong: str | None) -> None:
+        """A request for the policy was dealt with; `wrong` says why it has no actions."""
+        self._asked.labels(priority).inc()
+        if wrong in REFUSALS:
+            self._refused.labels(wrong, priority).inc()
+
+    def slack(self, seconds: float, priority: str) -> None:
+        self._slack.labels(priority).observe(seconds)
+        if seconds < 0:
+            self._misses.labels(priority).inc()
 
     def error(self, kind: str) -> None:
         assert kind in ERROR_KINDS, kind

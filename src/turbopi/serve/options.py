@@ -13,6 +13,8 @@ from turbopi.serve.limits import Limits
 if TYPE_CHECKING:  # `turbopi --help` needs no NumPy
     from turbopi.running_chunk import JoinMode
 
+MAX_BATCH = 64
+MAX_DEADLINE_MS = 60_000.0  # of options and requests, so that nobody waits behind others for ever
 JOINING = ("rtc", "rtc_identity", "rtc_trained")
 
 
@@ -24,6 +26,9 @@ class ServerOptions:
     api_key         if given, every client must send `Authorization: Api-Key <api_key>`, for /metrics too
     max_message_mb  larger messages end the connection with close code 1009
     queue_limit     requests that may wait while another one runs; more get a text frame "busy: ..."
+    max_batch       observations that may run together, at most, where that is sooner. None: up to 8, as far as the
+                    warm-up can measure them in seconds; 1: never
+    deadline_ms     from a request's arrival to its answer, for requests that don't say their own: for the order alone
     record_dir      if given, every observation and its actions are written below this folder
     allowed_hosts   names, besides its own, by which web pages may address this server (`hosts.AllowedHosts`)
     max_clients     connected at once; more are refused with HTTP 503
@@ -41,6 +46,8 @@ class ServerOptions:
     api_key: str | None = field(default=None, repr=False)
     max_message_mb: float = 64
     queue_limit: int = 16
+    max_batch: int | None = None
+    deadline_ms: float = 1000.0
     record_dir: str | Path | None = None
     allowed_hosts: Sequence[str] = ()
     max_clients: int = Limits.clients
@@ -57,6 +64,17 @@ class ServerOptions:
             raise ConfigError(f"max_message_mb must be more than 0 and finite, not {self.max_message_mb}")
         if self.queue_limit < 0:
             raise ConfigError(f"queue_limit must be 0 or more, not {self.queue_limit}")
+        if self.max_batch is not None and not 1 <= self.max_batch <= MAX_BATCH:
+            raise ConfigError(f"max_batch must be from 1 to {MAX_BATCH}, not {self.max_batch}")
+        if self.execution is not None and self.max_batch is not None and self.max_batch > 1:
+            raise ConfigError(
+                f"max_batch is {self.max_batch}, but with execution {self.execution!r} each request joins a chunk and "
+                "runs alone: leave one of them out"
+            )
+        if not 0 < self.deadline_ms <= MAX_DEADLINE_MS:
+            raise ConfigError(
+                f"deadline_ms must be more than 0 and at most {MAX_DEADLINE_MS:g}, not {self.deadline_ms:g}"
+            )
         if self.max_clients < 1:
             raise ConfigError(f"max_clients must be 1 or more, not {self.max_clients}")
         if self.execution is not None and self.execution not in JOINING:

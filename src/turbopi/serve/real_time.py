@@ -17,11 +17,12 @@ import numpy as np
 
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.execution import DelayEstimate
-from turbopi.execution.messages import KEYS, PREFIX, Asked, read_message
+from turbopi.execution.messages import KEYS, PREFIX, SCHEDULING_KEYS, Asked, read_message
 from turbopi.running_chunk import JoinMode, RunningChunk
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 
+NO_JOINING = "none"  # a mode: the session is there for the order of its requests alone
 MAX_SESSIONS = 256  # named ones; a connection's own ends with it
 IDLE_SECONDS = 300.0  # a named session that nobody used for so long is dropped
 
@@ -41,7 +42,7 @@ class _Session:
     used: float
     kept: _Kept | None = None
     delays: DelayEstimate = field(default_factory=DelayEstimate)
-    busy: bool = False
+    holder: "Plan | None" = None  # the request that is to have its next chunk
 
 
 @dataclass
@@ -52,12 +53,15 @@ class Plan:
     arguments: dict[str, Any] = field(default_factory=dict)  # of `policy.infer`, besides the observation
     asked: Asked = field(default_factory=Asked)
     session: _Session | None = None
+    name: str | None = None  # of the session
     received: float = 0.0
     about: dict[str, Any] = field(default_factory=dict)  # what the answer says of it, under "real_time"
 
 
 class RealTime:
     """What a server does of it, for one policy. For the event loop's thread alone.
+
+    waits  whether a request of the session of that name still waits for its turn: then a newer one replaces it
 
     Raises ConfigError if the policy doesn't offer the options' `execution`.
     """
@@ -68,11 +72,12 @@ class RealTime:
         options: ServerOptions,
         metrics: Metrics,
         clock: Callable[[], float] = time.monotonic,
+        waits: Callable[[str], bool] = lambda name: False,
     ) -> None:
         offered = metadata.get("real_time")
         self._offered: Mapping[str, Any] = offered if isinstance(offered, Mapping) else {}
         self._modes = list(self._offered.get("modes", ()))
-        self._options, self._metrics, self._clock = options, metrics, clock
+        self._options, self._metrics, self._clock, self._waits = options, metrics, clock, waits
         self._named: OrderedDict[Hashable, _Session] = OrderedDict()  # the one used last at the end
         self._of_connections: dict[Hashable, _Session] = {}
         if options.execution is not None and options.execution not in self._modes:
@@ -100,10 +105,23 @@ class RealTime:
     def plan(self, received: Mapping[str, Any], connection: Hashable) -> Plan:
         """What to do with a request that has just come. Raises ObservationError."""
         now = self._clock()
+        mode = received.get(PREFIX + "mode")
+        unjoined = isinstance(mode, str) and mode == NO_JOINING
+        if unjoined:
+            received = {key: value for key, value in received.items() if key != PREFIX + "mode"}
         observation, asked = read_message(received)
-        seeded = {} if asked.seed is None else {"seed": asked.seed}
-        if self._options.execution is None and replace(asked, seed=None) == Asked() and (self._modes or not seeded):
-            return Plan(observation, seeded)
+        seeded = _seed(asked)
+        told = replace(asked, seed=None)
+        if unjoined and (told.session is None or told != Asked(session=told.session)):
+            raise ObservationError(
+                f"{PREFIX}mode {NO_JOINING!r} joins nothing: it needs {PREFIX}session, and goes with no other key of "
+                "real-time execution"
+            )
+        if self._modes or not seeded:
+            if unjoined or (told.session is not None and told == Asked(session=told.session) and not self._modes):
+                return Plan(observation, seeded, name=told.session)
+            if told == Asked() and self._options.execution is None:
+                return Plan(observation, seeded)
         if not self._modes:
             raise ObservationError(
                 f"this server's policy joins no chunks (its metadata offers no real-time modes): leave out "
@@ -146,11 +164,9 @@ class RealTime:
             about |= more
         elif asked.step is None:
             self._need_control_hz()
-        session.busy = True
-        arguments: dict[str, Any] = {"previous": previous, "model_actions": True}
-        if asked.seed is not None:
-            arguments["seed"] = asked.seed
-        return Plan(observation, arguments, asked, session, now, about)
+        arguments = {"previous": previous, "model_actions": True, **_seed(asked)}
+        session.holder = Plan(observation, arguments, asked, session, asked.session, now, about)
+        return session.holder
 
     def finish(self, plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
         """The answer to a request, of the policy's result."""
@@ -175,8 +191,8 @@ class RealTime:
 
     def release(self, plan: Plan) -> None:
         """The session may have its next request. Without a result its robot goes on with the chunk it has."""
-        if plan.session is not None:
-            plan.session.busy = False
+        if plan.session is not None and plan.session.holder is plan:  # no newer one has replaced it
+            plan.session.holder = None
             plan.session.used = self._clock()
 
     def closed(self, connection: Hashable) -> None:
@@ -196,7 +212,7 @@ class RealTime:
                 self._drop_oldest()
             session = self._named[asked.session] = _Session(now)
         self._named.move_to_end(asked.session)
-        if session.busy:
+        if session.holder is not None and not self._waits(asked.session):
             raise ObservationError(
                 f"session {asked.session!r} has a request that isn't answered yet: give each robot its own session"
             )
@@ -206,14 +222,14 @@ class RealTime:
     def _drop_idle(self, now: float) -> None:
         while self._named:
             name, oldest = next(iter(self._named.items()))
-            if oldest.busy or now - oldest.used <= IDLE_SECONDS:
+            if oldest.holder is not None or now - oldest.used <= IDLE_SECONDS:
                 return
             del self._named[name]
             self._metrics.session_dropped("idle")
 
     def _drop_oldest(self) -> None:
         for name, session in self._named.items():
-            if not session.busy:
+            if session.holder is None:
                 del self._named[name]
                 self._metrics.session_dropped("full")
                 return
@@ -292,5 +308,11 @@ class RealTime:
         return max(1, horizon // 2)
 
 
+def _seed(asked: Asked) -> dict[str, Any]:
+    """The argument of `infer`, if the client chose one."""
+    return {} if asked.seed is None else {"seed": asked.seed}
+
+
 def _named(received: Mapping[str, Any]) -> str:
-    return ", ".join(key for key in received if key.startswith(PREFIX))
+    keys = [key for key in received if key.startswith(PREFIX) and key.removeprefix(PREFIX) not in SCHEDULING_KEYS]
+    return ", ".join(keys)

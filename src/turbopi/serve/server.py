@@ -1,4 +1,4 @@
-"""The policy server: openpi's websocket protocol around one inference worker.
+"""The policy server: openpi's websocket protocol around one policy, whose turns schedule.py decides about.
 
     client                          server
       ── GET, Upgrade ────────────▶   /healthz and /metrics are answered as plain HTTP
@@ -29,7 +29,8 @@ from websockets.frames import CloseCode
 
 from turbopi.errors import ConfigError, DeviceLost, ObservationError
 from turbopi.recordings import Recorder
-from turbopi.serve.calls import Outcome, Policy, PolicyCalls
+from turbopi.serve.asking import Asking, Askings
+from turbopi.serve.calls import Policy, PolicyCalls
 from turbopi.serve.connection import GuardedConnection, Shared
 from turbopi.serve.gate import Gate
 from turbopi.serve.hosts import AllowedHosts
@@ -38,11 +39,12 @@ from turbopi.serve.limits import Limits, limits_for
 from turbopi.serve.listener import Listener
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
+from turbopi.serve.outcome import Outcome
 from turbopi.serve.page.http import is_feed
 from turbopi.serve.page.live import Live
-from turbopi.serve.real_time import Plan, RealTime
+from turbopi.serve.real_time import RealTime
+from turbopi.serve.rows import row
 from turbopi.serve.signals import stop_signals
-from turbopi.serve.worker import Busy, Stopping, Worker
 from turbopi.wire import WireError, pack, unpack
 
 logger = logging.getLogger(__name__)
@@ -97,9 +99,10 @@ class PolicyServer:
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
-        self._worker = Worker(options.queue_limit)
-        self._calls = PolicyCalls(policy, self._worker, self.metrics, on_lost=self._lose)
-        self._real_time = RealTime(policy.metadata, options, self.metrics)
+        self._calls = PolicyCalls(policy, options, self.metrics, on_lost=self._lose)
+        self._worker = self._calls.worker
+        self._real_time = RealTime(policy.metadata, options, self.metrics, waits=self._worker.schedule.waits)
+        self._askings = Askings(self._calls, self._real_time, options, strict=bool(policy.metadata.get("strict")))
         self._lost: Future[str] = Future()  # set from the worker's thread
         self.metrics.watch(lambda: self._worker.waiting, lambda: self._worker.running)
         self._live = Live(self.metrics, self._worker, lambda: self.lost) if options.has_page else None
@@ -150,7 +153,7 @@ class PolicyServer:
             if self._record_dir is not None:
                 self._recorder = Recorder(self._record_dir, metadata, count=self.metrics.recorded)
             if self._live is not None:
-                self._live.start(metadata, self._worker.queue_limit)
+                self._live.start(metadata, self.options.queue_limit)
             self._listener.start()
         except BaseException:
             self._listener.close()
@@ -281,23 +284,25 @@ class PolicyServer:
             self._idle.discard(connection)
             received = time.perf_counter()
             self.metrics.requests.inc()
-            reply = await self._reply(connection, message, previous_total)
+            reply = await self._reply(connection, message, received, previous_total)
             if isinstance(reply, _Refusal):
                 await connection.send(reply.text)
                 await self._refused(connection, reply)
                 continue
-            await connection.send(pack(reply))
+            result, urgency = reply[0], reply[1].urgency
+            await connection.send(pack(result))
             finished = time.perf_counter()
             self.metrics.request_seconds.observe(finished - received)
+            if urgency.firm:
+                self.metrics.slack(received + urgency.within - finished, urgency.priority)
             previous_total = finished - started  # with the wait for the request, as openpi counts it
             if self._live is not None:
                 assert isinstance(message, bytes)
-                self._live.answered(connection, message, reply, finished - received)
-            if self._recorder is not None:  # decoded anew: the policy may have changed the dict it was given
+                self._live.answered(connection, message, result, finished - received)
+            if self._recorder is not None:
                 assert isinstance(message, bytes)
-                size = len(message)
-                self._recorder.put(unpack(message, max_bytes=self._limits.message_bytes), reply, size=size)
-            del message, reply  # a connection that waits holds nothing
+                self._record(message, result, urgency.rows)
+            del message, reply, result  # a connection that waits holds nothing
             connection.answered("good")
         await self._say_goodbye(connection)
 
@@ -310,35 +315,40 @@ class PolicyServer:
             self._log.warning(f"{connection.remote_address}: {reason}, the last one: {refusal.text}", "flood")
             await connection.close(CloseCode.POLICY_VIOLATION, f"{reason}: the text frames say what is wrong")
 
+    def _record(self, message: bytes, result: dict[str, object], rows: int | None) -> None:
+        """Record a call; of a batch message each row, as a call of its own."""
+        assert self._recorder is not None
+        observation = unpack(message, max_bytes=self._limits.message_bytes)  # the policy may have changed what it got
+        if rows is None:
+            self._recorder.put(observation, result, size=len(message))
+            return
+        for index in range(rows):
+            self._recorder.put(row(observation, index), row(result, index), size=len(message) // rows)
+
     async def _reply(
-        self, connection: GuardedConnection, message: str | bytes, previous_total: float | None
-    ) -> dict[str, object] | _Refusal:
+        self, connection: GuardedConnection, message: str | bytes, arrived: float, previous_total: float | None
+    ) -> tuple[dict[str, object], Asking] | _Refusal:
         """The result to send, or what to tell the client instead. Raises _PolicyFailed and _ClientGone."""
         if self.lost is not None:
             return self._refuse("lost", _REFUSALS["lost"].format(self.lost))
         try:
             received = await self._decode(connection, message)
-            plan = self._real_time.plan(received, connection)
-            outcome = await self._infer(connection, plan)
+            asking = self._askings.read(received, connection)
         except WireError as error:
             return self._refuse("malformed", f"bad request: {error}")
         except ObservationError as error:
             return self._refuse("observation", _REFUSALS["observation"].format(error))
-        except Busy:
-            limit = self._worker.queue_limit
-            return self._refuse("busy", f"busy: {limit} requests wait already (--queue-limit {limit}); try again")
-        except Stopping:
-            return self._refuse("stopping", "the server is shutting down")
-        if outcome.wrong == "policy":
-            raise _PolicyFailed(outcome.text)
-        if outcome.wrong is not None:
-            return self._refuse(outcome.wrong, _REFUSALS[outcome.wrong].format(outcome.text))
-        assert outcome.result is not None
-        result = self._real_time.finish(plan, outcome.result)
-        timing = {"infer_ms": outcome.seconds * 1e3}
+        outcomes = await self._infer(connection, asking, arrived)
+        wrong, priority = self._askings.wrong(asking, outcomes), asking.urgency.priority
+        self.metrics.asked(priority, None if wrong is None else wrong.wrong)
+        if wrong is not None and wrong.wrong is not None:
+            if wrong.wrong == "policy":
+                raise _PolicyFailed(wrong.text)
+            return self._refuse(wrong.wrong, _REFUSALS.get(wrong.wrong, "{}").format(wrong.text))
+        result = self._askings.answer(asking, outcomes)
         if previous_total is not None:
-            timing["prev_total_ms"] = previous_total * 1e3
-        return {**result, "server_timing": timing}
+            result["server_timing"]["prev_total_ms"] = previous_total * 1e3
+        return result, asking
 
     def _refuse(self, kind: str, text: str) -> _Refusal:
         self.metrics.error(kind)
@@ -358,19 +368,20 @@ class PolicyServer:
         finally:
             connection.took(time.perf_counter() - started)
 
-    async def _infer(self, connection: GuardedConnection, plan: Plan) -> Outcome:
+    async def _infer(self, connection: GuardedConnection, asking: Asking, arrived: float) -> list[Outcome]:
         """Run the policy when it is this request's turn, unless the client leaves first."""
-        work = asyncio.ensure_future(self._calls.run(plan.observation, plan.arguments))
+        work = self._askings.ask(asking, connection, arrived)
         gone = asyncio.ensure_future(connection.wait_closed())
         try:
-            await asyncio.wait({work, gone}, return_when=asyncio.FIRST_COMPLETED)
+            waits: set[asyncio.Future[Any]] = {work, gone}
+            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
             if not work.done():
                 raise _ClientGone
             return work.result()
         finally:
             gone.cancel()
             work.cancel()
-            self._real_time.release(plan)
+            self._askings.release(asking)
 
 
 def _decode(message: str | bytes, max_bytes: int) -> dict[str, object]:

@@ -1,0 +1,124 @@
+"""T(B): how long the policy takes for B observations together. From measured times alone; no clock of its own."""
+
+import math
+from bisect import bisect_left, insort
+from collections import deque
+
+KEPT = 50  # times of one size, the last ones
+FEW = 3  # times that a size needs to be known by what runs
+FRESH_SECONDS = 60.0  # a size that didn't run for so long has its times of the warm-up again
+GAIN = 0.95  # of B * T(1): a batch must be sooner than that, so that noise of a few percent forms none
+TYPICAL, SAFE = 0.5, 0.95  # quantiles: what is expected; what nearly every run keeps
+
+
+class _Times:
+    """The times of one size, in order of time and in order of size."""
+
+    def __init__(self) -> None:
+        self.last = -math.inf
+        self._in_time: deque[float] = deque()
+        self._sorted: list[float] = []
+
+    def add(self, seconds: float, now: float) -> None:
+        if len(self._in_time) == KEPT:
+            del self._sorted[bisect_left(self._sorted, self._in_time.popleft())]
+        self._in_time.append(seconds)
+        insort(self._sorted, seconds)
+        self.last = now
+
+    def tell(self, now: float) -> bool:
+        """Whether there are enough of them, and not too old."""
+        return len(self._in_time) >= FEW and now - self.last <= FRESH_SECONDS
+
+    def quantile(self, part: float) -> float:
+        """The smallest time that is at least as long as `part` of all."""
+        return self._sorted[max(0, math.ceil(part * len(self._sorted)) - 1)]
+
+
+class BatchTimes:
+    """The table T(B), measured at warm-up (`measured`) and kept up to date by what runs (`ran`).
+
+    Each size has its last 50 times; a size without times of its own counts as the next larger one that has some, as
+    engines round up, too. What was measured at warm-up holds again for a size that didn't run for a minute: so a
+    size that was slow once, beside another program, isn't given up for ever.
+
+    largest  observations of one batch, at most. Batches are formed of sizes up to the largest one that was measured at
+             warm-up: without a measurement, there are none
+    """
+
+    def __init__(self, largest: int = 1) -> None:
+        self.largest = largest
+        self._warm: dict[int, _Times] = {}
+        self._recent: dict[int, _Times] = {}
+        self._found: dict[tuple[int, float], float | None] = {}  # answers of `seconds` at `_found_at`
+        self._found_at = math.nan
+
+    def measured(self, rows: int, seconds: float) -> None:
+        """A run at warm-up."""
+        self._warm.setdefault(rows, _Times()).add(seconds, 0.0)
+        self._found_at = math.nan
+
+    def ran(self, rows: int, seconds: float, now: float) -> None:
+        """A run for requests, which ended at `now`."""
+        self._recent.setdefault(rows, _Times()).add(seconds, now)
+        self._found_at = math.nan
+
+    def failed(self, rows: int) -> None:
+        """A batch of that size failed, and not by an observation's fault: neither it nor a larger one is formed."""
+        self.largest = min(self.largest, max(1, rows - 1))
+
+    @property
+    def measured_largest(self) -> int:
+        """The largest batch that may be formed at all; 1 if none was measured."""
+        return max((rows for rows in self._warm if rows <= self.largest), default=1)
+
+    @property
+    def sizes(self) -> list[int]:
+        """Those that were measured at warm-up."""
+        return sorted(self._warm)
+
+    def seconds(self, rows: int, now: float, part: float = TYPICAL) -> float | None:
+        """T(rows), the `part`-quantile of its last times; None if neither that size nor a larger one was measured."""
+        if now != self._found_at:
+            self._found, self._found_at = {}, now
+        if (rows, part) not in self._found:
+            times = self._times(rows, now)
+            self._found[rows, part] = None if times is None else times.quantile(part)
+        return self._found[rows, part]
+
+    def _times(self, rows: int, now: float) -> _Times | None:
+        good = {size: times for size, times in self._recent.items() if times.tell(now)}
+        of_size = self._warm | good or self._recent  # before anything is known well, what there is
+        size = min((size for size in of_size if size >= rows), default=None)
+        return None if size is None else of_size[size]
+
+    def best(self, rows: int, now: float, longest: float = math.inf) -> int:
+        """Of `rows` observations that wait, how many to run together: as many as make the most a second.
+
+        That is 1 unless a batch is sooner than its observations one by one: T(B) < 0.95 * B * T(1).
+
+        longest  seconds that the run may take; one observation may take longer
+        """
+        most = min(rows, self.measured_largest)
+        alone = self.seconds(1, now) if most > 1 else None
+        if alone is None:
+            return 1
+        best, best_each = 1, alone * GAIN
+        for size in range(2, most + 1):
+            seconds = self.seconds(size, now)
+            assert seconds is not None  # as a size that is no smaller was measured
+            if seconds <= longest and seconds / size < best_each:
+                best, best_each = size, seconds / size
+        return best
+
+    def total(self, rows: int, now: float) -> float:
+        """Seconds for `rows` observations in as many runs as they need; 0 as long as nothing was measured."""
+        if rows == 1:  # nearly always
+            return self.seconds(1, now) or 0.0
+        seconds = 0.0
+        while rows > 0:
+            best = self.best(rows, now)
+            runs = rows // best
+            seconds += runs * (self.seconds(best, now) or 0.0)
+            rows -= runs * best
+        return seconds

@@ -1,0 +1,368 @@
+"""Whose turn it is: earliest deadline first, robots before simulators, batches where they pay.
+
+A pure decision: nothing here waits, and time is an argument (seconds of any steady clock). worker.py asks `decide`
+whenever something has changed or the moment `Decision.wake` has come, and runs the turn that it is given.
+
+What holds:
+
+- Requests with the same deadline, priority and size run in the order in which they came.
+- A request is overtaken (a turn goes to one that came later) at most OVERTAKEN times, and after that once for each
+  turn of another one that was overtaken as often: nobody starves, simulators neither.
+- What has a deadline of its own and can't meet it is refused: when it comes, if its wait and its run are already too
+  long; else as soon as that is so. Without one, nothing is refused for being late.
+- A turn has no more observations than the table T(B) says is worth it, nor than fit the earliest deadline in it.
+"""
+
+import math
+from collections import OrderedDict, deque
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any, Literal
+
+from turbopi.serve.batch_times import SAFE, BatchTimes
+
+Priority = Literal["robot", "simulator"]
+PRIORITIES: tuple[Priority, ...] = ("robot", "simulator")
+
+OVERTAKEN = 16
+ACTIVE_SECONDS = 1.0  # who asked within it may ask again soon: company to wait for
+TIGHT_SECONDS = 10.0  # for so long a robot's deadline limits how long a turn of others may be
+GAPS = 32  # between arrivals, that tell how soon company comes
+PATIENCE = 4.0  # usual gaps without an arrival, after which no more company is waited for
+LATER = 1e-4  # seconds after the moment from which a deadline can't be met, so that rounding doesn't matter
+
+
+@dataclass(eq=False)
+class Request:
+    """Observations that wait for one run of the policy.
+
+    arrived   when it came
+    deadline  when its answer is wanted
+    firm      the client said so: it is refused if it can't have its answer by then
+    source    who asks (a connection)
+    session   its name, if it has one: a newer request of the session replaces one that waits
+    rows      observations in it; they run together
+    later     observations of the same message that come after these, for whose last one the deadline is
+    alone     never in a batch with others
+    joins     it joins a chunk, or is else not as others are: it runs alone, and such runs have times of their own
+    call      what to run; not looked at here
+    """
+
+    arrived: float
+    deadline: float
+    firm: bool = False
+    priority: Priority = "robot"
+    source: Hashable = None
+    session: str | None = None
+    rows: int = 1
+    later: int = 0
+    alone: bool = False
+    joins: bool = False
+    continued: bool = False  # of a message that has its place in the line already
+    call: Any = None
+    number: int = field(default=0, init=False)  # in the order in which they came
+    overtaken: int = field(default=0, init=False)
+    queued: float = field(default=0.0, init=False)  # when it was added
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A request that gets no run, why, and what its client is told."""
+
+    request: Request
+    kind: Literal["busy", "late", "replaced"]
+    text: str
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to do now.
+
+    turn     requests to run together; empty: none yet
+    refused  requests to answer with a refusal
+    wake     when to ask again, if nothing changes before; None: not at all
+    """
+
+    turn: tuple[Request, ...] = ()
+    refused: tuple[Refused, ...] = ()
+    wake: float | None = None
+
+
+class _Recent:
+    """What sources did last, for a while."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._last: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()
+
+    def note(self, source: Hashable, value: float, now: float) -> None:
+        self._last[source] = (now, value)
+        self._last.move_to_end(source)
+        self._drop(now)
+
+    def values(self, now: float) -> dict[Hashable, float]:
+        self._drop(now)
+        return {source: value for source, (_, value) in self._last.items()}
+
+    def _drop(self, now: float) -> None:
+        while self._last and next(iter(self._last.values()))[0] < now - self._seconds:
+            self._last.popitem(last=False)
+
+
+class Schedule:
+    """Requests that wait for a policy that runs one turn at a time.
+
+    queue_limit  requests that may wait while a turn runs
+    times        T(B); one that forms no batches by default
+    turns        how long a turn keeps the next one from beginning, where that isn't T(B): a pipelined policy
+    """
+
+    def __init__(self, queue_limit: int, times: BatchTimes | None = None, turns: BatchTimes | None = None) -> None:
+        self.queue_limit = queue_limit
+        self.times = BatchTimes() if times is None else times
+        self._turns = self.times if turns is None else turns
+        self._joining = BatchTimes()  # of runs that join a chunk
+        self._waiting: list[Request] = []
+        self._running: tuple[Request, ...] = ()
+        self._until = 0.0  # when the running turn is expected to end
+        self._free_since = -math.inf
+        self._number = 0
+        self._exhausted_last = False  # the last turn went to one that had been overtaken too often
+        self._active = _Recent(ACTIVE_SECONDS)
+        self._tight = _Recent(TIGHT_SECONDS)
+        self._last_arrival = -math.inf
+        self._gaps: deque[float] = deque(maxlen=GAPS)
+
+    @property
+    def waiting(self) -> int:
+        """Requests that wait."""
+        return len(self._waiting)
+
+    @property
+    def running(self) -> bool:
+        return bool(self._running)
+
+    def waits(self, session: str) -> bool:
+        """Whether a request of that session waits: a newer one would replace it."""
+        return any(request.session == session for request in self._waiting)
+
+    # --- requests come and go -----------------------------------------------------------------------------------------
+
+    def add(self, request: Request, now: float) -> list[Refused]:
+        """A request has come. Those that are refused for it: an older one, or itself."""
+        refused = self._replace(request)
+        self._note(request, now)
+        if (late := self._late_on_arrival(request, now)) is not None:
+            return [*refused, late]
+        if not request.continued and self.waiting >= self._places:
+            gives_way = self._gives_way(request)
+            text = f"busy: {self.queue_limit} requests wait already (--queue-limit {self.queue_limit}); try again"
+            refused.append(Refused(gives_way, "busy", text))
+            if gives_way is request:
+                return refused
+            self._waiting.remove(gives_way)
+        self._waiting.append(request)
+        if request.firm and request.priority == "robot":
+            self._tight.note(request.source, request.deadline - request.arrived, now)
+        return refused
+
+    def remove(self, request: Request) -> None:
+        """Nobody waits for its answer any more."""
+        if request in self._waiting:
+            self._waiting.remove(request)
+
+    def put_back(self, request: Request) -> None:
+        """It was in a batch that failed: it waits again, where it was in the order, and runs alone."""
+        request.alone = True
+        self._waiting.append(request)
+
+    def stop(self) -> list[Request]:
+        """All that wait, which wait no more."""
+        waiting, self._waiting = self._waiting, []
+        return waiting
+
+    def freed(self, now: float, seconds: float | None) -> None:
+        """The running turn has ended: the next one may begin. `seconds` that it took; None if they tell nothing."""
+        if seconds is not None:
+            rows = sum(request.rows for request in self._running)
+            (self._joining if any(request.joins for request in self._running) else self._turns).ran(rows, seconds, now)
+        self._running, self._free_since = (), now
+
+    @property
+    def _places(self) -> int:
+        return self.queue_limit + (not self._running)  # with nothing running, one of those that wait is about to
+
+    def _replace(self, request: Request) -> list[Refused]:
+        older = [one for one in self._waiting if request.session is not None and one.session == request.session]
+        for one in older:
+            self._waiting.remove(one)
+        text = f"replaced: a newer observation of session {request.session!r} came before this one had its turn"
+        return [Refused(one, "replaced", text) for one in older]
+
+    def _gives_way(self, request: Request) -> Request:
+        """Who gets no place, as all are taken: for a robot, the last of the simulators."""
+        simulators = [one for one in self._waiting if one.priority == "simulator"]
+        return max(simulators, key=_order) if request.priority == "robot" and simulators else request
+
+    def _note(self, request: Request, now: float) -> None:
+        """Give it its number, and learn how soon others follow."""
+        self._number += 1
+        request.number, request.queued = self._number, now
+        if not (request.alone or request.continued):
+            if now - self._last_arrival <= ACTIVE_SECONDS:
+                self._gaps.append(now - self._last_arrival)
+            self._last_arrival = now
+            self._active.note(request.source, 0.0, now)
+
+    # --- deadlines ----------------------------------------------------------------------------------------------------
+
+    def _late_on_arrival(self, request: Request, now: float) -> Refused | None:
+        if not request.firm:
+            return None
+        before = [one for one in self._waiting if _order(one) < _order(request)]
+        together = sum(one.rows for one in before if not one.alone)
+        wait = self._until_free(now) + sum(self._turn_seconds(one, now) for one in before if one.alone)
+        run = self._seconds(request, now)
+        if self._turns is self.times and not request.alone:  # it may run together with those before it
+            rows = together + request.rows + request.later
+            wait += max(0.0, self.times.total(rows, now) - run)
+        else:
+            wait += self._turns.total(together, now)
+        return self._late(request, now, wait, run) if now + wait + run > request.deadline else None
+
+    def _hopeless(self, now: float) -> list[Refused]:
+        """Those that wait and can't meet their deadline any more; they wait no longer."""
+        refused = []
+        for request in tuple(self._waiting):
+            if not request.firm:
+                continue
+            wait, run = self._until_free(now), self._seconds(request, now)
+            if now + wait + run > request.deadline:
+                self._waiting.remove(request)
+                refused.append(self._late(request, now, wait, run))
+        return refused
+
+    def _until_free(self, now: float) -> float:
+        """Seconds until the running turn is expected to end."""
+        return max(0.0, self._until - now) if self._running else 0.0
+
+    def _seconds(self, request: Request, now: float) -> float:
+        """From the beginning of its turn to the actions of all rows of its message, if they run on their own."""
+        return (self._joining if request.joins else self.times).total(request.rows + request.later, now)
+
+    def _turn_seconds(self, request: Request, now: float) -> float:
+        """For how long its turn keeps others from theirs."""
+        return (self._joining if request.joins else self._turns).total(request.rows, now)
+
+    def _late(self, request: Request, now: float, wait: float, run: float) -> Refused:
+        since, deadline = now - request.arrived, request.deadline - request.arrived
+        text = (
+            f"late: {since * 1e3:.1f} ms after the request came, its answer would need {(wait + run) * 1e3:.1f} ms "
+            f"more ({wait * 1e3:.1f} ms until its turn, {run * 1e3:.1f} ms in the policy), but its deadline is "
+            f"{deadline * 1e3:.1f} ms: ask earlier, or give it more time"
+        )
+        return Refused(request, "late", text)
+
+    def _next_hopeless(self, now: float) -> float | None:
+        """When the first of those that wait can't meet its deadline any more, if nothing happens before."""
+        moments = [request.deadline - self._seconds(request, now) + LATER for request in self._waiting if request.firm]
+        return min(moments, default=None)
+
+    # --- turns --------------------------------------------------------------------------------------------------------
+
+    def decide(self, now: float) -> Decision:
+        """The next turn, if one may begin. It then runs until `freed`."""
+        refused = tuple(self._hopeless(now))
+        wake = self._next_hopeless(now)
+        if self._running or not self._waiting:
+            return Decision((), refused, wake)
+        head, exhausted = self._head()
+        group = self._company(head)
+        rows = sum(request.rows for request in group)
+        until = -math.inf if exhausted or head.alone or len(group) < self.waiting else self._window(group, rows, now)
+        if until > now:
+            return Decision((), refused, until if wake is None else min(until, wake))
+        turn = self._fitting(group, now)
+        for request in turn:
+            self._waiting.remove(request)
+        last = max(request.number for request in turn)
+        for request in self._waiting:
+            request.overtaken += request.number < last
+        self._running, self._exhausted_last = turn, exhausted
+        rows = sum(request.rows for request in turn)
+        self._until = now + (self._turns.total(rows, now) if rows > 1 else self._turn_seconds(turn[0], now))
+        refused += tuple(self._hopeless(now))  # those for whom this turn takes too long
+        return Decision(turn, refused, self._next_hopeless(now))
+
+    def _head(self) -> tuple[Request, bool]:
+        """Whose turn it is, and whether that is because it was overtaken too often: such turns aren't two in a row."""
+        exhausted = [request for request in self._waiting if request.overtaken >= OVERTAKEN]
+        others = [request for request in self._waiting if request.overtaken < OVERTAKEN]
+        if exhausted and not (self._exhausted_last and others):
+            return min(exhausted, key=lambda request: request.number), True
+        return min(others, key=_order), False
+
+    def _company(self, head: Request) -> list[Request]:
+        """The head, and behind it in their order those that may run together with it."""
+        if head.alone:
+            return [head]
+        others = (one for one in self._waiting if one is not head and not one.alone and one.priority == head.priority)
+        return [head, *sorted(others, key=_order)]
+
+    def _fitting(self, group: list[Request], now: float) -> tuple[Request, ...]:
+        """The first of a group, as many as pay and as keep the deadlines."""
+        if len(group) == 1:
+            return tuple(group)
+        rows = sum(request.rows for request in group)
+        best = self.times.best(rows, now, self._longest(group, now))
+        turn, taken = [group[0]], group[0].rows
+        for request in group[1:]:
+            if taken + request.rows > best:
+                break
+            turn.append(request)
+            taken += request.rows
+        return tuple(turn)
+
+    def _longest(self, group: Iterable[Request], now: float) -> float:
+        """Seconds that a batch may take: for the deadlines in it, and for a robot that may ask while it runs.
+
+        A robot whose deadline is shorter than two runs has no guarantee, and none is tried for it.
+        """
+        group = tuple(group)
+        alone = self.times.seconds(1, now) or 0.0
+        slacks = [one.deadline - now for one in group if one.firm]
+        sources = {request.source for request in group}
+        tight = (within - alone for source, within in self._tight.values(now).items() if source not in sources)
+        slacks += [slack for slack in tight if slack >= alone]
+        return max(alone, min(slacks, default=math.inf))
+
+    def part(self, rows: int, now: float) -> int:
+        """Of `rows` observations of one message, how many to ask for at once."""
+        return self.times.best(rows, now, self._longest((), now))
+
+    def _window(self, group: list[Request], rows: int, now: float) -> float:
+        """Until when to wait for company; it is over if that isn't later than now.
+
+        Company is waited for if it saves more time than it usually takes to come: as long as the saving, not longer
+        than a few usual gaps after the last arrival, and only while all deadlines of the group leave room for T(B).
+        """
+        expected = len(self._active.values(now).keys() - {request.source for request in group})
+        most = min(self._places - len(group), expected, self.times.measured_largest - rows)
+        if most < 1 or len(self._gaps) < GAPS // 4:
+            return -math.inf
+        gap, alone, together = median(self._gaps), self.times.total(1, now), self.times.total(rows, now)
+        opened = max(self._free_since, min(request.arrived for request in group))
+        deadline = min(request.deadline for request in group)
+        until = -math.inf
+        for more in range(1, most + 1):
+            saving = together + more * alone - self.times.total(rows + more, now)
+            safe = self.times.seconds(rows + more, now, SAFE)
+            if saving > more * gap and safe is not None:
+                until = max(until, min(opened + saving, deadline - safe))
+        return min(until, self._last_arrival + PATIENCE * gap)
+
+
+def _order(request: Request) -> tuple[int, float, int]:
+    """Who comes first: robots, then the earliest deadline, then who came first."""
+    return PRIORITIES.index(request.priority), request.deadline, request.number

@@ -1,0 +1,631 @@
+"""Whose turn it is: the decision alone, over simulated time in which a turn takes exactly what the table says."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import count
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from turbopi.serve.batch_times import FRESH_SECONDS, GAIN, KEPT, BatchTimes
+from turbopi.serve.schedule import OVERTAKEN, Priority, Refused, Request, Schedule
+
+T1 = 0.01
+PAYING = {1: 0.010, 2: 0.014, 4: 0.022, 8: 0.038}  # seconds by size, of an engine that batches
+SERIAL = {1: 0.010, 2: 0.020, 4: 0.040, 8: 0.080}  # of one that runs B observations one by one
+ROBOT: Priority = "robot"
+SIMULATOR: Priority = "simulator"
+
+
+def table(seconds: dict[int, float]) -> BatchTimes:
+    times = BatchTimes(max(seconds))
+    for size, value in seconds.items():
+        times.measured(size, value)
+    return times
+
+
+def request(
+    at: float = 0.0,
+    within: float = 1.0,
+    *,
+    firm: bool = False,
+    priority: Priority = ROBOT,
+    source: int = 0,
+    session: str | None = None,
+    rows: int = 1,
+    alone: bool = False,
+) -> Request:
+    return Request(at, at + within, firm, priority, source, session, rows, alone=alone)
+
+
+def begin(schedule: Schedule, now: float) -> list[Request]:
+    """The turn that begins now."""
+    decision = schedule.decide(now)
+    assert decision.turn, decision
+    return list(decision.turn)
+
+
+# --- simulated time ---------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Turn:
+    requests: tuple[Request, ...]
+    started: float
+    ended: float
+    waited: tuple[Request, ...]  # those that waited when it began, and weren't in it
+
+    @property
+    def rows(self) -> int:
+        return sum(one.rows for one in self.requests)
+
+
+@dataclass
+class History:
+    """What became of each request."""
+
+    turns: list[Turn] = field(default_factory=list)
+    refused: dict[Request, Refused] = field(default_factory=dict)
+    idle: float = 0.0  # seconds in which requests waited and no turn ran
+
+    def turn_of(self, one: Request) -> Turn | None:
+        found = [turn for turn in self.turns if one in turn.requests]
+        assert len(found) <= 1, "it ran twice"
+        return found[0] if found else None
+
+
+def simulate(schedule: Schedule, arrivals: Sequence[Request]) -> History:
+    """Run all arrivals through, until nothing waits."""
+    history, coming = History(), sorted(arrivals, key=lambda one: one.arrived)
+    now, ends, wake, at = 0.0, math.inf, math.inf, 0
+
+    def refuse(all_refused: Sequence[Refused]) -> None:
+        for one in all_refused:
+            assert one.request not in history.refused, "it was answered twice"
+            history.refused[one.request] = one
+
+    for _ in range(100 * len(coming) + 100):
+        arrives = coming[at].arrived if at < len(coming) else math.inf
+        then = min(arrives, ends, wake)
+        if then == math.inf:
+            assert schedule.waiting == 0 and not schedule.running, "requests wait and nothing will happen"
+            return history
+        if schedule.waiting and not schedule.running:
+            history.idle += max(0.0, then - now)
+        now = max(now, then)
+        if then == ends:
+            schedule.freed(now, history.turns[-1].ended - history.turns[-1].started)
+            ends = math.inf
+        elif then == arrives:
+            refuse(schedule.add(coming[at], now))
+            at += 1
+        decision = schedule.decide(now)
+        refuse(decision.refused)
+        if decision.turn:
+            rows = sum(one.rows for one in decision.turn)
+            ends = now + schedule.times.total(rows, now)
+            history.turns.append(Turn(decision.turn, now, ends, tuple(schedule._waiting)))
+        wake = math.inf if decision.wake is None else decision.wake
+    raise AssertionError("it never ends")
+
+
+milliseconds = st.integers(0, 400).map(lambda value: value / 1e3)
+
+
+@st.composite
+def arrivals(draw: st.DrawFn, *, plain: bool = False) -> list[Request]:
+    """Requests of up to eight sources; `plain` ones have all the same default deadline."""
+    made = []
+    for _ in range(draw(st.integers(1, 40))):
+        at, source = draw(milliseconds), draw(st.integers(0, 7))
+        if plain:
+            made.append(request(at, 1.0, source=source))
+            continue
+        firm = draw(st.booleans())
+        within = draw(st.integers(1, 300)) / 1e3 if firm else 1.0
+        made.append(
+            request(
+                at,
+                within,
+                firm=firm,
+                source=source,
+                priority=draw(st.sampled_from([ROBOT, SIMULATOR])),
+                session=draw(st.sampled_from([None, None, "a", "b"])),
+                rows=draw(st.sampled_from([1, 1, 1, 2])),
+                alone=draw(st.booleans()),
+            )
+        )
+    return made
+
+
+tables = st.sampled_from([PAYING, SERIAL, {1: T1}, {1: 0.01, 2: 0.011, 4: 0.03, 5: 0.031}])
+limits = st.integers(0, 20)
+
+
+@settings(max_examples=100, deadline=None)
+@given(arrivals(), tables, limits)
+def test_every_request_has_one_turn_or_one_refusal(made: list[Request], seconds: dict[int, float], limit: int) -> None:
+    history = simulate(Schedule(limit, table(seconds)), made)
+    for one in made:
+        assert (history.turn_of(one) is not None) != (one in history.refused)
+    for one, refused in history.refused.items():
+        assert refused.text.startswith(refused.kind) and (refused.kind != "late" or one.firm)
+        assert refused.kind != "replaced" or one.session is not None
+
+
+@settings(max_examples=100, deadline=None)
+@given(arrivals(), tables, limits)
+def test_a_turn_is_a_batch_only_where_the_table_says_it_is_sooner(
+    made: list[Request], seconds: dict[int, float], limit: int
+) -> None:
+    times = table(seconds)
+    for turn in simulate(Schedule(limit, times), made).turns:
+        assert len({one.priority for one in turn.requests}) == 1
+        if len(turn.requests) > 1:
+            assert not any(one.alone for one in turn.requests)
+            assert turn.rows <= max(seconds)
+            together = times.seconds(turn.rows, turn.started)
+            assert together is not None and together < turn.rows * T1
+
+
+@settings(max_examples=100, deadline=None)
+@given(arrivals(), tables, limits)
+def test_who_runs_meets_the_deadline_that_it_gave(made: list[Request], seconds: dict[int, float], limit: int) -> None:
+    history = simulate(Schedule(limit, table(seconds)), made)
+    for turn in history.turns:
+        for one in turn.requests:
+            assert not one.firm or turn.ended <= one.deadline + 1e-9
+
+
+@settings(max_examples=100, deadline=None)
+@given(arrivals(), tables, limits)
+def test_a_turn_is_of_the_earliest_deadline_and_of_robots_first(
+    made: list[Request], seconds: dict[int, float], limit: int
+) -> None:
+    for turn in simulate(Schedule(limit, table(seconds)), made).turns:
+        head = turn.requests[0]
+        if head.overtaken >= OVERTAKEN:
+            continue
+        fresh = [one for one in turn.waited if one.overtaken - (one.number < turn.requests[0].number) < OVERTAKEN]
+        for other in fresh:
+            assert head.priority == ROBOT or other.priority == SIMULATOR
+            if other.priority == head.priority:
+                assert head.deadline <= other.deadline
+
+
+@settings(max_examples=100, deadline=None)
+@given(arrivals(plain=True), limits)
+def test_without_deadlines_and_batches_it_is_first_come_first_served(made: list[Request], limit: int) -> None:
+    """Nobody begins later than in a line of one call at a time."""
+    history = simulate(Schedule(limit, table({1: T1})), made)
+    served = [turn.requests[0] for turn in history.turns]
+    assert served == sorted(served, key=lambda one: one.number)
+    free = 0.0
+    for turn in history.turns:
+        (one,) = turn.requests
+        assert turn.started == pytest.approx(max(free, one.arrived))
+        free = turn.ended
+    assert history.idle == 0.0
+
+
+@settings(max_examples=100, deadline=None)
+@given(arrivals(plain=True), limits)
+def test_batches_of_equal_deadlines_never_change_the_order(made: list[Request], limit: int) -> None:
+    served = [one for turn in simulate(Schedule(limit, table(PAYING)), made).turns for one in turn.requests]
+    assert served == sorted(served, key=lambda one: one.number)
+
+
+@settings(max_examples=100, deadline=None)
+@given(arrivals(), tables, limits)
+def test_only_so_many_that_came_later_go_first(made: list[Request], seconds: dict[int, float], limit: int) -> None:
+    history = simulate(Schedule(limit, table(seconds)), made)
+    for one in made:
+        before = [turn for turn in history.turns if one in turn.waited]
+        overtaking = sum(max(other.number for other in turn.requests) > one.number for turn in before)
+        assert overtaking <= OVERTAKEN + 2 * (limit + 1)
+
+
+def test_simulators_get_their_turn_beside_robots_without_end() -> None:
+    """Two robots that ask again at once would leave no turn for anybody else."""
+    schedule, numbers = Schedule(16, table({1: T1})), count()
+    simulator = request(0.0, priority=SIMULATOR, source=99)
+    schedule.add(simulator, 0.0)
+    now, turns = 0.0, 0
+    for robot in (1, 2):
+        schedule.add(request(now, source=robot), now)
+    while True:
+        (one,) = begin(schedule, now)
+        if one is simulator:
+            break
+        turns += 1
+        now += T1
+        schedule.freed(now, T1)
+        schedule.add(request(now, source=int(one.source)), now)  # type: ignore[call-overload]
+        assert next(numbers) < 100, "the simulator starves"
+    assert turns == OVERTAKEN
+
+
+def test_those_overtaken_too_often_take_every_other_turn_at_most() -> None:
+    schedule = Schedule(16, table({1: T1}))
+    simulators = [request(0.0, priority=SIMULATOR, source=10 + number) for number in range(3)]
+    for one in simulators:
+        one.overtaken = OVERTAKEN
+        schedule.add(one, 0.0)
+    for number in range(4):
+        schedule.add(request(0.0, source=number), 0.0)
+    kinds = []
+    for step in range(7):
+        (one,) = begin(schedule, step * T1)
+        kinds.append(one.priority[0])
+        schedule.freed((step + 1) * T1, T1)
+    assert "".join(kinds) == "srsrsrr"
+
+
+# --- deadlines --------------------------------------------------------------------------------------------------------
+
+
+def test_an_earlier_deadline_goes_first() -> None:
+    schedule = Schedule(16, table({1: T1}))
+    patient, urgent, plain = request(within=0.5, firm=True), request(within=0.1, firm=True), request(within=0.3)
+    for one in (patient, urgent, plain):
+        assert schedule.add(one, 0.0) == []
+    for expected in (urgent, plain, patient):
+        assert begin(schedule, 0.0) == [expected]
+        schedule.freed(0.0, T1)
+
+
+def test_what_is_hopeless_is_refused_when_it_comes_with_the_numbers() -> None:
+    schedule = Schedule(16, table({1: T1}))
+    schedule.add(request(), 0.0)
+    begin(schedule, 0.0)
+    schedule.add(request(within=0.02), 0.0)  # it goes first
+    late = request(0.004, within=0.025, firm=True)
+    (refused,) = schedule.add(late, 0.004)
+    assert refused.request is late and refused.kind == "late"
+    assert "would need 26.0 ms more (16.0 ms until its turn, 10.0 ms in the policy)" in refused.text
+    assert "its deadline is 25.0 ms" in refused.text
+    assert schedule.add(request(0.004, within=0.0265, firm=True), 0.004) == []
+
+
+def test_what_becomes_hopeless_while_it_waits_is_refused_at_that_moment() -> None:
+    schedule = Schedule(16, table({1: T1}))
+    schedule.add(request(), 0.0)
+    begin(schedule, 0.0)
+    waits = request(within=0.025, firm=True)
+    assert schedule.add(waits, 0.0) == []
+    decision = schedule.decide(0.0)
+    assert decision.refused == () and decision.wake == pytest.approx(
+        0.015, abs=1e-3
+    )  # the running turn is overdue then
+    assert decision.wake is not None
+    (refused,) = schedule.decide(decision.wake).refused
+    assert refused.request is waits and refused.kind == "late" and schedule.waiting == 0
+
+
+def test_without_a_deadline_of_its_own_nothing_is_refused_for_being_late() -> None:
+    schedule = Schedule(16, table({1: T1}))
+    waits = request(within=0.001)
+    assert schedule.add(waits, 0.0) == []
+    assert begin(schedule, 5.0) == [waits]
+
+
+def test_runs_that_join_a_chunk_have_times_of_their_own() -> None:
+    schedule = Schedule(16, table(PAYING))
+
+    def joining(within: float) -> Request:
+        one = request(within=within, firm=True, alone=True)
+        one.joins = True
+        return one
+
+    for _ in range(3):
+        schedule.add(joining(1.0), 0.0)
+        begin(schedule, 0.0)
+        schedule.freed(0.0, 0.030)
+    assert [one.kind for one in schedule.add(joining(0.029), 0.0)] == ["late"]
+    assert schedule.add(joining(0.031), 0.0) == []
+    (refused,) = schedule.add(request(within=0.035, firm=True), 0.0)  # behind the one that joins
+    assert "(30.0 ms until its turn, 10.0 ms in the policy)" in refused.text
+    begin(schedule, 0.0)
+    assert [one.kind for one in schedule.add(request(within=0.035, firm=True), 0.0)] == ["late"]
+    assert schedule.add(request(within=0.041, firm=True), 0.0) == []
+
+
+def test_before_anything_was_measured_only_the_past_is_too_late() -> None:
+    schedule = Schedule(16)
+    soon, past = request(within=1e-6, firm=True), request(0.0, within=0.1, firm=True)
+    assert schedule.add(soon, 0.0) == []
+    (refused,) = schedule.add(past, 0.2)
+    assert refused.request is past
+    assert begin(schedule, 0.0) == [soon]
+
+
+def test_all_rows_of_a_message_count_for_its_deadline() -> None:
+    schedule = Schedule(16, table({1: T1}))
+    first = request(within=0.05, firm=True)
+    first.later = 4  # 5 rows of 10 ms: just in time
+    assert schedule.add(first, 0.0) == []
+    too_many = request(within=0.05, firm=True)
+    too_many.later = 5
+    assert [one.kind for one in Schedule(16, table({1: T1})).add(too_many, 0.0)] == ["late"]
+
+
+def test_a_pipelined_policys_wait_is_shorter_than_its_answers() -> None:
+    turns = table({1: 0.004})
+    schedule = Schedule(16, table({1: T1}), turns)
+    schedule.add(request(), 0.0)
+    begin(schedule, 0.0)
+    assert schedule.add(request(within=0.015, firm=True), 0.0) == []
+    (refused,) = schedule.add(request(within=0.0135, firm=True), 0.0)
+    assert "4.0 ms until its turn, 10.0 ms in the policy" in refused.text
+
+
+# --- who gets a place -------------------------------------------------------------------------------------------------
+
+
+def test_the_newest_observation_of_a_session_replaces_the_one_that_waits_and_not_the_one_that_runs() -> None:
+    schedule = Schedule(1, table({1: T1}))
+    running, older, newer = (request(session="arm", source=number) for number in range(3))
+    schedule.add(running, 0.0)
+    assert begin(schedule, 0.0) == [running]
+    assert schedule.add(older, 0.0) == [] and schedule.waits("arm") and not schedule.waits("leg")
+    (refused,) = schedule.add(newer, 0.0)  # though there is no place beside it
+    assert refused.request is older and refused.kind == "replaced" and "session 'arm'" in refused.text
+    schedule.freed(0.01, T1)
+    assert begin(schedule, 0.01) == [newer]
+
+
+def test_a_robot_takes_the_place_of_the_last_simulator_when_all_are_taken() -> None:
+    schedule = Schedule(2, table({1: T1}))
+    schedule.add(request(), 0.0)
+    begin(schedule, 0.0)
+    first, last = (request(priority=SIMULATOR, within=within) for within in (1.0, 2.0))
+    schedule.add(first, 0.0)
+    schedule.add(last, 0.0)
+    (refused,) = schedule.add(request(priority=SIMULATOR), 0.0)
+    assert refused.request.deadline == 1.0 and refused.text.startswith("busy: 2 requests wait already")
+    (refused,) = schedule.add(request(), 0.0)
+    assert refused.request is last and refused.kind == "busy" and schedule.waiting == 2
+    schedule.add(request(), 0.0)
+    full = request()
+    assert [one.request for one in schedule.add(full, 0.0)] == [full]  # only robots are left
+
+
+def test_a_message_of_many_rows_keeps_its_place() -> None:
+    schedule = Schedule(1, table({1: T1}))
+    schedule.add(request(), 0.0)
+    begin(schedule, 0.0)
+    schedule.add(request(), 0.0)
+    part = request()
+    part.continued = True
+    assert schedule.add(part, 0.0) == []
+
+
+# --- batches ----------------------------------------------------------------------------------------------------------
+
+
+def waiting(schedule: Schedule, number: int, **of: float) -> list[Request]:
+    """So many that waited while another turn ran, which has just ended at 1.0."""
+    schedule.add(request(0.99, source=-1), 0.99)
+    begin(schedule, 0.99)
+    made = [request(0.99, source=one, **of) for one in range(number)]  # type: ignore[arg-type]
+    for one in made:
+        schedule.add(one, 0.99)
+    schedule.freed(1.0, None)
+    return made
+
+
+def test_those_that_wait_run_together_where_that_pays() -> None:
+    schedule = Schedule(16, table(PAYING))
+    made = waiting(schedule, 8)
+    assert begin(schedule, 1.0) == made
+    schedule = Schedule(16, table(SERIAL))
+    assert len(waiting(schedule, 8)) == 8 and len(begin(schedule, 1.0)) == 1
+
+
+def test_the_size_is_the_one_that_makes_the_most_a_second() -> None:
+    schedule = Schedule(16, table({1: 0.0075, 2: 0.0124, 4: 0.02, 8: 0.037}))
+    waiting(schedule, 5)
+    assert len(begin(schedule, 1.0)) == 4  # the engine would round 5 up to 8
+
+
+def test_a_batch_keeps_the_deadlines_in_it() -> None:
+    schedule = Schedule(16, table(PAYING))
+    made = waiting(schedule, 7)
+    tight = request(1.0, within=0.023, firm=True, source=50)
+    schedule.add(tight, 1.0)
+    assert begin(schedule, 1.0) == [tight, *made[:3]]  # 22 ms; one more would take 38
+
+
+def test_a_batch_is_no_longer_than_a_robot_with_a_deadline_can_wait() -> None:
+    """It asked a second ago, and may ask again while the batch runs."""
+    schedule = Schedule(16, table(PAYING))
+    schedule.add(request(0.0, within=0.03, firm=True, source=50), 0.0)
+    begin(schedule, 0.0)
+    schedule.freed(0.01, T1)
+    waiting(schedule, 8)
+    assert len(begin(schedule, 1.0)) == 2  # 14 ms, and 10 for the robot
+    later = Schedule(16, table(PAYING))
+    later.add(request(-20.0, within=0.03, firm=True, source=50), -20.0)
+    begin(later, -20.0)
+    later.freed(-19.99, T1)
+    waiting(later, 8)
+    assert len(begin(later, 1.0)) == 8
+
+
+def test_who_is_too_late_by_the_turn_that_begins_is_told_at_once() -> None:
+    schedule = Schedule(16, table({1: T1}))
+    robot = request(within=1.0)
+    simulator = request(within=0.015, firm=True, priority=SIMULATOR)
+    assert schedule.add(simulator, 0.0) == []
+    schedule.add(robot, 0.0)
+    decision = schedule.decide(0.0)
+    assert decision.turn == (robot,)
+    assert [one.request for one in decision.refused] == [simulator]
+    assert "(10.0 ms until its turn, 10.0 ms in the policy)" in decision.refused[0].text
+
+
+def test_a_deadline_that_no_turn_could_leave_room_for_limits_no_batch() -> None:
+    schedule = Schedule(16, table(PAYING))
+    schedule.add(request(0.0, within=0.019, firm=True, source=50), 0.0)
+    begin(schedule, 0.0)
+    schedule.freed(0.01, T1)
+    waiting(schedule, 8)
+    assert len(begin(schedule, 1.0)) == 8
+
+
+def test_one_that_was_in_a_failed_batch_runs_alone_in_its_place() -> None:
+    schedule = Schedule(16, table(PAYING))
+    made = waiting(schedule, 3)
+    turn = begin(schedule, 1.0)
+    schedule.freed(1.01, None)
+    for one in turn:
+        schedule.put_back(one)
+    schedule.add(request(1.01, source=9), 1.01)
+    assert [begin_and_end(schedule, 1.01)[0] for _ in range(3)] == made
+
+
+def begin_and_end(schedule: Schedule, now: float) -> list[Request]:
+    turn = begin(schedule, now)
+    schedule.freed(now, None)
+    return turn
+
+
+def test_a_message_of_several_rows_is_a_part_of_a_batch() -> None:
+    schedule = Schedule(16, table(PAYING))
+    first, pair, last = request(source=1), request(source=2, rows=2), request(source=3, rows=6)
+    for one in (first, pair, last):
+        schedule.add(one, 0.0)
+    assert begin(schedule, 0.0) == [first, pair]  # 9 rows are too many
+    assert schedule.part(20, 0.0) == 8 and schedule.part(4, 0.0) == 4
+    assert Schedule(16, table(SERIAL)).part(20, 0.0) == 1
+
+
+# --- waiting for company ----------------------------------------------------------------------------------------------
+
+
+def cohort(schedule: Schedule, rounds: int = 6, robots: int = 4, apart: float = 0.0002) -> float:
+    """Robots that asked together, again and again: the time of the last round's end."""
+    now = 0.0
+    for _ in range(rounds):
+        for robot in range(robots):
+            schedule.add(request(now, source=robot), now)
+            now += apart
+        while schedule.waiting:
+            decision = schedule.decide(now)
+            now = now if decision.turn else decision.wake or now
+            if decision.turn:
+                now += schedule.times.total(sum(one.rows for one in decision.turn), now)
+                schedule.freed(now, None)
+    return now
+
+
+def test_company_that_comes_at_once_is_waited_for_and_then_no_longer() -> None:
+    schedule = Schedule(16, table(PAYING))
+    now = cohort(schedule)
+    for robot in range(3):
+        schedule.add(request(now, source=robot), now)
+        decision = schedule.decide(now)
+        assert not decision.turn and decision.wake is not None and now < decision.wake < now + 0.002
+    schedule.add(request(now, source=3), now)
+    assert len(begin(schedule, now)) == 4  # all are there
+
+
+def test_company_that_does_not_come_is_waited_for_a_few_gaps_alone() -> None:
+    schedule = Schedule(16, table(PAYING))
+    now = cohort(schedule)
+    one = request(now, source=0)
+    schedule.add(one, now)
+    wake = schedule.decide(now).wake
+    assert wake is not None and begin(schedule, wake) == [one]
+
+
+@pytest.mark.parametrize("why", ["nobody else", "rare", "does not pay", "no slack", "no place", "another waits"])
+def test_nobody_waits_for_company_in_vain(why: str) -> None:
+    schedule = Schedule(0 if why == "no place" else 16, table(SERIAL if why == "does not pay" else PAYING))
+    now = 0.0
+    if why == "nobody else":
+        now = cohort(schedule, robots=1, rounds=40)
+    elif why == "rare":
+        for step in range(40):  # two robots, each ten times a second: a batch of two saves 6 ms
+            now = step * 0.05
+            schedule.add(request(now, source=step % 2), now)
+            begin_and_end(schedule, now)
+        now += 0.05
+    elif why == "no place":
+        for step in range(40):
+            now = step * 0.0002
+            schedule.add(request(now, source=step % 4), now)
+            begin_and_end(schedule, now)
+    else:
+        now = cohort(schedule)
+    tight = why == "no slack"
+    one = request(now, source=0, within=0.0135 if tight else 1.0, firm=tight)
+    schedule.add(one, now)
+    if why == "another waits":
+        schedule.add(request(now, source=7, priority=SIMULATOR), now)
+    assert begin(schedule, now) == [one]
+
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
+
+def test_a_size_counts_as_the_next_larger_one_that_was_measured() -> None:
+    times = table(PAYING)
+    assert [times.seconds(rows, 0.0) for rows in (1, 2, 3, 5, 8, 9)] == [0.01, 0.014, 0.022, 0.038, 0.038, None]
+
+
+def test_what_runs_replaces_what_was_measured_until_it_is_old() -> None:
+    times = table(PAYING)
+    times.ran(8, 0.2, 1.0)
+    times.ran(8, 0.2, 1.0)
+    assert times.seconds(8, 1.0) == 0.038  # two may have been disturbed
+    times.ran(8, 0.2, 1.0)
+    assert times.seconds(8, 1.0) == 0.2 and times.best(8, 1.0) == 4
+    assert times.seconds(8, 1.1 + FRESH_SECONDS) == 0.038 and times.best(8, 1.1 + FRESH_SECONDS) == 8
+
+
+def test_a_size_without_times_of_its_own_gets_them_by_running() -> None:
+    times = table(PAYING)
+    for _ in range(3):
+        times.ran(3, 0.018, 1.0)
+    assert times.seconds(3, 1.0) == 0.018 and times.seconds(4, 1.0) == 0.022
+
+
+def test_the_last_times_alone_count() -> None:
+    times = BatchTimes()
+    for number in range(2 * KEPT):
+        times.ran(1, float(number), float(number))
+    assert times.seconds(1, 99.0) == 74.0  # the median of 50 to 99
+    assert times.seconds(1, 99.0, 0.95) == 97.0
+    assert times.seconds(1, 1e6) == 74.0, "nothing better is known"
+
+
+@given(st.lists(st.floats(1e-3, 1.0), min_size=1, max_size=120), st.sampled_from([0.5, 0.95, 1.0]))
+def test_a_quantile_is_one_of_the_last_times_and_no_less_than_that_part(values: list[float], part: float) -> None:
+    times = BatchTimes()
+    for number, value in enumerate(values):
+        times.ran(1, value, float(number))
+    last, found = values[-KEPT:], times.seconds(1, float(len(values)), part)
+    assert found in last
+    assert found is not None and sum(value <= found for value in last) >= part * len(last)
+
+
+def test_without_measurements_there_are_no_batches() -> None:
+    times = BatchTimes(8)
+    times.ran(1, 0.01, 0.0)
+    assert times.best(8, 0.0) == 1 and times.measured_largest == 1
+
+
+def test_a_size_that_failed_is_not_formed_any_more() -> None:
+    times = table(PAYING)
+    times.failed(8)
+    assert times.best(8, 0.0) == 4 and times.measured_largest == 4
+    times.failed(2)
+    assert times.best(8, 0.0) == 1
+
+
+def test_a_gain_of_a_few_percent_is_none() -> None:
+    assert table({1: 0.01, 2: 0.02 * GAIN}).best(2, 0.0) == 1
+    assert table({1: 0.01, 2: 0.0199 * GAIN}).best(2, 0.0) == 2
