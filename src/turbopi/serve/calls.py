@@ -35,14 +35,23 @@ class Outcome:
     """What became of one call: a `result`, or what is `wrong` and the `text` about it.
 
     wrong   "observation": the client's fault; "actions": the model gave none that a robot may get; "lost": the device
-            failed for good; "policy": anything else, and `text` is the traceback
+            failed for good; "replica": of several processes the one that had this call gave no answer; "policy":
+            anything else, and `text` is the traceback
     seconds in the policy
     """
 
     seconds: float
     result: dict[str, Any] | None = None
-    wrong: Literal["observation", "actions", "lost", "policy"] | None = None
+    wrong: Literal["observation", "actions", "lost", "replica", "policy"] | None = None
     text: str = ""
+
+
+class Calls(Protocol):
+    """Where a server has its requests computed: PolicyCalls, in this process, or the replicas of a fleet."""
+
+    async def warm_up(self, **arguments: Any) -> None: ...
+
+    async def run(self, observation: dict[str, Any], arguments: dict[str, Any]) -> Outcome: ...
 
 
 class PolicyCalls:

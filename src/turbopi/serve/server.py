@@ -29,7 +29,7 @@ from websockets.frames import CloseCode
 
 from turbopi.errors import ConfigError, DeviceLost, ObservationError
 from turbopi.recordings import Recorder
-from turbopi.serve.calls import Outcome, Policy, PolicyCalls
+from turbopi.serve.calls import Calls, Outcome, Policy, PolicyCalls
 from turbopi.serve.connection import GuardedConnection, Shared
 from turbopi.serve.gate import Gate
 from turbopi.serve.hosts import AllowedHosts
@@ -51,6 +51,7 @@ _REFUSALS = {
     "observation": "bad observation: {}",
     "actions": "bad actions: {}",
     "lost": "the device is lost: {}",
+    "replica": "the replica is lost: {}",
 }
 LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers look seldom
 LARGE = 2**20  # bytes of a message that is decoded beside the event loop
@@ -77,13 +78,20 @@ class PolicyServer:
 
     options  what it is asked for; `given` are ServerOptions' fields, instead of its own
     limits   what else a client may cost; its `clients` and `message_bytes` are those of the options
+    calls    what runs the requests, if not the policy in this process, of which then the metadata alone is used
 
     `host` and `port` are where it listens; port 0 becomes the free one that it took, once started. Raises ConfigError
     for options that can't be right.
     """
 
     def __init__(
-        self, policy: Policy, options: ServerOptions | None = None, *, limits: Limits | None = None, **given: Any
+        self,
+        policy: Policy,
+        options: ServerOptions | None = None,
+        *,
+        limits: Limits | None = None,
+        calls: Callable[[Metrics], Calls] | None = None,
+        **given: Any,
     ) -> None:
         self.options = options = replace(options or ServerOptions(), **given)
         self.host, self.port = options.host, options.port
@@ -98,7 +106,11 @@ class PolicyServer:
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
         self._worker = Worker(options.queue_limit)
-        self._calls = PolicyCalls(policy, self._worker, self.metrics, on_lost=self._lose)
+        self._calls: Calls = (
+            PolicyCalls(policy, self._worker, self.metrics, on_lost=self._lose)
+            if calls is None
+            else calls(self.metrics)
+        )
         self._real_time = RealTime(policy.metadata, options, self.metrics)
         self._lost: Future[str] = Future()  # set from the worker's thread
         self.metrics.watch(lambda: self._worker.waiting, lambda: self._worker.running)

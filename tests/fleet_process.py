@@ -1,0 +1,91 @@
+"""A Ray of its own with a fleet of fake policies, as a process that tests command: a line in, a line out, both JSON.
+
+    {"do": "deploy", "generation": 2}     replace the replicas by those of another generation
+    {"do": "deploy", "generation": null}  by some that can't start
+    {"do": "room", "replicas": 2}         whether that many GPUs are free
+    {"do": "build", "arguments": {…}}     the application of `serve run`, behind Ray Serve's proxy
+
+The answer has "error" and its "text" if something was raised. The first line out has the addresses.
+"""
+
+import json
+import os
+import socket
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from turbopi.errors import CheckpointError, DeviceLost, ObservationError, TurboPiError
+from turbopi.serve import fleet, running
+from turbopi.serve.ray_app import build
+
+NAME = "fakes"
+OPTIONS = fleet.FleetOptions(NAME, "fake", replicas=2, cpus=0.25)
+
+
+class FakePolicy:
+    """Says which process answered. The prompt "hold FILE" waits until FILE.go is there, once it has made FILE."""
+
+    def __init__(self, generation: int | None) -> None:
+        if generation is None:
+            raise CheckpointError("the weights are damaged: nothing to be done")
+        self.generation = generation
+        self.metadata: dict[str, Any] = {"policy": "fake", "action_horizon": 2}
+
+    def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
+        if "observation/state" not in obs:
+            raise ObservationError("the key 'observation/state' is missing")
+        what, _, name = str(obs.get("prompt", "")).partition(" ")
+        if what == "hold":
+            Path(name).write_text(str(os.getpid()))
+            while not Path(f"{name}.go").exists():
+                time.sleep(0.02)
+        if what == "lost":
+            raise DeviceLost("CUDA error: an illegal memory access was encountered")
+        state = np.asarray(obs["observation/state"])
+        return {"actions": np.stack([state, state]), "pid": os.getpid(), "generation": self.generation}
+
+
+def deploy(generation: int | None) -> None:
+    fleet.deploy(fleet.replicas(partial(FakePolicy, generation), OPTIONS, warm=None), NAME, tell=lambda text: None)
+
+
+def command(do: str, **given: Any) -> dict[str, Any]:
+    if do == "deploy":
+        deploy(given["generation"])
+    elif do == "room":
+        fleet.check_room(fleet.FleetOptions("gpus", "gpus", replicas=given["replicas"], use_gpus=True))
+    else:
+        assert do == "build"
+        fleet.import_ray()[1].run(build(given["arguments"]), name="whole", route_prefix="/")
+    return {}
+
+
+def say(**fields: Any) -> None:
+    print(f"@{json.dumps(fields)}", flush=True)  # Ray writes here, too
+
+
+def main() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        http = free.getsockname()[1]
+    assert fleet.connect()
+    ray, serve = fleet.import_ray()
+    serve.start(proxy_location="HeadOnly", http_options={"port": http}, logging_config=fleet.QUIET)
+    deploy(1)
+    policies = fleet.Fleet.attach(NAME)
+    with running(policies, calls=policies.calls) as server:
+        say(url=server.url, proxy=f"ws://127.0.0.1:{http}", port=server.port, http=http)
+        for line in sys.stdin:
+            try:
+                say(**command(**json.loads(line)))
+            except TurboPiError as error:
+                say(error=type(error).__name__, text=str(error))
+    ray.shutdown()
+
+
+if __name__ == "__main__":
+    main()
