@@ -34,6 +34,7 @@ from turbopi.serve.worker import Busy
 logger = logging.getLogger(__name__)
 
 RAY = SpecifierSet(">=2.60,<3")
+ROUTER = "turbopi.serve.ray_router.FewestRequests"
 DEPLOYMENT = "policy"  # the replicas' name inside of their application
 HEALTH_PERIOD = 2.0  # seconds between Ray Serve's questions to a replica
 DRAIN_SECONDS = 30.0  # that a replica which is replaced may take for the requests that it has
@@ -178,6 +179,8 @@ def _running(name: str) -> int:
 def replicas(make_policy: Callable[[], Policy], options: FleetOptions, *, warm: Mapping[str, Any] | None) -> Any:
     """The replicas as a Ray Serve application; `make_policy` and `warm` are Replica's. Raises ConfigError."""
     _, serve = import_ray()
+    from ray.serve.config import RequestRouterConfig
+
     count, use_gpus = planned(options)
     scale: dict[str, Any] = {"num_replicas": count}
     if options.autoscaling is not None:
@@ -192,6 +195,7 @@ def replicas(make_policy: Callable[[], Policy], options: FleetOptions, *, warm: 
             graceful_shutdown_timeout_s=DRAIN_SECONDS,
             graceful_shutdown_wait_loop_s=POLL_SECONDS,
             max_constructor_retry_count=START_TRIES,
+            request_router_config=RequestRouterConfig(request_router_class=ROUTER),
             **scale,
         )(Replica)
     except (ValueError, TypeError) as error:
