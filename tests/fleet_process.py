@@ -72,13 +72,16 @@ def say(**fields: Any) -> None:
 def main() -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         http = free.getsockname()[1]
-    assert fleet.connect()
     ray, serve = fleet.import_ray()
+    os.environ.update(fleet.STARTED_HERE)
+    ray.init(address="local", num_cpus=4, include_dashboard=False, object_store_memory=fleet.OBJECT_STORE_BYTES)
+    assert not fleet.connect()
     serve.start(proxy_location="HeadOnly", http_options={"port": http}, logging_config=fleet.QUIET)
     deploy(1)
     policies = fleet.Fleet.attach(NAME)
     with running(policies, calls=policies.calls) as server:
-        say(url=server.url, proxy=f"ws://127.0.0.1:{http}", port=server.port, http=http)
+        cluster = ray.get_runtime_context().gcs_address
+        say(url=server.url, proxy=f"ws://127.0.0.1:{http}", port=server.port, http=http, cluster=cluster)
         for line in sys.stdin:
             try:
                 say(**command(**json.loads(line)))

@@ -13,6 +13,7 @@ import pytest
 from cli_helpers import refusal, text_of, turbopi
 from serve_fakes import FakePolicy, observation
 
+from turbopi.cli.serve_ray import check_fits, check_runs
 from turbopi.errors import ConfigError
 from turbopi.serve import PolicyServer, ray_app
 from turbopi.serve.calls import Outcome
@@ -141,6 +142,20 @@ def test_another_version_of_ray_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
 )
 def test_options_that_contradict_each_other_are_refused(options: tuple[str, ...], words: str) -> None:
     assert words in refusal(turbopi(*TINY, "--port", "0", *options))
+
+
+def test_what_does_not_run_is_not_updated() -> None:
+    check_runs("arms", ["arms", "legs"])
+    with pytest.raises(ConfigError, match="no fleet 'arm' runs on this machine's Ray cluster; there: arms, legs"):
+        check_runs("arm", ["arms", "legs"])
+    with pytest.raises(ConfigError, match="none does"):
+        check_runs("arm", [])
+
+
+def test_weights_with_chunks_of_another_length_are_no_update() -> None:
+    check_fits({"action_horizon": 10}, 10)
+    with pytest.raises(ConfigError, match="the running fleet's chunks have 10 actions, this checkpoint's 50"):
+        check_fits({"action_horizon": 10}, 50)
 
 
 def test_the_help_shows_a_fleet() -> None:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 from serve_fakes import http_get
+from test_cli_serve import serving
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -292,3 +293,33 @@ def test_serve_run_speaks_the_same_protocol_behind_rays_proxy(fleet: FleetProces
         assert closed.value.rcvd is None or closed.value.rcvd.code == 1009
     metrics = asyncio.run(http_get(http, "/metrics", "Connection: close", "Authorization: Api-Key k3y"))
     assert metrics[0] == 200 and 'turbopi_replica_inference_seconds_count{checkpoint="pi05_tiny"' in metrics[2]
+
+
+def test_the_command_serves_and_updates_a_fleet_of_a_cluster(
+    fleet: FleetProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", fleet.addresses["cluster"])
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    frame = load_frames()[0]
+    observation = {"observation/image": frame.base, "observation/wrist_image": frame.wrist, "prompt": "pick it up"}
+    with serving("--ray", "--replicas", "1", "--no-warmup") as (process, url, printed):
+        assert "Fleet pi05_tiny: 1 replica of pi05_tiny, on CPUs; loading and warming up …\n" in printed
+        with connect(url, compression=None, open_timeout=MOST_SECONDS) as connection:
+            robot = Robot(connection)
+            connection.send(pack({**observation, "observation/state": frame.state}))
+            before = robot.answer()
+            assert updated("pi05_tiny").stdout.endswith("Updated: 1 of 1 replicas run pi05_tiny.\n")
+            connection.send(pack({**observation, "observation/state": frame.state}))
+            after = robot.answer()
+        assert isinstance(before, dict) and isinstance(after, dict)
+        assert not np.array_equal(before["actions"], after["actions"])
+        process.send_signal(signal.SIGINT)
+        assert process.wait(MOST_SECONDS) == 0
+
+
+def updated(name: str) -> "subprocess.CompletedProcess[str]":
+    """`turbopi serve --update` with other weights than the tests' own."""
+    weights = ("--random-weights", "pi05_tiny", "--weights-seed", "1", "--steps", "2", "--no-warmup")
+    command = [sys.executable, "-m", "turbopi.cli", "serve", *weights, "--ray", "--update", "--fleet", name]
+    return subprocess.run(command, capture_output=True, text=True, timeout=MOST_SECONDS, check=False)

@@ -1,6 +1,6 @@
 """`turbopi serve --ray`: the options of a fleet, and its start and end."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -96,7 +96,7 @@ class FleetWishes:
         if len(several) > 1:
             raise ConfigError(f"{' and '.join(several)} each say how many replicas there are: give one of them")
         if self.update and self.name is None:
-            raise ConfigError("--update needs the running fleet's name: --fleet NAME (`serve status` lists them)")
+            raise ConfigError("--update needs the running fleet's name: --fleet NAME")
 
     def options(self, policy: PolicyOptions, checkpoint: str | None, queue_limit: int) -> "FleetOptions":
         """The fleet's options. Raises ConfigError."""
@@ -139,8 +139,9 @@ def serve_fleet(
     policy.tell_if_random(opened, output)
     make = partial(make_policy, _for_workers(policy), _absolute(checkpoint), strict)
     with _cluster(output.console) as ours:
-        if wishes.update and (ours or not fleet.runs(options.name)):
-            raise ConfigError(f"no fleet {options.name!r} runs on this Ray cluster (`serve status` lists them)")
+        if wishes.update:
+            check_runs(options.name, [] if ours else fleet.names())
+            check_fits(fleet.Fleet.attach(options.name).metadata, opened.config.model.action_horizon)
         fleet.check_room(options)
         application = fleet.replicas(make, options, warm=warm_up_of(warmup, server.execution))
         count, use_gpus = fleet.planned(options)
@@ -159,6 +160,22 @@ def serve_fleet(
         finally:
             if not wishes.update:
                 fleet.delete(options.name)
+
+
+def check_runs(name: str, running: list[str]) -> None:
+    """Raise ConfigError unless there is something to update."""
+    if name not in running:
+        there = f"there: {', '.join(running)}" if running else "none does"
+        raise ConfigError(f"no fleet {name!r} runs on this machine's Ray cluster; {there}")
+
+
+def check_fits(metadata: Mapping[str, object], horizon: int) -> None:
+    """Raise ConfigError for new weights whose chunks have another length: robots know that of the old ones."""
+    if metadata.get("action_horizon") != horizon:
+        raise ConfigError(
+            f"the running fleet's chunks have {metadata.get('action_horizon')} actions, this checkpoint's {horizon}: "
+            "start another fleet for it"
+        )
 
 
 def make_policy(options: PolicyOptions, checkpoint: str | None, strict: bool) -> "UnifiedPolicy":

@@ -119,7 +119,10 @@ def connect() -> bool:
         return False
     except ConnectionError as error:
         if address := os.environ.get("RAY_ADDRESS"):
-            raise ConfigError(f"no Ray cluster answers at RAY_ADDRESS={address}: {error}") from error
+            raise ConfigError(
+                f"no Ray cluster answers at RAY_ADDRESS={address}: {error}. One that has a token needs it here, too, "
+                "in ~/.ray/auth_token, with RAY_AUTH_MODE=token in the environment"
+            ) from error
     except (RuntimeError, ValueError) as error:  # other versions of Ray or Python there, an address that is none
         raise ConfigError(f"Ray's cluster can't be joined: {error}") from error
     ray.init(address="local", include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, **quiet)
@@ -151,15 +154,14 @@ def check_room(options: FleetOptions) -> None:
         if count * each > have + 1e-6:
             raise BackendUnavailable(
                 f"{count} replicas of {each:g} {kind} don't fit: Ray's cluster has {total.get(kind, 0.0):g}, of which "
-                f"{have:g} are free. Ask for fewer replicas, add machines (`ray start`), or end what takes them "
-                "(`ray status`)"
+                f"{have:g} are free. Ask for fewer replicas, add machines (`ray start`), or end what takes them"
             )
 
 
-def runs(name: str) -> bool:
-    """Whether there is a fleet of that name."""
+def names() -> list[str]:
+    """The fleets, and whatever else Ray Serve runs on the cluster."""
     _, serve = import_ray()
-    return name in serve.status().applications
+    return sorted(serve.status().applications)
 
 
 def delete(name: str) -> None:

@@ -41,6 +41,7 @@ PROXY_MB = 16.0  # of a message: what Ray Serve's proxy takes
 AHEAD_BYTES = 64 * 2**20  # that a client may send while its requests wait: Ray's proxy reads all that comes
 PASSED_ON = ("authorization", "origin")
 HTTP_SECONDS = 30.0
+CLOSE_SECONDS = 1.0  # for the server to see that a client has left, before the connection is cut
 
 
 class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -277,6 +278,7 @@ async def _websocket(port: int, scope: Scope, receive: Receive, send: Send) -> N
             compression=None,
             max_size=None,
             ping_interval=None,
+            close_timeout=CLOSE_SECONDS,
             user_agent_header=None,
             proxy=None,
         )
