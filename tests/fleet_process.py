@@ -2,6 +2,7 @@
 
     {"do": "deploy", "generation": 2}     replace the replicas by those of another generation
     {"do": "deploy", "generation": null}  by some that can't start
+                                          (with "autoscaling": as many as Ray Serve thinks right)
     {"do": "room", "replicas": 2}         whether that many GPUs are free
     {"do": "build", "arguments": {…}}     the application of `serve run`, behind Ray Serve's proxy
 
@@ -20,11 +21,11 @@ from typing import Any
 import numpy as np
 
 from turbopi.errors import CheckpointError, DeviceLost, ObservationError, TurboPiError
+from turbopi.running_chunk import RunningChunk
 from turbopi.serve import fleet, running
 from turbopi.serve.ray_app import build
 
-NAME = "fakes"
-OPTIONS = fleet.FleetOptions(NAME, "fake", replicas=2, cpus=0.25)
+NAME, HORIZON = "fakes", 10
 
 
 class FakePolicy:
@@ -34,9 +35,12 @@ class FakePolicy:
         if generation is None:
             raise CheckpointError("the weights are damaged: nothing to be done")
         self.generation = generation
-        self.metadata: dict[str, Any] = {"policy": "fake", "action_horizon": 2}
+        real_time = {"modes": ["rtc"], "trained_max_delay": 0, "execution_horizon": None}
+        self.metadata: dict[str, Any] = {"policy": "fake", "action_horizon": HORIZON, "real_time": real_time}
 
-    def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
+    def infer(
+        self, obs: dict[str, Any], *, previous: RunningChunk | None = None, model_actions: bool = False
+    ) -> dict[str, Any]:
         if "observation/state" not in obs:
             raise ObservationError("the key 'observation/state' is missing")
         what, _, name = str(obs.get("prompt", "")).partition(" ")
@@ -46,17 +50,21 @@ class FakePolicy:
                 time.sleep(0.02)
         if what == "lost":
             raise DeviceLost("CUDA error: an illegal memory access was encountered")
-        state = np.asarray(obs["observation/state"])
-        return {"actions": np.stack([state, state]), "pid": os.getpid(), "generation": self.generation}
+        actions = np.tile(np.asarray(obs["observation/state"]), (HORIZON, 1))
+        result = {"actions": actions, "pid": os.getpid(), "generation": self.generation}
+        result["left_over"] = 0 if previous is None else len(previous.left_over)
+        return result | ({"model_actions": actions.astype(np.float32)} if model_actions else {})
 
 
-def deploy(generation: int | None) -> None:
-    fleet.deploy(fleet.replicas(partial(FakePolicy, generation), OPTIONS, warm=None), NAME, tell=lambda text: None)
+def deploy(generation: int | None, autoscaling: dict[str, Any] | None = None) -> None:
+    replicas = 2 if autoscaling is None else None
+    options = fleet.FleetOptions(NAME, "fake", replicas=replicas, cpus=0.25, autoscaling=autoscaling)
+    fleet.deploy(fleet.replicas(partial(FakePolicy, generation), options, warm=None), NAME, tell=lambda text: None)
 
 
 def command(do: str, **given: Any) -> dict[str, Any]:
     if do == "deploy":
-        deploy(given["generation"])
+        deploy(**given)
     elif do == "room":
         fleet.check_room(fleet.FleetOptions("gpus", "gpus", replicas=given["replicas"], use_gpus=True))
     else:

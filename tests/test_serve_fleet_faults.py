@@ -173,7 +173,7 @@ def processes(robot: Robot, count: int = 2, apart_from: int | None = None) -> se
 
 def test_the_greeting_and_errors_are_the_servers(fleet: FleetProcess) -> None:
     with fleet.robot() as robot:
-        assert robot.metadata == {"policy": "fake", "action_horizon": 2, "fleet": "fakes"}
+        assert (robot.metadata["policy"], robot.metadata["fleet"]) == ("fake", "fakes")
         robot.connection.send(pack({"prompt": ""}))
         assert robot.answer() == "bad observation: the key 'observation/state' is missing"
         robot.connection.send(b"\xc1")
@@ -204,6 +204,23 @@ def test_a_killed_replica_costs_the_request_that_it_had_and_comes_back(fleet: Fl
         for robot in (unlucky, other):  # over the same connections
             assert robot.actions()["pid"] != killed
         assert len(processes(other, 2, killed)) == 2
+
+
+def test_a_session_outlives_the_replica_that_computed_its_chunk(fleet: FleetProcess) -> None:
+    def ask(robot: Robot, step: int) -> dict[str, Any] | str:
+        keys = {"session": "arm", "mode": "rtc", "step": step, "delay": 1}
+        observation = {"observation/state": np.arange(8.0), **{f"turbopi/{key}": value for key, value in keys.items()}}
+        robot.connection.send(pack(observation))
+        return robot.answer()
+
+    with fleet.robot() as robot, fleet.robot() as same_arm:
+        first = ask(robot, 0)
+        assert isinstance(first, dict) and not first["real_time"]["joined"]
+        os.kill(first["pid"], signal.SIGKILL)
+        second = wait_for(lambda: isinstance(answer := ask(same_arm, 2), dict) and answer)
+        assert second["pid"] != first["pid"]
+        assert second["real_time"]["joined"] and second["left_over"] == 10 - 2
+        processes(robot, 2, first["pid"])
 
 
 def test_under_load_a_killed_replica_costs_each_robot_one_request_at_most(fleet: FleetProcess) -> None:
@@ -240,7 +257,9 @@ def test_an_update_that_cannot_start_says_why_and_leaves_a_replica_serving(fleet
     assert "the weights are damaged: nothing to be done" in said["text"] and "\n" not in said["text"]
     with fleet.robot() as robot:
         assert robot.actions()["generation"] == 2
-    assert fleet.do("deploy", generation=3) == {}
+    said = fleet.do("deploy", generation=3, autoscaling={"min_replicas": 3, "max_replicas": 1})
+    assert said["error"] == "ConfigError" and "Ray Serve refuses the fleet's options" in said["text"]
+    assert fleet.do("deploy", generation=3, autoscaling={"min_replicas": 2, "max_replicas": 3}) == {}
 
 
 def test_a_lost_device_ends_its_replica_alone(fleet: FleetProcess) -> None:

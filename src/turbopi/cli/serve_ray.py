@@ -1,5 +1,6 @@
 """`turbopi serve --ray`: the options of a fleet, and its start and end."""
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -133,6 +134,7 @@ def serve_fleet(
     from turbopi.serve import fleet
     from turbopi.serve.ray_app import warm_up_of
 
+    os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")  # what asks Ray after its end mustn't start another one
     fleet.import_ray()
     options = wishes.options(policy, checkpoint, server.queue_limit)
     opened = policy.open(checkpoint)  # what is wrong with it shows here, not in a replica's log
@@ -193,7 +195,7 @@ def _cluster(console: Console) -> Iterator[bool]:
     try:
         yield ours
     finally:
-        fleet.import_ray()[0].shutdown()
+        fleet.disconnect()
 
 
 def _for_workers(options: PolicyOptions) -> PolicyOptions:

@@ -129,6 +129,12 @@ def connect() -> bool:
     return True
 
 
+def disconnect() -> None:
+    """Leave the cluster; one that was started here ends."""
+    ray, _ = import_ray()
+    ray.shutdown()
+
+
 def planned(options: FleetOptions) -> tuple[int, bool]:
     """How many replicas there are to be (with autoscaling, at first), and whether each has a GPU."""
     ray, _ = import_ray()
@@ -284,6 +290,7 @@ class RemoteCalls:
 
     async def run(self, observation: dict[str, Any], arguments: dict[str, Any]) -> Outcome:
         """One request. Cancelled, it is at the replica too, unless it runs already. Raises Busy."""
+        from grpc import RpcError
         from ray.exceptions import RayActorError, RayTaskError
         from ray.serve.exceptions import BackPressureError, DeploymentUnavailableError
 
@@ -303,7 +310,7 @@ class RemoteCalls:
             return self._lost(asked, f"there is none: {error.message}")
         except RayTaskError:  # raised by our code there
             raise
-        except RayActorError:
+        except (RayActorError, RpcError):
             return self._lost(asked, "its process ended, or can't be reached, during this request; ask again")
         if answer.outcome is None:
             raise Busy
