@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from cli_helpers import refusal, text_of, turbopi
 from serve_fakes import FakePolicy, observation
+from websockets.sync.client import connect
 
 from turbopi.cli.serve_ray import check_fits, check_runs
+from turbopi.client import RealTimeClient, ServerRefused
 from turbopi.errors import ConfigError
-from turbopi.serve import PolicyServer, ray_app
+from turbopi.serve import PolicyServer, ray_app, running
 from turbopi.serve.calls import Outcome
 from turbopi.serve.fleet import FleetOptions, import_ray, reason_in
 from turbopi.serve.ray_app import Arguments, build, gpus_for, name_of, read_autoscaling, relay
@@ -108,6 +110,43 @@ def test_a_lost_device_is_told_and_ends_the_process() -> None:
         await ended.wait()
 
     replicated(test, end=ended.set)
+
+
+class SecondTimeWell:
+    """Where requests are computed: the replica of the first one ends."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    async def warm_up(self, **arguments: Any) -> None: ...
+
+    async def run(self, observation: dict[str, Any], arguments: dict[str, Any]) -> Outcome:
+        self.asked += 1
+        if self.asked == 1:
+            return Outcome(0.0, wrong="replica", text="its process ended during this request; ask again")
+        return Outcome(0.0, result={"actions": np.zeros((2, 8))})
+
+
+def test_a_robot_is_told_of_a_lost_replica_and_keeps_its_connection() -> None:
+    with running(FakePolicy(), calls=lambda metrics: SecondTimeWell()) as server, connect(server.url) as connection:
+        connection.recv()
+        connection.send(pack(observation()))
+        assert connection.recv() == "the replica is lost: its process ended during this request; ask again"
+        connection.send(pack(observation()))
+        assert unpack(cast(bytes, connection.recv()))["actions"].shape == (2, 8)
+        assert server.metrics.errors_so_far() == {"replica": 1}
+
+
+def test_our_client_keeps_its_connection_too() -> None:
+    with (
+        running(FakePolicy(), calls=lambda metrics: SecondTimeWell()) as server,
+        RealTimeClient("127.0.0.1", server.port) as client,
+    ):
+        socket = client._socket
+        with pytest.raises(ServerRefused, match="the replica is lost: its process ended"):
+            client.infer(observation())
+        client.infer(observation())
+        assert client._socket is socket
 
 
 # --- what may be asked of a fleet -------------------------------------------------------------------------------------

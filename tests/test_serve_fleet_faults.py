@@ -9,6 +9,7 @@ import contextlib
 import importlib.util
 import json
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -34,6 +35,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 MOST_SECONDS = 120.0
+TOKEN = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}  # else Ray writes one into the home folder
 
 
 class FleetProcess:
@@ -132,7 +134,7 @@ def fleet() -> Iterator[FleetProcess]:
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        env=os.environ | TOKEN | {"PYTHONPATH": os.pathsep.join(sys.path)},
         start_new_session=True,
     ) as process:
         try:
@@ -318,8 +320,9 @@ def test_the_command_serves_and_updates_a_fleet_of_a_cluster(
     fleet: FleetProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RAY_ADDRESS", fleet.addresses["cluster"])
-    monkeypatch.setenv("RAY_AUTH_MODE", "token")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    for name, value in TOKEN.items():
+        monkeypatch.setenv(name, value)
     frame = load_frames()[0]
     observation = {"observation/image": frame.base, "observation/wrist_image": frame.wrist, "prompt": "pick it up"}
     with serving("--ray", "--replicas", "1", "--no-warmup") as (process, url, printed):
