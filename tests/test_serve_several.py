@@ -53,6 +53,12 @@ def pays(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
+def times_of(server: PolicyServer) -> BatchTimes:
+    """T(B), of a server that computes itself."""
+    assert isinstance(server._calls, PolicyCalls)
+    return server._calls.times
+
+
 def asks(prompt: str, **keys: Any) -> bytes:
     return pack({**observation(prompt), **{f"turbopi/{key}": value for key, value in keys.items()}})
 
@@ -331,7 +337,7 @@ def test_one_that_spoils_a_batch_is_refused_alone(fault: str) -> None:
             assert isinstance(text, str) and text.startswith(expected[fault])
             assert len(policy.batches) == 1
             if fault == "crash":
-                assert server._calls.times.measured_largest == 8  # not the batch's fault
+                assert times_of(server).measured_largest == 8  # not the batch's fault
                 with pytest.raises(ConnectionClosedError):
                     await waiting[1].recv()
             policy.started.clear()
@@ -363,7 +369,7 @@ def test_batches_that_fail_for_themselves_are_given_up_and_their_observations_ru
             waiting = [await line.wait("short" if how != "raises" else str(number)) for number in range(2)]
             await line.go()
             assert [isinstance(await answer(one), dict) for one in waiting] == [True, True]
-            assert len(policy.batches) == 1 and server._calls.times.measured_largest == 1
+            assert len(policy.batches) == 1 and times_of(server).measured_largest == 1
 
     served(test, policy_class=BatchingFakePolicy)
 
@@ -421,11 +427,11 @@ def test_batches_are_measured_at_warm_up_and_no_larger_ones_than_asked_for_are_r
     monkeypatch.setattr("turbopi.serve.calls.SIZE_SECONDS", float("inf"))
     policy = BatchingFakePolicy()
     with running(policy, max_batch=6) as server:
-        assert server._calls.times.sizes == [1, 2, 4, 6]
+        assert times_of(server).sizes == [1, 2, 4, 6]
         assert {len(batch) for batch in policy.batches} == {2, 4, 6} and set(policy.seen) == {"example"}
     policy = BatchingFakePolicy()
     with running(policy) as server:
-        assert server._calls.times.sizes == [1, 2, 4, 8]
+        assert times_of(server).sizes == [1, 2, 4, 8]
     policy = BatchingFakePolicy()
     with running(policy, max_batch=1):
         assert policy.seen == []
@@ -439,7 +445,7 @@ def test_batches_that_would_take_long_to_measure_are_not_formed() -> None:
 
     policy = Slow()
     with running(policy) as server:
-        assert server._calls.times.measured_largest == 1 and len(policy.seen) == 1
+        assert times_of(server).measured_largest == 1 and len(policy.seen) == 1
 
 
 def test_a_size_that_fails_at_warm_up_is_left_out_or_refused_if_it_was_asked_for(
@@ -454,7 +460,7 @@ def test_a_size_that_fails_at_warm_up_is_left_out_or_refused_if_it_was_asked_for
             return super().infer_batch(observations)
 
     with running(Small()) as server:
-        assert server._calls.times.measured_largest == 2
+        assert times_of(server).measured_largest == 2
     with (
         pytest.raises(ConfigError, match=r"batches of 4 fail: RuntimeError: out of memory. Choose a smaller --max-b"),
         running(Small(), max_batch=8),
@@ -659,7 +665,7 @@ def test_a_pipelined_policys_times_are_learned_from_its_answers() -> None:
     async def test(server: PolicyServer, policy: PipelinedFakePolicy) -> None:
         async with client(server) as connection:
             reply = await infer(connection, observation("one"))
-        seconds = server._calls.times.seconds(1, time.perf_counter())
+        seconds = times_of(server).seconds(1, time.perf_counter())
         assert seconds is not None and seconds * 1e3 == pytest.approx(reply["server_timing"]["infer_ms"])
 
     served(test, policy_class=PipelinedFakePolicy)
@@ -701,7 +707,7 @@ def test_a_message_whose_client_left_or_whose_server_stops_runs_no_more_rows() -
 def test_a_late_message_of_many_rows_says_all_of_them() -> None:
     async def test(server: PolicyServer, policy: FakePolicy) -> None:
         for _ in range(3):
-            server._calls.times.measured(1, 0.01)
+            times_of(server).measured(1, 0.01)
         async with client(server) as connection:
             text = await refused(connection, pack(batch(20, **{"turbopi/deadline_ms": 150})))
             assert "200.0 ms in the policy), but its deadline is 150.0 ms" in text

@@ -107,7 +107,7 @@ class RealTimeClient:
         for beginning, kind in _REFUSALS.items():
             if text.startswith(beginning):
                 raise kind(_printable(text.removeprefix(beginning)))
-        if not text.startswith("busy: "):
+        if not text.startswith(("busy: ", "the replica is lost: ")):
             self._drop()  # a server that sends a traceback closes the connection
         last = (text.strip().splitlines() or ["nothing"])[-1]
         raise ServerRefused(f"the policy server at {self.url} sent no actions but: {_printable(last)}")

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from turbopi.errors import ConfigError
+from turbopi.serve.options import key_in
 
 # hidden from --help: `ps` shows a key on the command line to everyone on the machine
 ApiKey = Annotated[str | None, typer.Option("--api-key", envvar="TURBOPI_API_KEY", metavar="KEY", hidden=True)]
@@ -28,12 +29,4 @@ def chosen_key(given: str | None, file: Path | None) -> str | None:
         return given
     if given is not None:
         raise ConfigError("--api-key-file was given, and a key besides it (TURBOPI_API_KEY or --api-key); give one")
-    try:
-        key = file.read_bytes()[:10_000].decode("ascii").strip()
-    except OSError as error:
-        raise ConfigError(f"the API key can't be read from {file}: {error.strerror}") from error
-    except UnicodeDecodeError:
-        raise ConfigError(f"{file} holds no API key: it should be one line of printable ASCII") from None
-    if not key:
-        raise ConfigError(f"{file} is empty; it should hold the API key")
-    return key
+    return key_in(file)

@@ -12,6 +12,7 @@ from turbopi.cli.files import check_folder
 from turbopi.cli.framework import Output, command, log_to_stderr
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.ports import why_not_free
+from turbopi.cli.serve_ray import Autoscaling, FleetName, FleetWishes, Gpus, Ray, Replicas, Update, serve_fleet
 from turbopi.errors import ConfigError
 from turbopi.serve.options import MAX_BATCH, ServerOptions
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
         "turbopi serve checkpoints/pi05_aloha --config pi05_aloha --execution rtc --control-hz 50",
         "turbopi serve checkpoints/pi05_libero --max-batch 16 --deadline-ms 200 --queue-limit 64",
         "turbopi serve --random-weights pi05_tiny --port 8001",
+        "turbopi serve checkpoints/pi05_libero --config pi05_libero --ray --gpus all --host 0.0.0.0 --api-key-file key",
     ),
 )
 def serve(
@@ -141,6 +143,12 @@ def serve(
         bool,
         typer.Option("--strict", help="Refuse requests that warm-up didn't cover, which would take a second or more."),
     ] = False,
+    ray: Ray = False,
+    replicas: Replicas = None,
+    gpus: Gpus = None,
+    fleet: FleetName = None,
+    autoscaling: Autoscaling = None,
+    update: Update = False,
 ) -> None:
     """Serve a policy to openpi's clients.
 
@@ -149,6 +157,8 @@ def serve(
     """
     output = Output()
     options.check(checkpoint)
+    wishes = FleetWishes(ray, replicas, gpus, fleet, autoscaling, update)
+    wishes.check()
     if strict and not warmup:
         raise ConfigError("--strict refuses what warm-up didn't cover: with --no-warmup that would be everything")
     if max_batch is not None and max_batch > 1 and not warmup:
@@ -173,22 +183,29 @@ def serve(
     )
     if record is not None:
         check_folder(record)
-    reason = why_not_free(host, port)
+    reason = None if update else why_not_free(host, port)
     if reason is not None:  # before minutes of loading, not after
         raise ConfigError(f"can't listen on {host}:{port}: {reason}. Choose another --host or --port")
     if shown:
         output.line(
             "note: `ps` shows a key on the command line to all; --api-key-file or TURBOPI_API_KEY hides it", "yellow"
         )
+    if ray:
+        serve_fleet(wishes, options, checkpoint, wanted, output, warmup=warmup, strict=strict, before_serving=_log_all)
+        return
     opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
     policy = options.make_policy(opened, output, strict=strict)
 
     from turbopi import serve as serving
 
+    _log_all()
+    serving.run(policy if warmup else _Cold(policy), wanted, console=output.console)
+
+
+def _log_all() -> None:
     logging.getLogger("turbopi").setLevel(logging.INFO)
     log_to_stderr(stamped=True)
-    serving.run(policy if warmup else _Cold(policy), wanted, console=output.console)
 
 
 class _Cold:

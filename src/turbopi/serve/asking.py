@@ -9,7 +9,7 @@ from typing import Any
 
 from turbopi.errors import ObservationError
 from turbopi.execution.messages import PREFIX
-from turbopi.serve.calls import PolicyCalls
+from turbopi.serve.calls import Calls
 from turbopi.serve.connection import GuardedConnection
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.outcome import Outcome
@@ -38,7 +38,7 @@ class Askings:
     strict  a batch message above the largest batch that was measured is refused instead of split
     """
 
-    def __init__(self, calls: PolicyCalls, real_time: RealTime, options: ServerOptions, *, strict: bool) -> None:
+    def __init__(self, calls: Calls, real_time: RealTime, options: ServerOptions, *, strict: bool) -> None:
         self._calls, self._real_time, self._options, self._strict = calls, real_time, options, strict
 
     def read(self, received: Mapping[str, Any], connection: GuardedConnection) -> Asking:
@@ -47,7 +47,7 @@ class Askings:
         if urgency.rows is None:
             return Asking(self._real_time.plan(received, connection), urgency)
         check_batch(received, joins=self._options.execution is not None)
-        largest = self._calls.times.measured_largest
+        largest = self._calls.largest
         if self._strict and urgency.rows > largest:
             raise ObservationError(
                 f"{PREFIX}batch is {urgency.rows}, and the largest batch that warm-up covered is {largest}: a server "
@@ -58,7 +58,7 @@ class Askings:
         return Asking(plan, urgency)
 
     def ask(self, asking: Asking, connection: GuardedConnection, arrived: float) -> "asyncio.Future[list[Outcome]]":
-        """An outcome of each row, as `PolicyCalls.ask` and `ask_rows` give it. It is in the line at once."""
+        """An outcome of each row, as `Calls.ask` and `ask_rows` give it. It is in the line at once."""
         plan, urgency = asking.plan, asking.urgency
 
         def request(rows: int, later: int) -> Request:

@@ -51,6 +51,42 @@ class _Call:
     arguments: Mapping[str, Any] = field(default_factory=dict)
 
 
+class Calls(Protocol):
+    """Where a server has its requests computed: PolicyCalls, in this process, or the replicas of a fleet."""
+
+    @property
+    def waiting(self) -> int:
+        """Requests that wait for their turn, as far as this process knows."""
+
+    @property
+    def running(self) -> bool: ...
+
+    @property
+    def largest(self) -> int:
+        """Observations of one batch message that aren't split."""
+
+    def waits(self, session: str) -> bool:
+        """Whether a request of that session waits: a newer one would replace it."""
+
+    async def warm_up(self, **arguments: Any) -> None: ...
+
+    def ask(
+        self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
+    ) -> "asyncio.Future[list[Outcome]]": ...
+
+    async def ask_rows(
+        self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
+    ) -> list[Outcome]: ...
+
+    def stop(self) -> None:
+        """Turn away the requests that wait, and all that come; what runs goes on."""
+
+    async def drain(self) -> None:
+        """Wait for what runs. Call `stop` first."""
+
+    def close(self) -> None: ...
+
+
 class PolicyCalls:
     """Runs a policy in the turns of a schedule, on the thread of `worker`.
 
@@ -69,7 +105,20 @@ class PolicyCalls:
         self._numbers = itertools.count()  # of runs
         self.times = BatchTimes(_largest(policy, self._pipelined, options))
         turns = BatchTimes() if self._pipelined else None
-        self.worker = Worker(Schedule(options.queue_limit, self.times, turns), self._run)
+        self.worker = worker = Worker(Schedule(options.queue_limit, self.times, turns), self._run)
+        self.waits, self.stop, self.drain, self.close = worker.schedule.waits, worker.stop, worker.drain, worker.close
+
+    @property
+    def waiting(self) -> int:
+        return self.worker.waiting
+
+    @property
+    def running(self) -> bool:
+        return self.worker.running
+
+    @property
+    def largest(self) -> int:
+        return self.times.measured_largest
 
     # --- warm-up ------------------------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from turbopi.serve.schedule import PRIORITIES
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 
 # Kinds of `turbopi_errors_total`. Those to "origin" are the client's, and so are "late" and "replaced"; "policy",
-# "actions" and "lost" are ours; the last two are nobody's.
+# "actions", "lost" and "replica" are ours; the last two are nobody's.
 ERROR_KINDS = (
     "malformed",
     "observation",
@@ -26,6 +26,7 @@ ERROR_KINDS = (
     "policy",
     "actions",
     "lost",
+    "replica",
     "disconnected",
     "stopping",
 )
@@ -34,7 +35,7 @@ DROPPED_SESSIONS = ("closed", "idle", "full")
 RECORD_OUTCOMES = ("written", "dropped", "failed")
 
 # Seconds. A policy takes 10 ms to 1 s; a control loop cares about every 5 ms of it.
-_BUCKETS = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
+BUCKETS = (0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
 _SLACKS = (-1.0, -0.3, -0.1, -0.05, -0.02, -0.01, 0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0)
 
 
@@ -45,7 +46,7 @@ class Metrics:
         self.registry = CollectorRegistry()
 
         def histogram(name: str, text: str) -> Histogram:
-            return Histogram(name, text, buckets=_BUCKETS, registry=self.registry)
+            return Histogram(name, text, buckets=BUCKETS, registry=self.registry)
 
         self.requests = Counter("turbopi_requests", "Messages received, good or bad", registry=self.registry)
         self.request_seconds = histogram(

@@ -103,3 +103,16 @@ def check_key(api_key: str | None) -> None:
     """Raise ConfigError for a key that no header can carry."""
     if api_key is not None and not (api_key and api_key.isascii() and api_key.isprintable() and " " not in api_key):
         raise ConfigError("the API key must be printable ASCII without spaces, and not empty")
+
+
+def key_in(file: Path) -> str:
+    """The API key that a file holds: its one line. Raises ConfigError."""
+    try:
+        key = file.read_bytes()[:10_000].decode("ascii").strip()
+    except OSError as error:
+        raise ConfigError(f"the API key can't be read from {file}: {error.strerror}") from error
+    except UnicodeDecodeError:
+        raise ConfigError(f"{file} holds no API key: it should be one line of printable ASCII") from None
+    if not key:
+        raise ConfigError(f"{file} is empty; it should hold the API key")
+    return key

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Wrong = Literal["observation", "actions", "lost", "policy", "busy", "late", "replaced", "stopping"]
+Wrong = Literal["observation", "actions", "lost", "replica", "policy", "busy", "late", "replaced", "stopping"]
 
 
 @dataclass(frozen=True)
@@ -11,8 +11,9 @@ class Outcome:
     """What became of it: a `result`, or what is `wrong` and the `text` about it.
 
     wrong    "observation": the client's fault; "actions": the model gave none that a robot may get; "lost": the device
-             failed for good; "policy": anything else of the policy's, and `text` is the traceback. "busy", "late",
-             "replaced" and "stopping": it got no turn, and `text` is what the client is told
+             failed for good; "replica": of several processes the one that had it gave no answer; "policy": anything
+             else of the policy's, and `text` is the traceback. "busy", "late", "replaced" and "stopping": it got no
+             turn, and `text` is what the client is told
     seconds  in the policy
     together observations in its run
     run      its run's number: rows of one run share it

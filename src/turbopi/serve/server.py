@@ -30,7 +30,7 @@ from websockets.frames import CloseCode
 from turbopi.errors import ConfigError, DeviceLost, ObservationError
 from turbopi.recordings import Recorder
 from turbopi.serve.asking import Asking, Askings
-from turbopi.serve.calls import Policy, PolicyCalls
+from turbopi.serve.calls import Calls, Policy, PolicyCalls
 from turbopi.serve.connection import GuardedConnection, Shared
 from turbopi.serve.gate import Gate
 from turbopi.serve.hosts import AllowedHosts
@@ -53,6 +53,7 @@ _REFUSALS = {
     "observation": "bad observation: {}",
     "actions": "bad actions: {}",
     "lost": "the device is lost: {}",
+    "replica": "the replica is lost: {}",
 }
 LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers look seldom
 LARGE = 4 * 2**20  # bytes of a message that is decoded beside the event loop
@@ -79,13 +80,20 @@ class PolicyServer:
 
     options  what it is asked for; `given` are ServerOptions' fields, instead of its own
     limits   what else a client may cost; its `clients` and `message_bytes` are those of the options
+    calls    what runs the requests, if not the policy in this process, of which then the metadata alone is used
 
     `host` and `port` are where it listens; port 0 becomes the free one that it took, once started. Raises ConfigError
     for options that can't be right.
     """
 
     def __init__(
-        self, policy: Policy, options: ServerOptions | None = None, *, limits: Limits | None = None, **given: Any
+        self,
+        policy: Policy,
+        options: ServerOptions | None = None,
+        *,
+        limits: Limits | None = None,
+        calls: Callable[[Metrics], Calls] | None = None,
+        **given: Any,
     ) -> None:
         self.options = options = replace(options or ServerOptions(), **given)
         self.host, self.port = options.host, options.port
@@ -99,13 +107,14 @@ class PolicyServer:
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
-        self._calls = PolicyCalls(policy, options, self.metrics, on_lost=self._lose)
-        self._worker = self._calls.worker
-        self._real_time = RealTime(policy.metadata, options, self.metrics, waits=self._worker.schedule.waits)
+        self._calls: Calls = (
+            PolicyCalls(policy, options, self.metrics, on_lost=self._lose) if calls is None else calls(self.metrics)
+        )
+        self._real_time = RealTime(policy.metadata, options, self.metrics, waits=self._calls.waits)
         self._askings = Askings(self._calls, self._real_time, options, strict=bool(policy.metadata.get("strict")))
         self._lost: Future[str] = Future()  # set from the worker's thread
-        self.metrics.watch(lambda: self._worker.waiting, lambda: self._worker.running)
-        self._live = Live(self.metrics, self._worker, lambda: self.lost) if options.has_page else None
+        self.metrics.watch(lambda: self._calls.waiting, lambda: self._calls.running)
+        self._live = Live(self.metrics, self._calls, lambda: self.lost) if options.has_page else None
         self._started = False
         self._idle: set[GuardedConnection] = set()  # connections that wait for a request
         self._stopping = False
@@ -157,7 +166,7 @@ class PolicyServer:
             self._listener.start()
         except BaseException:
             self._listener.close()
-            self._worker.close()
+            self._calls.close()
             raise
 
     async def stop(self) -> None:
@@ -167,15 +176,15 @@ class PolicyServer:
         """
         assert self._started, "start() first"
         self._stopping = True
-        self._worker.stop()
+        self._calls.stop()
         self._listener.close()
         if self._live is not None:
             self._live.let_go()
         goodbyes = [asyncio.create_task(self._say_goodbye(connection)) for connection in tuple(self._idle)]
-        await self._worker.drain()
+        await self._calls.drain()
         await self._listener.ended(self._limits.close_seconds)
         await asyncio.gather(*goodbyes)
-        self._worker.close()
+        self._calls.close()
         if self._live is not None:
             await self._live.close()
         self._decoder.shutdown(wait=False)

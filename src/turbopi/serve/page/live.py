@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
@@ -34,7 +34,6 @@ from turbopi.serve.page.messages import (
     Trouble,
     clean,
 )
-from turbopi.serve.worker import Worker
 from turbopi.showing import action_groups
 from turbopi.version import turbopi_version
 
@@ -83,11 +82,21 @@ class _Moment:
     robots: Sequence[RobotFrame]
 
 
+class Queue(Protocol):
+    """What the page shows of the requests that wait, and whether one runs."""
+
+    @property
+    def waiting(self) -> int: ...
+
+    @property
+    def running(self) -> bool: ...
+
+
 class Live:
     """What robots did, for those who watch. `start` it before anybody is let in; `let_go`, then `close` it."""
 
-    def __init__(self, metrics: Metrics, worker: Worker, why_lost: Callable[[], str | None]) -> None:
-        self._metrics, self._worker, self._why_lost = metrics, worker, why_lost
+    def __init__(self, metrics: Metrics, queue: Queue, why_lost: Callable[[], str | None]) -> None:
+        self._metrics, self._queue, self._why_lost = metrics, queue, why_lost
         self._robots: dict[GuardedConnection, _Robot] = {}
         self._known = 0
         self._timings: deque[Timing] = deque(maxlen=CALLS)
@@ -209,8 +218,8 @@ class Live:
             time=time.time(),
             requests=self._metrics.requests_so_far(),
             clients=len(self._robots),
-            waiting=self._worker.waiting,
-            running=self._worker.running,
+            waiting=self._queue.waiting,
+            running=self._queue.running,
             lost=self._why_lost(),
             errors=self._metrics.errors_so_far(),
             troubles=tuple(self._troubles),

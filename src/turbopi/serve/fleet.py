@@ -1,0 +1,411 @@
+"""A fleet: replicas of one policy on many GPUs and machines, run by Ray Serve, behind one policy server.
+
+    robot ── openpi's websocket ──▶ PolicyServer ── Fleet ── Ray Serve ──▶ Replica on a GPU
+    robot ──────────────────────▶      │                        └───────▶ Replica on another GPU
+
+The server in front is the one of `turbopi serve`, with its whole protocol, limits and metrics; only its requests are
+computed elsewhere (`RemoteCalls`). It also keeps the running chunks of real-time sessions. So a session belongs to the
+server, not to a replica: each request goes to the replica that has the fewest, and a replica that dies takes no session
+along. Which processes there are and where, whether they are well, and how they are replaced: that is Ray Serve's part.
+
+A request whose replica died is not tried again on another one: if it was the observation that killed it, one robot
+would kill them all. The client is told, and may ask again.
+
+Ray is imported when a fleet is started. docs/fleet.md is for users.
+"""
+
+import asyncio
+import logging
+import os
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from packaging.specifiers import SpecifierSet
+from prometheus_client import Histogram
+
+from turbopi.errors import BackendError, BackendUnavailable, ConfigError
+from turbopi.serve.calls import Policy
+from turbopi.serve.metrics import BUCKETS, Metrics
+from turbopi.serve.options import ServerOptions
+from turbopi.serve.outcome import Outcome
+from turbopi.serve.replica import Answer, Line, Replica
+from turbopi.serve.schedule import Request
+from turbopi.serve.urgency import MAX_ROWS
+from turbopi.serve.worker import STOPPING
+
+logger = logging.getLogger(__name__)
+
+RAY = SpecifierSet(">=2.60,<3")
+ROUTER = "turbopi.serve.ray_router.FewestRequests"
+DEPLOYMENT = "policy"  # the replicas' name inside of their application
+HEALTH_PERIOD = 2.0  # seconds between Ray Serve's questions to a replica
+DRAIN_SECONDS = 30.0  # that a replica which is replaced may take for the requests that it has
+START_TRIES = 3
+ROWS_AT_ONCE = 8  # observations of one batch message that are at the replicas
+MOST_AT_ONCE = 64  # requests of a replica: the line before its policy refuses earlier
+ROUTER_LINE = 256  # requests that may wait for a replica while none is there
+POLL_SECONDS = 0.5
+STARTED_HERE = {  # of a Ray that is started here
+    "RAY_USAGE_STATS_ENABLED": "0",  # it reports to nobody
+    "RAY_worker_niceness": "0",  # Ray's own 15 would let every other program on the machine go before the robots
+}
+QUIET = {"log_level": "WARNING", "enable_access_log": False}  # a line for each request would cost more than it tells
+OBJECT_STORE_BYTES = 256 * 2**20  # of a Ray that is started here: observations don't go through it
+
+
+@dataclass(frozen=True)
+class FleetOptions:
+    """How many replicas, and what each of them gets. Raises ConfigError for what can't be right.
+
+    name            of the fleet: Ray Serve's application
+    checkpoint      the name of its weights, for people: in metadata and metrics
+    replicas        None: one for each GPU of the cluster, or one if it has none
+    use_gpus        whether a replica gets a GPU; None: if the cluster has any
+    cpus            CPUs that a replica takes of those that the cluster counts
+    autoscaling     Ray Serve's `autoscaling_config`, instead of a number of replicas
+    line            what a replica's own line and batches go by: `line_of` the server's options
+    answer_seconds  after which a request without an answer is given up
+    """
+
+    name: str
+    checkpoint: str
+    replicas: int | None = None
+    use_gpus: bool | None = None
+    cpus: float = 1.0
+    autoscaling: Mapping[str, Any] | None = None
+    line: ServerOptions = field(default_factory=ServerOptions)
+    answer_seconds: float = 120.0
+
+    def __post_init__(self) -> None:
+        if not self.name or not all(c.isalnum() or c in "-_." for c in self.name):
+            raise ConfigError(f"a fleet's name is of letters, digits, - _ and ., not {self.name!r}")
+        if self.replicas is not None and self.replicas < 1:
+            raise ConfigError(f"replicas must be 1 or more, not {self.replicas}")
+        if self.replicas is not None and self.autoscaling is not None:
+            raise ConfigError("replicas and autoscaling were given: Ray Serve scales between its min_ and max_replicas")
+        if not 0 < self.answer_seconds < float("inf"):
+            raise ConfigError(f"answer_seconds must be more than 0 and finite, not {self.answer_seconds}")
+
+
+def line_of(server: ServerOptions) -> ServerOptions:
+    """Of the options of the server in front, what a replica's own line and batches go by: no key, no address."""
+    return ServerOptions(
+        queue_limit=server.queue_limit,
+        max_batch=server.max_batch,
+        execution=server.execution,
+        control_hz=server.control_hz,
+    )
+
+
+# --- Ray --------------------------------------------------------------------------------------------------------------
+
+
+def import_ray() -> tuple[Any, Any]:
+    """The modules `ray` and `ray.serve`. Raises ConfigError if they can't be used."""
+    try:
+        import ray
+        from ray import serve
+    except ImportError as error:
+        raise ConfigError(
+            f"a fleet needs Ray Serve, which can't be imported ({error}): pip install 'turbopi[ray]'"
+        ) from error
+    if ray.__version__ not in RAY:
+        raise ConfigError(f"a fleet needs Ray {RAY}, but {ray.__version__} is installed: pip install 'turbopi[ray]'")
+    return ray, serve
+
+
+def connect() -> bool:
+    """Join the Ray cluster that this machine belongs to or RAY_ADDRESS names; without one, start Ray here.
+
+    Returns whether it was started: then it ends with this process. Raises ConfigError for a cluster that isn't there or
+    runs another version.
+    """
+    ray, _ = import_ray()
+    for name, value in STARTED_HERE.items():
+        os.environ.setdefault(name, value)
+    quiet = {"logging_level": logging.WARNING, "configure_logging": True}
+    logging.getLogger("ray.serve").setLevel(logging.WARNING)
+    if ray.is_initialized():
+        return False
+    try:
+        ray.init(address="auto", **quiet)
+        return False
+    except ConnectionError as error:
+        if address := os.environ.get("RAY_ADDRESS"):
+            raise ConfigError(
+                f"no Ray cluster answers at RAY_ADDRESS={address}: {error}. One that has a token needs it here, too, "
+                "in ~/.ray/auth_token, with RAY_AUTH_MODE=token in the environment"
+            ) from error
+    except (RuntimeError, ValueError) as error:  # other versions of Ray or Python there, an address that is none
+        raise ConfigError(f"Ray's cluster can't be joined: {error}") from error
+    ray.init(address="local", include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, **quiet)
+    return True
+
+
+def disconnect() -> None:
+    """Leave the cluster; one that was started here ends."""
+    ray, _ = import_ray()
+    ray.shutdown()
+
+
+def planned(options: FleetOptions) -> tuple[int, bool]:
+    """How many replicas there are to be (with autoscaling, at first), and whether each has a GPU."""
+    ray, _ = import_ray()
+    gpus = int(ray.cluster_resources().get("GPU", 0))
+    use_gpus = gpus > 0 if options.use_gpus is None else options.use_gpus
+    if options.autoscaling is not None:
+        wanted = options.autoscaling.get("initial_replicas") or options.autoscaling.get("min_replicas", 1)
+        return max(int(wanted), 1), use_gpus
+    return options.replicas or (max(gpus, 1) if use_gpus else 1), use_gpus
+
+
+def check_room(options: FleetOptions) -> None:
+    """Raise BackendUnavailable if the cluster hasn't the GPUs or CPUs for the fleet: Ray would wait for more machines.
+
+    What a running fleet of that name has counts as free: its replicas are replaced one after the other.
+    """
+    ray, _ = import_ray()
+    count, use_gpus = planned(options)
+    total, free = ray.cluster_resources(), ray.available_resources()
+    own = _running(options.name)
+    for kind, each in (("GPU", 1.0 if use_gpus else 0.0), ("CPU", options.cpus)):
+        have = free.get(kind, 0.0) + own * each
+        if count * each > have + 1e-6:
+            raise BackendUnavailable(
+                f"{count} replicas of {each:g} {kind} don't fit: Ray's cluster has {total.get(kind, 0.0):g}, of which "
+                f"{have:g} are free. Ask for fewer replicas, add machines (`ray start`), or end what takes them"
+            )
+
+
+def names() -> list[str]:
+    """The fleets, and whatever else Ray Serve runs on the cluster."""
+    _, serve = import_ray()
+    return sorted(serve.status().applications)
+
+
+def delete(name: str) -> None:
+    """End the replicas of the fleet of that name, after the requests that they have."""
+    _, serve = import_ray()
+    serve.delete(name)
+
+
+def _running(name: str) -> int:
+    """How many replicas the fleet of that name has now."""
+    _, serve = import_ray()
+    application = serve.status().applications.get(name)
+    deployment = None if application is None else application.deployments.get(DEPLOYMENT)
+    return 0 if deployment is None else int(deployment.replica_states.get("RUNNING", 0))
+
+
+def replicas(make_policy: Callable[[], Policy], options: FleetOptions, *, warm: Mapping[str, Any] | None) -> Any:
+    """The replicas as a Ray Serve application; `make_policy` and `warm` are Replica's. Raises ConfigError."""
+    _, serve = import_ray()
+    from ray.serve.config import RequestRouterConfig
+
+    count, use_gpus = planned(options)
+    scale: dict[str, Any] = {"num_replicas": count}
+    if options.autoscaling is not None:
+        scale = {"autoscaling_config": dict(options.autoscaling)}
+    try:
+        deployment = serve.deployment(
+            name=DEPLOYMENT,
+            ray_actor_options={"num_gpus": int(use_gpus), "num_cpus": options.cpus},
+            max_ongoing_requests=MOST_AT_ONCE,
+            max_queued_requests=ROUTER_LINE,
+            health_check_period_s=HEALTH_PERIOD,
+            graceful_shutdown_timeout_s=DRAIN_SECONDS,
+            graceful_shutdown_wait_loop_s=POLL_SECONDS,
+            max_constructor_retry_count=START_TRIES,
+            request_router_config=RequestRouterConfig(request_router_class=ROUTER),
+            **scale,
+        )(Replica)
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"Ray Serve refuses the fleet's options: {error}") from error
+    return deployment.bind(make_policy, options.checkpoint, warm, options.line)
+
+
+def deploy(application: Any, name: str, tell: Callable[[str], None]) -> None:
+    """Start the replicas, or replace those of a fleet of that name one after the other, and wait until all serve.
+
+    `tell` gets what Ray says meanwhile. Raises BackendError if a replica can't start, with the reason.
+    """
+    _, serve = import_ray()
+    serve.start(proxy_location="Disabled", logging_config=QUIET)  # the server in front has the port; once is enough
+    target = serve.RunTarget(target=application, name=name, route_prefix=None, logging_config=QUIET)
+    serve.run_many([target], wait_for_applications_running=False)
+    told = ""
+    while True:
+        state = serve.status().applications.get(name)
+        deployment = None if state is None else state.deployments.get(DEPLOYMENT)
+        message = "" if deployment is None else deployment.message or (state.message if state else "")
+        if state is not None and state.status == "RUNNING":
+            return
+        if state is not None and state.status in ("DEPLOY_FAILED", "UNHEALTHY"):
+            raise BackendError(f"the replicas of {name!r} can't start: {reason_in(message or state.message)}")
+        if message and message != told:
+            told = message
+            tell(reason_in(message))
+        time.sleep(POLL_SECONDS)
+
+
+def reason_in(message: str) -> str:
+    """What went wrong, of a message of Ray Serve's that holds a traceback: the error's own line."""
+    lines = [line.strip() for line in message.strip().splitlines()]
+    named = [line for line in lines if line.partition(":")[0].rpartition(".")[2].endswith(("Error", "Unavailable"))]
+    return (named or lines or [""])[-1 if named else 0]
+
+
+# --- the server's side ------------------------------------------------------------------------------------------------
+
+
+class Fleet:
+    """The replicas as a policy for PolicyServer: `PolicyServer(fleet, calls=fleet.calls)`. `attach` makes one."""
+
+    def __init__(self, handle: Any, name: str, about: Mapping[str, Any], answer_seconds: float) -> None:
+        # Without references a request goes straight to the replica's gRPC port. By Ray's object store, the default,
+        # a call with two pictures took twice as long: 7.1 instead of 3.4 ms on two CPU cores.
+        self._handle = handle.options(_by_reference=False)
+        self._answer_seconds = answer_seconds
+        self.metadata: dict[str, Any] = {**about, "fleet": name}
+
+    @classmethod
+    def attach(cls, name: str, answer_seconds: float = FleetOptions.answer_seconds) -> "Fleet":
+        """The fleet of that name, whose replicas run already. Not for an event loop."""
+        _, serve = import_ray()
+        handle = serve.get_deployment_handle(DEPLOYMENT, app_name=name)
+        return cls(handle, name, handle.about.remote().result(timeout_s=answer_seconds), answer_seconds)
+
+    def calls(self, metrics: Metrics) -> "RemoteCalls":
+        return RemoteCalls(self._handle, metrics, self._answer_seconds)
+
+    def infer(self, obs: dict[str, Any], /, **arguments: Any) -> dict[str, Any]:
+        """One request, by whichever replica has the fewest. Raises BackendError if it gives no actions."""
+        outcome = asyncio.run(self.calls(Metrics()).run(obs, arguments, Line()))
+        if outcome.result is None:
+            raise BackendError(f"the fleet {self.metadata['fleet']!r} gave no actions: {outcome.text}")
+        return outcome.result
+
+
+class RemoteCalls:
+    """Has requests computed by the replicas of `handle`, and keeps their times by replica in `metrics`.
+
+    The line is at the replicas: each has its own, with the deadlines and priorities of its requests, and forms its own
+    batches. No request of a session replaces another: they may be at different replicas.
+    """
+
+    largest = MAX_ROWS  # a batch message's observations are requests of their own: there is nothing to split
+
+    def __init__(self, handle: Any, metrics: Metrics, answer_seconds: float) -> None:
+        self._handle, self._metrics, self._answer_seconds = handle, metrics, answer_seconds
+        self._going: set[asyncio.Future[list[Outcome]]] = set()
+        self._stopping = False
+
+        def histogram(name: str, text: str) -> Histogram:
+            return Histogram(name, text, ["replica", "checkpoint"], buckets=BUCKETS, registry=metrics.registry)
+
+        self._inference = histogram("turbopi_replica_inference_seconds", "In the policy, by replica")
+        self._waiting = histogram("turbopi_replica_queue_seconds", "Waiting for the policy at a replica, by replica")
+
+    @property
+    def waiting(self) -> int:
+        """Not known here: they wait at the replicas."""
+        return 0
+
+    @property
+    def running(self) -> bool:
+        return bool(self._going)
+
+    def waits(self, session: str) -> bool:
+        return False
+
+    async def warm_up(self, **arguments: Any) -> None:
+        """Nothing: a replica warms up before its first request."""
+
+    def ask(
+        self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
+    ) -> "asyncio.Future[list[Outcome]]":
+        """Cancelled, it is at the replica too, unless it runs already."""
+
+        async def one() -> list[Outcome]:
+            return [await self.run(observation, arguments, Line.of(request, time.perf_counter()))]
+
+        return self._follow(one())
+
+    async def ask_rows(
+        self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
+    ) -> list[Outcome]:
+        """An outcome of each row, up to the first few of which one is wrong. Each is a request of its own."""
+        outcomes: list[Outcome] = []
+        while len(outcomes) < rows and all(outcome.wrong is None for outcome in outcomes):
+            few = range(len(outcomes), min(rows, len(outcomes) + ROWS_AT_ONCE))
+            asked = [self.ask(make(1, rows - index - 1), row(index), {}) for index in few]
+            outcomes += [outcome for (outcome,) in await asyncio.gather(*asked)]
+        return outcomes
+
+    def stop(self) -> None:
+        self._stopping = True
+
+    async def drain(self) -> None:
+        if self._going:
+            await asyncio.wait(tuple(self._going))
+
+    def close(self) -> None:
+        self._stopping = True
+
+    def _follow(self, work: Coroutine[Any, Any, list[Outcome]]) -> "asyncio.Future[list[Outcome]]":
+        task = asyncio.ensure_future(work)
+        self._going.add(task)
+        task.add_done_callback(self._going.discard)
+        return task
+
+    async def run(self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line) -> Outcome:
+        """One request. Cancelled, it is at the replica too, unless it runs already."""
+        from grpc import RpcError
+        from ray.exceptions import RayActorError, RayTaskError
+        from ray.serve.exceptions import BackPressureError, DeploymentUnavailableError
+
+        if self._stopping:
+            return STOPPING
+        asked = time.perf_counter()
+        response = self._handle.infer.remote(observation, arguments, line)
+        try:
+            answer: Answer = await asyncio.wait_for(_result(response), self._answer_seconds)
+        except asyncio.TimeoutError:
+            response.cancel()
+            return self._lost(asked, f"no replica answered within {self._answer_seconds:g} s; ask again")
+        except asyncio.CancelledError:
+            response.cancel()
+            raise
+        except BackPressureError:
+            return Outcome(0.0, wrong="busy", text=f"busy: {ROUTER_LINE} requests wait for a replica; try again")
+        except DeploymentUnavailableError as error:
+            return self._lost(asked, f"there is none: {error.message}")
+        except RayTaskError:  # raised by our code there
+            raise
+        except (RayActorError, RpcError):
+            return self._lost(asked, "its process ended, or can't be reached, during this request; ask again")
+        return self._noted(answer, time.perf_counter() - asked)
+
+    def _noted(self, answer: Answer, total: float) -> Outcome:
+        """The outcome, its times in the metrics. `total`: seconds since it was asked for here."""
+        outcome = answer.outcome
+        if outcome.wrong == "stopping":
+            return Outcome(0.0, wrong="busy", text="busy: the replica is being replaced; try again")
+        if outcome.wrong in ("busy", "late", "replaced"):
+            return outcome
+        labels = (answer.replica, answer.checkpoint)
+        self._inference.labels(*labels).observe(outcome.seconds)
+        self._waiting.labels(*labels).observe(max(0.0, answer.seconds - outcome.seconds))
+        self._metrics.inference_seconds.observe(outcome.seconds)
+        self._metrics.queue_seconds.observe(max(0.0, total - outcome.seconds))
+        self._metrics.batch_size.observe(outcome.together)
+        return replace(outcome, run=hash((answer.replica, outcome.run)))  # replicas count their runs for themselves
+
+    def _lost(self, asked: float, text: str) -> Outcome:
+        return Outcome(time.perf_counter() - asked, wrong="replica", text=text)
+
+
+async def _result(response: Any) -> Any:
+    return await response
