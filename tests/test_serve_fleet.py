@@ -43,9 +43,9 @@ def replicated(
     async def main() -> None:
         policy = FakePolicy()
         replica = Replica.__new__(Replica)  # as Ray Serve makes one
-        await cast(
-            Awaitable[None], replica.__init__(lambda: policy, "weights", warm, ServerOptions(queue_limit=1), end)
-        )  # type: ignore[misc]
+        options = ServerOptions(queue_limit=1)
+        made: Any = replica.__init__(lambda: policy, "weights", warm, options, end)  # type: ignore[misc]
+        await made
         try:
             await asyncio.wait_for(test(replica, policy), 60)
         finally:
@@ -92,7 +92,7 @@ def test_a_full_replica_says_so_and_a_request_that_is_given_up_never_runs() -> N
         waiting.cancel()
         policy.release.set()
         await held
-        (await replica.infer(observation("next"), {})).outcome
+        await replica.infer(observation("next"), {})
         assert policy.seen == ["hold", "next"]
 
     replicated(test)
