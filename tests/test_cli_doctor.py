@@ -185,7 +185,7 @@ def test_busy_cpus_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("psutil.getloadavg", lambda: (1000.0, 1.0, 1.0))
     row: Row = checkups.check_cpu()
     assert row.level == "WARN"
-    assert "1000.0 want to run" in row.found
+    assert "the load is 1000.0" in row.found
 
 
 INSTALL = "on Debian and Ubuntu: apt-get install g++ python3-dev"

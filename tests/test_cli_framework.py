@@ -46,6 +46,32 @@ def test_every_help_ends_with_examples_of_that_command(command: str) -> None:
     assert text_of(result.stdout).split("Examples ")[1].startswith(f"turbopi {command}")
 
 
+@pytest.mark.parametrize("words", [(), *((command,) for command in COMMANDS)], ids=" ".join)
+def test_help_is_whole_at_eighty_columns(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """No word of an option, its values or its help is cut or broken, and every example can be copied as one line."""
+    monkeypatch.setenv("COLUMNS", "80")
+    output = turbopi(*words, "--help").stdout
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", output).splitlines()
+    assert max(map(len, lines)) <= 80
+    found = text_of(output).split()
+    group: Any = typer.main.get_command(app)
+    asked = group.commands[words[0]] if words else group
+    for one in asked.get_params(typer.Context(asked)):
+        if not getattr(one, "hidden", False):
+            said = [one.metavar or "", getattr(one, "help", None) or ""]
+            missing = {word for text in said for word in text.split()} - set(found)
+            assert not missing, f"{one.opts}: {missing}"
+        if one.opts[0].startswith("-") and not getattr(one, "hidden", False):
+            assert set(one.opts + one.secondary_opts) <= set(found)
+    for example in re.findall(r"\[cyan\](.*?)\[/\]", asked.epilog or ""):
+        assert f" {unescaped(example)}" in (line.rstrip() for line in lines), "an example is longer than a line"
+    assert "<bool>" not in found, "a flag takes no value"
+
+
+def unescaped(markup: str) -> str:
+    return markup.replace(r"\[", "[")
+
+
 @pytest.mark.parametrize("command", ["demo", "infer", "serve"])
 def test_commands_that_run_a_policy_share_its_options(command: str) -> None:
     help = text_of(turbopi(command, "--help").stdout)

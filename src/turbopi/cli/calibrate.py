@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     "calibrate",
     shared=RobotOptions,
     examples=(
-        "turbopi calibrate checkpoints/pi05_droid --config pi05_droid --observations recordings/20260101T120000Z",
-        "turbopi calibrate checkpoints/pi05_libero --config pi05_libero --out libero_fp8.json",
+        "turbopi calibrate checkpoints/mine --observations recordings",
+        "turbopi calibrate checkpoints/pi05_libero --config pi05_libero --out fp8.json",
         "turbopi calibrate --random-weights pi05_tiny --out tiny_fp8.json --noises 2",
     ),
 )

@@ -218,7 +218,7 @@ def check_cpu() -> Row:
         return Row("WARN", "CPU", found, f"set OMP_NUM_THREADS={usable}: more threads than CPUs are slow")
     load = psutil.getloadavg()[0]
     if load > usable:
-        busy = f"{found}, but {load:.1f} want to run"
+        busy = f"{found}; the load is {load:.1f}, so other programs use them, too"
         return Row("WARN", "CPU", busy, "stop other programs: they make every call on the CPU slower")
     return Row("OK", "CPU", found)
 

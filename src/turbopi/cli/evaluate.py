@@ -214,12 +214,12 @@ class EvalOptions(PolicyOptions):
     shared=EvalOptions,
     examples=(
         "turbopi eval libero checkpoints/pi05_libero --config pi05_libero",
-        "turbopi eval libero checkpoints/pi05_libero --config pi05_libero --suite goal --trials 10 --workers 8",
+        "turbopi eval libero checkpoints/pi05_libero --suite goal --trials 10",
         "turbopi eval libero --port 8000 --suite libero_10",
-        "turbopi eval libero checkpoints/pi05_libero --config pi05_libero --trials 5 --control prompt",
-        "turbopi eval libero --random-weights pi05_tiny --tasks 0,1 --trials 1 --max-steps 20",
+        "turbopi eval libero checkpoints/pi05_libero --trials 5 --control prompt",
+        "turbopi eval libero --random-weights pi05_tiny --tasks 0,1 --max-steps 20",
         "turbopi eval reacher --random-weights pi05_tiny --trials 2",
-        "turbopi eval chase CKPT --execution async,rtc --delay-steps 0,2,4 --trials 100 --videos none",
+        "turbopi eval chase checkpoints/mine --execution async,rtc --delay-steps 0,2,4",
     ),
 )
 def evaluate_command(

@@ -24,11 +24,10 @@ if TYPE_CHECKING:
     shared=PolicyOptions,
     examples=(
         "turbopi verify --random-weights pi05_tiny --backend pytorch --precision bf16",
-        "turbopi verify checkpoints/pi05_libero --config pi05_libero --backend fused --report certificate",
-        "turbopi verify checkpoints/pi05_droid --observations recordings/20260101T120000Z --count 32 --noises 4",
+        "turbopi verify checkpoints/mine --backend fused --report certificate",
+        "turbopi verify checkpoints/mine --observations recordings --count 32",
         "turbopi verify checkpoints/pi05_libero --precision f32 --bound 2e-6 --json",
-        "turbopi verify checkpoints/pi05_libero --precision fp8 --quantization fp8.json --observations recordings/new "
-        "--count 32",
+        "turbopi verify checkpoints/mine --precision fp8 --observations recordings/new",
     ),
 )
 def verify(

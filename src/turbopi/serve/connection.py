@@ -17,7 +17,7 @@ from websockets.frames import CloseCode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
-from turbopi.serve.limited_log import LimitedLog
+from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.limits import Credit, Limits, MemoryBudget, WorkPool
 from turbopi.serve.metrics import Metrics
 
@@ -335,4 +335,4 @@ class GuardedConnection(ServerConnection):
 
     def _complain(self, text: str) -> None:
         self._shared.metrics.error("slow")
-        self._shared.log.warning(f"{self.remote_address}: {text}", "slow")
+        self._shared.log.warning(f"{peer(self)}: {text}", "slow")
