@@ -58,7 +58,7 @@ def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_exp
         assert heading in out
     for frame in shipped.load_frames()[:2]:
         assert frame.prompt.split()[-1] in out
-    assert "its chunk of 10 actions, 7 numbers each" in out
+    assert "frame 0: the next 10 actions, 7 numbers each" in out
     assert "The bound is 10 times the control" in out
     assert "OK: pytorch bf16 is within" in out
     assert "\x1b" not in out

@@ -87,7 +87,11 @@ def demo(
         from turbopi.shipped import SMALL_POLICY
 
         checkpoint = str(SMALL_POLICY)
-    check_folder(report)  # what can't be written is better known before the work
+    check_folder(report)  # what can't be written, or played, is better known before the work
+    if episodes:
+        from turbopi.sim import create
+
+        create("libero").check()
     output = Output(as_json)
     run = _Run(options, checkpoint, frames, seed, output)
     run.play(report / "episodes", episodes)
@@ -183,8 +187,8 @@ class _Run:
 
         steps, dims = actions.shape
         shown = min(steps, 10, max(3, (self.output.console.width - 42) // 9))
-        cut = f"; the first {shown}" if shown < steps else ""
-        title = f"frame 0: its chunk of {steps} actions, {dims} numbers each{cut} (0 is the next to carry out)"
+        cut = f"; the first {shown} of them" if shown < steps else ""
+        title = f"frame 0: the next {steps} actions, {dims} numbers each{cut}"
         table = Table(title=title, title_justify="left")
         for heading in ("action", "unit"):
             table.add_column(heading)

@@ -218,7 +218,7 @@ class EvalOptions(PolicyOptions):
         "turbopi eval libero --port 8000 --suite libero_10",
         "turbopi eval libero checkpoints/pi05_libero --trials 5 --control prompt",
         "turbopi eval libero --random-weights pi05_tiny --tasks 0,1 --max-steps 20",
-        "turbopi eval reacher --random-weights pi05_tiny --trials 2",
+        "turbopi eval reacher --random-weights pi05_tiny --trials 2 --videos none",
         "turbopi eval chase checkpoints/mine --execution async,rtc --delay-steps 0,2,4",
     ),
 )
