@@ -170,11 +170,11 @@ def _calibration(fp8: "Fp8Details") -> str:
 
 def _intermediates(document: "Certificate") -> Table:
     """One row a name: its worst layer or step, in proportion to what is allowed there."""
-    table = Table(title="against the float32 reference, attended slots", title_justify="left")
+    table = Table(title="against the float32 reference, without padding", title_justify="left")
     table.add_column("intermediate")
     for column in ("relative rms", "control's", "allowed"):
         table.add_column(column, justify="right")
-    table.add_column("which")
+    table.add_column("verdict")
     for column in ("cosine", "max"):
         table.add_column(column, justify="right")
     worst: dict[str, IntermediateDocument] = {}
