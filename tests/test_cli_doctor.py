@@ -81,7 +81,7 @@ def test_a_checkpoint_without_its_tokenizer_fails(tmp_path: Path) -> None:
     assert code == 1
     assert rows["checkpoint"]["level"] == "OK"
     assert "openpi_torch, pi05, pi05_tiny for libero, 6 M parameters" in rows["checkpoint"]["found"]
-    assert "this checkpoint takes 0.0 GB" in rows["memory"]["found"]
+    assert "this checkpoint takes 11 MB in bf16, 23 MB in f32" in rows["memory"]["found"]
     assert rows["tokenizer"]["level"] == "FAIL"
     assert rows["tokenizer"]["found"] == "no tokenizer found"
     code, rows = doctor("--checkpoint", folder, "--tokenizer", TINY_TOKENIZER)

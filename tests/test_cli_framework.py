@@ -1,6 +1,7 @@
 """The command line as a whole: help, exit codes, where output and errors go."""
 
 import inspect
+import io
 import json
 import re
 import subprocess
@@ -14,11 +15,13 @@ import pytest
 import typer
 from checkpoint_helpers import GOLDEN
 from cli_helpers import refusal, text_of, turbopi
+from rich.console import Console
 from typer.testing import CliRunner
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.cli import app
-from turbopi.cli.framework import plain, with_errors_told
+from turbopi.cli.framework import Output, plain, with_errors_told
+from turbopi.cli.progress import with_stages
 from turbopi.cli.typed import OPTIONS, as_typed
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.policy import UnifiedPolicy
@@ -250,6 +253,24 @@ def test_running_out_of_memory_says_what_the_model_needs(capsys: Any) -> None:
         "error: out of memory: 8 GB. Full-size models need 7.2 GB in bf16 and 14.5 GB in f32; "
         "`turbopi doctor` shows what there is\n"
     )
+
+
+def test_a_bar_is_drawn_once_its_first_stage_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`0/?` tells nothing."""
+    seen = io.StringIO()
+    console = Console(file=seen, force_terminal=True, width=80)
+    monkeypatch.setattr("turbopi.cli.progress.new_console", lambda *, stderr: console)
+    monkeypatch.setattr(Output, "shows_progress", True)
+
+    def work(told: tuple[Callable[[str, int], None], Callable[[], None]]) -> str:
+        begin, advance = told
+        begin("a stage", 2)
+        advance()
+        return "done"
+
+    assert with_stages(work, lambda begin, advance: (begin, advance), Output()) == "done"
+    assert "a stage" in seen.getvalue() and "1/2" in seen.getvalue()
+    assert "?" not in seen.getvalue().replace("\x1b[?25", "")
 
 
 def test_ctrl_c_is_quiet_and_code_130(capsys: Any) -> None:

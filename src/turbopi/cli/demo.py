@@ -118,6 +118,7 @@ class _Run:
         policy = options.make_policy(opened, output)
         self.metadata = policy.metadata
         self.robot: str = self.metadata["robot"]
+        output.line("Warming up …")
         output.line(f"warm-up: {policy.warmup():.2f} s")
         observed = observations(policy, self.frames)
         with _progress(output) as bar:

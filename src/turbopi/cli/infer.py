@@ -102,6 +102,7 @@ def infer(
     if warmup:
         if policy.backend.name == "pytorch_compile":
             output.line("warm-up: compiling, which takes a minute or more")
+        output.line("Warming up …")
         output.line(f"warm-up: {policy.warmup():.2f} s")
     answers = _run(policy, sources, draw, output)
     _show_timings([answer.timing for answer in answers], output)
