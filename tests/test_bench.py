@@ -294,7 +294,7 @@ def test_floors_are_shown_with_three_digits(bytes_per_second: float, flops_per_s
 
 
 def test_on_a_cpu_the_matrix_rate_is_of_weights_as_the_model_keeps_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """[outputs, inputs]: the other layout is ten times slower in bfloat16 on CPUs without its instructions."""
+    """[outputs, inputs]: the other layout is twenty times slower in bfloat16 on CPUs without its instructions."""
     asked: list[tuple[torch.Size, bool]] = []
     linear = torch.nn.functional.linear
 

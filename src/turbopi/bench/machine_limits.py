@@ -65,8 +65,8 @@ def _copy_rate(device: torch.device, size: int) -> float:
 
 
 def _matmul_rate(device: torch.device, dtype: torch.dtype, n: int) -> float:
-    """On a CPU with `b` as nn.Linear's weights lie: PyTorch 2.13 takes ten times as long for a bfloat16 product of the
-    other layout where the CPU has no such instructions (0.31 and 3.3 GFLOP/s were seen), which would be no ceiling.
+    """On a CPU with `b` as nn.Linear's weights lie: PyTorch 2.13 takes twenty times as long for a bfloat16 product of
+    the other layout where the CPU has no such instructions (0.92 and 20 GFLOP/s were seen), which would be no ceiling.
     """
     a, b = (torch.randn(n, n, device=device).to(dtype) for _ in range(2))
 
