@@ -17,7 +17,7 @@ import time
 from typing import Any
 
 import numpy as np
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 from turbopi.wire import pack, unpack
 
@@ -54,6 +54,18 @@ def so101(port: str, cameras: dict[str, int]) -> Any:
     return SO101Follower(SO101FollowerConfig(port=port, cameras=configs, max_relative_target=10.0))
 
 
+def connected(server: str, patience_s: float) -> ClientConnection:
+    """A server takes connections once it is warm: some seconds to a minute after its start."""
+    end = time.monotonic() + patience_s
+    while True:
+        try:
+            return connect(server, max_size=None, compression=None)
+        except ConnectionRefusedError:
+            if time.monotonic() > end:
+                raise SystemExit(f"no server answers at {server}; start one with: turbopi serve CHECKPOINT") from None
+            time.sleep(1)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--server", default="ws://localhost:8000")
@@ -61,12 +73,15 @@ def main() -> None:
     parser.add_argument("--camera", action="append", default=[], metavar="NAME=INDEX")
     parser.add_argument("--task", default="put the cube into the box")
     parser.add_argument("--chunks", type=int, default=10)
+    parser.add_argument(
+        "--patience", type=float, default=120, metavar="S", help="seconds that the server may take to start"
+    )
     options = parser.parse_args()
     cameras = {name: int(index) for name, _, index in (camera.partition("=") for camera in options.camera)}
     robot = so101(options.arm, cameras) if options.arm else FakeSO101()
     robot.connect()
     try:
-        with connect(options.server, max_size=None, compression=None) as server:
+        with connected(options.server, options.patience) as server:
             server.recv()  # the policy's metadata
             for _ in range(options.chunks):
                 server.send(pack({**robot.get_observation(), "task": options.task}))

@@ -39,13 +39,30 @@ class Arm:
         """Stay where it is."""
 
 
+def connected(host: str, port: int, patience_s: float) -> WebsocketClientPolicy:
+    """A server takes connections once it is warm: some seconds to a minute after its start."""
+    end = time.monotonic() + patience_s
+    while True:
+        try:
+            return WebsocketClientPolicy(host, port)
+        except ConnectionRefusedError:
+            if time.monotonic() > end:
+                raise SystemExit(
+                    f"no server answers at {host}:{port}; start one with: turbopi serve CHECKPOINT"
+                ) from None
+            time.sleep(1)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--host", default="localhost")
     parser.add_argument("--port", type=int, default=8000)
     parser.add_argument("--chunks", type=int, default=4)
+    parser.add_argument(
+        "--patience", type=float, default=120, metavar="S", help="seconds that the server may take to start"
+    )
     options = parser.parse_args()
-    policy, arm = WebsocketClientPolicy(options.host, options.port), Arm()
+    policy, arm = connected(options.host, options.port, options.patience), Arm()
     print("connected to a policy for", policy.get_server_metadata()["robot"])
     for _ in range(options.chunks):
         asked = time.monotonic()

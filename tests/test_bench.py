@@ -13,7 +13,7 @@ from msgspec import to_builtins
 from msgspec.structs import asdict, replace
 from typer.testing import CliRunner
 
-from turbopi.bench import profile
+from turbopi.bench import machine_limits, profile
 from turbopi.bench import run as running
 from turbopi.bench.document import BenchDocument, Kernel, Memory, Result, Times, read_benchmark
 from turbopi.bench.machine_limits import Floors
@@ -291,6 +291,21 @@ def floors_of(monkeypatch: pytest.MonkeyPatch, bytes_per_second: float, flops_pe
 )
 def test_floors_are_shown_with_three_digits(bytes_per_second: float, flops_per_second: float, line: str) -> None:
     assert floors_line("bf16", Floors(bytes_per_second, flops_per_second)) == f"floors, bf16: {line}"
+
+
+def test_on_a_cpu_the_matrix_rate_is_of_weights_as_the_model_keeps_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """[outputs, inputs]: the other layout is twenty times slower in bfloat16 on CPUs without its instructions."""
+    asked: list[tuple[torch.Size, bool]] = []
+    linear = torch.nn.functional.linear
+
+    def seen(x: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        asked.append((weight.shape, weight.is_contiguous()))
+        return linear(x, weight)
+
+    monkeypatch.setattr(torch.nn.functional, "linear", seen)
+    monkeypatch.setattr(machine_limits, "median_seconds", lambda run, device: 0.5 if run() is not None else 0.0)
+    assert machine_limits._matmul_rate(CPU, torch.bfloat16, 16) == 2 * 16**3 / 0.5
+    assert asked == [((16, 16), True)]
 
 
 def test_points_above_the_roofline_are_warned_about(

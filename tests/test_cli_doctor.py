@@ -81,7 +81,7 @@ def test_a_checkpoint_without_its_tokenizer_fails(tmp_path: Path) -> None:
     assert code == 1
     assert rows["checkpoint"]["level"] == "OK"
     assert "openpi_torch, pi05, pi05_tiny for libero, 6 M parameters" in rows["checkpoint"]["found"]
-    assert "this checkpoint takes 0.0 GB" in rows["memory"]["found"]
+    assert "this checkpoint takes 11 MB in bf16, 23 MB in f32" in rows["memory"]["found"]
     assert rows["tokenizer"]["level"] == "FAIL"
     assert rows["tokenizer"]["found"] == "no tokenizer found"
     code, rows = doctor("--checkpoint", folder, "--tokenizer", TINY_TOKENIZER)
@@ -185,7 +185,7 @@ def test_busy_cpus_are_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("psutil.getloadavg", lambda: (1000.0, 1.0, 1.0))
     row: Row = checkups.check_cpu()
     assert row.level == "WARN"
-    assert "1000.0 want to run" in row.found
+    assert "the load is 1000.0" in row.found
 
 
 INSTALL = "on Debian and Ubuntu: apt-get install g++ python3-dev"

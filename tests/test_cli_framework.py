@@ -1,6 +1,7 @@
 """The command line as a whole: help, exit codes, where output and errors go."""
 
 import inspect
+import io
 import json
 import re
 import subprocess
@@ -14,11 +15,13 @@ import pytest
 import typer
 from checkpoint_helpers import GOLDEN
 from cli_helpers import refusal, text_of, turbopi
+from rich.console import Console
 from typer.testing import CliRunner
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.cli import app
-from turbopi.cli.framework import plain, with_errors_told
+from turbopi.cli.framework import Output, plain, with_errors_told
+from turbopi.cli.progress import with_stages
 from turbopi.cli.typed import OPTIONS, as_typed
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.policy import UnifiedPolicy
@@ -44,6 +47,32 @@ def test_every_help_ends_with_examples_of_that_command(command: str) -> None:
     result = turbopi(command, "--help")
     assert result.exit_code == 0
     assert text_of(result.stdout).split("Examples ")[1].startswith(f"turbopi {command}")
+
+
+@pytest.mark.parametrize("words", [(), *((command,) for command in COMMANDS)], ids=" ".join)
+def test_help_is_whole_at_eighty_columns(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """No word of an option, its values or its help is cut or broken, and every example can be copied as one line."""
+    monkeypatch.setenv("COLUMNS", "80")
+    output = turbopi(*words, "--help").stdout
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", output).splitlines()
+    assert max(map(len, lines)) <= 80
+    found = text_of(output).split()
+    group: Any = typer.main.get_command(app)
+    asked = group.commands[words[0]] if words else group
+    for one in asked.get_params(typer.Context(asked)):
+        if not getattr(one, "hidden", False):
+            said = [one.metavar or "", getattr(one, "help", None) or ""]
+            missing = {word for text in said for word in text.split()} - set(found)
+            assert not missing, f"{one.opts}: {missing}"
+        if one.opts[0].startswith("-") and not getattr(one, "hidden", False):
+            assert set(one.opts + one.secondary_opts) <= set(found)
+    for example in re.findall(r"\[cyan\](.*?)\[/\]", asked.epilog or ""):
+        assert f" {unescaped(example)}" in (line.rstrip() for line in lines), "an example is longer than a line"
+    assert "<bool>" not in found, "a flag takes no value"
+
+
+def unescaped(markup: str) -> str:
+    return markup.replace(r"\[", "[")
 
 
 @pytest.mark.parametrize("command", ["demo", "infer", "serve"])
@@ -224,6 +253,24 @@ def test_running_out_of_memory_says_what_the_model_needs(capsys: Any) -> None:
         "error: out of memory: 8 GB. Full-size models need 7.2 GB in bf16 and 14.5 GB in f32; "
         "`turbopi doctor` shows what there is\n"
     )
+
+
+def test_a_bar_is_drawn_once_its_first_stage_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`0/?` tells nothing."""
+    seen = io.StringIO()
+    console = Console(file=seen, force_terminal=True, width=80)
+    monkeypatch.setattr("turbopi.cli.progress.new_console", lambda *, stderr: console)
+    monkeypatch.setattr(Output, "shows_progress", True)
+
+    def work(told: tuple[Callable[[str, int], None], Callable[[], None]]) -> str:
+        begin, advance = told
+        begin("a stage", 2)
+        advance()
+        return "done"
+
+    assert with_stages(work, lambda begin, advance: (begin, advance), Output()) == "done"
+    assert "a stage" in seen.getvalue() and "1/2" in seen.getvalue()
+    assert "?" not in seen.getvalue().replace("\x1b[?25", "")
 
 
 def test_ctrl_c_is_quiet_and_code_130(capsys: Any) -> None:

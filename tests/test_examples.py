@@ -2,6 +2,7 @@
 
 import ast
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -67,6 +68,20 @@ def test_the_so101_says_why_it_got_no_actions(policy: UnifiedPolicy) -> None:
     """A server for another robot."""
     with running(policy) as server, pytest.raises(AssertionError, match=r"no 'observation/image'.*shoulder_pan\.pos"):
         run("lerobot_so101.py", "--server", server.url, "--chunks", "1")
+
+
+def test_a_server_that_is_not_warm_yet_is_waited_for(policy: UnifiedPolicy) -> None:
+    """The examples start it in the background, and the robot at once."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])  # free when it is closed
+    asked = {
+        "robot_loop.py": ("--host", "127.0.0.1", "--port", port),
+        "lerobot_so101.py": ("--server", f"ws://127.0.0.1:{port}"),
+    }
+    for name, where in asked.items():
+        with pytest.raises(AssertionError, match=r"no server answers at .*; start one with: turbopi serve") as failed:
+            run(name, *where, "--patience", "0")
+        assert "Traceback" not in str(failed.value)
 
 
 def test_a_robot_of_ones_own_is_a_file_or_a_class() -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import os
 import random
 import re
@@ -282,6 +283,30 @@ def test_a_full_queue_says_busy_and_the_connection_stays() -> None:
             assert metric(server, "turbopi_inference_in_progress") == 0
 
     served(test, queue_limit=1)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [("ends", r"disconnected"), ("closes", r"disconnected: it closed with 1000 \(OK\)")],
+)
+def test_the_log_says_plainly_who_came_and_left(how: str, said: str, caplog: pytest.LogCaptureFixture) -> None:
+    """openpi's client ends without a closing message: nothing went wrong, and nothing is said of frames."""
+
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with client(server) as connection:
+            await infer(connection, observation("one"))
+            if how == "ends":
+                connection.transport.close()
+            else:
+                await connection.close()
+            await eventually(lambda: metric(server, "turbopi_clients") == 0)
+
+    with caplog.at_level(logging.INFO, "turbopi"):
+        served(test)
+    told = [message for message in caplog.messages if "connected" in message]
+    assert len(told) == 2
+    assert re.fullmatch(r"127\.0\.0\.1:\d+ connected", told[0])
+    assert re.fullmatch(rf"127\.0\.0\.1:\d+ {said}", told[1])
 
 
 @pytest.mark.parametrize("how", ["close", "abort"])

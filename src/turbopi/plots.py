@@ -116,7 +116,7 @@ def _draw_group(ax: Axes, group: ActionGroup, row: Row) -> None:
             ax.plot(steps[: len(row.expert)], row.expert[: len(steps), index], color=color, **broken)
     if row.oracle is not None:
         handles.append(
-            Line2D([], [], marker="o", color="0.3", linestyle="", markerfacecolor="none", label="f32 oracle")
+            Line2D([], [], marker="o", color="0.3", linestyle="", markerfacecolor="none", label="float32 reference")
         )
     if row.expert is not None:
         handles.append(Line2D([], [], color="0.3", label="expert", **broken))

@@ -32,8 +32,8 @@ def warnings_on(results: Sequence[Result]) -> list[str]:
         if stages:
             found.append(
                 f"{label(result)}, {result.job} is faster than its floor in {', '.join(stages)}: above the roofline. "
-                "These floors are too high, as other programs used the machine while they were measured; run again "
-                "when it is idle"
+                "These floors are too high: most likely other programs used the machine while they were measured; run "
+                "again when it is idle"
             )
     return found
 

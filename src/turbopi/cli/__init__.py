@@ -29,7 +29,7 @@ from turbopi.cli import (  # noqa: F401
     doctor,
 )
 from turbopi.cli import process
-from turbopi.cli.framework import app
+from turbopi.cli.framework import Commands, app
 # isort: on
 
 __all__ = ["app", "main"]
@@ -45,8 +45,9 @@ def _show_version(wanted: bool) -> None:
 
 
 @app.callback(
+    cls=Commands,
     epilog="[bold]Exit codes[/]: 0 all is well, 1 a check failed, 2 bad usage or input, 3 a fault of Turbo-Pi's own, "
-    "4 the GPU failed for good, 130 Ctrl-C, 141 the output's reader has left."
+    "4 the GPU failed for good, 130 Ctrl-C, 141 the output's reader has left.",
 )
 def _root(
     version: Annotated[

@@ -131,9 +131,9 @@ def _backends(names: list[str], precisions: "list[Precision]", device: "torch.de
     shared=RobotOptions,
     examples=(
         "turbopi bench --random-weights pi05_tiny --calls 20",
-        "turbopi bench --random-weights pi05_libero --backends pytorch,cuda_graph --steps 1,3,10",
-        "turbopi bench checkpoints/pi05_libero --table --main-calls 2000 --ready --profile --report bench-report",
-        "turbopi bench checkpoints/pi05_libero --backends fused --precisions bf16,fp8 --quantization fp8.json",
+        "turbopi bench --random-weights pi05_libero --backends cuda_graph --steps 1,10",
+        "turbopi bench checkpoints/mine --table --ready --profile --report bench-report",
+        "turbopi bench checkpoints/mine --backends fused --precisions bf16,fp8",
         "turbopi bench checkpoints/pi05_libero --image-size 224x224,640x480,1280x720",
         "turbopi bench checkpoints/my_arm --config pi05_base --robot my_arm.json",
     ),
@@ -147,10 +147,12 @@ def bench(
     ] = "",
     precisions: Annotated[
         str | None,
-        typer.Option(metavar="bf16,f32,fp8,fp8-mlp", help="Else bf16, or what the backends have instead."),
+        typer.Option(
+            metavar="NAME,NAME,…", help="bf16, f32, fp8, fp8-mlp; else bf16, or what the backends have instead."
+        ),
     ] = None,
     table: Annotated[
-        bool, typer.Option("--table", help="1, 2, 3 cameras × 48, 200 tokens × H 10, 50 × 1, 2, 3, 5, 10 steps.")
+        bool, typer.Option("--table", help="All of 1, 2, 3 cameras; 48, 200 tokens; H = 10, 50; 1, 2, 3, 5, 10 steps.")
     ] = False,
     cameras: Annotated[str | None, typer.Option(metavar="N,N,…", help="Valid cameras, of three; else 2.")] = None,
     prompt_tokens: Annotated[str | None, typer.Option(metavar="N,N,…", help="Valid prompt tokens; else 48.")] = None,
@@ -162,23 +164,26 @@ def bench(
     join: Annotated[
         str | None,
         typer.Option(
-            metavar="none,held,identity,jacobian",
-            help="Chunks that join a running one (docs/real_time.md): a quarter of the actions held, or guidance.",
+            metavar="NAME,NAME,…",
+            help="Chunks that join a running one (docs/real_time.md): none, held (a quarter of the actions), or guided "
+            "by identity or jacobian.",
         ),
     ] = None,
     calls: Annotated[
-        int, typer.Option(min=1, max=MOST_CALLS, help="Calls of each measurement, after three for warm-up.")
+        int,
+        typer.Option(metavar="N", min=1, max=MOST_CALLS, help="Calls of each measurement, after three for warm-up."),
     ] = 100,
     main_calls: Annotated[
         int | None,
         typer.Option(
+            metavar="N",
             min=1,
             max=MOST_CALLS,
             help="Calls of the main job (2 cameras, 48 tokens, H = 10, 10 steps, or the nearest).",
         ),
     ] = None,
     seconds: Annotated[
-        float, typer.Option(min=0, help="A measurement ends after them, though not before 20 calls.")
+        float, typer.Option(metavar="S", min=0, help="A measurement ends after them, though not before 20 calls.")
     ] = 60,
     error: Annotated[
         bool, typer.Option(help="Also the error against the float32 reference, for the main job's cameras and prompt.")
@@ -195,7 +200,7 @@ def bench(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Measure the policy's latency, each stage beside the floor that this machine sets.
+    """Measure the policy's latency, each stage beside its floor: the least time that this machine needs for it.
 
     Every call gets new pictures, another prompt and new noise, and is timed from host to host. With --robot the
     observations are random ones of that robot, with its cameras and its prompt, and the job has the checkpoint's own

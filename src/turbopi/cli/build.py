@@ -25,14 +25,14 @@ PRECISIONS = ("bf16", "fp8")
     shared=WeightOptions,
     examples=(
         "turbopi build checkpoints/pi05_libero --cameras 2 --prompt-tokens 48",
-        "turbopi build checkpoints/pi05_libero --precision fp8 --method modelopt --calibration recording/",
+        "turbopi build checkpoints/mine --precision fp8 --calibration recordings",
         "turbopi build --random-weights pi05_libero --cameras 2 --json",
     ),
 )
 def build(
     options: WeightOptions,
     checkpoint: CheckpointArgument = None,
-    cameras: Annotated[int, typer.Option(min=0, max=4, help="Valid cameras of an observation.")] = 2,
+    cameras: Annotated[int, typer.Option(metavar="N", min=0, max=4, help="Valid cameras of an observation.")] = 2,
     prompt_tokens: Annotated[
         int | None,
         typer.Option(

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     "calibrate",
     shared=RobotOptions,
     examples=(
-        "turbopi calibrate checkpoints/pi05_droid --config pi05_droid --observations recordings/20260101T120000Z",
-        "turbopi calibrate checkpoints/pi05_libero --config pi05_libero --out libero_fp8.json",
+        "turbopi calibrate checkpoints/mine --observations recordings",
+        "turbopi calibrate checkpoints/pi05_libero --config pi05_libero --out fp8.json",
         "turbopi calibrate --random-weights pi05_tiny --out tiny_fp8.json --noises 2",
     ),
 )
@@ -137,10 +137,10 @@ def _show(result: "Quantization", output: Output) -> None:
     seen, worst = report.observations, report.held_out.worst
     output.line(
         f"{report.model}: {len(seen.calibration)} observations ({seen.source}), {len(seen.held_out)} more "
-        f"held out; {seen.noises} noises, {report.steps} steps, on {report.device}"
+        f"held out; noises for each: {seen.noises}; {report.steps} steps, on {report.device}"
     )
     methods = ", ".join(f"{name} {significant(error.relative_rms)}" for name, error in report.methods.items())
-    output.line(f"scales by {report.method} (actions' relative rms: {methods})")
+    output.line(f"scales chosen by {report.method} (the actions' relative rms with each way: {methods})")
     output.table(_table("one group of sites in FP8 alone, calibration observations", report.groups_alone))
     title = "held-out observations, against float32; sites that are kept run in float32 here"
     output.table(_table(title, report.held_out.errors()))
@@ -148,6 +148,9 @@ def _show(result: "Quantization", output: Output) -> None:
         f"worst: {worst.observation}, noise seed {worst.seed}: relative rms {significant(worst.relative_rms)}; "
         f"largest saturation {significant(max(site.saturated for site in result.sites.values()))}"
     )
+    if report.target_reached is not None:
+        verdict = "met" if report.target_reached else "NOT met"
+        output.line(f"cosine of the deltas (actions less noise): the target for fp8, {report.target:g}, is {verdict}")
     kept: dict[str, list[str]] = {}
     for name, site in result.sites.items():
         if site.kept is not None:
@@ -164,7 +167,7 @@ def _show(result: "Quantization", output: Output) -> None:
 def _table(title: str, errors: "dict[str, ActionsError]") -> Table:
     table = Table(title=title, title_justify="left")
     table.add_column("")
-    for column in ("relative rms of the actions", "cosine of the deltas", "max"):
+    for column in ("relative rms of the actions", "cosine of the deltas", "largest error"):
         table.add_column(column, justify="right")
     for name, error in errors.items():
         table.add_row(name, significant(error.relative_rms), f"{error.delta_cosine:.6f}", significant(error.max))

@@ -186,9 +186,9 @@ class _ConvertCommand(CheckpointThen):
     cls=_ConvertCommand,
     shared=RobotOptions,
     examples=(
-        "turbopi convert checkpoints/pi05_droid_jax checkpoints/pi05_droid --config pi05_droid",
+        "turbopi convert checkpoints/jax checkpoints/pi05_droid --config pi05_droid",
         "turbopi convert my_lerobot_policy converted --precision f32",
-        "turbopi convert checkpoints/my_arm_jax checkpoints/my_arm --config pi05_base --robot my_arm.json",
+        "turbopi convert checkpoints/jax my_arm --config pi05_base --robot my_arm.json",
         "turbopi convert --random-weights pi05_tiny tiny_checkpoint",
     ),
 )

@@ -218,7 +218,7 @@ def check_cpu() -> Row:
         return Row("WARN", "CPU", found, f"set OMP_NUM_THREADS={usable}: more threads than CPUs are slow")
     load = psutil.getloadavg()[0]
     if load > usable:
-        busy = f"{found}, but {load:.1f} want to run"
+        busy = f"{found}; the load is {load:.1f}, so other programs use them, too"
         return Row("WARN", "CPU", busy, "stop other programs: they make every call on the CPU slower")
     return Row("OK", "CPU", found)
 
@@ -233,7 +233,7 @@ def check_memory(parameters: int | None) -> Row:
     usable = min(available, limit) if limit is not None else available
     need = {"bf16": 2e-9 * parameters, "f32": 4e-9 * parameters} if parameters is not None else FULL_SIZE_GB
     what = "this checkpoint" if parameters is not None else "full size"
-    needs = f"{what} takes {need['bf16']:.1f} GB in bf16, {need['f32']:.1f} GB in f32"
+    needs = f"{what} takes {_size(need['bf16'])} in bf16, {_size(need['f32'])} in f32"
     if usable < need["bf16"]:
         level: Level = "FAIL" if parameters is not None and not _has_gpu() else "WARN"
         fix = f"{needs}: free memory" + (", or load it onto a GPU" if _has_gpu() else ", or use a larger machine")
@@ -241,6 +241,10 @@ def check_memory(parameters: int | None) -> Row:
     if usable < need["f32"]:
         return Row("OK", "memory", f"{found}; {needs}: enough for bf16 alone")
     return Row("OK", "memory", f"{found}; {needs}")
+
+
+def _size(gigabytes: float) -> str:
+    return f"{gigabytes:.1f} GB" if gigabytes >= 0.1 else f"{1e3 * gigabytes:.0f} MB"
 
 
 def cgroup_limit_gb(root: Path = Path("/sys/fs/cgroup")) -> float | None:

@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     shared=EvalOptions,
     examples=(
         "turbopi compare turbopi-eval/run-a turbopi-eval/run-b",
-        "turbopi compare pytorch:f32 pytorch:bf16 pytorch:bf16:5 --checkpoint checkpoints/pi05_libero "
-        "--config pi05_libero --trials 10 --out turbopi-compare",
-        "turbopi compare pytorch:f32 fused:bf16 fused:fp8 --checkpoint checkpoints/pi05_libero --quantization fp8.json",
+        "turbopi compare pytorch:f32 pytorch:bf16:5 --checkpoint mine --trials 10",
+        "turbopi compare fused:bf16 fused:fp8 --checkpoint mine --quantization fp8.json",
     ),
 )
 def compare_command(

@@ -11,7 +11,7 @@ from rich.table import Table
 from turbopi.cli.files import check_folder
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console, plain
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
-from turbopi.cli.timings import timing_columns
+from turbopi.cli.timings import STAGES, timing_columns
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
 from turbopi.wording import significant
@@ -87,7 +87,11 @@ def demo(
         from turbopi.shipped import SMALL_POLICY
 
         checkpoint = str(SMALL_POLICY)
-    check_folder(report)  # what can't be written is better known before the work
+    check_folder(report)  # what can't be written, or played, is better known before the work
+    if episodes:
+        from turbopi.sim import create
+
+        create("libero").check()
     output = Output(as_json)
     run = _Run(options, checkpoint, frames, seed, output)
     run.play(report / "episodes", episodes)
@@ -114,6 +118,7 @@ class _Run:
         policy = options.make_policy(opened, output)
         self.metadata = policy.metadata
         self.robot: str = self.metadata["robot"]
+        output.line("Warming up …")
         output.line(f"warm-up: {policy.warmup():.2f} s")
         observed = observations(policy, self.frames)
         with _progress(output) as bar:
@@ -156,8 +161,9 @@ class _Run:
 
         if self.robot != "libero" or self.metadata["random_weights"]:
             return
-        table = Table(title="against what the expert did next (first 5 actions)", title_justify="left")
-        for column in ("frame", "mean difference of position", "expert's mean command", "same gripper command"):
+        title = "against what the expert did next: the first 5 actions, 1 = 0.05 m a step"
+        table = Table(title=title, title_justify="left")
+        for column in ("frame", "mean difference of translation", "expert's mean translation", "same gripper command"):
             table.add_column(column, justify="right")
         for number, (frame, result) in enumerate(zip(self.frames, self.results, strict=True)):
             if frame.expert is not None:
@@ -175,14 +181,15 @@ class _Run:
         for name, key in timing_columns(self.results[0]["policy_timing"]).items():
             table.add_row(name, *(f"{result['policy_timing'][key]:.1f}" for result in self.results))
         self.output.table(table)
+        self.output.line(STAGES, "dim")
 
     def _show_chunk(self, actions: "np.ndarray") -> None:
         from turbopi.showing import action_groups
 
         steps, dims = actions.shape
         shown = min(steps, 10, max(3, (self.output.console.width - 42) // 9))
-        cut = f"; the first {shown}" if shown < steps else ""
-        title = f"frame 0: the chunk, {steps} steps of {dims}{cut} (step 0 is the next to execute)"
+        cut = f"; the first {shown} of them" if shown < steps else ""
+        title = f"frame 0: the next {steps} actions, {dims} numbers each{cut}"
         table = Table(title=title, title_justify="left")
         for heading in ("action", "unit"):
             table.add_column(heading)
@@ -198,7 +205,7 @@ class _Run:
     def _show_check(self) -> None:
         check, worst = self.check, self.check.worst
         table = Table(title="against the float32 reference, same noise", title_justify="left")
-        for column in ("frame", "rms error", "its bound", "max error", ""):
+        for column in ("frame", "rms error", "its bound", "largest error", ""):
             table.add_column(column, justify="left" if column == "" else "right")
         for number, difference in enumerate(check.differences):
             ok = difference.rms <= check.bound

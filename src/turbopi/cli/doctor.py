@@ -29,7 +29,9 @@ def doctor(
     tokenizer: Annotated[
         str | None, typer.Option("--tokenizer", metavar="FILE", help="Check this SentencePiece model.")
     ] = None,
-    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="That `turbopi serve` would take.")] = 8000,
+    port: Annotated[
+        int, typer.Option("--port", metavar="N", min=1, max=65535, help="That `turbopi serve` would take.")
+    ] = 8000,
     as_json: JsonFlag = False,
 ) -> None:
     """Check this machine: what Turbo-Pi needs, what is there, and how to mend it.
@@ -46,7 +48,7 @@ def doctor(
         if row.fix:
             output.styled(f"{'':<{width + 8}}[cyan]->[/] {escape(row.fix)}")
     counts = {level: sum(row.level == level for row in rows) for level in STYLES}
-    summary = f"{counts['OK']} OK, {counts['WARN']} to know about, {counts['FAIL']} failed"
+    summary = f"{counts['OK']} OK, {counts['WARN']} warnings, {counts['FAIL']} failed"
     output.line(summary, STYLES["FAIL" if counts["FAIL"] else "OK"])
     output.document({"ok": not counts["FAIL"], "checks": [asdict(row) for row in rows]})
     if counts["FAIL"]:

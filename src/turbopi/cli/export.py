@@ -26,9 +26,9 @@ class _ExportCommand(CheckpointThen):
     shared=WeightOptions,
     examples=(
         "turbopi export onnx checkpoints/pi05_libero pi05_libero_onnx",
-        "turbopi export onnx checkpoints/pi05_droid_jax droid_onnx --config pi05_droid --json",
+        "turbopi export onnx checkpoints/jax droid_onnx --config pi05_droid --json",
         "turbopi export onnx --random-weights pi05_tiny tiny_onnx",
-        "turbopi export onnx checkpoints/pi05_libero fp8_onnx --precision fp8 --calibration recording/",
+        "turbopi export onnx checkpoints/mine fp8_onnx --precision fp8",
     ),
 )
 def export(

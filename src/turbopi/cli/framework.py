@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import rich
 import typer
@@ -27,7 +27,7 @@ from msgspec import Struct
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from turbopi.cli.process import (
     BAD_INPUT,
@@ -118,7 +118,29 @@ def plain(value: object) -> object:
     return str(value) if isinstance(value, Path) else value
 
 
-class CheckpointThen(TyperCommand):
+class Command(TyperCommand):
+    """A command whose --help gives flags no type: `--json <bool>` looks as if a value had to follow."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        return without_types(super().get_params(ctx))
+
+
+class Commands(TyperGroup):
+    """All commands; likewise."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        return without_types(super().get_params(ctx))
+
+
+def without_types(params: list[Any]) -> list[Any]:
+    """The same options, and nothing in --help's column of types for flags."""
+    for param in params:
+        if getattr(param, "is_flag", False) and param.metavar is None:
+            param.metavar = ""
+    return params
+
+
+class CheckpointThen(Command):
     """A command whose one argument is a list: a checkpoint, which random weights do without, and something else."""
 
     other = "PATH"
@@ -128,7 +150,7 @@ class CheckpointThen(TyperCommand):
 
 
 def command(
-    name: str, *, examples: Sequence[str], shared: type | None = None, cls: type[TyperCommand] | None = None
+    name: str, *, examples: Sequence[str], shared: type | None = None, cls: type[Command] = Command
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Declare a function as `turbopi <name>`.
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from turbopi.cli.files import check_writable, load_noise
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command, new_console
 from turbopi.cli.options import PolicyOptions
-from turbopi.cli.timings import timing_columns
+from turbopi.cli.timings import STAGES, timing_columns
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.files import write_whole
 
@@ -36,7 +36,7 @@ class _InferCommand(CheckpointThen):
     shared=PolicyOptions,
     examples=(
         "turbopi infer checkpoints/pi05_libero observation.npz --config pi05_libero",
-        "turbopi infer checkpoints/pi05_droid my_observation/ -o actions.npz --plot actions.png --seed 7",
+        "turbopi infer checkpoints/mine my_observation/ -o mine.npz --seed 7",
         "turbopi infer --random-weights pi05_tiny recordings/20260101T120000Z --call 0",
     ),
 )
@@ -102,6 +102,7 @@ def infer(
     if warmup:
         if policy.backend.name == "pytorch_compile":
             output.line("warm-up: compiling, which takes a minute or more")
+        output.line("Warming up …")
         output.line(f"warm-up: {policy.warmup():.2f} s")
     answers = _run(policy, sources, draw, output)
     _show_timings([answer.timing for answer in answers], output)
@@ -239,6 +240,7 @@ def _show_timings(timings: list[dict[str, float]], output: Output) -> None:
     for name, row in rows.items() if len(timings) > 1 else [("", values[0])]:
         table.add_row(*([name] if name else []), *(f"{value:.1f}" for value in row))
     output.table(table)
+    output.line(STAGES, "dim")
 
 
 def _plot(file: Path, about: dict[str, Any], answers: list[_Answer]) -> None:

@@ -20,9 +20,9 @@ def with_stages(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = new_console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not output.shows_progress) as bar:
-        task = bar.add_task("", total=None)
+        task = bar.add_task("", total=None, visible=False)
 
         def begin(text: str, total: int) -> None:
-            bar.reset(task, description=text, total=total)
+            bar.reset(task, description=text, total=total, visible=True)
 
         return work(told(begin, lambda: bar.advance(task)))

@@ -28,20 +28,22 @@ if TYPE_CHECKING:
     shared=PolicyOptions,
     examples=(
         "turbopi serve checkpoints/pi05_libero --config pi05_libero",
-        "turbopi serve checkpoints/pi05_droid --host 0.0.0.0 --api-key-file key --record recordings",
-        "TURBOPI_API_KEY=… turbopi serve checkpoints/pi05_libero --host 0.0.0.0 --allowed-hosts robot.lab",
-        "turbopi serve checkpoints/pi05_aloha --config pi05_aloha --execution rtc --control-hz 50",
-        "turbopi serve checkpoints/pi05_libero --max-batch 16 --deadline-ms 200 --queue-limit 64",
+        "turbopi serve checkpoints/mine --host 0.0.0.0 --api-key-file key",
+        "turbopi serve checkpoints/mine --config pi05_droid --record recordings",
+        "turbopi serve checkpoints/mine --execution rtc --control-hz 50",
+        "turbopi serve checkpoints/mine --max-batch 16 --deadline-ms 200",
         "turbopi serve --random-weights pi05_tiny --port 8001",
-        "turbopi serve checkpoints/pi05_libero --config pi05_libero --ray --gpus all --host 0.0.0.0 --api-key-file key",
+        "turbopi serve checkpoints/mine --ray --gpus all",
     ),
 )
 def serve(
     options: PolicyOptions,
     checkpoint: CheckpointArgument = None,
-    host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets other machines in.")] = ServerOptions.host,
+    host: Annotated[
+        str, typer.Option("--host", metavar="HOST", help="0.0.0.0 lets other machines in.")
+    ] = ServerOptions.host,
     port: Annotated[
-        int, typer.Option("--port", "-p", min=0, max=65535, help="0 takes a free one.")
+        int, typer.Option("--port", "-p", min=0, max=65535, metavar="N", help="0 takes a free one.")
     ] = ServerOptions.port,
     api_key: ApiKey = None,
     api_key_file: Annotated[
@@ -105,8 +107,9 @@ def serve(
         str | None,
         typer.Option(
             "--execution",
-            metavar="rtc|rtc_identity|rtc_trained",
-            help="Join each client's chunks, without any change of the client (docs/real_time.md). Needs --control-hz.",
+            metavar="WAY",
+            help="Join each client's chunks, without any change of the client: rtc, rtc_identity or rtc_trained, "
+            "with --control-hz. See docs/real_time.md",
         ),
     ] = None,
     control_hz: Annotated[

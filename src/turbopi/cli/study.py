@@ -41,7 +41,12 @@ RANDOM_OBSERVATIONS = 8
 def study(
     options: WeightOptions,
     which: Annotated[
-        str, typer.Argument(metavar="precision,mask,actions,throughput", help="What to study.", show_default=False)
+        str,
+        typer.Argument(
+            metavar="STUDY,STUDY,…",
+            help="What to study: precision, mask, actions, throughput.",
+            show_default=False,
+        ),
     ],
     checkpoint: CheckpointArgument = None,
     observation: Annotated[
@@ -52,12 +57,15 @@ def study(
         ),
     ] = None,
     steps: Annotated[
-        int, typer.Option(min=1, max=LIMITS["num_denoising_steps"], help="Denoising steps; the mask study has its own.")
+        int,
+        typer.Option(
+            metavar="N", min=1, max=LIMITS["num_denoising_steps"], help="Denoising steps; the mask study has its own."
+        ),
     ] = 10,
     calls: Annotated[
-        int, typer.Option(min=1, max=MOST_CALLS, help="Calls of each measurement of the throughput study.")
+        int, typer.Option(metavar="N", min=1, max=MOST_CALLS, help="Calls of each measurement of the throughput study.")
     ] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of the precision and mask studies' noise.")] = 0,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the precision and mask studies' noise.")] = 0,
     device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the results there as JSON.")] = None,
     as_json: JsonFlag = False,

@@ -14,6 +14,11 @@ _COLUMNS = {
     "total": "total_ms",
 }
 
+STAGES = (
+    "vision, prefix (the tokens of pictures and prompt) and denoise (the actions) are the model's stages; queue is "
+    "waiting for other calls"
+)
+
 
 def timing_columns(timing: Mapping[str, float]) -> dict[str, str]:
     """Heading -> key of `policy_timing`, in the order of time, then the sums; without stages the backend can't tell."""

@@ -24,11 +24,10 @@ if TYPE_CHECKING:
     shared=PolicyOptions,
     examples=(
         "turbopi verify --random-weights pi05_tiny --backend pytorch --precision bf16",
-        "turbopi verify checkpoints/pi05_libero --config pi05_libero --backend fused --report certificate",
-        "turbopi verify checkpoints/pi05_droid --observations recordings/20260101T120000Z --count 32 --noises 4",
+        "turbopi verify checkpoints/mine --backend fused --report certificate",
+        "turbopi verify checkpoints/mine --observations recordings --count 32",
         "turbopi verify checkpoints/pi05_libero --precision f32 --bound 2e-6 --json",
-        "turbopi verify checkpoints/pi05_libero --precision fp8 --quantization fp8.json --observations recordings/new "
-        "--count 32",
+        "turbopi verify checkpoints/mine --precision fp8 --observations recordings/new",
     ),
 )
 def verify(
@@ -171,11 +170,11 @@ def _calibration(fp8: "Fp8Details") -> str:
 
 def _intermediates(document: "Certificate") -> Table:
     """One row a name: its worst layer or step, in proportion to what is allowed there."""
-    table = Table(title="against the float32 reference, attended slots", title_justify="left")
+    table = Table(title="against the float32 reference, without padding", title_justify="left")
     table.add_column("intermediate")
     for column in ("relative rms", "control's", "allowed"):
         table.add_column(column, justify="right")
-    table.add_column("which")
+    table.add_column("verdict")
     for column in ("cosine", "max"):
         table.add_column(column, justify="right")
     worst: dict[str, IntermediateDocument] = {}

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     examples=(
         "turbopi view recordings/20260131T093000Z --rate 20",
         "turbopi view http://127.0.0.1:8000",
-        "turbopi view http://gpu-box:8000 --api-key-file key --save morning.rrd --seconds 600",
+        "turbopi view http://gpu-box:8000 --save morning.rrd --seconds 600",
     ),
 )
 def view(

@@ -101,9 +101,13 @@ def plot_successes(path: Path, played: Sequence[Played]) -> Path:
 
 
 def plot_commands(path: Path, played: Sequence[Played]) -> Path:
-    """The commands of one episode, with the seams: the first one that not all ways solved, else the first."""
+    """The commands of one episode, with the seams: the first one that the last way solved and the one before it didn't,
+    else the first one that not all ways solved, else the first. The plot says so.
+    """
     solved = [[ending.status == "success" for ending in one.endings] for one in played]
-    differing = [number for number, outcomes in enumerate(zip(*solved, strict=True)) if len(set(outcomes)) > 1]
+    outcomes = list(enumerate(zip(*solved, strict=True)))
+    differing = [number for number, ends in outcomes if ends[-1] and not ends[-2]]
+    differing += [number for number, ends in outcomes if len(set(ends)) > 1]
     episode = differing[0] if differing else 0
     figure = Figure(figsize=(8.0, 1.9 * len(played) + 0.6), layout="constrained")
     rows = figure.subplots(len(played), 1, squeeze=False, sharex=True)[:, 0]
@@ -117,7 +121,9 @@ def plot_commands(path: Path, played: Sequence[Played]) -> Path:
         axes.set_title(f"{one.way}, delay {one.delay}, initial state {episode}: {ending.status}", fontsize=9)
         axes.set_ylabel("command")
         axes.set_ylim(-1.3, 1.3)
-        axes.legend(fontsize=8, frameon=False, loc="upper right")
-    rows[-1].set_xlabel("control step; dotted: a chunk takes over")
+        axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    saved = f"an episode that {played[-1].way} solved and {played[-2].way} under the same delay didn't"
+    which = saved if solved[-1][episode] and not solved[-2][episode] else "one episode"
+    rows[-1].set_xlabel(f"control step; dotted: a chunk takes over\n{which}")
     write_figure(path, figure, dpi=120)
     return path

@@ -18,7 +18,7 @@ from websockets.frames import CloseCode, Frame, Opcode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
-from turbopi.serve.limited_log import LimitedLog
+from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.limits import Credit, Limits, MemoryBudget, WorkPool
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.straight import SpareBuffer, StraightFrame, goes_straight
@@ -393,4 +393,4 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
 
     def _complain(self, text: str) -> None:
         self._shared.metrics.error("slow")
-        self._shared.log.warning(f"{self.remote_address}: {text}", "slow")
+        self._shared.log.warning(f"{peer(self)}: {text}", "slow")

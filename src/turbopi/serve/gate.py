@@ -9,7 +9,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from turbopi.serve.hosts import AllowedHosts
-from turbopi.serve.limited_log import LimitedLog
+from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.metrics import CONTENT_TYPE, Metrics
 from turbopi.serve.options import check_key
 from turbopi.serve.page.http import document, is_feed, is_page, page_key
@@ -93,14 +93,14 @@ class Gate:
 
     def _forbidden(self, connection: ServerConnection, why: str) -> Response:
         self._metrics.error("origin")
-        self._log.warning(f"{_peer(connection)} refused: {why}")
+        self._log.warning(f"{peer(connection)} refused: {why}")
         return connection.respond(HTTPStatus.FORBIDDEN, f"{why}; --allowed-hosts names those that may.\n")
 
     def _unauthorized(self, connection: ServerConnection, request: Request) -> Response:
         self._metrics.error("unauthorized")
         sent = request.headers.get_all("Authorization") or (is_feed(request) and page_key(request))
         what = "a wrong API key" if sent else "no API key"
-        self._log.warning(f"{_peer(connection)} refused: it sent {what}")
+        self._log.warning(f"{peer(connection)} refused: it sent {what}")
         response = connection.respond(HTTPStatus.UNAUTHORIZED, "Send the header `Authorization: Api-Key <key>`.\n")
         response.headers["WWW-Authenticate"] = "Api-Key"
         return response
@@ -126,9 +126,3 @@ def _short(value: str | None) -> str:
     if value is None:
         return "a request without one Host"
     return repr(value if len(value) <= 80 else value[:80] + "…")
-
-
-def _peer(connection: ServerConnection) -> str:
-    """Address and port of whoever asks."""
-    address = connection.remote_address
-    return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else str(address)

@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from websockets.asyncio.server import ServerConnection
+
 
 @dataclass
 class _Kind:
@@ -56,3 +58,9 @@ class LimitedLog:
             if known.left_out:
                 self._logger.warning("%d lines were left out%s", known.left_out, f" ({kind})" if kind else "")
                 known.left_out = 0
+
+
+def peer(connection: ServerConnection) -> str:
+    """Address and port of whoever is at the other end, as the log writes them."""
+    address = connection.remote_address
+    return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else str(address)

@@ -14,6 +14,7 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 from turbopi.serve.connection import GuardedConnection, Shared
+from turbopi.serve.limited_log import peer
 from turbopi.serve.limits import SPARE_CONNECTIONS, AtMost, room_for_connections, trim_memory
 from turbopi.serve.page.http import is_feed, select_subprotocol
 
@@ -186,7 +187,7 @@ class Listener:
             await self._handle(connection)
             await connection.close()
         except Exception:
-            logger.exception("%s: the server failed", connection.remote_address)
+            logger.exception("%s: the server failed", peer(connection))
         finally:
             connection.transport.abort()
             await connection.wait_closed()

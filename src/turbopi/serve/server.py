@@ -34,7 +34,7 @@ from turbopi.serve.calls import Calls, Policy, PolicyCalls
 from turbopi.serve.connection import GuardedConnection, Shared
 from turbopi.serve.gate import Gate
 from turbopi.serve.hosts import AllowedHosts
-from turbopi.serve.limited_log import LimitedLog
+from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.limits import Limits, limits_for
 from turbopi.serve.listener import Listener
 from turbopi.serve.metrics import Metrics
@@ -244,25 +244,25 @@ class PolicyServer:
         """One client, from its metadata to its close; or one who watches."""
         if self._live is not None:
             if is_feed(connection.request):
-                self._log.info(f"{connection.remote_address} watches", "connections")
+                self._log.info(f"{peer(connection)} watches", "connections")
                 return await self._live.watch(connection)
             self._live.joined(connection)
         self.metrics.clients.inc()
-        self._log.info(f"{connection.remote_address} connected", "connections")
+        self._log.info(f"{peer(connection)} connected", "connections")
         try:
             await connection.send(self._greeting)
             await self._converse(connection)
         except _ClientGone:
             self.metrics.error("disconnected")
-            self._log.info(f"{connection.remote_address} left during its request", "connections")
+            self._log.info(f"{peer(connection)} left during its request", "connections")
         except ConnectionClosed as closed:
             if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
                 self.metrics.error("too_large")
-            self._log.info(f"{connection.remote_address} disconnected: {closed}", "connections")
+            self._log.info(f"{peer(connection)} disconnected{_said(closed)}", "connections")
         except _PolicyFailed as failure:
             await self._fail(connection, str(failure))
         except Exception:  # a fault of this server must cost one client, not all
-            logger.exception("%s: the server failed", connection.remote_address)
+            logger.exception("%s: the server failed", peer(connection))
             await self._fail(connection, traceback.format_exc())
         finally:
             self._idle.discard(connection)
@@ -321,7 +321,7 @@ class PolicyServer:
         if connection.bad_in_a_row >= self._limits.bad_messages:
             self.metrics.error("flood")
             reason = f"{connection.bad_in_a_row} bad requests in a row"
-            self._log.warning(f"{connection.remote_address}: {reason}, the last one: {refusal.text}", "flood")
+            self._log.warning(f"{peer(connection)}: {reason}, the last one: {refusal.text}", "flood")
             await connection.close(CloseCode.POLICY_VIOLATION, f"{reason}: the text frames say what is wrong")
 
     def _record(self, message: bytes, result: dict[str, object], rows: int | None) -> None:
@@ -391,6 +391,14 @@ class PolicyServer:
             gone.cancel()
             work.cancel()
             self._askings.release(asking)
+
+
+def _said(closed: ConnectionClosed) -> str:
+    """What the end of a connection said of itself. A client that only ends, as openpi's does, says nothing."""
+    frame = closed.rcvd if closed.rcvd_then_sent or closed.sent is None else closed.sent
+    if frame is None:
+        return ""
+    return f": {'it' if frame is closed.rcvd else 'the server'} closed with {frame}"
 
 
 def _decode(message: str | bytes, max_bytes: int) -> dict[str, object]:

@@ -20,6 +20,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 
 from turbopi.serve.connection import GuardedConnection
+from turbopi.serve.limited_log import peer
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.page.device import memory_of
 from turbopi.serve.page.look import look_at
@@ -136,9 +137,7 @@ class Live:
 
     def joined(self, connection: GuardedConnection) -> None:
         self._known += 1
-        peer = connection.remote_address
-        address = f"{peer[0]}:{peer[1]}" if isinstance(peer, tuple) else str(peer)
-        self._robots[connection] = _Robot(self._known, address, time.time())
+        self._robots[connection] = _Robot(self._known, peer(connection), time.time())
 
     def left(self, connection: GuardedConnection) -> None:
         self._robots.pop(connection, None)
