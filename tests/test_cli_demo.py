@@ -71,7 +71,8 @@ def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_exp
     assert len(report["frames"]) == 2
     check = report["check"]
     assert check["bound"] == pytest.approx(10 * check["control_rms"])
-    assert 0 < max(check["rms"]) <= check["bound"]
+    assert check["rms_of_all"] == pytest.approx(np.sqrt(np.mean(np.square(check["rms"]))))
+    assert 0 < check["rms_of_all"] <= check["bound"]
     with np.load(tmp_path / "report" / "actions.npz") as actions:
         assert actions["actions"].shape == actions["oracle_actions"].shape == (2, 10, 7)
         assert actions["actions"].dtype == np.float64
@@ -120,7 +121,7 @@ def test_a_backend_that_swaps_cameras_fails_with_code_1(tmp_path: Path, monkeypa
     assert "from the reference, beyond its bound" in result.stderr
     document = json.loads(result.stdout)
     assert document["ok"] is False
-    assert max(document["check"]["rms"]) > 2 * document["check"]["bound"]
+    assert document["check"]["rms_of_all"] > 2 * document["check"]["bound"]
     assert json.loads((tmp_path / "report.json").read_text()) == document
 
 
@@ -161,7 +162,7 @@ def test_the_check_passes_the_oracle_itself_and_refuses_anything_else() -> None:
 
     same = judged(exact[0])
     assert same.ok
-    assert same.worst.rms == 0
+    assert same.all_frames.rms == 0
     assert 1e-4 < same.control < 2e-2
     units = demo.action_units(oracle, observed[0])
     assert not judged(exact[0] + 1.1 * same.bound * units).ok
@@ -173,6 +174,17 @@ def test_the_check_passes_the_oracle_itself_and_refuses_anything_else() -> None:
     assert judged(exact[0], "f32").bound < 1e-5
     with pytest.raises(BackendError, match=r"the backend's chunk has shape \[9, 7\], the oracle's \[10, 7\]"):
         judged(exact[0][:9])
+
+
+def test_a_fault_in_one_of_several_frames_fails_the_check() -> None:
+    """Faults make 73 times the control and more: seven times the bound, in one of six frames nearly three times."""
+    oracle = tiny_oracle()
+    observed = shipped.observations(oracle, shipped.load_frames()[:6])
+    exact = [result["actions"] for result in demo.run_frames(oracle, observed, 0, lambda: None)]
+    bound = demo.check(exact, oracle, observed, precision="bf16", seed=0).bound
+    wrong = [exact[0] + 7.3 * bound * demo.action_units(oracle, observed[0]), *exact[1:]]
+    judged = demo.check(wrong, oracle, observed, precision="bf16", seed=0)
+    assert not judged.ok and judged.all_frames.rms == pytest.approx(7.3 * bound / np.sqrt(6), rel=1e-3)
 
 
 def test_an_error_is_the_same_however_many_frames_are_shown() -> None:
