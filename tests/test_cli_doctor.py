@@ -218,6 +218,7 @@ def test_an_environment_without_pythons_headers_is_told_before_anything_compiles
 def test_backends_are_listed_with_reasons_and_what_auto_takes(monkeypatch: Any) -> None:
     reason = "torch.compile needs a C++ compiler on a CPU; install g++"
     monkeypatch.setattr(PyTorchCompileBackend, "unavailable", classmethod(lambda cls, device: reason))
+    monkeypatch.setenv("COLUMNS", "160")
     result = turbopi("backends", "--device", "cpu", "--json")
     document = json.loads(result.stdout)
     assert (document["device"], document["auto"]) == ("cpu", "pytorch")

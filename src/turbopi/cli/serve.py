@@ -85,8 +85,8 @@ def serve(
         typer.Option(
             "--deadline-ms",
             metavar="MS",
-            help="From a request to its answer, for robots that don't say their own (turbopi/deadline_ms): it sets "
-            "the order alone, nothing is refused for it.",
+            help="From a request to its answer, for robots that don't say their own (docs/serving.md): it sets the "
+            "order alone, nothing is refused for it.",
         ),
     ] = ServerOptions.deadline_ms,
     max_clients: Annotated[
