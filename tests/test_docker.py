@@ -2,12 +2,10 @@
 
 import json
 import re
-import shlex
 from pathlib import Path
 
-import click
 import pytest
-from test_document_commands import command_of
+from test_document_commands import check_parses
 
 from turbopi.serve.options import ServerOptions
 
@@ -22,13 +20,6 @@ def instructions(file: Path, name: str) -> list[str]:
     return re.findall(rf"^\s*{name} (.*)$", text, re.MULTILINE)
 
 
-def parses(words: list[str]) -> None:
-    try:
-        command_of(words).make_context(words[0], words[1:])
-    except click.ClickException as error:
-        pytest.fail(f"turbopi {shlex.join(words)}: {error.format_message()}")
-
-
 def compose_command() -> list[str]:
     """The service's command, with its variables' defaults."""
     block = re.search(r"^    command:\n((?:      - .*\n)+)", COMPOSE.read_text(encoding="utf-8"), re.MULTILINE)
@@ -40,12 +31,12 @@ def compose_command() -> list[str]:
 @pytest.mark.parametrize("file", FILES, ids=lambda path: path.name)
 def test_what_an_image_runs_is_a_command_of_turbopi(file: Path) -> None:
     (command,) = instructions(file, "CMD")[-1:]
-    parses(json.loads(command))
+    check_parses(json.loads(command), file.name)
 
 
 def test_what_the_service_runs_is_a_command_of_turbopi_with_a_key() -> None:
     words = compose_command()
-    parses(words)
+    check_parses(words, COMPOSE.name)
     assert "--host=0.0.0.0" in words and any(word.startswith("--api-key-file=/run/secrets/") for word in words)
 
 

@@ -42,6 +42,13 @@ def command_of(words: list[str]) -> click.Command:
     return command
 
 
+def check_parses(words: list[str], where: str) -> None:
+    try:
+        command_of(words).make_context(words[0], words[1:])
+    except click.ClickException as error:
+        pytest.fail(f"{where}: turbopi {shlex.join(words)}: {error.format_message()}")
+
+
 def all_of(kind: str) -> list[tuple[str, str]]:
     read = commands if kind == "blocks" else mentioned
     return [(path.relative_to(ROOT).as_posix(), shlex.join(words)) for path in DOCUMENTS for words in read(path)]
@@ -58,12 +65,7 @@ def examples() -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("document", "line"), all_of("blocks") + examples())
 def test_every_command_in_code_blocks_and_help_parses(document: str, line: str) -> None:
-    words = shlex.split(line)
-    command = command_of(words)
-    try:
-        command.make_context(words[0], words[1:])
-    except click.ClickException as error:
-        pytest.fail(f"{document}: turbopi {line}: {error.format_message()}")
+    check_parses(shlex.split(line), document)
 
 
 @pytest.mark.parametrize(("document", "line"), sorted(set(all_of("text"))))

@@ -18,11 +18,12 @@ from turbopi.cli.serve_ray import check_fits, check_runs
 from turbopi.client import RealTimeClient, ServerRefused
 from turbopi.errors import ConfigError
 from turbopi.serve import PolicyServer, ray_app, running
-from turbopi.serve.fleet import FleetOptions, RemoteCalls, import_ray, reason_in
+from turbopi.serve.fleet import FleetOptions, import_ray, reason_in
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.outcome import Outcome
 from turbopi.serve.ray_app import Arguments, build, gpus_for, name_of, read_autoscaling, relay
+from turbopi.serve.remote_calls import RemoteCalls
 from turbopi.serve.replica import Line, Replica
 from turbopi.wire import pack, unpack
 

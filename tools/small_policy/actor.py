@@ -12,6 +12,7 @@ from turbopi.model.denoise import euler_step, run_expert, time_embedding, time_g
 from turbopi.model.layers import rope_tables
 from turbopi.model.prefix import embed_images, embed_prompt, prefix_keys_values
 from turbopi.model.reference import Pi0Model, parameter_dtype
+from turbopi.preprocess.normalize import Normalizer
 
 NUM_STEPS = 10
 
@@ -92,6 +93,13 @@ class Actor:
                 self._graph.replay()
                 return self._out[:n].cpu().numpy()
             return self._compute()[:n].cpu().numpy()
+
+    def chunks(
+        self, scale: Normalizer, pictures: np.ndarray, prompts: list[int], held: Sequence[np.ndarray]
+    ) -> np.ndarray:
+        """As `act`, with held actions [d, 7] and chunks float64[n, H, 7] in the robot's units."""
+        actions = self.act(pictures, prompts, [scale.normalize(one) for one in held])
+        return scale.unnormalize(actions)[..., :7]
 
     @torch.no_grad()
     def _compute(self) -> Tensor:

@@ -79,7 +79,7 @@ class Player:
         drawn = []
         for joints in tape.joints:
             self.world.place_joints(joints)
-            self.world._pictures = dict(zip(CAMERAS, self.world.draw(), strict=True))
+            self._draw()
             drawn.append(self._pictures())
         return np.array(drawn, np.uint8).reshape(-1, 2, IMAGE_PX, IMAGE_PX, 3)
 
@@ -175,7 +175,10 @@ class Player:
     def _draw_if_needed(self) -> None:
         """When the expert hands over between frames: what the cameras see now, without a step."""
         if not self.world._pictures:
-            self.world._pictures = dict(zip(CAMERAS, self.world.draw(), strict=True))
+            self._draw()
+
+    def _draw(self) -> None:
+        self.world._pictures = dict(zip(CAMERAS, self.world.draw(), strict=True))
 
     def _pictures(self) -> np.ndarray:
         return np.stack([resize_with_pad(self.world._pictures[key], IMAGE_PX, IMAGE_PX) for key in CAMERAS])

@@ -133,8 +133,7 @@ class Fleet(threading.Thread):
     def _answer(self, asked: list[tuple[Any, np.ndarray, int, np.ndarray]]) -> None:
         pipes, pictures, prompts, held = zip(*asked, strict=True)
         with self._weights_lock:
-            actions = self.actor.act(np.stack(pictures), list(prompts), [self.scale.normalize(one) for one in held])
-        chunks = self.scale.unnormalize(actions)[..., :7]
+            chunks = self.actor.chunks(self.scale, np.stack(pictures), list(prompts), held)
         for pipe, chunk in zip(pipes, chunks, strict=True):
             try:
                 pipe.send(("chunk", chunk))

@@ -33,8 +33,7 @@ def learner_of(folder: Path) -> Learner:
     actor.take(checkpoint.load(device, "f32").state)
 
     def ask(pictures: np.ndarray, prompt: int, held: np.ndarray) -> np.ndarray:
-        actions = actor.act(pictures[None], [prompt], [scale.normalize(held)])
-        return scale.unnormalize(actions)[0, :, :7]
+        return actor.chunks(scale, pictures[None], [prompt], [held])[0]
 
     return ask
 

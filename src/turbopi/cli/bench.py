@@ -103,9 +103,7 @@ def _joins(text: str) -> "list[Join]":
     names = _names(text)
     if not names or (wrong := [name for name in names if name not in JOINS]):
         raise ConfigError(f"--join has {shown(wrong[0] if names else text)}; expected some of {', '.join(JOINS)}")
-    known: dict[str, Join] = {
-        name: name for name in JOINS
-    }  # the very strings: msgspec leaves out a default if it is the same object
+    known: dict[str, Join] = {name: name for name in JOINS}  # msgspec leaves out a default if it is the same object
     return list(dict.fromkeys(known[name] for name in names))
 
 

@@ -111,17 +111,8 @@ class RealTime:
             received = {key: value for key, value in received.items() if key != PREFIX + "mode"}
         observation, asked = read_message(received)
         seeded = _seed(asked)
-        told = replace(asked, seed=None)
-        if unjoined and (told.session is None or told != Asked(session=told.session)):
-            raise ObservationError(
-                f"{PREFIX}mode {NO_JOINING!r} joins nothing: it needs {PREFIX}session, and goes with no other key of "
-                "real-time execution"
-            )
-        if self._modes or not seeded:
-            if unjoined or (told.session is not None and told == Asked(session=told.session) and not self._modes):
-                return Plan(observation, seeded, name=told.session)
-            if told == Asked() and self._options.execution is None:
-                return Plan(observation, seeded)
+        if self._joins_nothing(asked, unjoined) and (self._modes or not seeded):
+            return Plan(observation, seeded, name=asked.session)
         if not self._modes:
             raise ObservationError(
                 f"this server's policy joins no chunks (its metadata offers no real-time modes): leave out "
@@ -151,6 +142,18 @@ class RealTime:
                 "(or start the server with --execution)"
             )
         return self._plan_in_session(observation, asked, mode, connection, now)
+
+    def _joins_nothing(self, asked: Asked, unjoined: bool) -> bool:
+        """Whether a request is for the policy alone. `unjoined`: its mode said so. Raises ObservationError."""
+        alone = replace(asked, seed=None) == Asked(session=asked.session)  # nothing but a session was said, if that
+        if unjoined and (asked.session is None or not alone):
+            raise ObservationError(
+                f"{PREFIX}mode {NO_JOINING!r} joins nothing: it needs {PREFIX}session, and goes with no other key of "
+                "real-time execution"
+            )
+        if asked.session is None:
+            return alone and self._options.execution is None
+        return unjoined or (alone and not self._modes)
 
     def _plan_in_session(
         self, observation: dict[str, Any], asked: Asked, mode: JoinMode, connection: Hashable, now: float
