@@ -20,7 +20,7 @@ from turbopi.errors import BackendUnavailable
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.quantize import quantize
 from turbopi.observation import Observation
-from turbopi.quantization.fp8 import Matrix
+from turbopi.quantization.fp8 import Fp8Matrix, Matrix
 from turbopi.quantization.sites import Site, sites
 from turbopi.verify.check_golden import golden_calibration
 
@@ -119,12 +119,44 @@ def test_the_experts_first_copy_goes_away_unless_operations_read_it() -> None:
     assert moved == [CPU]
 
 
+def test_batches_denoise_by_operations_in_the_kernels_precision() -> None:
+    """In bfloat16 with the expert's first copy, which stays; in FP8 with matrices of their own, and it goes away."""
+    backend = FusedBackend.__new__(FusedBackend)
+    moved: list[torch.device] = []
+    backend.config, backend.device = golden_model("pi05").config, CPU
+    state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
+    backend._weights, backend._refused, backend._plan = pack(backend.config, state), {}, None
+    backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
+    assert backend._batch_weights() is backend._weights
+    backend._put_expert_away()
+    assert moved == [CPU], "it is asked for, and then not let go"
+
+    backend = FusedBackend.__new__(FusedBackend)
+    moved: list[torch.device] = []
+    backend.config, backend.device = golden_model("pi05").config, torch.device("meta")
+    calibration = golden_calibration(golden_folder(), "pi05", CPU)
+    every = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}
+    backend._plan = dataclasses.replace(calibration, sites=every).plan(backend.config, "fp8")
+    state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
+    backend._weights, backend._refused = pack(backend.config, state), {}
+    backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
+    expert = backend._batch_weights().expert
+    assert moved == [backend.device, CPU]
+    for i, (ours, bf16) in enumerate(zip(expert, backend._weights.expert, strict=True)):
+        for kind in ("qkv", "out", "gate_up", "down"):
+            made, was, scale = getattr(ours, kind), getattr(bf16, kind), backend._plan.scales[f"expert.{i}.{kind}"]
+            assert isinstance(made, Fp8Matrix) and made.inverse == 1 / scale
+            assert float((made.dequantized() - was).norm() / was.norm()) < 0.05
+    assert backend._batch_weights().expert is expert
+
+
 def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in() -> None:
     backend, calibration = FusedBackend.__new__(FusedBackend), golden_calibration(golden_folder(), "pi05", CPU)
     everything = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}
     calibration = dataclasses.replace(calibration, sites=everything)
     backend._quantization, backend._plan = calibration, calibration.plan(golden_model("pi05").config, "fp8")
     backend._calls, backend._ops, backend._denoisers = {}, PLAIN, {}
+    backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
     backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
     backend._refused = {
         (Loop(5, 60), 968): "too many",

@@ -11,6 +11,7 @@ from turbopi.errors import ConfigError, ObservationError
 MAX_STEPS = LIMITS["num_denoising_steps"]  # far beyond any use; a larger number is a mistake, not a wish
 MAX_HORIZON = LIMITS["action_horizon"]
 MAX_CAMERAS = 16
+MAX_BATCH = 256
 
 Error = type[ConfigError] | type[ObservationError]
 Numbers = int | Sequence[int] | None  # None: as the policy is made
@@ -26,6 +27,10 @@ def checked_horizon(horizon: int, error: Error) -> int:
 
 def checked_cameras(cameras: int, error: Error) -> int:
     return _checked("the number of cameras", cameras, MAX_CAMERAS, error)
+
+
+def checked_batch(size: int, error: Error) -> int:
+    return _checked("the size of a batch", size, MAX_BATCH, error)
 
 
 def _checked(what: str, number: int, most: int, error: Error) -> int:

@@ -74,9 +74,14 @@ class RealTimeClient:
             self.metadata = self._connect()
 
     def infer(
-        self, obs: Mapping[str, Any], *, previous: RunningChunk | None = None, model_actions: bool = False
+        self,
+        obs: Mapping[str, Any],
+        *,
+        previous: RunningChunk | None = None,
+        model_actions: bool = False,
+        seed: int | None = None,
     ) -> dict[str, Any]:
-        """The server's answer: {"actions": float64[H, d], …}; `previous` and `model_actions` as for UnifiedPolicy.
+        """The server's answer: {"actions": float64[H, d], …}; the other arguments as for UnifiedPolicy.
 
         Raises ObservationError, ActionError, DeviceLost for what the server says of this call, ConfigError if the
         server doesn't offer what is asked, ServerRefused for other answers, and ServerLost.
@@ -84,9 +89,9 @@ class RealTimeClient:
         with self._lock:
             if self._socket is None:
                 self.metadata = self._connect()
-            if previous is not None or model_actions:
+            if previous is not None or model_actions or seed is not None:
                 self._check_offered(None if previous is None else previous.mode)
-            packed = pack(message(obs, previous, model_actions))
+            packed = pack(message(obs, previous, model_actions, seed))
             assert self._socket is not None
             try:
                 self._socket.send(packed)

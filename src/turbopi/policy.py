@@ -15,6 +15,7 @@ import torch
 from turbopi import backends
 from turbopi.arguments import (
     Numbers,
+    checked_batch,
     checked_cameras,
     checked_horizon,
     checked_steps,
@@ -193,6 +194,10 @@ class UnifiedPolicy:
 
         `noise` is [B, H, action_dim]; `seed` one number for the batch's first row, the next row taking the next
         number, or one for each row.
+
+        `runs_batches` says whether the backend runs observations together: in calls of 1, 2, 4, 8 or 16, into which it
+        splits other numbers (`backend.batch_costs`). Observations may differ in cameras and prompts. Actions then
+        differ from what `infer` returns by as much as sums in another order do: docs/performance.md.
         """
         return self._infer(observations, noise, seed, num_steps, horizon)
 
@@ -228,6 +233,19 @@ class UnifiedPolicy:
                 sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps, **asked_for)
                 infer_end = time.perf_counter()
             states = [seen.state]
+        elif isinstance(self.backend, backends.RunsBatches) and conditioning is None and chunk is None:
+            each = [self._pipeline.see(obs, resize=False) for obs in observations]
+            asked = time.perf_counter()
+            with self._lock, self._guard:
+                infer_start = time.perf_counter()
+                batch = self.backend.begin_batch([seen.pictures for seen in each], self._pipeline.config.image_resize)
+                for seen in each:
+                    self._pipeline.read(seen)  # while the device is at the first ones' pictures
+                x_1 = self._noise(len(each), actions, noise, seed)
+                tokens = [seen.tokens[seen.token_mask] for seen in each]
+                sample = batch.finish(tokens, np.stack([seen.model_state for seen in each]), x_1, steps)
+                infer_end = time.perf_counter()
+            states = [seen.state for seen in each]
         else:
             prepared = [self._pipeline.before(obs) for obs in observations]
             inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
@@ -306,6 +324,7 @@ class UnifiedPolicy:
         cameras: Numbers = None,
         horizons: Numbers = None,
         steps: Numbers = None,
+        batches: Numbers = None,
         real_time: JoinMode | Sequence[JoinMode] = (),
         conditioning: Sequence[Conditioning] = (),
     ) -> float:
@@ -318,6 +337,8 @@ class UnifiedPolicy:
                         built yet, but for the example observation's
             horizons    action horizons, see `infer`. None: the config's
             steps       numbers of denoising steps. None: the policy's
+            batches     sizes of the batches that `infer_batch` will be given, whose observations have any of these
+                        numbers of cameras on average. None: none, only single observations
             real_time   modes of `RunningChunk` that calls will have, besides calls without one
             conditioning
                         examples of other conditionings that they will have, each for its own steps and horizon alone:
@@ -334,6 +355,7 @@ class UnifiedPolicy:
         own = int(inputs.image_mask.sum())
         sent = [own, *(getattr(self._pipeline.robot, "camera_counts", None) or ())]  # the example's first
         counts = several("cameras", cameras, sent, lambda n, error: n if n == own else checked_cameras(n, error))
+        sizes = several("batches", 1 if batches is None else batches, [], checked_batch)
         loops = warm_loops(
             several("steps", steps, [self._num_steps], checked_steps),
             several("horizons", horizons, [self.config.model.action_horizon], self._checked_horizon),
@@ -352,6 +374,8 @@ class UnifiedPolicy:
                     last=i + 1 == len(plan),
                     **({} if one is None else {"conditioning": one}),
                 )
+                if one is None and sizes and isinstance(self.backend, backends.RunsBatches):
+                    self.backend.warmup_batches(Observation.stack([seen]), num_steps, horizon, sizes)
         if own in counts:
             self._whole_call(example, *loops[0])
         return time.perf_counter() - start
@@ -378,6 +402,11 @@ class UnifiedPolicy:
         without touching the GPU. Out of memory isn't such a failure.
         """
         return self._guard.lost
+
+    @property
+    def runs_batches(self) -> bool:
+        """Whether `infer_batch` runs observations together, and `warmup` prepares `batches` of them."""
+        return isinstance(self.backend, backends.RunsBatches)
 
     @property
     def pipelined(self) -> bool:

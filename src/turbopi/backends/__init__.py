@@ -9,7 +9,18 @@ from dataclasses import dataclass
 
 import torch
 
-from turbopi.backends.base import Backend, Begins, Begun, Conditions, LoadState, Precision, RunsFp8, Sample, Submits
+from turbopi.backends.base import (
+    Backend,
+    Begins,
+    Begun,
+    Conditions,
+    LoadState,
+    Precision,
+    RunsBatches,
+    RunsFp8,
+    Sample,
+    Submits,
+)
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
@@ -25,6 +36,7 @@ __all__ = [
     "Conditions",
     "LoadState",
     "Precision",
+    "RunsBatches",
     "RunsFp8",
     "Sample",
     "Submits",

@@ -1,6 +1,6 @@
 """The protocol that every backend implements. The policy knows nothing else about the one it holds."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -44,7 +44,7 @@ class Backend(Protocol):
     """A way to run the model. All of them compute what `turbopi.model.reference.Pi0Model` computes.
 
     Observations and noise may be on the host or on the device; both are moved where they are needed. What only some
-    can do besides are `Begins`, `Submits`, `Conditions` and `RunsFp8`.
+    can do besides are `Begins`, `RunsBatches`, `Submits`, `Conditions` and `RunsFp8`.
 
     any_horizon     whether noise may have another action horizon than the config's
     strict          whether a call that would capture, compile or build is refused with an ObservationError, made by
@@ -111,6 +111,37 @@ class Begins(Protocol):
         They are copied, and `begin` returns without waiting for the device, so that the host can tokenise meanwhile. An
         observation that never gets to `finish` is given up by the next `begin`, `sample` or `prefix`.
         """
+
+
+class BegunBatch(Protocol):
+    """Several observations whose pictures a backend works on already: what `RunsBatches.begin_batch` returns."""
+
+    def finish(self, tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+        """Actions of all of them, with the time of each stage of the whole batch.
+
+        tokens  of each int64[valid prompt tokens]
+        state   float32[B, action_dim]
+        noise   float32[B, H, action_dim]
+        """
+
+
+@runtime_checkable
+class RunsBatches(Protocol):
+    """A backend whose batches are sooner than their observations one by one.
+
+    batch_costs  how many observations it runs together, and how long that takes, in calls of one; other batches are
+        split into these
+    """
+
+    batch_costs: ClassVar[Mapping[int, float]]
+
+    def begin_batch(self, pictures: Sequence[Sequence[np.ndarray]], resize: ImageResize | None = None) -> BegunBatch:
+        """`Begins.begin` of several observations: each one's valid pictures, perhaps none."""
+
+    def warmup_batches(
+        self, observation: Observation, num_steps: int, horizon: int | None, batches: Sequence[int]
+    ) -> None:
+        """Capture whatever batches of these sizes need if each observation has so many cameras as this one."""
 
 
 @runtime_checkable

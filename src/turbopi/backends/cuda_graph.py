@@ -1,6 +1,6 @@
 """Backend `cuda_graph`: a call is two CUDA graphs, one for pictures and one for all the rest, with stock PyTorch.
 
-What is captured, kept and refused: engine/runner.py.
+What is captured, kept and refused: engine/runner.py; of batches: engine/batches.py.
 """
 
 import dataclasses
@@ -13,16 +13,16 @@ from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.config import ModelConfig
 from turbopi.engine import without_compiler
+from turbopi.engine.batch_runner import BatchRunner
 from turbopi.engine.call import CallShape
 from turbopi.engine.compiled import compiled
 from turbopi.engine.recent_loops import Loop
-from turbopi.engine.runner import GraphRunner
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import Denoiser, Ops
 
 
-class CudaGraphBackend(GraphRunner):
+class CudaGraphBackend(BatchRunner):
     """The engine's forward pass with PyTorch's kernels, those between products fused by Inductor if it is there."""
 
     name: ClassVar[str] = "cuda_graph"

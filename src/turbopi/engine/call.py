@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
@@ -295,7 +294,7 @@ class StaticCall:
             self.cache_v,
             rope,
         )
-        return self._project("action_out_proj", out[-self.shape.horizon :])
+        return forward.project(self.weights.small, "action_out_proj", out[-self.shape.horizon :])
 
     def _guided_velocity(self, asked: Conditioned, step: int, rope: forward.Rope) -> Tensor:
         """v_t float32[H, A], pulled as `model.conditioning` says."""
@@ -307,7 +306,7 @@ class StaticCall:
         table, length = self._modulation(step), self.inputs.length
         expert = Expert(self.config, self.weights, self.ops, back, table, length, *cache, rope)
         out, kept, last = expert.forward(self._suffix_tokens(step))
-        v_t = self._project("action_out_proj", out[-horizon:])
+        v_t = forward.project(self.weights.small, "action_out_proj", out[-horizon:])
         error = asked.error(step, x_t, v_t) * asked.weights
         d_out = torch.zeros_like(out)  # Pi0's state token has no velocity
         d_out[-horizon:] = (asked.tokens.times[step, :, None] * error) @ self.weights.small["action_out_proj.weight"]
@@ -327,13 +326,6 @@ class StaticCall:
 
     def _suffix_tokens(self, step: int) -> Tensor:
         """The suffix [H, D] of a step: actions, and for Pi0 the state token before them and the time mixed in."""
-        actions = self._project("action_in_proj", self.x_t[step])
-        dtype = self.weights.embed_tokens.dtype
-        if self.config.kind == "pi05":
-            return actions.to(dtype)
-        mixed = torch.cat((actions, self._time(step).expand_as(actions)), dim=-1)
-        actions = self._project("action_time_mlp_out", F.silu(self._project("action_time_mlp_in", mixed)))
-        return torch.cat((self._project("state_proj", self.inputs.state[None]), actions)).to(dtype)
-
-    def _project(self, name: str, x: Tensor) -> Tensor:
-        return F.linear(x, self.weights.small[f"{name}.weight"], self.weights.small[f"{name}.bias"])
+        x_t, time = self.x_t[step], self._time(step)
+        tokens = forward.suffix_tokens(self.config, self.weights.small, x_t, time, self.inputs.state)
+        return tokens.to(self.weights.embed_tokens.dtype)

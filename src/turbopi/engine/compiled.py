@@ -11,7 +11,7 @@ from torch import Tensor
 
 from turbopi.engine import without_compiler
 from turbopi.kernels import backward
-from turbopi.kernels.interface import BackwardOps, Ops
+from turbopi.kernels.interface import BackwardOps, BatchOps, Ops
 from turbopi.kernels.plain import (
     PLAIN,
     attention,
@@ -51,6 +51,12 @@ def _resize_pictures(table: Tensor, images: Tensor) -> None:
     resize_pictures(table, images)
 
 
+def _batch() -> BatchOps:
+    from turbopi.kernels.portable.batch import BATCH  # as above
+
+    return BATCH
+
+
 def compiled() -> Ops:
     """The same operations with torch.compile between the matrix products, for any number of tokens and keys.
 
@@ -78,6 +84,7 @@ def compiled() -> Ops:
         rope_split=_compiled(rope_split),
         vision_attention=vision_attention,
         attention=compiled_attention,
+        batch=_batch() if torch.cuda.is_available() else None,
         backward=BackwardOps(
             softmax=softmax,
             geglu=_compiled(backward.geglu),

@@ -1,4 +1,4 @@
-"""The reference's forward pass for batch 1 in static shapes: what a CUDA graph captures.
+"""The reference's forward pass in static shapes: what a CUDA graph captures.
 
 The prefix is compacted on the host: valid cameras, then valid prompt tokens, then padding up to the bucket. Padding
 sits at the end only and `length`, in device memory, says where it begins; so nothing is captured anew when the prompt
@@ -9,20 +9,28 @@ or the state changes. The mathematics is `turbopi.model.reference`'s; only its o
   - where the next matrix is an `Fp8Matrix`, an operation's result is rounded to E4M3 for it;
   - logits leave their product in float32 and keys beyond `length` get -inf before the softmax.
 
-Shapes: V cameras, S prefix slots of the bucket, H suffix tokens, D width, K head_dim, n query heads.
+Rows of several observations may stand one behind the other: only attention knows whose they are (engine/batch.py).
+
+Shapes: V cameras, S prefix slots of the bucket, H suffix tokens, D width, K head_dim, n query heads, A action_dim.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.weights import Weights
-from turbopi.kernels.interface import Ops
+from turbopi.kernels.interface import Ops, State
 from turbopi.model.layers import rope_tables
-from turbopi.quantization.fp8 import input_of
+from turbopi.quantization.fp8 import Matrix, input_of
 
 Rope = tuple[Tensor, Tensor]  # cos, sin float32[tokens, K/2]
 Normed = tuple[Tensor, Tensor, Tensor | None]  # residual stream, its norm, the gate of the next residual
+Attend = Callable[..., Tensor]  # a layer's number and its queries [tokens * n, K] -> [tokens, n * K]
+Places = Callable[[int], tuple[Tensor, Tensor]]  # a layer's number -> where its keys and values go, each [tokens, K]
 
 
 def vision_tokens(config: ModelConfig, weights: Weights, ops: Ops, images: Tensor, out: Tensor) -> None:
@@ -52,17 +60,30 @@ def prefix_cache(
     rope: Rope,
 ) -> None:
     """Run prefix embeddings [S, D] through the language model, writing the first S rows of [layer, S + H, K]."""
-    g, eps, slots = config.vlm, config.rms_norm_eps, x.shape[0]
+    slots, heads = x.shape[0], config.vlm.num_heads
+
+    def places(i: int) -> tuple[Tensor, Tensor]:
+        return cache_k[i, :slots], cache_v[i, :slots]
+
+    def attend(i: int, q: Tensor, **input: Any) -> Tensor:
+        return ops.attention(q, *places(i), length, slots, heads, **input)
+
+    prefix_layers(config, weights, ops, x, rope, places, attend)
+
+
+def prefix_layers(
+    config: ModelConfig, weights: Weights, ops: Ops, x: Tensor, rope: Rope, places: Places, attend: Attend
+) -> None:
+    """Prefix embeddings [S, D] through the language model; nothing is left of it but keys and values."""
+    g, eps = config.vlm, config.rms_norm_eps
     y = None
     for i, layer in enumerate(weights.vlm):
-        k, v = cache_k[i, :slots], cache_v[i, :slots]
         x, normed = ops.residual_rms_norm(x, y, None, layer.norm1, None, eps, **input_of(layer.qkv))
         if i + 1 == len(weights.vlm):  # nothing but K and V of the last layer is ever used
-            ops.rope_split(ops.linear(normed, layer.qkv[-2 * g.head_dim :]), *rope, k, v)
+            ops.rope_split(ops.linear(normed, layer.qkv[-2 * g.head_dim :]), *rope, *places(i))
             return
-        q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, k, v)
-        attended = ops.attention(q, k, v, length, slots, g.num_heads, **input_of(layer.out))
-        y = ops.residual_linear(attended, layer.out)
+        q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, *places(i))
+        y = ops.residual_linear(attend(i, q, **input_of(layer.out)), layer.out)
         x, normed = ops.residual_rms_norm(x, y, None, layer.norm2, None, eps, **input_of(layer.gate_up))
         y = ops.residual_linear(ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down)), layer.down)
 
@@ -83,21 +104,63 @@ def expert_output(
     Its keys and values go into the last H rows of the cache [layer, S + H, K], behind the prefix's. `table`
     float32[2 * layers + 1, 3, D] is one step of the modulation (Pi0.5) or None (Pi0).
     """
-    g, eps, suffix = config.expert, config.rms_norm_eps, tokens.shape[0]
-    slots = cache_k.shape[1] - suffix
+    slots, heads = cache_k.shape[1] - tokens.shape[0], config.expert.num_heads
 
-    def norm(x: Tensor, y: Tensor | None, gate: Tensor | None, plain: Tensor | None, index: int) -> Normed:
+    def places(i: int) -> tuple[Tensor, Tensor]:
+        return cache_k[i, slots:], cache_v[i, slots:]
+
+    def attend(i: int, q: Tensor, **input: Any) -> Tensor:
+        return ops.attention(q, cache_k[i], cache_v[i], length, slots, heads, config.kind == "pi0", **input)
+
+    return expert_layers(config, weights, ops, tokens, table, rope, places, attend)
+
+
+def expert_layers(
+    config: ModelConfig,
+    weights: Weights,
+    ops: Ops,
+    tokens: Tensor,
+    table: Tensor | None,
+    rope: Rope,
+    places: Places,
+    attend: Attend,
+) -> Tensor:
+    """`expert_output`, wherever its keys and values go and whatever its queries see."""
+    g, eps = config.expert, config.rms_norm_eps
+
+    def norm(
+        x: Tensor, y: Tensor | None, gate: Tensor | None, plain: Tensor | None, index: int, before: Matrix | None = None
+    ) -> Normed:
         scale, shift, next_gate = (plain, None, None) if table is None else table[index].unbind(0)
-        return (*ops.residual_rms_norm(x, y, gate, scale, shift, eps), next_gate)
+        input = {} if before is None else input_of(before)
+        return (*ops.residual_rms_norm(x, y, gate, scale, shift, eps, **input), next_gate)
 
     x, y, gate = tokens, None, None
     for i, layer in enumerate(weights.expert):
-        x, normed, gate = norm(x, y, gate, layer.norm1, 2 * i)
-        q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, cache_k[i, slots:], cache_v[i, slots:])
-        attended = ops.attention(q, cache_k[i], cache_v[i], length, slots, g.num_heads, config.kind == "pi0")
-        x, normed, gate = norm(x, ops.residual_linear(attended, layer.out), gate, layer.norm2, 2 * i + 1)
-        y = ops.residual_linear(ops.linear_geglu(normed, layer.gate_up), layer.down)
+        x, normed, gate = norm(x, y, gate, layer.norm1, 2 * i, layer.qkv)
+        q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, *places(i))
+        y = ops.residual_linear(attend(i, q, **input_of(layer.out)), layer.out)
+        x, normed, gate = norm(x, y, gate, layer.norm2, 2 * i + 1, layer.gate_up)
+        y = ops.residual_linear(ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down)), layer.down)
     return norm(x, y, gate, weights.expert_norm, 2 * g.depth)[1].float()
+
+
+def suffix_tokens(config: ModelConfig, small: State, x_t: Tensor, time: Tensor, state: Tensor) -> Tensor:
+    """The suffix [..., H, D] of actions x_t float32[..., H, A], in float32; for Pi0 the state's token before them.
+
+    time float32[D], or [H, D] by token, and state [..., A] are Pi0's: Pi0.5 has the time in its norms.
+    """
+    actions = project(small, "action_in_proj", x_t)
+    if config.kind == "pi05":
+        return actions
+    mixed = torch.cat((actions, time.expand_as(actions)), dim=-1)
+    actions = project(small, "action_time_mlp_out", F.silu(project(small, "action_time_mlp_in", mixed)))
+    return torch.cat((project(small, "state_proj", state[..., None, :]), actions), dim=-2)
+
+
+def project(small: State, name: str, x: Tensor) -> Tensor:
+    """One of the small projections, in float32."""
+    return F.linear(x, small[f"{name}.weight"], small[f"{name}.bias"])
 
 
 def rope_of_all_positions(config: ModelConfig, count: int, device: torch.device) -> Rope:

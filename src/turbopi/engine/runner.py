@@ -5,7 +5,7 @@ second, prefix and all denoising steps, is for a bucket, which rounds the prompt
 inside it nothing is captured anew when pictures, prompt, state or noise change. That of a conditioned call is for its
 form and the times that its actions may have, whatever is held or pulls. A bucket that warm-up didn't capture is
 captured when first needed, with a log line, or refused if the runner is `strict`. Graphs of the denoising loops used
-last are kept, see recent_loops.py. Batches run one observation after the other.
+last are kept, see recent_loops.py. Observations run one after the other here; batch_runner.py has them run together.
 """
 
 import logging
@@ -166,8 +166,7 @@ class GraphRunner:
     def begin(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> Begun:
         """See `turbopi.backends.base.Begins`. One observation at a time: this ends the turn of the one before."""
         self._check_cameras(len(pictures))
-        floats = pictures[0].dtype == np.float32 if resize is None and pictures else resize not in (None, "openpi")
-        begun = Begun(self, len(pictures), floats and bool(pictures))
+        begun = Begun(self, len(pictures), floats(pictures, resize))
         buffers = self._pictures_of(begun.cameras, begun.float_images)
         self._begun = None  # one given up may still be read from the buffers, but nobody gets what becomes of it
         try:
@@ -214,6 +213,14 @@ class GraphRunner:
         if count > MAX_CAMERAS:
             raise BackendError(f"{self.name} takes up to {MAX_CAMERAS} cameras, this observation has {count}")
 
+    def _check_tokens(self, cameras: int, tokens: int) -> None:
+        most = self.config.max_prompt_tokens
+        if tokens > most or cameras + tokens == 0:
+            raise BackendError(
+                f"{self.name} takes up to {MAX_CAMERAS} cameras and {most} prompt tokens, this observation has "
+                f"{cameras} and {tokens}"
+            )
+
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """All denoising steps at once; None: the engine's operations one by one."""
         return None
@@ -237,12 +244,8 @@ class GraphRunner:
         """Replay a part behind vision, "prefix" or the whole "answer"."""
         if self._begun is not begun:
             raise BackendError(f"{self.name} has finished this observation, or begun another one since")
-        cameras, most = begun.cameras, self.config.max_prompt_tokens
-        if len(tokens) > most or cameras + len(tokens) == 0:
-            raise BackendError(
-                f"{self.name} takes up to {MAX_CAMERAS} cameras and {most} prompt tokens, this observation has "
-                f"{cameras} and {len(tokens)}"
-            )
+        cameras = begun.cameras
+        self._check_tokens(cameras, len(tokens))
         loop = conditioned_loop(conditioning, num_steps, len(noise), self.config)
         shape = CallShape(cameras, bucket(len(tokens)), loop, begun.float_images)
         try:
@@ -339,8 +342,8 @@ class GraphRunner:
             self._pictures[key] = Pictures(self.config, self._weights, self._ops, cameras, float_images, slots)
         return self._pictures[key]
 
-    def _call(self, shape: CallShape) -> StaticCall:
-        loop = shape.loop
+    def _table(self, loop: Loop) -> Tensor | None:
+        """Its modulation, on the device."""
         if loop.table not in self._tables:
             table = (
                 modulation_at(self.config, self._weights.conditioning, np.array(loop.times, np.float32))
@@ -348,8 +351,11 @@ class GraphRunner:
                 else modulation(self.config, self._weights.conditioning, loop.steps)
             )
             self._tables[loop.table] = None if table is None else table.to(self.device)
+        return self._tables[loop.table]
+
+    def _call(self, shape: CallShape) -> StaticCall:
         if shape not in self._calls:
-            pictures, table = self._pictures_of(shape.cameras, shape.float_images), self._tables[loop.table]
+            pictures, table = self._pictures_of(shape.cameras, shape.float_images), self._table(shape.loop)
             self._calls[shape] = StaticCall(self.config, self._weights, self._ops, shape, pictures, self._cache, table)
         return self._calls[shape]
 
@@ -365,20 +371,32 @@ class GraphRunner:
         return golden_trace(call, length, valid)
 
 
+def floats(pictures: Sequence[np.ndarray], resize: ImageResize | None) -> bool:
+    """Whether vision is given float32 pictures."""
+    if not pictures:
+        return False
+    return bool(pictures[0].dtype == np.float32) if resize is None else resize != "openpi"
+
+
 def golden_trace(call: Any, length: int, valid: Tensor) -> Trace:
     """A call's intermediates in golden layouts: its `length` cache rows go back to the slots in `valid` bool[S]."""
+    return padded_trace(call.cache_k[:, :length], call.cache_v[:, :length], call.x_t, call.v_t, valid)
 
-    def padded(x: Tensor) -> Tensor:  # [layer, rows, K] -> [layer, 1, S, 1, K]
+
+def padded_trace(k: Tensor, v: Tensor, x_t: Tensor, v_t: Tensor, valid: Tensor) -> Trace:
+    """One observation's intermediates in golden layouts: k, v [layer, length, K], x_t [N + 1, H, A], v_t [N, H, A]."""
+
+    def padded(x: Tensor) -> Tensor:  # -> [layer, 1, S, 1, K]
         out = torch.zeros(x.shape[0], len(valid), x.shape[-1])
-        out[:, valid] = x[:, :length].float().cpu()
+        out[:, valid] = x.float().cpu()
         return out[:, None, :, None]
 
     return {
-        "kv_k": padded(call.cache_k),
-        "kv_v": padded(call.cache_v),
-        "x_t": call.x_t[:, None].clone(),
-        "v_t": call.v_t[:, None].clone(),
-        "actions": call.x_t[-1:].clone(),
+        "kv_k": padded(k),
+        "kv_v": padded(v),
+        "x_t": x_t[:, None].clone(),
+        "v_t": v_t[:, None].clone(),
+        "actions": x_t[-1:].clone(),
     }
 
 

@@ -86,6 +86,7 @@ class Ops:
     prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
     resize_pictures: Callable[[Tensor, Tensor], None] | None = None  # as `SOURCE` says; None: the host resizes them
     backward: "BackwardOps | None" = None  # None: `kernels.backward.PLAIN_BACKWARD`
+    batch: "BatchOps | None" = None  # None: `kernels.plain_batch.PLAIN_BATCH`
     origin: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -102,6 +103,27 @@ class BackwardOps:
     geglu_vjp: Callable[[Tensor, Tensor], Tensor]
     softmax_vjp: Callable[[Tensor, Tensor, float], Tensor]
     rope_vjp: Callable[..., Tensor]
+    origin: str
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Which packed rows belong together, on the device: observations one behind the other, then padding."""
+
+    starts: Tensor  # int32[B + 1]  first row of each; the last one is the padding's
+    lengths: Tensor  # int32[B + 1]  rows of each, perhaps none
+    # int32[tiles, 4]  query rows of packed attention that are one block's: the first one, where its segment ends, and
+    # that segment's first key and number of keys. Blocks take 64 rows; a tile that ends where it begins is none.
+    tiles: Tensor
+
+
+@dataclass(frozen=True)
+class BatchOps:
+    """What a batch takes beside `Ops`: see `kernels.plain_batch` for the twins."""
+
+    embed_rows: Callable[[Tensor, Tensor, Tensor, Tensor], None]
+    packed_attention: Callable[..., Tensor]
+    suffix_attention: Callable[..., Tensor]
     origin: str
 
 

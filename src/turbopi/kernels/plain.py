@@ -117,18 +117,18 @@ def linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | 
 def linear_gelu(x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None) -> Tensor:
     """gelu(x @ weightᵀ + bias). An Fp8Matrix's product isn't rounded before."""
     if not isinstance(weight, Fp8Matrix):
-        return _as_input(gelu(F.linear(x, weight, bias)), x.dtype, inverse)
-    return _as_input(gelu(weight.product(x, bias)), weight.dtype, inverse)
+        return as_input(gelu(F.linear(x, weight, bias)), x.dtype, inverse)
+    return as_input(gelu(weight.product(x, bias)), weight.dtype, inverse)
 
 
 def linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None) -> Tensor:
     """[tokens, D] times [2F, D], gate rows before up rows -> gelu(gate) * up [tokens, F]."""
     if not isinstance(gate_up, Fp8Matrix):
-        return _as_input(geglu(F.linear(x, gate_up)), x.dtype, inverse)
-    return _as_input(geglu(gate_up.product(x)), gate_up.dtype, inverse)
+        return as_input(geglu(F.linear(x, gate_up)), x.dtype, inverse)
+    return as_input(geglu(gate_up.product(x)), gate_up.dtype, inverse)
 
 
-def _as_input(x: Tensor, dtype: torch.dtype, inverse: float | None) -> Tensor:
+def as_input(x: Tensor, dtype: torch.dtype, inverse: float | None) -> Tensor:
     """x for the product behind it: E4M3 if it asks for that."""
     return x.to(dtype) if inverse is None else to_e4m3(x, inverse)
 
@@ -172,7 +172,7 @@ def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     q, k, v = qkv.view(images, -1, 3, heads, width // heads).permute(2, 0, 3, 1, 4)
     attended = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(rows, width)
-    return _as_input(attended, qkv.dtype, inverse)
+    return as_input(attended, qkv.dtype, inverse)
 
 
 def masked_softmax(
@@ -207,7 +207,7 @@ def attention(
     """
     logits = matmul_f32(q, k.t())
     probabilities = softmax(logits, length, slots, heads, state_token, q.shape[1] ** -0.5, v.dtype)
-    return _as_input((probabilities @ v).view(-1, heads * q.shape[1]), q.dtype, inverse)
+    return as_input((probabilities @ v).view(-1, heads * q.shape[1]), q.dtype, inverse)
 
 
 def matmul_f32(a: Tensor, b: Tensor) -> Tensor:

@@ -120,6 +120,12 @@ class PolicyCalls:
     def largest(self) -> int:
         return self.times.measured_largest
 
+    @property
+    def _sizes(self) -> list[int]:
+        """The batches to measure: 1, 2, 4, 8, … and the largest one."""
+        largest = self.times.largest
+        return [*(2**power for power in range(largest.bit_length()) if 2**power < largest), largest]
+
     # --- warm-up ------------------------------------------------------------------------------------------------------
 
     async def warm_up(self, **arguments: Any) -> None:
@@ -128,15 +134,17 @@ class PolicyCalls:
         Raises what it raises, and ConfigError if batches were asked for and fail.
         """
         warmup = getattr(self._policy, "warmup", None)
+        if self.times.largest > 1 and getattr(self._policy, "runs_batches", False):
+            arguments["batches"] = self._sizes
         if warmup is not None:
             await self.worker.call(lambda: warmup(**arguments))
         if self.times.largest > 1:
             await self.worker.call(self._measure)
 
     def _measure(self) -> None:
-        """Fill the table T(B) for B = 1, 2, 4, 8, … and the largest one, as far as the time for it allows."""
-        largest, asked_for = self.times.largest, self._asked_for
-        for size in [*(2**power for power in range(largest.bit_length()) if 2**power < largest), largest]:
+        """Fill the table T(B), as far as the time for it allows."""
+        asked_for = self._asked_for
+        for size in self._sizes:
             try:
                 enough = self._measure_size(size)
             except DeviceLost:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
-from turbopi.kernels.portable import attention, backward, embedding, norms, products, resize, rope
+from turbopi.kernels.portable import attention, backward, batch, embedding, norms, products, resize, rope
 
 
 def portable_ops() -> Ops:
@@ -26,6 +26,7 @@ def portable_ops() -> Ops:
         attention=attend,
         resize_pictures=resize.resize_pictures,
         backward=backward.BACKWARD,
+        batch=batch.BATCH,
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
             "vision products": "cuBLAS",

@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbopi.kernels.interface import Ops
+from turbopi.kernels.interface import Ops, Segments
 from turbopi.kernels.portable import attention as portable_attention
+from turbopi.kernels.portable.batch import BATCH
 from turbopi.kernels.portable.ops import attend as attend_portably
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90.attention import kernel as attention
@@ -40,6 +41,7 @@ def hopper_ops(device: torch.device) -> Ops:
         linear_geglu=products.tuned_linear_geglu,
         vision_attention=vision_attention,
         attention=attend,
+        batch=replace(BATCH, packed_attention=packed_attention, origin="CUDA for prefixes, Triton for suffixes"),
         origin={**portable.origin, **origin},
     )
 
@@ -61,6 +63,13 @@ def attend(
     if k.shape[0] == slots and attention.takes(q.shape[1]):  # no suffix behind the prefix
         return attention.prefix_attention(q, k, v, length, heads, inverse)
     return attend_portably(q, k, v, length, slots, heads, *state_token, inverse=inverse)
+
+
+def packed_attention(
+    q: Tensor, k: Tensor, v: Tensor, segments: Segments, heads: int, inverse: float | None = None
+) -> Tensor:
+    ours = attention.packed_attention if attention.takes(q.shape[1]) else BATCH.packed_attention
+    return ours(q, k, v, segments, heads, inverse)
 
 
 def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:

@@ -9,6 +9,9 @@
 // TP_SHARING CTAs of one group form a cluster: each loads a share of every tile of keys and values into all of them.
 // All tiles must have room then, as nobody waits for the others to free a slot.
 //
+// TP_PACKED: rows of several groups follow each other, and `segments` says of each CTA's rows which keys they see: see
+// `kernels.interface.Segments`.
+//
 // TP_WHOLE: there are KEYS keys for each warpgroup and no length, so that nothing is decided while it runs.
 //
 // A CTA has 64 rows of q, a producer warp and TP_WGS consumer warpgroups, which take tiles of TP_KEYS keys in turn: one
@@ -18,7 +21,7 @@
 // lane / 4 and lane / 4 + 8 of its warp's 16.
 
 constexpr int WGS = TP_WGS, KEYS = TP_KEYS, STAGES = TP_STAGES, DIM = TP_DIM, SHARING = TP_SHARING;
-constexpr bool OUT_FP8 = TP_OUT_FP8, WHOLE = TP_WHOLE;
+constexpr bool OUT_FP8 = TP_OUT_FP8, WHOLE = TP_WHOLE, PACKED = TP_PACKED;
 #if TP_OUT_FP8
 typedef unsigned char Element;
 #else
@@ -90,7 +93,9 @@ attention(ATTENTION_PARAMETERS) {
     if (!WHOLE) asm volatile("griddepcontrol.wait;" ::: "memory");
 
     const int series = quotient(blockIdx.x, tiles), group = quotient(series, heads), head = series - group * heads;
-    const int row = (blockIdx.x - series * tiles) * 64;  // in its group
+    const int4 segment = PACKED ? segments[blockIdx.x] : make_int4((blockIdx.x - series * tiles) * 64, rows, 0, 0);
+    const int row = segment.x, end_of_rows = segment.y;  // in its group
+    if (PACKED && row >= end_of_rows) return;
 
     // Tiles pass through the ring in rounds: one of keys for each warpgroup, then their values. Each warpgroup's first
     // keys, up to `early`, are loaded and multiplied before the length is known.
@@ -104,7 +109,7 @@ attention(ATTENTION_PARAMETERS) {
                 const u32 s = place % STAGES;
                 if (place >= STAGES) barrier_wait(empty + 8 * s, (place / STAGES + 1) & 1);
                 barrier_expect(full + 8 * s, STAGE_BYTES);
-                const int part = blockIdx.x % SHARING, from = group * keys + tile * KEYS + part * (KEYS / SHARING);
+                const int part = blockIdx.x % SHARING, from = group * keys + segment.z + tile * KEYS + part * (KEYS / SHARING);
                 for (int p = 0; p < PANELS; ++p) {
                     const u32 to = ring + s * STAGE_BYTES + p * KEY_PANEL + part * (KEY_PANEL / SHARING);
                     if (SHARING > 1) load_into_all(to, map, 64 * p, first + head, from, full + 8 * s);
@@ -116,7 +121,8 @@ attention(ATTENTION_PARAMETERS) {
             for (int p = 0; p < PANELS; ++p)
                 load(base + p * Q_PANEL, &map_q, 64 * p, head, group * rows + row, q_full);
             for (int tile = 0; tile < early; ++tile) load_tile(&map_k, k_first, tile, place_of_keys(tile));
-            const int valid = WHOLE ? WGS * KEYS : length ? (int)*length : keys, last = (valid + KEYS - 1) / KEYS;
+            const int valid = WHOLE ? WGS * KEYS : PACKED ? segment.w : length ? (int)*length : keys;
+        const int last = (valid + KEYS - 1) / KEYS;
 #pragma unroll 1
             for (int round = 0; round < last; round += WGS) {
                 const int end = min(round + WGS, last);
@@ -129,7 +135,8 @@ attention(ATTENTION_PARAMETERS) {
     } else {
         asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
         const int lane = threadIdx.x % 32, own = threadIdx.x % 128, warp = own / 32;
-        const int valid = WHOLE ? WGS * KEYS : length ? (int)*length : keys, last = (valid + KEYS - 1) / KEYS;
+        const int valid = WHOLE ? WGS * KEYS : PACKED ? segment.w : length ? (int)*length : keys;
+        const int last = (valid + KEYS - 1) / KEYS;
         const float none = __uint_as_float(0xff800000);  // -inf
         float logits[KEYS / 2], sums[DIM / 2] = {};      // of the values, by weight
         float top[2] = {none, none}, total[2] = {};
@@ -287,7 +294,7 @@ attention(ATTENTION_PARAMETERS) {
             for (int j = 0; j + 3 < BLOCKS; j += 4) {
                 if (owner(j) != warpgroup) continue;
                 const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
-                if (at < rows) {
+                if (at < end_of_rows) {
                     Element* const here = to + (j + lane % 4) * 8;
                     if (OUT_FP8) *(uint2*)here = make_uint2(v.x | v.y << 16, v.z | v.w << 16);
                     else *(uint4*)here = v;
@@ -297,7 +304,7 @@ attention(ATTENTION_PARAMETERS) {
             for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
                 if (owner(j) != warpgroup) continue;
                 const u32 v = value(j);
-                if (at < rows) {
+                if (at < end_of_rows) {
                     Element* const here = to + j * 8 + lane % 4 * 2;
                     if (OUT_FP8) *(u16*)here = (u16)v;
                     else *(u32*)here = v;

@@ -1,7 +1,8 @@
 """Attention without materialised logits through wgmma and TMA, for compute capability 9.0: see kernel.cu.
 
-Twins: `vision_attention` of `kernels.plain`, and its `attention` without a suffix. The kernels for all other GPUs, and
-for heads that this one doesn't take, are in kernels/portable/attention.py.
+Twins: `vision_attention` of `kernels.plain`, its `attention` without a suffix, and `packed_attention` of
+`kernels.plain_batch`. The kernels for all other GPUs, and for heads that this one doesn't take, are in
+kernels/portable/{attention,batch}.py.
 """
 
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
 from turbopi.kernels.dependent_launch import result_dtype
+from turbopi.kernels.interface import Segments
 from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.sm90 import instructions
@@ -25,6 +27,7 @@ PARAMETERS = Parameters(
         *(Parameter("int", name) for name in ("rows", "keys", "heads", "k_first", "v_first", "tiles")),
         Parameter("float", "scale"),
         Parameter("float", "inverse"),
+        Parameter("const int4*", "segments", "packed rows: see `kernels.interface.Segments`"),
     )
 )
 
@@ -76,6 +79,18 @@ def prefix_attention(
     return out
 
 
+def packed_attention(
+    q: Tensor, k: Tensor, v: Tensor, segments: Segments, heads: int, inverse: float | None = None
+) -> Tensor:
+    """Each row of q [R * n, K] over the keys of its own segment: k, v [R, K] -> [R, n * K]; `inverse` as above."""
+    assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
+    rows, dim = q.shape
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
+    tile = AttentionTile(dim, keys=64)
+    _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, None, rows, k.shape[0], 1, inverse, segments.tiles)
+    return out
+
+
 def vision_attention(
     qkv: Tensor, images: int, heads: int, inverse: float | None = None, tile: AttentionTile | None = None
 ) -> Tensor:
@@ -109,12 +124,14 @@ def _launch(
     keys: int,
     groups: int,
     inverse: float | None,
+    segments: Tensor | None = None,
 ) -> None:
     """matrices q, k, v of `heads` heads side by side, theirs beginning with the `first`; groups of pictures and heads.
 
-    rows and keys: of one picture.
+    rows and keys: of one picture. `segments` int32[blocks, 4]: of packed rows.
     """
-    count = out.shape[-1] // tile.dim if length is None else 1  # query heads beside each other
+    packed = segments is not None
+    count = out.shape[-1] // tile.dim if length is None and not packed else 1  # query heads beside each other
     boxes = (64, tile.keys // tile.sharing, tile.keys // tile.sharing)
     maps = [
         instructions.tensor_map(
@@ -125,10 +142,10 @@ def _launch(
         )
         for matrix, width, box in zip(matrices, heads, boxes, strict=True)
     ]
-    tiles = -(-rows // 64)
+    tiles = -(-rows // 64) if segments is None else len(segments)
     assert tile.sharing == 1 or (tiles % tile.sharing == 0 and tile.holds(keys)), "who shares never waits for a slot"
-    whole = length is None and keys == tile.keys * tile.warpgroups
-    kernel = _kernel(tile, inverse is not None, whole, out.device)
+    whole = length is None and not packed and keys == tile.keys * tile.warpgroups
+    kernel = _kernel(tile, inverse is not None, whole, packed, out.device)
     given = {
         **dict(zip(("map_q", "map_k", "map_v"), maps, strict=True)),
         "out": out.data_ptr(),
@@ -141,11 +158,12 @@ def _launch(
         "tiles": tiles,
         "scale": tile.dim**-0.5 * LOG2_E,
         "inverse": 1.0 if inverse is None else inverse,
+        "segments": None if segments is None else segments.data_ptr(),
     }
     kernel.launch_dependent(tiles * groups, given)
 
 
-def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False) -> dict[str, int]:
+def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False, packed: bool = False) -> dict[str, int]:
     """What kernel.cu is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
     return {
         "TP_DIM": tile.dim,
@@ -155,6 +173,7 @@ def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False) -> dict[s
         "TP_OUT_FP8": int(out_fp8),
         "TP_SHARING": tile.sharing,
         "TP_WHOLE": int(whole),
+        "TP_PACKED": int(packed),
     }
 
 
@@ -167,9 +186,9 @@ def source(tile: AttentionTile) -> str:
 
 
 @cache
-def _kernel(tile: AttentionTile, out_fp8: bool, whole: bool, device: torch.device) -> DependentKernel:
+def _kernel(tile: AttentionTile, out_fp8: bool, whole: bool, packed: bool, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
-        cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8, whole))
+        cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8, whole, packed))
         threads = 128 * (tile.warpgroups + 1)
         return DependentKernel(
             cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=threads, cluster=tile.sharing

@@ -169,15 +169,18 @@ FIXED, WRITING, STEP, LOADING, ADDING = 2300, 0.098, 205, 0.013, 0.00042
 GATHERING_SMS = 132  # on a GPU or a part of one with fewer, the clusters that gather sums may not all fit at once
 
 
-def candidates(epilogue: Epilogue) -> list[Tile]:
-    """All that may be worth trying."""
+MOST_SPLIT = 1536  # rows: of more the tiles fill the GPU without, and parts would only have to be added up
+
+
+def candidates(epilogue: Epilogue, rows: int = 0) -> list[Tile]:
+    """All that may be worth trying for so many rows."""
     unit = 16 if epilogue == "geglu" else 8
     found = [
         Tile(warpgroups, columns, splits=splits)
         for warpgroups in (1, 2, 3)
         for columns in range(2 * unit, 257, unit)
         if 64 * warpgroups * columns <= 192 * 192
-        for splits in ((1, 2, 3, 4) if epilogue in SPLIT else (1,))
+        for splits in ((1, 2, 3, 4) if epilogue in SPLIT and rows <= MOST_SPLIT else (1,))
     ]
     return [tile for tile in found if tile.stages(factors=1, lines=epilogue == "parts") >= 3]
 
@@ -200,7 +203,7 @@ def best_tile(m: int, n: int, k: int, epilogue: Epilogue, sms: int) -> Tile:
     measured = TILES_FP8.get((m, n, k))
     if measured is not None and (sms >= GATHERING_SMS or not measured.gather):
         return measured
-    fitting = [tile for tile in candidates(epilogue) if tile.splits <= -(-k // DEPTH)]
+    fitting = [tile for tile in candidates(epilogue, m) if tile.splits <= -(-k // DEPTH)]
     if -(-k // DEPTH) > UNPROMOTED_STEPS:  # long sums need room for promotion
         fitting = [tile for tile in fitting if _short(tile, k) or promotion(tile, k)]
     best = min(fitting, key=lambda tile: cost(tile, m, n, k, epilogue, sms))

@@ -8,7 +8,7 @@ from torch import Tensor
 from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
 from turbopi.kernels.sm90.gemm.bf16 import DEPTH, SPLIT, Epilogue, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import best_tile, matmul_fp8
-from turbopi.kernels.sm90.gemm.tiles import GEGLU_TILES, PARTS_TILES, VISION_TILES
+from turbopi.kernels.sm90.gemm.tiles import FEW_GEGLU_TILES, FEW_TILES, GEGLU_TILES, PARTS_TILES, VISION_TILES
 from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
 
 GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
@@ -21,10 +21,16 @@ def vision_tile(x: Tensor, weight: Tensor) -> Tile | None:
 def tuned_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
     if isinstance(weight, Fp8Matrix):
         return _fp8(x, weight, "plain" if bias is None else "bias", bias, out)
+    if bias is None and (few := FEW_TILES.get(_in_whole_64(x, weight))) is not None:
+        return matmul(x, weight, few, "plain", out=out)
     tile = vision_tile(x, weight)
     if tile is None or bias is None:
         return linear(x, weight, bias, out)
     return matmul(x, weight, tile, "bias", bias, out)
+
+
+def _in_whole_64(x: Tensor, weight: Tensor) -> tuple[int, int, int]:
+    return -(-x.shape[0] // 64) * 64, weight.shape[0], weight.shape[1]
 
 
 def tuned_residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, ahead: Tensor | None = None) -> Tensor:
@@ -32,7 +38,7 @@ def tuned_residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None,
     if isinstance(weight, Fp8Matrix):
         return _fp8(x, weight, "parts" if bias is None else "partial", bias, ahead=ahead)
     if bias is None:
-        cut = PARTS_TILES.get((-(-x.shape[0] // 64) * 64, weight.shape[0], weight.shape[1]))
+        cut = PARTS_TILES.get(_in_whole_64(x, weight))
         if isinstance(cut, Tile):
             return matmul(x, weight, cut, "parts", ahead=ahead)
         return linear(x, weight) if cut is None else parts_at_once(x, weight, cut)
@@ -95,6 +101,8 @@ def num_sms(device: torch.device) -> int:
 @lru_cache
 def _geglu_tile(rows: int, hidden: int, inner: int, device: torch.device) -> Tile | None:
     """The first tile to waste least on the matrix's ragged edges and on the last wave of tiles, if that is little."""
+    if (few := FEW_GEGLU_TILES.get((-(-rows // 64) * 64, hidden, inner))) is not None:
+        return few
     sms = num_sms(device)
 
     def fill(tile: Tile) -> float:

@@ -42,11 +42,28 @@ RESIDUAL_TILES_FP8 = RESIDUAL_TILES | {
 # The prefix's products that leave as bfloat16 parts and so beat cuBLAS and its pass that adds parts up, by [rows in
 # whole 64, out, in]: in our tiles, or as so many products over parts of the inner axis that cuBLAS makes at once.
 PARTS_TILES: dict[tuple[int, int, int], Tile | int] = {
+    (64, 1024, 2048): Tile(1, 104, splits=8),  # the action expert's
+    (128, 1024, 2048): Tile(1, 80, splits=4),
+    (192, 1024, 2048): Tile(3, 64, splits=8),
+    (64, 1024, 4096): Tile(1, 120, splits=8),
+    (128, 1024, 4096): Tile(2, 64, splits=8),
+    (192, 1024, 4096): Tile(3, 64, splits=8),
     (320, 2048, 16384): 4,
     (512, 2048, 16384): 2,
     (576, 2048, 16384): Tile(3, 192, splits=4),
     (768, 2048, 16384): Tile(3, 192, splits=3),
     (832, 2048, 16384): 2,
+}
+
+# The action expert's other products, of the tokens of several observations, by [rows in whole 64, out, in].
+FEW_TILES = {
+    (64, 2560, 1024): Tile(1, 40),
+    (128, 2560, 1024): Tile(1, 80),
+}
+FEW_GEGLU_TILES = {
+    (64, 4096, 1024): Tile(1, 64),
+    (128, 4096, 1024): Tile(2, 64),
+    (192, 4096, 1024): Tile(3, 64),
 }
 
 GEGLU_TILES = (Tile(3, 128, 1, 2, overlap=True), Tile(3, 192), Tile(2, 256), Tile(2, 160, 1, 2, overlap=True))

@@ -1,0 +1,185 @@
+"""One call for several observations: their pictures, prefixes and action chunks as rows of the same products.
+
+A batched call is three graphs, one after the other: vision of so many pictures (`call.Pictures`), `PackedPrefix` of so
+many rows, and `BatchLoop`, all denoising steps of so many observations. Observations of other cameras, prompts and
+lengths stand side by side (packing.py); which rows are whose is said in device memory, so nothing is captured anew
+when that changes.
+
+Shapes: B observations, R packed prefix rows, T suffix tokens of one observation, H actions, A action_dim, K head_dim.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.engine import forward
+from turbopi.engine.call import Cache, Pictures
+from turbopi.engine.flat import allocate
+from turbopi.engine.packing import most_tiles, pack_rows
+from turbopi.engine.recent_loops import Loop
+from turbopi.engine.weights import Weights
+from turbopi.kernels.interface import Ops, Segments
+from turbopi.kernels.plain_batch import PLAIN_BATCH
+from turbopi.model.denoise import euler_step, time_embedding, time_grid
+
+
+@dataclass(frozen=True)
+class BatchSize:
+    """What buffers and graphs of a batch are fixed to, beside the prompts' bucket and the denoising loop."""
+
+    batch: int  # observations
+    pictures: int  # of all of them together
+    float_images: bool = False  # as `CallShape`'s
+
+
+class BatchBuffers:
+    """What the three graphs of one size share."""
+
+    def __init__(
+        self, config: ModelConfig, weights: Weights, ops: Ops, size: BatchSize, pictures: Pictures, prompt_slots: int
+    ) -> None:
+        """`prompt_slots`: the most of any call, of all observations together."""
+        self.config, self.weights, self.ops, self.size, self.pictures = config, weights, ops, size, pictures
+        assert pictures.cameras == size.pictures
+        table = weights.embed_tokens
+        self.device, self.rows = table.device, pictures.rows + prompt_slots
+        self.cache = Cache.allocate(config, self.rows, self.device, table.dtype)
+        self.segments = torch.zeros((2, size.batch + 1), dtype=torch.int32, device=self.device)
+        self.rope = forward.rope_of_all_positions(config, self.rows, self.device)
+        self.embs = torch.empty((self.rows, config.vlm.width), device=self.device, dtype=table.dtype)
+
+
+class PackedPrefix:
+    """Prefix of all observations of a batch: tokens of pictures, which are there, and prompts to keys and values."""
+
+    def __init__(self, buffers: BatchBuffers, prompt_slots: int) -> None:
+        self._buffers, config, device = buffers, buffers.config, buffers.device
+        self.rows = buffers.pictures.rows + prompt_slots
+        assert 0 < self.rows <= buffers.rows
+        batch, heads = buffers.size.batch, config.vlm.num_heads
+        fields = {
+            "source": ((self.rows,), torch.int64),
+            "positions": ((self.rows,), torch.int64),
+            "segments": ((2, batch + 1), torch.int32),
+            "tiles": ((most_tiles(self.rows, batch, heads), 4), torch.int32),
+        }
+        self._host, host = allocate(fields, torch.device("cpu"), pinned=device.type == "cuda")
+        self._arrays = {name: view.numpy() for name, view in host.items()}
+        self._flat, self._inputs = allocate(fields, device, pinned=False)
+        self._embs = buffers.embs[: self.rows]
+
+    def write(self, cameras: Sequence[int], tokens: Sequence[np.ndarray]) -> np.ndarray:
+        """Put what a call needs beside its pictures into the host's buffer. Returns the segments int32[2, B + 1].
+
+        cameras  of each observation, how many pictures it has
+        tokens   of each, int64[valid prompt tokens]
+        """
+        config = self._buffers.config
+        packed = pack_rows(
+            cameras,
+            tokens,
+            batch=self._buffers.size.batch,
+            rows=self.rows,
+            per_picture=config.vision.num_tokens,
+            heads=config.vlm.num_heads,
+        )
+        for name, array in self._arrays.items():
+            array[:] = getattr(packed, name)
+        return packed.segments
+
+    def run(self, *_: Any) -> None:
+        buffers, inputs = self._buffers, self._inputs
+        config, weights, ops = buffers.config, buffers.weights, buffers.ops
+        batched = ops.batch or PLAIN_BATCH
+        self._flat.copy_(self._host, non_blocking=True)
+        buffers.segments.copy_(inputs["segments"])
+        batched.embed_rows(inputs["source"], buffers.pictures.embs, weights.embed_tokens, self._embs)
+        rope = (buffers.rope[0][inputs["positions"]], buffers.rope[1][inputs["positions"]])
+        segments, heads = Segments(inputs["segments"][0], inputs["segments"][1], inputs["tiles"]), config.vlm.num_heads
+
+        def places(i: int) -> tuple[Tensor, Tensor]:
+            return buffers.cache.k[i, : self.rows], buffers.cache.v[i, : self.rows]
+
+        def attend(i: int, q: Tensor, **input: Any) -> Tensor:
+            return batched.packed_attention(q, *places(i), segments, heads, **input)
+
+        forward.prefix_layers(config, weights, ops, self._embs, rope, places, attend)
+
+
+class BatchLoop:
+    """All denoising steps of a batch, from the keys and values that `PackedPrefix` left."""
+
+    def __init__(
+        self,
+        buffers: BatchBuffers,
+        loop: Loop,
+        weights: Weights,  # their expert's matrices may be others than those of `buffers`
+        table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation
+    ) -> None:
+        assert loop.form == "plain", loop
+        self._buffers, self._weights, self._table = buffers, weights, table
+        config, device, batch = buffers.config, buffers.device, buffers.size.batch
+        on_gpu = device.type == "cuda"
+        self._steps, self._horizon = loop.steps, loop.horizon
+        self._tokens = loop.horizon + (config.kind == "pi0")
+        times = time_grid(loop.steps, config.time_grid)
+        self._time_embs = time_embedding(times, config.expert.width).to(device)  # Pi0's
+        chunk = (batch, loop.horizon, config.action_dim)
+        fields = {"noise": (chunk, torch.float32), "state": ((batch, config.action_dim), torch.float32)}
+        self._host, host = allocate(fields, torch.device("cpu"), pinned=on_gpu)
+        self._arrays = {name: view.numpy() for name, view in host.items()}
+        self._flat, inputs = allocate(fields, device, pinned=False)
+        self._noise, self._state = inputs["noise"], inputs["state"]
+        self._offsets = torch.arange(self._tokens, device=device)
+        self._rope = forward.rope_of_all_positions(config, buffers.rows + self._tokens, device)
+        self.x_t = torch.empty(loop.steps + 1, *chunk, device=device)
+        self.v_t = torch.empty(loop.steps, *chunk, device=device)
+        size, dtype = (batch * self._tokens, config.vlm.head_dim), buffers.weights.embed_tokens.dtype
+        self._keys, self._values = (torch.empty(size, device=device, dtype=dtype) for _ in range(2))
+        self.actions = torch.empty(chunk, pin_memory=on_gpu)
+
+    def write(self, noise: np.ndarray, state: np.ndarray) -> None:
+        """noise float32[b, H, A] and state float32[b, A] of b <= B observations; the others are zeros."""
+        for name, given in (("noise", noise), ("state", state)):
+            array = self._arrays[name]
+            array[: len(given)] = given
+            array[len(given) :] = 0
+
+    def run(self, *_: Any) -> None:
+        self._flat.copy_(self._host, non_blocking=True)
+        lengths = self._buffers.segments[1, :-1].long()
+        positions = (lengths[:, None] + self._offsets).flatten()
+        rope = (self._rope[0][positions], self._rope[1][positions])
+        self.x_t[0] = self._noise
+        for step in range(self._steps):
+            v_t = self._velocity(step, rope)
+            self.x_t[step + 1] = euler_step(self.x_t[step], v_t, self._steps)
+            self.v_t[step] = v_t
+        self.actions.copy_(self.x_t[-1], non_blocking=True)
+
+    def _velocity(self, step: int, rope: forward.Rope) -> Tensor:
+        """v_t float32[B, H, A]"""
+        buffers = self._buffers
+        config, weights, ops = buffers.config, self._weights, buffers.ops
+        batched, heads = ops.batch or PLAIN_BATCH, config.expert.num_heads
+
+        def places(i: int) -> tuple[Tensor, Tensor]:
+            return self._keys, self._values
+
+        def attend(i: int, q: Tensor, **input: Any) -> Tensor:
+            prefix, suffix = (buffers.cache.k[i], buffers.cache.v[i]), (self._keys, self._values)
+            return batched.suffix_attention(
+                q, *prefix, *suffix, *buffers.segments, heads, config.kind == "pi0", **input
+            )
+
+        tokens = forward.suffix_tokens(config, weights.small, self.x_t[step], self._time_embs[step], self._state)
+        tokens = tokens.flatten(0, 1).to(weights.embed_tokens.dtype)
+        table = None if self._table is None else self._table[step]
+        out = forward.expert_layers(config, weights, ops, tokens, table, rope, places, attend)
+        out = out.view(-1, self._tokens, out.shape[-1])[:, -self._horizon :]
+        return forward.project(weights.small, "action_out_proj", out)

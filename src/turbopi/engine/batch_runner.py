@@ -1,0 +1,204 @@
+"""A runner that has several observations run together.
+
+A batch of any number is split into calls of 1, 2, 4, 8 or 16 observations, in the way that is the soonest by the
+backend's `batch_costs`; they run one after the other. One observation alone is the runner's own call, to the last bit.
+What is captured: batches.py.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbopi.config import ImageResize, ModelConfig
+from turbopi.engine.batches import Batches
+from turbopi.engine.graph import building
+from turbopi.engine.not_warm import not_warm
+from turbopi.engine.packing import split
+from turbopi.engine.recent_loops import Loop
+from turbopi.engine.runner import BUCKET, GraphRunner, HostRow, floats, padded_trace
+from turbopi.engine.weights import Weights
+from turbopi.kernels.interface import Ops
+from turbopi.model.conditioning import Conditionings, of_rows
+from turbopi.model.reference import Trace
+from turbopi.model.sample import Sample
+from turbopi.observation import Observation
+
+Finish = Callable[[Sequence[np.ndarray], np.ndarray, np.ndarray, int], Sample]
+
+
+class BegunBatch:
+    """What `BatchRunner.begin_batch` returns: several observations, the first ones' pictures on their way."""
+
+    def __init__(
+        self,
+        begin: Callable[[int, Sequence[Sequence[np.ndarray]]], Finish],
+        calls: Sequence[int],  # buckets
+        pictures: Sequence[Sequence[np.ndarray]],
+    ) -> None:
+        self._begin, self._pictures = begin, pictures
+        ends = [min(end, len(pictures)) for end in accumulate(calls)]
+        self._calls = [(bucket, slice(start, end)) for bucket, start, end in zip(calls, [0, *ends], ends, strict=False)]
+        self._first = self._begun(0)
+
+    def finish(self, tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+        """See `turbopi.backends.base.RunsBatches`."""
+        samples = []
+        for number, (_, rows) in enumerate(self._calls):
+            finish = self._begun(number) if number else self._first
+            samples.append(finish(tokens[rows], state[rows], noise[rows], num_steps))
+        stages = {name: sum(one.stage_ms[name] for one in samples) for name in samples[0].stage_ms}
+        return Sample(torch.cat([one.actions for one in samples]), stages)
+
+    def _begun(self, number: int) -> Finish:
+        bucket, rows = self._calls[number]
+        return self._begin(bucket, self._pictures[rows])
+
+
+class BatchRunner(GraphRunner):
+    """`GraphRunner` whose batches are batched calls.
+
+    batch_costs  how long a call of so many observations takes, in calls of one
+    """
+
+    batch_costs: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.6, 4: 2.9, 8: 5.5, 16: 10.7}
+
+    def __init__(
+        self, config: ModelConfig, weights: Weights, ops: Ops, device: torch.device, *, joint: bool = False
+    ) -> None:
+        super().__init__(config, weights, ops, device, joint=joint)
+        self._batches = Batches(
+            *(config, weights, ops, device),
+            bucket=BUCKET,
+            capture=lambda run, like: self._capture(run, None, like),
+            table=self._table,
+            denoising_weights=self._batch_weights,
+            refuse=self._refuse_batch_if_cold,
+        )
+
+    def warmup_batches(
+        self, observation: Observation, num_steps: int, horizon: int | None, batches: Sequence[int]
+    ) -> None:
+        """See `turbopi.backends.base.RunsBatches`."""
+        cameras, float_images = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
+        loop = Loop(num_steps, self.config.action_horizon if horizon is None else horizon)
+        self._check_cameras(cameras)
+        self._warming = True
+        try:
+            for batch in sorted({bucket for count in batches for bucket in split(count, self.batch_costs)} - {1}):
+                with building(self.device):
+                    self._recent.use(loop)
+                    size = self._batches.size(batch, [cameras] * batch, float_images)
+                    self._batches.warm(size, loop, resized=self._ops.resize_pictures is not None)
+        finally:
+            self._warming = False
+
+    def begin_batch(self, pictures: Sequence[Sequence[np.ndarray]], resize: ImageResize | None = None) -> BegunBatch:
+        """See `turbopi.backends.base.RunsBatches`."""
+        for one in pictures:
+            self._check_cameras(len(one))
+        float_images = floats([picture for one in pictures for picture in one], resize)
+
+        def begin(bucket: int, these: Sequence[Sequence[np.ndarray]]) -> Finish:
+            return (
+                self._begin_one(these[0], resize)
+                if bucket == 1
+                else self._begin_call(bucket, these, resize, float_images)
+            )
+
+        return BegunBatch(begin, self._calls_of(len(pictures)), pictures)
+
+    def sample(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Sample:
+        """Rows with a conditioning run one after the other."""
+        if observation.batch_size == 1 or not _plain(conditioning, observation.batch_size):
+            return super().sample(observation, noise, num_steps, conditioning=conditioning)
+        rows = [HostRow.of(observation, row) for row in range(observation.batch_size)]
+        begun = self.begin_batch([row.images for row in rows])
+        state = np.stack([row.state for row in rows])
+        return begun.finish([row.tokens for row in rows], state, noise.cpu().numpy(), num_steps)
+
+    def intermediates(
+        self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
+    ) -> Trace:
+        """Of a batched call where the observations are one; else, and with a conditioning, one by one."""
+        count = observation.batch_size
+        if self._calls_of(count) != [count] or not _plain(conditioning, count):
+            return super().intermediates(observation, noise, num_steps, conditioning=conditioning)
+        self.sample(observation, noise, num_steps)
+        size = self._batches.size(
+            count, observation.image_mask.sum(1).tolist(), observation.images.dtype == torch.float32
+        )
+        per_image, traces = self.config.vision.num_tokens, []
+        for row in range(count):
+            cameras = observation.image_mask[row].repeat_interleave(per_image)
+            valid = torch.cat((cameras, observation.token_mask[row])).cpu()
+            left = self._batches.trace(size, Loop(num_steps, noise.shape[1]), row)
+            traces.append(padded_trace(*left, valid))
+        return {name: torch.cat([one[name] for one in traces], dim=int(name != "actions")) for name in traces[0]}
+
+    def describe(self) -> dict[str, Any]:
+        return super().describe() | {"batches": self._batches.describe()}
+
+    def _calls_of(self, count: int) -> list[int]:
+        """Observations of each call that a batch is split into; strict: of those that are captured."""
+        if not self.strict:
+            return split(count, self.batch_costs)
+        warm = {1, *self._batches.warm_sizes()}
+        if count > max(warm) > 1:
+            raise not_warm(self.name, f"{count} observations at once", self._batches.describe(), batches=count)
+        return split(count, {size: cost for size, cost in self.batch_costs.items() if size in warm})
+
+    def _batch_weights(self) -> Weights:
+        """What batches denoise with; they go on pointing to it."""
+        return self._weights
+
+    def _begin_one(self, pictures: Sequence[np.ndarray], resize: ImageResize | None) -> Finish:
+        begun = self.begin(pictures, resize)
+
+        def finish(tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+            return begun.finish(tokens[0], state[0], noise[0], num_steps)
+
+        return finish
+
+    def _begin_call(
+        self, bucket: int, pictures: Sequence[Sequence[np.ndarray]], resize: ImageResize | None, float_images: bool
+    ) -> Finish:
+        """Start on the pictures of up to `bucket` observations; what is returned ends their call."""
+        cameras = [len(one) for one in pictures]
+        size = self._batches.size(bucket, cameras, float_images)
+
+        def finish(tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+            loop = Loop(num_steps, noise.shape[1])
+            for count, prompt in zip(cameras, tokens, strict=True):
+                self._check_tokens(count, len(prompt))
+            self._recent.use(loop)
+            try:
+                return self._batches.finish(size, loop, cameras, tokens, state, noise)
+            except RuntimeError as error:
+                self._explain(error)
+                raise
+
+        self._begun = None  # its pictures' buffers stay, but nobody gets what becomes of them
+        try:
+            self._batches.launch_vision(size, [picture for one in pictures for picture in one], resize)
+        except RuntimeError as error:
+            self._explain(error)
+            raise
+        return finish
+
+    def _forget(self, loop: Loop) -> None:
+        super()._forget(loop)
+        self._batches.forget(loop)
+
+    def _refuse_batch_if_cold(self, needs: str, batch: int) -> None:
+        if self.strict and not self._warming:
+            raise not_warm(self.name, needs, self._batches.describe(), batches=batch)
+
+
+def _plain(conditioning: Conditionings, rows: int) -> bool:
+    return all(asked is None for asked in of_rows(conditioning, rows))

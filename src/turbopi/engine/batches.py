@@ -1,0 +1,190 @@
+"""Batched calls as CUDA graphs: which are captured and replayed, and how a batch of any size is put together of them.
+
+A batch is split into calls of 1, 2, 4, 8 or 16 observations (batch_runner.py); one of them alone is the runner's own
+call. Rows are packed, so a call's sizes are sums over its observations: their pictures, rounded up to a multiple of its
+size, and their prompts' tokens, rounded up to 16 an observation. Of each size buffers are kept for good.
+"""
+
+import itertools
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbopi.config import ImageResize, ModelConfig
+from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix
+from turbopi.engine.call import Pictures
+from turbopi.engine.graph import Graph, Mark
+from turbopi.engine.recent_loops import Loop
+from turbopi.engine.weights import Weights
+from turbopi.kernels.interface import Ops
+from turbopi.model.sample import Sample
+
+logger = logging.getLogger(__name__)
+
+STAGES = ("vision", "prefix", "denoise")
+Capture = Callable[[Callable[[Mark], None], "Graph | None"], Graph]  # and in whose place it may be launched
+
+
+class Batches:
+    """The batched calls of one runner, which gives what they share with its own: weights, graphs' memory, tables.
+
+    capture     makes a graph of a function, see `GraphRunner`
+    table       a loop's modulation
+    denoising_weights  those of a batch's denoising, when it is first captured
+    refuse      is told what a call needs that isn't captured, and raises if that isn't allowed now
+    """
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        weights: Weights,
+        ops: Ops,
+        device: torch.device,
+        *,
+        bucket: int,
+        capture: Capture,
+        table: Callable[[Loop], Tensor | None],
+        denoising_weights: Callable[[], Weights],
+        refuse: Callable[[str, int], None],
+    ) -> None:
+        self._config, self._weights, self._ops, self._device = config, weights, ops, device
+        self._bucket, self._capture, self._table = bucket, capture, table
+        self._denoising_weights, self._refuse = denoising_weights, refuse
+        self._pictures: dict[tuple[int, bool], Pictures] = {}
+        self._buffers: dict[BatchSize, BatchBuffers] = {}
+        self._prefixes: dict[tuple[BatchSize, int], PackedPrefix] = {}
+        self._loops: dict[tuple[BatchSize, Loop], BatchLoop] = {}
+        self._graphs: dict[tuple[Any, ...], Graph] = {}
+        self._marks = [torch.cuda.Event(enable_timing=True) for _ in range(4)] if device.type == "cuda" else []  # type: ignore[no-untyped-call]
+
+    def size(self, batch: int, cameras: Sequence[int], float_images: bool) -> BatchSize:
+        """The size of a call of `batch` observations for at most so many, with their numbers of cameras."""
+        return BatchSize(batch, -(-sum(cameras) // batch) * batch, float_images)
+
+    def slots(self, batch: int, tokens: Sequence[int]) -> int:
+        """Prompt tokens of all observations together, rounded up to a bucket."""
+        step = self._bucket * batch
+        return max(1, -(-sum(tokens) // step)) * step
+
+    def warm(self, size: BatchSize, loop: Loop, resized: bool) -> None:
+        """Capture the calls of a size, for prompts of any length."""
+        step = self._bucket * size.batch
+        most = self.slots(size.batch, [self._config.max_prompt_tokens] * size.batch)
+        for slots in range(step, most + 1, step):
+            self._prefix_graph(size, slots)
+        self._vision_graph(size, False)
+        if resized:
+            self._vision_graph(size, True)
+        self._loop_graph(size, loop)
+
+    def launch_vision(self, size: BatchSize, pictures: Sequence[np.ndarray], resize: ImageResize | None) -> None:
+        """Send the pictures of all observations and start on them, without waiting."""
+        buffers = self._pictures_of(size)
+        blank = np.zeros(tuple(buffers.images.shape[1:]), np.float32 if size.float_images else np.uint8)
+        given = [*pictures, *(blank for _ in range(size.pictures - len(pictures)))]
+        resized = resize is not None and self._ops.resize_pictures is not None and buffers.resizes(given)
+        graph = self._vision_graph(size, resized)
+        self._mark(0)
+        graph.launch(lambda: buffers.upload(given, resize))
+        self._mark(1)
+
+    def finish(
+        self,
+        size: BatchSize,
+        loop: Loop,
+        cameras: Sequence[int],
+        tokens: Sequence[np.ndarray],
+        state: np.ndarray,
+        noise: np.ndarray,
+    ) -> Sample:
+        """What comes behind `launch_vision`: actions float32[b, H, A] of the observations that are there."""
+        slots = self.slots(size.batch, [len(prompt) for prompt in tokens])
+        encode, denoise = self._prefix_graph(size, slots), self._loop_graph(size, loop)
+        self._prefixes[size, slots].write(cameras, tokens)
+        run = self._loops[size, loop]
+        run.write(noise, state)
+        encode.launch()
+        self._mark(2)
+        denoise.launch()
+        self._mark(3)
+        if self._marks:
+            self._marks[-1].synchronize()
+        times = [start.elapsed_time(end) for start, end in itertools.pairwise(self._marks)]
+        return Sample(run.actions[: len(noise)].clone(), dict(zip(STAGES, times, strict=False)))
+
+    def trace(self, size: BatchSize, loop: Loop, row: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What the last call left of one observation: keys and values [layer, length, K], x_t and v_t [N.., H, A]."""
+        buffers, run = self._buffers[size], self._loops[size, loop]
+        start, length = (int(one) for one in buffers.segments[:, row])
+        rows = slice(start, start + length)
+        return buffers.cache.k[:, rows], buffers.cache.v[:, rows], run.x_t[:, row], run.v_t[:, row]
+
+    def forget(self, loop: Loop) -> None:
+        """Let go of all that is a denoising loop's alone."""
+        for key in [key for key in self._loops if key[1] == loop]:
+            del self._loops[key]
+            self._graphs.pop(("denoise", *key), None)
+
+    def describe(self) -> list[str]:
+        """What is captured, in words."""
+        return [
+            f"{size.batch} observations with {size.pictures} pictures, {loop}"
+            for size, loop in sorted(self._loops, key=str)
+        ]
+
+    def warm_sizes(self) -> set[int]:
+        """Observations of the calls that are captured."""
+        return {size.batch for size, _ in self._loops}
+
+    def _mark(self, place: int) -> None:
+        if self._marks:
+            self._marks[place].record(torch.cuda.current_stream(self._device))
+
+    def _pictures_of(self, size: BatchSize) -> Pictures:
+        key = (size.pictures, size.float_images)
+        if key not in self._pictures:
+            self._pictures[key] = Pictures(self._config, self._weights, self._ops, *key, 0)
+        return self._pictures[key]
+
+    def _buffers_of(self, size: BatchSize) -> BatchBuffers:
+        if size not in self._buffers:
+            most = self.slots(size.batch, [self._config.max_prompt_tokens] * size.batch)
+            pictures = self._pictures_of(size)
+            self._buffers[size] = BatchBuffers(self._config, self._weights, self._ops, size, pictures, most)
+        return self._buffers[size]
+
+    def _vision_graph(self, size: BatchSize, resized: bool) -> Graph:
+        def capture() -> Graph:
+            pictures = self._pictures_of(size)
+            if resized:
+                return self._capture(pictures.run_resized, self._vision_graph(size, False))
+            return self._capture(pictures.run, None)
+
+        return self._graph(size, ("vision", size.pictures, size.float_images, resized), capture)
+
+    def _prefix_graph(self, size: BatchSize, slots: int) -> Graph:
+        def capture() -> Graph:
+            prefix = self._prefixes[size, slots] = PackedPrefix(self._buffers_of(size), slots)
+            prefix.write([0] * size.batch, [np.zeros(1, np.int64)] * size.batch)
+            return self._capture(prefix.run, None)
+
+        return self._graph(size, ("prefix", size, slots), capture)
+
+    def _loop_graph(self, size: BatchSize, loop: Loop) -> Graph:
+        def capture() -> Graph:
+            table, buffers = self._table(loop), self._buffers_of(size)
+            run = self._loops[size, loop] = BatchLoop(buffers, loop, self._denoising_weights(), table)
+            return self._capture(run.run, None)
+
+        return self._graph(size, ("denoise", size, loop), capture)
+
+    def _graph(self, size: BatchSize, key: tuple[Any, ...], capture: Callable[[], Graph]) -> Graph:
+        if key not in self._graphs:
+            self._refuse(f"{size.batch} observations with {size.pictures} pictures", size.batch)
+            self._graphs[key] = capture()
+            logger.info("captured %s of %s", key[0], size)
+        return self._graphs[key]

@@ -1,0 +1,80 @@
+"""The twins, in plain PyTorch, of what a batch has beside `kernels.plain`: rows of several observations together.
+
+Shapes: B observations, R packed prefix rows, T suffix tokens of each, n query heads, K head_dim, D width.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.kernels.interface import BatchOps, Segments
+from turbopi.kernels.plain import as_input, matmul_f32
+
+
+def embed_rows(source: Tensor, pictures: Tensor, table: Tensor, out: Tensor) -> None:
+    """Prefix rows into `out` [R, D]: of source int64[R] >= 0 that row of `pictures`, of others that of `table` [vocab,
+    D] for the token -1 - source, times √D and rounded to its dtype.
+    """
+    prompt = table[(-1 - source).clamp(min=0)]
+    prompt = (prompt.float() * table.shape[1] ** 0.5).to(out.dtype)
+    seen = pictures[source.clamp(min=0)] if len(pictures) else prompt
+    out.copy_(torch.where((source >= 0)[:, None], seen, prompt))
+
+
+def packed_attention(
+    q: Tensor, k: Tensor, v: Tensor, segments: Segments, heads: int, inverse: float | None = None
+) -> Tensor:
+    """Each row of q [R * n, K] over the keys of its own segment: k, v [R, K], finite -> [R, n * K]."""
+    rows, dim = k.shape
+    whose = _whose(segments.starts, rows)
+    visible = whose[:, None] == whose
+    queries = q.view(rows, heads, dim).transpose(0, 1)
+    attended = F.scaled_dot_product_attention(queries, k.expand(heads, -1, -1), v.expand(heads, -1, -1), visible)
+    return as_input(attended.transpose(0, 1).reshape(rows, heads * dim), q.dtype, inverse)
+
+
+def suffix_attention(
+    q: Tensor,
+    prefix_k: Tensor,
+    prefix_v: Tensor,
+    k: Tensor,
+    v: Tensor,
+    starts: Tensor,
+    lengths: Tensor,
+    heads: int,
+    state_token: bool = False,
+    inverse: float | None = None,
+) -> Tensor:
+    """Each observation's T tokens over its prefix and each other: q [B * T * n, K] -> [B * T, n * K].
+
+    prefix_k, prefix_v [rows, K]; those of observation b begin at starts[b], int32[B + 1], and are lengths[b] many. k, v
+    [B * T, K]. With `state_token` the first token of an observation sees no other one of them (Pi0).
+    """
+    batch, (count, dim) = len(starts) - 1, k.shape
+    row, token, device = torch.arange(len(prefix_k), device=q.device), count // batch, q.device
+    own = torch.arange(count, device=device) // token
+    starts, lengths = starts[own, None], lengths[own, None]
+    to_prefix = (row >= starts) & (row < starts + lengths)
+    to_suffix = own[:, None] == own
+    if state_token:
+        place = torch.arange(count, device=device) % token
+        to_suffix = to_suffix & ((place[:, None] > 0) | (place == 0))
+    visible = torch.cat((to_prefix, to_suffix), 1).repeat_interleave(heads, 0)
+    # what nobody has written yet counts with 0, but 0 * NaN is NaN
+    keys, values = torch.cat((prefix_k, k)), torch.cat((prefix_v, v)).nan_to_num(0.0)
+    logits = (matmul_f32(q, keys.t()) * dim**-0.5).masked_fill(~visible, -torch.inf)
+    attended = (logits.softmax(-1).to(v.dtype) @ values).view(count, heads * dim)
+    return as_input(attended, q.dtype, inverse)
+
+
+def _whose(starts: Tensor, rows: int) -> Tensor:
+    """int64[R]: of each row the last segment that begins at it or before; empty ones have none."""
+    return torch.searchsorted(starts, torch.arange(rows, device=starts.device, dtype=starts.dtype), right=True)
+
+
+PLAIN_BATCH = BatchOps(
+    embed_rows=embed_rows,
+    packed_attention=packed_attention,
+    suffix_attention=suffix_attention,
+    origin="PyTorch; attention over the rows of all observations, masked",
+)

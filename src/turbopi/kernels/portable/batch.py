@@ -1,0 +1,225 @@
+"""Rows of several observations together: embedding them, and attention that keeps them apart.
+
+Twins: `kernels.plain_batch`. Logits, softmax and sums are float32; probabilities are rounded to the values' dtype for
+their product, as in the twins.
+"""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
+from turbopi.kernels.interface import BatchOps, Segments
+from turbopi.kernels.portable.attention import LOG2_E
+
+PACKED_TILE = (64, 4, 3)  # keys at a time, warps, stages; queries: as `Segments.tiles` says
+QUERIES = 64
+SUFFIX_TILE = (16, 64, 4, 2)  # queries, keys at a time, warps, stages
+BLOCKS_AT_ONCE = 264  # of suffix attention, two a multiprocessor of Hopper: keys are split over blocks up to so many
+
+
+@triton.jit
+def _embed_kernel(source, pictures, table, out, width, scale, BLOCK: tl.constexpr, PDL: tl.constexpr):
+    row = tl.program_id(0).to(tl.int64)
+    cols = tl.arange(0, BLOCK)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    place = tl.load(source + row)
+    if place >= 0:
+        tl.store(out + row * width + cols, tl.load(pictures + place * width + cols, cols < width, 0.0), cols < width)
+    else:
+        x = tl.load(table + (-1 - place) * width + cols, cols < width, 0.0).to(tl.float32)
+        tl.store(out + row * width + cols, (x * scale).to(out.dtype.element_ty), cols < width)
+
+
+def embed_rows(source: Tensor, pictures: Tensor, table: Tensor, out: Tensor) -> None:
+    """See `kernels.plain_batch.embed_rows`. All contiguous."""
+    assert all(t.is_contiguous() for t in (source, pictures, table, out)), "rows are read as they lie in memory"
+    width = table.shape[1]
+    _embed_kernel[(len(source),)](
+        source, pictures, table, out, width, width**0.5,
+        BLOCK=triton.next_power_of_2(width), num_warps=4, **dependent_launch(out),
+    )  # fmt: skip
+
+
+@triton.jit
+def _keys(queries, k, v, at, loaded, valid, acc, top, total, scale):
+    """One tile of keys and values into the running sums of a softmax."""
+    logits = tl.dot(queries, tl.load(k + at, loaded, 0.0).T, input_precision="ieee") * scale
+    logits = tl.where(valid, logits, -float("inf"))
+    new_top = tl.maximum(top, tl.max(logits, 1))
+    p = tl.exp2(logits - new_top[:, None])
+    shrink = tl.exp2(top - new_top)
+    values = tl.load(v + at, loaded, 0.0)
+    acc = tl.dot(p.to(values.dtype), values, acc * shrink[:, None], input_precision="ieee")
+    return acc, new_top, total * shrink + tl.sum(p, 1)
+
+
+@triton.jit
+def _packed_kernel(
+    q, k, v, tiles, out, scale, inverse,
+    DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SCALED: tl.constexpr,
+    PDL: tl.constexpr,
+):  # fmt: skip
+    """A tile's rows of queries (of any head: they share the keys) over the keys of their segment."""
+    tile = tiles + tl.program_id(0) * 4
+    n = tl.arange(0, BLOCK_N)
+    d = tl.arange(0, BLOCK_D)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    first, end, key, count = tl.load(tile), tl.load(tile + 1), tl.load(tile + 2), tl.load(tile + 3)
+    if first < end:
+        m = (first + tl.arange(0, BLOCK_M)).to(tl.int64)
+        inside = (m < end)[:, None] & (d < DIM)[None, :]
+        queries = tl.load(q + m[:, None] * DIM + d[None, :], inside, 0.0)
+        acc = tl.zeros((BLOCK_M, BLOCK_D), tl.float32)
+        top = tl.full((BLOCK_M,), -float("inf"), tl.float32)
+        total = tl.zeros((BLOCK_M,), tl.float32)
+        for start in range(0, count, BLOCK_N):
+            valid = start + n < count
+            loaded = valid[:, None] & (d < DIM)[None, :]
+            at = (key + start + n)[:, None] * DIM + d[None, :]
+            acc, top, total = _keys(queries, k, v, at, loaded, valid[None, :], acc, top, total, scale)
+        if SCALED:
+            total /= inverse
+        tl.store(out + m[:, None] * DIM + d[None, :], (acc / total[:, None]).to(out.dtype.element_ty), inside)
+
+
+def packed_attention(
+    q: Tensor, k: Tensor, v: Tensor, segments: Segments, heads: int, inverse: float | None = None
+) -> Tensor:
+    """See `kernels.plain_batch.packed_attention`. With `inverse` the result leaves as E4M3."""
+    assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
+    rows, dim = q.shape
+    assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
+    block_n, warps, stages = PACKED_TILE
+    _packed_kernel[(len(segments.tiles),)](
+        q, k, v, segments.tiles, out, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim,
+        BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=QUERIES, BLOCK_N=block_n, SCALED=inverse is not None,
+        num_warps=warps, num_stages=stages, **dependent_launch(q),
+    )  # fmt: skip
+    return out
+
+
+@triton.jit
+def _suffix_kernel(
+    q, prefix_k, prefix_v, k, v, starts, lengths, out, parts, weights, rows, tokens, heads, scale, inverse,
+    DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SPLITS: tl.constexpr,
+    STATE_TOKEN: tl.constexpr, SCALED: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """BLOCK_M rows of one observation's queries over every SPLITS-th tile of its prefix; the last split has its suffix.
+
+    With one split the result goes to `out`, else sums to `parts` and (top, total) to `weights`, by split and row.
+    """
+    batch, split = tl.program_id(1), tl.program_id(2)
+    own = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
+    n = tl.arange(0, BLOCK_N)
+    d = tl.arange(0, BLOCK_D)
+    begin, end = tl.load(starts + batch), tl.load(lengths + batch)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    m = batch * rows + own
+    inside = (own < rows)[:, None] & (d < DIM)[None, :]
+    queries = tl.load(q + m[:, None] * DIM + d[None, :], inside, 0.0)
+    acc = tl.zeros((BLOCK_M, BLOCK_D), tl.float32)
+    top = tl.full((BLOCK_M,), -float("inf"), tl.float32)
+    total = tl.zeros((BLOCK_M,), tl.float32)
+    for start in range(split * BLOCK_N, end, SPLITS * BLOCK_N):
+        valid = start + n < end
+        loaded = valid[:, None] & (d < DIM)[None, :]
+        at = (begin + start + n).to(tl.int64)[:, None] * DIM + d[None, :]
+        acc, top, total = _keys(queries, prefix_k, prefix_v, at, loaded, valid[None, :], acc, top, total, scale)
+    if split == SPLITS - 1:
+        for start in range(0, tokens, BLOCK_N):
+            valid = start + n < tokens
+            loaded = valid[:, None] & (d < DIM)[None, :]
+            at = (batch * tokens + start + n)[:, None] * DIM + d[None, :]
+            visible = valid[None, :]
+            if STATE_TOKEN:
+                visible = visible & ((own >= heads)[:, None] | (start + n == 0)[None, :])
+            acc, top, total = _keys(queries, k, v, at, loaded, visible, acc, top, total, scale)
+    if SPLITS == 1:
+        if SCALED:
+            total /= inverse
+        tl.store(out + m[:, None] * DIM + d[None, :], (acc / total[:, None]).to(out.dtype.element_ty), inside)
+    else:
+        place = split.to(tl.int64) * tl.num_programs(1) * rows + m
+        tl.store(parts + place[:, None] * DIM + d[None, :], acc, inside)
+        tl.store(weights + place * 2, top, own < rows)
+        tl.store(weights + place * 2 + 1, total, own < rows)
+
+
+@triton.jit
+def _combine_kernel(
+    parts, weights, out, count, inverse,
+    DIM: tl.constexpr, BLOCK_D: tl.constexpr, SPLITS: tl.constexpr, BLOCK_S: tl.constexpr, SCALED: tl.constexpr,
+    PDL: tl.constexpr,
+):  # fmt: skip
+    row = tl.program_id(0)
+    d = tl.arange(0, BLOCK_D)
+    split = tl.arange(0, BLOCK_S)
+    place = split * count + row
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    top = tl.load(weights + place * 2, split < SPLITS, -float("inf"))
+    total = tl.load(weights + place * 2 + 1, split < SPLITS, 0.0)
+    sums = tl.load(
+        parts + place.to(tl.int64)[:, None] * DIM + d[None, :], (split < SPLITS)[:, None] & (d < DIM)[None, :], 0.0
+    )
+    factor = tl.exp2(top - tl.max(top, 0))  # 2^-inf is 0: who had no keys counts for nothing
+    whole = tl.sum(factor * total, 0)
+    if SCALED:
+        whole /= inverse
+    result = tl.sum(sums * factor[:, None], 0) / whole
+    tl.store(out + row * DIM + d, result.to(out.dtype.element_ty), d < DIM)
+
+
+def suffix_attention(
+    q: Tensor,
+    prefix_k: Tensor,
+    prefix_v: Tensor,
+    k: Tensor,
+    v: Tensor,
+    starts: Tensor,
+    lengths: Tensor,
+    heads: int,
+    state_token: bool = False,
+    inverse: float | None = None,
+) -> Tensor:
+    """See `kernels.plain_batch.suffix_attention`. All contiguous. With `inverse` the result leaves as E4M3."""
+    assert all(t.is_contiguous() for t in (q, prefix_k, prefix_v, k, v, starts, lengths)), "rows are read as they lie"
+    batch, (count, dim) = len(starts) - 1, k.shape
+    assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
+    rows = count // batch * heads  # of queries of an observation
+    block_m, block_n, warps, stages = SUFFIX_TILE
+    tiles = triton.cdiv(rows, block_m)
+    splits = suffix_splits(tiles * batch, len(prefix_k) // batch, block_n)
+    out = q.new_empty(count, heads * dim, dtype=result_dtype(q, inverse))
+    parts = torch.empty(splits, batch * rows, dim, device=q.device) if splits > 1 else out
+    weights = torch.empty(splits, batch * rows, 2, device=q.device) if splits > 1 else out
+    sizes = {
+        "DIM": dim, "BLOCK_D": triton.next_power_of_2(dim), "SPLITS": splits, "SCALED": inverse is not None,
+    }  # fmt: skip
+    _suffix_kernel[(tiles, batch, splits)](
+        q, prefix_k, prefix_v, k, v, starts, lengths, out, parts, weights, rows, count // batch, heads,
+        dim**-0.5 * LOG2_E, inverse or 1.0, BLOCK_M=block_m, BLOCK_N=block_n, STATE_TOKEN=state_token,
+        num_warps=warps, num_stages=stages, **sizes, **dependent_launch(q),
+    )  # fmt: skip
+    if splits > 1:
+        _combine_kernel[(batch * rows,)](
+            parts, weights, out, batch * rows, inverse or 1.0,
+            BLOCK_S=triton.next_power_of_2(splits), num_warps=1, **sizes, **dependent_launch(q),
+        )  # fmt: skip
+    return out
+
+
+def suffix_splits(blocks: int, keys: int, block_n: int) -> int:
+    """Over how many blocks the keys of an observation's prefix are split, if each of `blocks` has all of them."""
+    return max(1, min(BLOCKS_AT_ONCE // blocks, triton.cdiv(keys, 2 * block_n)))
+
+
+BATCH = BatchOps(
+    embed_rows=embed_rows, packed_attention=packed_attention, suffix_attention=suffix_attention, origin="Triton"
+)

@@ -1,0 +1,114 @@
+"""Triton's kernels for several observations' rows equal their plain twins, and keep observations apart.
+
+In float32 through Triton's interpreter, or on a GPU in bfloat16: see test_kernels_ops.py.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from conftest import gpu_or_interpreter, on_hopper
+from torch import Tensor
+
+ON_GPU = torch.cuda.is_available()
+pytest.importorskip("triton", reason="Triton isn't installed")
+
+from turbopi.engine.packing import pack_rows  # noqa: E402
+from turbopi.kernels import plain_batch  # noqa: E402
+from turbopi.kernels.interface import Segments  # noqa: E402
+from turbopi.kernels.portable import batch as portable_batch  # noqa: E402
+from turbopi.kernels.sm90.attention import kernel as attention  # noqa: E402
+
+DEVICE = torch.device("cuda" if ON_GPU else "cpu")
+DTYPE = torch.bfloat16 if ON_GPU else torch.float32
+TOLERANCE = 2e-2 if ON_GPU else 2e-5
+pytestmark = gpu_or_interpreter()
+HEADS, DIM = 4, 24
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed)).to(DEVICE, DTYPE)
+
+
+def packed(lengths: list[int], spare: int, batch: int) -> tuple[Segments, Tensor]:
+    """Segments of observations of prompts alone, and where their rows come from."""
+    prompts = [np.arange(length, dtype=np.int64) for length in lengths]
+    rows = sum(lengths) + spare
+    made = pack_rows([0] * len(lengths), prompts, batch=batch, rows=rows, per_picture=1, heads=HEADS)
+    segments, tiles = torch.from_numpy(made.segments).to(DEVICE), torch.from_numpy(made.tiles).to(DEVICE)
+    return Segments(segments[0], segments[1], tiles), torch.from_numpy(made.source).to(DEVICE)
+
+
+LENGTHS = pytest.mark.parametrize(
+    ("lengths", "spare", "batch"), [([70, 3, 33], 5, 4), ([1], 0, 1), ([16, 16], 16, 2), ([9] * 8, 0, 8)]
+)
+
+
+@LENGTHS
+def test_packed_attention(lengths: list[int], spare: int, batch: int) -> None:
+    check_packed(portable_batch.packed_attention, lengths, spare, batch)
+
+
+@on_hopper
+@LENGTHS
+def test_packed_attention_on_hopper(lengths: list[int], spare: int, batch: int) -> None:
+    check_packed(attention.packed_attention, lengths, spare, batch)
+
+
+def check_packed(attend: Callable[..., Tensor], lengths: list[int], spare: int, batch: int) -> None:
+    segments, _ = packed(lengths, spare, batch)
+    rows = sum(lengths) + spare
+    q, k, v = random(rows * HEADS, DIM), random(rows, DIM, seed=1), random(rows, DIM, seed=2)
+    ours = attend(q, k, v, segments, HEADS)
+    torch.testing.assert_close(
+        ours, plain_batch.packed_attention(q, k, v, segments, HEADS), atol=TOLERANCE, rtol=TOLERANCE
+    )
+    at = 0
+    for length in lengths:  # and what each gets alone
+        own = slice(at, at + length)
+        logits = q.view(rows, HEADS, DIM)[own].flatten(0, 1).float() @ k[own].float().T * DIM**-0.5
+        alone = (logits.softmax(-1) @ v[own].float()).view(length, HEADS * DIM)
+        torch.testing.assert_close(ours[own].float(), alone, atol=TOLERANCE, rtol=TOLERANCE)
+        at += length
+
+
+@pytest.mark.parametrize("state_token", [False, True])
+@pytest.mark.parametrize("blocks", [1, 1000])
+@pytest.mark.parametrize("lengths", [[300, 0, 5], [64, 129]])
+def test_suffix_attention(lengths: list[int], blocks: int, state_token: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With keys in one block or split over several; NaN beyond an observation's rows never counts."""
+    monkeypatch.setattr(portable_batch, "BLOCKS_AT_ONCE", blocks)
+    segments, _ = packed(lengths, 0, len(lengths))
+    batch, tokens = len(lengths), 3
+    prefix_k, prefix_v = random(sum(lengths) + 400, DIM), random(sum(lengths) + 400, DIM, seed=1)
+    prefix_k[sum(lengths) :] = prefix_v[sum(lengths) :] = torch.nan
+    q = random(batch * tokens * HEADS, DIM, seed=2)
+    k, v = random(batch * tokens, DIM, seed=3), random(batch * tokens, DIM, seed=4)
+    given = (q, prefix_k, prefix_v, k, v, segments.starts, segments.lengths, HEADS, state_token)
+    ours = portable_batch.suffix_attention(*given)
+    torch.testing.assert_close(ours, plain_batch.suffix_attention(*given), atol=TOLERANCE, rtol=TOLERANCE)
+    at = 0
+    for row, length in enumerate(lengths):
+        own, mine = slice(at, at + length), slice(row * tokens, (row + 1) * tokens)
+        keys, values = (torch.cat((x[own], y[mine])).float() for x, y in ((prefix_k, k), (prefix_v, v)))
+        logits = q.view(-1, HEADS, DIM)[mine].float() @ keys.T * DIM**-0.5  # [T, n, keys]
+        if state_token:
+            logits[0, :, length + 1 :] = -torch.inf
+        torch.testing.assert_close(
+            ours[mine].float(), (logits.softmax(-1) @ values).flatten(1), atol=TOLERANCE, rtol=TOLERANCE
+        )
+        at += length
+
+
+def test_keys_are_split_as_there_are_blocks_to_fill() -> None:
+    assert portable_batch.suffix_splits(40, 720, 64) == 6
+    assert portable_batch.suffix_splits(40, 100, 64) == 1 and portable_batch.suffix_splits(1000, 720, 64) == 1
+
+
+def test_embedding_rows() -> None:
+    pictures, table, source = random(6, 20), random(9, 20, seed=1), torch.tensor([2, -1, -9, 5, 0], device=DEVICE)
+    ours, twin = torch.empty(5, 20, device=DEVICE, dtype=DTYPE), torch.empty(5, 20, device=DEVICE, dtype=DTYPE)
+    portable_batch.embed_rows(source, pictures, table, ours)
+    plain_batch.embed_rows(source, pictures, table, twin)
+    assert torch.equal(ours, twin) and torch.equal(ours[[0, 3, 4]], pictures[[2, 5, 0]])
