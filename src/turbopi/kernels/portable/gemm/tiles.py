@@ -3,7 +3,7 @@
 Nothing is tried out inside a call.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
@@ -17,6 +17,7 @@ BLOCK_SHARED = {  # bytes of shared memory a block may use (CUDA C++ programming
     **dict.fromkeys([(9, 0), (10, 0), (10, 3), (11, 0)], 227 * 1024),
 }
 LEAST_SHARED = min(BLOCK_SHARED.values())
+SPLITS = (1, 2, 3, 4)
 UNPROMOTED = 2176  # longest sum of E4M3 products that stays in the tensor cores, as in sm90/gemm/fp8.py
 
 
@@ -33,23 +34,37 @@ class Tile:
     stages: int
     splits: int = 1
 
-    @property
-    def shared_bytes(self) -> int:
-        return self.stages * (self.rows + self.columns) * STEP_BYTES
+    def shared_bytes(self, capability: Capability) -> int:
+        """With mma.sync Triton holds one stage in registers."""
+        held = self.stages - 1 if by_mma_sync(capability) else self.stages
+        return held * (self.rows + self.columns) * STEP_BYTES + BARRIERS
 
-    def fits(self, capability: Capability) -> bool:
-        return self.shared_bytes <= BLOCK_SHARED.get(capability, LEAST_SHARED)
+    def takes(self, capability: Capability, epilogue: Epilogue, promoted: bool) -> bool:
+        """Whether it fits shared memory and registers."""
+        if self.shared_bytes(capability) > BLOCK_SHARED.get(capability, LEAST_SHARED):
+            return False
+        if self.rows * self.columns // (32 * self.warps) <= WIDE:
+            return True
+        geglu = epilogue == "geglu"
+        return not promoted and {9: True, 10: geglu, 11: geglu}.get(capability[0], not geglu)
 
 
 TILES = (
-    *(Tile(128, 256, 8, 4), Tile(128, 256, 8, 3), Tile(128, 128, 8, 3), Tile(128, 128, 4, 4)),
-    *(Tile(64, 256, 4, 3), Tile(64, 256, 8, 2), Tile(64, 128, 4, 4), Tile(64, 64, 4, 6), Tile(32, 64, 4, 6)),
+    *(Tile(128, 256, 8, 4), Tile(128, 256, 8, 3), Tile(128, 128, 8, 4), Tile(128, 128, 8, 3)),
+    *(Tile(64, 256, 8, 3), Tile(64, 128, 4, 4), Tile(64, 64, 4, 6), Tile(32, 64, 4, 6)),
 )
+BARRIERS = 128  # bytes beside the operands
+WIDE = 64  # sums a thread: with more, those that are promoted spill, and so do mma.sync's GeGLU and tcgen05's others
 
 # Measured tiles, made by `python -m product_tiles`: (capability, E4M3?, epilogue, rows rounded up to 64, out, in) ->
 # tile; of "geglu", out is the hidden width.
 Shape = tuple[Capability, bool, Epilogue, int, int, int]
 MEASURED: dict[Shape, Tile] = {}
+
+
+def by_mma_sync(capability: Capability) -> bool:
+    """Whether Triton multiplies by mma.sync here: 9.0 has wgmma, 10.x and 11.0 tcgen05."""
+    return capability[0] not in (9, 10, 11)
 
 
 def fp8_refusal(capability: Capability) -> str | None:
@@ -68,16 +83,18 @@ def promotes(capability: Capability, inner: int) -> bool:
     return inner > UNPROMOTED and capability[0] not in (10, 11)
 
 
-def candidates(capability: Capability, epilogue: Epilogue, inner_steps: int = 1 << 30) -> list[Tile]:
-    """All tiles that fit."""
-    fitting = [tile for tile in TILES if tile.fits(capability)]
+def candidates(capability: Capability, fp8: bool, epilogue: Epilogue, inner: int) -> list[Tile]:
+    """All tiles that this GPU takes."""
+    promoted = fp8 and promotes(capability, inner)
+    fitting = [tile for tile in TILES if tile.takes(capability, epilogue, promoted)]
     if epilogue != "parts":
         return fitting
+    steps = -(-inner // (STEP_BYTES if fp8 else STEP_BYTES // 2))
     return [
-        Tile(tile.rows, tile.columns, tile.warps, tile.stages, splits)
+        replace(tile, splits=splits)
         for tile in fitting
-        for splits in (1, 2, 3, 4)
-        if splits * tile.stages <= inner_steps or splits == 1
+        for splits in SPLITS
+        if splits == 1 or steps >= splits * 2 * tile.stages
     ]
 
 
@@ -111,7 +128,7 @@ def _resident(tile: Tile, capability: Capability) -> int:
     """How many blocks a multiprocessor holds, by its shared memory and 64 K registers."""
     registers = 32 * tile.warps * min(255, tile.rows * tile.columns // (32 * tile.warps) + 64)
     shared = BLOCK_SHARED.get(capability, LEAST_SHARED)
-    return max(1, min(shared // tile.shared_bytes, 65536 // registers))
+    return max(1, min(shared // tile.shared_bytes(capability), 65536 // registers))
 
 
 @cache
@@ -121,6 +138,5 @@ def best_tile(capability: Capability, fp8: bool, epilogue: Epilogue, m: int, n: 
     measured = MEASURED.get((capability, fp8, epilogue, m, n, k))
     if measured is not None:
         return measured
-    steps = -(-k // (STEP_BYTES if fp8 else STEP_BYTES // 2))
-    fitting = candidates(capability, epilogue, steps)
+    fitting = candidates(capability, fp8, epilogue, k)
     return min(fitting, key=lambda tile: cost(tile, capability, fp8, epilogue, m, n, k, sms))
