@@ -32,4 +32,6 @@ def fused_ops(device: torch.device) -> Ops:
     if capability(device) != (9, 0) or forced_portable():
         return portable_ops()
     ops = hopper_ops(device)
-    return replace(ops, origin={**ops.origin, "FP8 products": "CUDA, with bias, GELU, GeGLU and rounding in the epilogue"})
+    return replace(
+        ops, origin={**ops.origin, "FP8 products": "CUDA, with bias, GELU, GeGLU and rounding in the epilogue"}
+    )

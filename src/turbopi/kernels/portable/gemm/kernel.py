@@ -38,7 +38,7 @@ def _sum(a, b, acc, PROMOTE: tl.constexpr, DEPTH: tl.constexpr):
 def _product_kernel(
     x, weight, scale, bias, out, rows, columns, inner, inverse,
     GELU: tl.constexpr, GEGLU: tl.constexpr, HAS_BIAS: tl.constexpr, HAS_SCALE: tl.constexpr, SCALED: tl.constexpr,
-    PROMOTE: tl.constexpr, WHOLE: tl.constexpr, SPLITS: tl.constexpr, GROUP: tl.constexpr,
+    PROMOTE: tl.constexpr, WHOLE: tl.constexpr, SPLIT: tl.constexpr, GROUP: tl.constexpr,
     BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, DEPTH: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     """Tile [BLOCK_M, BLOCK_N] of the result. WHOLE: `inner` is a multiple of DEPTH. GEGLU: weight has 2 * columns rows."""
@@ -57,8 +57,8 @@ def _product_kernel(
     up_at = b_at + columns * inner
     steps = tl.cdiv(inner, DEPTH)
     begin, end = 0, steps
-    if SPLITS > 1:
-        begin, end = steps * split // SPLITS, steps * (split + 1) // SPLITS
+    if SPLIT:
+        begin, end = steps * split // tl.num_programs(1), steps * (split + 1) // tl.num_programs(1)
     wait_for_producer(PDL)
     for step in range(begin, end):
         at = step * DEPTH
@@ -126,7 +126,7 @@ def product(
         1.0 if inverse is None else inverse,
         GELU=epilogue == "gelu", GEGLU=epilogue == "geglu", HAS_BIAS=bias is not None, HAS_SCALE=fp8,
         SCALED=inverse is not None, PROMOTE=fp8 and x.dtype == E4M3 and promotes(on[0], k), WHOLE=k % depth == 0,
-        SPLITS=tile.splits, GROUP=GROUP, BLOCK_M=tile.rows, BLOCK_N=block_n, DEPTH=depth,
+        SPLIT=tile.splits > 1, GROUP=GROUP, BLOCK_M=tile.rows, BLOCK_N=block_n, DEPTH=depth,
         num_warps=tile.warps, num_stages=tile.stages, **dependent_launch(x),
     )  # fmt: skip
     return out
