@@ -11,13 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import machine_code
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from triton.runtime.errors import PTXASError
 from triton.runtime.jit import JITFunction
 
-import machine_code
 from compile_for_all.calls import all_calls
 from compile_for_all.cubin import used
 from compile_for_all.document import Compiled
@@ -89,8 +89,7 @@ def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], 
     if target.capability == HOPPER:
         yield from ((f"sm90: {name}", make) for name, make in machine_code.SHAPES.items())
     for module in portable_modules():
-        for name, make in getattr(module, "for_all", lambda arch: ())(target.arch):
-            yield name, make
+        yield from getattr(module, "for_all", lambda arch: ())(target.arch)
 
 
 def portable_modules() -> list[Any]:

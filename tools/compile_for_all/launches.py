@@ -20,8 +20,13 @@ from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.portable.gemm.kernel import gpu
 
 TYPES = {
-    **{torch.bfloat16: "bf16", torch.float32: "fp32", torch.float8_e4m3fn: "fp8e4nv", torch.float16: "fp16"},
-    **{torch.uint8: "u8", torch.int32: "i32", torch.int64: "i64"},
+    torch.bfloat16: "bf16",
+    torch.float32: "fp32",
+    torch.float8_e4m3fn: "fp8e4nv",
+    torch.float16: "fp16",
+    torch.uint8: "u8",
+    torch.int32: "i32",
+    torch.int64: "i64",
 }
 OPTIONS = ("num_warps", "num_stages", "launch_pdl", "num_ctas")
 

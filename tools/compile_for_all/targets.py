@@ -6,9 +6,17 @@ from turbopi.kernels.portable.gemm.tiles import BLOCK_SHARED, Capability
 
 REGISTERS, THREADS = 65536, 1024  # of a multiprocessor; a block's threads at most
 
-MULTIPROCESSORS = {  # of the GPU that the tiles are chosen for: A100, RTX 3090, Orin, RTX 4090, H100, B200, B300, Thor …
-    **{(8, 0): 108, (8, 6): 82, (8, 7): 16, (8, 9): 128, (9, 0): 132},
-    **{(10, 0): 148, (10, 3): 148, (11, 0): 20, (12, 0): 170, (12, 1): 48},
+MULTIPROCESSORS = {  # of A100, RTX 3090, Orin, RTX 4090, H100, B200, B300, Thor, RTX 5090, GB10
+    (8, 0): 108,
+    (8, 6): 82,
+    (8, 7): 16,
+    (8, 9): 128,
+    (9, 0): 132,
+    (10, 0): 148,
+    (10, 3): 148,
+    (11, 0): 20,
+    (12, 0): 170,
+    (12, 1): 48,
 }
 
 

@@ -10,7 +10,7 @@ from turbopi.reading import read_document
 
 
 class TimedTile(Struct, frozen=True):
-    """tile: (rows, columns, warps, stages, splits). error: relative rms to the product in float32, None for E4M3 out."""
+    """tile: rows, columns, warps, stages, splits. error: relative rms to the product in float32; None for E4M3 out."""
 
     tile: tuple[int, int, int, int, int]
     microseconds: float

@@ -1,5 +1,6 @@
-"""Matrix products: an `Fp8Matrix`'s in Triton, with its epilogue; bfloat16's by the library, with what its epilogues can
-do. Twins: `kernels.plain`.
+"""Matrix products: an `Fp8Matrix`'s in Triton, bfloat16's by the library, with what its epilogues can do.
+
+Twins: `kernels.plain`.
 """
 
 import torch

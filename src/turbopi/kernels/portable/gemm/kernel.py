@@ -41,7 +41,7 @@ def _product_kernel(
     PROMOTE: tl.constexpr, WHOLE: tl.constexpr, SPLIT: tl.constexpr, GROUP: tl.constexpr,
     BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, DEPTH: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
-    """Tile [BLOCK_M, BLOCK_N] of the result. WHOLE: `inner` is a multiple of DEPTH. GEGLU: weight has 2 * columns rows."""
+    """Tile [BLOCK_M, BLOCK_N] of the result. WHOLE: DEPTH divides `inner`. GEGLU: weight has 2 * columns rows."""
     along_m, along_n = tl.cdiv(rows, BLOCK_M), tl.cdiv(columns, BLOCK_N)
     program, split = tl.program_id(0), tl.program_id(1)
     first = program // (GROUP * along_n) * GROUP
