@@ -1,13 +1,37 @@
 """The engine's operations on an NVIDIA GPU: its generation's own kernels where there are some, else those for all."""
 
+import os
+from dataclasses import replace
+
 import torch
 
+from turbopi.errors import ConfigError
 from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90.ops import hopper_ops
 
+KERNELS_VARIABLE = "TURBOPI_KERNELS"
+
+
+def forced_portable() -> bool:
+    """Whether TURBOPI_KERNELS=portable asks for the kernels for every GPU on Hopper, too.
+
+    Unset or "auto": no. Raises ConfigError for another value.
+    """
+    value = os.environ.get(KERNELS_VARIABLE, "auto")
+    if value not in ("auto", "portable"):
+        raise ConfigError(f"{KERNELS_VARIABLE} is {value!r}; expected 'auto' (or unset) or 'portable'")
+    return value == "portable"
+
 
 def fused_ops(device: torch.device) -> Ops:
-    """Activations are bfloat16; with an `Fp8Matrix` (on Hopper only) E4M3 between it and the operation before it."""
-    return hopper_ops(device) if capability(device) == (9, 0) else portable_ops()
+    """Activations are bfloat16; with an `Fp8Matrix` (from compute capability 8.9) E4M3 between it and the operation
+    before it. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor "portable".
+    """
+    if capability(device) != (9, 0) or forced_portable():
+        return portable_ops()
+    ops = hopper_ops(device)
+    return replace(
+        ops, origin={**ops.origin, "FP8 products": "CUDA, with bias, GELU, GeGLU and rounding in the epilogue"}
+    )

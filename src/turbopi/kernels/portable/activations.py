@@ -4,7 +4,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 
 
 @triton.jit
@@ -14,7 +14,7 @@ def gelu_tanh(x):
 
 
 @triton.jit
-def _geglu_kernel(gate_up, out, hidden, BLOCK: tl.constexpr, PDL: tl.constexpr):
+def _geglu_kernel(gate_up, out, hidden, inverse, SCALED: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr):
     wait_for_producer(PDL)
     launch_dependents(PDL)
     row = tl.program_id(1).to(tl.int64)
@@ -22,16 +22,23 @@ def _geglu_kernel(gate_up, out, hidden, BLOCK: tl.constexpr, PDL: tl.constexpr):
     mask = cols < hidden
     gate = gelu_tanh(tl.load(gate_up + row * 2 * hidden + cols, mask, 0.0).to(tl.float32))
     up = tl.load(gate_up + (row * 2 + 1) * hidden + cols, mask, 0.0).to(tl.float32)
-    tl.store(out + row * hidden + cols, (gate * up).to(out.dtype.element_ty), mask)
+    result = gate * up
+    if SCALED:
+        result *= inverse
+    tl.store(out + row * hidden + cols, result.to(out.dtype.element_ty), mask)
 
 
-def geglu(gate_up: Tensor) -> Tensor:
-    """[tokens, 2F], gate columns before up columns -> [tokens, F]; the product isn't rounded in between."""
+def geglu(gate_up: Tensor, inverse: float | None = None) -> Tensor:
+    """[tokens, 2F], gate columns before up columns -> [tokens, F]; the product isn't rounded in between.
+
+    With `inverse` the result leaves as E4M3: see `quantization.fp8`.
+    """
     assert gate_up.is_contiguous(), "gate_up is read as it lies in memory"
     rows, hidden = gate_up.shape[0], gate_up.shape[1] // 2
-    out = gate_up.new_empty(rows, hidden)
+    out = gate_up.new_empty(rows, hidden, dtype=result_dtype(gate_up, inverse))
     block = min(2048, triton.next_power_of_2(hidden))
     _geglu_kernel[(triton.cdiv(hidden, block), rows)](
-        gate_up, out, hidden, BLOCK=block, num_warps=max(1, block // 256), **dependent_launch(gate_up)
-    )
+        gate_up, out, hidden, inverse or 1.0,
+        SCALED=inverse is not None, BLOCK=block, num_warps=max(1, block // 256), **dependent_launch(gate_up),
+    )  # fmt: skip
     return out

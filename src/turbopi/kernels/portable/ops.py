@@ -1,4 +1,4 @@
-"""The engine's operations for any NVIDIA GPU: Triton's kernels between cuBLAS's products."""
+"""The engine's operations for any NVIDIA GPU: Triton's kernels between cuBLAS's products; FP8 products are Triton's."""
 
 from typing import Any
 
@@ -10,6 +10,8 @@ from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.portable import attention, backward, batch, embedding, norms, products, resize, rope
 
+GEGLU_ORIGIN = "Triton, in its product's epilogue" if products.BF16_GEGLU_IN_EPILOGUE else "Triton behind cuBLAS"
+
 
 def portable_ops() -> Ops:
     return Ops(
@@ -18,7 +20,7 @@ def portable_ops() -> Ops:
         residual_rms_norm=norms.residual_rms_norm,
         residual_layer_norm=norms.residual_layer_norm,
         linear=products.linear,
-        residual_linear=products.linear,
+        residual_linear=products.residual_linear,
         linear_gelu=products.linear_gelu,
         linear_geglu=products.linear_geglu,
         rope_split=rope.rope_split,
@@ -29,8 +31,9 @@ def portable_ops() -> Ops:
         batch=batch.BATCH,
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
+            "FP8 products": "Triton, with bias, GELU, GeGLU and rounding in the epilogue",
             "vision products": "cuBLAS",
-            "GeGLU of the prefix": "Triton",
+            "GeGLU of the prefix": GEGLU_ORIGIN,
             "product behind the prefix's GeGLU": "cuBLAS",
             "vision and prefix attention": "Triton",
             "suffix attention": "cuBLAS and Triton's softmax",

@@ -1,0 +1,254 @@
+"""The portable products equal their twins, their tiles fit every GPU, and TURBOPI_KERNELS chooses them.
+
+Without a GPU in float32 through Triton's interpreter, which takes E4M3 but can't round to it. On a GPU with FP8 each
+product is held against the float32 sums of its numbers.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from conftest import gpu_or_interpreter
+from torch import Tensor
+
+ON_GPU = torch.cuda.is_available()
+pytest.importorskip("triton", reason="Triton isn't installed")
+
+from turbopi.errors import ConfigError  # noqa: E402
+from turbopi.kernels import ops as kernels_ops  # noqa: E402
+from turbopi.kernels import plain  # noqa: E402
+from turbopi.kernels.portable import activations, norms, products  # noqa: E402
+from turbopi.kernels.portable.gemm import tiles  # noqa: E402
+from turbopi.kernels.portable.gemm.kernel import gpu, product  # noqa: E402
+from turbopi.kernels.portable.gemm.tiles import Capability, Epilogue, Tile  # noqa: E402
+from turbopi.kernels.portable.ops import portable_ops  # noqa: E402
+from turbopi.kernels.quantize import quantize  # noqa: E402
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Fp8Matrix, to_e4m3  # noqa: E402
+
+DEVICE = torch.device("cuda" if ON_GPU else "cpu")
+DTYPE = torch.bfloat16 if ON_GPU else torch.float32
+HERE: Capability = torch.cuda.get_device_capability() if ON_GPU else (8, 9)
+pytestmark = [
+    *gpu_or_interpreter(),
+    pytest.mark.skipif(tiles.fp8_refusal(HERE) is not None, reason="needs compute capability 8.9"),
+]
+SMALL = (Tile(32, 64, 4, 6),)  # the interpreter computes whole tiles
+EPILOGUES: tuple[Epilogue, ...] = ("plain", "gelu", "geglu", "parts")
+seeds = iter(range(10**6))
+
+
+def on_gpu(test: Callable[..., None]) -> Callable[..., None]:
+    return pytest.mark.gpu(pytest.mark.skipif(not ON_GPU, reason="needs an NVIDIA GPU")(test))
+
+
+def random(*shape: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(next(seeds))).to(DEVICE, DTYPE)
+
+
+def operands(m: int, n: int, k: int) -> tuple[Tensor, Fp8Matrix]:
+    matrix = quantize(random(n, k) / k**0.5, 0.01)
+    return to_e4m3(random(m, k), matrix.inverse), matrix
+
+
+def exactly(x: Tensor, weight: Fp8Matrix, epilogue: str, bias: Tensor | None) -> Tensor:
+    sums = weight.product(x, bias)
+    return plain.gelu(sums) if epilogue == "gelu" else plain.geglu(sums) if epilogue == "geglu" else sums
+
+
+def relative(ours: Tensor, exact: Tensor) -> float:
+    return float((ours.double() - exact.double()).norm() / exact.double().norm())
+
+
+def every_tile(epilogue: Epilogue, k: int) -> list[Tile]:
+    fitting = tiles.candidates(HERE, True, epilogue, k)
+    return fitting if ON_GPU else [tile for tile in fitting if replace(tile, splits=1) in SMALL]
+
+
+@pytest.mark.parametrize("epilogue", EPILOGUES)
+@pytest.mark.parametrize("out_fp8", [False, True])
+@pytest.mark.parametrize(("m", "n", "k"), [(1, 16, 16), (33, 72, 272), (130, 136, 4304)])
+def test_products_in_every_tile(m: int, n: int, k: int, epilogue: Epilogue, out_fp8: bool) -> None:
+    if not ON_GPU:
+        m, k = min(m, 33), min(k, 400)
+    x, matrix = operands(m, 2 * n if epilogue == "geglu" else n, k)
+    bias = None if epilogue == "geglu" else random(n)
+    exact, inverse = exactly(x, matrix, epilogue, bias), 30.0 if out_fp8 and epilogue != "parts" else None
+    for tile in every_tile(epilogue, k):
+        ours = product(x, matrix, epilogue, bias, inverse=inverse, tile=tile)
+        assert ours.dtype == ((E4M3 if ON_GPU else torch.float32) if inverse else DTYPE)
+        assert ours.shape == ((m, n) if tile.splits == 1 else (tile.splits, m, n))
+        ours = (ours.float().sum(0) if tile.splits > 1 else ours.float()) / (inverse or 1)
+        rounding = relative(to_e4m3(exact, inverse).float() / inverse, exact) if inverse and ON_GPU else 0.0
+        assert relative(ours, exact) < (0.006 if ON_GPU else 1e-6) + rounding, tile
+
+
+@on_gpu
+@pytest.mark.parametrize(
+    ("m", "n", "k", "epilogue"),
+    [
+        *((512, 3456, 1152, "plain"), (512, 1152, 4304, "parts"), (512, 4304, 1152, "gelu")),
+        *((560, 2560, 2048, "plain"), (304, 2048, 16384, "parts"), (563, 16384, 2048, "geglu")),
+    ],
+)
+def test_products_of_the_full_size(m: int, n: int, k: int, epilogue: Epilogue) -> None:
+    x, matrix = operands(m, 2 * n if epilogue == "geglu" else n, k)
+    bias = random(n) if k in (1152, 4304) else None
+    exact = exactly(x, matrix, epilogue, bias)
+    for tile in tiles.candidates(HERE, True, epilogue, k):
+        ours = product(x, matrix, epilogue, bias, tile=tile).float()
+        assert relative(ours.sum(0) if tile.splits > 1 else ours, exact) < 0.006, tile
+
+
+@on_gpu
+@pytest.mark.parametrize("k", [1152, 2048, 4304, 16384])
+def test_long_sums_lose_little_to_the_tensor_cores(k: int) -> None:
+    """Products of one sign are the worst case. Sums up to UNPROMOTED, or between two promotions, may lose 14 bits'
+    worth of rounding down for each product: measured on Hopper up to 4e-3 of 2048 such products.
+    """
+    x, matrix = operands(256, 512, k)
+    x, matrix.data[:] = to_e4m3(x.float().abs(), 1.0), to_e4m3(matrix.data.float().abs(), 1.0)
+    exact = matrix.product(x)
+    assert relative(product(x, replace(matrix, dtype=torch.float32)), exact) < 0.01
+
+
+@on_gpu
+def test_nan_shows_and_too_much_saturates() -> None:
+    x, matrix = operands(8, 32, 64)
+    x.view(torch.uint8)[2, 5] = 0x7F
+    ours = product(x, matrix, inverse=1e9).float()
+    assert bool(ours[2].isnan().all())
+    assert bool((ours[[0, 1, 3]].abs() == E4M3_MAX).all())
+
+
+@on_gpu
+def test_the_bfloat16_geglu_in_the_epilogue_is_as_good_as_behind_the_product() -> None:
+    x, gate_up = random(203, 2048), random(2 * 4304, 2048) / 2048**0.5
+    exact = plain.geglu(x.float() @ gate_up.float().T)
+    for tile in tiles.candidates(HERE, False, "geglu", 2048):
+        assert relative(product(x, gate_up, "geglu", tile=tile), exact) < 2 * relative(
+            plain.linear_geglu(x, gate_up), exact
+        )
+
+
+def test_rows_beyond_the_result_are_left_alone() -> None:
+    x, matrix = operands(5, 24, 32)
+    whole = torch.full((7, 24), torch.nan, device=DEVICE, dtype=DTYPE)
+    product(x, matrix, out=whole[1:6], tile=SMALL[0])
+    assert bool(whole[[0, 6]].isnan().all()) and bool(whole[1:6].isfinite().all())
+
+
+def test_operations_take_both_kinds_of_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("turbopi.kernels.portable.gemm.kernel.best_tile", lambda *_: SMALL[0])
+    ops, bias = portable_ops(), random(24)
+    x, matrix = operands(5, 48, 32)
+    half = matrix[:24]
+    tolerance = 0.006 if ON_GPU else 1e-6
+    for ours, twin in (
+        (ops.linear(x, half, bias), plain.linear(x, half, bias)),
+        (ops.linear(x, half, None, random(5, 24)), plain.linear(x, half)),
+        (ops.residual_linear(x, half, bias), plain.linear(x, half, bias)),
+        (ops.linear_gelu(x, half, bias), plain.linear_gelu(x, half, bias)),
+        (ops.linear_geglu(x, matrix), plain.linear_geglu(x, matrix)),
+    ):
+        assert ours.shape == twin.shape and relative(ours, twin) < tolerance
+    wide, gate_up = random(5, 32), random(48, 32)
+    assert relative(ops.linear_geglu(wide, gate_up), plain.linear_geglu(wide, gate_up)) < tolerance
+    rounded, twin = ops.linear_geglu(wide, gate_up, inverse=30.0), plain.linear_geglu(wide, gate_up)
+    assert rounded.dtype == (E4M3 if ON_GPU else torch.float32) and relative(rounded.float() / 30, twin) < 0.04
+
+
+def test_parts_are_what_the_norms_add_up() -> None:
+    x, matrix = operands(9, 32, 800)
+    stream, scale = random(9, 32), torch.ones(32, device=DEVICE)
+    parts = product(x, matrix, "parts", tile=Tile(32, 64, 4, 6, splits=3))
+    ours = norms.residual_rms_norm(stream, parts, None, scale, None, 1e-6)
+    twin = plain.residual_rms_norm(stream, plain.linear(x, matrix), None, scale, None, 1e-6)
+    assert all(relative(a, b) < (0.01 if ON_GPU else 1e-6) for a, b in zip(ours, twin, strict=True))
+
+
+def test_geglu_behind_a_product_leaves_in_e4m3() -> None:
+    x = random(5, 96)
+    ours = activations.geglu(x, 30.0)
+    assert ours.dtype == (E4M3 if ON_GPU else torch.float32)
+    assert relative(ours.float() / 30, plain.geglu(x.float())) < (0.04 if ON_GPU else 1e-6)
+
+
+# Which tile
+
+
+@pytest.mark.parametrize("capability", tiles.BLOCK_SHARED)
+@pytest.mark.parametrize("rows", [1, 11, 304, 512, 560, 976, 4480])
+@pytest.mark.parametrize(
+    ("n", "k", "epilogue"),
+    [(3456, 1152, "plain"), (1152, 4304, "parts"), (2048, 16384, "parts"), (16384, 2048, "geglu"), (16, 16, "gelu")],
+)
+def test_the_chosen_tile_fits_the_gpu(capability: Capability, rows: int, n: int, k: int, epilogue: Epilogue) -> None:
+    for fp8 in (False, True):
+        tile = tiles.best_tile(capability, fp8, epilogue, rows, n, k, 100)
+        assert tile.takes(capability, epilogue, fp8 and tiles.promotes(capability, k))
+        assert tile.splits == 1 or epilogue == "parts"
+
+
+def test_a_gpu_nobody_has_seen_gets_tiles_that_fit_the_smallest() -> None:
+    for epilogue in EPILOGUES:
+        for tile in tiles.candidates((12, 9), True, epilogue, 16384):
+            assert tile.shared_bytes((12, 9)) <= 99 * 1024
+
+
+def test_a_measured_tile_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(tiles.MEASURED, ((9, 0), True, "plain", 576, 2560, 2048), Tile(32, 64, 4, 6))
+    tiles.best_tile.cache_clear()
+    assert tiles.best_tile((9, 0), True, "plain", 560, 2560, 2048, 132) == Tile(32, 64, 4, 6)
+    tiles.best_tile.cache_clear()
+
+
+def test_few_rows_do_not_take_the_tallest_tile_and_long_sums_are_split() -> None:
+    assert tiles.best_tile((9, 0), True, "plain", 11, 2560, 2048, 132).rows < 128
+    assert tiles.best_tile((9, 0), True, "parts", 560, 2048, 16384, 132).splits > 1
+
+
+def test_fp8_is_refused_below_8_9_and_says_why() -> None:
+    assert all(tiles.fp8_refusal(one) is None for one in ((8, 9), (9, 0), (12, 0)))
+    for capability in ((8, 0), (8, 6), (8, 7)):
+        why = tiles.fp8_refusal(capability)
+        assert why is not None and f"this GPU has {capability[0]}.{capability[1]}" in why
+
+
+# Which kernels
+
+
+@pytest.fixture
+def hopper(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels_ops, "capability", lambda device: (9, 0))
+    monkeypatch.setattr(kernels_ops, "hopper_ops", lambda device: replace(portable_ops(), origin={"all": "Hopper's"}))
+
+
+def test_the_variable_forces_the_portable_kernels(hopper: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TURBOPI_KERNELS", "portable")
+    assert kernels_ops.forced_portable()
+    assert kernels_ops.fused_ops(DEVICE).origin["FP8 products"].startswith("Triton")
+    for value in ("auto", None):
+        if value is None:
+            monkeypatch.delenv("TURBOPI_KERNELS")
+        else:
+            monkeypatch.setenv("TURBOPI_KERNELS", value)
+        assert not kernels_ops.forced_portable()
+        origin = kernels_ops.fused_ops(DEVICE).origin
+        assert origin["all"] == "Hopper's" and origin["FP8 products"].startswith("CUDA")
+
+
+@pytest.mark.parametrize("value", ["hopper", "", "Portable"])
+def test_another_value_is_an_error_that_names_it(hopper: None, value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TURBOPI_KERNELS", value)
+    with pytest.raises(ConfigError, match=f"TURBOPI_KERNELS is '{value}'; expected 'auto' .* or 'portable'"):
+        kernels_ops.fused_ops(DEVICE)
+
+
+def test_the_origin_says_where_geglu_is() -> None:
+    where = portable_ops().origin["GeGLU of the prefix"]
+    assert ("epilogue" in where) == products.BF16_GEGLU_IN_EPILOGUE
+
+
+def test_the_interpreter_chooses_as_one_gpu_would() -> None:
+    assert gpu(torch.device("cpu"))[0] == (9, 0)

@@ -1,0 +1,159 @@
+"""Calls of everything that launches a Triton kernel, at the full model's sizes: two pictures and a prompt's bucket."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from compile_for_all.targets import Target
+from turbopi.kernels.interface import SOURCE
+from turbopi.kernels.portable import activations, attention, backward, embedding, norms, resize, rope, rounding
+from turbopi.kernels.portable.gemm import tiles
+from turbopi.kernels.portable.gemm.kernel import product
+from turbopi.quantization.fp8 import E4M3, Fp8Matrix
+
+BF16, F32 = torch.bfloat16, torch.float32
+Calls = list[Callable[[], Any]]
+ROWS, PREFIX, SUFFIX = 512, 560, 50
+# name, epilogue, rows, out, in, bias, E4M3 behind it
+PRODUCTS: tuple[tuple[str, tiles.Epilogue, int, int, int, bool, bool], ...] = (
+    ("vision's qkv", "plain", ROWS, 3456, 1152, True, False),
+    ("vision's out", "parts", ROWS, 1152, 1152, True, False),
+    ("vision's fc1", "gelu", ROWS, 4304, 1152, True, True),
+    ("vision's fc1 before bf16", "gelu", ROWS, 4304, 1152, True, False),
+    ("vision's fc2", "parts", ROWS, 1152, 4304, True, False),
+    ("projector", "plain", ROWS, 2048, 1152, True, False),
+    ("prefix's qkv", "plain", PREFIX, 2560, 2048, False, False),
+    ("prefix's out", "parts", PREFIX, 2048, 2048, False, False),
+    ("prefix's gate and up", "geglu", PREFIX, 16384, 2048, False, True),
+    ("prefix's gate and up before bf16", "geglu", PREFIX, 16384, 2048, False, False),
+    ("prefix's down", "parts", PREFIX, 2048, 16384, False, False),
+)
+
+
+def of(*shape: int, dtype: torch.dtype = BF16) -> Tensor:
+    return torch.empty(shape, dtype=dtype, device="cuda")
+
+
+def all_calls(target: Target, chosen: bool = False) -> Calls:
+    """Every variant that the product can launch there at full size; E4M3 where the GPU has it. chosen: see below."""
+    fp8 = tiles.fp8_refusal(target.capability) is None
+    inverses: tuple[float | None, ...] = (None, 30.0) if fp8 else (None,)
+    calls = [*_norms(inverses), *_attention(inverses), *_rest(), *_backward()]
+    calls += [lambda inverse=one: activations.geglu(of(PREFIX, 2 * 16384), inverse) for one in inverses]
+    if fp8:
+        calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152))]
+    return [*calls, *product_calls(target, fp8, chosen)]
+
+
+def product_calls(target: Target, fp8: bool, chosen: bool = False) -> Calls:
+    """The products in every tile of the table that this GPU takes; `chosen`: in the tile that it would choose alone.
+
+    Splits of the inner axis are two, which stands for more.
+    """
+    calls: Calls = []
+    for in_fp8 in (True, False) if fp8 else (False,):
+        for _, epilogue, m, n, k, bias, out_fp8 in PRODUCTS:
+            if not in_fp8 and (epilogue != "geglu" or out_fp8):
+                continue  # the library's
+            for tile in tiles.candidates(target.capability, in_fp8, epilogue, k):
+                if tile.splits <= 2:
+                    calls.append(partial(_product, in_fp8, epilogue, m, n, k, bias, out_fp8, None if chosen else tile))
+    return calls
+
+
+def _product(
+    fp8: bool, epilogue: tiles.Epilogue, m: int, n: int, k: int, bias: bool, out_fp8: bool, tile: tiles.Tile | None
+) -> Tensor:
+    rows = 2 * n if epilogue == "geglu" else n
+    weight = Fp8Matrix(of(rows, k, dtype=E4M3), of(rows, dtype=F32), 50.0, BF16) if fp8 else of(rows, k)
+    x = of(m, k, dtype=E4M3 if fp8 else BF16)
+    return product(x, weight, epilogue, of(n) if bias else None, inverse=30.0 if out_fp8 else None, tile=tile)
+
+
+def _norms(inverses: tuple[float | None, ...]) -> Calls:
+    calls: Calls = []
+    for inverse in inverses:
+        for splits in (None, 0, 2, 3, 4):
+            for width, rows in ((2048, PREFIX), (1152, ROWS)):
+                y = (rows, width) if not splits else (splits, rows, width)
+                if width == 2048:
+                    calls.append(partial(_rms, rows, width, None if splits is None else y, None, False, inverse))
+                else:
+                    calls.append(partial(_layer_norm, rows, width, None if splits is None else y, inverse))
+    for by_row in (False, True):
+        for y in (None, (SUFFIX, 1024)):
+            calls.append(partial(_rms, SUFFIX, 1024, y, y, by_row, None))
+    return calls
+
+
+def _rms(
+    rows: int, width: int, y: tuple[int, ...] | None, gate: Any, by_row: bool, inverse: float | None
+) -> tuple[Tensor, Tensor]:
+    shape = (rows, width) if by_row else (width,)
+    modulated = width == 1024
+    factor, shift = of(*shape, dtype=F32), of(*shape, dtype=F32) if modulated else None
+    gated = None if gate is None else of(*shape, dtype=F32)
+    given = None if y is None else of(*y)
+    return norms.residual_rms_norm(of(rows, width), given, gated, factor, shift, 1e-6, inverse)
+
+
+def _layer_norm(rows: int, width: int, y: tuple[int, ...] | None, inverse: float | None) -> tuple[Tensor, Tensor]:
+    given = None if y is None else of(*y)
+    return norms.residual_layer_norm(of(rows, width), given, of(width), of(width), 1e-6, inverse)
+
+
+def _attention(inverses: tuple[float | None, ...]) -> Calls:
+    def prefix(inverse: float | None) -> Tensor:
+        k = of(PREFIX, 256)
+        return attention.prefix_attention(of(PREFIX * 8, 256), k, k, of(1, dtype=torch.int64), 8, inverse)
+
+    def softmax(state_token: bool) -> Tensor:
+        length = of(1, dtype=torch.int64)
+        return attention.masked_softmax(of(SUFFIX * 8, 1026, dtype=F32), length, 976, 8, state_token, 0.06, BF16)
+
+    return [
+        *(partial(lambda one: attention.vision_attention(of(ROWS, 3456), 2, 16, one), one) for one in inverses),
+        *(partial(prefix, one) for one in inverses),
+        *(partial(softmax, state_token) for state_token in (False, True)),
+    ]
+
+
+def _rest() -> Calls:
+    def rope_split() -> Tensor:
+        cos, cache = of(PREFIX, 128, dtype=F32), of(PREFIX, 256)
+        return rope.rope_split(of(PREFIX, 2560), cos, cos, cache, cache)
+
+    def pictures(dtype: torch.dtype) -> None:
+        resize.resize_pictures(of(2, len(SOURCE), dtype=torch.int64), of(2, 224, 224, 3, dtype=dtype))
+
+    pixels = (torch.uint8, F32)
+    return [
+        rope_split,
+        *(partial(pictures, dtype) for dtype in pixels),
+        *(partial(lambda dtype: embedding.patch_rows(of(2, 224, 224, 3, dtype=dtype), 14), dtype) for dtype in pixels),
+        lambda: embedding.odd_rows(of(2, 224, 224, 3, dtype=torch.uint8), 14),
+        lambda: embedding.add_position(of(ROWS, 1152, dtype=F32), of(256, 1152, dtype=F32), BF16),
+        lambda: embedding.embed_prompt(of(48, dtype=torch.int64), of(257152, 2048), of(48, 2048)),
+    ]
+
+
+def _backward() -> Calls:
+    def rms(by_row: bool, full: bool) -> Any:
+        factor = of(SUFFIX, 1024, dtype=F32) if by_row else of(1024, dtype=F32)
+        d_x, gate = (of(SUFFIX, 1024, dtype=F32), factor) if full else (None, None)
+        return backward.rms_norm_vjp(of(SUFFIX, 1024), of(SUFFIX, 1024), factor, 1e-6, d_x, gate)
+
+    cos, head = (lambda: of(SUFFIX, 128, dtype=F32)), (lambda: of(SUFFIX, 256))
+    return [
+        *(partial(rms, by_row, full) for by_row in (False, True) for full in (False, True)),
+        lambda: backward.geglu_vjp(of(SUFFIX, 4096), of(SUFFIX, 8192)),
+        lambda: backward.softmax_vjp(of(SUFFIX * 8, 1026), of(SUFFIX * 8, 1026, dtype=F32), 0.06),
+        lambda: backward.rope_vjp(of(SUFFIX * 8, 256), head(), head(), cos(), cos()),
+    ]
+
+
+def _feedback(columns: int) -> tuple[Tensor, Tensor, Tensor]:
+    return of(columns, dtype=torch.int64), of(columns, 16, dtype=F32), of(columns, 16, dtype=F32)

@@ -1,0 +1,119 @@
+"""One target's kernels, compiled: Triton's by `triton.compile` for a GPU that isn't here, CUDA C++ by NVRTC."""
+
+import contextlib
+import importlib
+import importlib.metadata
+import io
+import pkgutil
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import machine_code
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from triton.runtime.errors import PTXASError
+from triton.runtime.jit import JITFunction
+
+from compile_for_all.calls import all_calls
+from compile_for_all.cubin import used
+from compile_for_all.document import Compiled
+from compile_for_all.launches import Launch, launches
+from compile_for_all.targets import Target, over_limit
+from turbopi.errors import BackendError
+from turbopi.kernels import portable
+from turbopi.kernels.portable.gemm.tiles import fp8_refusal
+
+HOPPER = (9, 0)
+
+
+def compile_target(target: Target, only: str = "", chosen: bool = False) -> list[Compiled]:
+    """A row for each kernel and variant; `only`: of kernels with this in their name."""
+    found = [one for one in launches(target, all_calls(target, chosen)) if only in one.name]
+    rows = [compiled_launch(target, launch) for launch in found]
+    for name, make in cuda_kernels(target):
+        if only in name:
+            rows.append(compiled_cuda(target, name, make))
+    if (why := fp8_refusal(target.capability)) is not None and only in "gemm.kernel.product":
+        rows.append(Compiled("gemm.kernel.product, FP8", "", target.arch, refused=why))
+    return rows
+
+
+def compiled_launch(target: Target, launch: Launch) -> Compiled:
+    """As `triton.compile` leaves it. A compiler that doesn't know the target is a problem, not a crash."""
+    at = {name: (i,) for i, name in enumerate(launch.kernel.arg_names)}
+    source = ASTSource(
+        launch.kernel,
+        dict(launch.signature),
+        {at[name]: value for name, value in launch.constants},
+        {at[name]: [["tt.divisibility", 16]] for name in launch.divisible},
+    )
+    row = partial(Compiled, launch.name, launch.variant, target.arch)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():  # Triton prints what failed
+            warnings.simplefilter("ignore")
+            code = triton.compile(source, GPUTarget("cuda", target.number, 32), dict(launch.options))
+    except PTXASError as e:
+        if f"'{target.arch}' is not defined" in str(e):
+            ptxas = versions()["ptxas from 10.0 on" if target.number >= 100 else "ptxas"]
+            return row(
+                refused=f"Triton's ptxas {ptxas} doesn't know it; set TRITON_PTXAS_BLACKWELL_PATH to a newer one"
+            )
+        return row(problem=next((line for line in str(e).splitlines() if "fatal" in line or "error" in line), str(e)))
+    except (triton.CompilationError, RuntimeError, ValueError) as e:
+        return row(problem=str(e).strip().splitlines()[-1])
+    registers, spilled, _ = used(code.asm["cubin"])
+    shared = int(code.metadata.shared)
+    problem = over_limit(target, registers, shared, launch.threads)
+    if problem is None and spilled:
+        problem = f"a thread spills {spilled} bytes"
+    return row(registers=registers, spilled=spilled, shared=shared, problem=problem)
+
+
+def compiled_cuda(target: Target, name: str, make: Callable[[Path | None], bytes]) -> Compiled:
+    try:
+        registers, spilled, shared = used(make(None))
+    except BackendError as e:
+        return Compiled(name, "", target.arch, problem=str(e).splitlines()[0])
+    return Compiled(name, "", target.arch, registers, spilled, shared)
+
+
+def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], bytes]]]:
+    """(name, what compiles it): Hopper's for 9.0, and those that modules below kernels/portable offer.
+
+    Such a module has `for_all(arch)`: pairs as these, with the cubin made by `nvrtc.compile_cubin` for that arch.
+    """
+    if target.capability == HOPPER:
+        yield from ((f"sm90: {name}", make) for name, make in machine_code.SHAPES.items())
+    for module in portable_modules():
+        yield from getattr(module, "for_all", lambda arch: ())(target.arch)
+
+
+def portable_modules() -> list[Any]:
+    """Every module below kernels/portable."""
+    prefix = f"{portable.__name__}."
+    return [importlib.import_module(one.name) for one in pkgutil.walk_packages(portable.__path__, prefix)]
+
+
+def triton_kernels() -> set[str]:
+    """Names of all kernels below kernels/portable, as `Launch.name` has them."""
+    return {
+        Launch(one, (), (), (), ()).name
+        for module in portable_modules()
+        for one in vars(module).values()
+        if isinstance(one, JITFunction) and one.__name__.endswith(("_kernel",)) and one.__module__ == module.__name__
+    }
+
+
+def versions() -> dict[str, str]:
+    """The compilers'."""
+    nvidia = triton.knobs.nvidia
+    return {
+        "triton": importlib.metadata.version("triton"),
+        "ptxas": nvidia.ptxas.version,
+        "ptxas from 10.0 on": nvidia.ptxas_blackwell.version,
+        "nvrtc": machine_code.compiler() or "none",
+    }

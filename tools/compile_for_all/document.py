@@ -1,0 +1,34 @@
+"""What `python -m compile_for_all --json` writes, and reads again."""
+
+from pathlib import Path
+
+from msgspec import Struct
+
+from turbopi.errors import ConfigError
+from turbopi.reading import read_document
+
+
+class Compiled(Struct, frozen=True, omit_defaults=True):
+    """One kernel for one target. problem: why it isn't fit to run there; refused: why it isn't to run there."""
+
+    kernel: str
+    variant: str
+    target: str
+    registers: int = 0  # a thread
+    spilled: int = 0  # bytes of a thread's stack
+    shared: int = 0  # bytes a block
+    problem: str | None = None
+    refused: str | None = None
+
+
+class CompiledForAll(Struct, frozen=True):
+    """versions: of the compilers. rows: each kernel, variant and target once."""
+
+    date: str
+    versions: dict[str, str]
+    rows: list[Compiled]
+
+
+def read_compiled(file: Path) -> CompiledForAll:
+    """Raises ConfigError for another file."""
+    return read_document(file, CompiledForAll, ConfigError)

@@ -1,0 +1,1 @@
+"""Times the tiles of the portable products."""
