@@ -45,11 +45,13 @@ inline float __fdividef(float x, float y) { return x / y; }
 inline float __fadd_rn(float x, float y) { return x + y; }
 inline float __fmul_rn(float x, float y) { return x * y; }
 inline void sincosf(float x, float* sine, float* cosine) { *sine = std::sin(x), *cosine = std::cos(x); }
+inline float exp2f(float x) { return std::exp2(x); }
 inline float __uint_as_float(unsigned x) { float y; memcpy(&y, &x, 4); return y; }
 inline unsigned __float_as_uint(float x) { unsigned y; memcpy(&y, &x, 4); return y; }
 inline float __int_as_float(int x) { return __uint_as_float(x); }
 inline int __float_as_int(float x) { return __float_as_uint(x); }
 template <typename T> T __ldg(const T* p) { return *p; }
+template <typename T> T __ldcg(const T* p) { return *p; }
 inline unsigned __byte_perm(unsigned x, unsigned y, unsigned s) {
     const uint64_t both = uint64_t(y) << 32 | x;
     unsigned r = 0;
@@ -454,6 +456,31 @@ inline void ptx_mma_bf16(float& c0, float& c1, float& c2, float& c3, unsigned a0
 inline void ptx_mma_half(float& c0, float& c1, float& c2, float& c3, unsigned a0, unsigned a1, unsigned a2, unsigned a3,
                          unsigned b0, unsigned b1) {
     mma({&c0, &c1, &c2, &c3}, {a0, a1, a2, a3, b0, b1}, machine::half);
+}
+// The same of mma.m16n8k32: where bfloat16 has two columns, E4M3 has four.
+inline void ptx_mma_e4m3(float& c0, float& c1, float& c2, float& c3, unsigned a0, unsigned a1, unsigned a2, unsigned a3,
+                         unsigned b0, unsigned b1) {
+    float* const c[4] = {&c0, &c1, &c2, &c3};
+    const int g = threadIdx.x % 32 / 4, t = threadIdx.x % 4;
+    exchanged(std::array<unsigned, 6>{a0, a1, a2, a3, b0, b1}, [&](auto of_lane) {
+        for (int i = 0; i < 4; ++i)
+            for (int k = 0; k < 32; ++k) {
+                const unsigned a = of_lane(g * 4 + k % 16 / 4)[i / 2 + k / 16 * 2];
+                const unsigned b = of_lane((2 * t + i % 2) * 4 + k % 16 / 4)[4 + k / 16];
+                *c[i] += machine::e4m3(a >> k % 4 * 8 & 255) * machine::e4m3(b >> k % 4 * 8 & 255);
+            }
+        return 0;
+    });
+}
+// Of all blocks, which here are one cluster.
+inline void ptx_add_released(unsigned* to, unsigned what) { *to += what, ++machine::moved; }
+inline void ptx_load_acquired(unsigned& value, const unsigned* from) {
+    swapcontext(&machine::now->context, &machine::scheduler);  // others go on while somebody looks
+    value = *from;
+}
+inline void ptx_load_once(unsigned& x, unsigned& y, unsigned& z, unsigned& w, const void* from) {
+    const uint4 v = *(const uint4*)from;
+    x = v.x, y = v.y, z = v.z, w = v.w;
 }
 inline void ptx_copy_bytes(unsigned to, const void* from, unsigned bytes, unsigned bar, uint64_t) {
     machine::Copy c{};

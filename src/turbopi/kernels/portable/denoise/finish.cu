@@ -1,0 +1,126 @@
+// What becomes of a product's sums.
+
+__device__ __forceinline__ float2 two(const float* from) { return __ldg((const float2*)from); }
+
+// 1 / rms of all tokens, from the sums of squares of all tiles.
+__device__ __forceinline__ void make_inverse_rms(const Args& args, float* smem) {
+  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+#pragma unroll
+  for (int first = 0; first < T; first += WARPS) {
+    const int token = first + warp;
+    float sum = 0;
+    if (token < T)
+#pragma unroll
+      for (int tile = 0; tile < D_TILES; tile += 32)
+        if (tile + lane < D_TILES) sum += __ldcg(args.squares + token * D_TILES + tile + lane);
+#pragma unroll
+    for (int by = 16; by; by /= 2) sum += __shfl_xor_sync(~0u, sum, by);
+    if (token < T && lane == 0) smem[S_RMS + token] = rsqrtf(sum / D + args.eps);
+  }
+}
+
+// Sums of the stream behind a norm: times 1 / rms (of E4M3, and the channel's scale), plus the shift's product.
+struct Normed {
+  const float *shifted, *scales;  // of the product's first channel
+  const float* inverse_rms;       // shared memory
+  struct Factors {
+    float2 shift, scale;
+  };
+  __device__ __forceinline__ Factors of(Item i) const {
+    Factors f{make_float2(0, 0), make_float2(1, 1)};
+    if (i.valid) f.shift = two(shifted + i.tile * 8 + i.pair * 2);
+    if (FP8 && i.valid) f.scale = two(scales + i.tile * 8 + i.pair * 2);
+    return f;
+  }
+  __device__ __forceinline__ float2 apply(Item i, Factors f, float2 sum) const {
+    const float by = inverse_rms[i.token];
+    return make_float2(sum.x * (by * f.scale.x) + f.shift.x, sum.y * (by * f.scale.y) + f.shift.y);
+  }
+};
+
+// q|k|v. A tile of queries or keys has RoPE's partners side by side: pair p of it are columns 4 t + p and HD / 2 more.
+struct FinishQkv {
+  Normed normed;
+  const float2* rope;  // [T][HD / 2] cosine, sine
+  unsigned short *queries, *keys, *values;
+  static constexpr int HEAD_TILES = HD / 8;
+  struct Factors {
+    Normed::Factors normed;
+    float2 rope;
+  };
+  __device__ __forceinline__ Factors factors(Item i) const {
+    Factors f{normed.of(i), make_float2(1, 0)};
+    if (i.valid && i.tile < (HEADS + 1) * HEAD_TILES)
+      f.rope = __ldg(rope + i.token * (HD / 2) + i.tile % HEAD_TILES * 4 + i.pair);
+    return f;
+  }
+  __device__ __forceinline__ void apply(Item i, Factors f, float2 sum) const {
+    if (!i.valid) return;
+    const float2 v = normed.apply(i, f.normed, sum);
+    const int head = i.tile / HEAD_TILES;
+    if (head == HEADS + 1) {
+      *(u32*)(values + i.token * HD + i.tile % HEAD_TILES * 8 + i.pair * 2) = pack(v.x, v.y);
+      return;
+    }
+    const u32 both = pack(v.x * f.rope.x - v.y * f.rope.y, v.y * f.rope.x + v.x * f.rope.y);
+    unsigned short* const to =
+        (head < HEADS ? queries + (i.token * HEADS + head) * HD : keys + i.token * HD) + i.tile % HEAD_TILES * 4 + i.pair;
+    to[0] = both, to[HD / 2] = both >> 16;
+  }
+};
+
+// gate|up: of a pair the first is a unit's gate, the second its up.
+struct FinishGateUp {
+  Normed normed;
+  byte* hidden;
+  using Factors = Normed::Factors;
+  __device__ __forceinline__ Factors factors(Item i) const { return normed.of(i); }
+  __device__ __forceinline__ void apply(Item i, Factors f, float2 sum) const {
+    float unit = 0;
+    if (i.valid) {
+      const float2 v = normed.apply(i, f, sum);
+      const float inner = 0.7978845608028654f * (v.x + 0.044715f * v.x * v.x * v.x);
+      unit = __fdividef(v.x, 1 + exp2f(inner * (-2 * 1.4426950408889634f))) * v.y;  // GELU by tanh, times up
+    }
+    const float next = __shfl_xor_sync(~0u, unit, 1);
+    if (i.valid && i.pair % 2 == 0) store_operand(hidden, i.token, i.tile * 4 + i.pair, unit, next);
+  }
+};
+
+// x's new columns: kept, and given to the next norm.
+struct Stream {
+  const float* scale;  // the next norm's, [D]
+  float *x, *squares;  // [T][D], [T][D_TILES]
+  byte* stream;
+  __device__ __forceinline__ void keep(Item i, float2 v, float2 by) const {
+    float sum = v.x * v.x + v.y * v.y;
+    sum += __shfl_xor_sync(~0u, sum, 1);
+    sum += __shfl_xor_sync(~0u, sum, 2);
+    if (!i.valid) return;
+    const int column = i.tile * 8 + i.pair * 2;
+    *(float2*)(x + i.token * D + column) = v;
+    store_operand(stream, i.token, column, v.x * by.x, v.y * by.y);
+    if (i.pair == 0) squares[i.token * D_TILES + i.tile] = sum;
+  }
+};
+
+// out and down: a gated residual. x is the block's own.
+struct FinishResidual {
+  Stream into;
+  const float* gate;
+  struct Factors {
+    float2 gate, scale, x;
+  };
+  __device__ __forceinline__ Factors factors(Item i) const {
+    Factors f{};
+    if (i.valid) {
+      const int column = i.tile * 8 + i.pair * 2;
+      f.gate = two(gate + column), f.scale = two(into.scale + column);
+      f.x = __ldcg((const float2*)(into.x + i.token * D + column));
+    }
+    return f;
+  }
+  __device__ __forceinline__ void apply(Item i, Factors f, float2 sum) const {
+    into.keep(i, make_float2(f.x.x + sum.x * f.gate.x, f.x.y + sum.y * f.gate.y), f.scale);
+  }
+};

@@ -1,0 +1,281 @@
+"""The whole denoising loop of Pi0.5 in one cooperative kernel for compute capability 8.0 and newer: sizes and launch.
+
+It needs no clusters, no copy engine and no more than 99 KB of a block's shared memory. How it works: sizes.cu.
+
+Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns, A action_dim.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.kernels.arguments import Parameter, Struct
+from turbopi.kernels.interface import State, TokenInputs
+from turbopi.kernels.nvrtc import Kernel, compile_cubin
+from turbopi.kernels.portable.denoise.packing import CHUNK_BYTES, PackedExpert, Tables
+
+PARTS = ("primitives", "product", "finish", "attention", "kernel")  # behind sizes.cu and the arguments
+MAX_SUFFIX = 64
+SHARED_BYTES = 99 * 1024  # what a block has on every GPU from 8.0 on
+MAX_SPLITS, MAX_SPLIT_KEYS = 16, 256  # shares of the keys: as many as are combined at once; what fits a block
+PREPARE_THREADS = 256
+LARGE_L2 = 32 << 20  # bytes: a layer's weights, and what else is read meanwhile
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How a launch uses a multiprocessor; they change the speed and nothing else."""
+
+    warps: int  # of a block, a multiple of 4
+    sums: int  # tiles of 16 tokens by 8 channels that a warp adds up at once, 4 registers each
+    weights: int  # loads of 16 bytes that a lane has on their way, at most
+    activations: int  # the same of activations, in groups of 8 tokens
+    ahead: bool  # weights of later phases go to L2, where L2 is large
+
+
+FEW = Choices(warps=16, sums=8, weights=8, activations=8, ahead=True)  # up to 16 tokens
+MANY = Choices(warps=8, sums=16, weights=8, activations=14, ahead=True)
+
+
+def choices(suffix: int) -> Choices:
+    return FEW if suffix <= 16 else MANY
+
+
+def unavailable(device: torch.device, fp8: bool = False) -> str | None:
+    """Why the kernel can't run on this device, or None if it can."""
+    if device.type != "cuda":
+        return "the portable denoising kernel needs an NVIDIA GPU"
+    major, minor = torch.cuda.get_device_capability(device)
+    needed = (8, 9) if fp8 else (8, 0)
+    if (major, minor) < needed:
+        what = " in FP8" if fp8 else ""
+        return (
+            f"the portable denoising kernel{what} needs compute capability {needed[0]}.{needed[1]} or newer, "
+            f"this GPU has {major}.{minor}"
+        )
+    return None
+
+
+ARGS = Struct(
+    "Args",
+    (
+        Parameter("const unsigned char*", "weights", "[L] qkv, out, gate|up, down: [tile][chunk][8 channels][64 bytes]"),
+        Parameter("const float*", "table", "[N][2L+1][3][D]: scale, shift, gate"),
+        Parameter("const float*", "shifted", "[N][L][channels of qkv, gate|up]: W shift"),
+        Parameter("const float*", "row_scales", "[L][channels of qkv, gate|up]: FP8"),
+        Parameter("const float*", "attended_times", "[L]: FP8"),
+        Parameter("const float*", "out_w", "[A][D]"),
+        Parameter("const float*", "out_shift", "[N][A]: action_out_proj of the final norm's shift, and its bias"),
+        Parameter("const float*", "in_w", "[A][D]"),
+        Parameter("const float*", "in_b", "[D]"),
+        Parameter("const float*", "inv_freq", "[K/2]"),
+        Parameter("const unsigned char*", "cache_k", "bf16 [L][rows][K], layer_stride bytes from layer to layer"),
+        Parameter("const unsigned char*", "cache_v"),
+        Parameter("const long long*", "length", "valid rows of the cache"),
+        Parameter("const float*", "noise", "[T][A]"),
+        Parameter("float*", "x_t", "[N+1][T][A]"),
+        Parameter("float*", "v_t", "[N][T][A]"),
+        Parameter("float*", "x", "[T][D] the residual stream"),
+        Parameter("float*", "squares", "[T][D/8] of x, added up by tiles"),
+        Parameter("unsigned char*", "stream", "[chunk][T][64 bytes] x times a norm's scale; zeros beyond D"),
+        Parameter("unsigned char*", "attended", "the same of attention's outputs"),
+        Parameter("unsigned char*", "hidden", "the same of the feed-forward's hidden units"),
+        Parameter("unsigned char*", "queries", "bf16 [T * n][K]"),
+        Parameter("unsigned char*", "keys", "bf16 [T][K] of the suffix"),
+        Parameter("unsigned char*", "values"),
+        Parameter("float*", "partial", "[row tile][share of keys][16][K] outputs"),
+        Parameter("float*", "tops", "[row tile][share of keys][16][2] largest logit, sum of weights"),
+        Parameter("float*", "rope", "[T][K/2][2] cosine, sine"),
+        Parameter("u32*", "counter", "of the grid's barrier"),
+        Parameter("long long", "layer_stride"),
+        Parameter("int", "steps"),
+        Parameter("float", "dt"),
+        Parameter("float", "eps"),
+        Parameter("float", "logit_scale"),
+    ),
+)
+
+
+def kernel_sizes(
+    config: ModelConfig, *, blocks: int, cache_rows: int, suffix: int, fp8: bool, choice: Choices
+) -> dict[str, int]:
+    """The kernel's compile-time constants."""
+    g, keys = config.expert, cache_rows + suffix
+    row_tiles = -(-suffix * g.num_heads // 16)
+    splits = max(min(blocks // row_tiles, MAX_SPLITS), 1, -(-keys // MAX_SPLIT_KEYS))
+    split_keys = -(-(-(-keys // 8)) // splits) * 8
+    return {
+        "TP_WIDTH": g.width,
+        "TP_MLP_DIM": g.mlp_dim,
+        "TP_DEPTH": g.depth,
+        "TP_HEADS": g.num_heads,
+        "TP_HEAD_DIM": g.head_dim,
+        "TP_TOKENS": suffix,
+        "TP_ACTION_DIM": config.action_dim,
+        "TP_BLOCKS": blocks,
+        "TP_WARPS": choice.warps,
+        "TP_SUMS": max(choice.sums, -(-suffix // 16)),
+        "TP_WEIGHTS_IN_FLIGHT": choice.weights,
+        "TP_ACTIVATIONS_IN_FLIGHT": choice.activations,
+        "TP_AHEAD": int(choice.ahead),
+        "TP_SPLITS": splits,
+        "TP_SPLIT_KEYS": -(-split_keys // 16) * 16,
+        "TP_FP8": int(fp8),
+        "TP_SHARED_BYTES": SHARED_BYTES,
+    }
+
+
+def source() -> str:
+    folder = Path(__file__).parent
+    parts = ((folder / f"{part}.cu").read_text() for part in PARTS)
+    return "\n".join(((folder / "sizes.cu").read_text(), ARGS.source, *parts))
+
+
+def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
+    """The kernel's machine code. Raises BackendError with the compiler's log."""
+    return compile_cubin(source(), arch, sizes, folder=folder)
+
+
+class PortableDenoiser:
+    """The loop for a fixed number of steps and suffix tokens; capturable in a CUDA graph.
+
+    `table` float32[N, 2L + 1, 3, D] is the modulation (`engine.weights.modulation`), `small` holds action_in_proj and
+    action_out_proj, `cache_rows` is an upper bound of the valid cache rows. Every token has the same time. Raises
+    BackendError for a suffix that it doesn't cover, BackendUnavailable for a GPU or a loop with times by token.
+
+    blocks  how many share the work; default: one for each multiprocessor
+    """
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        packed: PackedExpert,
+        small: State,
+        table: Tensor,
+        *,
+        cache_rows: int,
+        suffix: int,
+        device: torch.device,
+        num_steps: int | None = None,
+        by_token: bool = False,
+        choice: Choices | None = None,
+        blocks: int | None = None,
+    ) -> None:
+        if by_token or num_steps is not None:
+            raise BackendUnavailable("the portable denoising kernel has no times by token")
+        reason = unavailable(device, packed.fp8)
+        if reason is not None:
+            raise BackendUnavailable(reason)
+        if not 1 <= suffix <= MAX_SUFFIX:
+            raise BackendError(f"the portable denoising kernel takes 1 to {MAX_SUFFIX} suffix tokens, not {suffix}")
+        self._config, self._suffix, self._choice = config, suffix, choice or choices(suffix)
+        self._blocks = blocks or multiprocessors(device)
+        if not has_large_l2(device):
+            self._choice = replace(self._choice, ahead=False)
+        self._sizes = kernel_sizes(
+            config, blocks=self._blocks, cache_rows=cache_rows, suffix=suffix, fp8=packed.fp8, choice=self._choice
+        )
+        self._kernel, self._prepare = load(device, self._sizes)
+        self._steps = len(table)
+        self._tensors = tensors(packed, small, table.to(device).float().contiguous(), self._sizes)
+
+    def launch(
+        self,
+        noise: Tensor,
+        cache_k: Tensor,
+        cache_v: Tensor,
+        length: Tensor,
+        x_t: Tensor,
+        v_t: Tensor,
+        tokens: TokenInputs | None = None,
+    ) -> None:
+        """Denoise on the current stream.
+
+        noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], the first `length` (int64[1], on the device) rows
+        valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A].
+        """
+        steps, g, chunk = self._steps, self._config.expert, (self._suffix, self._config.action_dim)
+        assert tokens is None, "this kernel has no times by token"
+        assert noise.shape == chunk and x_t.shape == (steps + 1, *chunk) and v_t.shape == (steps, *chunk)
+        assert cache_k.stride() == cache_v.stride() and cache_k.stride()[1:] == (g.head_dim, 1), cache_k.stride()
+        assert cache_k.dtype == cache_v.dtype == torch.bfloat16 and length.dtype == torch.int64
+        assert all(t.is_contiguous() and t.dtype == torch.float32 for t in (noise, x_t, v_t))
+        named = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "length": length, "noise": noise}
+        pointers = {name: t.data_ptr() for name, t in {**named, "x_t": x_t, "v_t": v_t}.items()}
+        args = ARGS.value(
+            {
+                **pointers,
+                "layer_stride": cache_k.stride(0) * 2,
+                "steps": steps,
+                "dt": float(np.float32(-1.0 / steps)),
+                "eps": self._config.rms_norm_eps,
+                "logit_scale": g.head_dim**-0.5,
+            }
+        )
+        prepared = max(self._suffix * g.head_dim // 2, noise.numel())
+        self._prepare.launch(-(-prepared // PREPARE_THREADS), PREPARE_THREADS, args)
+        self._kernel.launch_cooperative(self._blocks, self._choice.warps * 32, args)
+
+
+def multiprocessors(device: torch.device) -> int:
+    return int(torch.cuda.get_device_properties(device).multi_processor_count)
+
+
+def has_large_l2(device: torch.device) -> bool:
+    return int(torch.cuda.get_device_properties(device).L2_cache_size) >= LARGE_L2
+
+
+def load(device: torch.device, sizes: dict[str, int]) -> tuple[Kernel, Kernel]:
+    """The loop, and what runs in front of it."""
+    major, minor = torch.cuda.get_device_capability(device)
+    cubin = compiled(f"sm_{major}{minor}", sizes)
+    with torch.cuda.device(device):
+        loop = Kernel(cubin, "turbopi_portable_denoise", SHARED_BYTES)
+        return loop, Kernel(cubin, "turbopi_portable_denoise_prepare", 0)
+
+
+def tensors(packed: PackedExpert, small: State, table: Tensor, sizes: dict[str, int]) -> dict[str, Tensor]:
+    """What the kernel reads beside a launch's own, and its scratch memory, on the table's device."""
+    g, device, suffix = packed.config.expert, table.device, sizes["TP_TOKENS"]
+    made = Tables.make(packed, table)
+
+    def scratch(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.zeros(*shape, dtype=dtype, device=device)
+
+    def activation(columns: int) -> Tensor:
+        chunk = CHUNK_BYTES // packed.weights.element_size()
+        return scratch(-(-columns // chunk), suffix, CHUNK_BYTES, dtype=torch.uint8)
+
+    exponents = torch.arange(0, g.head_dim, 2, dtype=torch.float32, device=device) / g.head_dim
+    weight, bias = small["action_out_proj.weight"], small["action_out_proj.bias"]
+    out_shift = table[:, -1, 1].double() @ weight.double().T + bias.double()
+    shares = -(-suffix * g.num_heads // 16) * sizes["TP_SPLITS"]
+    return {
+        "weights": packed.weights,
+        "table": made.modulation,
+        "shifted": made.shifted,
+        "row_scales": made.row_scales,
+        "attended_times": made.attended_times,
+        "out_w": weight.float().contiguous(),
+        "out_shift": out_shift.float().contiguous(),
+        "in_w": small["action_in_proj.weight"].float().T.contiguous(),
+        "in_b": small["action_in_proj.bias"].float().contiguous(),
+        "inv_freq": 1.0 / packed.config.rope_base**exponents,  # as `model.layers.rope_tables` computes them
+        "x": scratch(suffix, g.width),
+        "squares": scratch(suffix, g.width // 8),
+        "stream": activation(g.width),
+        "attended": activation(g.num_heads * g.head_dim),
+        "hidden": activation(g.mlp_dim),
+        "queries": scratch(suffix * g.num_heads, g.head_dim, dtype=torch.bfloat16),
+        "keys": scratch(suffix, g.head_dim, dtype=torch.bfloat16),
+        "values": scratch(suffix, g.head_dim, dtype=torch.bfloat16),
+        "partial": scratch(shares, 16, g.head_dim),
+        "tops": scratch(shares, 16, 2),
+        "rope": scratch(suffix, g.head_dim // 2, 2),
+        "counter": scratch(1, dtype=torch.int32),
+    }

@@ -1,0 +1,176 @@
+"""The action expert's weights in the order in which the portable denoising kernel reads them: see sizes.cu.
+
+Shapes: N steps, L layers, D width, F feed-forward width, n query heads of K columns.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from turbopi.config import GemmaConfig, ModelConfig
+from turbopi.errors import BackendError
+from turbopi.kernels.interface import GemmaLayer
+from turbopi.kernels.quantize import quantize
+from turbopi.quantization.fp8 import E4M3, Directions
+
+TILE = 8  # output channels
+CHUNK_BYTES = 64  # of a channel: the part of the reduction of which a lane has 16 bytes
+KINDS = ("qkv", "out", "gate_up", "down")  # a layer's matrices, in the order in which they are read
+
+
+def refusal(config: ModelConfig) -> str | None:
+    """Why the kernel can't run this model, or None if it can."""
+    g = config.expert
+    if config.kind != "pi05":
+        return f"it covers Pi0.5, this model is {config.kind}"
+    if g.num_kv_heads != 1:
+        return f"it needs one key/value head, this model has {g.num_kv_heads}"
+    if g.width % 16 or g.mlp_dim % 16:
+        return f"widths must be multiples of 16: width {g.width}, mlp_dim {g.mlp_dim}"
+    if g.head_dim % 16 or g.head_dim > 256:
+        return f"head_dim must be a multiple of 16 up to 256, it is {g.head_dim}"
+    return None
+
+
+def shapes(g: GemmaConfig) -> list[tuple[int, int]]:
+    """(rows, columns) of a layer's qkv, out, gate|up and down."""
+    heads = g.num_heads * g.head_dim
+    return [(heads + 2 * g.head_dim, g.width), (g.width, heads), (2 * g.mlp_dim, g.width), (g.width, g.mlp_dim)]
+
+
+def qkv_rows(g: GemmaConfig) -> Tensor:
+    """int64[rows]: which row of q|k|v each channel is. Of queries and keys RoPE's partners are neighbours."""
+    half = g.head_dim // 2
+    paired = torch.arange(g.head_dim).view(2, half).T.flatten()
+    heads = [head * g.head_dim + paired for head in range(g.num_heads + 1)]
+    return torch.cat([*heads, (g.num_heads + 1) * g.head_dim + torch.arange(g.head_dim)])
+
+
+def gate_up_rows(g: GemmaConfig) -> Tensor:
+    """int64[rows]: which row of gate|up each channel is: a unit's gate, then its up."""
+    return torch.arange(2 * g.mlp_dim).view(2, g.mlp_dim).T.flatten()
+
+
+def tiles(matrix: Tensor) -> Tensor:
+    """[rows, columns] -> flat [tile][chunk][8 rows][columns of a chunk], zeros beyond the columns."""
+    rows, columns = matrix.shape
+    chunk = CHUNK_BYTES // matrix.element_size()
+    chunks = -(-columns // chunk)
+    padded = matrix.new_zeros(rows, chunks * chunk)
+    padded[:, :columns] = matrix
+    return padded.view(rows // TILE, TILE, chunks, chunk).transpose(1, 2).flatten()
+
+
+@dataclass(frozen=True)
+class PackedExpert:
+    """The expert's matrices in the kernel's order. One serves kernels of any number of steps, tokens and blocks."""
+
+    config: ModelConfig
+    weights: Tensor  # bfloat16 or e4m3[L, elements]: of a layer qkv, out, gate|up, down
+    scales: Tensor  # float32[L, rows of qkv, out, gate|up, down] of E4M3 weights, in the matrices' order; else [L, 0]
+    inputs: Tensor  # float32[L, 4] of the activations that meet E4M3 weights; [L, 0] of others
+
+    @classmethod
+    def pack(
+        cls,
+        config: ModelConfig,
+        layers: list[GemmaLayer],
+        inputs: Mapping[str, float] | None = None,
+        directions: Mapping[str, Directions] | None = None,
+    ) -> "PackedExpert":
+        """`inputs`: the activations' scales by site, and weights become E4M3 with a scale for each output channel,
+        rounded for `directions` by site.
+
+        Raises BackendError for sizes that the kernel doesn't cover.
+        """
+        reason = refusal(config)
+        if reason is not None:
+            raise BackendError(f"the portable denoising kernel can't run this model: {reason}")
+        packed, scales, of_inputs = [], [], []
+        orders = [None if order is None else order.to(layers[0].qkv.device) for order in _orders(config.expert)]
+        for i, layer in enumerate(layers):
+            parts = [layer.qkv, layer.out, layer.gate_up, layer.down]
+            sites = [f"expert.{i}.{kind}" for kind in KINDS]
+            if inputs is not None:
+                made = [quantize(m, 1.0, (directions or {}).get(s)) for m, s in zip(parts, sites, strict=True)]
+                parts = [matrix.data.view(torch.uint8) for matrix in made]
+                scales.append(torch.cat([matrix.scale for matrix in made]))
+                of_inputs.append([inputs[site] for site in sites])
+            else:
+                parts = [part.to(torch.bfloat16) for part in parts]
+            ordered = [m if order is None else m[order] for m, order in zip(parts, orders, strict=True)]
+            packed.append(torch.cat([tiles(m) for m in ordered]))
+        weights = torch.stack(packed)
+        none = torch.empty(len(layers), 0, device=weights.device)
+        return cls(
+            config,
+            weights if inputs is None else weights.view(E4M3),
+            torch.stack(scales) if scales else none,
+            torch.tensor(of_inputs, dtype=torch.float32, device=weights.device) if of_inputs else none,
+        )
+
+    @property
+    def fp8(self) -> bool:
+        return self.weights.dtype == E4M3
+
+    def row_scales(self, layer: int) -> tuple[Tensor, ...]:
+        """float32 of the output channels of a layer's qkv, out, gate|up and down; E4M3 weights alone have them."""
+        return torch.split(self.scales[layer], [rows for rows, _ in shapes(self.config.expert)])
+
+    def matrices(self, layer: int) -> tuple[Tensor, ...]:
+        """A layer's qkv, out, gate|up and down as they were before packing; of E4M3 weights what they stand for, in
+        float32.
+        """
+        g, found, at = self.config.expert, [], 0
+        chunk = CHUNK_BYTES // self.weights.element_size()
+        flat = self.weights[layer].float() if self.fp8 else self.weights[layer]
+        for k, ((rows, columns), order) in enumerate(zip(shapes(g), _orders(g), strict=True)):
+            size = rows * -(-columns // chunk) * chunk
+            part = flat[at : at + size].view(rows // TILE, -1, TILE, chunk)
+            ordered = part.transpose(1, 2).reshape(rows, -1)[:, :columns]
+            matrix = torch.empty_like(ordered)
+            matrix[torch.arange(rows) if order is None else order] = ordered
+            found.append(matrix * self.row_scales(layer)[k][:, None] if self.fp8 else matrix)
+            at += size
+        return tuple(found)
+
+
+def _orders(g: GemmaConfig) -> tuple[Tensor | None, ...]:
+    return qkv_rows(g), None, gate_up_rows(g), None
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What the kernel needs beside the weights. Scales of E4M3 numbers are in it, so that the kernel applies few."""
+
+    modulation: Tensor  # float32[N, 2L + 1, 3, D]
+    shifted: Tensor  # float32[N, L, channels of qkv, gate|up]: what the norms' shifts add to the products behind them
+    row_scales: Tensor  # float32[L, channels of qkv, gate|up]; [L, 0] of bfloat16
+    attended_times: Tensor  # float32[L]: 1 / scale of attention's outputs; empty of bfloat16
+
+    @classmethod
+    def make(cls, packed: PackedExpert, table: Tensor) -> "Tables":
+        """table float32[N, 2L + 1, 3, D], see `engine.weights.modulation`"""
+        g = packed.config.expert
+        qkv_order, gate_up_order = qkv_rows(g).to(table.device), gate_up_rows(g).to(table.device)
+        modulation, shifted, rows = table.clone() if packed.fp8 else table, [], []
+        for i in range(g.depth):
+            qkv, _, gate_up, _ = packed.matrices(i)
+            products = [table[:, 2 * i + j, 1].double() @ m.double().T for j, m in enumerate((qkv, gate_up))]
+            if packed.fp8:
+                of_qkv, of_out, of_gate_up, of_down = packed.row_scales(i)
+                stream, attended, stream_2, hidden = packed.inputs[i]
+                modulation[:, 2 * i, 0] /= stream
+                modulation[:, 2 * i, 2] *= of_out * attended
+                modulation[:, 2 * i + 1, 0] /= stream_2
+                modulation[:, 2 * i + 1, 2] *= of_down * hidden
+                after = torch.ones_like(of_gate_up)  # hidden units are linear in up's rows
+                after[g.mlp_dim :] /= hidden
+                products[1] = products[1] * after
+                rows.append(torch.cat(((of_qkv * stream)[qkv_order], (of_gate_up * stream_2 * after)[gate_up_order])))
+            shifted.append(torch.cat((products[0][:, qkv_order], products[1][:, gate_up_order]), dim=1).float())
+        row_scales = torch.stack(rows) if rows else packed.inputs
+        times = 1 / packed.inputs[:, 1] if packed.fp8 else packed.inputs[:, 0:0]
+        return cls(modulation, torch.stack(shifted, dim=1).contiguous(), row_scales.contiguous(), times.contiguous())

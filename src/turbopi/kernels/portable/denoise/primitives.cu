@@ -1,0 +1,75 @@
+// Loads, the grid's barrier, arithmetic.
+
+// Weights: read once, so they take no room in L1.
+__device__ __forceinline__ uint4 load_weights(const byte* from) {
+  uint4 v;
+  asm volatile("ld.global.nc.L1::no_allocate.L2::256B.v4.u32 {%0, %1, %2, %3}, [%4];"
+               : "=r"(v.x), "=r"(v.y), "=r"(v.z), "=r"(v.w)
+               : "l"(from));
+  return v;
+}
+// What other blocks have written: from L2, as L1 may have an old copy.
+__device__ __forceinline__ uint4 load_shared_by_grid(const void* from) { return __ldcg((const uint4*)from); }
+__device__ __forceinline__ void to_l2(const void* at) { asm volatile("prefetch.global.L2 [%0];" ::"l"(at)); }
+
+// A barrier of the whole grid in two halves: what lies between depends on no other block.
+struct Grid {
+  u32* counter;
+  u32 expected = 0;
+  __device__ __forceinline__ void arrive() {
+    __syncthreads();
+    expected += gridDim.x;
+    if (threadIdx.x == 0) asm volatile("red.release.gpu.global.add.u32 [%0], %1;" ::"l"(counter), "r"(1) : "memory");
+  }
+  __device__ __forceinline__ void wait() {
+    if (threadIdx.x == 0) {
+      u32 arrived;
+      do {
+        asm volatile("ld.acquire.gpu.global.u32 %0, [%1];" : "=r"(arrived) : "l"(counter) : "memory");
+      } while (arrived < expected);
+    }
+    __syncthreads();
+  }
+};
+
+__device__ __forceinline__ float infinity() { return __int_as_float(0x7f800000); }
+__device__ __forceinline__ u32 pack(float low, float high) {
+  u32 v;
+  asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(v) : "f"(high), "f"(low));
+  return v;
+}
+__device__ __forceinline__ float low_of(u32 v) { return __uint_as_float(v << 16); }
+__device__ __forceinline__ float high_of(u32 v) { return __uint_as_float(v & 0xffff0000u); }
+// Two neighbouring columns of an activation [chunk][token][CHUNK columns] that meets weights.
+__device__ __forceinline__ void store_operand(byte* activation, int token, int column, float first, float second) {
+  byte* const to = activation + ((column / CHUNK * T + token) * CHUNK + column % CHUNK) * OPERAND_BYTES;
+#if TP_FP8
+  unsigned short both;
+  asm("cvt.rn.satfinite.e4m3x2.f32 %0, %1, %2;" : "=h"(both) : "f"(second), "f"(first));
+  *(unsigned short*)to = both;
+#else
+  *(u32*)to = pack(first, second);
+#endif
+}
+__device__ __forceinline__ void mma(float (&c)[4], u32 a0, u32 a1, u32 a2, u32 a3, u32 b0, u32 b1) {
+  asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+      : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
+      : "r"(a0), "r"(a1), "r"(a2), "r"(a3), "r"(b0), "r"(b1));
+}
+#if TP_FP8
+__device__ __forceinline__ void mma_operands(float (&c)[4], u32 a0, u32 a1, u32 a2, u32 a3, u32 b0, u32 b1) {
+  asm("mma.sync.aligned.m16n8k32.row.col.f32.e4m3.e4m3.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+      : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
+      : "r"(a0), "r"(a1), "r"(a2), "r"(a3), "r"(b0), "r"(b1));
+}
+#else
+__device__ __forceinline__ void mma_operands(float (&c)[4], u32 a0, u32 a1, u32 a2, u32 a3, u32 b0, u32 b1) {
+  mma(c, a0, a1, a2, a3, b0, b1);
+}
+#endif
+// A chunk of 16 rows (8 in `low`, 8 in `high`) times 8: any order of columns that all three have.
+__device__ __forceinline__ void mma_chunk(float (&c)[4], uint4 low, uint4 high, uint4 b) {
+  mma_operands(c, low.x, high.x, low.y, high.y, b.x, b.y);
+  mma_operands(c, low.z, high.z, low.w, high.w, b.z, b.w);
+}
+__device__ __forceinline__ float2 operator*(float2 v, float by) { return make_float2(v.x * by, v.y * by); }

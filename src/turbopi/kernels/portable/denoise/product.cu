@@ -1,0 +1,131 @@
+// A product of activations with the block's tiles of weights.
+//
+//   Product<Shape> p(weights)   names the tiles
+//   p.ask()                     asks for the first weights, before the barrier
+//   p.run(...)                  all passes: multiply, add up the warps' sums in shared memory, finish each item
+//
+// An item is two neighbouring channels of a tile for one token. `finish` says what becomes of it: `factors` loads what
+// depends on no other block, for the first item before the barrier, and `apply` takes the sums. All lanes of a warp come to
+// `apply` (`valid` says which have an item), and four lanes side by side have the 8 channels of a token.
+
+struct Item {
+  int tile, token, pair;  // channels tile * 8 + 2 * pair, + 1
+  bool valid;
+};
+
+template <class S>
+struct Product {
+  const byte* weights;  // this lane's of the product's first tile and chunk
+  int first, end;       // tiles
+  uint4 w[S::IN_FLIGHT];
+
+  __device__ __forceinline__ explicit Product(const byte* all) {
+    weights = all + threadIdx.x % 32 * 16;
+    first = (long long)S::TILES * blockIdx.x / BLOCKS;
+    end = (long long)S::TILES * (blockIdx.x + 1) / BLOCKS;
+  }
+  __device__ __forceinline__ static int first_chunk() { return threadIdx.x / 32 / S::WN * S::WARP_CHUNKS; }
+  // Load number n of a lane, counted over all passes.
+  __device__ __forceinline__ uint4 load(int pass, int n) const {
+    const int tile = first + pass * S::PASS_TILES + threadIdx.x / 32 % S::WN * S::WARP_TILES + n % S::WARP_TILES;
+    const int chunk = n / S::WARP_TILES;
+    uint4 v = make_uint4(0, 0, 0, 0);
+    const bool there = S::CHUNKS % S::WK == 0 || first_chunk() + chunk < S::CHUNKS;
+    if (tile < end && there)
+      v = load_weights(weights + ((long long)tile * S::CHUNKS + first_chunk() + chunk) * CHUNK_BYTES);
+    return v;
+  }
+  __device__ __forceinline__ void ask() {
+#pragma unroll
+    for (int n = 0; n < S::IN_FLIGHT; ++n) w[n] = load(0, n);
+  }
+  __device__ __forceinline__ void load_chunk(uint4 (&a)[GROUPS], const byte* activation, int chunk) const {
+    const int lane = threadIdx.x % 32, at = first_chunk() + chunk;
+    const bool there = S::CHUNKS % S::WK == 0 || at < S::CHUNKS;
+#pragma unroll
+    for (int group = 0; group < GROUPS; ++group) {
+      const int token = group * 8 + lane / 4;
+      a[group] = make_uint4(0, 0, 0, 0);
+      if (there && token < T) a[group] = load_shared_by_grid(activation + (at * T + token) * 64 + lane % 4 * 16);
+    }
+  }
+  __device__ __forceinline__ Item item(int pass, int index) const {
+    const int tile = index / (4 * T);
+    Item i{first + pass * S::PASS_TILES + tile, index / 4 % T, index % 4, false};
+    i.valid = tile < S::PASS_TILES && i.tile < end;
+    return i;
+  }
+
+  // `meanwhile` is done while the first activations are on their way.
+  template <class Finish, class Meanwhile>
+  __device__ __forceinline__ void run(Grid& grid, float* smem, const byte* activation, Finish& finish, Meanwhile meanwhile) {
+    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+    Item mine = item(0, threadIdx.x);
+    auto factors = finish.factors(mine);
+    grid.wait();
+    uint4 a[S::A_IN_FLIGHT][GROUPS];
+    for (int pass = 0; pass < S::PASSES; ++pass) {
+      if (pass == 0 || S::A_IN_FLIGHT < S::WARP_CHUNKS) {
+#pragma unroll
+        for (int chunk = 0; chunk < S::A_IN_FLIGHT; ++chunk) load_chunk(a[chunk], activation, chunk);
+      }
+      if (pass == 0) meanwhile();
+      float c[S::WARP_TILES][M_TILES][4] = {};
+#pragma unroll
+      for (int chunk = 0; chunk < S::WARP_CHUNKS; ++chunk) {
+        uint4(&here)[GROUPS] = a[chunk % S::A_IN_FLIGHT];
+#pragma unroll
+        for (int tile = 0; tile < S::WARP_TILES; ++tile) {
+          const int n = chunk * S::WARP_TILES + tile, next = n + S::IN_FLIGHT;
+          const uint4 b = w[n % S::IN_FLIGHT];
+#pragma unroll
+          for (int m = 0; m < M_TILES; ++m) {
+            const uint4 none = make_uint4(0, 0, 0, 0);
+            mma_chunk(c[tile][m], here[2 * m], 2 * m + 1 < GROUPS ? here[2 * m + 1 < GROUPS ? 2 * m + 1 : 0] : none, b);
+          }
+          if (next < S::LOADS)
+            w[n % S::IN_FLIGHT] = load(pass, next);
+          else if (pass + 1 < S::PASSES)
+            w[n % S::IN_FLIGHT] = load(pass + 1, next - S::LOADS);
+        }
+        if (chunk + S::A_IN_FLIGHT < S::WARP_CHUNKS) load_chunk(here, activation, chunk + S::A_IN_FLIGHT);
+      }
+      if (pass > 0) __syncthreads();  // the sums before have been read
+      float* const sums = smem + S_WORK;  // [WK][tile][token][8]
+#pragma unroll
+      for (int tile = 0; tile < S::WARP_TILES; ++tile)
+#pragma unroll
+        for (int half = 0; half < GROUPS; ++half) {
+          const int at = warp / S::WN * S::PASS_TILES + warp % S::WN * S::WARP_TILES + tile;
+          const float(&of)[4] = c[tile][half / 2];
+          *(float2*)(sums + (at * GROUPS * 8 + half * 8 + lane / 4) * 8 + lane % 4 * 2) =
+              half % 2 ? make_float2(of[2], of[3]) : make_float2(of[0], of[1]);
+        }
+      __syncthreads();
+#pragma unroll 1
+      for (int index = threadIdx.x; index - lane < S::PASS_TILES * T * 4; index += THREADS) {
+        if (pass > 0 || index >= THREADS) mine = item(pass, index), factors = finish.factors(mine);
+        float2 sum = make_float2(0, 0);
+        if (mine.valid) {
+          const float* const of = sums + ((mine.tile - first - pass * S::PASS_TILES) * GROUPS * 8 + mine.token) * 8 + mine.pair * 2;
+#pragma unroll
+          for (int k = 0; k < S::WK; ++k) {
+            const float2 part = *(const float2*)(of + k * S::PASS_TILES * GROUPS * 64);
+            sum.x += part.x, sum.y += part.y;
+          }
+        }
+        finish.apply(mine, factors, sum);
+      }
+    }
+  }
+};
+
+// Brings the block's weights of a product to L2.
+template <class S>
+__device__ __forceinline__ void ahead(const byte* weights) {
+  if (!TP_AHEAD) return;
+  const long long first = (long long)S::TILES * blockIdx.x / BLOCKS, end = (long long)S::TILES * (blockIdx.x + 1) / BLOCKS;
+  const byte* const from = weights + first * S::CHUNKS * CHUNK_BYTES;
+  for (long long at = threadIdx.x * 128; at < (end - first) * S::CHUNKS * CHUNK_BYTES; at += THREADS * 128)
+    to_l2(from + at);
+}

@@ -1,0 +1,93 @@
+// The denoising loop of Pi0.5's action expert in one cooperative kernel, for compute capability 8.0 and newer.
+//
+// Every step reads all weights once and does little else, so the plan is about two things: weights that are on their way
+// all the time, and few, short phases. A phase ends with a barrier of the whole grid; a layer has six:
+//
+//   q|k|v      stream x weights, 1 / rms, shift, RoPE             -> queries, keys, values
+//   attention  a block: 16 query rows and a share of the keys     -> partial outputs, largest logits, sums
+//   combine    all shares of a row                                -> attended
+//   out        attended x weights, gate, residual                 -> x, and the stream of the next norm
+//   gate|up    stream x weights, 1 / rms, shift, GeGLU            -> hidden
+//   down       hidden x weights, gate, residual                   -> x, and the stream of the next norm
+//
+// A step adds one phase in front (action_in_proj) and one behind (final norm, action_out_proj, Euler step).
+//
+// x is float32. The stream is x times the next norm's scale, rounded to OPERAND; 1 / rms is multiplied in behind the
+// product, and the norm's shift comes as a table that is already multiplied with the weights, `shifted`.
+//
+// Products: a *tile* is 8 output channels, a *chunk* is the part of the reduction of which a lane has 16 bytes (32
+// columns of bfloat16, 64 of E4M3). Activations are operand A of mma.sync (16 tokens), weights operand B (8 channels). The
+// order of columns within a chunk is free as long as both operands have the same, so a lane takes 16 bytes that lie side
+// by side: [tile][chunk][8 channels][32 columns] of weights, [chunk][token][32 columns] of activations, both coalesced.
+// A block has whole tiles; its warps share out the chunks, and above that (WN) the tiles; their sums meet in shared memory.
+// Weights depend on nothing: their first loads are asked for before the barrier in front of the phase, and those of later
+// phases are brought to L2 (TP_AHEAD) while DRAM has nothing else to do.
+
+using byte = unsigned char;
+using u32 = unsigned;
+using u64 = unsigned long long;
+
+constexpr int D = TP_WIDTH, F = TP_MLP_DIM, L = TP_DEPTH, HEADS = TP_HEADS, HD = TP_HEAD_DIM;
+constexpr int T = TP_TOKENS, A = TP_ACTION_DIM;
+constexpr int BLOCKS = TP_BLOCKS, WARPS = TP_WARPS, THREADS = WARPS * 32;
+constexpr bool FP8 = TP_FP8;
+constexpr int OPERAND_BYTES = FP8 ? 1 : 2;
+constexpr int CHUNK = 64 / OPERAND_BYTES;  // columns
+constexpr int CHUNK_BYTES = 512;           // of a tile
+constexpr int GROUPS = (T + 7) / 8;        // of 8 tokens
+constexpr int M_TILES = (T + 15) / 16;
+constexpr int ROWS = T * HEADS;  // of queries, row = token * HEADS + head
+constexpr int ROW_TILES = (ROWS + 15) / 16;
+constexpr int SPLITS = TP_SPLITS;  // shares of the keys
+constexpr int SPLIT_KEYS = TP_SPLIT_KEYS;
+constexpr int QKV_ROWS = (HEADS + 2) * HD;
+
+constexpr __host__ __device__ int divisor(int of, int limit) {  // the largest one up to the limit
+  int found = 1;
+  for (int i = 1; i <= limit; ++i)
+    if (of % i == 0) found = i;
+  return found;
+}
+
+// A product's shape and how warps share it out.
+template <int CHANNELS_, int COLUMNS_>
+struct Shape {
+  static constexpr int TILES = CHANNELS_ / 8;
+  static constexpr int CHUNKS = (COLUMNS_ + CHUNK - 1) / CHUNK;
+  static constexpr int BLOCK_TILES = (TILES + BLOCKS - 1) / BLOCKS;  // of a block at most
+  static constexpr int TILE_ROOM = TP_SUMS / M_TILES;                // of a warp, by its registers for sums
+  static constexpr int WN_WANTED = (BLOCK_TILES + TILE_ROOM - 1) / TILE_ROOM;
+  static constexpr int WN = WN_WANTED <= 1 ? 1 : WN_WANTED <= 2 ? 2 : 4;
+  static constexpr int WK = WARPS / WN;
+  static constexpr int WARP_WANTED = (BLOCK_TILES + WN - 1) / WN;
+  static constexpr int WARP_TILES = WARP_WANTED < TILE_ROOM ? WARP_WANTED : TILE_ROOM;
+  static constexpr int PASS_TILES = WN * WARP_TILES;
+  static constexpr int PASSES = (BLOCK_TILES + PASS_TILES - 1) / PASS_TILES;
+  static constexpr int WARP_CHUNKS = (CHUNKS + WK - 1) / WK;
+  static constexpr int LOADS = WARP_CHUNKS * WARP_TILES;  // of a lane, in a pass
+  static constexpr int IN_FLIGHT = divisor(LOADS, TP_WEIGHTS_IN_FLIGHT);
+  static constexpr int A_WANTED = TP_ACTIVATIONS_IN_FLIGHT / GROUPS < 1 ? 1 : TP_ACTIVATIONS_IN_FLIGHT / GROUPS;
+  static constexpr int A_IN_FLIGHT = A_WANTED < WARP_CHUNKS ? A_WANTED : WARP_CHUNKS;  // chunks
+  static constexpr int SUM_WORDS = WK * PASS_TILES * GROUPS * 8 * 8;
+  static constexpr long long BYTES = (long long)TILES * CHUNKS * CHUNK_BYTES;
+};
+using QkvShape = Shape<QKV_ROWS, D>;
+using OutShape = Shape<D, HEADS * HD>;
+using GateUpShape = Shape<2 * F, D>;
+using DownShape = Shape<D, F>;
+constexpr long long QKV_AT = 0, OUT_AT = QkvShape::BYTES, GATE_UP_AT = OUT_AT + OutShape::BYTES;
+constexpr long long DOWN_AT = GATE_UP_AT + GateUpShape::BYTES, LAYER_BYTES = DOWN_AT + DownShape::BYTES;
+constexpr int D_TILES = D / 8;
+
+// Shared memory, words. Sums of products and what attention keeps take turns.
+constexpr int DIM_GROUPS = (HD + 63) / 64;        // of 64 columns: what a warp weighs of values
+constexpr int KEY_GROUPS = WARPS / DIM_GROUPS;    // of warps, which share out the keys
+constexpr int LOGITS_ROW = SPLIT_KEYS + 4, WEIGHTS_ROW = SPLIT_KEYS / 2 + 4, OUT_ROW = HD + 4;
+constexpr int S_RMS = 0, S_WORK = 64;
+constexpr int S_WEIGHTS = S_WORK + 16 * LOGITS_ROW, S_OUT = S_WEIGHTS + 16 * WEIGHTS_ROW;
+constexpr int ATTENTION_END = S_OUT + KEY_GROUPS * 16 * OUT_ROW;
+constexpr __host__ __device__ int larger(int a, int b) { return a > b ? a : b; }
+constexpr int PRODUCTS_END = S_WORK + larger(larger(QkvShape::SUM_WORDS, OutShape::SUM_WORDS),
+                                             larger(GateUpShape::SUM_WORDS, DownShape::SUM_WORDS));
+static_assert(larger(ATTENTION_END, PRODUCTS_END) * 4 <= TP_SHARED_BYTES, "too little shared memory");
+static_assert(T <= 64 && WARPS >= DIM_GROUPS && WARPS % 4 == 0, "sizes");

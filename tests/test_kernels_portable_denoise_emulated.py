@@ -1,0 +1,104 @@
+"""The portable denoising kernel, run on a CPU thread by thread: a whole loop on a grid of a few blocks.
+
+g++ stands for NVRTC, and tests/emulator/machine.h for the GPU: all blocks of the grid are one of its clusters.
+"""
+
+import ctypes
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from emulator import emulate
+from kernel_turns.problems import Problem, input_scales, ordinary_bf16, plain, problem, relative
+from torch import Tensor
+
+from turbopi.kernels.arguments import Parameter, Parameters
+from turbopi.kernels.portable.denoise import kernel as denoise
+from turbopi.kernels.portable.denoise.packing import PackedExpert
+from turbopi.model.denoise import euler_step
+
+pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
+CPU = torch.device("cpu")
+TAKES = Parameters((Parameter("Args", "args"),))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Compiled kernels."""
+    return tmp_path_factory.mktemp("emulated")
+
+
+class Emulated:
+    """In place of `Kernel`."""
+
+    def __init__(self, name: str, sizes: dict[str, int], folder: Path, seed: int) -> None:
+        self.library = emulate.compiled(denoise.source(), name, TAKES, sizes, folder)
+        self.seed = seed
+
+    def _launch(self, blocks: int, threads: int, together: int, args: ctypes.Structure) -> None:
+        run = ctypes.CDLL(str(self.library)).run
+        run.restype = ctypes.c_char_p
+        pointers = (ctypes.c_void_p * 1)(ctypes.addressof(args))
+        if (why := run(blocks, threads, together, self.seed, pointers)) is not None:
+            raise RuntimeError(why.decode())
+
+    def launch(self, blocks: int, threads: int, args: ctypes.Structure) -> None:
+        self._launch(blocks, threads, 1, args)
+
+    def launch_cooperative(self, blocks: int, threads: int, args: ctypes.Structure) -> None:
+        self._launch(blocks, threads, blocks, args)
+
+
+def run(
+    p: Problem,
+    packed: PackedExpert,
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    *,
+    blocks: int,
+    seed: int = 0,
+    choice: denoise.Choices | None = None,
+) -> tuple[Tensor, Tensor]:
+    def load(device: torch.device, sizes: dict[str, int]) -> tuple[Any, Any]:
+        names = "turbopi_portable_denoise", "turbopi_portable_denoise_prepare"
+        loop, prepare = (Emulated(name, sizes, folder, seed) for name in names)
+        return loop, prepare
+
+    monkeypatch.setattr(denoise, "load", load)
+    monkeypatch.setattr(denoise, "unavailable", lambda device, fp8: None)
+    monkeypatch.setattr(denoise, "has_large_l2", lambda device: True)
+    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+    suffix, rows, steps = p.noise.shape[0], p.cache_k.shape[1], len(p.table)
+    kernel = denoise.PortableDenoiser(
+        *(p.config, packed, p.small, p.table),
+        **{"cache_rows": rows, "suffix": suffix, "device": CPU, "choice": choice, "blocks": blocks},
+    )
+    x_t = torch.full((steps + 1, *p.noise.shape), torch.nan)
+    v_t = torch.full((steps, *p.noise.shape), torch.nan)
+    kernel.launch(p.noise, p.cache_k, p.cache_v, torch.tensor([p.length]), x_t, v_t)
+    return x_t, v_t
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "suffix", "length", "blocks"),
+    [
+        ("golden", 2, 1, 5, 1),
+        ("golden", 2, 10, 37, 5),
+        ("odd", 1, 17, 70, 2),
+        ("uneven", 1, 10, 30, 3),
+        ("golden", 1, 50, 300, 2),
+    ],
+)
+def test_the_loop_is_as_exact_as_ordinary_bf16(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, name: str, steps: int, suffix: int, length: int, blocks: int
+) -> None:
+    p = problem(name, steps, suffix, length, 1, CPU)
+    packed = PackedExpert.pack(p.config, p.layers)
+    reference = plain(p, torch.float64)[0]
+    x_t, v_t = run(p, packed, monkeypatch, folder, blocks=blocks)
+    print(relative(x_t[-1], reference[-1]), relative(ordinary_bf16(p), reference[-1]))
+    assert torch.equal(x_t[0], p.noise)
+    torch.testing.assert_close(x_t[1:], euler_step(x_t[:-1], v_t, steps), rtol=0, atol=0)
+    assert relative(x_t[-1], reference[-1]) <= 1.1 * relative(ordinary_bf16(p), reference[-1])
