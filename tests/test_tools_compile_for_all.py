@@ -1,0 +1,69 @@
+"""A few kernels compiled for GPUs that aren't here; the whole is `python -m compile_for_all`, whose result is kept."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("triton", reason="Triton isn't installed")
+
+from compile_for_all.document import CompiledForAll, read_compiled
+from compile_for_all.targets import TARGETS, over_limit
+
+ROOT = Path(__file__).parents[1]
+ALL = {"sm_80", "sm_86", "sm_87", "sm_89", "sm_90a", "sm_100a", "sm_103a", "sm_110a", "sm_120a", "sm_121a"}
+
+
+def ours(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Apart from the tests' own process, in which Triton interprets."""
+    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    environment["PYTHONPATH"] = f"{ROOT / 'src'}{os.pathsep}{ROOT / 'tools'}"
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT)
+
+
+def compiled(tmp_path: Path, *arguments: str) -> CompiledForAll:
+    file = tmp_path / "compiled.json"
+    done = ours("-m", "compile_for_all", "--processes", "1", "--json", str(file), *arguments)
+    assert file.is_file(), done.stdout + done.stderr
+    assert all(len(line) <= 80 for line in done.stdout.splitlines())
+    return read_compiled(file)
+
+
+def test_the_chosen_products_compile_and_fit(tmp_path: Path) -> None:
+    result = compiled(tmp_path, "--targets", "89", "--kernels", "gemm", "--chosen")
+    assert len(result.rows) > 5 and result.versions["triton"]
+    assert [row for row in result.rows if row.problem or row.refused] == []
+    assert all(row.registers and not row.spilled for row in result.rows)
+
+
+def test_fp8_is_refused_below_8_9_with_the_reason(tmp_path: Path) -> None:
+    result = compiled(tmp_path, "--targets", "80", "--kernels", "gemm", "--chosen")
+    refused = [row for row in result.rows if row.refused]
+    assert len(refused) == 1 and "from compute capability 8.9 on" in str(refused[0].refused)
+    assert not any("fp8" in row.variant for row in result.rows)
+
+
+def test_every_triton_kernel_is_among_the_calls() -> None:
+    done = ours(
+        "-c",
+        "import json; from compile_for_all import calls, compiling, launches, targets; hopper = targets.TARGETS[4];"
+        "found = {one.name for one in launches.launches(hopper, calls.all_calls(hopper))};"
+        "print(json.dumps(sorted(compiling.triton_kernels() - found)), len(found))",
+    )
+    left, count = done.stdout.rsplit(" ", 1)
+    assert json.loads(left) == [] and int(count) > 15, done.stderr
+
+
+def test_what_is_over_a_limit_is_named() -> None:
+    ada = next(target for target in TARGETS if target.number == 89)
+    assert over_limit(ada, 255, 99 * 1024, 256) is None
+    assert "bytes of shared memory; sm_89 gives a block 101376" in str(over_limit(ada, 32, 99 * 1024 + 1, 256))
+    assert "registers in 512 threads" in str(over_limit(ada, 255, 0, 512))
+
+
+def test_all_targets_are_there() -> None:
+    assert {target.arch for target in TARGETS} == ALL
