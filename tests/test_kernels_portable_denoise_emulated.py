@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from emulator import emulate
-from kernel_turns.problems import Problem, input_scales, ordinary_bf16, plain, problem, relative
+from kernel_turns.problems import Problem, ordinary_bf16, plain, problem, relative
 from torch import Tensor
 
 from turbopi.kernels.arguments import Parameter, Parameters
@@ -73,7 +73,11 @@ def run(
     suffix, rows, steps = p.noise.shape[0], p.cache_k.shape[1], len(p.table)
     kernel = denoise.PortableDenoiser(
         *(p.config, packed, p.small, p.table),
-        **{"cache_rows": rows, "suffix": suffix, "device": CPU, "choice": choice, "blocks": blocks},
+        cache_rows=rows,
+        suffix=suffix,
+        device=CPU,
+        choice=choice,
+        blocks=blocks,
     )
     x_t = torch.full((steps + 1, *p.noise.shape), torch.nan)
     v_t = torch.full((steps, *p.noise.shape), torch.nan)

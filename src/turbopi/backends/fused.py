@@ -1,14 +1,16 @@
 """Backend `fused`: the call of `cuda_graph` with kernels of our own where they beat PyTorch's.
 
 Nothing is compiled by Inductor. On compute capability 9.0 the whole denoising loop, attention of vision and prefix, the
-prefix's feed-forward and many of vision's products are CUDA C++ kernels; a model, horizon or GPU that they don't cover
-takes the engine's operations one by one, and `describe()` says so.
+prefix's feed-forward and many of vision's products are CUDA C++ kernels for it. On other GPUs, and with
+TURBOPI_KERNELS=portable, they are the kernels of kernels/portable. A model, horizon or loop that the denoising kernels
+don't cover takes the engine's operations one by one. `describe()` says what runs.
 """
 
 import importlib.util
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from functools import cached_property
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -29,12 +31,16 @@ from turbopi.quantization.fp8 import Directions, Matrix
 from turbopi.quantization.plan import TIERS
 from turbopi.toolchain import missing_for_c
 
-if TYPE_CHECKING:
-    from turbopi.kernels.sm90.denoise.kernel import DenoiseKernel
-    from turbopi.kernels.sm90.denoise.packing import PackedExpert
-
-
 KINDS = ("qkv", "out", "gate_up", "down")  # an expert layer's matrices
+
+
+@runtime_checkable
+class Watched(Protocol):
+    """A denoising kernel that tells how it fares: the one for Hopper."""
+
+    def clock_mhz(self) -> float | None: ...
+
+    def why_it_trapped(self) -> str | None: ...
 
 
 class FusedBackend(CudaGraphBackend):
@@ -59,8 +65,8 @@ class FusedBackend(CudaGraphBackend):
         check_given(precision, quantization)
         self._quantization = quantization
         self._plan = None if quantization is None else quantization.plan(config, precision)
-        self._packed_expert: PackedExpert | None = None
-        self._denoisers: dict[tuple[Loop, int], DenoiseKernel] = {}  # by loop and cache rows
+        self._packed_expert: Any = None  # as the denoising kernels have it
+        self._denoisers: dict[tuple[Loop, int], Denoiser] = {}  # by loop and cache rows
         self._refused: dict[tuple[Loop, int], str] = {}  # what operations denoise, and why
         super().__init__(config, load, device=device, precision=precision)
 
@@ -84,12 +90,10 @@ class FusedBackend(CudaGraphBackend):
         """Why this precision, besides the backend, can't run on a GPU that the backend runs on; or None."""
         if precision not in TIERS:
             return None
-        major, minor = torch.cuda.get_device_capability(device)
-        if (major, minor) == (9, 0):
-            return None
-        if (major, minor) < (8, 9):
-            return f"its tensor cores have no FP8: that begins with 8.9, this GPU has {major}.{minor}; use 'bf16'"
-        return f"its FP8 products are written for compute capability 9.0, this GPU has {major}.{minor}; use 'bf16'"
+        from turbopi.kernels.portable.gemm.tiles import fp8_refusal
+
+        reason = fp8_refusal(torch.cuda.get_device_capability(device))
+        return None if reason is None else f"{reason}; use 'bf16'"
 
     def describe(self) -> dict[str, Any]:
         described = super().describe()
@@ -109,11 +113,12 @@ class FusedBackend(CudaGraphBackend):
             calls = by_operations.setdefault(f"operations, as {why}", [])
             if str(loop) not in calls:
                 calls.append(str(loop))
-        described["denoising"] = ({"one CUDA kernel": by_kernel} if by_kernel else {}) | by_operations
+        kernel = "one CUDA kernel" if self._on_hopper else "one portable CUDA kernel"
+        described["denoising"] = ({kernel: by_kernel} if by_kernel else {}) | by_operations
         clocks = {
             str(loop): round(clock)
             for (loop, _), kernel in list(self._denoisers.items())
-            if (clock := kernel.clock_mhz()) is not None
+            if isinstance(kernel, Watched) and (clock := kernel.clock_mhz()) is not None
         }
         if clocks:
             described["denoising_clock_mhz"] = clocks
@@ -201,39 +206,71 @@ class FusedBackend(CudaGraphBackend):
         if self._denoisers:  # if no graph of operations is left, none points to the matrices on the device
             self._put_expert_away()
 
-    def _denoising_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> "DenoiseKernel":
+    def _denoising_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Denoiser:
         """Raises BackendUnavailable for what it doesn't cover."""
+        if table is None:
+            raise BackendUnavailable("there is no modulation")
+        if loop.form == "jacobian":
+            raise BackendUnavailable("the denoising kernel has no way back, which the true Jacobian takes")
+        kernel = self._hopper_kernel(loop, rows, table) if self._on_hopper else self._portable_kernel(loop, rows, table)
+        self._put_expert_away()
+        return kernel
+
+    @cached_property
+    def _on_hopper(self) -> bool:
+        """Whether kernels for compute capability 9.0 run."""
+        from turbopi.kernels.ops import hopper_kernels
+
+        return hopper_kernels(self.device)
+
+    def _hopper_kernel(self, loop: Loop, rows: int, table: Tensor) -> Denoiser:
         from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, DenoiseKernel, unavailable
         from turbopi.kernels.sm90.denoise.packing import PackedExpert, refusal
 
-        reason = unavailable(self.device) or refusal(self.config)
-        if reason is None and loop.horizon > MAX_SUFFIX:
-            reason = f"the denoising kernel takes up to {MAX_SUFFIX} actions"
-        if reason is None and loop.form == "jacobian":
-            reason = "the denoising kernel has no way back, which the true Jacobian takes"
-        if reason is not None or table is None:
-            raise BackendUnavailable(reason or "there is no modulation")
-        if self._packed_expert is None:
-            self._keep_expert_on(self.device)
-            self._packed_expert = PackedExpert.pack(
-                self.config, self._weights.expert, inputs=self._expert_inputs(), directions=self._directions
-            )
-        packed, small = self._packed_expert, self._weights.small
+        self._check_kernel(unavailable(self.device) or refusal(self.config), loop, MAX_SUFFIX)
         by_token = loop.form != "plain"
-        kernel = DenoiseKernel(
-            *(self.config, packed, small, table),
+        return DenoiseKernel(
+            *(self.config, self._packed(PackedExpert), self._weights.small, table),
             cache_rows=rows,
             suffix=loop.horizon,
             device=self.device,
             num_steps=loop.steps if by_token else None,
             by_token=by_token,
         )
-        self._put_expert_away()
-        return kernel
+
+    def _portable_kernel(self, loop: Loop, rows: int, table: Tensor) -> Denoiser:
+        from turbopi.kernels.portable.denoise.kernel import MAX_SUFFIX, PortableDenoiser, unavailable
+        from turbopi.kernels.portable.denoise.packing import PackedExpert, refusal
+
+        in_fp8 = self._expert_inputs() is not None
+        self._check_kernel(unavailable(self.device, in_fp8) or refusal(self.config), loop, MAX_SUFFIX)
+        if loop.form != "plain":
+            raise BackendUnavailable("the portable denoising kernel has one time for all actions")
+        return PortableDenoiser(
+            *(self.config, self._packed(PackedExpert), self._weights.small, table),
+            cache_rows=rows,
+            suffix=loop.horizon,
+            device=self.device,
+        )
+
+    def _check_kernel(self, reason: str | None, loop: Loop, most: int) -> None:
+        if reason is None and loop.horizon > most:
+            reason = f"the denoising kernel takes up to {most} actions"
+        if reason is not None:
+            raise BackendUnavailable(reason)
+
+    def _packed(self, kind: Any) -> Any:
+        """The expert's matrices as a denoising kernel has them."""
+        if self._packed_expert is None:
+            self._keep_expert_on(self.device)
+            self._packed_expert = kind.pack(
+                self.config, self._weights.expert, inputs=self._expert_inputs(), directions=self._directions
+            )
+        return self._packed_expert
 
     def _explain(self, error: RuntimeError) -> None:
         for kernel in self._denoisers.values():
-            if (why := kernel.why_it_trapped()) is not None:
+            if isinstance(kernel, Watched) and (why := kernel.why_it_trapped()) is not None:
                 raise DeviceLost(
                     f"{why}; {ADVICE}, and free the GPU of other work; if that doesn't help, use backend 'cuda_graph'"
                 ) from error

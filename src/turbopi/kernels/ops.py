@@ -25,11 +25,16 @@ def forced_portable() -> bool:
     return value == "portable"
 
 
+def hopper_kernels(device: torch.device) -> bool:
+    """Whether the kernels for compute capability 9.0 run on this device."""
+    return capability(device) == (9, 0) and not forced_portable()
+
+
 def fused_ops(device: torch.device) -> Ops:
     """Activations are bfloat16; with an `Fp8Matrix` (from compute capability 8.9) E4M3 between it and the operation
     before it. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor "portable".
     """
-    if capability(device) != (9, 0) or forced_portable():
+    if not hopper_kernels(device):
         return portable_ops()
     ops = hopper_ops(device)
     return replace(

@@ -64,7 +64,9 @@ def unavailable(device: torch.device, fp8: bool = False) -> str | None:
 ARGS = Struct(
     "Args",
     (
-        Parameter("const unsigned char*", "weights", "[L] qkv, out, gate|up, down: [tile][chunk][8 channels][64 bytes]"),
+        Parameter(
+            "const unsigned char*", "weights", "[L] qkv, out, gate|up, down: [tile][chunk][8 channels][64 bytes]"
+        ),
         Parameter("const float*", "table", "[N][2L+1][3][D]: scale, shift, gate"),
         Parameter("const float*", "shifted", "[N][L][channels of qkv, gate|up]: W shift"),
         Parameter("const float*", "row_scales", "[L][channels of qkv, gate|up]: FP8"),
