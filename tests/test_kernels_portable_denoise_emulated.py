@@ -4,6 +4,7 @@ g++ stands for NVRTC, and tests/emulator/machine.h for the GPU: all blocks of th
 """
 
 import ctypes
+import dataclasses
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ from torch import Tensor
 
 from turbopi.kernels.arguments import Parameter, Parameters
 from turbopi.kernels.portable.denoise import kernel as denoise
-from turbopi.kernels.portable.denoise.packing import PackedExpert
+from turbopi.kernels.portable.denoise.packing import KINDS, PackedExpert
+from turbopi.kernels.sm90.denoise.plain import in_e4m3
 from turbopi.model.denoise import euler_step
 
 pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
@@ -106,3 +108,45 @@ def test_the_loop_is_as_exact_as_ordinary_bf16(
     assert torch.equal(x_t[0], p.noise)
     torch.testing.assert_close(x_t[1:], euler_step(x_t[:-1], v_t, steps), rtol=0, atol=0)
     assert relative(x_t[-1], reference[-1]) <= 1.1 * relative(ordinary_bf16(p), reference[-1])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_it_is_right_in_whatever_order_its_threads_go(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, seed: int
+) -> None:
+    p = problem("golden", 2, 10, 37, 1, CPU)
+    packed = PackedExpert.pack(p.config, p.layers)
+    first = run(p, packed, monkeypatch, folder, blocks=5)
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(first, run(p, packed, monkeypatch, folder, blocks=5, seed=seed), strict=True)
+    )
+
+
+def test_choices_of_a_launch_change_no_more_than_the_order_of_sums(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    p = problem("golden", 1, 10, 37, 1, CPU)
+    packed = PackedExpert.pack(p.config, p.layers)
+    usual = run(p, packed, monkeypatch, folder, blocks=3)[0]
+    choice = denoise.Choices(warps=8, sums=2, weights=2, activations=2, ahead=False)
+    assert relative(run(p, packed, monkeypatch, folder, blocks=3, choice=choice)[0], usual) < 3e-3
+
+
+@pytest.mark.parametrize(("name", "suffix", "length", "blocks"), [("golden", 10, 37, 3), ("odd", 17, 70, 2)])
+def test_in_fp8_it_is_as_exact_as_its_emulation(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, name: str, suffix: int, length: int, blocks: int
+) -> None:
+    """Both against exact activations. Rounded numbers near an edge fall either way, so each problem has some luck."""
+    ours, emulated = [], []
+    for seed in range(2):
+        p = problem(name, 1, suffix, length, seed, CPU)
+        packed = PackedExpert.pack(p.config, p.layers, input_scales(p))
+        x_t, _ = run(p, packed, monkeypatch, folder, blocks=blocks)
+        stood_for = [dict(zip(KINDS, packed.matrices(i), strict=True)) for i in range(p.config.expert.depth)]
+        p.layers = [dataclasses.replace(layer, **new) for layer, new in zip(p.layers, stood_for, strict=True)]
+        reference = plain(p, torch.float64)[0][-1]
+        ours.append(relative(x_t[-1], reference))
+        emulated.append(relative(plain(p, torch.float64, in_e4m3(packed.inputs))[0][-1], reference))
+    print(ours, emulated)
+    assert sum(x * x for x in ours) <= 1.2**2 * sum(x * x for x in emulated)

@@ -1,6 +1,7 @@
 // Attention of all query rows over the prefix's and the suffix's keys: a block takes 16 rows and one share of the keys.
 
-constexpr float LOGIT_SCALE_LOG2 = 1.4426950408889634f;
+constexpr float LOG2_E = 1.4426950408889634f;
+constexpr int LOGIT_STEPS = (HD + 31) / 32;  // 32 columns each
 
 struct Keys {
   const byte *prefix, *suffix;  // [rows][HD]
@@ -15,28 +16,61 @@ struct Keys {
   }
 };
 
-__device__ __forceinline__ void logits(const Args& args, float* smem, const Keys& keys, int row_tile, int begin, int count) {
+// What a warp reads first of its share: asked for before the barrier, as far as it is the prefix's. The rest, of the
+// suffix, comes behind it.
+struct First {
+  uint4 keys[LOGIT_STEPS], values[4];
+};
+__device__ __forceinline__ int key_of(int tile) { return tile * 8 + threadIdx.x % 32 / 4; }
+__device__ __forceinline__ int value_of(int step, int i) { return step * 16 + threadIdx.x % 4 * 2 + i % 2 + i / 2 * 8; }
+__device__ __forceinline__ int value_column() { return threadIdx.x / 32 % DIM_GROUPS * 64 + threadIdx.x % 32 / 4 * 8; }
+
+template <bool PREFIX>
+__device__ __forceinline__ void ask_first(First& first, const Keys& keys, const Keys& values, int begin, int count) {
+  const int key = key_of(threadIdx.x / 32), group = threadIdx.x / 32 / DIM_GROUPS;
+  if (PREFIX || (begin + key >= keys.length && key < count))
+#pragma unroll
+    for (int i = 0; i < LOGIT_STEPS; ++i)
+      first.keys[i] =
+          keys.load(begin + key, i * 32 + threadIdx.x % 4 * 8, key < count && (!PREFIX || begin + key < keys.length));
+#pragma unroll
+  for (int i = 0; i < 4; ++i) {
+    const int at = value_of(group, i);
+    if (PREFIX || (begin + at >= keys.length && at < count))
+      first.values[i] = values.load(begin + at, value_column(), at < count && (!PREFIX || begin + at < keys.length));
+  }
+}
+
+// The queries of a row tile, to shared memory.
+__device__ __forceinline__ void take_queries(const Args& args, float* smem, int row_tile) {
+  for (int i = threadIdx.x; i < 16 * HD / 8; i += THREADS) {
+    const int row = i / (HD / 8), at = i % (HD / 8);
+    uint4 v = make_uint4(0, 0, 0, 0);
+    if (row_tile * 16 + row < ROWS) v = load_shared_by_grid(args.queries + ((row_tile * 16 + row) * HD + at * 8) * 2);
+    *(uint4*)(smem + S_QUERIES + row * QUERIES_ROW + at * 4) = v;
+  }
+}
+
+__device__ __forceinline__ void logits(const Args& args, float* smem, const First& first, const Keys& keys, int begin,
+                                       int count) {
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32, g = lane / 4, t = lane % 4;
-  constexpr int STEPS = (HD + 31) / 32;
+  const float* const queries = smem + S_QUERIES + g * QUERIES_ROW + t * 4;
   for (int tile = warp; tile * 8 < count; tile += WARPS) {
     float c[4] = {};
-    uint4 k[STEPS], low[STEPS], high[STEPS];
+    uint4 k[LOGIT_STEPS];
 #pragma unroll
-    for (int i = 0; i < STEPS; ++i) {
-      k[i] = keys.load(begin + tile * 8 + g, i * 32 + t * 8, tile * 8 + g < count);
-      low[i] = high[i] = make_uint4(0, 0, 0, 0);
-      const int row = row_tile * 16 + g;
+    for (int i = 0; i < LOGIT_STEPS; ++i)
+      k[i] = tile == warp ? first.keys[i] : keys.load(begin + key_of(tile), i * 32 + t * 8, key_of(tile) < count);
+#pragma unroll
+    for (int i = 0; i < LOGIT_STEPS; ++i) {
+      uint4 low = make_uint4(0, 0, 0, 0), high = low;
       if (i * 32 + t * 8 < HD) {
-        if (row < ROWS) low[i] = load_shared_by_grid(args.queries + (row * HD + i * 32 + t * 8) * 2);
-        if (row + 8 < ROWS) high[i] = load_shared_by_grid(args.queries + ((row + 8) * HD + i * 32 + t * 8) * 2);
+        low = *(const uint4*)(queries + i * 16), high = *(const uint4*)(queries + i * 16 + 8 * QUERIES_ROW);
       }
+      mma(c, low.x, high.x, low.y, high.y, k[i].x, k[i].y);
+      mma(c, low.z, high.z, low.w, high.w, k[i].z, k[i].w);
     }
-#pragma unroll
-    for (int i = 0; i < STEPS; ++i) {
-      mma(c, low[i].x, high[i].x, low[i].y, high[i].y, k[i].x, k[i].y);
-      mma(c, low[i].z, high[i].z, low[i].w, high[i].w, k[i].z, k[i].w);
-    }
-    const float by = LOGIT_SCALE_LOG2 * args.logit_scale;
+    const float by = LOG2_E * args.logit_scale;
     float* const to = smem + S_WORK + g * LOGITS_ROW + tile * 8 + t * 2;
     *(float2*)to = make_float2(c[0] * by, c[1] * by);
     *(float2*)(to + 8 * LOGITS_ROW) = make_float2(c[2] * by, c[3] * by);
@@ -64,7 +98,7 @@ __device__ __forceinline__ void softmax(const Args& args, float* smem, int share
 }
 
 // A warp weighs 64 columns of its key group's values. Column n of mma's tile j is column 8 n + j: a lane's 16 bytes.
-__device__ __forceinline__ void weigh(float* smem, const Keys& values, int begin, int count) {
+__device__ __forceinline__ void weigh(float* smem, const First& first, const Keys& values, int begin, int count) {
   const int warp = threadIdx.x / 32, lane = threadIdx.x % 32, g = lane / 4, t = lane % 4;
   const int dims = warp % DIM_GROUPS * 64, group = warp / DIM_GROUPS;
   if (group >= KEY_GROUPS) return;
@@ -77,8 +111,8 @@ __device__ __forceinline__ void weigh(float* smem, const Keys& values, int begin
     } rows[4];
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
-      const int key = step * 16 + t * 2 + i % 2 + i / 2 * 8;
-      rows[i].all = values.load(begin + key, dims + g * 8, key < count);
+      const int key = value_of(step, i);
+      rows[i].all = step == group ? first.values[i] : values.load(begin + key, value_column(), key < count);
     }
     const u32* const weights = (const u32*)(smem + S_WEIGHTS) + g * WEIGHTS_ROW + step * 8 + t;
     const u32 a0 = weights[0], a1 = weights[8 * WEIGHTS_ROW], a2 = weights[4], a3 = weights[8 * WEIGHTS_ROW + 4];
@@ -100,17 +134,29 @@ __device__ __forceinline__ void weigh(float* smem, const Keys& values, int begin
   }
 }
 
-__device__ __forceinline__ void attend(const Args& args, float* smem, int layer, int length) {
+__device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem, int layer, int length) {
   const Keys keys{args.cache_k + layer * args.layer_stride, args.keys, length};
   const Keys values{args.cache_v + layer * args.layer_stride, args.values, length};
   const int total = length + T, share_keys = ((total + 7) / 8 + SPLITS - 1) / SPLITS * 8;
-  for (int share = blockIdx.x; share < ROW_TILES * SPLITS; share += BLOCKS) {
-    const int begin = share % SPLITS * share_keys, count = max(min(total - begin, share_keys), 0);
-    logits(args, smem, keys, share / SPLITS, begin, count);
+  First first;
+  auto begin_of = [&](int share) { return share % SPLITS * share_keys; };
+  auto count_of = [&](int share) {
+    return share < ROW_TILES * SPLITS ? max(min(total - begin_of(share), share_keys), 0) : 0;
+  };
+  int share = blockIdx.x;
+  ask_first<true>(first, keys, values, begin_of(share), count_of(share));
+  grid.wait();
+  for (; share < ROW_TILES * SPLITS; share += BLOCKS) {
+    const int begin = begin_of(share), count = count_of(share);
+    if (share != blockIdx.x) ask_first<true>(first, keys, values, begin, count);
+    ask_first<false>(first, keys, values, begin, count);
+    take_queries(args, smem, share / SPLITS);
+    __syncthreads();
+    logits(args, smem, first, keys, begin, count);
     __syncthreads();
     softmax(args, smem, share, count);
     __syncthreads();
-    weigh(smem, values, begin, count);
+    weigh(smem, first, values, begin, count);
     __syncthreads();
     for (int i = threadIdx.x; i < 16 * HD / 4; i += THREADS) {
       float4 sum = make_float4(0, 0, 0, 0);

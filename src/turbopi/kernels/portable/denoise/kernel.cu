@@ -26,6 +26,7 @@ __device__ __forceinline__ void advance(const Args& args, const float* scale, in
   for (int task = threadIdx.x / 32 * BLOCKS + blockIdx.x; task < T * A; task += WARPS * BLOCKS) {
     const int token = task / A, a = task % A;
     float sum = 0, squares = 0;
+#pragma unroll 8
     for (int column = lane * 2; column < D; column += 64) {
       const float2 x = __ldcg((const float2*)(args.x + token * D + column));
       const float2 w = two(args.out_w + a * D + column), s = two(scale + column);
@@ -65,7 +66,7 @@ extern "C" __global__ void __launch_bounds__(256) turbopi_portable_denoise_prepa
 
 extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denoise(const Args args) {
   extern __shared__ __align__(16) float smem[];
-  Grid grid{args.counter};
+  Grid grid(args.counter, args.trace);
   const int length = *args.length;
   auto nothing = [] {};
   auto inverse_rms = [&] { make_inverse_rms(args, smem); };
@@ -91,8 +92,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denois
       }
       grid.arrive();
       ahead<GateUpShape>(weights + GATE_UP_AT);
-      grid.wait();
-      attend(args, smem, layer, length);
+      attend(grid, args, smem, layer, length);
       grid.arrive();
       grid.wait();
       combine(args, FP8 ? __ldg(args.attended_times + layer) : 1.0f);

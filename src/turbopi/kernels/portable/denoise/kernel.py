@@ -24,6 +24,7 @@ MAX_SUFFIX = 64
 SHARED_BYTES = 99 * 1024  # what a block has on every GPU from 8.0 on
 MAX_SPLITS, MAX_SPLIT_KEYS = 16, 256  # shares of the keys: as many as are combined at once; what fits a block
 PREPARE_THREADS = 256
+PHASES = ("qkv", "attention", "combine", "out", "gate_up", "down", "embed", "advance")  # of the trace
 LARGE_L2 = 32 << 20  # bytes: a layer's weights, and what else is read meanwhile
 
 
@@ -94,6 +95,7 @@ ARGS = Struct(
         Parameter("float*", "tops", "[row tile][share of keys][16][2] largest logit, sum of weights"),
         Parameter("float*", "rope", "[T][K/2][2] cosine, sine"),
         Parameter("u32*", "counter", "of the grid's barrier"),
+        Parameter("u32*", "trace", "[blocks][PHASES][2] cycles at work and at the barrier behind it, with TP_TRACE"),
         Parameter("long long", "layer_stride"),
         Parameter("int", "steps"),
         Parameter("float", "dt"),
@@ -129,6 +131,7 @@ def kernel_sizes(
         "TP_SPLIT_KEYS": -(-split_keys // 16) * 16,
         "TP_FP8": int(fp8),
         "TP_SHARED_BYTES": SHARED_BYTES,
+        "TP_TRACE": 0,
     }
 
 
@@ -150,7 +153,8 @@ class PortableDenoiser:
     action_out_proj, `cache_rows` is an upper bound of the valid cache rows. Every token has the same time. Raises
     BackendError for a suffix that it doesn't cover, BackendUnavailable for a GPU or a loop with times by token.
 
-    blocks  how many share the work; default: one for each multiprocessor
+    choice, blocks  how it is launched; default: as `choices` has it, one block for each multiprocessor
+    traced  slower, and `trace` then says where cycles went
     """
 
     def __init__(
@@ -167,6 +171,7 @@ class PortableDenoiser:
         by_token: bool = False,
         choice: Choices | None = None,
         blocks: int | None = None,
+        traced: bool = False,
     ) -> None:
         if by_token or num_steps is not None:
             raise BackendUnavailable("the portable denoising kernel has no times by token")
@@ -182,6 +187,7 @@ class PortableDenoiser:
         self._sizes = kernel_sizes(
             config, blocks=self._blocks, cache_rows=cache_rows, suffix=suffix, fp8=packed.fp8, choice=self._choice
         )
+        self._sizes["TP_TRACE"] = int(traced)
         self._kernel, self._prepare = load(device, self._sizes)
         self._steps = len(table)
         self._tensors = tensors(packed, small, table.to(device).float().contiguous(), self._sizes)
@@ -222,6 +228,10 @@ class PortableDenoiser:
         prepared = max(self._suffix * g.head_dim // 2, noise.numel())
         self._prepare.launch(-(-prepared // PREPARE_THREADS), PREPARE_THREADS, args)
         self._kernel.launch_cooperative(self._blocks, self._choice.warps * 32, args)
+
+    def trace(self) -> Tensor:
+        """int64[blocks, PHASES, 2]: cycles of all launches so far at work, and at the barrier behind it; if `traced`."""
+        return self._tensors["trace"].long() & 0xFFFFFFFF
 
 
 def multiprocessors(device: torch.device) -> int:
@@ -280,4 +290,5 @@ def tensors(packed: PackedExpert, small: State, table: Tensor, sizes: dict[str, 
         "tops": scratch(shares, 16, 2),
         "rope": scratch(suffix, g.head_dim // 2, 2),
         "counter": scratch(1, dtype=torch.int32),
+        "trace": scratch(sizes["TP_BLOCKS"], len(PHASES), 2, dtype=torch.int32),
     }

@@ -14,11 +14,16 @@ __device__ __forceinline__ void to_l2(const void* at) { asm volatile("prefetch.g
 
 // A barrier of the whole grid in two halves: what lies between depends on no other block.
 struct Grid {
-  u32* counter;
-  u32 expected = 0;
+  u32 *counter, *trace;
+  u32 expected;
+  long long last;
+  __device__ __forceinline__ Grid(u32* counter, u32* trace) : counter(counter), trace(trace), expected(0) {
+    if (TP_TRACE) last = clock64();
+  }
   __device__ __forceinline__ void arrive() {
     __syncthreads();
-    expected += gridDim.x;
+    if (TP_TRACE) note(0);
+    expected += BLOCKS;
     if (threadIdx.x == 0) asm volatile("red.release.gpu.global.add.u32 [%0], %1;" ::"l"(counter), "r"(1) : "memory");
   }
   __device__ __forceinline__ void wait() {
@@ -29,6 +34,15 @@ struct Grid {
       } while (arrived < expected);
     }
     __syncthreads();
+    if (TP_TRACE) note(1);
+  }
+  // Cycles of thread 0: [block][phase][working, at the barrier behind it]; phases are PHASES of kernel.py.
+  __device__ __forceinline__ void note(int waited) {
+    if (threadIdx.x > 0) return;
+    const int before = expected / BLOCKS % (6 * L + 2) - waited, barrier = before < 0 ? 6 * L + 1 : before;
+    const int phase = barrier == 0 ? 6 : barrier == 6 * L + 1 ? 7 : (barrier - 1) % 6;
+    const long long now = clock64();
+    trace[(blockIdx.x * 8 + phase) * 2 + waited] += now - last, last = now;
   }
 };
 

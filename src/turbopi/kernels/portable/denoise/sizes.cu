@@ -85,7 +85,8 @@ constexpr int KEY_GROUPS = WARPS / DIM_GROUPS;    // of warps, which share out t
 constexpr int LOGITS_ROW = SPLIT_KEYS + 4, WEIGHTS_ROW = SPLIT_KEYS / 2 + 4, OUT_ROW = HD + 4;
 constexpr int S_RMS = 0, S_WORK = 64;
 constexpr int S_WEIGHTS = S_WORK + 16 * LOGITS_ROW, S_OUT = S_WEIGHTS + 16 * WEIGHTS_ROW;
-constexpr int ATTENTION_END = S_OUT + KEY_GROUPS * 16 * OUT_ROW;
+constexpr int QUERIES_ROW = HD / 2 + 16;  // two rows in different banks
+constexpr int S_QUERIES = S_OUT + KEY_GROUPS * 16 * OUT_ROW, ATTENTION_END = S_QUERIES + 16 * QUERIES_ROW;
 constexpr __host__ __device__ int larger(int a, int b) { return a > b ? a : b; }
 constexpr int PRODUCTS_END = S_WORK + larger(larger(QkvShape::SUM_WORDS, OutShape::SUM_WORDS),
                                              larger(GateUpShape::SUM_WORDS, DownShape::SUM_WORDS));
