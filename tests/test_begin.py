@@ -121,7 +121,7 @@ def test_a_batch_equals_its_observations(policy: UnifiedPolicy) -> None:
     alone = [policy.infer(observation, seed=seed)["actions"] for seed, observation in enumerate(observations)]
     together = policy.infer_batch(observations, seed=0)
     for one, actions in zip(together, alone, strict=True):
-        np.testing.assert_array_equal(one["actions"], actions)
+        np.testing.assert_allclose(one["actions"], actions, atol=1e-4)  # sums in another order
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ def test_batches_denoise_by_operations_in_the_kernels_precision() -> None:
     assert moved == [CPU], "it is asked for, and then not let go"
 
     backend = FusedBackend.__new__(FusedBackend)
-    moved: list[torch.device] = []
+    moved = []
     backend.config, backend.device = golden_model("pi05").config, torch.device("meta")
     calibration = golden_calibration(golden_folder(), "pi05", CPU)
     every = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}

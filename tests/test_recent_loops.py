@@ -118,6 +118,7 @@ class Fused(FusedBackend):
         self._graphs, self._calls, self._tables, self._loops = {}, {}, {}, {}
         self._denoisers, self._refused, self._packed_expert = {}, {}, None
         self._recent = RecentLoops(self._forget)
+        self._batches = SimpleNamespace(forget=lambda loop: None)  # type: ignore[assignment]
         self.expert_on = "device"
 
     def _denoising_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Any:
