@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -111,7 +112,7 @@ def timed(given: Product, workers: int) -> TimedProduct:
         result = run(tile, operands.weights[0]).float()
         result = (result.sum(0) if result.dim() == 3 else result) / (inverse or 1.0)
         error = float((result - exact).norm() / exact.norm())
-        taken = microseconds([lambda weight=weight, tile=tile: run(tile, weight) for weight in operands.weights])
+        taken = microseconds([partial(run, tile, weight) for weight in operands.weights])
         rows.append(TimedTile(astuple(tile), taken, None if given.out_fp8 else error))
     rows.sort(key=lambda row: row.microseconds)
     library = [call for weight in operands.weights if (call := by_library(given, operands, weight)) is not None]
