@@ -146,12 +146,15 @@ def _backward() -> Calls:
         d_x, gate = (of(SUFFIX, 1024, dtype=F32), factor) if full else (None, None)
         return backward.rms_norm_vjp(of(SUFFIX, 1024), of(SUFFIX, 1024), factor, 1e-6, d_x, gate)
 
-    cos, head = (lambda: of(SUFFIX, 128, dtype=F32)), (lambda: of(SUFFIX, 256))
+    def rope_vjp() -> Tensor:
+        cos, head = of(SUFFIX, 128, dtype=F32), of(SUFFIX, 256)
+        return backward.rope_vjp(of(SUFFIX * 8, 256), head, head, cos, cos)
+
     return [
         *(partial(rms, by_row, full) for by_row in (False, True) for full in (False, True)),
         lambda: backward.geglu_vjp(of(SUFFIX, 4096), of(SUFFIX, 8192)),
         lambda: backward.softmax_vjp(of(SUFFIX * 8, 1026), of(SUFFIX * 8, 1026, dtype=F32), 0.06),
-        lambda: backward.rope_vjp(of(SUFFIX * 8, 256), head(), head(), cos(), cos()),
+        rope_vjp,
     ]
 
 

@@ -81,7 +81,9 @@ class Operands:
     def sums(self, given: Product) -> Tensor:
         first = self.weights[0]
         sums = first.product(self.x, self.bias) if isinstance(first, Fp8Matrix) else self.x.float() @ first.float().T
-        return {"gelu": plain.gelu, "geglu": plain.geglu}.get(given.epilogue, lambda x: x)(sums)
+        if given.epilogue == "gelu":
+            return plain.gelu(sums)
+        return plain.geglu(sums) if given.epilogue == "geglu" else sums
 
 
 def timed(given: Product, workers: int) -> TimedProduct:
