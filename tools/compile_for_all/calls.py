@@ -42,7 +42,7 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
     fp8 = tiles.fp8_refusal(target.capability) is None
     inverses: tuple[float | None, ...] = (None, 30.0) if fp8 else (None,)
     calls = [*_norms(inverses), *_attention(inverses), *_rest(), *_backward()]
-    calls += [lambda inverse=one: activations.geglu(of(PREFIX, 2 * 16384), inverse) for one in inverses]
+    calls += [partial(lambda inverse: activations.geglu(of(PREFIX, 2 * 16384), inverse), one) for one in inverses]
     if fp8:
         calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152))]
     return [*calls, *product_calls(target, fp8, chosen)]
@@ -78,14 +78,14 @@ def _norms(inverses: tuple[float | None, ...]) -> Calls:
     for inverse in inverses:
         for splits in (None, 0, 2, 3, 4):
             for width, rows in ((2048, PREFIX), (1152, ROWS)):
-                y = (rows, width) if not splits else (splits, rows, width)
+                y: tuple[int, ...] = (rows, width) if not splits else (splits, rows, width)
                 if width == 2048:
                     calls.append(partial(_rms, rows, width, None if splits is None else y, None, False, inverse))
                 else:
                     calls.append(partial(_layer_norm, rows, width, None if splits is None else y, inverse))
     for by_row in (False, True):
-        for y in (None, (SUFFIX, 1024)):
-            calls.append(partial(_rms, SUFFIX, 1024, y, y, by_row, None))
+        for given in (None, (SUFFIX, 1024)):
+            calls.append(partial(_rms, SUFFIX, 1024, given, given, by_row, None))
     return calls
 
 
@@ -146,12 +146,15 @@ def _backward() -> Calls:
         d_x, gate = (of(SUFFIX, 1024, dtype=F32), factor) if full else (None, None)
         return backward.rms_norm_vjp(of(SUFFIX, 1024), of(SUFFIX, 1024), factor, 1e-6, d_x, gate)
 
-    cos, head = (lambda: of(SUFFIX, 128, dtype=F32)), (lambda: of(SUFFIX, 256))
+    def rope_vjp() -> Tensor:
+        cos, head = of(SUFFIX, 128, dtype=F32), of(SUFFIX, 256)
+        return backward.rope_vjp(of(SUFFIX * 8, 256), head, head, cos, cos)
+
     return [
         *(partial(rms, by_row, full) for by_row in (False, True) for full in (False, True)),
         lambda: backward.geglu_vjp(of(SUFFIX, 4096), of(SUFFIX, 8192)),
         lambda: backward.softmax_vjp(of(SUFFIX * 8, 1026), of(SUFFIX * 8, 1026, dtype=F32), 0.06),
-        lambda: backward.rope_vjp(of(SUFFIX * 8, 256), head(), head(), cos(), cos()),
+        rope_vjp,
     ]
 
 

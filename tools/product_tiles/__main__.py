@@ -33,9 +33,9 @@ def main() -> None:
     from turbopi.reading import plain_document
 
     started, capability = time.monotonic(), gpu(DEVICE)[0]
-    rows = [tuple(int(number) for number in pair.split(":")) for pair in given.rows.split(",")]
+    rows = [[int(number) for number in pair.split(":")] for pair in given.rows.split(",")]
     kinds = (True, False) if fp8_refusal(capability) is None else (False,)
-    wanted = [one for pair in rows for fp8 in kinds for one in products(*pair, fp8)]
+    wanted = [one for pair in rows for fp8 in kinds for one in products(pair[0], pair[1], fp8)]
     done, left_out = time_all(wanted, given.seconds, min(8, os.cpu_count() or 1))
     seconds = time.monotonic() - started
     document = TilesDocument(provenance(DEVICE), capability, seconds, done, left_out)

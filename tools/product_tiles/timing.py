@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, replace
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -80,7 +81,9 @@ class Operands:
     def sums(self, given: Product) -> Tensor:
         first = self.weights[0]
         sums = first.product(self.x, self.bias) if isinstance(first, Fp8Matrix) else self.x.float() @ first.float().T
-        return {"gelu": plain.gelu, "geglu": plain.geglu}.get(given.epilogue, lambda x: x)(sums)
+        if given.epilogue == "gelu":
+            return plain.gelu(sums)
+        return plain.geglu(sums) if given.epilogue == "geglu" else sums
 
 
 def timed(given: Product, workers: int) -> TimedProduct:
@@ -111,7 +114,7 @@ def timed(given: Product, workers: int) -> TimedProduct:
         result = run(tile, operands.weights[0]).float()
         result = (result.sum(0) if result.dim() == 3 else result) / (inverse or 1.0)
         error = float((result - exact).norm() / exact.norm())
-        taken = microseconds([lambda weight=weight, tile=tile: run(tile, weight) for weight in operands.weights])
+        taken = microseconds([partial(run, tile, weight) for weight in operands.weights])
         rows.append(TimedTile(astuple(tile), taken, None if given.out_fp8 else error))
     rows.sort(key=lambda row: row.microseconds)
     library = [call for weight in operands.weights if (call := by_library(given, operands, weight)) is not None]
