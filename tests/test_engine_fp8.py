@@ -18,7 +18,7 @@ from turbopi.engine.recent_loops import Loop, RecentLoops
 from turbopi.engine.weights import modulation, pack
 from turbopi.errors import BackendUnavailable
 from turbopi.kernels.plain import PLAIN
-from turbopi.kernels.quantize import quantize
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.observation import Observation
 from turbopi.quantization.fp8 import Fp8Matrix, Matrix
 from turbopi.quantization.sites import Site, sites

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import nvrtc
-from turbopi.kernels.quantize import quantize
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise import packing
 from turbopi.kernels.sm90.denoise.packing import KINDS, PackedExpert

@@ -11,7 +11,7 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 from turbopi.kernels import plain
 from turbopi.kernels.ops import fused_ops
 from turbopi.kernels.portable import norms
-from turbopi.kernels.quantize import quantize
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Folded, Sums, Tile, clusters, matmul
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8

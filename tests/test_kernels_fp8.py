@@ -17,7 +17,7 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.kernels import plain  # noqa: E402
 from turbopi.kernels.portable import attention, norms  # noqa: E402
-from turbopi.kernels.quantize import quantize  # noqa: E402
+from turbopi.kernels.portable.quantize import quantize  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8  # noqa: E402
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402

@@ -111,15 +111,12 @@ def test_the_loop_is_as_exact_as_ordinary_bf16(
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_it_is_right_in_whatever_order_its_threads_go(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, seed: int
-) -> None:
+def test_it_is_right_in_whatever_order_its_threads_go(monkeypatch: pytest.MonkeyPatch, folder: Path, seed: int) -> None:
     p = problem("golden", 2, 10, 37, 1, CPU)
     packed = PackedExpert.pack(p.config, p.layers)
     first = run(p, packed, monkeypatch, folder, blocks=5)
     assert all(
-        torch.equal(a, b)
-        for a, b in zip(first, run(p, packed, monkeypatch, folder, blocks=5, seed=seed), strict=True)
+        torch.equal(a, b) for a, b in zip(first, run(p, packed, monkeypatch, folder, blocks=5, seed=seed), strict=True)
     )
 
 

@@ -23,7 +23,7 @@ from turbopi.kernels.portable.gemm import tiles  # noqa: E402
 from turbopi.kernels.portable.gemm.kernel import gpu, product  # noqa: E402
 from turbopi.kernels.portable.gemm.tiles import Capability, Epilogue, Tile  # noqa: E402
 from turbopi.kernels.portable.ops import portable_ops  # noqa: E402
-from turbopi.kernels.quantize import quantize  # noqa: E402
+from turbopi.kernels.portable.quantize import quantize  # noqa: E402
 from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Fp8Matrix, to_e4m3  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")

@@ -12,8 +12,8 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
+from turbopi.kernels.portable.quantize import quantize, round_rows
 from turbopi.kernels.portable.rounding import round_with_feedback
-from turbopi.kernels.quantize import quantize, round_rows
 from turbopi.quantization.directions import COUNT, ROWS, Rows, directions
 from turbopi.quantization.fp8 import Directions, to_e4m3
 from turbopi.quantization.rounding import feedback, round_with_feedback_plain

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from compile_for_all.targets import Target
-from turbopi.kernels.interface import SOURCE
-from turbopi.kernels.portable import activations, attention, backward, embedding, norms, resize, rope, rounding
+from turbopi.kernels.interface import SOURCE, Segments
+from turbopi.kernels.portable import activations, attention, backward, batch, embedding, norms, resize, rope, rounding
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
 from turbopi.quantization.fp8 import E4M3, Fp8Matrix
@@ -41,7 +41,7 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
     """Every variant that the product can launch there at full size; E4M3 where the GPU has it. chosen: see below."""
     fp8 = tiles.fp8_refusal(target.capability) is None
     inverses: tuple[float | None, ...] = (None, 30.0) if fp8 else (None,)
-    calls = [*_norms(inverses), *_attention(inverses), *_rest(), *_backward()]
+    calls = [*_norms(inverses), *_attention(inverses), *_batch(inverses), *_rest(), *_backward()]
     calls += [partial(lambda inverse: activations.geglu(of(PREFIX, 2 * 16384), inverse), one) for one in inverses]
     if fp8:
         calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152))]
@@ -118,6 +118,30 @@ def _attention(inverses: tuple[float | None, ...]) -> Calls:
         *(partial(lambda one: attention.vision_attention(of(ROWS, 3456), 2, 16, one), one) for one in inverses),
         *(partial(prefix, one) for one in inverses),
         *(partial(softmax, state_token) for state_token in (False, True)),
+    ]
+
+
+def _batch(inverses: tuple[float | None, ...]) -> Calls:
+    """Of two and sixteen observations: keys of a suffix split over blocks, and in one."""
+
+    def packed(inverse: float | None) -> Tensor:
+        k, rows = of(2 * PREFIX, 256), of(3, dtype=torch.int32)
+        segments = Segments(rows, rows, of(143, 4, dtype=torch.int32))
+        return batch.packed_attention(of(2 * PREFIX * 8, 256), k, k, segments, 8, inverse)
+
+    def suffix(count: int, state_token: bool, inverse: float | None) -> Tensor:
+        prefix, own, rows = of(count * PREFIX, 256), of(count * SUFFIX, 256), of(count + 1, dtype=torch.int32)
+        queries = of(count * SUFFIX * 8, 256)
+        return batch.suffix_attention(queries, prefix, prefix, own, own, rows, rows, 8, state_token, inverse)
+
+    def embed() -> None:
+        batch.embed_rows(of(2 * PREFIX, dtype=torch.int64), of(4 * 256, 2048), of(257152, 2048), of(2 * PREFIX, 2048))
+
+    return [
+        embed,
+        *(partial(packed, one) for one in inverses),
+        *(partial(suffix, count, False, one) for count in (2, 16) for one in inverses),
+        *(partial(suffix, count, True, None) for count in (2, 16)),
     ]
 
 

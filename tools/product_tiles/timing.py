@@ -16,7 +16,7 @@ from turbopi.kernels import plain
 from turbopi.kernels.portable import activations
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import gpu, product
-from turbopi.kernels.quantize import quantize
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
 
 DEVICE = torch.device("cuda", 0)

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.kernels.quantize import quantize
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.model.layers import AdaRMSNorm, inverse_rms
 from turbopi.model.reference import Pi0Model
 from turbopi.model.sites import linears, norm_of

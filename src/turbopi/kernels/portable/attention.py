@@ -10,6 +10,7 @@ import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
+from turbopi.kernels.portable.shared_memory import roomy
 
 LOG2_E = 1.4426950408889634
 
@@ -136,7 +137,7 @@ def prefix_attention(
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
-    block_m, block_n, warps, stages = PREFIX_TILE
+    block_m, block_n, warps, stages = PREFIX_TILE if roomy(q) else NARROW_PREFIX_TILE
     _prefix_kernel[(triton.cdiv(rows, block_m),)](
         q, k, v, length, out, rows, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim, BLOCK_D=triton.next_power_of_2(dim),
         BLOCK_M=block_m, BLOCK_N=block_n, SCALED=inverse is not None, num_warps=warps, num_stages=stages,
@@ -145,7 +146,7 @@ def prefix_attention(
     return out
 
 
-PREFIX_TILE = (64, 64, 4, 2)
+PREFIX_TILE, NARROW_PREFIX_TILE = (64, 64, 4, 2), (64, 32, 8, 2)  # the second for less shared memory
 
 
 @triton.jit

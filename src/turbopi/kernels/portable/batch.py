@@ -12,10 +12,12 @@ from torch import Tensor
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 from turbopi.kernels.interface import BatchOps, Segments
 from turbopi.kernels.portable.attention import LOG2_E
+from turbopi.kernels.portable.shared_memory import roomy
 
-PACKED_TILE = (64, 4, 3)  # keys at a time, warps, stages; queries: as `Segments.tiles` says
+# Keys at a time, warps, stages; queries: as `Segments.tiles` says. The second one of each pair: for less shared memory.
+PACKED_TILE, NARROW_PACKED_TILE = (64, 4, 3), (32, 8, 2)
 QUERIES = 64
-SUFFIX_TILE = (16, 64, 4, 2)  # queries, keys at a time, warps, stages
+SUFFIX_TILE, NARROW_SUFFIX_TILE = (16, 64, 4, 2), (16, 32, 4, 2)  # queries, keys at a time, warps, stages
 BLOCKS_AT_ONCE = 264  # of suffix attention, two a multiprocessor of Hopper: keys are split over blocks up to so many
 
 
@@ -94,7 +96,7 @@ def packed_attention(
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
-    block_n, warps, stages = PACKED_TILE
+    block_n, warps, stages = PACKED_TILE if roomy(q) else NARROW_PACKED_TILE
     _packed_kernel[(len(segments.tiles),)](
         q, k, v, segments.tiles, out, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim,
         BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=QUERIES, BLOCK_N=block_n, SCALED=inverse is not None,
@@ -193,7 +195,7 @@ def suffix_attention(
     batch, (count, dim) = len(starts) - 1, k.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     rows = count // batch * heads  # of queries of an observation
-    block_m, block_n, warps, stages = SUFFIX_TILE
+    block_m, block_n, warps, stages = SUFFIX_TILE if roomy(q) else NARROW_SUFFIX_TILE
     tiles = triton.cdiv(rows, block_m)
     splits = suffix_splits(tiles * batch, len(prefix_k) // batch, block_n)
     out = q.new_empty(count, heads * dim, dtype=result_dtype(q, inverse))

@@ -12,7 +12,7 @@ from torch import Tensor
 from turbopi.config import GemmaConfig, ModelConfig
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import GemmaLayer
-from turbopi.kernels.quantize import quantize
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization.fp8 import E4M3, Directions
 
 TILE = 8  # output channels

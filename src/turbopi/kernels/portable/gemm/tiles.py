@@ -7,16 +7,12 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
+from turbopi.kernels.portable.shared_memory import BLOCK_SHARED, LEAST_SHARED
+
 Epilogue = Literal["plain", "gelu", "geglu", "parts"]
 Capability = tuple[int, int]
 
 STEP_BYTES = 128  # of a row along the inner axis in one step: 128 E4M3 or 64 bfloat16
-BLOCK_SHARED = {  # bytes of shared memory a block may use (CUDA C++ programming guide, table of compute capabilities)
-    **dict.fromkeys([(8, 0), (8, 7)], 163 * 1024),
-    **dict.fromkeys([(8, 6), (8, 9), (12, 0), (12, 1)], 99 * 1024),
-    **dict.fromkeys([(9, 0), (10, 0), (10, 3), (11, 0)], 227 * 1024),
-}
-LEAST_SHARED = min(BLOCK_SHARED.values())
 SPLITS = (1, 2, 3, 4)
 UNPROMOTED = 2176  # longest sum of E4M3 products that stays in the tensor cores, as in sm90/gemm/fp8.py
 

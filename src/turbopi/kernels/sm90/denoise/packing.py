@@ -14,7 +14,7 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import GemmaLayer
-from turbopi.kernels.quantize import quantize
+from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization.fp8 import E4M3, Directions
 
 BLOCK = 16  # rows of a tile, columns of a block
