@@ -30,25 +30,29 @@ pytestmark = [
 ]
 CASES = [path.parent.name for path in sorted(GOLDEN.glob("cases/*/inputs.npz"))]
 GRAPHS = ["cuda_graph", "fused"]
+PORTABLE = "fused, portable kernels"
 MODES = [  # pytorch_compile takes minutes to compile them all; gpu_check runs it through scripts/check_golden
     (name, precision)
     for name in ("pytorch", *GRAPHS)  # tensorrt: test_tensorrt_gpu.py
     for precision in backends.precisions(name)
     if precision in ("bf16", "f32")  # FP8 needs a calibration: test_gpu_fp8.py
-]
+] + [(PORTABLE, "bf16")]
 
 
 @lru_cache
 def backend(name: str, kind: Kind, precision: FloatPrecision) -> backends.Backend:
     checkpoint = golden_folder().checkpoint(kind)
     device = torch.device("cuda", 0)
-    return backends.create(
-        name,
-        checkpoint.config.model,
-        lambda to, mode: checkpoint.load(to, mode).state,
-        device=device,
-        precision=precision,
-    )
+    with pytest.MonkeyPatch.context() as patched:
+        if name == PORTABLE:
+            patched.setenv("TURBOPI_KERNELS", "portable")
+        return backends.create(
+            "fused" if name == PORTABLE else name,
+            checkpoint.config.model,
+            lambda to, mode: checkpoint.load(to, mode).state,
+            device=device,
+            precision=precision,
+        )
 
 
 @pytest.mark.parametrize(("name", "precision"), MODES)
@@ -91,16 +95,41 @@ def test_every_prompt_length_in_a_bucket_is_right(name: str, kind: Kind) -> None
         assert float(relative) < 0.012, length  # openpi's own at 3 steps: 0.0111 and 0.0061
 
 
-@pytest.mark.parametrize("name", GRAPHS)
-def test_a_batch_equals_its_rows(name: str) -> None:
+@pytest.mark.parametrize("name", [*GRAPHS, PORTABLE])
+@pytest.mark.parametrize("count", [2, 3, 4, 8])
+def test_a_batch_equals_its_rows(name: str, count: int) -> None:
+    """Within what sums in another order make of bfloat16: rows of other cameras and prompts, beside each other."""
     rows = [golden_cases()[case].observation for case in ("a_three_cams", "b_third_masked")]
     fields = [field.name for field in dataclasses.fields(Observation)]
-    batch = Observation(**{field: torch.cat([getattr(row, field) for row in rows]) for field in fields})
-    noise = torch.randn(2, 10, 32, generator=torch.Generator().manual_seed(1))
-    runner = backend(name, "pi05", "bf16")
+    chosen = [rows[i % 2] for i in range(count)]
+    batch = Observation(**{field: torch.cat([getattr(row, field) for row in chosen]) for field in fields})
+    noise = torch.randn(count, 10, 32, generator=torch.Generator().manual_seed(1))
+    runner, reference = backend(name, "pi05", "bf16"), backend("pytorch", "pi05", "f32")
     together = runner.sample(batch, noise, 3).actions
-    for i, row in enumerate(rows):
-        assert torch.equal(runner.sample(row, noise[i : i + 1], 3).actions[0], together[i])
+    assert torch.equal(runner.sample(batch, noise, 3).actions, together)
+    for i, row in enumerate(chosen):
+        alone = runner.sample(row, noise[i : i + 1], 3).actions[0]
+        exact = reference.sample(row, noise[i : i + 1], 3).actions[0]
+
+        def relative(x: torch.Tensor, y: torch.Tensor, size: torch.Tensor = exact) -> float:
+            return float((x - y).norm() / size.norm())
+
+        assert relative(together[i], exact) < 0.012, "as every prompt's own call: see above"
+        assert relative(together[i], alone) < 0.012
+
+
+@pytest.mark.parametrize("name", [*GRAPHS, PORTABLE])
+def test_intermediates_of_a_batch(name: str) -> None:
+    """Every step of four observations that run together, against float32."""
+    rows = [golden_cases()[case].observation for case in ("a_three_cams", "b_third_masked")] * 2
+    fields = [field.name for field in dataclasses.fields(Observation)]
+    batch = Observation(**{field: torch.cat([getattr(row, field) for row in rows]) for field in fields})
+    noise = torch.randn(4, 10, 32, generator=torch.Generator().manual_seed(1))
+    ours = backend(name, "pi05", "bf16").intermediates(batch, noise, 10)
+    exact = backend("pytorch", "pi05", "f32").intermediates(batch, noise, 10)
+    for tensor in ("x_t", "v_t", "actions"):
+        assert float((ours[tensor].cpu() - exact[tensor].cpu()).norm() / exact[tensor].norm()) < 0.012, tensor
+    assert any("4 observations" in one for one in backend(name, "pi05", "bf16").describe()["batches"])
 
 
 @pytest.mark.parametrize("name", GRAPHS)

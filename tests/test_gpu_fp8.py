@@ -18,6 +18,7 @@ from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX
 from turbopi.kernels.sm90.denoise.packing import refusal
 from turbopi.model.conditioning import Conditioning
 from turbopi.model.reference import Pi0Model
+from turbopi.observation import Observation
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.sites import sites
 from turbopi.verify.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
@@ -46,16 +47,18 @@ def quantization(kind: Kind, target: float) -> Quantization:
 
 
 @lru_cache
-def backend(kind: Kind, precision: Precision, target: float = 0.0) -> backends.Backend:
+def backend(kind: Kind, precision: Precision, target: float = 0.0, kernels: str = "auto") -> backends.Backend:
     checkpoint = golden_folder().checkpoint(kind)
-    return backends.create(
-        "fused",
-        checkpoint.config.model,
-        lambda to, mode: checkpoint.load(to, mode).state,
-        device=torch.device("cuda", 0),
-        precision=precision,
-        quantization=quantization(kind, target),
-    )
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("TURBOPI_KERNELS", kernels)
+        return backends.create(
+            "fused",
+            checkpoint.config.model,
+            lambda to, mode: checkpoint.load(to, mode).state,
+            device=torch.device("cuda", 0),
+            precision=precision,
+            quantization=quantization(kind, target),
+        )
 
 
 def emulated(
@@ -77,17 +80,33 @@ def emulated(
         return exact.cpu(), model.sample(observation, noise, STEPS, conditioning=asked).cpu()
 
 
+@pytest.mark.parametrize("kernels", ["auto", "portable"])
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("precision", ["fp8", "fp8-mlp"])
-def test_the_engine_is_as_far_from_float32_as_its_emulation(case: str, precision: Precision) -> None:
+def test_the_engine_is_as_far_from_float32_as_its_emulation(case: str, precision: Precision, kernels: str) -> None:
     one = golden_cases()[case]
     exact, expected = emulated(one, precision, 0.0)
-    ours = backend(one.kind, precision).sample(one.observation, one.noise, STEPS).actions
+    ours = backend(one.kind, precision, kernels=kernels).sample(one.observation, one.noise, STEPS).actions
     print(
         f"{case} {precision}: {relative_rms(ours, exact):.4f} of float32, emulated {relative_rms(expected, exact):.4f}"
     )
     assert relative_rms(ours, exact) < 1.3 * relative_rms(expected, exact) + 0.01
     assert relative_rms(ours, expected) < 0.75 * relative_rms(expected, exact) + 0.02
+
+
+@pytest.mark.parametrize("kernels", ["auto", "portable"])
+def test_a_batch_is_as_far_from_float32_as_its_emulation(kernels: str) -> None:
+    one = golden_cases()["b_third_masked"]
+    exact, expected = emulated(one, "fp8", 0.0)
+    four = Observation(
+        **{name: value.repeat(4, *[1] * (value.dim() - 1)) for name, value in vars(one.observation).items()}
+    )
+    runner: Any = backend("pi05", "fp8", kernels=kernels)
+    ours = runner.sample(four, one.noise.repeat(4, 1, 1), STEPS).actions
+    assert any("4 observations" in batch for batch in runner.describe()["batches"])
+    for row in ours:
+        assert relative_rms(row[None], exact) < 1.3 * relative_rms(expected, exact) + 0.01
+        assert relative_rms(row[None], expected) < 0.75 * relative_rms(expected, exact) + 0.02
 
 
 @pytest.mark.parametrize("which", ["held", "identity", "staircase"])

@@ -178,7 +178,7 @@ def test_a_call_may_have_a_horizon_of_its_own(horizon: int, reference: UnifiedPo
     expected = reference.infer(obs, noise=noise, num_steps=2, horizon=horizon)["actions"]
     np.testing.assert_allclose(result, expected, rtol=0, atol=2e-5)
     both = policy.infer_batch([obs, obs], seed=3, horizon=horizon)
-    np.testing.assert_array_equal(both[0]["actions"], result)
+    np.testing.assert_allclose(both[0]["actions"], result, rtol=0, atol=2e-5)
     np.testing.assert_array_equal(
         policy.submit(obs, seed=3, horizon=horizon, serially=True).result()["actions"], result
     )

@@ -9,7 +9,6 @@ don't cover takes the engine's operations one by one. `describe()` says what run
 import importlib.util
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cached_property
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
@@ -49,6 +48,7 @@ class FusedBackend(CudaGraphBackend):
     name: ClassVar[str] = "fused"
     # measured on an H200 in bfloat16, two cameras; in FP8 it is 1, 2.2, 3.0, 5.3, 9.8
     batch_costs: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.2, 8: 5.6, 16: 11}
+    _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
     _fp8_expert: list[Any] | None = None  # layers with `Fp8Matrix`, of batches
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
@@ -155,8 +155,9 @@ class FusedBackend(CudaGraphBackend):
         return "fp8 in the denoising kernel; bf16 where operations denoise"
 
     def _make_ops(self) -> Ops:
-        from turbopi.kernels.ops import fused_ops  # Triton isn't imported for other backends
+        from turbopi.kernels.ops import fused_ops, hopper_kernels  # Triton isn't imported for other backends
 
+        self._on_hopper = hopper_kernels(self.device)
         return fused_ops(self.device)
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
@@ -215,13 +216,6 @@ class FusedBackend(CudaGraphBackend):
         kernel = self._hopper_kernel(loop, rows, table) if self._on_hopper else self._portable_kernel(loop, rows, table)
         self._put_expert_away()
         return kernel
-
-    @cached_property
-    def _on_hopper(self) -> bool:
-        """Whether kernels for compute capability 9.0 run."""
-        from turbopi.kernels.ops import hopper_kernels
-
-        return hopper_kernels(self.device)
 
     def _hopper_kernel(self, loop: Loop, rows: int, table: Tensor) -> Denoiser:
         from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, DenoiseKernel, unavailable
