@@ -3,7 +3,7 @@
 Shapes: N steps, L layers, D width, F feed-forward width, n query heads of K columns.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -12,12 +12,25 @@ from torch import Tensor
 from turbopi.config import GemmaConfig, ModelConfig
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import GemmaLayer
-from turbopi.kernels.quantize import quantize
-from turbopi.quantization.fp8 import E4M3, Directions
+from turbopi.quantization.fp8 import E4M3, Directions, Fp8Matrix, channel_scales, to_e4m3
+from turbopi.quantization.rounding import feedback, round_with_feedback_plain
 
 TILE = 8  # output channels
 CHUNK_BYTES = 64  # of a channel: the part of the reduction of which a lane has 16 bytes
 KINDS = ("qkv", "out", "gate_up", "down")  # a layer's matrices, in the order in which they are read
+
+
+Quantize = Callable[[Tensor, float, Directions | None], Fp8Matrix]
+
+
+def quantize_plain(weight: Tensor, input_scale: float, directions: Directions | None) -> Fp8Matrix:
+    """`kernels.quantize.quantize` without its kernel (which is in this file's own parent, so it can't be imported)."""
+    scale = channel_scales(weight)
+    if directions is None:
+        rounded = to_e4m3(weight, (1 / scale)[:, None])
+    else:
+        rounded = round_with_feedback_plain(weight, 1 / scale, *feedback(directions.to(weight.device)))
+    return Fp8Matrix(rounded, scale * input_scale, 1 / input_scale, weight.dtype)
 
 
 def refusal(config: ModelConfig) -> str | None:
@@ -79,9 +92,10 @@ class PackedExpert:
         layers: list[GemmaLayer],
         inputs: Mapping[str, float] | None = None,
         directions: Mapping[str, Directions] | None = None,
+        quantize: Quantize = quantize_plain,
     ) -> "PackedExpert":
         """`inputs`: the activations' scales by site, and weights become E4M3 with a scale for each output channel,
-        rounded for `directions` by site.
+        rounded for `directions` by site; `kernels.quantize.quantize` does the same faster, on a GPU.
 
         Raises BackendError for sizes that the kernel doesn't cover.
         """
