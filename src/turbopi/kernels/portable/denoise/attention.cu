@@ -21,29 +21,29 @@ struct Keys {
 struct First {
   uint4 keys[LOGIT_STEPS], values[4];
 };
-__device__ __forceinline__ int key_of(int tile) { return tile * 8 + threadIdx.x % 32 / 4; }
-__device__ __forceinline__ int value_of(int step, int i) { return step * 16 + threadIdx.x % 4 * 2 + i % 2 + i / 2 * 8; }
-__device__ __forceinline__ int value_column() { return threadIdx.x / 32 % DIM_GROUPS * 64 + threadIdx.x % 32 / 4 * 8; }
+__device__ __forceinline__ int key_of(int thread, int tile) { return tile * 8 + thread % 32 / 4; }
+__device__ __forceinline__ int value_of(int thread, int step, int i) { return step * 16 + thread % 4 * 2 + i % 2 + i / 2 * 8; }
+__device__ __forceinline__ int value_column(int thread) { return thread / 32 % DIM_GROUPS * 64 + thread % 32 / 4 * 8; }
 
 template <bool PREFIX>
-__device__ __forceinline__ void ask_first(First& first, const Keys& keys, const Keys& values, int begin, int count) {
-  const int key = key_of(threadIdx.x / 32), group = threadIdx.x / 32 / DIM_GROUPS;
+__device__ __forceinline__ void ask_first(int thread, First& first, const Keys& keys, const Keys& values, int begin, int count) {
+  const int key = key_of(thread, thread / 32), group = thread / 32 / DIM_GROUPS;
   if (PREFIX || (begin + key >= keys.length && key < count))
 #pragma unroll
     for (int i = 0; i < LOGIT_STEPS; ++i)
       first.keys[i] =
-          keys.load(begin + key, i * 32 + threadIdx.x % 4 * 8, key < count && (!PREFIX || begin + key < keys.length));
+          keys.load(begin + key, i * 32 + thread % 4 * 8, key < count && (!PREFIX || begin + key < keys.length));
 #pragma unroll
   for (int i = 0; i < 4; ++i) {
-    const int at = value_of(group, i);
+    const int at = value_of(thread, group, i);
     if (PREFIX || (begin + at >= keys.length && at < count))
-      first.values[i] = values.load(begin + at, value_column(), at < count && (!PREFIX || begin + at < keys.length));
+      first.values[i] = values.load(begin + at, value_column(thread), at < count && (!PREFIX || begin + at < keys.length));
   }
 }
 
 // The queries of a row tile, to shared memory.
-__device__ __forceinline__ void take_queries(const Args& args, float* smem, int row_tile) {
-  for (int i = threadIdx.x; i < 16 * HD / 8; i += THREADS) {
+__device__ __forceinline__ void take_queries(int thread, const Args& args, float* smem, int row_tile) {
+  for (int i = thread; i < 16 * HD / 8; i += THREADS) {
     const int row = i / (HD / 8), at = i % (HD / 8);
     uint4 v = make_uint4(0, 0, 0, 0);
     if (row_tile * 16 + row < ROWS) v = load_shared_by_grid(args.queries + ((row_tile * 16 + row) * HD + at * 8) * 2);
@@ -51,16 +51,12 @@ __device__ __forceinline__ void take_queries(const Args& args, float* smem, int 
   }
 }
 
-__device__ __forceinline__ void logits(const Args& args, float* smem, const First& first, const Keys& keys, int begin,
+__device__ __forceinline__ void logits(int thread, const Args& args, float* smem, const First& first, const Keys& keys, int begin,
                                        int count) {
-  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32, g = lane / 4, t = lane % 4;
+  const int warp = thread / 32, lane = thread % 32, g = lane / 4, t = lane % 4;
   const float* const queries = smem + S_QUERIES + g * QUERIES_ROW + t * 4;
-  for (int tile = warp; tile * 8 < count; tile += WARPS) {
+  auto multiply = [&](int tile, const uint4(&k)[LOGIT_STEPS]) {
     float c[4] = {};
-    uint4 k[LOGIT_STEPS];
-#pragma unroll
-    for (int i = 0; i < LOGIT_STEPS; ++i)
-      k[i] = tile == warp ? first.keys[i] : keys.load(begin + key_of(tile), i * 32 + t * 8, key_of(tile) < count);
 #pragma unroll
     for (int i = 0; i < LOGIT_STEPS; ++i) {
       uint4 low = make_uint4(0, 0, 0, 0), high = low;
@@ -74,12 +70,21 @@ __device__ __forceinline__ void logits(const Args& args, float* smem, const Firs
     float* const to = smem + S_WORK + g * LOGITS_ROW + tile * 8 + t * 2;
     *(float2*)to = make_float2(c[0] * by, c[1] * by);
     *(float2*)(to + 8 * LOGITS_ROW) = make_float2(c[2] * by, c[3] * by);
+  };
+  if (warp * 8 < count) multiply(warp, first.keys);
+#pragma unroll 1
+  for (int tile = warp + WARPS; tile * 8 < count; tile += WARPS) {
+    uint4 k[LOGIT_STEPS];
+#pragma unroll
+    for (int i = 0; i < LOGIT_STEPS; ++i)
+      k[i] = keys.load(begin + key_of(thread, tile), i * 32 + t * 8, key_of(thread, tile) < count);
+    multiply(tile, k);
   }
 }
 
 // Weights 2^(logit - largest), rounded to bfloat16; largest and sum of a row go to the combination.
-__device__ __forceinline__ void softmax(const Args& args, float* smem, int share, int count) {
-  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+__device__ __forceinline__ void softmax(int thread, const Args& args, float* smem, int share, int count) {
+  const int warp = thread / 32, lane = thread % 32;
   for (int row = warp; row < 16; row += WARPS) {
     const float* const from = smem + S_WORK + row * LOGITS_ROW;
     unsigned short* const to = (unsigned short*)(smem + S_WEIGHTS + row * WEIGHTS_ROW);
@@ -98,22 +103,16 @@ __device__ __forceinline__ void softmax(const Args& args, float* smem, int share
 }
 
 // A warp weighs 64 columns of its key group's values. Column n of mma's tile j is column 8 n + j: a lane's 16 bytes.
-__device__ __forceinline__ void weigh(float* smem, const First& first, const Keys& values, int begin, int count) {
-  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32, g = lane / 4, t = lane % 4;
+__device__ __forceinline__ void weigh(int thread, float* smem, const First& first, const Keys& values, int begin, int count) {
+  const int warp = thread / 32, lane = thread % 32, g = lane / 4, t = lane % 4;
   const int dims = warp % DIM_GROUPS * 64, group = warp / DIM_GROUPS;
   if (group >= KEY_GROUPS) return;
   float c[8][4] = {};
-#pragma unroll 2
-  for (int step = group; step * 16 < count; step += KEY_GROUPS) {
-    union Row {
-      uint4 all;
-      u32 of[4];
-    } rows[4];
-#pragma unroll
-    for (int i = 0; i < 4; ++i) {
-      const int key = value_of(step, i);
-      rows[i].all = step == group ? first.values[i] : values.load(begin + key, value_column(), key < count);
-    }
+  union Row {
+    uint4 all;
+    u32 of[4];
+  };
+  auto multiply = [&](int step, const Row(&rows)[4]) {
     const u32* const weights = (const u32*)(smem + S_WEIGHTS) + g * WEIGHTS_ROW + step * 8 + t;
     const u32 a0 = weights[0], a1 = weights[8 * WEIGHTS_ROW], a2 = weights[4], a3 = weights[8 * WEIGHTS_ROW + 4];
 #pragma unroll
@@ -122,6 +121,18 @@ __device__ __forceinline__ void weigh(float* smem, const First& first, const Key
       mma(c[j], a0, a1, a2, a3, __byte_perm(rows[0].of[j / 2], rows[1].of[j / 2], half),
           __byte_perm(rows[2].of[j / 2], rows[3].of[j / 2], half));
     }
+  };
+  Row rows[4];
+  if (group * 16 < count) {
+#pragma unroll
+    for (int i = 0; i < 4; ++i) rows[i].all = first.values[i];
+    multiply(group, rows);
+  }
+#pragma unroll(WARPS > 8 ? 1 : 3)
+  for (int step = group + KEY_GROUPS; step * 16 < count; step += KEY_GROUPS) {
+#pragma unroll
+    for (int i = 0; i < 4; ++i) rows[i].all = values.load(begin + value_of(thread, step, i), value_column(thread), value_of(thread, step, i) < count);
+    multiply(step, rows);
   }
   float* const to = smem + S_OUT + (group * 16 + g) * OUT_ROW;
 #pragma unroll
@@ -135,6 +146,7 @@ __device__ __forceinline__ void weigh(float* smem, const First& first, const Key
 }
 
 __device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem, int layer, int length) {
+  const int thread = thread_of_phase();
   const Keys keys{args.cache_k + layer * args.layer_stride, args.keys, length};
   const Keys values{args.cache_v + layer * args.layer_stride, args.values, length};
   const int total = length + T, share_keys = ((total + 7) / 8 + SPLITS - 1) / SPLITS * 8;
@@ -143,22 +155,23 @@ __device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem
   auto count_of = [&](int share) {
     return share < ROW_TILES * SPLITS ? max(min(total - begin_of(share), share_keys), 0) : 0;
   };
-  int share = blockIdx.x;
-  ask_first<true>(first, keys, values, begin_of(share), count_of(share));
+  const int block = block_of_phase();
+  int share = block;
+  ask_first<true>(thread, first, keys, values, begin_of(share), count_of(share));
   grid.wait();
   for (; share < ROW_TILES * SPLITS; share += BLOCKS) {
     const int begin = begin_of(share), count = count_of(share);
-    if (share != blockIdx.x) ask_first<true>(first, keys, values, begin, count);
-    ask_first<false>(first, keys, values, begin, count);
-    take_queries(args, smem, share / SPLITS);
+    if (share != block) ask_first<true>(thread, first, keys, values, begin, count);
+    ask_first<false>(thread, first, keys, values, begin, count);
+    take_queries(thread, args, smem, share / SPLITS);
     __syncthreads();
-    logits(args, smem, first, keys, begin, count);
+    logits(thread, args, smem, first, keys, begin, count);
     __syncthreads();
-    softmax(args, smem, share, count);
+    softmax(thread, args, smem, share, count);
     __syncthreads();
-    weigh(smem, first, values, begin, count);
+    weigh(thread, smem, first, values, begin, count);
     __syncthreads();
-    for (int i = threadIdx.x; i < 16 * HD / 4; i += THREADS) {
+    for (int i = thread; i < 16 * HD / 4; i += THREADS) {
       float4 sum = make_float4(0, 0, 0, 0);
 #pragma unroll
       for (int group = 0; group < KEY_GROUPS; ++group) {
@@ -173,9 +186,10 @@ __device__ __forceinline__ void attend(Grid& grid, const Args& args, float* smem
 
 // All shares of a row: a lane has two columns of it.
 __device__ __forceinline__ void combine(const Args& args, float attended_times) {
+  const int thread = thread_of_phase();
   constexpr int TOGETHER = SPLITS < 16 ? SPLITS : 16;
-  for (int task = threadIdx.x / 32 * BLOCKS + blockIdx.x; task * 64 < ROWS * HD; task += WARPS * BLOCKS) {
-    const int at = task * 64 + threadIdx.x % 32 * 2, row = at / HD, column = at % HD;
+  for (int task = thread / 32 * BLOCKS + block_of_phase(); task * 64 < ROWS * HD; task += WARPS * BLOCKS) {
+    const int at = task * 64 + thread % 32 * 2, row = at / HD, column = at % HD;
     if (at >= ROWS * HD) continue;
     float top = -infinity(), sum = 0;
     float2 out = make_float2(0, 0);

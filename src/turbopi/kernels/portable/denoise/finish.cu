@@ -4,7 +4,7 @@ __device__ __forceinline__ float2 two(const float* from) { return __ldg((const f
 
 // 1 / rms of all tokens, from the sums of squares of all tiles.
 __device__ __forceinline__ void make_inverse_rms(const Args& args, float* smem) {
-  const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
+  const int thread = thread_of_phase(), warp = thread / 32, lane = thread % 32;
 #pragma unroll
   for (int first = 0; first < T; first += WARPS) {
     const int token = first + warp;

@@ -22,8 +22,8 @@ __device__ __forceinline__ void embed(const Args& args, const Stream& into, cons
 
 // Final norm, action_out_proj and the Euler step: a warp takes one number of a token.
 __device__ __forceinline__ void advance(const Args& args, const float* scale, int step) {
-  const int lane = threadIdx.x % 32;
-  for (int task = threadIdx.x / 32 * BLOCKS + blockIdx.x; task < T * A; task += WARPS * BLOCKS) {
+  const int thread = thread_of_phase(), lane = thread % 32;
+  for (int task = thread / 32 * BLOCKS + blockIdx.x; task < T * A; task += WARPS * BLOCKS) {
     const int token = task / A, a = task % A;
     float sum = 0, squares = 0;
 #pragma unroll 8

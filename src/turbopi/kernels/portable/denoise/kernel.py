@@ -65,9 +65,7 @@ def unavailable(device: torch.device, fp8: bool = False) -> str | None:
 ARGS = Struct(
     "Args",
     (
-        Parameter(
-            "const unsigned char*", "weights", "[L] qkv, out, gate|up, down: [tile][chunk][8 channels][64 bytes]"
-        ),
+        Parameter("const unsigned char*", "weights", "[L] qkv, out, gate|up, down: [tile][chunk][8][64 bytes]"),
         Parameter("const float*", "table", "[N][2L+1][3][D]: scale, shift, gate"),
         Parameter("const float*", "shifted", "[N][L][channels of qkv, gate|up]: W shift"),
         Parameter("const float*", "row_scales", "[L][channels of qkv, gate|up]: FP8"),
@@ -112,7 +110,8 @@ def kernel_sizes(
     g, keys = config.expert, cache_rows + suffix
     row_tiles = -(-suffix * g.num_heads // 16)
     splits = max(min(blocks // row_tiles, MAX_SPLITS), 1, -(-keys // MAX_SPLIT_KEYS))
-    split_keys = -(-(-(-keys // 8)) // splits) * 8
+    key_tiles = -(-keys // 8)
+    split_keys = -(-key_tiles // splits) * 8
     return {
         "TP_WIDTH": g.width,
         "TP_MLP_DIM": g.mlp_dim,
@@ -229,8 +228,8 @@ class PortableDenoiser:
         self._prepare.launch(-(-prepared // PREPARE_THREADS), PREPARE_THREADS, args)
         self._kernel.launch_cooperative(self._blocks, self._choice.warps * 32, args)
 
-    def trace(self) -> Tensor:
-        """int64[blocks, PHASES, 2]: cycles of all launches so far at work, and at the barrier behind it; if `traced`."""
+    def trace(self) -> Tensor:  # of a kernel that was made with `traced`
+        """int64[blocks, PHASES, 2]: cycles of all launches so far at work, and at the barrier behind it."""
         return self._tensors["trace"].long() & 0xFFFFFFFF
 
 

@@ -12,6 +12,15 @@ __device__ __forceinline__ uint4 load_weights(const byte* from) {
 __device__ __forceinline__ uint4 load_shared_by_grid(const void* from) { return __ldcg((const uint4*)from); }
 __device__ __forceinline__ void to_l2(const void* at) { asm volatile("prefetch.global.L2 [%0];" ::"l"(at)); }
 
+// threadIdx.x and blockIdx.x, of which the compiler doesn't know that they are the same in all phases: what follows from
+// them would be made once for all of them, and kept in local memory.
+__device__ __forceinline__ int of_phase(int index) {
+  asm volatile("" : "+r"(index));
+  return index;
+}
+__device__ __forceinline__ int thread_of_phase() { return of_phase(threadIdx.x); }
+__device__ __forceinline__ int block_of_phase() { return of_phase(blockIdx.x); }
+
 // A barrier of the whole grid in two halves: what lies between depends on no other block.
 struct Grid {
   u32 *counter, *trace;

@@ -13,21 +13,28 @@ struct Item {
   bool valid;
 };
 
+// Tiles are shared out evenly: a block's first one.
+template <class S>
+__device__ __forceinline__ int first_tile(int block) {
+  return (long long)S::TILES * block / BLOCKS;
+}
+
 template <class S>
 struct Product {
   const byte* weights;  // this lane's of the product's first tile and chunk
-  int first, end;       // tiles
+  int thread;
+  int first, end;  // tiles
   uint4 w[S::IN_FLIGHT];
 
-  __device__ __forceinline__ explicit Product(const byte* all) {
-    weights = all + threadIdx.x % 32 * 16;
-    first = (long long)S::TILES * blockIdx.x / BLOCKS;
-    end = (long long)S::TILES * (blockIdx.x + 1) / BLOCKS;
+  __device__ __forceinline__ explicit Product(const byte* all) : thread(thread_of_phase()) {
+    weights = all + thread % 32 * 16;
+    const int block = block_of_phase();
+    first = first_tile<S>(block), end = first_tile<S>(block + 1);
   }
-  __device__ __forceinline__ static int first_chunk() { return threadIdx.x / 32 / S::WN * S::WARP_CHUNKS; }
+  __device__ __forceinline__ int first_chunk() const { return thread / 32 / S::WN * S::WARP_CHUNKS; }
   // Load number n of a lane, counted over all passes.
   __device__ __forceinline__ uint4 load(int pass, int n) const {
-    const int tile = first + pass * S::PASS_TILES + threadIdx.x / 32 % S::WN * S::WARP_TILES + n % S::WARP_TILES;
+    const int tile = first + pass * S::PASS_TILES + thread / 32 % S::WN * S::WARP_TILES + n % S::WARP_TILES;
     const int chunk = n / S::WARP_TILES;
     uint4 v = make_uint4(0, 0, 0, 0);
     const bool there = S::CHUNKS % S::WK == 0 || first_chunk() + chunk < S::CHUNKS;
@@ -40,7 +47,7 @@ struct Product {
     for (int n = 0; n < S::IN_FLIGHT; ++n) w[n] = load(0, n);
   }
   __device__ __forceinline__ void load_chunk(uint4 (&a)[GROUPS], const byte* activation, int chunk) const {
-    const int lane = threadIdx.x % 32, at = first_chunk() + chunk;
+    const int lane = thread % 32, at = first_chunk() + chunk;
     const bool there = S::CHUNKS % S::WK == 0 || at < S::CHUNKS;
 #pragma unroll
     for (int group = 0; group < GROUPS; ++group) {
@@ -59,8 +66,8 @@ struct Product {
   // `meanwhile` is done while the first activations are on their way.
   template <class Finish, class Meanwhile>
   __device__ __forceinline__ void run(Grid& grid, float* smem, const byte* activation, Finish& finish, Meanwhile meanwhile) {
-    const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
-    Item mine = item(0, threadIdx.x);
+    const int warp = thread / 32, lane = thread % 32;
+    Item mine = item(0, thread);
     auto factors = finish.factors(mine);
     grid.wait();
     uint4 a[S::A_IN_FLIGHT][GROUPS];
@@ -103,7 +110,7 @@ struct Product {
         }
       __syncthreads();
 #pragma unroll 1
-      for (int index = threadIdx.x; index - lane < S::PASS_TILES * T * 4; index += THREADS) {
+      for (int index = thread; index - lane < S::PASS_TILES * T * 4; index += THREADS) {
         if (pass > 0 || index >= THREADS) mine = item(pass, index), factors = finish.factors(mine);
         float2 sum = make_float2(0, 0);
         if (mine.valid) {
@@ -124,8 +131,8 @@ struct Product {
 template <class S>
 __device__ __forceinline__ void ahead(const byte* weights) {
   if (!TP_AHEAD) return;
-  const long long first = (long long)S::TILES * blockIdx.x / BLOCKS, end = (long long)S::TILES * (blockIdx.x + 1) / BLOCKS;
-  const byte* const from = weights + first * S::CHUNKS * CHUNK_BYTES;
-  for (long long at = threadIdx.x * 128; at < (end - first) * S::CHUNKS * CHUNK_BYTES; at += THREADS * 128)
+  const int block = block_of_phase(), first = first_tile<S>(block), end = first_tile<S>(block + 1);
+  const byte* const from = weights + (long long)first * S::CHUNKS * CHUNK_BYTES;
+  for (int at = thread_of_phase() * 128; at < (end - first) * S::CHUNKS * CHUNK_BYTES; at += THREADS * 128)
     to_l2(from + at);
 }

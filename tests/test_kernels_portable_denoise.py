@@ -1,0 +1,182 @@
+"""The portable denoising kernel: its packing and its machine code on the CPU, its results on any GPU from 8.0 on."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from kernel_turns.problems import (
+    CONFIGS,
+    FULL,
+    GPU,
+    Problem,
+    has_nvrtc,
+    input_scales,
+    ordinary_bf16,
+    plain,
+    problem,
+    relative,
+)
+from torch import Tensor
+
+from turbopi.errors import BackendError, BackendUnavailable
+from turbopi.kernels.portable.denoise import kernel as denoise
+from turbopi.kernels.portable.denoise import packing
+from turbopi.kernels.portable.denoise.packing import KINDS, PackedExpert
+from turbopi.kernels.portable.quantize import quantize
+from turbopi.kernels.sm90.denoise.plain import in_e4m3
+from turbopi.model.denoise import euler_step
+
+CPU = torch.device("cpu")
+SMALL = pytest.mark.parametrize("name", ["golden", "tiny", "odd", "uneven"])
+
+
+@SMALL
+def test_packing_keeps_every_weight(name: str) -> None:
+    p = problem(name, 1, 1, 3, 0, CPU)
+    packed = PackedExpert.pack(p.config, p.layers)
+    for i, layer in enumerate(p.layers):
+        matrices = layer.qkv, layer.out, layer.gate_up, layer.down
+        assert all(torch.equal(a, b) for a, b in zip(packed.matrices(i), matrices, strict=True))
+
+
+@SMALL
+def test_packing_in_fp8_keeps_every_weight_as_e4m3_rounds_it(name: str) -> None:
+    p = problem(name, 1, 1, 3, 0, CPU, outliers=True)
+    ones = {f"expert.{i}.{kind}": 1.0 for i in range(p.config.expert.depth) for kind in KINDS}
+    packed = PackedExpert.pack(p.config, p.layers, ones)
+    for i, layer in enumerate(p.layers):
+        for found, matrix in zip(packed.matrices(i), (layer.qkv, layer.out, layer.gate_up, layer.down), strict=True):
+            torch.testing.assert_close(found, quantize(matrix, 1.0).dequantized(), rtol=1e-6, atol=0)
+
+
+def test_a_lane_has_16_bytes_of_one_channel_side_by_side() -> None:
+    matrix = torch.arange(16 * 48).view(16, 48).to(torch.int16)
+    tiles = packing.tiles(matrix).view(2, 2, 8, 4, 8)  # [tile][chunk][channel][lane of four][column]
+    assert torch.equal(tiles[1, 0, 3, 2], matrix[11, 16:24])
+    assert torch.equal(tiles[0, 1, 5, :2].flatten(), matrix[5, 32:]) and not tiles[:, 1, :, 2:].any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"width": 1000}, "multiples of 16: width 1000"),
+        ({"head_dim": 40, "num_heads": 4}, "multiple of 16 up to 256, it is 40"),
+        ({"head_dim": 512}, "multiple of 16 up to 256, it is 512"),
+    ],
+)
+def test_sizes_it_does_not_cover_are_named(changes: dict[str, int], text: str) -> None:
+    g = dataclasses.replace(FULL.expert, **changes)
+    vlm = dataclasses.replace(FULL.vlm, head_dim=g.head_dim, num_heads=g.num_heads)
+    with pytest.raises(BackendError, match=text):
+        PackedExpert.pack(dataclasses.replace(FULL, expert=g, vlm=vlm), [])
+
+
+def test_a_machine_without_gpu_is_refused() -> None:
+    p = problem("golden", 1, 4, 3, 0, CPU)
+    packed = PackedExpert.pack(p.config, p.layers)
+    with pytest.raises(BackendUnavailable, match="needs an NVIDIA GPU"):
+        denoise.PortableDenoiser(p.config, packed, p.small, p.table, cache_rows=10, suffix=4, device=CPU)
+
+
+def test_times_by_token_are_refused() -> None:
+    p = problem("golden", 1, 4, 3, 0, CPU)
+    packed = PackedExpert.pack(p.config, p.layers)
+    with pytest.raises(BackendUnavailable, match="no times by token"):
+        denoise.PortableDenoiser(
+            *(p.config, packed, p.small, p.table),
+            cache_rows=10,
+            suffix=4,
+            device=CPU,
+            num_steps=1,
+            by_token=True,
+        )
+
+
+def test_older_gpus_are_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (8, 6))
+    assert denoise.unavailable(GPU) is None
+    assert "in FP8 needs compute capability 8.9 or newer, this GPU has 8.6" in str(denoise.unavailable(GPU, fp8=True))
+
+
+@pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
+@pytest.mark.parametrize("arch", ["sm_80", "sm_86", "sm_89", "sm_120"])
+def test_the_source_compiles_for_gpus_that_are_not_here(tmp_path: Path, arch: str) -> None:
+    for fp8 in {False, arch in ("sm_89", "sm_120")}:
+        sizes = denoise.kernel_sizes(
+            CONFIGS["golden"], blocks=84, cache_rows=976, suffix=10, fp8=fp8, choice=denoise.choices(10)
+        )
+        assert denoise.compiled(arch, sizes, folder=tmp_path)
+
+
+# ---- on a GPU
+
+
+def run(p: Problem, packed: PackedExpert, blocks: int | None = None) -> tuple[Tensor, Tensor]:
+    """Both outputs, poisoned before."""
+    steps, chunk, rows = p.table.shape[0], p.noise.shape, p.cache_k.shape[1]
+    x_t = torch.full((steps + 1, *chunk), torch.nan, device=GPU)
+    v_t = torch.full((steps, *chunk), torch.nan, device=GPU)
+    kernel = denoise.PortableDenoiser(
+        *(p.config, packed, p.small, p.table), cache_rows=rows, suffix=chunk[0], device=GPU, blocks=blocks
+    )
+    for _ in range(2):  # scratch memory of the first launch changes nothing
+        kernel.launch(p.noise, p.cache_k, p.cache_v, torch.tensor([p.length], device=GPU), x_t, v_t)
+    torch.cuda.synchronize()
+    return x_t, v_t
+
+
+SHAPES = pytest.mark.parametrize(
+    ("name", "steps", "suffix", "length"),
+    [
+        ("golden", 3, 10, 37),
+        ("golden", 1, 1, 5),
+        ("golden", 10, 50, 77),
+        ("tiny", 3, 10, 300),
+        ("odd", 3, 17, 101),
+        ("uneven", 2, 33, 256),
+        ("shallow", 3, 10, 571),
+        ("shallow", 2, 64, 968),
+        ("shallow", 1, 50, 1100),
+        ("full", 10, 10, 560),
+        ("full", 3, 50, 560),
+    ],
+)
+
+
+@pytest.mark.gpu
+@SHAPES
+def test_kernel_is_as_exact_as_ordinary_bf16(name: str, steps: int, suffix: int, length: int) -> None:
+    p = problem(name, steps, suffix, length, steps * 1000 + suffix, GPU)
+    x_t, v_t = run(p, PackedExpert.pack(p.config, p.layers))
+    reference, _ = plain(p, torch.float64)
+    assert torch.equal(x_t[0], p.noise)
+    torch.testing.assert_close(x_t[1:], euler_step(x_t[:-1], v_t, steps), rtol=0, atol=0)
+    assert relative(x_t[-1], reference[-1]) <= 1.1 * relative(ordinary_bf16(p), reference[-1])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("blocks", [1, 7, 40])
+def test_any_number_of_blocks_gives_the_same(blocks: int) -> None:
+    p = problem("tiny", 2, 20, 100, 5, GPU)
+    packed = PackedExpert.pack(p.config, p.layers)
+    assert relative(run(p, packed, blocks=blocks)[0], run(p, packed)[0]) < 5e-3
+
+
+@pytest.mark.gpu
+@SHAPES
+def test_in_fp8_it_is_as_exact_as_its_emulation(name: str, steps: int, suffix: int, length: int) -> None:
+    """Both against exact activations. Rounded numbers near an edge fall either way, so each problem has some luck."""
+    if denoise.unavailable(GPU, fp8=True):
+        pytest.skip("this GPU has no FP8")
+    ours, emulated = [], []
+    for seed in range(4 if name in ("shallow", "full") else 16):
+        p = problem(name, steps, suffix, length, seed, GPU)
+        packed = PackedExpert.pack(p.config, p.layers, input_scales(p))
+        x_t, _ = run(p, packed)
+        stood_for = [dict(zip(KINDS, packed.matrices(i), strict=True)) for i in range(p.config.expert.depth)]
+        p.layers = [dataclasses.replace(layer, **new) for layer, new in zip(p.layers, stood_for, strict=True)]
+        reference = plain(p, torch.float64)[0][-1]
+        ours.append(relative(x_t[-1], reference))
+        emulated.append(relative(plain(p, torch.float64, in_e4m3(packed.inputs))[0][-1], reference))
+    assert sum(x * x for x in ours) <= 1.2**2 * sum(x * x for x in emulated)
