@@ -13,7 +13,7 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from turbopi.errors import ConfigError
-from turbopi.reading import read_document
+from turbopi.reading import read_document, shown
 
 FILE = Path(__file__).parents[1] / "data" / "gpus.json"
 _Positive = Annotated[float, Meta(gt=0)]
@@ -61,7 +61,7 @@ def find_gpu(name: str) -> GpuSpec:
     known = published_gpus()
     if typed not in known:
         raise ConfigError(
-            f"no published numbers of a GPU {name!r} are known here; known are {', '.join(known)}. On the GPU itself "
-            "`turbopi bench` measures"
+            f"no published numbers of a GPU {shown(name)} are known here; known are {', '.join(known)}. "
+            "On the GPU itself `turbopi bench` measures"
         )
     return known[typed]
