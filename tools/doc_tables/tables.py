@@ -9,6 +9,7 @@ from kernel_turns.document import MarkedVariant, read_turns
 from msgspec.structs import replace
 
 from doc_tables.fleet import sizing
+from doc_tables.gpus import gpu_predictions, gpu_refusals, gpus
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
 from turbopi.bench.work import JOINS
 from turbopi.provenance import Gpu
@@ -310,5 +311,5 @@ TABLES = {
     "attacks": Table(_read_attacks, attacks),
     "delays": Table(_read_delays, delays),
     "layer_in_cycles": Table(_read_marks, layer_in_cycles),
-    "sizing": Table(_read_nothing, sizing),
+    **{lines.__name__: Table(_read_nothing, lines) for lines in (sizing, gpus, gpu_refusals, gpu_predictions)},
 }
