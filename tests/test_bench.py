@@ -351,6 +351,7 @@ def test_a_robots_own_observations_are_measured(monkeypatch: pytest.MonkeyPatch)
     assert document["robot"] == "libero"
     height, width = seen[0]["observation/image"].shape[:2]
     expected = {"cameras": 2, "horizon": 10, "steps": 1, "image_width": width, "image_height": height, "join": "none"}
+    expected["batch"] = 1
     job = asdict(as_document(document["main_job"], Job, "stdout"))
     assert {**job, "prompt_tokens": 0} == {**expected, "prompt_tokens": 0}
     assert document["main_job"]["prompt_tokens"] > 20
@@ -482,3 +483,37 @@ def test_a_backend_that_breaks_is_named_and_costs_no_other_result(monkeypatch: p
     result = CliRunner().invoke(app, [*command.split(), "bf16"])
     assert result.exit_code == 2
     assert "the workspace is too small" in result.output
+
+
+def test_a_batch_is_one_call_with_observations_of_its_own(
+    policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[list[str]] = []
+    together = policy.infer_batch
+
+    def noted(observations: list[dict[str, Any]], **more: Any) -> list[dict[str, Any]]:
+        asked.append([one["prompt"] for one in observations])
+        return together(observations, **more)
+
+    monkeypatch.setattr(policy, "infer_batch", noted)
+    latency = measure_calls(policy, Job(cameras=1, prompt_tokens=3, steps=1, batch=3), 2)
+    assert latency["total"].calls == 2 and len(asked) == 5
+    assert all(len(prompts) == len(set(prompts)) == 3 for prompts in asked)
+
+
+def test_a_batch_reads_the_weights_once() -> None:
+    one, four = (stage_work(ModelConfig(), Job(batch=batch), 2) for batch in (1, 4))
+    for stage in one:
+        assert four[stage].flops == 4 * one[stage].flops
+        assert one[stage].bytes <= four[stage].bytes < 1.2 * one[stage].bytes
+    assert str(Job(batch=4)) == "2 cameras, 48 tokens, H=10, B=4, 10 steps"
+    assert "batch" not in to_builtins(Job()) and to_builtins(Job(batch=4))["batch"] == 4
+
+
+def test_batches_are_planned_and_refused_for_chunks_that_join() -> None:
+    plan = BenchPlan(["pytorch"], ["f32"], batches=[2, 1, 4])
+    assert [job.batch for job in plan.jobs()] == [2, 1, 4] and plan.main == Job()
+    assert [plan.judges(job) for job in plan.jobs()] == [False, True, False]
+    joined = BenchPlan(["pytorch"], ["f32"], batches=[2], joins=["held"])
+    with pytest.raises(ConfigError, match="--join without --batch"):
+        joined.check(CPU)

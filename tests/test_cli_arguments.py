@@ -10,6 +10,7 @@ import pytest
 from cli_helpers import turbopi
 
 TINY = ("--random-weights", "pi05_tiny")
+PLAN = ("plan", "--hz", "50", "--horizon", "50")
 NOWHERE = ("--observations", "there/is/no/such/recording")  # refused late: what is refused first is another thing
 
 
@@ -35,6 +36,12 @@ NUMBERS: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
     (("bench", *TINY, "--image-size"), ("0x3", "640", "640x", "8193x1", "640x480,", "-1x3", HUGE)),
     (("bench", *TINY, "--horizons"), ("0", "1001", HUGE)),
     (("bench", *TINY, "--calls"), ("0", HUGE, "nan")),
+    (("bench", *TINY, "--batch"), ("0", "1025", "x", HUGE)),
+    ((*PLAN, "--gpu", "h200", "--robots"), ("0", "10001", "x", HUGE)),
+    ((*PLAN, "--robots", "1", "--gpu", "h200", "--delay-steps"), ("0", "26", HUGE)),
+    ((*PLAN, "--robots", "1", "--gpu", "h200", "--execution-horizon"), ("0", "50", "51", HUGE)),
+    ((*PLAN, "--robots", "1", "--gpu", "h200", "--overhead-ms"), ("-1", "nan", "60000", HUGE)),
+    ((*PLAN, "--robots", "1", "--gpu", "h200", "--precision"), ("", "fp7", "f32")),
     (("bench", *TINY, "--main-calls"), ("0", HUGE)),
     (("bench", *TINY, "--seconds"), ("-1", "nan", "x")),
     (("calibrate", *TINY, *NOWHERE, "--out", "never.json", "--count"), ("1", "-1", HUGE)),

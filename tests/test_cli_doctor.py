@@ -13,8 +13,8 @@ from cli_helpers import refusal, turbopi
 
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.checkpoint import write_random
-from turbopi.cli import checkups
-from turbopi.cli.checkups import Row
+from turbopi.cli import checkups, gpu_checkups
+from turbopi.cli.checkup import Row
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER
 
 
@@ -30,7 +30,8 @@ def doctor(*arguments: object) -> tuple[int, dict[str, dict[str, str]]]:
 def cpu_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A machine without a GPU, without PaliGemma's tokenizer, and with nothing else to do."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(checkups, "nvidia_smi", lambda: (None, []))
+    monkeypatch.setattr(gpu_checkups, "nvidia_smi", lambda: (None, []))
+    monkeypatch.setattr(gpu_checkups, "jetson", lambda: None)
     monkeypatch.setattr("psutil.getloadavg", lambda: (0.5, 0.5, 0.5))
     monkeypatch.setattr("shutil.disk_usage", lambda folder: types.SimpleNamespace(free=100e9))
     monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
@@ -114,46 +115,6 @@ def test_missing_and_old_packages_fail_by_name(monkeypatch: pytest.MonkeyPatch) 
     row = checkups.check_packages()
     assert row.level == "FAIL"
     assert row.found == f"rich is {version('rich')}, not >=99.1; no-such-package is missing"
-
-
-GPU_CASES = [
-    ((9, 0), 141, ["sm_80", "sm_90"], "OK", ""),
-    ((8, 6), 24, ["sm_80", "sm_90"], "OK", ""),
-    ((12, 0), 32, ["sm_90", "compute_90"], "OK", ""),
-    ((12, 0), 32, ["sm_80", "sm_90"], "FAIL", "install a PyTorch built for it: pytorch.org"),
-    ((8, 0), 40, ["sm_86"], "FAIL", "install a PyTorch built for it: pytorch.org"),
-    ((7, 5), 16, ["sm_75"], "WARN", "bfloat16 is slow below 8.0 (Ampere): use a newer GPU"),
-    ((8, 6), 8, ["sm_80"], "WARN", "too small for a full-size model in bf16 (about 9 GB); tiny ones run"),
-]
-
-
-@pytest.mark.parametrize(("capability", "memory", "code", "level", "fix"), GPU_CASES)
-def test_a_gpu_is_judged_by_capability_code_and_memory(
-    capability: tuple[int, int], memory: float, code: list[str], level: str, fix: str
-) -> None:
-    row = checkups.judge_gpu(0, "Some GPU", capability, memory, code)
-    assert (row.level, row.fix) == (level, fix)
-    assert row.found.startswith(f"Some GPU, compute capability {capability[0]}.{capability[1]}, {memory} GB")
-
-
-@pytest.mark.parametrize(
-    ("cuda", "found", "fix"),
-    [
-        (None, "this PyTorch is built without CUDA", "pip install --force-reinstall torch"),
-        ("12.8", "PyTorch (CUDA 12.8) can't use it", "update the NVIDIA driver"),
-    ],
-)
-def test_a_gpu_that_pytorch_cannot_use_fails(
-    cuda: str | None, found: str, fix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.version, "cuda", cuda)
-    monkeypatch.setattr(checkups, "nvidia_smi", lambda: ("570.1", ["NVIDIA H200"]))
-    (row,) = checkups.check_gpu()
-    assert row.level == "FAIL"
-    assert "NVIDIA H200" in row.found
-    assert found in row.found
-    assert row.fix.startswith(fix)
 
 
 @pytest.mark.parametrize(

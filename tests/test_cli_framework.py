@@ -27,7 +27,20 @@ from turbopi.errors import ConfigError, ObservationError
 from turbopi.policy import UnifiedPolicy
 
 COMMANDS = (
-    *("demo", "infer", "serve", "view", "inspect", "convert", "calibrate", "build", "export", "verify", "bench"),
+    *(
+        "demo",
+        "infer",
+        "serve",
+        "view",
+        "inspect",
+        "convert",
+        "calibrate",
+        "build",
+        "export",
+        "verify",
+        "bench",
+        "plan",
+    ),
     *("study", "eval", "compare", "backends", "doctor"),
 )
 

@@ -80,7 +80,8 @@ def test_every_command_in_the_text_exists_with_its_options(document: str, line: 
 
 def needs_nothing(words: list[str]) -> bool:
     """Whether a command runs anywhere in a minute: no checkpoint, no GPU, no second program."""
-    return words in (["backends"], ["doctor"]) or "pi05_tiny" in words
+    reckons = "--predict" in words[:-1] or (words[0] == "plan" and "--gpu" in words)
+    return words in (["backends"], ["doctor"]) or "pi05_tiny" in words or reckons
 
 
 def test_commands_that_need_no_checkpoint_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,6 +91,7 @@ def test_commands_that_need_no_checkpoint_run(tmp_path: Path, monkeypatch: pytes
     lines = {line for kind in ("blocks", "text") for name, line in all_of(kind) if name != "docs/tutorial.md"}
     runnable = [words for words in map(shlex.split, sorted(lines)) if needs_nothing(words)]
     assert any(words[0] == "eval" for words in runnable) and any(words[0] == "doctor" for words in runnable)
+    assert any("--predict" in words for words in runnable) and any(words[0] == "plan" for words in runnable)
     for words in runnable:
         result = turbopi(*words)
         assert result.exit_code == 0, f"turbopi {shlex.join(words)}: {result.output}"

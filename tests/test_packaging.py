@@ -1,13 +1,17 @@
 """The wheel has everything that the package needs, and works outside a checkout; what importing it does."""
 
 import os
+import re
 import subprocess
 import sys
 import sysconfig
 import zipfile
+from email.message import Message
+from email.parser import Parser
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "turbopi"
@@ -81,3 +85,32 @@ def test_importing_turbopi_keeps_threads_from_spinning(before: str, given: str |
     code = f"{before}import turbopi, os; print(os.environ.get('OMP_WAIT_POLICY'))"
     ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == seen
+
+
+@pytest.fixture
+def told(wheel: Path) -> Message:
+    """The wheel's metadata: what an index shows."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        return Parser().parsestr(archive.read(name).decode())
+
+
+def test_the_metadata_is_complete(told: Message) -> None:
+    """`scripts/check_wheel` has twine check the rest."""
+    assert told["License-Expression"] == "Apache-2.0" and told.get_all("License-File") == ["LICENSE", "NOTICE"]
+    assert told["Description-Content-Type"] == "text/markdown" and str(told.get_payload()).startswith("# Turbo-Pi")
+    assert told["Author"] == "the Turbo-Pi authors" and "openpi" in told["Keywords"] and told["Summary"]
+    pythons = [line.rsplit(" ", 1)[1] for line in told.get_all("Classifier", []) if ":: Python :: 3." in line]
+    versions = (ROOT / "docs" / "dev" / "versions.md").read_text()
+    assert pythons and all(f"| {python} |" in versions for python in pythons), "those that tests run with"
+    assert set(told.get_all("Provides-Extra", [])) >= {"cuda", "libero", "tensorrt", "onnx", "ray", "rerun"}
+
+
+def test_extras_end_at_what_was_tested(told: Message) -> None:
+    seen = set()
+    for requirement in map(Requirement, told.get_all("Requires-Dist", [])):
+        extra = re.search(r'extra == "(\w+)"', str(requirement.marker or ""))
+        if extra is not None and extra[1] in ("cuda", "tensorrt", "onnx", "ray", "view"):
+            assert {one.operator for one in requirement.specifier} & {"==", "<"}, requirement
+            seen.add(extra[1])
+    assert len(seen) == 5

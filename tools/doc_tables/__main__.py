@@ -1,5 +1,5 @@
-"""Write the documents' tables and plots from the result files below benchmarks/results/, and docs/api_reference.md
-from the docstrings, or check that they agree.
+"""Write the documents' tables and plots and the package's table of measured calls from the result files below
+benchmarks/results/, and docs/api_reference.md from the docstrings, or check that they agree.
 
     scripts/tables           fill them in
     scripts/tables --check   change nothing; exit code 1 and a list if one differs
@@ -11,7 +11,8 @@ A table stands between two lines of a document, which name what it shows and of 
 
 `tables.py` has one function for each name. The plots are those that `turbopi bench --report` draws: every folder below
 benchmarks/results/ with a benchmark's results.json has them, and each names the document it was drawn of. README's plot
-of others' latency beside ours is drawn of benchmarks/peers.json and the result file that it names.
+of others' latency beside ours is drawn of benchmarks/peers.json and the result file that it names. The measured calls
+that predictions and fleet plans go by are those of the result files that benchmarks/measured.json names.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from pathlib import Path
 
 from doc_tables.blocks import differences, fill
 from doc_tables.drawn import draw, stale_plots
+from doc_tables.measured import stale_measured, write_measured
 from doc_tables.peers import draw_peers, stale_peers
 from doc_tables.reference import stale_reference, write_reference
 
@@ -34,11 +36,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 if a table or plot differs")
     given = parser.parse_args(arguments)
     if given.check:
-        found = differences(ROOT) + stale_plots(ROOT) + stale_peers(ROOT) + stale_reference(ROOT)
+        found = stale_measured(ROOT) + differences(ROOT)
+        found += stale_plots(ROOT) + stale_peers(ROOT) + stale_reference(ROOT)
         for line in found:
             print(line, file=sys.stderr)
         return 1 if found else 0
-    for changed in (*fill(ROOT), *draw(ROOT), *draw_peers(ROOT), *write_reference(ROOT)):
+    for changed in (*write_measured(ROOT), *fill(ROOT), *draw(ROOT), *draw_peers(ROOT), *write_reference(ROOT)):
         print(f"wrote {changed.relative_to(ROOT)}")
     return 0
 

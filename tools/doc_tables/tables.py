@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 from kernel_turns.document import MarkedVariant, read_turns
 from msgspec.structs import replace
 
+from doc_tables.fleet import sizing
+from doc_tables.gpus import gpu_predictions, gpu_refusals, gpus
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
 from turbopi.bench.work import JOINS
 from turbopi.provenance import Gpu
@@ -269,6 +271,10 @@ class Table:
     lines: Callable[..., list[str]]  # of what was read of each file
 
 
+def _read_nothing(file: Path) -> Any:
+    raise ValueError(f"the table takes no result file, but {file.name} is named")
+
+
 def _read_attacks(file: Path) -> "list[Piece]":
     from attack import results
 
@@ -305,4 +311,5 @@ TABLES = {
     "attacks": Table(_read_attacks, attacks),
     "delays": Table(_read_delays, delays),
     "layer_in_cycles": Table(_read_marks, layer_in_cycles),
+    **{lines.__name__: Table(_read_nothing, lines) for lines in (sizing, gpus, gpu_refusals, gpu_predictions)},
 }

@@ -168,6 +168,18 @@ class Latency:
         return Times(mean=self.mean, p5=p5, p50=p50, p95=p95, p99=p99)
 
 
+def call(
+    policy: UnifiedPolicy, job: Job, observations: Observations, asked: Conditioning | None = None
+) -> dict[str, float]:
+    """The times of one call with new observations: of a batch all of it. `asked` is `conditioning(policy, job)`."""
+    if job.batch > 1:
+        batch = [next(observations) for _ in range(job.batch)]
+        return dict(policy.infer_batch(batch, num_steps=job.steps)[0]["policy_timing"])
+    if asked is None:
+        asked = conditioning(policy, job)
+    return dict(policy.infer(next(observations), num_steps=job.steps, conditioning=asked)["policy_timing"])
+
+
 def measure_calls(
     policy: UnifiedPolicy,
     job: Job,
@@ -185,13 +197,13 @@ def measure_calls(
     timings: dict[str, list[float]] = {}
     asked = conditioning(policy, job)
     for _ in range(WARMING):
-        policy.infer(next(observations), num_steps=job.steps, conditioning=asked)
+        call(policy, job, observations, asked)
         advance()
     end = time.perf_counter() + seconds
     for i in range(calls):
         if i >= FEWEST and time.perf_counter() > end:
             break
-        timing = policy.infer(next(observations), num_steps=job.steps, conditioning=asked)["policy_timing"]
+        timing = call(policy, job, observations, asked)
         stages = [timing[f"{stage}_ms"] for stage in ("vision", "prefix", "denoise") if f"{stage}_ms" in timing]
         if stages:
             timing["device_ms"] = sum(stages)

@@ -19,7 +19,7 @@ from turbopi.bench.measure import (
     answers,
     at_horizon,
     bench_policy,
-    conditioning,
+    call,
     error_against,
     measure_calls,
 )
@@ -49,6 +49,7 @@ class BenchPlan:
     steps: Sequence[int] = (10,)
     image_sizes: Sequence[tuple[int, int]] = (MODEL_SIZE,)  # width, height
     joins: Sequence[Join] = ("none",)
+    batches: Sequence[int] = (1,)
     calls: int = 100
     error: bool = True  # also against the float32 reference
     tokenizer: str | None = None
@@ -74,6 +75,7 @@ class BenchPlan:
             usual.steps if usual.steps in self.steps else max(self.steps),
             *(MODEL_SIZE if MODEL_SIZE in self.image_sizes else self.image_sizes[0]),
             "none" if "none" in self.joins else self.joins[0],
+            pick(self.batches, usual.batch),
         )
 
     def check(self, device: torch.device) -> None:
@@ -82,6 +84,8 @@ class BenchPlan:
             raise ConfigError("there is nothing to measure: name a backend and a precision")
         if self.quantization is not None and not set(self.precisions) & set(TIERS):
             raise ConfigError(f"a calibration was given, but none of the precisions is of FP8: {', '.join(TIERS)}")
+        if max(self.batches) > 1 and set(self.joins) != {"none"}:
+            raise ConfigError("chunks that join a running one are measured one at a time: --join without --batch")
         named = [*self.backends, *self.beside]
         for precision in self.precisions:
             if precision in PRECISIONS and not any(precision in backends.precisions(name) for name in named):
@@ -94,8 +98,8 @@ class BenchPlan:
         for horizon, cameras, size, tokens in itertools.product(
             self.horizons, self.cameras, self.image_sizes, self.prompt_tokens
         ):
-            for steps, join in itertools.product(self.steps, self.joins):
-                yield Job(cameras, tokens, horizon, steps, *size, join)
+            for steps, join, batch in itertools.product(self.steps, self.joins, self.batches):
+                yield Job(cameras, tokens, horizon, steps, *size, join, batch)
 
     def policies(self) -> Iterator[tuple[Precision, str, list[Job]]]:
         """Precision, backend, and the jobs it runs. A backend without one of several precisions is left out there."""
@@ -209,10 +213,7 @@ def _measure(
     for job in jobs:
         progress.doing(f"{backend} {precision}: {job}")
         shaped = at_horizon(policy, job.horizon)
-        asked = conditioning(shaped, job)
-        first = shaped.infer(next(Observations(shaped, job, seed=2)), num_steps=job.steps, conditioning=asked)[
-            "policy_timing"
-        ]["total_ms"]
+        first = call(shaped, job, Observations(shaped, job, seed=2))["total_ms"]
         latency = measure_calls(
             shaped, job, plan.calls_of(backend, job), seconds=plan.seconds, advance=progress.advance
         )

@@ -10,11 +10,11 @@ _Key = tuple[str, str, int, int, int]
 
 
 def linear_models(results: Sequence[Result]) -> list[Line]:
-    """A line for all jobs that differ in steps alone, with pictures of the model's size."""
+    """A line for all jobs that differ in steps alone, with pictures of the model's size, one observation a call."""
     groups: dict[_Key, dict[int, float]] = {}
     for result in results:
         job = result.job
-        if job.of_size or job.joined:
+        if job.of_size or job.joined or job.of_batch:
             continue
         key = (result.backend, result.precision, job.cameras, job.prompt_tokens, job.horizon)
         groups.setdefault(key, {})[job.steps] = result.milliseconds["total"].p50

@@ -36,15 +36,23 @@ class Job(Struct, frozen=True, omit_defaults=True):
     image_width: _Count = MODEL_SIZE[0]  # of what cameras send; not in files where it is the model's, as in older ones
     image_height: _Count = MODEL_SIZE[1]
     join: Join = "none"  # not in files where it is none
+    batch: _Count = 1  # observations of one call; not in files where it is 1
 
     def __str__(self) -> str:
         pictures = f"{self.cameras} cameras{self.of_size}"
-        return f"{pictures}, {self.prompt_tokens} tokens, H={self.horizon}, {self.steps} steps{self.joined}"
+        return (
+            f"{pictures}, {self.prompt_tokens} tokens, H={self.horizon}{self.of_batch}, {self.steps} steps{self.joined}"
+        )
 
     @property
     def joined(self) -> str:
         """`guided by …` behind a comma, where a chunk joins another; else nothing."""
         return "" if self.join == "none" else f", {JOINS[self.join]}"
+
+    @property
+    def of_batch(self) -> str:
+        """`B=8` behind a comma, where a call is for several observations; else nothing."""
+        return "" if self.batch == 1 else f", B={self.batch}"
 
     @property
     def of_size(self) -> str:
@@ -62,14 +70,17 @@ class Work(Struct, frozen=True):
 
 
 def stage_work(config: ModelConfig, job: Job, bytes_per_value: int) -> dict[str, Work]:
-    """Stage ("vision", "prefix", "denoise") -> its work: batch 1, compacted, the last prefix layer cut to K and V."""
+    """Stage ("vision", "prefix", "denoise") -> its work: compacted, the last prefix layer cut to K and V.
+
+    A batch's observations read the weights together, and each has its own operations and KV cache.
+    """
     image_tokens = job.cameras * config.vision.num_tokens
     prefix = image_tokens + job.prompt_tokens
     suffix = job.horizon + (config.kind == "pi0")
     return {
-        "vision": _vision(config, image_tokens, bytes_per_value),
-        "prefix": _prefix(config, prefix, bytes_per_value),
-        "denoise": _denoise(config, prefix, suffix, job.steps, bytes_per_value),
+        "vision": _vision(config, image_tokens, job.batch, bytes_per_value),
+        "prefix": _prefix(config, prefix, job.batch, bytes_per_value),
+        "denoise": _denoise(config, prefix, suffix, job.steps, job.batch, bytes_per_value),
     }
 
 
@@ -78,12 +89,12 @@ def floor_ms(work: Work, flops_per_second: float, bytes_per_second: float) -> fl
     return max(work.flops / flops_per_second, work.bytes / bytes_per_second) * 1e3
 
 
-def _vision(config: ModelConfig, tokens: int, value: int) -> Work:
+def _vision(config: ModelConfig, tokens: int, rows: int, value: int) -> Work:
     v = config.vision
     block = 4 * v.width**2 + 2 * v.width * v.mlp_dim
     weights = v.depth * block + 3 * v.patch_size**2 * v.width + v.width * config.vlm.width
     attention = v.depth * 4 * tokens * v.num_tokens * v.width  # q kᵀ and p v, within one picture
-    return Work(2 * tokens * weights + attention, weights * value)
+    return Work(rows * (2 * tokens * weights + attention), weights * value)
 
 
 def _layer_weights(g: GemmaConfig) -> tuple[int, int]:
@@ -92,19 +103,19 @@ def _layer_weights(g: GemmaConfig) -> tuple[int, int]:
     return 2 * g.width * g.num_kv_heads * g.head_dim, 2 * g.width * heads + 3 * g.width * g.mlp_dim
 
 
-def _prefix(config: ModelConfig, tokens: int, value: int) -> Work:
+def _prefix(config: ModelConfig, tokens: int, rows: int, value: int) -> Work:
     g = config.vlm
     kv, rest = _layer_weights(g)
     weights = g.depth * kv + (g.depth - 1) * rest
     attention = (g.depth - 1) * 4 * tokens**2 * g.num_heads * g.head_dim
     cache = g.depth * 2 * tokens * g.num_kv_heads * g.head_dim
-    return Work(2 * tokens * weights + attention, (weights + cache) * value)
+    return Work(rows * (2 * tokens * weights + attention), (weights + rows * cache) * value)
 
 
-def _denoise(config: ModelConfig, prefix: int, suffix: int, steps: int, value: int) -> Work:
+def _denoise(config: ModelConfig, prefix: int, suffix: int, steps: int, rows: int, value: int) -> Work:
     g = config.expert
     kv, rest = _layer_weights(g)
     weights = g.depth * (kv + rest) + 2 * config.action_dim * g.width
     attention = g.depth * 4 * suffix * (prefix + suffix) * g.num_heads * g.head_dim
     cache = g.depth * 2 * prefix * g.num_kv_heads * g.head_dim
-    return Work(steps * (2 * suffix * weights + attention), steps * (weights + cache) * value)
+    return Work(steps * rows * (2 * suffix * weights + attention), steps * (weights + rows * cache) * value)

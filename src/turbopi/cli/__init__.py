@@ -1,6 +1,6 @@
 """The command line.
 
-turbopi demo | infer | serve | view | bench | calibrate | verify | eval |
+turbopi demo | infer | serve | view | bench | plan | calibrate | verify | eval |
     compare | inspect | convert | export | build | study | backends | doctor
 """
 
@@ -17,6 +17,7 @@ from turbopi.cli import (  # noqa: F401
     serve,
     view,
     bench,
+    plan,
     calibrate,
     verify,
     evaluate,

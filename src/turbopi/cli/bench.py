@@ -16,7 +16,8 @@ from rich.table import Table
 from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions, own_precision
-from turbopi.config import CAMERAS, LIMITS
+from turbopi.cli.predict import show_predictions
+from turbopi.config import CAMERAS, LIMITS, ModelConfig
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
 from turbopi.reading import plain_document, shown
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
     from turbopi.robots import Robot
 
 RESULTS = "results.json"
-_ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps": "10"}
-_TABLE = {"--cameras": "1,2,3", "--prompt-tokens": "48,200", "--horizons": "10,50", "--steps": "1,2,3,5,10"}
+_ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps": "10", "--batch": "1"}
+_TABLE = _ONE | {"--cameras": "1,2,3", "--prompt-tokens": "48,200", "--horizons": "10,50", "--steps": "1,2,3,5,10"}
 
 
 MOST_PIXELS = 8192  # of a camera's width or height
@@ -42,6 +43,7 @@ _MOST = {
     "--prompt-tokens": LIMITS["max_prompt_tokens"],
     "--horizons": LIMITS["action_horizon"],
     "--steps": LIMITS["num_denoising_steps"],
+    "--batch": 1024,
 }
 
 
@@ -94,7 +96,15 @@ def _robots_own(
         "--prompt-tokens": str(job.prompt_tokens),
         "--horizons": axes["--horizons"] or str(job.horizon),
         "--steps": axes["--steps"] or str(job.steps),
+        "--batch": axes["--batch"],
     }
+
+
+def _model(options: RobotOptions, checkpoint: str | None) -> ModelConfig:
+    """The sizes of the weights that were named; of Pi0.5 if none were. No weight is loaded."""
+    if checkpoint is None and options.random_weights is None:
+        return ModelConfig()
+    return options.open(checkpoint).config.model
 
 
 def _joins(text: str) -> "list[Join]":
@@ -134,6 +144,8 @@ def _backends(names: list[str], precisions: "list[Precision]", device: "torch.de
         "turbopi bench checkpoints/mine --backends fused --precisions bf16,fp8",
         "turbopi bench checkpoints/pi05_libero --image-size 224x224,640x480,1280x720",
         "turbopi bench checkpoints/my_arm --config pi05_base --robot my_arm.json",
+        "turbopi bench checkpoints/mine --batch 1,2,4,8,16 --no-error --report times",
+        "turbopi bench --predict rtx4090,rtx5090,orin,thor",
     ),
 )
 def bench(
@@ -156,6 +168,7 @@ def bench(
     prompt_tokens: Annotated[str | None, typer.Option(metavar="N,N,…", help="Valid prompt tokens; else 48.")] = None,
     horizons: Annotated[str | None, typer.Option(metavar="N,N,…", help="Actions in a chunk; else 10.")] = None,
     steps: Annotated[str | None, typer.Option(metavar="N,N,…", help="Denoising steps; else 10.")] = None,
+    batch: Annotated[str | None, typer.Option(metavar="N,N,…", help="Observations of one call; else 1.")] = None,
     image_size: Annotated[
         str | None, typer.Option(metavar="WxH,WxH,…", help="Of the cameras' pictures; else 224x224, the model's.")
     ] = None,
@@ -193,6 +206,14 @@ def bench(
     quantization: Annotated[
         str | None, typer.Option(metavar="FILE", help="What `turbopi calibrate` wrote, for fp8 and fp8-mlp.")
     ] = None,
+    predict: Annotated[
+        str | None,
+        typer.Option(
+            metavar="GPU,GPU,…",
+            help="Measure nothing: predict what calls take on these GPUs, from published numbers. Needs no GPU and no "
+            "checkpoint.",
+        ),
+    ] = None,
     report: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write results.json, report.md and plots there.")
     ] = None,
@@ -204,6 +225,17 @@ def bench(
     observations are random ones of that robot, with its cameras and its prompt, and the job has the checkpoint's own
     horizon and steps unless they are given.
     """
+    output = Output(as_json)
+    axes = {"--cameras": cameras, "--prompt-tokens": prompt_tokens, "--horizons": horizons, "--steps": steps}
+    axes |= {"--batch": batch}
+    if predict is not None:
+        given = {"--backends": backends != "auto", "--beside": beside, "--precisions": precisions, "--join": join}
+        given |= {"--image-size": image_size, "--main-calls": main_calls, "--ready": ready, "--profile": profile}
+        given |= {"--quantization": quantization, "--robot": options.robot, "--report": report}
+        numbers = {option: _axis(option, text, table) for option, text in axes.items()}
+        ignored = [option for option, value in given.items() if value]
+        show_predictions(_names(predict), _model(options, checkpoint), numbers, output, ignored=ignored)
+        return
     from turbopi.bench.ready import empty_caches
 
     # before Triton is imported and looks for its cache: what the measured starts compile serves this process, too
@@ -211,7 +243,6 @@ def bench(
         from turbopi import backends as registry
         from turbopi.bench.run import BenchPlan, run
 
-        output = Output(as_json)
         opened = options.open(checkpoint)
         options.tell_if_random(opened, output)
         if opened.format == "onnx":
@@ -223,7 +254,6 @@ def bench(
         tiers: list[Precision] = chosen  # type: ignore[assignment]  # checked when a backend is created
         names = _backends(_names(backends), tiers, resolved)
         robot = options.make_robot()
-        axes = {"--cameras": cameras, "--prompt-tokens": prompt_tokens, "--horizons": horizons, "--steps": steps}
         axes["--image-size"] = image_size
         if robot is not None:
             axes = _robots_own(axes, table, opened, robot, tokenizer)
@@ -236,6 +266,7 @@ def bench(
             steps=_axis("--steps", axes["--steps"], table),
             image_sizes=_image_sizes(axes["--image-size"] or "224x224"),
             joins=_joins("none" if join is None else join),
+            batches=_axis("--batch", axes["--batch"], table),
             robot=robot,
             calls=calls,
             error=error,
@@ -359,8 +390,8 @@ def _row(result: "Result") -> list[str]:
         return times[stage].text() if stage in times else "-"
 
     return [
-        f"{label(result)}: {job.cameras} cam{job.of_size}, {job.prompt_tokens} tok, H={job.horizon}, "
-        f"{job.steps} steps{job.joined}",
+        f"{label(result)}: {job.cameras} cam{job.of_size}, {job.prompt_tokens} tok, H={job.horizon}"
+        f"{job.of_batch}, {job.steps} steps{job.joined}",
         *(median(stage) for stage in ("vision", "prefix", "denoise", "device", "total")),
         *(times["total"].text(percentile) for percentile in PERCENTILES),
         f"{result.floor_ms['total']:.2f}",

@@ -1,47 +1,27 @@
 """What `turbopi doctor` looks at. Each check is a function that returns a row; none of them changes anything."""
 
-import importlib
-import importlib.util
 import os
 import platform
-import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.version import Version
 
+from turbopi.cli.checkup import FULL_SIZE_GB, Level, Row, has_gpu, imported_torch
+from turbopi.cli.gpu_checkups import check_gpu, check_triton
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.typed import as_typed
 from turbopi.errors import TurboPiError
 from turbopi.installation import install_command
 from turbopi.toolchain import missing_for_c, missing_for_cpp
 
-Level = Literal["OK", "WARN", "FAIL"]
-
 MIN_PYTHON, MIN_TORCH = (3, 10), "2.8"
-# Weights of the full-size model (docs: 3.617 B parameters), and room for what runs beside them
-FULL_SIZE_GB = {"bf16": 7.2, "f32": 14.5}
-ACTIVATIONS_GB = 1.5
-MIN_CAPABILITY = (8, 0)  # the first with bfloat16 tensor cores
-MIN_DRIVER = 525  # CUDA 12
 MIN_DISK_GB = 15.0
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the report; `fix` is empty if there is nothing to do."""
-
-    level: Level
-    name: str
-    found: str
-    fix: str = ""
 
 
 def examine(*, checkpoint: str | None, config: str | None, tokenizer: str | None, port: int) -> Iterator[Row]:
@@ -105,97 +85,6 @@ def check_torch() -> Row:
     return Row("OK", "PyTorch", found)
 
 
-def check_gpu() -> Iterator[Row]:
-    """Driver and GPUs, or why there are none."""
-    torch: Any = _torch()
-    if torch is None:
-        return
-    driver, names = nvidia_smi()
-    if not torch.cuda.is_available():
-        yield _no_gpu(torch, driver, names)
-        return
-    if driver is not None:
-        major = driver.split(".", 1)[0]
-        old = major.isdigit() and int(major) < MIN_DRIVER
-        fix = f"update the NVIDIA driver to {MIN_DRIVER} or newer" if old else ""
-        yield Row("WARN" if old else "OK", "NVIDIA driver", driver, fix)
-    supported = torch.cuda.get_arch_list()
-    for index in range(torch.cuda.device_count()):
-        properties = torch.cuda.get_device_properties(index)
-        yield judge_gpu(
-            index,
-            properties.name,
-            (properties.major, properties.minor),
-            properties.total_memory / 1e9,
-            supported,
-        )
-
-
-def judge_gpu(index: int, name: str, capability: tuple[int, int], memory_gb: float, supported: list[str]) -> Row:
-    """One GPU: what PyTorch can do with it, and whether the model fits."""
-    major, minor = capability
-    found = f"{name}, compute capability {major}.{minor}, {memory_gb:.0f} GB"
-    label = f"GPU {index}"
-    known = [re.sub(r"\D", "", arch) for arch in supported]
-    # code for 8.0 runs on 8.6; a PTX ("compute_90") runs on anything newer
-    runs = any(arch[:-1] == str(major) and int(arch[-1]) <= minor for arch in known if arch)
-    ptx = [int(re.sub(r"\D", "", arch)) for arch in supported if arch.startswith("compute_")]
-    if supported and not runs and not any(major * 10 + minor >= arch for arch in ptx):
-        return Row(
-            "FAIL", label, f"{found}; this PyTorch has no code for it", "install a PyTorch built for it: pytorch.org"
-        )
-    if capability < MIN_CAPABILITY:
-        return Row("WARN", label, found, "bfloat16 is slow below 8.0 (Ampere): use a newer GPU")
-    if memory_gb < FULL_SIZE_GB["bf16"] + ACTIVATIONS_GB:
-        return Row("WARN", label, found, "too small for a full-size model in bf16 (about 9 GB); tiny ones run")
-    return Row("OK", label, found)
-
-
-def _no_gpu(torch: Any, driver: str | None, names: list[str]) -> Row:
-    if names and torch.version.cuda is None:
-        return Row(
-            "FAIL",
-            "GPU",
-            f"{', '.join(names)}, but this PyTorch is built without CUDA",
-            "pip install --force-reinstall torch (on Linux the wheels of PyPI have CUDA)",
-        )
-    if names:
-        return Row(
-            "FAIL",
-            "GPU",
-            f"{', '.join(names)} (driver {driver}), but PyTorch (CUDA {torch.version.cuda}) can't use it",
-            "update the NVIDIA driver, or see that CUDA_VISIBLE_DEVICES and the container let the GPU through",
-        )
-    return Row("WARN", "GPU", "no NVIDIA GPU", "none needed for pi05_tiny, tests and development; real time needs one")
-
-
-def nvidia_smi() -> tuple[str | None, list[str]]:
-    """Driver version and GPU names as nvidia-smi tells them; nothing if it isn't there or fails."""
-    program = shutil.which("nvidia-smi")
-    if program is None:
-        return None, []
-    query = [program, "--query-gpu=driver_version,name", "--format=csv,noheader"]
-    try:
-        lines = subprocess.run(query, capture_output=True, text=True, timeout=20, check=True).stdout.splitlines()
-    except (OSError, subprocess.SubprocessError):
-        return None, []
-    pairs = [line.split(",", 1) for line in lines if "," in line]
-    return (pairs[0][0].strip() if pairs else None), [name.strip() for _, name in pairs]
-
-
-def check_triton() -> Row:
-    torch: Any = _torch()
-    has_gpu = torch is not None and torch.cuda.is_available()
-    if importlib.util.find_spec("triton") is None:
-        if has_gpu:
-            return Row("FAIL", "Triton", "missing", "pip install triton")
-        return Row("OK", "Triton", "not installed; only GPUs need it")
-    try:
-        return Row("OK", "Triton", str(importlib.import_module("triton").__version__))
-    except Exception as error:
-        return Row("FAIL", "Triton", f"can't be imported: {error}", "pip install --force-reinstall triton")
-
-
 def check_compiler() -> Row:
     """Triton builds its launcher with a C compiler, torch.compile its CPU code with a C++ one."""
     found = [path for name in ("gcc", "g++", "clang", "clang++") if (path := shutil.which(name))]
@@ -209,7 +98,7 @@ def check_compiler() -> Row:
 def check_cpu() -> Row:
     import psutil
 
-    torch: Any = _torch()
+    torch = imported_torch()
     cores = psutil.cpu_count(logical=False)
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = None if torch is None else torch.get_num_threads()
@@ -235,8 +124,8 @@ def check_memory(parameters: int | None) -> Row:
     what = "this checkpoint" if parameters is not None else "full size"
     needs = f"{what} takes {_size(need['bf16'])} in bf16, {_size(need['f32'])} in f32"
     if usable < need["bf16"]:
-        level: Level = "FAIL" if parameters is not None and not _has_gpu() else "WARN"
-        fix = f"{needs}: free memory" + (", or load it onto a GPU" if _has_gpu() else ", or use a larger machine")
+        level: Level = "FAIL" if parameters is not None and not has_gpu() else "WARN"
+        fix = f"{needs}: free memory" + (", or load it onto a GPU" if has_gpu() else ", or use a larger machine")
         return Row(level, "memory", found, fix)
     if usable < need["f32"]:
         return Row("OK", "memory", f"{found}; {needs}: enough for bf16 alone")
@@ -313,16 +202,3 @@ def check_disk(folder: Path) -> Row:
     if not os.access(folder, os.W_OK):
         return Row("WARN", "disk", f"{folder} isn't writable", "work in a folder of yours: reports are written to it")
     return Row("OK", "disk", found)
-
-
-def _torch() -> Any:
-    """PyTorch, or None where it can't be imported (check_torch says so)."""
-    try:
-        return importlib.import_module("torch")
-    except Exception:
-        return None
-
-
-def _has_gpu() -> bool:
-    torch = _torch()
-    return torch is not None and bool(torch.cuda.is_available())

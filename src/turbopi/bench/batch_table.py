@@ -1,0 +1,123 @@
+"""The times T(B) of a GPU, as fleet plans need them: measured and checked in, of a file, or predicted."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from turbopi.bench.document import Times, read_benchmark
+from turbopi.bench.gpus import find_gpu
+from turbopi.bench.measured import measured_calls
+from turbopi.bench.predict import PRECISIONS, PredictedCall, predict
+from turbopi.bench.work import Job
+from turbopi.config import ModelConfig
+from turbopi.errors import ConfigError
+
+
+class BatchTable(Struct, frozen=True, kw_only=True):
+    """T(B) of one backend on one GPU."""
+
+    gpu: str
+    backend: str
+    precision: str
+    job: Job  # that was measured or predicted, of one observation
+    seconds: dict[int, float]  # by observations of a batch: the 99th percentile of calls
+    predicted: bool  # nothing was measured on that GPU
+    source: str  # the file of the measurement that it is, or goes by
+
+
+class _Timed(Struct, frozen=True):
+    """One measurement, wherever it comes from."""
+
+    backend: str
+    job: Job
+    seconds: float
+    source: str
+
+
+def published_table(gpu: str, precision: str, horizon: int) -> BatchTable:
+    """Of a GPU of the table: measured calls if there are some with chunks that long or longer, else a prediction.
+
+    Raises ConfigError for a GPU that isn't known, and where there is nothing to go by.
+    """
+    spec = find_gpu(gpu)
+    measured = [
+        _Timed(call.backend, call.job, slow(call.milliseconds["total"]), call.source)
+        for call in measured_calls()
+        if (call.gpu, call.precision) == (spec.key, precision)
+    ]
+    if any(one.job.horizon >= horizon for one in measured):
+        return _table(spec.key, precision, horizon, measured)
+    if precision not in PRECISIONS:
+        raise ConfigError(f"precision {precision!r} is neither measured on {spec.name} nor predicted")
+    config, job = ModelConfig(), Job(horizon=horizon)
+    batches = sorted({call.job.batch for call in measured_calls()})
+    found: dict[str, dict[int, PredictedCall]] = {}
+    for batch in batches:
+        for one in predict(spec, config, replace(job, batch=batch)):
+            for call in one.calls if one.precision == precision else ():
+                found.setdefault(call.backend, {})[batch] = call
+    backend = min((name for name in found if 1 in found[name]), key=lambda name: found[name][1].high_ms, default=None)
+    if backend is None:
+        raise ConfigError(
+            f"nothing that runs in {precision} on {spec.name} was measured anywhere, so there is no prediction; "
+            "measure T(B) there with `turbopi bench --batch 1,2,4,8 --report DIR`, and give --times DIR/results.json"
+        )
+    calls = found[backend]
+    return BatchTable(
+        gpu=spec.key,
+        backend=backend,
+        precision=precision,
+        job=job,
+        seconds={batch: call.high_ms / 1e3 for batch, call in calls.items()},
+        predicted=True,
+        source=calls[1].source,
+    )
+
+
+def table_of_file(file: Path, precision: str, horizon: int) -> BatchTable:
+    """Of a benchmark's document: what `turbopi bench --batch …` writes or prints.
+
+    Its main job's cameras, prompt and steps count. Raises ConfigError for another file, and where it hasn't that
+    precision, or a call of one observation with chunks that long or longer.
+    """
+    document = read_benchmark(file)
+    main = replace(document.main_job, batch=1)
+    timed = [
+        _Timed(one.backend, one.job, slow(one.milliseconds["total"]), file.name)
+        for one in document.results
+        if one.precision == precision and replace(one.job, batch=1, horizon=main.horizon) == main
+    ]
+    if not timed:
+        has = ", ".join(dict.fromkeys(one.precision for one in document.results))
+        raise ConfigError(f"{file}: no calls in {precision}; it has {has}")
+    return _table(document.provenance.device_name, precision, horizon, timed)
+
+
+def slow(times: Times) -> float:
+    """Seconds that nearly no call exceeds: the 99th percentile, or what the file has instead."""
+    return (times.p99 if times.p99 is not None else times.p95) / 1e3
+
+
+def _table(gpu: str, precision: str, horizon: int, timed: Sequence[_Timed]) -> BatchTable:
+    """Of the backend that is fastest for one observation, at the shortest horizon that is long enough."""
+    alone = [one for one in timed if one.job.batch == 1 and one.job.horizon >= horizon]
+    if not alone:
+        known = ", ".join(str(one) for one in sorted({one.job.horizon for one in timed if one.job.batch == 1}))
+        raise ConfigError(
+            f"chunks of {horizon} actions weren't measured in {precision}, one observation at a time: only of "
+            f"{known or 'none'}. Measure with `turbopi bench --horizons {horizon} --batch 1,2,4,8`"
+        )
+    shortest = min(one.job.horizon for one in alone)
+    best = min((one for one in alone if one.job.horizon == shortest), key=lambda one: one.seconds)
+    same = [one for one in timed if one.backend == best.backend and replace(one.job, batch=1) == best.job]
+    return BatchTable(
+        gpu=gpu,
+        backend=best.backend,
+        precision=precision,
+        job=best.job,
+        seconds={one.job.batch: one.seconds for one in sorted(same, key=lambda one: one.job.batch)},
+        predicted=False,
+        source=best.source,
+    )

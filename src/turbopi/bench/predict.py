@@ -1,0 +1,120 @@
+"""How long a call may take on a GPU that nobody measured: predictions, from published numbers and measured calls.
+
+The floor is `work.py`'s counts at the published rates. A call takes longer, and by how much depends on the program. Two
+ways to carry that over from a GPU on which the same backend was measured give a range:
+
+    what was lost beyond the floor takes as long there     floor + (measured - its floor)
+    the ratio to the floor is the same there               floor * (measured / its floor)
+
+each stage on its own, a denoising step's loss for each step, and the host's part of a call as it was measured. Launches
+and barriers cost about the same on every GPU, badly used bandwidth and matrix units cost in proportion; no GPU's loss
+is all of one kind.
+"""
+
+from collections.abc import Iterable, Sequence
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from turbopi.bench.gpus import GpuSpec, find_gpu
+from turbopi.bench.measured import Kernels, MeasuredCall, measured_calls
+from turbopi.bench.work import Job, floor_ms, stage_work
+from turbopi.config import ModelConfig
+
+PRECISIONS = ("bf16", "fp8", "int8")
+STAGES = ("vision", "prefix", "denoise")
+_BYTES = {"bf16": 2, "fp8": 1, "int8": 1}
+
+
+class PredictedCall(Struct, frozen=True, kw_only=True):
+    """Milliseconds from host to host, by a backend that was measured elsewhere."""
+
+    backend: str
+    kernels: Kernels
+    low_ms: float
+    high_ms: float
+    measured_on: str  # a key of gpus.json
+    measured_job: Job
+    source: str  # the file below benchmarks/results
+
+
+class Prediction(Struct, frozen=True, kw_only=True):
+    """One GPU in one precision on one job. Nothing in it was measured on that GPU."""
+
+    gpu: GpuSpec
+    precision: str
+    job: Job
+    floor_ms: dict[str, float]  # by stage, and their sum as "total", at the published rates
+    calls: list[PredictedCall]  # none where no backend that runs there was measured in such a batch and model
+
+
+def predict(gpu: GpuSpec, config: ModelConfig, job: Job) -> list[Prediction]:
+    """A prediction for each precision that the GPU's tensor cores have."""
+    return [
+        Prediction(
+            gpu=gpu,
+            precision=precision,
+            job=job,
+            floor_ms=published_floors(gpu, config, job, precision),
+            calls=list(_calls(gpu, config, job, precision)),
+        )
+        for precision in PRECISIONS
+        if gpu.rate(precision) is not None
+    ]
+
+
+def published_floors(gpu: GpuSpec, config: ModelConfig, job: Job, precision: str) -> dict[str, float]:
+    """Milliseconds by stage, and their sum as "total", at the published rates. The GPU has that precision."""
+    rate = gpu.rate(precision)
+    assert rate is not None
+    work = stage_work(config, job, _BYTES[precision])
+    floors = {stage: floor_ms(one, rate, gpu.gb_per_second * 1e9) for stage, one in work.items()}
+    return floors | {"total": sum(floors.values())}
+
+
+def predicted_call(gpu: GpuSpec, config: ModelConfig, job: Job, measured: MeasuredCall) -> PredictedCall:
+    """What a call would take on the GPU, going by one that was measured, of the full-size model, elsewhere."""
+    there = published_floors(gpu, config, job, measured.precision)
+    here = published_floors(find_gpu(measured.gpu), ModelConfig(), measured.job, measured.precision)
+    took = {name: times.p50 for name, times in measured.milliseconds.items()}
+    host = took["total"] - sum(took[stage] for stage in STAGES)
+    times = {"denoise": job.steps / measured.job.steps}  # a loss there is one of each step
+    added = host + sum(there[stage] + (took[stage] - here[stage]) * times.get(stage, 1.0) for stage in STAGES)
+    scaled = host + sum(there[stage] * took[stage] / here[stage] for stage in STAGES)
+    return PredictedCall(
+        backend=measured.backend,
+        kernels=measured.kernels,
+        low_ms=min(added, scaled),
+        high_ms=max(added, scaled),
+        measured_on=measured.gpu,
+        measured_job=measured.job,
+        source=measured.source,
+    )
+
+
+def runs_on(kernels: Kernels, gpu: GpuSpec) -> bool:
+    """Whether kernels of that kind run on a GPU of the table at all."""
+    return kernels != "hopper" or gpu.capability == (9, 0)
+
+
+def _full_size(config: ModelConfig) -> bool:
+    """Whether the model has the sizes of those that were measured: what a smaller one loses is another matter."""
+    full = ModelConfig()
+    return (config.vision, config.vlm, config.expert) == (full.vision, full.vlm, full.expert)
+
+
+def _calls(gpu: GpuSpec, config: ModelConfig, job: Job, precision: str) -> Iterable[PredictedCall]:
+    if not _full_size(config):
+        return
+    by_backend: dict[tuple[str, str], list[MeasuredCall]] = {}
+    for call in measured_calls():
+        if call.precision == precision and call.job.batch == job.batch and runs_on(call.kernels, gpu):
+            by_backend.setdefault((call.backend, call.kernels), []).append(call)
+    for calls in by_backend.values():
+        yield predicted_call(gpu, config, job, nearest(calls, job))
+
+
+def nearest(calls: Sequence[MeasuredCall], job: Job) -> MeasuredCall:
+    """The measured call whose job is most like another: the same but for the horizon if there is one."""
+    same = [call for call in calls if replace(call.job, horizon=job.horizon) == job]
+    return min(same or calls, key=lambda call: abs(call.job.horizon - job.horizon))

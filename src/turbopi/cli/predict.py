@@ -1,0 +1,98 @@
+"""`turbopi bench --predict`: what a call may take on GPUs that aren't here."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from turbopi.cli.framework import Output
+from turbopi.errors import ConfigError
+from turbopi.reading import plain_document
+
+if TYPE_CHECKING:
+    from turbopi.bench.predict import PredictedCall, Prediction
+    from turbopi.bench.work import Job
+    from turbopi.config import ModelConfig
+
+Axes = Mapping[str, Sequence[int]]
+
+
+def show_predictions(
+    names: Sequence[str], config: "ModelConfig", axes: Axes, output: Output, *, ignored: Sequence[str]
+) -> None:
+    """Print a table for each job of the axes, with all GPUs, and the JSON document.
+
+    ignored   options that were given and mean nothing here: refused
+    """
+    from turbopi.bench.gpus import find_gpu
+    from turbopi.bench.predict import predict
+    from turbopi.bench.work import Job
+
+    if ignored:
+        raise ConfigError(f"--predict runs nothing: leave out {', '.join(ignored)}")
+    gpus = [find_gpu(name) for name in names]
+    if not gpus:
+        raise ConfigError("--predict names no GPU; such as --predict rtx4090,h100")
+    predictions: list[Prediction] = []
+    for cameras, tokens, horizon, batch, steps in itertools.product(
+        axes["--cameras"], axes["--prompt-tokens"], axes["--horizons"], axes["--batch"], axes["--steps"]
+    ):
+        job = Job(cameras, tokens, horizon, steps, batch=batch)
+        here = [prediction for gpu in gpus for prediction in predict(gpu, config, job)]
+        output.table(_table(job, here))
+        predictions += here
+    for line in _notes(predictions):
+        output.line(line)
+    output.document({"predictions": [plain_document(prediction) for prediction in predictions]})
+
+
+def _table(job: "Job", predictions: "Sequence[Prediction]") -> Table:
+    from turbopi.bench.predict import STAGES
+
+    table = Table(title=f"PREDICTIONS, ms: {job}", title_justify="left")
+    table.add_column("GPU, precision")
+    for column in (*STAGES, "floor", "call"):
+        table.add_column(column, justify="right")
+    table.add_column("backend")
+    for one in predictions:
+        floors = [f"{one.floor_ms[name]:.2f}" for name in (*STAGES, "total")]
+        name = f"{one.gpu.key} {one.precision}"
+        for call in one.calls:
+            table.add_row(name, *floors, call_text(call), call.backend)
+        if not one.calls:
+            table.add_row(name, *floors, "-", "")
+    return table
+
+
+def call_text(call: "PredictedCall") -> str:
+    """ "33-78": milliseconds, without a false last digit."""
+    low, high = (f"{value:.1f}" if value < 10 else f"{value:.0f}" for value in (call.low_ms, call.high_ms))
+    return low if low == high else f"{low}-{high}"
+
+
+def _notes(predictions: "Sequence[Prediction]") -> list[str]:
+    """What the tables mean, where their numbers come from, and what can't run."""
+    from turbopi.backends import PRECISIONS
+    from turbopi.bench.measured import KERNELS
+
+    lines = [
+        "These are predictions: nothing was run for them.",
+        "floor: the counted work at NVIDIA's published rates",
+        "call: the floor and what the backend lost beyond its floor on the GPU where it",
+        "      was measured, as the same time at one end, as the same ratio at the other",
+    ]
+    calls = {(call.backend, call.kernels, call.measured_on, call.source) for one in predictions for call in one.calls}
+    lines += [f"{name}, {KERNELS[kernels]}, as on {gpu}: {source}" for name, kernels, gpu, source in sorted(calls)]
+    without = [one for one in predictions if not one.calls]
+    for precision in dict.fromkeys(one.precision for one in without):
+        gpus = dict.fromkeys(one.gpu.key for one in without if one.precision == precision)
+        if precision not in PRECISIONS:
+            lines.append(f"{precision}: no backend runs in it")
+        else:
+            lines.append(f"{precision} on {', '.join(gpus)}: nothing that runs there was measured on such a job")
+    for gpu in {one.gpu.key: one.gpu for one in predictions}.values():
+        rates = f"bf16 {gpu.bf16_tflops:g} TFLOP/s" + (f", FP8 {gpu.fp8_tflops:g}" if gpu.fp8_tflops else "")
+        lines += [f"{gpu.key}: {gpu.gb_per_second:g} GB/s, {rates}, INT8 {gpu.int8_tops:g} TOP/s, {gpu.memory_gb:g} GB"]
+        lines += [f"  {gpu.name}: {gpu.source}"]
+    return lines

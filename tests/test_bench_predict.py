@@ -1,0 +1,172 @@
+"""Predictions for GPUs that aren't here: from published numbers, labelled, and near what was measured where it was."""
+
+import json
+from pathlib import Path
+
+import pytest
+from cli_helpers import refusal, turbopi
+from doc_tables.measured import WRITTEN, stale_measured, write_measured
+from msgspec.structs import replace
+
+from turbopi.bench.document import Result, read_benchmark
+from turbopi.bench.gpus import find_gpu, published_gpus
+from turbopi.bench.measured import measured_calls
+from turbopi.bench.predict import PRECISIONS, STAGES, predict, predicted_call, published_floors, runs_on
+from turbopi.bench.work import Job, stage_work
+from turbopi.config import ModelConfig, preset
+from turbopi.errors import ConfigError
+
+ROOT = Path(__file__).parents[1]
+FULL = ModelConfig()
+NEAR = 1.25  # a prediction by one job's measurement is that near to what other jobs took
+
+
+def checked_in() -> list[tuple[str, str, Result]]:
+    """(file, key of the GPU, result) of every checked-in measurement of full-size calls on a GPU of the table."""
+    found = []
+    files = [*(ROOT / "benchmarks/results").glob("*.json"), *(ROOT / "benchmarks/results").glob("*/results.json")]
+    for file in files:
+        try:
+            document = read_benchmark(file)
+        except ConfigError:
+            continue  # another kind of result
+        gpu = document.provenance.gpu
+        keys = [key for key in ("h100", "h200") if gpu and key in (gpu.name or "").lower()]
+        if keys and document.model in ("pi05_libero", "pi05_base"):
+            found += [(file.name, keys[0], result) for result in document.results]
+    return found
+
+
+def test_predictions_are_near_all_that_was_measured_on_hopper() -> None:
+    """Of 1 to 3 cameras, 48 and 200 tokens, 1 to 10 steps and both horizons, from the main job's calls alone."""
+    by_main_job = {(one.backend, one.precision): one for one in measured_calls() if one.job == Job()}
+    judged = 0
+    for file, key, result in checked_in():
+        measured = by_main_job.get((result.backend, result.precision))
+        if measured is None or result.job.of_size or result.job.joined or result.job.batch > 1:
+            continue
+        call = predicted_call(find_gpu(key), FULL, result.job, measured)
+        took = result.milliseconds["total"].p50
+        assert call.low_ms / NEAR < took < call.high_ms * NEAR, (file, result.job, took, call)
+        judged += 1
+    assert judged > 100
+
+
+def test_no_measured_call_is_under_its_published_floor() -> None:
+    for one in measured_calls():
+        floors = published_floors(find_gpu(one.gpu), FULL, one.job, one.precision)
+        for name in (*STAGES, "total"):
+            assert one.milliseconds[name].p50 > floors[name]
+
+
+def test_on_the_measured_gpu_and_job_the_prediction_is_the_measurement() -> None:
+    for one in measured_calls():
+        call = predicted_call(find_gpu(one.gpu), FULL, one.job, one)
+        took = one.milliseconds["total"].p50
+        assert call.low_ms == pytest.approx(took) and call.high_ms == pytest.approx(took)
+
+
+@pytest.mark.parametrize("key", list(published_gpus()))
+def test_a_floor_is_the_work_at_the_published_rates(key: str) -> None:
+    gpu = find_gpu(key)
+    predictions = predict(gpu, FULL, Job())
+    assert [one.precision for one in predictions] == [name for name in PRECISIONS if gpu.rate(name) is not None]
+    for one in predictions:
+        rate = gpu.rate(one.precision)
+        assert rate is not None
+        for stage, work in stage_work(FULL, Job(), 2 if one.precision == "bf16" else 1).items():
+            seconds = max(work.flops / rate, work.bytes / (gpu.gb_per_second * 1e9))
+            assert one.floor_ms[stage] == pytest.approx(1e3 * seconds)
+        assert one.floor_ms["total"] == pytest.approx(sum(one.floor_ms[stage] for stage in STAGES))
+        for call in one.calls:
+            assert one.floor_ms["total"] < call.low_ms <= call.high_ms
+
+
+def test_published_numbers_are_consistent() -> None:
+    for gpu in published_gpus().values():
+        assert (gpu.fp8_tflops is not None) == (gpu.capability >= (8, 9)), gpu
+        assert gpu.source and gpu.bf16_tflops < gpu.int8_tops
+        if gpu.fp8_tflops is not None:
+            assert gpu.fp8_tflops == pytest.approx(2 * gpu.bf16_tflops, rel=0.02)
+
+
+def test_hoppers_kernels_are_predicted_on_hopper_alone() -> None:
+    assert [key for key, gpu in published_gpus().items() if runs_on("hopper", gpu)] == ["h100", "h200", "h20"]
+    for gpu in published_gpus().values():
+        kinds = {call.kernels for one in predict(gpu, FULL, Job()) for call in one.calls}
+        assert ("hopper" in kinds) == (gpu.compute_capability == "9.0")
+
+
+def test_a_batch_that_nobody_measured_has_a_floor_and_no_call() -> None:
+    largest = max(one.job.batch for one in measured_calls())
+    one = predict(find_gpu("h200"), FULL, Job())[0]
+    many = predict(find_gpu("h200"), FULL, replace(Job(), batch=2 * largest))[0]
+    assert one.floor_ms["total"] < many.floor_ms["total"] < 2 * largest * one.floor_ms["total"]
+    assert many.calls == []
+
+
+def test_a_smaller_model_has_a_floor_and_no_call() -> None:
+    for one in predict(find_gpu("h200"), preset("pi05_tiny").model, Job()):
+        assert one.calls == []
+
+
+@pytest.mark.parametrize("typed", ["rtx4090", "RTX 4090", "GeForce RTX 4090", "nvidia geforce rtx-4090"])
+def test_a_gpu_is_found_as_people_write_it(typed: str) -> None:
+    assert find_gpu(typed).key == "rtx4090"
+
+
+def test_an_unknown_gpu_is_refused_with_the_list() -> None:
+    with pytest.raises(ConfigError, match=r"'rtx9090'.* known are rtx3090, .*b200"):
+        find_gpu("rtx9090")
+
+
+def test_the_packages_measured_calls_are_those_of_the_result_files(tmp_path: Path) -> None:
+    assert stale_measured(ROOT) == []
+    named = json.loads((ROOT / "benchmarks/measured.json").read_text())["files"]
+    assert {one.source for one in measured_calls()} == {one["file"] for one in named}
+    for folder in ("benchmarks/results", WRITTEN.parent):
+        (tmp_path / folder).mkdir(parents=True)
+    assert write_measured(tmp_path) == [], "nothing to write from"
+    (tmp_path / "benchmarks/measured.json").write_text(json.dumps({"files": []}))
+    (tmp_path / WRITTEN).write_text("")
+    assert len(stale_measured(tmp_path)) == 1
+    assert write_measured(tmp_path) == [tmp_path / WRITTEN] and stale_measured(tmp_path) == []
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_says_that_it_predicts_and_fits_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    result = turbopi("bench", "--predict", ",".join(published_gpus()), "--batch", "1,8")
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert sum(line.startswith("PREDICTIONS, ms: ") for line in lines) == 2
+    assert max(len(line) for line in lines if line[:1] in "┃│┏┗┡└") <= 80
+    assert "These are predictions: nothing was run for them." in lines
+    assert any("rtx4090 bf16" in line and "cuda_graph" in line for line in lines)
+    assert any(line.startswith("cuda_graph, PyTorch's kernels, as on h200: ") for line in lines)
+    for gpu in published_gpus().values():
+        assert f"  {gpu.name}: {gpu.source}" in lines
+
+
+def test_the_commands_document_holds_the_same_predictions() -> None:
+    result = turbopi("bench", "--predict", "l40s,thor", "--steps", "5", "--horizons", "50", "--json")
+    document = json.loads(result.stdout)
+    job = Job(steps=5, horizon=50)
+    expected = [one for key in ("l40s", "thor") for one in predict(find_gpu(key), FULL, job)]
+    assert [one["floor_ms"] for one in document["predictions"]] == [one.floor_ms for one in expected]
+    assert document["predictions"][0]["calls"][0]["high_ms"] == expected[0].calls[0].high_ms
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--predict", "gtx1080"], "no published numbers of a GPU 'gtx1080'"),
+        (["--predict", ","], "--predict names no GPU"),
+        (["--predict", "h100", "--ready", "--backends", "fused"], "leave out --backends, --ready"),
+        (["--predict", "h100", "--batch", "0"], "--batch has 0; expected whole numbers from 1 to 1024"),
+    ],
+)
+def test_what_cannot_be_predicted_is_refused(arguments: list[str], said: str) -> None:
+    assert said in refusal(turbopi("bench", *arguments))

@@ -1,0 +1,118 @@
+"""docs/gpus.md says of each GPU what the backends, the checked-in results and the predictions say."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from doc_tables import gpus as tables
+
+from turbopi import backends
+from turbopi.bench.gpus import find_gpu, published_gpus
+from turbopi.bench.measured import measured_calls
+from turbopi.bench.predict import predict
+from turbopi.bench.work import Job
+from turbopi.config import ModelConfig
+from turbopi.errors import BackendUnavailable
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "docs" / "gpus.md").read_text(encoding="utf-8")
+GPUS_ASKED_FOR = ("rtx4090", "rtx5090", "l40s", "a100", "orin", "thor", "h100", "h200")  # issues and users name them
+
+
+def cells(lines: list[str], name: str) -> dict[str, str]:
+    """A row of a table, by its heads."""
+    heads = [head.strip() for head in lines[0].split("|")[1:-1]]
+    (row,) = (line for line in lines[2:] if line.startswith(f"| {name} |"))
+    return dict(zip(heads, (cell.strip() for cell in row.split("|")[1:-1]), strict=True))
+
+
+@pytest.mark.parametrize("key", list(published_gpus()))
+def test_the_backend_in_the_table_is_the_one_that_auto_takes(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The registry is asked by another way than the table's own."""
+    gpu = find_gpu(key)
+    row = cells(tables.gpus(), gpu.name)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: gpu.capability)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: object())
+    monkeypatch.setattr("shutil.which", lambda name, *rest: f"/usr/bin/{name}")
+    monkeypatch.setattr("turbopi.toolchain._missing_headers", lambda: None)
+    device = torch.device("cuda", 0)
+    for precision in tables.TIERS:
+        chosen = backends.choose(device, precision)[0]
+        if row[precision] == "no":
+            with pytest.raises(BackendUnavailable) as refused:
+                backends.check(chosen, device, precision)
+            reasons = [line for line in tables.gpu_refusals() if line.startswith(f"| {precision}: refused |")]
+            said = str(refused.value).replace(f"this GPU has {gpu.compute_capability}", "this GPU has …")
+            assert any(line.rstrip(" |").split("| ")[-1] in said for line in reasons)
+        else:
+            backends.check(chosen, device, precision)
+            assert row[precision] == f"`{chosen}`"
+
+
+def test_every_gpu_asked_for_has_its_rows() -> None:
+    for key in GPUS_ASKED_FOR:
+        assert TEXT.count(f"\n| {find_gpu(key).name} |") == 2, "what was done, and what it may take"
+
+
+def test_only_what_a_checked_in_result_names_was_run() -> None:
+    checked = json.loads((ROOT / "benchmarks/results/gpu_check.json").read_text())
+    for gpu in published_gpus().values():
+        said = cells(tables.gpus(), gpu.name)["run"]
+        tested = checked["ok"] and gpu.key in checked["provenance"]["gpu"]["name"].lower().split()
+        assert ("GPU tests" in said) == tested
+        assert ("speed" in said) == any(call.gpu == gpu.key for call in measured_calls())
+
+
+def test_a_failed_check_is_no_run(tmp_path: Path) -> None:
+    checked = json.loads((ROOT / "benchmarks/results/gpu_check.json").read_text())
+    (tmp_path / tables.TESTED).write_text(json.dumps(checked | {"ok": False}))
+    assert "GPU tests" not in cells(tables.gpus(tmp_path), "H200 SXM")["run"]
+
+
+def test_compiled_kernels_are_counted_by_target(tmp_path: Path) -> None:
+    (tmp_path / tables.TESTED).write_bytes((ROOT / "benchmarks/results/gpu_check.json").read_bytes())
+    rows: list[dict[str, Any]] = [
+        {"kernel": "a", "variant": "1", "target": "sm_89"},
+        {"kernel": "b", "variant": "1", "target": "sm_89", "problem": "spills 400 bytes"},
+        {"kernel": "c", "variant": "1", "target": "sm_89", "refused": "Hopper's own"},
+        {"kernel": "a", "variant": "1", "target": "sm_120a"},
+    ]
+    (tmp_path / tables.COMPILED).write_text(json.dumps({"rows": rows}))
+    (tmp_path / tables.AS_PTX).write_text(json.dumps({"rows": rows[3:]}))
+    found = tables.gpus(tmp_path)
+    assert cells(found, "GeForce RTX 4090")["kernels compiled"] == "1 of 2"
+    assert cells(found, "GeForce RTX 5090")["kernels compiled"] == "1"
+    assert cells(found, "GeForce RTX 5090")["run as PTX on Hopper"] == "1"
+    assert cells(found, "A100 80 GB SXM")["kernels compiled"] == "no"
+
+
+def test_predictions_are_of_the_backend_that_runs_there() -> None:
+    assert "**Predictions**" in TEXT
+    for gpu in published_gpus().values():
+        row, taken = cells(tables.gpu_predictions(), gpu.name), tables.runs(gpu)
+        by_precision = {one.precision: one for one in predict(gpu, ModelConfig(), Job())}
+        assert row["bf16 floor"] == f"{by_precision['bf16'].floor_ms['total']:.1f}"
+        assert bool(row["FP8 floor"]) == ("fp8" in by_precision)
+        assert ("measured" in row["bf16 call"]) == (gpu.key in {call.gpu for call in measured_calls()})
+        if taken["fp8"] == "no":
+            assert row["FP8 call"] == ""
+
+
+def test_what_it_takes_of_memory_is_what_was_measured() -> None:
+    most = {
+        (call.backend, call.precision): max(
+            one.device_bytes or 0
+            for one in measured_calls()
+            if (one.backend, one.precision, one.job.batch) == (call.backend, call.precision, 1)
+        )
+        for call in measured_calls()
+    }
+    said = {
+        ("fused", "bf16"): "8.6 GB",
+        ("cuda_graph", "bf16"): "7.3 GB with `cuda_graph`",
+        ("fused", "fp8"): "7.3 GB in FP8",
+    }
+    for kind, text in said.items():
+        assert text in TEXT and text.startswith(f"{most[kind] / 1e9:.1f} GB")

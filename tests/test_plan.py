@@ -1,0 +1,335 @@
+"""`turbopi plan`: its arithmetic keeps what it promises, held against the server's own scheduler in simulated time."""
+
+import json
+import math
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli_helpers import refusal, turbopi
+from doc_tables import fleet as fleet_table
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from test_serve_schedule import PAYING, SERIAL, request, simulate, table
+
+from turbopi.bench import batch_table
+from turbopi.bench.batch_table import published_table, slow, table_of_file
+from turbopi.bench.document import Times
+from turbopi.bench.measured import measured_calls
+from turbopi.bench.work import Job
+from turbopi.errors import ConfigError
+from turbopi.serve.schedule import Schedule
+from turbopi.serve.sizing import Fleet, Plan, batch_times, plan_fleet, worst_seconds
+
+ROOT = Path(__file__).parents[1]
+SETTINGS = settings(max_examples=60, deadline=None)  # how long an example takes says nothing
+RESULT = ROOT / "benchmarks/results/h200_2026-11-24_pi05_libero/results.json"
+
+
+@st.composite
+def batch_tables(draw: st.DrawFn) -> dict[int, float]:
+    """T(B) of any engine: times grow with the batch, by anything from nothing to what single calls take."""
+    seconds, alone = {}, draw(st.integers(1, 40)) / 1e3
+    took = 0.0
+    for size in (1, 2, 4, 8, 16)[: draw(st.integers(1, 5))]:
+        took = alone if size == 1 else took + draw(st.floats(0.0, 1.2)) * alone * size / 2
+        seconds[size] = took
+    return seconds
+
+
+@st.composite
+def fleets(draw: st.DrawFn) -> Fleet:
+    horizon = draw(st.integers(2, 60))
+    steps = draw(st.integers(1, horizon - 1))
+    delay = draw(st.none() | st.integers(1, min(steps, horizon - steps)))
+    hz = draw(st.sampled_from([5.0, 10.0, 20.0, 33.3, 50.0]))
+    overhead = draw(st.sampled_from([0.0, 1.0, 2.5]))
+    return Fleet(draw(st.integers(1, 40)), hz, horizon, steps, delay, overhead)
+
+
+def planned(fleet: Fleet, seconds: dict[int, float]) -> Plan | None:
+    try:
+        return plan_fleet(fleet, seconds)
+    except ConfigError:
+        return None
+
+
+def with_robots(fleet: Fleet, robots: int) -> Fleet:
+    return Fleet(
+        robots, fleet.hz, fleet.horizon, fleet.execution_horizon, fleet.delay_steps, overhead_ms=fleet.overhead_ms
+    )
+
+
+# --- the arithmetic ---------------------------------------------------------------------------------------------------
+
+
+@SETTINGS
+@given(fleets(), batch_tables())
+def test_more_robots_never_need_fewer_gpus(fleet: Fleet, seconds: dict[int, float]) -> None:
+    plans = [planned(with_robots(fleet, robots), seconds) for robots in range(1, 31)]
+    if plans[0] is None:
+        assert plans == [None] * 30, "what can't serve one robot can't serve more"
+        return
+    gpus = [one.gpus for one in plans if one is not None]
+    assert len(gpus) == 30 and gpus == sorted(gpus) and gpus[0] == 1
+    for robots, one in enumerate(plans, 1):
+        assert one is not None
+        assert (one.robots_per_gpu - 1) * one.gpus < robots <= one.robots_per_gpu * one.gpus
+
+
+@SETTINGS
+@given(fleets(), batch_tables())
+def test_a_plan_is_within_what_was_asked(fleet: Fleet, seconds: dict[int, float]) -> None:
+    plan = planned(fleet, seconds)
+    if plan is None:
+        assert seconds[1] > fleet.allowed
+        return
+    assert 1 <= plan.delay_steps <= fleet.most_delay
+    assert fleet.delay_steps is None or plan.delay_steps <= fleet.delay_steps
+    assert plan.worst_seconds <= fleet.allowed + 1e-6
+    assert plan.delay_steps / fleet.hz >= plan.worst_seconds + fleet.overhead_ms / 1e3 - 1e-9
+    assert 0 < plan.utilisation <= 1 + 1e-9
+    assert plan.batch <= max(seconds)
+
+
+@SETTINGS
+@given(fleets(), batch_tables())
+def test_one_gpu_less_would_not_do(fleet: Fleet, seconds: dict[int, float]) -> None:
+    plan = planned(fleet, seconds)
+    if plan is None or plan.gpus == 1:
+        return
+    crowded = math.ceil(fleet.robots / (plan.gpus - 1))
+    for largest in seconds:
+        assert worst_seconds(batch_times(seconds, largest), crowded) > fleet.allowed - 1e-6
+
+
+@SETTINGS
+@given(fleets(), batch_tables(), st.floats(0.2, 1.0))
+def test_a_faster_gpu_never_needs_more_of_them(fleet: Fleet, seconds: dict[int, float], part: float) -> None:
+    slower, faster = planned(fleet, seconds), planned(fleet, {size: part * took for size, took in seconds.items()})
+    if slower is not None:
+        assert faster is not None and faster.gpus <= slower.gpus
+
+
+@SETTINGS
+@given(batch_tables(), st.integers(1, 40))
+def test_more_robots_wait_at_least_as_long(seconds: dict[int, float], robots: int) -> None:
+    times = batch_times(seconds, max(seconds))
+    assert worst_seconds(times, robots) <= worst_seconds(times, robots + 1) + 1e-12
+
+
+def test_without_batches_the_last_of_n_waits_for_all() -> None:
+    for robots in range(1, 20):
+        assert worst_seconds(batch_times(SERIAL, 8), robots) == pytest.approx(robots * SERIAL[1])
+
+
+def test_with_batches_robots_wait_for_the_turn_that_runs_and_their_own() -> None:
+    times = batch_times(PAYING, 8)
+    assert worst_seconds(times, 1) == pytest.approx(PAYING[1])
+    assert 2 * PAYING[8] <= worst_seconds(times, 9) < 3 * PAYING[8]  # eight run, one and who comes then run next
+    one, many = plan_fleet(Fleet(24, 20, 20), {1: PAYING[1]}), plan_fleet(Fleet(24, 20, 20), PAYING)
+    assert many.worst_seconds < one.worst_seconds and many.utilisation < one.utilisation and many.batch > 1
+
+
+def test_half_a_chunk_is_carried_out_between_two_requests_unless_said_otherwise() -> None:
+    fleet = Fleet(1, 50, 50)
+    assert (fleet.steps, fleet.most_delay) == (25, 25) and fleet.allowed == pytest.approx(0.5)
+    assert Fleet(1, 50, 50, 40).most_delay == 10
+    assert Fleet(1, 50, 50, 40, 3, 10).allowed == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((0, 50, 50), "a fleet has robots"),
+        ((1, math.inf, 50), "a fleet has robots"),
+        ((1, 50, 50, 51), "the execution horizon is 51; expected 1 to 50"),
+        ((1, 50, 50, 50), "leave no control step for computing it"),
+        ((1, 50, 50, 40, 11), "expected 1 to 10: d ≤ s and d ≤ H - s, with s = 40 and H = 50"),
+    ],
+)
+def test_what_cannot_be_a_fleet_is_refused(arguments: tuple[Any, ...], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        Fleet(*arguments)
+
+
+def test_a_gpu_that_is_too_slow_for_one_robot_is_told_with_the_numbers() -> None:
+    with pytest.raises(
+        ConfigError, match=r"a call takes 120.0 ms, with 2 ms of overhead that is 7 control steps at 50 Hz; 5"
+    ):
+        plan_fleet(Fleet(3, 50, 50, None, 5, 2.0), {1: 0.12})
+
+
+# --- the promise, against the server's scheduler ----------------------------------------------------------------------
+
+
+@SETTINGS
+@given(fleets(), batch_tables(), st.data())
+def test_the_promised_delay_holds_in_the_servers_scheduler(
+    fleet: Fleet, seconds: dict[int, float], data: st.DataObject
+) -> None:
+    """Robots on one GPU ask every s steps, each from a moment of its own, and a turn takes T(B)."""
+    plan = planned(fleet, seconds)
+    if plan is None:
+        return
+    period, within = fleet.steps / fleet.hz, plan.delay_steps / fleet.hz - fleet.overhead_ms / 1e3
+    phases = data.draw(
+        st.lists(st.floats(0.0, 1.0), min_size=plan.robots_per_gpu, max_size=plan.robots_per_gpu), label="phases"
+    )
+    asked = [
+        request((phase + round_) * period, within, source=robot)
+        for robot, phase in enumerate(phases)
+        for round_ in range(4)
+    ]
+    served = {size: took for size, took in seconds.items() if size <= plan.batch}
+    history = simulate(Schedule(10 * len(phases), table(served)), asked)
+    assert not history.refused
+    for one in asked:
+        turn = history.turn_of(one)
+        assert turn is not None and turn.ended <= one.deadline + 1e-6
+
+
+@SETTINGS
+@given(batch_tables(), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=20))
+def test_robots_without_deadlines_wait_no_longer_either(seconds: dict[int, float], phases: list[float]) -> None:
+    """As openpi's clients, which say nothing; but for the moment that the server waits for company."""
+    robots = len(phases)
+    worst = worst_seconds(batch_times(seconds, max(seconds)), robots)
+    asked = [
+        request(worst * (phase + round_), 1e3, source=robot)
+        for robot, phase in enumerate(phases)
+        for round_ in range(3)
+    ]
+    history = simulate(Schedule(10 * robots, table(seconds)), asked)
+    for one in asked:
+        turn = history.turn_of(one)
+        assert turn is not None and turn.ended - one.arrived <= worst + history.idle + 1e-9
+
+
+# --- T(B): measured, predicted, of a file -----------------------------------------------------------------------------
+
+
+def test_measured_times_are_the_slow_calls_of_the_measurement() -> None:
+    for call in measured_calls():
+        if call.backend == "fused" and call.job.batch == 1:
+            found = published_table(call.gpu, call.precision, call.job.horizon)
+            assert not found.predicted and found.job == call.job and found.source == call.source
+            assert found.seconds[1] == slow(call.milliseconds["total"]) > call.milliseconds["total"].p50 / 1e3
+
+
+def test_a_horizon_between_those_measured_counts_as_the_longer_one() -> None:
+    assert published_table("h200", "bf16", 11).job.horizon == 50
+    assert published_table("h200", "bf16", 5).job.horizon == 10
+
+
+def test_beyond_what_was_measured_it_is_a_prediction_and_says_so() -> None:
+    long = published_table("h200", "bf16", 100)
+    assert long.predicted and long.job.horizon == 100
+    other = published_table("rtx4090", "bf16", 10)
+    assert other.predicted and other.backend == "cuda_graph" and other.seconds[1] > 0.03
+    with pytest.raises(ConfigError, match="nothing that runs in fp8 on A100 80 GB SXM was measured"):
+        published_table("a100", "fp8", 10)
+    with pytest.raises(ConfigError, match="'fp7' is neither measured"):
+        published_table("h200", "fp7", 10)
+
+
+def test_measured_batches_are_taken_as_soon_as_there_are_some(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What exchanging data/measured_calls.json does."""
+    (one,) = (call for call in measured_calls() if (call.backend, call.precision, call.job) == ("fused", "fp8", Job()))
+
+    def slower(batch: int) -> Any:
+        times = {name: Times(p50=v.p50 * batch**0.7, p95=v.p95 * batch**0.7) for name, v in one.milliseconds.items()}
+        return replace(one, job=replace(one.job, batch=batch), milliseconds=times)
+
+    calls = (*measured_calls(), *map(slower, (2, 4, 8, 16)))
+    monkeypatch.setattr(batch_table, "measured_calls", lambda: calls)
+    found = published_table("h200", "fp8", 10)
+    assert list(found.seconds) == [1, 2, 4, 8, 16]
+    assert plan_fleet(Fleet(60, 20, 10), found.seconds).batch > 1
+    assert published_table("h200", "fp8", 50).seconds.keys() == {1}, "other chunks have times of their own"
+
+
+def test_the_times_of_a_benchmarks_file_are_taken(tmp_path: Path) -> None:
+    document = json.loads(RESULT.read_text())
+    main = [one for one in document["results"] if one["job"] == document["main_job"] and one["precision"] == "bf16"]
+    for batch in (2, 4):
+        again = json.loads(json.dumps(main[0]))
+        again["job"]["batch"] = batch
+        again["milliseconds"]["total"]["p99"] *= batch**0.5
+        document["results"].append(again)
+    file = tmp_path / "times.json"
+    file.write_text(json.dumps(document))
+    found = table_of_file(file, "bf16", 10)
+    p99 = main[0]["milliseconds"]["total"]["p99"] / 1e3
+    assert (found.gpu, found.backend, found.predicted) == ("NVIDIA H200", "fused", False)
+    assert found.seconds == {1: p99, 2: pytest.approx(p99 * 2**0.5), 4: pytest.approx(p99 * 2)}
+    with pytest.raises(ConfigError, match="no calls in int8; it has bf16, fp8"):
+        table_of_file(file, "int8", 10)
+    with pytest.raises(ConfigError, match="chunks of 80 actions weren't measured in bf16"):
+        table_of_file(file, "bf16", 80)
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+ASK = ["plan", "--robots", "12", "--hz", "50", "--horizon", "50"]
+
+
+def test_the_commands_document_is_the_plan() -> None:
+    result = turbopi(*ASK, "--gpu", "h200", "--precision", "fp8", "--json")
+    document = json.loads(result.stdout)
+    times = published_table("h200", "fp8", 50)
+    plan = plan_fleet(Fleet(12, 50, 50, overhead_ms=2.0), times.seconds)
+    assert document["plan"]["gpus"] == plan.gpus and document["plan"]["delay_steps"] == plan.delay_steps
+    assert document["predicted"] is False and document["times"]["source"] == times.source
+
+
+def test_a_prediction_is_called_one() -> None:
+    said = turbopi(*ASK, "--gpu", "rtx4090")
+    assert said.exit_code == 0 and "PREDICTED, never measured there" in said.stdout
+    assert json.loads(turbopi(*ASK, "--gpu", "rtx4090", "--json").stdout)["predicted"] is True
+    assert "PREDICTED" not in turbopi(*ASK, "--gpu", "h200").stdout
+
+
+def test_the_command_to_serve_parses_and_has_as_many_replicas() -> None:
+    from test_document_commands import check_parses
+
+    said = turbopi("plan", "--robots", "100", "--hz", "50", "--horizon", "10", "--gpu", "h200").stdout
+    (line,) = (line for line in said.splitlines() if line.startswith("run "))
+    words = shlex.split(line.removeprefix("run").strip())
+    (gpus,) = (line.split()[1].rstrip(",") for line in said.splitlines() if line.startswith("GPUs"))
+    assert words[0] == "turbopi" and words[-2:] == ["--replicas", gpus] and int(gpus) > 1
+    check_parses(words[1:], "turbopi plan")
+    assert max(map(len, said.splitlines())) <= 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "give --gpu GPU, or --times FILE"),
+        (["--gpu", "h200", "--times", "x"], "give --gpu GPU, or --times FILE"),
+        (["--times", "no/such/file.json"], "no/such/file.json"),
+        (["--gpu", "orin"], "this GPU can't do it for a single robot"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused(arguments: list[str], said: str) -> None:
+    more = ["--delay-steps", "5"] if "orin" in arguments else []
+    assert said in refusal(turbopi(*ASK, *arguments, *more))
+
+
+@pytest.mark.parametrize(("gpu", "precision"), fleet_table.GPUS)
+def test_the_documents_table_is_what_the_command_prints(gpu: str, precision: str) -> None:
+    text = (ROOT / "docs" / "fleet.md").read_text()
+    column = fleet_table.GPUS.index((gpu, precision))
+    for robots, (hz, horizon) in [(8, fleet_table.CONTROL[0]), (64, fleet_table.CONTROL[1])]:
+        (row,) = (line for line in text.splitlines() if line.startswith(f"| {robots}, {hz:g} Hz, H = {horizon} |"))
+        cell = row.split("|")[2 + column].strip()
+        asked = ["--robots", robots, "--hz", hz, "--horizon", horizon, "--gpu", gpu, "--precision", precision]
+        said = turbopi("plan", *asked)
+        if cell == "no":
+            assert "can't do it for a single robot" in refusal(said)
+        else:
+            (gpus,) = (line.split()[1].rstrip(",") for line in said.stdout.splitlines() if line.startswith("GPUs"))
+            (delay,) = (line.split()[1] for line in said.stdout.splitlines() if line.startswith("delay"))
+            assert cell == f"{gpus} ({delay})"

@@ -1,0 +1,155 @@
+"""The tables of docs/gpus.md: what was done for each GPU, what runs there, what it may take.
+
+Numbers of GPUs are data/gpus.json's. What was run is told by the checked-in results' own provenance, what was compiled
+or run as PTX by the files named below, as soon as they are there. What runs where is asked of the backends, which look
+at a device of that compute capability that isn't there.
+"""
+
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from unittest.mock import patch
+
+import torch
+
+from turbopi import backends
+from turbopi.backends import Precision
+from turbopi.bench.gpus import GpuSpec, published_gpus
+from turbopi.bench.measured import measured_calls
+from turbopi.bench.predict import PredictedCall, predict
+from turbopi.bench.work import Job
+from turbopi.cli.predict import call_text
+from turbopi.config import ModelConfig
+from turbopi.errors import TurboPiError
+
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
+TESTED = "gpu_check.json"
+COMPILED, AS_PTX = "compiled_for_all.json", "ptx_on_hopper.json"
+DEVICE = torch.device("cuda", 0)
+TIERS: tuple[Precision, ...] = tuple(one for one in backends.PRECISIONS if one != "f32" and not one.endswith("-mlp"))
+
+
+@contextmanager
+def pretended(capability: tuple[int, int]) -> Iterator[None]:
+    """One GPU of that compute capability, with every package and compiler there: hardware alone decides."""
+    found = lambda name, *rest: object()  # noqa: E731
+    with (
+        patch.object(torch.cuda, "is_available", lambda: True),
+        patch.object(torch.cuda, "get_device_capability", lambda device=None: capability),
+        patch("importlib.util.find_spec", found),
+        patch.object(shutil, "which", lambda name, *rest: f"/usr/bin/{name}"),
+        patch("turbopi.toolchain._missing_headers", lambda: None),
+    ):
+        yield
+
+
+def runs(gpu: GpuSpec) -> dict[str, str]:
+    """Precision -> the backend that `auto` takes on it; "no" where none runs."""
+    found: dict[str, str] = {}
+    with pretended(gpu.capability):
+        for precision in TIERS:
+            name = backends.choose(DEVICE, precision)[0]
+            try:
+                backends.check(name, DEVICE, precision)
+            except TurboPiError:
+                name = "no"
+            found[precision] = name if name == "no" else f"`{name}`"
+    return found
+
+
+def refusals(gpu: GpuSpec) -> dict[str, str]:
+    """What isn't taken on a GPU, or refused -> why, in the backends' words."""
+    found = {}
+    with pretended(gpu.capability):
+        for precision in TIERS:
+            name, why = backends.choose(DEVICE, precision)
+            try:
+                backends.check(name, DEVICE, precision)
+            except TurboPiError as error:
+                found[f"{precision}: refused"] = str(error).partition(f" on {DEVICE}: ")[2] or str(error)
+                continue
+            if passed_over := re.search(r"\(not (\w+): (.*)\)$", why):
+                found[f"{precision}: not `{passed_over[1]}`"] = passed_over[2]
+    return found
+
+
+def rows_of(file: Path) -> list[dict[str, object]]:
+    """The `rows` of a result file, each of a kernel for a `target`; none where the file isn't there yet."""
+    if not file.is_file():
+        return []
+    document = json.loads(file.read_text(encoding="utf-8"))
+    rows = document.get("rows", []) if isinstance(document, dict) else []
+    return [row for row in rows if isinstance(row, dict) and "target" in row]
+
+
+def done(gpu: GpuSpec, rows: list[dict[str, object]]) -> str:
+    """How many kernels are fit for a GPU, of those that are meant for it."""
+    digits = "".join(map(str, gpu.capability))
+    mine = [row for row in rows if re.sub(r"\D", "", str(row["target"])) == digits and not row.get("refused")]
+    fit = sum(not row.get("problem") for row in mine)
+    return "no" if not mine else f"{fit}" if fit == len(mine) else f"{fit} of {len(mine)}"
+
+
+def was_run(gpu: GpuSpec, results: Path) -> str:
+    """What of checked-in results was run on it: by the GPU's name that is in them."""
+    found = []
+    document = json.loads((results / TESTED).read_text(encoding="utf-8"))
+    name = str(document["provenance"].get("gpu", {}).get("name", ""))
+    if document["ok"] and re.search(rf"\b{gpu.key}\b", name.lower()):
+        found.append("GPU tests")
+    if any(call.gpu == gpu.key for call in measured_calls()):
+        found.append("speed")
+    return ", ".join(found) or "no"
+
+
+def gpus(results: Path = RESULTS) -> list[str]:
+    """Each GPU: what `auto` takes by precision, and what was run, run as PTX, compiled."""
+    compiled, as_ptx = rows_of(results / COMPILED), rows_of(results / AS_PTX)
+    heads = ["GPU", "compute capability", *TIERS, "run", "run as PTX on Hopper", "kernels compiled"]
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    for gpu in published_gpus().values():
+        taken = runs(gpu)
+        cells = [gpu.name, gpu.compute_capability, *(taken[precision] for precision in TIERS)]
+        cells += [was_run(gpu, results), done(gpu, as_ptx), done(gpu, compiled)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def gpu_refusals() -> list[str]:
+    """Why something doesn't run, or isn't taken, and on which compute capabilities."""
+    by_reason: dict[tuple[str, str], list[str]] = {}
+    for gpu in sorted(published_gpus().values(), key=lambda gpu: gpu.capability):
+        for what, why in refusals(gpu).items():
+            said = re.sub(r"\b(this GPU has|compute capability) " + re.escape(gpu.compute_capability), r"\1 …", why)
+            where = by_reason.setdefault((what, said), [])
+            if gpu.compute_capability not in where:
+                where.append(gpu.compute_capability)
+    lines = ["| | compute capability | why |", "|---|---|---|"]
+    return [*lines, *(f"| {what} | {', '.join(where)} | {why} |" for (what, why), where in by_reason.items())]
+
+
+def gpu_predictions() -> list[str]:
+    """Milliseconds of the main job: floors, and calls of the backend that `auto` takes."""
+    heads = ["ms", "GB/s", "bf16 floor", "bf16 call", "FP8 floor", "FP8 call", "INT8 floor"]
+    lines = [f"| {' | '.join(heads)} |", "|---|" + "--:|" * (len(heads) - 1)]
+    for gpu in published_gpus().values():
+        taken = runs(gpu)
+        by_precision = {one.precision: one for one in predict(gpu, ModelConfig(), Job())}
+        cells = [gpu.name, f"{gpu.gb_per_second:g}"]
+        for precision in ("bf16", "fp8", "int8"):
+            one = by_precision.get(precision)
+            cells.append("" if one is None else f"{one.floor_ms['total']:.1f}")
+            if precision != "int8":
+                calls = [] if one is None else [call for call in one.calls if f"`{call.backend}`" == taken[precision]]
+                cells.append(_call(gpu, calls))
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def _call(gpu: GpuSpec, calls: list[PredictedCall]) -> str:
+    if not calls:
+        return ""
+    return call_text(calls[0]) + (" (measured)" if calls[0].measured_on == gpu.key else "")
