@@ -40,7 +40,8 @@ _DRAWN = 4096  # random numbers of an episode; they begin again after that
 
 @dataclass
 class Chase:
-    """N episodes. Everything is an array with N rows; `surprise` float64[N, _DRAWN] decides when targets turn back."""
+    """N episodes. Everything is an array with N rows; `surprise` float64[N, M] decides when targets turn back,
+    and begins again after M steps."""
 
     tip: np.ndarray  # float64[N, 2]
     angle: np.ndarray  # float64[N]  of the target
@@ -75,7 +76,7 @@ class Chase:
     def step(self, actions: np.ndarray) -> np.ndarray:
         """One control step with actions float64[N, ≥ 2]; bool[N]: solved after it."""
         self.before = np.concatenate((self.before[:, 1:], self.target[:, None]), axis=1)
-        self.pace = np.where(self.surprise[:, self.time % _DRAWN] < TURN, -self.pace, self.pace)
+        self.pace = np.where(self.surprise[:, self.time % self.surprise.shape[1]] < TURN, -self.pace, self.pace)
         self.angle = self.angle + self.pace / self.orbit
         self.time += 1
         way = SPEED * cut(actions[:, :2])

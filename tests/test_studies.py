@@ -1,0 +1,231 @@
+"""Studies: their one form of report, and the machinery that answers: solvers, grids, closed loops, statistics."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cli_helpers import turbopi
+from matplotlib.figure import Figure
+from msgspec.structs import replace
+from torch import Tensor
+
+from turbopi.evaluate.statistics import Paired, Rate
+from turbopi.reading import read_document
+from turbopi.studies import STUDIES, load, post, report, solvers, steps
+from turbopi.studies.report import Control, Grid, Report
+from turbopi.studies.rollouts import CHASE, Call, open_policy, play
+from turbopi.studies.spread import UNIFORM, bimodality
+from turbopi.studies.study import Setup
+
+BROKEN = Control("Two and two is four.", False, "It is five.")
+
+
+@pytest.fixture(scope="module")
+def small_steps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the steps study in its small form."""
+    folder = tmp_path_factory.mktemp("studies")
+    result = turbopi("study", "steps", "--small", "--episodes", "4", "--device", "cpu", "--out", folder)
+    assert result.exit_code == 0, result.output
+    return folder / "steps"
+
+
+# --- the report -------------------------------------------------------------------------------------------------------
+
+
+def test_every_study_loads_under_its_name_and_asks_a_question() -> None:
+    for name in STUDIES:
+        study = load(name)
+        assert study.name == name and study.question.endswith("?") and study.claimed
+
+
+def test_a_study_writes_a_report_that_reads_back_and_shows_every_part(small_steps: Path) -> None:
+    found = read_document(small_steps / report.JSON, Report)
+    text = (small_steps / report.MARKDOWN).read_text()
+    assert found.small and found.sound and text == report.markdown(found)
+    parts = [
+        "**Claimed before.**",
+        "**Method.**",
+        "**Controls.**",
+        "**Verdict.**",
+        "**What would change it.**",
+        "**Not run.**",
+    ]
+    assert [text.index(part) for part in parts] == sorted(text.index(part) for part in parts)
+    assert all(
+        table.title in text and all(len(row) == len(table.columns) for row in table.rows) for table in found.tables
+    )
+    assert all((small_steps / f"{plot.name}.png").is_file() for plot in found.plots)
+
+
+def test_a_failed_control_voids_the_verdict_and_the_exit_code_says_so(
+    small_steps: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = replace(read_document(small_steps / report.JSON, Report), controls=[BROKEN])
+    assert not broken.sound
+    assert "A control failed. The verdict means nothing" in report.markdown(broken)
+    assert "**FAILED**: Two and two is four. It is five." in report.markdown(broken)
+    study = load("steps")
+    monkeypatch.setattr(steps, "STUDY", type(study)(study.name, study.question, study.claimed, lambda setup: broken))
+    result = turbopi("study", "steps", "--small", "--device", "cpu")
+    assert result.exit_code == 1 and "control FAILED: Two and two is four." in result.stdout
+
+
+def test_numbers_stand_on_the_right_and_what_is_missing_is_empty() -> None:
+    table = Grid("t", ["name", "value"], [["a", 0.0012345], ["b", None], ["c", "+1.0 [-2.0, +3.0]"]])
+    lines = ["| name | value |", "|---|--:|", "| a | 0.00123 |", "| b |  |", "| c | +1.0 [-2.0, +3.0] |"]
+    assert report.table_lines(table) == lines
+
+
+def test_cells_say_rates_and_differences_in_percent() -> None:
+    assert report.rate_cells(Rate(9, 10).document) == ["9 of 10", "90.0 [59.6, 98.2]"]
+    assert str(report.paired_cell(Paired(90, 6, 0, 4).document)).startswith("-6.0 [-11")
+
+
+def test_plots_show_intervals(drawn: list[Figure], tmp_path: Path) -> None:
+    series = report.Series("rate", [1.0, 2.0], [50.0, 60.0], [40.0, 55.0], [70.0, 65.0])
+    report.draw(report.Plot("p", [report.Panel("t", "x", "y", [series])]), tmp_path / "p.png")
+    (bars,) = drawn[0].axes[0].containers
+    segments = np.array(bars.lines[2][0].get_segments())  # type: ignore[attr-defined]
+    assert segments[:, :, 1].tolist() == [[40, 70], [55, 65]]
+
+
+# --- solvers ----------------------------------------------------------------------------------------------------------
+
+
+def bent(x: Tensor, t: float) -> Tensor:
+    """dx/dt = cos(3 t) x, with the solution x(0) = x(1) exp(−sin(3) / 3)."""
+    return math.cos(3 * t) * x
+
+
+@pytest.mark.parametrize("solver", solvers.SOLVERS)
+def test_solvers_converge_with_the_second_order_and_euler_with_the_first(solver: str) -> None:
+    start = torch.ones(1, 1, 1, dtype=torch.float64)
+    exact = math.exp(-math.sin(3) / 3)
+    errors = []
+    for evaluations in (4096, 16384):
+        times = solvers.uniform(solvers.intervals(solver, evaluations))
+        errors.append(abs(float(solvers.integrate(bent, start, solver, times, evaluations)) - exact))
+    assert math.log(errors[0] / errors[1], 4) == pytest.approx(1 if solver == "euler" else 2, abs=0.3)
+
+
+def test_the_exponential_solver_is_exact_after_its_first_interval_for_actions_linear_in_t() -> None:
+    # D(t) = a + b t: the flow is (x − D) / t, and x(t) = c t + a − b t log t
+    a, b, c = 2.0, 3.0, 5.0
+
+    def velocity(x: Tensor, t: float) -> Tensor:
+        return (x - (a + b * t)) / t
+
+    second = solvers.intervals("exponential", 2)
+    x = torch.full((1, 1, 1), c + a, dtype=torch.float64)
+    found = solvers.integrate(velocity, x, "exponential", solvers.uniform(second), 2)
+    euler = solvers.integrate(velocity, x, "euler", solvers.uniform(second), 2)
+    assert abs(float(found) - a) < 1e-12 < abs(float(euler) - a)
+
+
+@pytest.mark.parametrize("solver", solvers.SOLVERS)
+@pytest.mark.parametrize("evaluations", solvers.EVALUATIONS)
+def test_a_solver_evaluates_as_often_as_it_is_told_and_one_evaluation_is_eulers(solver: str, evaluations: int) -> None:
+    asked: list[float] = []
+
+    def velocity(x: Tensor, t: float) -> Tensor:
+        asked.append(t)
+        return bent(x, t)
+
+    x = torch.ones(1, 1, 1)
+    found = solvers.integrate(velocity, x, solver, solvers.uniform(solvers.intervals(solver, evaluations)), evaluations)
+    assert len(asked) == evaluations and all(0 <= t <= 1 for t in asked)
+    if evaluations == 1:
+        assert float(found) == float(x - bent(x, 1.0))
+
+
+def test_grids_fall_from_one_and_shift_where_they_say() -> None:
+    for shift in solvers.SHIFTS.values():
+        times = solvers.shifted(10, shift)
+        assert times[0] == 1 and times == sorted(times, reverse=True) and times[-1] > 0
+    assert solvers.shifted(4, 3.0)[2] == pytest.approx(0.75) and solvers.shifted(4, 1 / 3)[2] == pytest.approx(0.25)
+
+
+def test_a_learned_grid_is_never_worse_and_stays_a_grid() -> None:
+    wanted = [1.0, 0.9, 0.2]
+
+    def error(times: solvers.Times) -> float:
+        return sum((a - b) ** 2 for a, b in zip(times, wanted, strict=True))
+
+    found = solvers.learn_times(error, solvers.uniform(3))
+    assert error(found) < error(solvers.uniform(3)) / 2
+    assert found[0] == 1 and found == sorted(found, reverse=True) and found[-1] > 0
+
+
+# --- closed loop ------------------------------------------------------------------------------------------------------
+
+
+def test_cells_are_paired_episode_by_episode() -> None:
+    policy = open_policy("chase")
+
+    def starts(episodes: range) -> tuple[np.ndarray, Tensor]:
+        seen: list[Call] = []
+
+        def still(call: Call) -> Tensor:
+            seen.append(call)
+            return torch.zeros_like(call.noise)
+
+        play(policy, episodes, still)
+        return np.asarray(seen[0].observation.images), seen[2].noise
+
+    (few_pictures, few_noise), (pictures, noise) = starts(range(2, 4)), starts(range(5))
+    assert np.array_equal(few_pictures, pictures[2:4]) and torch.equal(few_noise, noise[2:4])
+    assert not torch.equal(noise[0], noise[1])
+
+
+def test_the_shipped_chase_policy_solves_what_chance_doesnt() -> None:
+    policy, episodes = open_policy("chase"), range(16)
+    assert policy.toy is CHASE
+    solved = play(policy, episodes, steps.actor(policy, solvers.Way("euler", "uniform", 3), {})).rate.successes
+    lost = play(policy, episodes, lambda call: call.noise).rate.successes
+    assert solved >= 10 and lost <= 3
+
+
+def test_the_post_is_between_the_tip_and_a_target_that_never_moves() -> None:
+    world = post.start([(1, n) for n in range(50)])
+    before = world.target
+    cosines = (world.tip * before).sum(1) / np.linalg.norm(world.tip, axis=1) / np.linalg.norm(before, axis=1)
+    assert (cosines < math.cos(math.pi - post.SPREAD / 2) + 1e-9).all()
+    for _ in range(5):
+        world.step(np.zeros((50, 2)))
+    assert np.array_equal(world.target, before)
+
+
+def test_the_controls_of_steps_fail_where_the_loop_isnt_the_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = open_policy("chase")
+    assert steps.loop_is_the_models(policy) < 1e-5
+    true = solvers.velocity_of
+
+    def slow(*given: Any) -> solvers.Velocity:
+        velocity = true(*given)
+        return lambda x, t: 0.99 * velocity(x, t)
+
+    monkeypatch.setattr(solvers, "velocity_of", slow)
+    assert steps.loop_is_the_models(policy) > 1e-3
+
+
+def test_a_verdict_needs_an_interval() -> None:
+    def cell(first: int, second: int, episodes: int) -> str:
+        paired = Paired(episodes - first - second, first, second, 0).document
+        return steps.SuccessCell("p", "euler", "uniform", False, 1, Rate(1, 2).document, paired, 0).verdict
+
+    assert cell(20, 0, 200) == "worse" and cell(0, 0, 200) == "as good" and cell(0, 0, 20) == "open"
+
+
+def test_the_bimodality_of_known_distributions() -> None:
+    rng = np.random.default_rng(0)
+    assert bimodality(rng.normal(size=20_000)) == pytest.approx(1 / 3, abs=0.02)
+    assert bimodality(rng.uniform(size=20_000)) == pytest.approx(UNIFORM, abs=0.02)
+    assert bimodality(np.where(rng.uniform(size=20_000) < 0.5, -1.0, 1.0)) > 0.98
+
+
+def test_a_study_of_checkpoints_says_what_it_lacks() -> None:
+    with pytest.raises(Exception, match="the mask study needs weights"):
+        load("mask").run(Setup())
