@@ -14,7 +14,7 @@ from torch import Tensor
 
 from turbopi.evaluate.statistics import Paired, Rate
 from turbopi.reading import read_document
-from turbopi.studies import STUDIES, load, post, report, solvers, steps
+from turbopi.studies import STUDIES, kv_reuse, load, post, report, solvers, steps
 from turbopi.studies.report import Control, Grid, Report
 from turbopi.studies.rollouts import CHASE, Call, open_policy, play
 from turbopi.studies.spread import UNIFORM, bimodality
@@ -229,3 +229,44 @@ def test_the_bimodality_of_known_distributions() -> None:
 def test_a_study_of_checkpoints_says_what_it_lacks() -> None:
     with pytest.raises(Exception, match="the mask study needs weights"):
         load("mask").run(Setup())
+
+
+# --- reuse of keys and values -----------------------------------------------------------------------------------------
+
+
+def test_nothing_reused_is_the_plain_run_and_everything_reused_is_the_first_call() -> None:
+    policy, episodes = open_policy("chase"), range(3)
+    plain = play(policy, episodes, kv_reuse.plain(policy.model)).paths
+    for what in ("full", "camera", "patch"):
+        never = kv_reuse.Reusing(policy.model, kv_reuse.Reuse(what, kv_reuse.NOTHING))
+        assert np.array_equal(play(policy, episodes, never).paths, plain) and sum(never.shares) == 0
+        always = kv_reuse.Reusing(policy.model, kv_reuse.Reuse(what, -1.0))
+        assert not np.array_equal(play(policy, episodes, always).paths, plain)
+        assert always.whole == [0.0] + [1.0] * (len(always.whole) - 1)
+        assert always.error > 0.1
+
+
+def test_forms_of_reuse_agree_where_all_or_nothing_is_old() -> None:
+    """With everything old, each form leaves the keys and values of the first call."""
+    policy, episodes = open_policy("chase"), range(3)
+    forms = ("full", "camera", "patch")
+    found = [play(policy, episodes, kv_reuse.Reusing(policy.model, kv_reuse.Reuse(what, -1.0))).paths for what in forms]
+    every = play(policy, episodes, kv_reuse.Reusing(policy.model, kv_reuse.Reuse("every", 1000))).paths
+    assert all(np.allclose(paths, every, atol=1e-4) for paths in found)
+
+
+def test_another_episodes_memory_changes_what_is_done() -> None:
+    policy, episodes, reuse = open_policy("chase"), range(3), kv_reuse.Reuse("every", 2)
+    own, other = (play(policy, episodes, kv_reuse.Reusing(policy.model, reuse, roll)).paths for roll in (0, 1))
+    same = play(policy, episodes, kv_reuse.Reusing(policy.model, reuse, roll=3)).paths
+    assert np.array_equal(own, same) and not np.array_equal(own, other)
+
+
+def test_work_is_saved_where_it_isnt_done() -> None:
+    for what in ("full", "camera", "patch"):
+        assert kv_reuse.speed_ups(kv_reuse.Reuse(what, 0.9), 0.0, 0.0) == pytest.approx((1, 1, 1))
+    half = kv_reuse.speed_ups(kv_reuse.Reuse("every", 2), 0.5, 0.5)
+    ms = kv_reuse.CALL_MS
+    assert half[1] == pytest.approx(ms["total"] / (ms["total"] - (ms["vision"] + ms["prefix"]) / 2))
+    patch, full = (kv_reuse.speed_ups(kv_reuse.Reuse(what, 0.9), 0.5, 0.2) for what in ("patch", "full"))
+    assert patch[1] > full[1] > 1 and full[2] > full[1]
