@@ -14,9 +14,9 @@ from torch import Tensor
 
 from turbopi.evaluate.statistics import Paired, Rate
 from turbopi.reading import read_document
-from turbopi.studies import STUDIES, kv_reuse, load, post, report, solvers, steps
+from turbopi.studies import STUDIES, formats, fp4_products, fp8_and_fp4, kv_reuse, load, post, report, solvers, steps
 from turbopi.studies.report import Control, Grid, Report
-from turbopi.studies.rollouts import CHASE, Call, open_policy, play
+from turbopi.studies.rollouts import CHASE, Call, met, open_policy, play, sampled
 from turbopi.studies.spread import UNIFORM, bimodality
 from turbopi.studies.study import Setup
 
@@ -236,7 +236,7 @@ def test_a_study_of_checkpoints_says_what_it_lacks() -> None:
 
 def test_nothing_reused_is_the_plain_run_and_everything_reused_is_the_first_call() -> None:
     policy, episodes = open_policy("chase"), range(3)
-    plain = play(policy, episodes, kv_reuse.plain(policy.model)).paths
+    plain = play(policy, episodes, sampled(policy.model, kv_reuse.STEPS)).paths
     for what in ("full", "camera", "patch"):
         never = kv_reuse.Reusing(policy.model, kv_reuse.Reuse(what, kv_reuse.NOTHING))
         assert np.array_equal(play(policy, episodes, never).paths, plain) and sum(never.shares) == 0
@@ -270,3 +270,52 @@ def test_work_is_saved_where_it_isnt_done() -> None:
     assert half[1] == pytest.approx(ms["total"] / (ms["total"] - (ms["vision"] + ms["prefix"]) / 2))
     patch, full = (kv_reuse.speed_ups(kv_reuse.Reuse(what, 0.9), 0.5, 0.2) for what in ("patch", "full"))
     assert patch[1] > full[1] > 1 and full[2] > full[1]
+
+
+# --- numbers of four bits ---------------------------------------------------------------------------------------------
+
+
+def test_mxfp4_is_e2m1_under_powers_of_two() -> None:
+    x = torch.randn(8, 64, generator=torch.Generator().manual_seed(0))
+    rounded = formats.round_mxfp4(x)
+    blocks, exact = rounded.view(8, 2, 32), x.view(8, 2, 32)
+    scale = 2.0 ** (torch.floor(torch.log2(exact.abs().amax(-1, keepdim=True))) - 2)
+    assert torch.equal(formats.round_e2m1(blocks / scale), blocks / scale)
+    within = exact.abs() <= 6 * scale  # others are cut
+    assert ((blocks - exact).abs() <= scale)[within].all() and torch.equal(formats.round_mxfp4(rounded), rounded)
+    assert torch.equal(formats.round_mxfp4(torch.zeros(2, 32)), torch.zeros(2, 32))
+
+
+def test_a_product_without_scales_is_nothing_and_with_unread_ones_is_most_of_it() -> None:
+    found = {one.how: one.median for one in fp4_products.product_cosines(fp4_products.normal_matrices(1))}
+    right = found["NVFP4, right"]
+    assert abs(found[fp4_products.UNSCALED]) < 0.02 and 0.9 < found[fp4_products.UNREAD] < right and right > 0.99
+
+
+def test_scales_in_the_tensor_cores_order_are_the_same_scales_elsewhere() -> None:
+    x = torch.randn(128, 64, generator=torch.Generator().manual_seed(0)) * torch.arange(1, 129)[:, None]
+    right, mixed = formats.round_nvfp4(x), formats.nvfp4_with_swizzled_scales(x)
+    assert not torch.equal(right, mixed)
+    first = slice(0, 16)  # row 0's first block stays where it is: place 0
+    assert torch.equal(right[0, first], mixed[0, first])
+    few = x[:64]  # no whole tile: nothing to mix
+    assert torch.equal(formats.round_nvfp4(few), formats.nvfp4_with_swizzled_scales(few))
+
+
+def test_four_bits_are_gone_after_the_block_and_activations_are_rounded_where_that_is_asked_for() -> None:
+    policy = open_policy("chase")
+    made = [met(policy, range(2), sampled(policy.model, 2), calls=1)]
+    exact = policy.model.sample(*made[0], 2)
+    chosen = fp8_and_fp4.cases(policy.model, made, made, 2)
+    found = {}
+    for name in ("NVFP4, weights alone", "W4A8", "NVFP4", fp8_and_fp4.WRONG):
+        with chosen[name]():
+            found[name] = float((policy.model.sample(*made[0], 2) - exact).norm())
+    assert torch.equal(policy.model.sample(*made[0], 2), exact)
+    assert 0 < found["NVFP4, weights alone"] != found["W4A8"] < found["NVFP4"] < found[fp8_and_fp4.WRONG]
+
+
+def test_fewer_bits_are_read_sooner() -> None:
+    for row in fp4_products.savings().rows:
+        times = [float(cell) for cell in row[2:6] if isinstance(cell, float)]
+        assert len(times) == 4 and times == sorted(times, reverse=True)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 STUDIES: dict[str, str] = {  # name -> what it asks, in a few words; modules are imported when they are asked for
     "steps": "how few denoising steps are enough, and with which solver",
     "kv_reuse": "keys and values of old pictures, reused while new ones look alike",
+    "fp8_and_fp4": "numbers of eight and four bits",
     "mask": "a padded cache without its mask (any checkpoint)",
     "precision": "attention and precisions inside TensorRT (any checkpoint)",
     "actions": "what backends do to actions (any checkpoint; TensorRT)",

@@ -13,7 +13,7 @@ Vision alone, with text and state computed afresh, gives what `full` gives where
 policies here have one instruction and read no state.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -32,7 +32,7 @@ from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.reading import plain_document
 from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
-from turbopi.studies.rollouts import Call, Played, ToyPolicy, open_policy, play
+from turbopi.studies.rollouts import Call, Played, ToyPolicy, open_policy, play, sampled
 from turbopi.studies.study import Setup, Study
 
 NOTHING = 1.5  # θ above any cosine: nothing is ever reused
@@ -226,17 +226,13 @@ def speed_ups(reuse: Reuse, reused: float, whole: float) -> tuple[float, float, 
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
-def plain(model: Pi0Model) -> Callable[[Call], Tensor]:
-    return lambda call: model.sample(call.observation, call.noise, STEPS)
-
-
 def run(setup: Setup) -> Report:
     policies = [open_policy("chase"), *(open_policy(name, folder) for name, folder in setup.policies.items())]
     episodes = range(setup.cell_episodes)
     found: list[ReuseCell] = []
     baselines: dict[str, Played] = {}
     for policy in policies:
-        baselines[policy.name] = play(policy, episodes, plain(policy.model))
+        baselines[policy.name] = play(policy, episodes, sampled(policy.model, STEPS))
         for reuse in cells(setup.small):
             actor = Reusing(policy.model, reuse)
             found.append(_cell(policy, reuse, play(policy, episodes, actor), baselines[policy.name], actor))
@@ -289,7 +285,7 @@ CLAIMED = (
 
 def _controls(policy: ToyPolicy, episodes: Sequence[int], baseline: Played) -> list[Control]:
     few = range(min(16, len(episodes)))
-    expected = play(policy, few, plain(policy.model)).paths
+    expected = play(policy, few, sampled(policy.model, STEPS)).paths
     never = [Reuse("every", 1), *(Reuse(what, NOTHING) for what in ("full", "camera", "patch"))]
     equal = all(np.array_equal(play(policy, few, Reusing(policy.model, one)).paths, expected) for one in never)
     own, others = (play(policy, episodes, Reusing(policy.model, Reuse("every", 2), roll)) for roll in (0, 1))

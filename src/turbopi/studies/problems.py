@@ -9,6 +9,7 @@ from msgspec import Struct
 from torch import Tensor
 
 from turbopi import shipped
+from turbopi.calibrate.observations import Batch
 from turbopi.checkpoint import Checkpoint
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import Pi0Model
@@ -106,8 +107,8 @@ def errors(name: str, problem: Problem, learned: Learned, small: bool) -> list[E
     return cells
 
 
-def libero_problems(checkpoint: Checkpoint, device: torch.device, small: bool) -> tuple[Problem, Problem]:
-    """On LIBERO pictures, to learn grids on and to measure errors on: other pictures and other noise."""
+def libero_batches(checkpoint: Checkpoint, device: torch.device, small: bool) -> tuple[Pi0Model, Batch, Batch]:
+    """The model in float32, and two batches on LIBERO pictures: to learn on, and others to judge on."""
     config = checkpoint.config
     tokenizer = load_tokenizer(TINY_TOKENIZER, vocab_size=config.model.vocab_size)
     pipeline = Pipeline(config, checkpoint.norm_stats, tokenizer)
@@ -115,7 +116,7 @@ def libero_problems(checkpoint: Checkpoint, device: torch.device, small: bool) -
     model = Pi0Model.from_state(config.model, checkpoint.load(device, "f32").state)
     shape = (config.model.action_horizon, config.model.action_dim)
 
-    def problem(chosen: Sequence[shipped.Frame], seed: int) -> Problem:
+    def batch(chosen: Sequence[shipped.Frame], seed: int) -> Batch:
         seen = [
             {
                 "observation/image": frame.base,
@@ -128,11 +129,18 @@ def libero_problems(checkpoint: Checkpoint, device: torch.device, small: bool) -
         ]
         observation = Observation.stack([pipeline.before(one)[0] for one in seen]).to(device)
         noise = np.random.default_rng(seed).standard_normal((len(seen), *shape), dtype=np.float32)
-        return Problem.of(model, observation, torch.from_numpy(noise).to(device), 7, SMALL_EXACT if small else EXACT)
+        return observation, torch.from_numpy(noise).to(device)
 
     repeats = 1 if small else NOISES
     half = 1 if small else len(frames) // 2
-    return problem(frames[:half], 0), problem(frames[half : 2 * half], 1)
+    return model, batch(frames[:half], 0), batch(frames[half : 2 * half], 1)
+
+
+def libero_problems(checkpoint: Checkpoint, device: torch.device, small: bool) -> tuple[Problem, Problem]:
+    """The two batches of `libero_batches` as problems, in LIBERO's seven dimensions."""
+    model, learning, judged = libero_batches(checkpoint, device, small)
+    count = SMALL_EXACT if small else EXACT
+    return Problem.of(model, *learning, 7, count), Problem.of(model, *judged, 7, count)
 
 
 def one_problem(policy: UnifiedPolicy, setup: Setup) -> tuple[Observation, Tensor, str]:

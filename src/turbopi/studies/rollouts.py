@@ -115,6 +115,27 @@ class Played:
         return Paired.of(list(zip(baseline.solved.tolist(), self.solved.tolist(), strict=True)))
 
 
+def sampled(model: Pi0Model, steps: int) -> Actor:
+    """The reference as it is."""
+    return lambda call: model.sample(call.observation, call.noise, steps)
+
+
+def met(policy: ToyPolicy, episodes: Sequence[int], actor: Actor, calls: int = 4) -> tuple[Observation, Tensor]:
+    """What the policy meets in the first calls of some episodes, and its noise, as one batch."""
+    seen: list[Observation] = []
+    noises: list[Tensor] = []
+
+    def keeping(call: Call) -> Tensor:
+        if call.number < calls:
+            seen.append(call.observation)
+            noises.append(call.noise)
+        return actor(call)
+
+    play(policy, episodes, keeping)
+    names = Observation.__dataclass_fields__
+    return Observation(*(torch.cat([getattr(one, name) for one in seen]) for name in names)), torch.cat(noises)
+
+
 def seeds_of(episodes: Sequence[int]) -> list[tuple[int, int]]:
     """Of the worlds; training's are of 41 bits."""
     return [(7, n) for n in episodes]

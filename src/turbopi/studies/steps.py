@@ -9,19 +9,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-import torch
 from msgspec import Struct
 from torch import Tensor
 
 from turbopi import shipped
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
-from turbopi.observation import Observation
 from turbopi.reading import plain_document
 from turbopi.studies import solvers
 from turbopi.studies.problems import EXACT, ErrorCell, Problem, errors, learned_grids, libero_problems
 from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
-from turbopi.studies.rollouts import POST, Call, Played, ToyPolicy, open_policy, play, seeds_of
+from turbopi.studies.rollouts import POST, Call, Played, ToyPolicy, met, open_policy, play, seeds_of
 from turbopi.studies.solvers import BASELINE, Learned, Way, grid_times, ways
 from turbopi.studies.spread import UNIFORM, Spread, spread
 from turbopi.studies.study import Setup, Study
@@ -69,20 +67,8 @@ def actor(policy: ToyPolicy, way: Way, learned: Learned, warm: float = WARM) -> 
 
 def practice(policy: ToyPolicy, episodes: int) -> Problem:
     """What the policy meets in its first calls, ten Euler steps each, with the exact solutions."""
-    seen: list[Observation] = []
-    noises: list[Tensor] = []
-    plain = actor(policy, BASELINE, {})
-
-    def keeping(call: Call) -> Tensor:
-        if call.number < 4:
-            seen.append(call.observation)
-            noises.append(call.noise)
-        return plain(call)
-
-    play(policy, range(_PRACTICE, _PRACTICE + episodes), keeping)
-    names = Observation.__dataclass_fields__
-    joined = Observation(*(torch.cat([getattr(one, name) for one in seen]) for name in names))
-    return Problem.of(policy.model, joined, torch.cat(noises), 2)
+    numbers = range(_PRACTICE, _PRACTICE + episodes)
+    return Problem.of(policy.model, *met(policy, numbers, actor(policy, BASELINE, {})), 2)
 
 
 def successes(policy: ToyPolicy, learned: Learned, setup: Setup) -> list[SuccessCell]:
