@@ -14,7 +14,20 @@ from torch import Tensor
 
 from turbopi.evaluate.statistics import Paired, Rate
 from turbopi.reading import read_document
-from turbopi.studies import STUDIES, formats, fp4_products, fp8_and_fp4, kv_reuse, load, post, report, solvers, steps
+from turbopi.sim.chase import SPEED as CHASE_SPEED
+from turbopi.studies import (
+    STUDIES,
+    formats,
+    fp4_products,
+    fp8_and_fp4,
+    kv_reuse,
+    load,
+    pipelining,
+    post,
+    report,
+    solvers,
+    steps,
+)
 from turbopi.studies.report import Control, Grid, Report
 from turbopi.studies.rollouts import CHASE, Call, met, open_policy, play, sampled
 from turbopi.studies.spread import UNIFORM, bimodality
@@ -319,3 +332,50 @@ def test_fewer_bits_are_read_sooner() -> None:
     for row in fp4_products.savings().rows:
         times = [float(cell) for cell in row[2:6] if isinstance(cell, float)]
         assert len(times) == 4 and times == sorted(times, reverse=True)
+
+
+# --- pipelining -------------------------------------------------------------------------------------------------------
+
+
+def test_overlapping_raises_the_rate_and_never_lowers_the_latency() -> None:
+    for stage in (1, 2, 3):
+        serial, ideal, slower = pipelining.timings(stage, stage)
+        assert ideal.period < serial.period and ideal.latency == serial.latency <= slower.latency
+        assert ideal.age < serial.age
+
+
+def test_ages_are_counted_from_the_observation_behind_an_action() -> None:
+    policy = open_policy("chase")
+    _, ages = pipelining.play_late(
+        policy, range(2), lambda call: torch.zeros_like(call.noise), pipelining.Timing("", latency=3, period=2)
+    )
+    assert ages[:9] == [0, 1, 2, 3, 4, 3, 4, 3, 4]
+    assert ages[:5] == [0, 1, 2, 3, 4]  # the clock starts with a chunk; the next one comes 3 steps after step 2
+    assert np.mean(ages[5:59]) == pipelining.Timing("", 3, 2).age
+
+
+def test_a_late_chunk_goes_on_from_the_action_that_is_due() -> None:
+    policy = open_policy("chase")
+
+    def numbered(call: Call) -> Tensor:
+        """A chunk whose i-th action is as long as 0.001 (100 call + i)."""
+        chunk = torch.zeros_like(call.noise)
+        chunk[..., 0] = 0.001 * (100 * call.number + torch.arange(chunk.shape[1]))
+        return chunk
+
+    played, _ = pipelining.play_late(policy, range(1), numbered, pipelining.Timing("", latency=2, period=4))
+    moved = np.diff(played.paths[:, 0, 0]) / CHASE_SPEED
+    due = [round(float(value * 1000)) for value in moved[:11]]
+    assert due == [0, 1, 2, 3, 4, 5, 102, 103, 104, 105, 202]
+
+
+def test_overlap_finds_actions_that_change_beside_others() -> None:
+    class Policy:
+        def __init__(self, off: float) -> None:
+            self.off = off
+
+        def infer(self, observation: object, *, seed: int) -> dict[str, np.ndarray]:
+            return {"actions": np.full(3, seed + self.off)}
+
+    assert pipelining.overlap([Policy(0.0), Policy(0.0)], None, 3).actions_equal_bit_for_bit
+    assert not pipelining.overlap([Policy(0.0), Policy(1e-9)], None, 3).actions_equal_bit_for_bit

@@ -24,6 +24,7 @@ STUDIES: dict[str, str] = {  # name -> what it asks, in a few words; modules are
     "steps": "how few denoising steps are enough, and with which solver",
     "kv_reuse": "keys and values of old pictures, reused while new ones look alike",
     "fp8_and_fp4": "numbers of eight and four bits",
+    "pipelining": "the next observation encoded beside this one's denoising",
     "mask": "a padded cache without its mask (any checkpoint)",
     "precision": "attention and precisions inside TensorRT (any checkpoint)",
     "actions": "what backends do to actions (any checkpoint; TensorRT)",

@@ -251,7 +251,8 @@ METHOD = (
     "Every product of vision, prefix and expert whose sizes allow it, with operands rounded exactly as the format "
     "holds them, float32 between. NVFP4: E2M1 numbers in blocks of 16 with an E4M3 scale, and a float32 scale for the "
     "tensor. W4A8: weights in NVFP4, or in MXFP4 (blocks of 32, scales powers of two), activations in E4M3 with a "
-    f"calibrated scale for each site. Closed loop on toy tasks, {STEPS} steps, the same episodes and noise in every cell."
+    f"calibrated scale for each site. Closed loop on toy tasks, {STEPS} steps, the same episodes and noise in every "
+    "cell."
 )
 WOULD_CHANGE = (
     "Trained weights of full size, whose outliers are larger than any here; a kernel. On 10.x and 11.0 `tcgen05.mma` "

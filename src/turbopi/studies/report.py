@@ -114,9 +114,21 @@ def write(report: Report, folder: Path) -> list[Path]:
     """Write the report's files into `folder`, which is made; their paths. Raises OutputError if they can't be."""
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / JSON, folder / MARKDOWN]
-    write_whole(files[0], json.dumps(plain_document(report), indent=1, ensure_ascii=False) + "\n")
+    write_whole(files[0], _lines(plain_document(report), depth=3) + "\n")
     write_whole(files[1], markdown(report))
     return files + [draw(plot, folder / f"{plot.name}.png") for plot in report.plots]
+
+
+def _lines(value: object, depth: int, indent: str = "") -> str:
+    """JSON with a line for each item of the outer `depth` levels, so that a raw result is one line."""
+    if depth == 0 or not value or not isinstance(value, dict | list):
+        return json.dumps(value, ensure_ascii=False)
+    inner = indent + " "
+    if isinstance(value, dict):
+        items = [f"{json.dumps(key)}: {_lines(item, depth - 1, inner)}" for key, item in value.items()]
+        return "{\n" + ",\n".join(inner + item for item in items) + f"\n{indent}}}"
+    items = [_lines(item, depth - 1, inner) for item in value]
+    return "[\n" + ",\n".join(inner + item for item in items) + f"\n{indent}]"
 
 
 # --- Markdown ---------------------------------------------------------------------------------------------------------
