@@ -154,6 +154,19 @@ def test_a_solver_evaluates_as_often_as_it_is_told_and_one_evaluation_is_eulers(
         assert float(found) == float(x - bent(x, 1.0))
 
 
+def test_no_solver_asks_for_a_velocity_at_the_end_where_none_was_trained() -> None:
+    for way in solvers.ways(small=False):
+        asked: list[float] = []
+
+        def velocity(x: Tensor, t: float, asked: list[float] = asked) -> Tensor:
+            asked.append(t)
+            return bent(x, t)
+
+        count = solvers.intervals(way.solver, way.evaluations)
+        solvers.integrate(velocity, torch.ones(1, 1, 1), way.solver, solvers.uniform(count), way.evaluations)
+        assert min(asked) >= 0.05 and len(asked) == way.evaluations, way
+
+
 def test_grids_fall_from_one_and_shift_where_they_say() -> None:
     for shift in solvers.SHIFTS.values():
         times = solvers.shifted(10, shift)

@@ -11,7 +11,8 @@ A table stands between two lines of a document, which name what it shows and of 
 
 `tables.py` has one function for each name. The plots are those that `turbopi bench --report` draws: every folder below
 benchmarks/results/ with a benchmark's results.json has them, and each names the document it was drawn of. README's plot
-of others' latency beside ours is drawn of benchmarks/peers.json and the result file that it names.
+of others' latency beside ours is drawn of benchmarks/peers.json and the result file that it names. Reports of studies
+have their Markdown and plots beside their report.json.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from doc_tables.blocks import differences, fill
 from doc_tables.drawn import draw, stale_plots
 from doc_tables.peers import draw_peers, stale_peers
 from doc_tables.reference import stale_reference, write_reference
+from doc_tables.studies import stale_reports, write_reports
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,11 +36,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 if a table or plot differs")
     given = parser.parse_args(arguments)
     if given.check:
-        found = differences(ROOT) + stale_plots(ROOT) + stale_peers(ROOT) + stale_reference(ROOT)
+        found = differences(ROOT) + stale_plots(ROOT) + stale_peers(ROOT) + stale_reference(ROOT) + stale_reports(ROOT)
         for line in found:
             print(line, file=sys.stderr)
         return 1 if found else 0
-    for changed in (*fill(ROOT), *draw(ROOT), *draw_peers(ROOT), *write_reference(ROOT)):
+    for changed in (*fill(ROOT), *draw(ROOT), *draw_peers(ROOT), *write_reference(ROOT), *write_reports(ROOT)):
         print(f"wrote {changed.relative_to(ROOT)}")
     return 0
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from kernel_turns.document import MarkedVariant, read_turns
 from msgspec.structs import replace
 
+from doc_tables.studies import few_steps, read_report, study
 from turbopi.bench.document import BenchDocument, Percentile, Result, all_steps, read_benchmark
 from turbopi.bench.work import JOINS
 from turbopi.provenance import Gpu
@@ -305,4 +306,6 @@ TABLES = {
     "attacks": Table(_read_attacks, attacks),
     "delays": Table(_read_delays, delays),
     "layer_in_cycles": Table(_read_marks, layer_in_cycles),
+    "study": Table(read_report, study),
+    "few_steps": Table(read_report, few_steps),
 }

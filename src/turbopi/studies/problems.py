@@ -32,7 +32,7 @@ from turbopi.studies.solvers import (
 )
 from turbopi.studies.study import Setup
 
-EXACT = 100  # intervals of Heun's method: the solution that errors are measured against
+EXACT = 100  # intervals of the midpoint method: the solution that errors are measured against
 SMALL_EXACT = 10
 NOISES = 4  # of each LIBERO picture
 
@@ -64,14 +64,14 @@ class Problem:
         cls, model: Pi0Model, observation: Observation, noise: Tensor, dims: int, exact_intervals: int = EXACT
     ) -> "Problem":
         cache, count = model.prefix(observation), exact_intervals
-        exact = integrate(velocity_of(model, cache), noise, "heun", uniform(count), 2 * count)
+        exact = integrate(velocity_of(model, cache), noise, "midpoint", uniform(count), 2 * count)
         return cls(model, cache, noise, dims, exact, count)
 
     @property
     def halved(self) -> float:
         """The error of half as many steps of the exact solution's solver."""
         count = self.exact_intervals // 2
-        return self.error("heun", uniform(count), 2 * count)
+        return self.error("midpoint", uniform(count), 2 * count)
 
     def solve(self, solver: str, times: Sequence[float], evaluations: int) -> Tensor:
         return integrate(velocity_of(self.model, self.cache), self.noise, solver, times, evaluations)
