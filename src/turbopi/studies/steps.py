@@ -159,9 +159,9 @@ METHOD = (
     "and to actions, learned on other observations by moving one time after the other) in 1, 2, 3, 5 and 10 "
     f"evaluations; and by the same from a warm start (t = {WARM}: the rest of the chunk before, with noise). Errors "
     f"against {EXACT} steps of the midpoint method from the same noise. Closed loop on toy tasks, five actions of a "
-    "chunk carried out, no delay, the same episodes and noise in every cell; differences are against ten Euler steps on "
-    "a uniform grid. The two policies of the post differ in their demonstrations alone: the expert passes on one side, "
-    "or on either, drawn for each episode."
+    "chunk carried out, no delay, the same episodes and noise in every cell; differences are against ten Euler steps "
+    "on a uniform grid. The two policies of the post differ in their demonstrations alone: the expert passes on one "
+    "side, or on either, drawn for each episode."
 )
 WOULD_CHANGE = (
     "A policy of a real task whose demonstrations differ: several people, several grasps. The toy's two ways are as "
