@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cli_helpers import turbopi
+from cli_helpers import refusal, turbopi
 from matplotlib.figure import Figure
 from msgspec.structs import replace
 from torch import Tensor
 
+from turbopi import UnifiedPolicy
 from turbopi.evaluate.statistics import Paired, Rate
 from turbopi.reading import read_document
+from turbopi.shipped import CHASE_POLICY
 from turbopi.sim.chase import SPEED as CHASE_SPEED
 from turbopi.studies import (
     STUDIES,
@@ -206,6 +208,20 @@ def test_cells_are_paired_episode_by_episode() -> None:
     assert not torch.equal(noise[0], noise[1])
 
 
+def test_decided_episodes_end_alike_whether_the_policy_is_still_asked_for_them() -> None:
+    policy, episodes = open_policy("chase"), range(12)
+    asked: list[int] = []
+
+    def counting(call: Call) -> Tensor:
+        asked.append(len(call.episodes))
+        return sampled(policy.model, 3)(call)
+
+    few = play(policy, episodes, counting)
+    everyone = play(policy, episodes, sampled(policy.model, 3), everyone=True)
+    assert np.array_equal(few.solved, everyone.solved) and np.array_equal(few.touched, everyone.touched)
+    assert asked[0] == 12 and asked == sorted(asked, reverse=True) and asked[-1] < 6
+
+
 def test_the_shipped_chase_policy_solves_what_chance_doesnt() -> None:
     policy, episodes = open_policy("chase"), range(16)
     assert policy.toy is CHASE
@@ -262,12 +278,12 @@ def test_a_study_of_checkpoints_says_what_it_lacks() -> None:
 
 def test_nothing_reused_is_the_plain_run_and_everything_reused_is_the_first_call() -> None:
     policy, episodes = open_policy("chase"), range(3)
-    plain = play(policy, episodes, sampled(policy.model, kv_reuse.STEPS)).paths
+    plain = play(policy, episodes, sampled(policy.model, kv_reuse.STEPS), everyone=True).paths
     for what in ("full", "camera", "patch"):
         never = kv_reuse.Reusing(policy.model, kv_reuse.Reuse(what, kv_reuse.NOTHING))
-        assert np.array_equal(play(policy, episodes, never).paths, plain) and sum(never.shares) == 0
+        assert np.array_equal(play(policy, episodes, never, everyone=True).paths, plain) and sum(never.shares) == 0
         always = kv_reuse.Reusing(policy.model, kv_reuse.Reuse(what, -1.0))
-        assert not np.array_equal(play(policy, episodes, always).paths, plain)
+        assert not np.array_equal(play(policy, episodes, always, everyone=True).paths, plain)
         assert always.whole == [0.0] + [1.0] * (len(always.whole) - 1)
         assert always.error > 0.1
 
@@ -276,15 +292,20 @@ def test_forms_of_reuse_agree_where_all_or_nothing_is_old() -> None:
     """With everything old, each form leaves the keys and values of the first call."""
     policy, episodes = open_policy("chase"), range(3)
     forms = ("full", "camera", "patch")
-    found = [play(policy, episodes, kv_reuse.Reusing(policy.model, kv_reuse.Reuse(what, -1.0))).paths for what in forms]
-    every = play(policy, episodes, kv_reuse.Reusing(policy.model, kv_reuse.Reuse("every", 1000))).paths
+    found = [
+        play(policy, episodes, kv_reuse.Reusing(policy.model, kv_reuse.Reuse(what, -1.0)), everyone=True).paths
+        for what in forms
+    ]
+    every = play(policy, episodes, kv_reuse.Reusing(policy.model, kv_reuse.Reuse("every", 1000)), everyone=True).paths
     assert all(np.allclose(paths, every, atol=1e-4) for paths in found)
 
 
 def test_another_episodes_memory_changes_what_is_done() -> None:
     policy, episodes, reuse = open_policy("chase"), range(3), kv_reuse.Reuse("every", 2)
-    own, other = (play(policy, episodes, kv_reuse.Reusing(policy.model, reuse, roll)).paths for roll in (0, 1))
-    same = play(policy, episodes, kv_reuse.Reusing(policy.model, reuse, roll=3)).paths
+    own, other = (
+        play(policy, episodes, kv_reuse.Reusing(policy.model, reuse, roll), everyone=True).paths for roll in (0, 1)
+    )
+    same = play(policy, episodes, kv_reuse.Reusing(policy.model, reuse, roll=3), everyone=True).paths
     assert np.array_equal(own, same) and not np.array_equal(own, other)
 
 
@@ -392,3 +413,28 @@ def test_overlap_finds_actions_that_change_beside_others() -> None:
 
     assert pipelining.overlap([Policy(0.0), Policy(0.0)], None, 3).actions_equal_bit_for_bit
     assert not pipelining.overlap([Policy(0.0), Policy(1e-9)], None, 3).actions_equal_bit_for_bit
+
+
+# --- in a simulator ---------------------------------------------------------------------------------------------------
+
+
+def test_a_backend_with_a_solver_is_the_policys_own_where_that_is_ten_euler_steps() -> None:
+    policies = [UnifiedPolicy(CHASE_POLICY, backend="pytorch", precision="f32", device="cpu") for _ in range(3)]
+    observation = policies[0].example_observation(0)
+    plain = policies[0].infer(observation, seed=0, num_steps=10)["actions"]
+    found = []
+    for policy, way in zip(policies[1:], (solvers.BASELINE, solvers.Way("exponential", "uniform", 2)), strict=True):
+        policy.backend = steps_libero.SolvedBackend(policy.backend, way)  # type: ignore[assignment]
+        found.append(policy.infer(observation, seed=0)["actions"])
+    assert np.allclose(found[0], plain, atol=1e-5) and not np.allclose(found[1], plain, atol=1e-3)
+
+
+def test_steps_in_a_simulator_are_paired_kept_and_continued(tmp_path: Path) -> None:
+    given = ("study", "steps_libero", CHASE_POLICY, "--simulator", "chase", "--small", "--episodes", "2")
+    result = turbopi(*given, "--device", "cpu", "--workers", "1", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    found = read_document(tmp_path / "steps_libero" / report.JSON, Report)
+    assert found.sound and [row[2] for row in found.tables[0].rows] == [10, 2]
+    assert len(list((tmp_path / "episodes").glob("*/results.json"))) == 3  # two cells, and the control
+    said = refusal(turbopi("study", "steps_libero", "--way", "euler, uniform, 4", "--simulator", "chase"))
+    assert "unknown way 'euler, uniform, 4'; choose of: euler, uniform, 10; euler, uniform, 1" in said

@@ -12,7 +12,7 @@ import math
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,11 +119,6 @@ class Frames:
         return torch.cat((self.places.flatten(1), 2 * (target - tip)), dim=1)
 
 
-def rows_of(world: Chase, rows: np.ndarray) -> Chase:
-    arrays = {item.name: getattr(world, item.name)[rows] for item in fields(Chase) if item.name != "time"}
-    return Chase(**arrays, time=world.time)
-
-
 def demonstrations(number: int, seed: int, workers: int = 1, at_once: int = 250) -> Frames:
     """Frames of episodes, none of which is one of the simulator's own. Of each frame the target's place comes first."""
     rounds = math.ceil(number / (at_once * MAX_STEPS))
@@ -157,7 +152,7 @@ def _play(number: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         asked = since >= every
         if asked.any():
             rows = np.flatnonzero(asked)
-            chosen, sides[rows] = _continued(rows_of(world, rows), running[rows], delay[rows], sides[rows], rng)
+            chosen, sides[rows] = _continued(world.rows(rows), running[rows], delay[rows], sides[rows], rng)
             running = running.copy()
             running[rows], since[rows] = _padded(chosen), 0
         action = running[everyone, 0] + noise * rng.normal(size=(number, 2))

@@ -59,6 +59,20 @@ def study(
             metavar="N", min=1, max=MOST_EPISODES, help="Of each cell in closed loop; 200, or 8 in the small form."
         ),
     ] = None,
+    simulator: Annotated[
+        str, typer.Option(metavar="NAME", help="Of steps_libero: another simulator of `turbopi eval`.")
+    ] = "libero",
+    way: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SOLVER, GRID, N",
+            help="Of steps_libero: one cell, such as 'euler, uniform, 1'. May be given again; all unless given.",
+            show_default=False,
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Of steps_libero: simulators at a time; half of the CPUs.")
+    ] = None,
     observation: Annotated[
         Path | None,
         typer.Option(
@@ -105,7 +119,7 @@ def study(
     for one in studies:
         one.check(on)
     opened = None
-    if set(chosen) & set(OF_CHECKPOINTS):
+    if set(chosen) & set(OF_CHECKPOINTS) or checkpoint is not None or options.random_weights is not None:
         opened = options.open(checkpoint)
         options.tell_if_random(opened, output)
     setup = Setup(
@@ -115,6 +129,10 @@ def study(
         checkpoint=opened,
         observations=lambda judged: given_observations(judged, observation),
         policies=policies,
+        simulator=simulator,
+        ways=way or (),
+        folder=None if out is None else out / "episodes",
+        workers=workers,
         episodes=episodes,
         steps=steps,
         calls=calls,

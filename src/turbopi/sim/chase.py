@@ -17,7 +17,7 @@ Where the target is behind the post there are two ways around it, so that two ch
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -67,6 +67,13 @@ class Chase:
         self.held = np.zeros(len(self.tip), np.int64)
         self.stopped = np.zeros(len(self.tip), np.bool_)
         return self
+
+    def rows(self, rows: np.ndarray) -> "Chase":
+        """Some of the episodes, int64[M], as they are now."""
+        arrays = {item.name: getattr(self, item.name)[rows] for item in fields(self) if item.name != "time"}
+        chosen = Chase(**arrays, time=self.time).cleared()
+        chosen.held, chosen.stopped = self.held[rows], self.stopped[rows]
+        return chosen
 
     @property
     def target(self) -> np.ndarray:

@@ -25,6 +25,7 @@ STUDIES: dict[str, str] = {  # name -> what it asks, in a few words; modules are
     "kv_reuse": "keys and values of old pictures, reused while new ones look alike",
     "fp8_and_fp4": "numbers of eight and four bits",
     "pipelining": "the next observation encoded beside this one's denoising",
+    "steps_libero": "the same on LIBERO (any checkpoint for it; else the small policy)",
     "mask": "a padded cache without its mask (any checkpoint)",
     "precision": "attention and precisions inside TensorRT (any checkpoint)",
     "actions": "what backends do to actions (any checkpoint; TensorRT)",

@@ -232,10 +232,12 @@ def run(setup: Setup) -> Report:
     found: list[ReuseCell] = []
     baselines: dict[str, Played] = {}
     for policy in policies:
-        baselines[policy.name] = play(policy, episodes, sampled(policy.model, STEPS))
+        baselines[policy.name] = play(policy, episodes, sampled(policy.model, STEPS), everyone=True)
         for reuse in cells(setup.small):
             actor = Reusing(policy.model, reuse)
-            found.append(_cell(policy, reuse, play(policy, episodes, actor), baselines[policy.name], actor))
+            found.append(
+                _cell(policy, reuse, play(policy, episodes, actor, everyone=True), baselines[policy.name], actor)
+            )
             setup.tell(f"{policy.name}: {reuse}: {found[-1].rate.rate}, reused {found[-1].reused:.2f}")
     return setup.report(
         STUDY,
@@ -285,10 +287,14 @@ CLAIMED = (
 
 def _controls(policy: ToyPolicy, episodes: Sequence[int], baseline: Played) -> list[Control]:
     few = range(min(16, len(episodes)))
-    expected = play(policy, few, sampled(policy.model, STEPS)).paths
+    expected = play(policy, few, sampled(policy.model, STEPS), everyone=True).paths
     never = [Reuse("every", 1), *(Reuse(what, NOTHING) for what in ("full", "camera", "patch"))]
-    equal = all(np.array_equal(play(policy, few, Reusing(policy.model, one)).paths, expected) for one in never)
-    own, others = (play(policy, episodes, Reusing(policy.model, Reuse("every", 2), roll)) for roll in (0, 1))
+    equal = all(
+        np.array_equal(play(policy, few, Reusing(policy.model, one), everyone=True).paths, expected) for one in never
+    )
+    own, others = (
+        play(policy, episodes, Reusing(policy.model, Reuse("every", 2), roll), everyone=True) for roll in (0, 1)
+    )
     rates = f"{others.rate} with another's, {own.rate} with the episode's own, {baseline.rate} plain."
     return [
         Control("With θ above any cosine the run is the plain one, bit for bit, in every form.", equal, ""),

@@ -209,7 +209,7 @@ def _controls(
 ) -> list[Control]:
     few, actor = range(min(16, len(episodes))), sampled(policy.model, STEPS)
     noises = _NoiseByStep(actor, policy)
-    plain = play(policy, few, noises)
+    plain = play(policy, few, noises, everyone=True)
     same = play_late(policy, few, actor, Timing("plain", 0, REPLAN))[0]
     expected = [abs(cell.age - Timing("", cell.latency, cell.period).age) < 0.35 for cell in cells]
     controls = [

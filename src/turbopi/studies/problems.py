@@ -34,7 +34,7 @@ from turbopi.studies.study import Setup
 
 EXACT = 100  # intervals of the midpoint method: the solution that errors are measured against
 SMALL_EXACT = 10
-NOISES = 4  # of each LIBERO picture
+NOISES = 2  # of each LIBERO picture
 
 
 class ErrorCell(Struct, frozen=True):

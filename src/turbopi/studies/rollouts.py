@@ -104,7 +104,7 @@ class Played:
 
     solved: np.ndarray  # bool[N]
     touched: np.ndarray  # bool[N]: the tip touched the post before the task was solved
-    paths: np.ndarray = field(repr=False)  # float64[steps + 1, N, 2]: where the tips were
+    paths: np.ndarray = field(repr=False)  # float64[steps + 1, N, 2]: where the tips were, while they mattered
 
     @property
     def rate(self) -> Rate:
@@ -141,19 +141,29 @@ def seeds_of(episodes: Sequence[int]) -> list[tuple[int, int]]:
     return [(7, n) for n in episodes]
 
 
-def play(policy: ToyPolicy, episodes: Sequence[int], actor: Actor, replan: int = REPLAN) -> Played:
-    """The episodes from their start to the task's limit; nothing is delayed."""
+def play(
+    policy: ToyPolicy, episodes: Sequence[int], actor: Actor, replan: int = REPLAN, *, everyone: bool = False
+) -> Played:
+    """The episodes from their start to the task's limit; nothing is delayed.
+
+    The policy isn't asked any more for episodes that are decided: solved, or lost at the post. `everyone`: it is.
+    """
     world = policy.toy.start(seeds_of(episodes))
     solved, touched = (np.zeros(len(episodes), np.bool_) for _ in range(2))
-    paths, chunk, place = [world.tip], torch.empty(0), replan
+    config = policy.config.model
+    chunk = torch.zeros(len(episodes), config.action_horizon, config.action_dim)
+    paths = [world.tip]
     for step in range(policy.toy.max_steps):
-        if place == replan:
-            previous = None if step == 0 else _rest(chunk, replan)
-            call = step // replan
-            chunk, place = actor(Call(call, episodes, policy.observe(world), policy.noise(episodes, call), previous)), 0
-        solved |= world.step(chunk[:, place, :2].double().numpy())
+        if step % replan == 0:
+            rows = np.flatnonzero(everyone | ~(solved | world.stopped))
+            if not len(rows):
+                break
+            call, numbers = step // replan, [episodes[row] for row in rows]
+            previous = None if step == 0 else _rest(chunk[rows], replan)
+            seen, noise = policy.observe(world.rows(rows)), policy.noise(numbers, call)
+            chunk[rows] = actor(Call(call, numbers, seen, noise, previous))
+        solved |= world.step(chunk[:, step % replan, :2].double().numpy())
         touched |= world.stopped & ~solved
-        place += 1
         paths.append(world.tip)
     return Played(solved, touched, np.stack(paths))
 

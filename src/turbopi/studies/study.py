@@ -1,6 +1,6 @@
 """What a study is, and what it is given. Each file of one has a `STUDY`."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -43,6 +43,10 @@ class Setup:
     checkpoint: Checkpoint | None = None
     observations: Callable[[UnifiedPolicy], tuple[list[dict[str, object]], str]] = _packaged
     policies: Mapping[str, Path] = field(default_factory=dict)
+    simulator: str = "libero"  # of the studies in a simulator
+    ways: Sequence[str] = ()  # which of their cells; none: all
+    folder: Path | None = None  # where they keep episodes, so that they can go on; None: nowhere
+    workers: int | None = None  # simulators at a time
     episodes: int | None = None  # of a cell; None: the form's own number
     steps: int = 10  # of denoising
     calls: int = 100
