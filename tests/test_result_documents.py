@@ -21,9 +21,11 @@ from turbopi.calibrate.report import read_report
 from turbopi.errors import CalibrationError, ConfigError
 from turbopi.provenance import Provenance
 from turbopi.reading import as_document, plain_document, read_document
+from turbopi.studies.actions import BackendOff
 from turbopi.studies.certificates import CondensedDimension, WorstPlace
 from turbopi.studies.fp8_and_fp4 import Research
-from turbopi.studies.tensorrt import BackendOff, CacheOff, Throughput
+from turbopi.studies.mask import CacheOff
+from turbopi.studies.throughput import Throughput
 from turbopi.verify.document import Determinism
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"

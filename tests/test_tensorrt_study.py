@@ -17,7 +17,11 @@ from turbopi import UnifiedPolicy
 from turbopi.checkpoint import random_checkpoint
 from turbopi.observation import Observation
 from turbopi.reading import plain_document, read_document
-from turbopi.studies.tensorrt import StudyDocument, actions_study, attention_study, mask_study, throughput_study
+from turbopi.studies.actions import actions_study
+from turbopi.studies.mask import mask_study
+from turbopi.studies.precision import attention_study
+from turbopi.studies.report import Report
+from turbopi.studies.throughput import throughput_study
 
 
 def one() -> tuple[Observation, torch.Tensor]:
@@ -93,16 +97,19 @@ def test_throughput_compares_every_answer_bit_for_bit(wrong: float, equal: bool)
 
 
 def test_the_command_writes_what_it_measured(tmp_path: Path) -> None:
-    out = tmp_path / "study.json"
-    result = turbopi("study", "mask", "--random-weights", "pi05_tiny", "--device", "cpu", "--out", out, "--json")
+    result = turbopi("study", "mask", "--random-weights", "pi05_tiny", "--device", "cpu", "--out", tmp_path, "--json")
     assert result.exit_code == 0, result.output
-    document = json.loads(result.stdout)
-    assert json.loads(out.read_text()) == document == plain_document(read_document(out, StudyDocument))
-    assert [r["steps"] for r in document["mask"]] == [1, 10] * 3 and document["random_weights"]
+    (document,) = json.loads(result.stdout).values()
+    file = tmp_path / "mask" / "report.json"
+    assert json.loads(file.read_text()) == document == plain_document(read_document(file, Report))
+    assert [row["steps"] for row in document["data"]["mask"]] == [1, 10] * 3 and document["data"]["random_weights"]
+    assert (tmp_path / "mask" / "mask.png").is_file() and (tmp_path / "mask" / "report.md").is_file()
 
 
 def test_the_command_refuses_what_it_cant_study(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "unknown study 'speed'; choose of precision, mask, actions, throughput" in refusal(turbopi("study", "speed"))
+    assert "unknown study 'speed'; choose of steps, " in refusal(turbopi("study", "speed"))
+    assert "no weights: give a checkpoint's folder" in refusal(turbopi("study", "mask"))
+    assert "--policy is 'two_ways'; expected NAME=FOLDER" in refusal(turbopi("study", "steps", "--policy", "two_ways"))
     monkeypatch.setattr("turbopi.tensorrt.importlib.util.find_spec", lambda name: None)
     said = refusal(turbopi("study", "precision", "--random-weights", "pi05_tiny", "--device", "cpu"))
     assert "the precision study needs TensorRT: neither tensorrt_rtx nor tensorrt is installed" in said

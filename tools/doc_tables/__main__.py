@@ -12,7 +12,8 @@ A table stands between two lines of a document, which name what it shows and of 
 `tables.py` has one function for each name. The plots are those that `turbopi bench --report` draws: every folder below
 benchmarks/results/ with a benchmark's results.json has them, and each names the document it was drawn of. README's plot
 of others' latency beside ours is drawn of benchmarks/peers.json and the result file that it names. The measured calls
-that predictions and fleet plans go by are those of the result files that benchmarks/measured.json names.
+that predictions and fleet plans go by are those of the result files that benchmarks/measured.json names. Reports of
+studies have their Markdown and plots beside their report.json.
 """
 
 import argparse
@@ -25,6 +26,7 @@ from doc_tables.drawn import draw, stale_plots
 from doc_tables.measured import stale_measured, write_measured
 from doc_tables.peers import draw_peers, stale_peers
 from doc_tables.reference import stale_reference, write_reference
+from doc_tables.studies import stale_reports, write_reports
 
 ROOT = Path(__file__).parents[2]
 
@@ -36,12 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 if a table or plot differs")
     given = parser.parse_args(arguments)
     if given.check:
-        found = stale_measured(ROOT) + differences(ROOT)
-        found += stale_plots(ROOT) + stale_peers(ROOT) + stale_reference(ROOT)
+        found = stale_measured(ROOT) + differences(ROOT) + stale_plots(ROOT)
+        found += stale_peers(ROOT) + stale_reference(ROOT) + stale_reports(ROOT)
         for line in found:
             print(line, file=sys.stderr)
         return 1 if found else 0
-    for changed in (*write_measured(ROOT), *fill(ROOT), *draw(ROOT), *draw_peers(ROOT), *write_reference(ROOT)):
+    written = (*write_measured(ROOT), *fill(ROOT), *draw(ROOT), *draw_peers(ROOT))
+    for changed in (*written, *write_reference(ROOT), *write_reports(ROOT)):
         print(f"wrote {changed.relative_to(ROOT)}")
     return 0
 

@@ -12,7 +12,7 @@ import math
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from torch import Tensor
 
 from small_policy.export import export
 from small_policy.forward import Guide, draw_times, flow_loss, held_actions, mixed, velocity
-from small_policy.start import fresh_model
+from small_policy.start import fresh_model, trained_model
 from turbopi.checkpoint.norm_stats import FeatureStats, NormStats
 from turbopi.config import GemmaConfig, ModelConfig, PolicyConfig, RealTime, VisionConfig
 from turbopi.model.reference import Pi0Model
@@ -86,12 +86,14 @@ class Frames:
     def to(self, device: torch.device) -> "Frames":
         return Frames(self.places.to(device), self.chunks.to(device), self.delays.to(device))
 
-    def draw(self, number: int) -> "Frames":
-        """As many of them, each turned around the post and perhaps mirrored: it looks the same from everywhere."""
+    def draw(self, number: int, *, mirrored: bool = True) -> "Frames":
+        """As many of them, each turned around the post and, unless `mirrored` is False, half of them mirrored: it looks
+        the same from everywhere.
+        """
         device = self.places.device
         rows = torch.randint(len(self), (number,), device=device)
         turns = 2 * math.pi * torch.rand(number, device=device)
-        mirror = torch.where(torch.rand(number, device=device) < 0.5, 1.0, -1.0)
+        mirror = torch.where(torch.rand(number, device=device) < (0.5 if mirrored else 1.0), 1.0, -1.0)
         cos, sin = turns.cos(), turns.sin()
         change = torch.stack((torch.stack((cos, sin), -1), torch.stack((-sin * mirror, cos * mirror), -1)), -2)
         return Frames(self.places[rows] @ change, self.chunks[rows] @ change, self.delays[rows])
@@ -115,11 +117,6 @@ class Frames:
         """float32[N, GUIDED]"""
         target, _, tip = self.places.unbind(1)
         return torch.cat((self.places.flatten(1), 2 * (target - tip)), dim=1)
-
-
-def rows_of(world: Chase, rows: np.ndarray) -> Chase:
-    arrays = {item.name: getattr(world, item.name)[rows] for item in fields(Chase) if item.name != "time"}
-    return Chase(**arrays, time=world.time)
 
 
 def demonstrations(number: int, seed: int, workers: int = 1, at_once: int = 250) -> Frames:
@@ -155,12 +152,12 @@ def _play(number: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         asked = since >= every
         if asked.any():
             rows = np.flatnonzero(asked)
-            chosen, sides[rows] = _continued(rows_of(world, rows), running[rows], delay[rows], sides[rows], rng)
+            chosen, sides[rows] = _continued(world.rows(rows), running[rows], delay[rows], sides[rows], rng)
             running = running.copy()
             running[rows], since[rows] = _padded(chosen), 0
         action = running[everyone, 0] + noise * rng.normal(size=(number, 2))
         world.step(action)
-        _revive(world, rng)
+        revive(world, rng)
         running = np.concatenate((running[:, 1:], running[:, -1:]), axis=1)
         since += 1
     places, chunks, ahead = (np.concatenate(column) for column in zip(*frames, strict=True))
@@ -187,7 +184,7 @@ def _padded(chunks: np.ndarray) -> np.ndarray:
     return np.concatenate((chunks, np.repeat(chunks[:, -1:], MOST_DELAY, axis=1)), axis=1)
 
 
-def _revive(world: Chase, rng: np.random.Generator) -> None:
+def revive(world: Chase, rng: np.random.Generator) -> None:
     """Tips that touched the post go on from where they are pushed out: no policy learns from standing still."""
     if world.stopped.any():
         far = np.linalg.norm(world.tip, axis=1, keepdims=True)
@@ -197,11 +194,21 @@ def _revive(world: Chase, rng: np.random.Generator) -> None:
 
 
 class Trainer:
-    def __init__(self, settings: Settings) -> None:
+    """Learns from `Frames`, all under one prompt: token ids and mask [1, P]; None: the chase's.
+
+    `start` is a checkpoint of the same sizes to begin with; None: fresh weights.
+    """
+
+    def __init__(
+        self, settings: Settings, prompted: tuple[Tensor, Tensor] | None = None, start: Path | None = None
+    ) -> None:
         self.settings, self.device = settings, torch.device(settings.device)
         torch.manual_seed(settings.seed)
-        self.model = fresh_model(CONFIG.model, settings.seed)
-        _see_dots(self.model)
+        if start is None:
+            self.model = fresh_model(CONFIG.model, settings.seed)
+            _see_dots(self.model)
+        else:
+            self.model = trained_model(CONFIG.model, start)
         self.model.to(self.device)
         self.average = {name: value.detach().clone() for name, value in self.model.state_dict().items()}
         self.guide = Guide(CONFIG.model.vlm.width, GUIDED, 1, queries=3).to(self.device)
@@ -209,7 +216,7 @@ class Trainer:
         self.optimizer = torch.optim.AdamW(self._parameters, settings.learning_rate, (0.9, 0.95), weight_decay=0.01)
         self.steps = 0
         self._weights = WEIGHTS.to(self.device)
-        self.tokens, self.mask = (tensor.to(self.device) for tensor in prompt())
+        self.tokens, self.mask = (tensor.to(self.device) for tensor in prompted or prompt())
 
     def step(self, batch: Frames, progress: float) -> tuple[float, float]:
         """The losses: of the flow, and of the guide."""

@@ -17,7 +17,7 @@ Where the target is behind the post there are two ways around it, so that two ch
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,8 @@ _DRAWN = 4096  # random numbers of an episode; they begin again after that
 
 @dataclass
 class Chase:
-    """N episodes. Everything is an array with N rows; `surprise` float64[N, _DRAWN] decides when targets turn back."""
+    """N episodes. Everything is an array with N rows; `surprise` float64[N, M] decides when targets turn back,
+    and begins again after M steps."""
 
     tip: np.ndarray  # float64[N, 2]
     angle: np.ndarray  # float64[N]  of the target
@@ -67,6 +68,13 @@ class Chase:
         self.stopped = np.zeros(len(self.tip), np.bool_)
         return self
 
+    def rows(self, rows: np.ndarray) -> "Chase":
+        """Some of the episodes, int64[M], as they are now."""
+        arrays = {item.name: getattr(self, item.name)[rows] for item in fields(self) if item.name != "time"}
+        chosen = Chase(**arrays, time=self.time).cleared()
+        chosen.held, chosen.stopped = self.held[rows], self.stopped[rows]
+        return chosen
+
     @property
     def target(self) -> np.ndarray:
         """float64[N, 2]"""
@@ -75,7 +83,7 @@ class Chase:
     def step(self, actions: np.ndarray) -> np.ndarray:
         """One control step with actions float64[N, ≥ 2]; bool[N]: solved after it."""
         self.before = np.concatenate((self.before[:, 1:], self.target[:, None]), axis=1)
-        self.pace = np.where(self.surprise[:, self.time % _DRAWN] < TURN, -self.pace, self.pace)
+        self.pace = np.where(self.surprise[:, self.time % self.surprise.shape[1]] < TURN, -self.pace, self.pace)
         self.angle = self.angle + self.pace / self.orbit
         self.time += 1
         way = SPEED * cut(actions[:, :2])

@@ -1,6 +1,47 @@
-"""Research: one file a question, with what it takes to answer it again. Nothing else in Turbo-Pi imports this.
+"""Research: one file a question, with what it takes to answer it again. Only `turbopi study` imports this.
 
-fp8_and_fp4.py    what numbers of eight and four bits do to actions (formats.py, weights.py)
-certificates.py   FP8's certificates at full size, without a checkpoint
-tensorrt.py       what layouts, attention and precisions cost inside TensorRT: `turbopi study`
+Each study gives a `Report` (report.py): question, method, controls, tables, plots, verdict, what would change it. The
+questions, by the name that `turbopi study` takes, are in STUDIES; the reports that stand are in docs/research.md.
+
+study.py                what a study is and is given
+solvers.py, spread.py   integrators and time grids; how broad a policy's actions are
+rollouts.py, post.py    closed loop on toy tasks; the task with two ways
+problems.py             batches with exact solutions
+formats.py, weights.py  emulated number formats; kinds of weights
+certificates.py         FP8's certificates at full size, without a checkpoint: no question, a tool
 """
+
+import importlib
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from turbopi.errors import ConfigError
+
+if TYPE_CHECKING:
+    from turbopi.studies.study import Study
+
+STUDIES: dict[str, str] = {  # name -> what it asks, in a few words; modules are imported when they are asked for
+    "steps": "how few denoising steps are enough, and with which solver",
+    "kv_reuse": "keys and values of old pictures, reused while new ones look alike",
+    "fp8_and_fp4": "numbers of eight and four bits",
+    "pipelining": "the next observation encoded beside this one's denoising",
+    "steps_libero": "the same on LIBERO (any checkpoint for it; else the small policy)",
+    "mask": "a padded cache without its mask (any checkpoint)",
+    "precision": "attention and precisions inside TensorRT (any checkpoint)",
+    "actions": "what backends do to actions (any checkpoint; TensorRT)",
+    "throughput": "several observations in flight (any checkpoint; TensorRT)",
+}
+OF_CHECKPOINTS = ("mask", "precision", "actions", "throughput")
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Raises ConfigError, listing the choices, for a name that no study has."""
+    for name in names:
+        if name not in STUDIES:
+            raise ConfigError(f"unknown study {name!r}; choose of {', '.join(STUDIES)}")
+
+
+def load(name: str) -> "Study":
+    """The study called `name`, one of STUDIES."""
+    study: Study = importlib.import_module(f"turbopi.studies.{name}").STUDY
+    return study

@@ -1,39 +1,62 @@
-"""What numbers of eight and four bits do to actions: `python -m turbopi.studies.fp8_and_fp4 --out FILE`.
+"""What do numbers of eight and four bits do to actions, and to success?
 
-Emulated exactly in float32 (emulate.py, formats.py) on three sets of full-size weights (weights.py).
+Emulated exactly in float32 (engine/emulate.py, formats.py): on trained policies, in closed loop on toy tasks, and on
+three kinds of random weights (weights.py), full size on a GPU and tiny on a CPU.
 """
 
-import argparse
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
-from pathlib import Path
 
-import numpy as np
 import torch
 from msgspec import Struct
 from torch import Tensor
 
-from turbopi import backends, shipped
-from turbopi.calibrate.observations import Batch, batches
+from turbopi import shipped
+from turbopi.calibrate.observations import Batch
 from turbopi.calibrate.statistics import collect
-from turbopi.checkpoint import random_checkpoint
-from turbopi.engine.emulate import Round, RoundedWeights, delta_cosine, relative_rms, replaced, rounded
-from turbopi.examples import Example, with_noises
-from turbopi.files import write_whole
+from turbopi.checkpoint import open_checkpoint
+from turbopi.engine.emulate import (
+    Round,
+    RoundedWeights,
+    delta_cosine,
+    relative_rms,
+    replaced,
+    round_activation,
+    rounded,
+)
+from turbopi.evaluate.statistics import PairedDocument, RateDocument
 from turbopi.model.reference import Pi0Model
 from turbopi.model.sites import linears
-from turbopi.preprocess.pipeline import Pipeline
-from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
-from turbopi.provenance import Provenance, provenance
+from turbopi.provenance import Provenance
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, PARTS, Site, sites
 from turbopi.reading import plain_document
-from turbopi.studies.formats import attention_in_fp8, round_nvfp4
-from turbopi.studies.weights import WEIGHTS, Weights, studied_checkpoint
-from turbopi.wording import significant
+from turbopi.studies.formats import attention_in_fp8, nvfp4_without_scales, round_mxfp4, round_nvfp4
+from turbopi.studies.fp4_products import (
+    UNREAD,
+    UNSCALED,
+    ProductCosine,
+    matrices,
+    normal_matrices,
+    product_cosines,
+    savings,
+)
+from turbopi.studies.problems import libero_batches
+from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
+from turbopi.studies.rollouts import ToyPolicy, met, open_policy, play, sampled
+from turbopi.studies.study import Setup, Study
+from turbopi.studies.weights import WEIGHTS, studied_checkpoint
+
+WRONG = "NVFP4, scales ignored"
+NORMAL = "normal, 0.02"  # matrices
+IN_CLOSED_LOOP = (
+    *("FP8", "FP8, rounded for directions", "NVFP4", "NVFP4, rounded for directions", "NVFP4, weights alone"),
+    *("W4A8", "W4A8, rounded for directions", "W4A8 (MXFP4)", WRONG),
+)
+_JUDGED, _SEEN = 30_000, 40_000  # numbers of the first episodes that errors are measured on, that give directions
+STEPS = 5  # in closed loop, as these policies were judged
 
 
 class FormatError(Struct, frozen=True):
@@ -44,7 +67,7 @@ class FormatError(Struct, frozen=True):
 
 
 class Research(Struct, frozen=True):
-    """What this writes."""
+    """What this study wrote before there were reports: benchmarks/results/h200_*_fp8_research.json."""
 
     provenance: Provenance
     preset: str
@@ -53,15 +76,21 @@ class Research(Struct, frozen=True):
     errors: dict[str, dict[str, FormatError]]  # by weights, then by format and place
 
 
-def errors(
-    model: Pi0Model, made: list[Batch], seen: list[Batch], steps: int, formats: Sequence[str] | None = None
-) -> Iterator[tuple[str, FormatError]]:
-    """Formats and places, all or some, each with the actions' error; weights are rounded for what `seen` have in
-    common, where that is said.
+class FormatSuccess(Struct, frozen=True):
+    policy: str
+    format: str
+    rate: RateDocument
+    against_float32: PairedDocument
+
+
+Cases = dict[str, Callable[[], AbstractContextManager[None]]]
+
+
+def cases(model: Pi0Model, made: list[Batch], seen: list[Batch], steps: int) -> Cases:
+    """Formats and places. Activations' scales come from `made`; weights are rounded for what `seen` have in common,
+    where that is said. W4A8: weights in NVFP4 or MXFP4, activations in E4M3 with a scale for each site.
     """
-    noise = torch.cat([noise for _, noise in made])
-    exact = _actions(model, made, steps)
-    every = [site for site in sites(model.config) if site.refusal is None]
+    every = [site for site in sites(model.config) if site.refusal is None and site.width % 32 == 0]
     histograms = collect(model, every, made, steps)
     scales = {site: histograms[str(site)].scale("headroom") for site in every}
     rows: dict[str, Rows] = {}
@@ -71,7 +100,8 @@ def errors(
     def of(*parts: str, mlp: bool = False) -> dict[Site, float]:
         return {s: x for s, x in scales.items() if s.part in parts and (not mlp or s.kind in MLP_KINDS)}
 
-    cases: dict[str, Callable[[], AbstractContextManager[None]]] = {
+    four = partial(in_four_bits, model, of(*PARTS))
+    return {
         "FP8": lambda: rounded(model, of(*PARTS)),
         "FP8, rounded for directions": lambda: rounded(model, of(*PARTS), RoundedWeights(common)),
         "FP8, vision and prefix": lambda: rounded(model, of("vision", "prefix")),
@@ -79,13 +109,26 @@ def errors(
         **{f"FP8, {part}": lambda part=part: rounded(model, of(part)) for part in PARTS},  # type: ignore[misc]
         "FP8 attention, vision": lambda: attention_in_fp8("vision"),
         "FP8 attention, prefix and expert": lambda: attention_in_fp8("gemma"),
-        "NVFP4": lambda: in_nvfp4(model, of(*PARTS), activations=True),
-        "NVFP4, weights alone": lambda: in_nvfp4(model, of(*PARTS), activations=False),
-        "NVFP4, weights of the expert alone": lambda: in_nvfp4(model, of("expert"), activations=False),
-        "NVFP4, rounded for directions": lambda: in_nvfp4(model, of(*PARTS), common, activations=True),
-        "NVFP4, weights alone, rounded for directions": lambda: in_nvfp4(model, of(*PARTS), common, activations=False),
+        "NVFP4": lambda: four(activations="nvfp4"),
+        "NVFP4, weights alone": lambda: four(activations="exact"),
+        "NVFP4, weights of the expert alone": lambda: in_four_bits(model, of("expert"), activations="exact"),
+        "NVFP4, rounded for directions": lambda: four(common, activations="nvfp4"),
+        "NVFP4, weights alone, rounded for directions": lambda: four(common, activations="exact"),
+        "W4A8": lambda: four(activations="fp8"),
+        "W4A8, rounded for directions": lambda: four(common, activations="fp8"),
+        "W4A8 (MXFP4)": lambda: four(activations="fp8", weights=round_mxfp4),
+        "W4A8 (MXFP4), rounded for directions": lambda: four(common, activations="fp8", weights=round_mxfp4),
+        WRONG: lambda: four(activations="nvfp4", weights=lambda x, _: nvfp4_without_scales(x)),
     }
-    for name, context in cases.items():
+
+
+def errors(
+    model: Pi0Model, made: list[Batch], seen: list[Batch], steps: int, formats: Sequence[str] | None = None
+) -> Iterator[tuple[str, FormatError]]:
+    """Formats and places, all or some, each with the actions' error."""
+    noise = torch.cat([noise for _, noise in made])
+    exact = _actions(model, made, steps)
+    for name, context in cases(model, made, seen, steps).items():
         if formats is not None and name not in formats:
             continue
         with context():
@@ -93,99 +136,218 @@ def errors(
         yield name, FormatError(relative_rms(actions, exact), delta_cosine(actions, exact, noise))
 
 
+RoundFor = Callable[[Tensor, Directions | None], Tensor]
+
+
 @contextmanager
-def in_nvfp4(
-    model: Pi0Model, scales: dict[Site, float], common: Mapping[Site, Directions] | None = None, *, activations: bool
+def in_four_bits(
+    model: Pi0Model,
+    scales: Mapping[Site, float],
+    common: Mapping[Site, Directions] | None = None,
+    *,
+    activations: str,
+    weights: RoundFor = round_nvfp4,
 ) -> Iterator[None]:
-    """For a while, these sites' products are of NVFP4 numbers, the expert's activations too if any are; weights are
-    rounded for the sites' directions, if given.
+    """For a while, these sites' products are of weights in four bits, rounded for the sites' directions, if given.
+
+    activations  "exact", "nvfp4", or "fp8": E4M3 with the site's scale
     """
     held: dict[int, Tensor] = {}
 
-    def same(x: Tensor) -> Tensor:
-        return x
-
     def once(weight: Tensor, site: Site) -> Tensor:
         if id(weight) not in held:
-            held[id(weight)] = round_nvfp4(weight, (common or {}).get(site))
+            held[id(weight)] = weights(weight, (common or {}).get(site))
         return held[id(weight)]
 
-    inputs = round_nvfp4 if activations else same
+    def inputs(scale: float) -> Round:
+        if activations == "fp8":
+            return partial(round_activation, scale=scale)
+        return round_nvfp4 if activations == "nvfp4" else _same
+
     changes: list[tuple[torch.nn.Linear, Round, Round]] = [
-        (linear, inputs, partial(once, site=site)) for site in scales for linear in linears(model, site)
+        (linear, inputs(scale), partial(once, site=site))
+        for site, scale in scales.items()
+        for linear in linears(model, site)
     ]
     with replaced(changes):
         yield
 
 
-def _observation(frame: shipped.Frame, prompt: str) -> dict[str, np.ndarray | str]:
-    return {
-        "observation/image": frame.base,
-        "observation/wrist_image": frame.wrist,
-        "observation/state": frame.state,
-        "prompt": prompt,
-    }
+def _same(x: Tensor) -> Tensor:
+    return x
 
 
 def _actions(model: Pi0Model, made: list[Batch], steps: int) -> Tensor:
     return torch.cat([model.sample(observation, noise, steps) for observation, noise in made])
 
 
-def run(
-    preset: str,
-    device: torch.device,
-    count: int,
-    steps: int,
-    out: Path,
-    kinds: Sequence[Weights] = WEIGHTS,
-    formats: Sequence[str] | None = None,
-) -> Research:
-    """All errors, on LIBERO pictures: by weights and format; written to `out` as they come."""
-    checkpoint = shipped.with_libero_stats(random_checkpoint(preset))
-    sizes = checkpoint.config.model
-    tokenizer = load_tokenizer(TINY_TOKENIZER, checkpoint_dir=None, candidates=(), vocab_size=sizes.vocab_size)
-    pipeline = Pipeline(checkpoint.config, checkpoint.norm_stats, tokenizer)
-    frames = shipped.load_frames()
-    if not 1 <= count < len(frames):
-        raise SystemExit(f"--count is from 1 to {len(frames) - 1}, as other frames give the directions; it is {count}")
-    examples = [  # one prompt, so that they are one batch
-        Example(f"LIBERO frame {i}", *pipeline.before(_observation(frame, frames[0].prompt)))
-        for i, frame in enumerate(frames)
-    ]
-    shape = (sizes.action_horizon, sizes.action_dim)
-    made, seen = (
-        [batch for _, batch in batches(with_noises(some, shape, 1, seed), 8, device)]
-        for seed, some in enumerate((examples[:count], examples[count:]))
+# --- the study --------------------------------------------------------------------------------------------------------
+
+
+def run(setup: Setup) -> Report:
+    found: dict[str, dict[str, FormatError]] = {}
+    products = {NORMAL: product_cosines(normal_matrices())}
+    successes: list[FormatSuccess] = []
+    for name, (model, made, seen) in _problems(setup).items():
+        found[name] = dict(errors(model, made, seen, setup.steps, IN_CLOSED_LOOP if setup.small else None))
+        products[name] = product_cosines(matrices(model))
+        setup.tell(f"{name}: {len(found[name])} formats")
+    for policy in [open_policy("chase"), *(open_policy(name, folder) for name, folder in setup.policies.items())]:
+        count, actor = 2 if setup.small else 12, sampled(policy.model, STEPS)
+        made, seen = ([met(policy, range(first, first + count), actor)] for first in (_JUDGED, _SEEN))
+        found[policy.name] = dict(errors(policy.model, made, seen, STEPS, IN_CLOSED_LOOP if setup.small else None))
+        successes += _successes(policy, made, seen, setup)
+    return setup.report(
+        STUDY,
+        method=METHOD,
+        controls=_controls(found, successes, products),
+        tables=[_error_table(found), _product_table(products), _success_table(successes), savings()],
+        plots=[_plot(found, successes)],
+        verdict=verdict(found, successes),
+        would_change=WOULD_CHANGE,
+        not_run=[
+            "Golden cases: their weights are random, too.",
+            "Full-size weights, unless the device is a GPU: `turbopi study fp8_and_fp4 --device cuda`.",
+            "A kernel: nothing here is faster yet.",
+            "Closed loop on LIBERO.",
+        ],
+        data={
+            "errors": {name: {f: plain_document(e) for f, e in of.items()} for name, of in found.items()},
+            "products": {name: [plain_document(one) for one in of] for name, of in products.items()},
+            "successes": [plain_document(one) for one in successes],
+        },
     )
-    document = Research(provenance(device), preset, steps, count, errors={})
-    for kind in kinds:
-        model = Pi0Model.from_state(sizes, studied_checkpoint(kind, preset, device).load(device, "f32").state)
-        of_kind = document.errors.setdefault(kind, {})
-        for name, error in errors(model, made, seen, steps, formats):
-            of_kind[name] = error
-            print(
-                f"{kind}: {name:42} relative rms {significant(error.relative_rms)}  cosine {error.delta_cosine:.6f}",
-                flush=True,
+
+
+def _problems(setup: Setup) -> dict[str, tuple[Pi0Model, list[Batch], list[Batch]]]:
+    """By weights: a model, what it is judged on, and others, which give the directions. On LIBERO pictures."""
+    size = "pi05_libero" if setup.device.type == "cuda" else "pi05_tiny"
+    checkpoints = {"small policy": open_checkpoint(shipped.SMALL_POLICY)}
+    if not setup.small:
+        for kind in WEIGHTS:
+            drawn = studied_checkpoint(kind, size, setup.device)
+            checkpoints[f"{size}, {kind}"] = shipped.with_libero_stats(drawn)
+    problems = {}
+    for name, checkpoint in checkpoints.items():
+        model, seen, made = libero_batches(checkpoint, setup.device, setup.small)
+        problems[name] = model, [made], [seen]
+    return problems
+
+
+def _successes(policy: ToyPolicy, made: list[Batch], seen: list[Batch], setup: Setup) -> list[FormatSuccess]:
+    episodes, actor = range(setup.cell_episodes), sampled(policy.model, STEPS)
+    exact = play(policy, episodes, actor)
+    chosen = cases(policy.model, made, seen, STEPS)
+    cells = []
+    for name in ("float32", *(("W4A8", WRONG) if setup.small else IN_CLOSED_LOOP)):
+        with chosen.get(name, nullcontext)():
+            played = play(policy, episodes, actor)
+        cells.append(FormatSuccess(policy.name, name, played.rate.document, played.against(exact).document))
+        setup.tell(f"{policy.name}: {name}: {played.rate}")
+    return cells
+
+
+METHOD = (
+    "Every product of vision, prefix and expert whose sizes allow it, with operands rounded exactly as the format "
+    "holds them, float32 between. NVFP4: E2M1 numbers in blocks of 16 with an E4M3 scale, and a float32 scale for the "
+    "tensor. W4A8: weights in NVFP4, or in MXFP4 (blocks of 32, scales powers of two), activations in E4M3 with a "
+    f"calibrated scale for each site. Closed loop on toy tasks, {STEPS} steps, the same episodes and noise in every "
+    "cell."
+)
+WOULD_CHANGE = (
+    "Trained weights of full size, whose outliers are larger than any here; a kernel. On 10.x and 11.0 `tcgen05.mma` "
+    "multiplies NVFP4 by NVFP4 (kind::mxf4nvf4, block scales in tensor memory, in 128 × 4 tiles), on 12.x `mma.sync` "
+    "does with scales in registers. Both multiply E2M1 by E4M3 only with MX scales (blocks of 32, powers of two; "
+    "kind::mxf8f6f4): W4A8 with NVFP4's scales has to be unpacked to FP8 first, as on Hopper."
+)
+CLAIMED = "NVFP4's cosine is 0.0004, W4A8's −0.0008: “scale ignored”. Not viable; FP8 has 0.9996."
+
+
+def _controls(
+    found: Mapping[str, Mapping[str, FormatError]],
+    successes: Sequence[FormatSuccess],
+    products: Mapping[str, Sequence[ProductCosine]],
+) -> list[Control]:
+    right = min(of["NVFP4"].delta_cosine for of in found.values())
+    wrong = max(of[WRONG].delta_cosine for of in found.values())
+    by_how = {one.how: one for one in products[NORMAL]}
+    unscaled, unread = abs(by_how[UNSCALED].median), by_how[UNREAD].median
+    cells = {(one.policy, one.format): one.against_float32 for one in successes}
+    lost = max(cells[policy, WRONG].difference or 0.0 for policy, _ in cells)
+    return [
+        Control(
+            "Actions are worse with scales ignored than right, on all weights.",
+            all(of[WRONG].relative_rms > of["NVFP4"].relative_rms for of in found.values()),
+            f"Cosine of what denoising did: at most {wrong:.3f}, right at least {right:.3f}.",
+        ),
+        Control(
+            "Without any scale nothing is left of a product, and with scales that aren't read most is.",
+            unscaled < 0.05 < 0.9 < unread,
+            f"Cosine {unscaled:.4f} and {unread:.4f}, of normal weights with deviation 0.02.",
+        ),
+        Control(
+            "With scales ignored the tasks aren't solved.", lost < -0.2, f"Smallest loss {-100 * lost:.1f} points."
+        ),
+        Control("float32 is float32.", all(cells[policy, "float32"].difference == 0 for policy, _ in cells), ""),
+    ]
+
+
+def verdict(found: Mapping[str, Mapping[str, FormatError]], successes: Sequence[FormatSuccess]) -> str:
+    said = []
+    for policy in dict.fromkeys(one.policy for one in successes):
+        cells = [one for one in successes if one.policy == policy and one.format not in ("float32", WRONG)]
+        worse = [one.format for one in cells if one.against_float32.difference95[1] < 0]
+        said.append(
+            f"{policy}: {'worse than float32: ' + ', '.join(worse) if worse else 'no format is worse than float32'}"
+        )
+    small = found["small policy"]
+    told = ", ".join(f"{name} {small[name].relative_rms:.3f}" for name in ("FP8", "W4A8", "NVFP4"))
+    return f"{'. '.join(said)}. Relative rms error of the small policy's actions: {told}."
+
+
+def _error_table(found: Mapping[str, Mapping[str, FormatError]]) -> Grid:
+    formats = list(next(iter(found.values())))
+    rows: list[list[Cell]] = [
+        [name, *(f"{of[name].relative_rms:.4f} / {of[name].delta_cosine:.5f}" for of in found.values())]
+        for name in formats
+    ]
+    return Grid("Actions: relative rms error / cosine of what denoising did", ["format", *found], rows)
+
+
+def _product_table(products: Mapping[str, Sequence[ProductCosine]]) -> Grid:
+    how = [one.how for one in next(iter(products.values()))]
+    rows: list[list[Cell]] = [
+        [name, *(f"{of[i].median:.5f} / {of[i].worst:.5f}" for of in products.values())] for i, name in enumerate(how)
+    ]
+    return Grid("One product with weights in four bits, cosine: median / worst", ["how", *products], rows)
+
+
+def _success_table(successes: Sequence[FormatSuccess]) -> Grid:
+    columns = ["policy", "format", "solved", "success, % [95 %]", "against float32, points"]
+    rows: list[list[Cell]] = [
+        [one.policy, one.format, *rate_cells(one.rate), paired_cell(one.against_float32)] for one in successes
+    ]
+    return Grid("Closed loop", columns, rows)
+
+
+def _plot(found: Mapping[str, Mapping[str, FormatError]], successes: Sequence[FormatSuccess]) -> Plot:
+    series = []
+    for policy in dict.fromkeys(one.policy for one in successes):
+        own = [one for one in successes if one.policy == policy and one.format in found[policy]]
+        own.sort(key=lambda one: found[policy][one.format].relative_rms)
+        ends = [one.rate.wilson95 for one in own]
+        series.append(
+            Series(
+                policy,
+                [found[policy][one.format].relative_rms for one in own],
+                [100 * (one.rate.rate or 0.0) for one in own],
+                [100 * low for low, _ in ends],
+                [100 * high for _, high in ends],
             )
-            write_whole(out, json.dumps(plain_document(document), indent=1) + "\n")
-        del model
-    return document
+        )
+    title = "Success by the error of the actions"
+    panel = Panel(title, "relative rms error", "%, with Wilson's interval, 95 %", series, log_x=True)
+    return Plot("fp8_and_fp4", [panel])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", default="pi05_libero")
-    parser.add_argument("--device", default="auto")
-    parser.add_argument("--count", type=int, default=2, help="observations, of 6")
-    parser.add_argument("--steps", type=int, default=10)
-    parser.add_argument("--weights", choices=WEIGHTS, action="append", help="one of the three; may be given again")
-    parser.add_argument("--format", action="append", help="one of what is printed; may be given again")
-    parser.add_argument("--out", type=Path, required=True)
-    options = parser.parse_args()
-    device = backends.resolve_device(options.device)
-    kinds = options.weights or WEIGHTS
-    run(options.preset, device, options.count, options.steps, options.out, kinds, options.format)
-
-
-if __name__ == "__main__":
-    main()
+STUDY = Study("fp8_and_fp4", "What do numbers of eight and four bits do to actions, and to success?", CLAIMED, run)

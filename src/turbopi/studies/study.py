@@ -1,0 +1,98 @@
+"""What a study is, and what it is given. Each file of one has a `STUDY`."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from turbopi import backends, shipped
+from turbopi.checkpoint import Checkpoint
+from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.policy import UnifiedPolicy
+from turbopi.provenance import provenance
+from turbopi.studies.report import Report
+
+FEWEST_EPISODES = 200  # of a cell that a conclusion rests on
+SMALL_EPISODES = 8
+
+
+def _silent(line: str) -> None:
+    return None
+
+
+def _packaged(policy: UnifiedPolicy) -> tuple[list[dict[str, object]], str]:
+    return shipped.observations(policy, shipped.load_frames()), "LIBERO pictures that come with Turbo-Pi"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    """How a study is run.
+
+    small        the form for trying and tests: seconds, and numbers that mean little
+    command      what the user typed, for the report
+    checkpoint   for studies of any checkpoint; None: the study has policies of its own
+    observations gives those to measure on, under the keys of a policy's robot, and says where they are from
+    policies     folders of toy policies that aren't shipped, by name (studies/rollouts.py)
+    tell         is told of progress, a line at a time
+    """
+
+    small: bool = False
+    command: str = "turbopi study"
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    checkpoint: Checkpoint | None = None
+    observations: Callable[[UnifiedPolicy], tuple[list[dict[str, object]], str]] = _packaged
+    policies: Mapping[str, Path] = field(default_factory=dict)
+    simulator: str = "libero"  # of the studies in a simulator
+    ways: Sequence[str] = ()  # which of their cells; none: all
+    folder: Path | None = None  # where they keep episodes, so that they can go on; None: nowhere
+    workers: int | None = None  # simulators at a time
+    episodes: int | None = None  # of a cell; None: the form's own number
+    steps: int = 10  # of denoising
+    calls: int = 100
+    seed: int = 0
+    tell: Callable[[str], None] = _silent
+
+    @property
+    def cell_episodes(self) -> int:
+        if self.episodes is not None:
+            return self.episodes
+        return SMALL_EPISODES if self.small else FEWEST_EPISODES
+
+    def needed_checkpoint(self, study: str) -> Checkpoint:
+        """The checkpoint. Raises ConfigError if none was given."""
+        if self.checkpoint is None:
+            raise ConfigError(
+                f"the {study} study needs weights: give a checkpoint's folder, or --random-weights PRESET "
+                "(such as pi05_tiny)"
+            )
+        return self.checkpoint
+
+    def report(self, study: "Study", **parts: object) -> Report:
+        """A report of `study` with what every report says of how it was run."""
+        return Report(
+            study=study.name,
+            question=study.question,
+            claimed=study.claimed,
+            small=self.small,
+            command=self.command,
+            provenance=provenance(self.device),
+            **parts,  # type: ignore[arg-type]
+        )
+
+
+@dataclass(frozen=True)
+class Study:
+    """A question and what answers it. `claimed`: what an earlier project found."""
+
+    name: str
+    question: str
+    claimed: str
+    run: Callable[[Setup], Report]
+    needs_tensorrt: bool = False
+
+    def check(self, device: torch.device) -> None:
+        """Raise BackendUnavailable where it can't run."""
+        reason = backends.availability("tensorrt", device) if self.needs_tensorrt else None
+        if reason is not None:
+            raise BackendUnavailable(f"the {self.name} study needs TensorRT: {reason}")

@@ -1,0 +1,82 @@
+"""Reports of studies below benchmarks/results/: their Markdown and plots, and the documents' tables of them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from turbopi.errors import ConfigError
+from turbopi.reading import read_document
+from turbopi.studies import report
+from turbopi.studies.report import Report, table_lines
+
+
+def read_report(file: Path) -> Report:
+    """Raises ConfigError, a ValueError, for a file of another kind."""
+    return read_document(file, Report, ConfigError)
+
+
+def _reports(root: Path) -> Iterator[tuple[Path, Report]]:
+    for file in sorted((root / "benchmarks" / "results").glob(f"*/*/{report.JSON}")):
+        yield file.parent, read_report(file)
+
+
+def stale_reports(root: Path) -> list[str]:
+    """One line for each report whose Markdown isn't what its JSON says, or whose plots are missing."""
+    found = []
+    for folder, document in _reports(root):
+        text = folder / report.MARKDOWN
+        if not text.is_file() or text.read_text(encoding="utf-8") != report.markdown(document):
+            found.append(f"{text.relative_to(root)} isn't what {report.JSON} beside it says; run scripts/tables")
+        plots = (folder / f"{plot.name}.png" for plot in document.plots)
+        found += [f"{plot.relative_to(root)} is missing; run scripts/tables" for plot in plots if not plot.is_file()]
+    return found
+
+
+def write_reports(root: Path) -> list[Path]:
+    """Write Markdown and plots of every report that needs them anew."""
+    if not stale_reports(root):
+        return []
+    return [path for folder, document in _reports(root) for path in report.write(document, folder)]
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def study(document: Report) -> list[str]:
+    """What was found and whether it can be believed: the verdict and the controls."""
+    controls = [
+        f"{'held' if one.held else '**failed**'}: {one.claim} {one.evidence}".rstrip() for one in document.controls
+    ]
+    return [f"*Verdict of the intervals.* {document.verdict}", "", *(f"- Control {line}" for line in controls)]
+
+
+def few_steps(document: Report) -> list[str]:
+    """Success by the number of evaluations: Euler's steps, the best other cell, and the warm start."""
+    cells = document.data["successes"]
+    assert isinstance(cells, list)
+    rows: list[list[report.Cell]] = []
+    for policy in dict.fromkeys(cell["policy"] for cell in cells):
+        for count in dict.fromkeys(cell["evaluations"] for cell in cells):
+            own = [cell for cell in cells if (cell["policy"], cell["evaluations"]) == (policy, count)]
+            cold = [cell for cell in own if not cell["warm"]]
+            (euler,) = [cell for cell in cold if (cell["solver"], cell["grid"]) == ("euler", "uniform")]
+            (warm,) = [cell for cell in own if cell["warm"] and cell["solver"] == "euler"]
+            best = max(cold, key=lambda cell: cell["rate"]["successes"])
+            named = "" if count == 1 else f"{_percent(best)} ({best['solver']}, {best['grid']})"
+            rows.append([policy, count, f"{_percent(euler)} {_interval(euler)}", named, _percent(warm)])
+    head = [
+        "policy",
+        "evaluations",
+        "Euler, uniform grid, % [95 %]",
+        "best of all solvers and grids",
+        "Euler, warm start",
+    ]
+    return table_lines(report.Grid("", head, rows))
+
+
+def _percent(cell: dict[str, dict[str, float]]) -> str:
+    return f"{100 * cell['rate']['rate']:.1f}"
+
+
+def _interval(cell: dict[str, dict[str, list[float]]]) -> str:
+    low, high = cell["rate"]["wilson95"]
+    return f"[{100 * low:.1f}, {100 * high:.1f}]"
