@@ -115,7 +115,7 @@ def test_the_loop_is_as_exact_as_ordinary_bf16(
     assert relative(x_t[-1], reference[-1]) <= 1.1 * relative(ordinary_bf16(p), reference[-1])
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [4, 5, 6])  # blocks stand still for a while, so that others run ahead
 def test_it_is_right_in_whatever_order_its_threads_go(monkeypatch: pytest.MonkeyPatch, folder: Path, seed: int) -> None:
     p = problem("golden", 2, 10, 37, 1, CPU)
     packed = PackedExpert.pack(p.config, p.layers)

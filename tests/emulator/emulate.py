@@ -142,7 +142,8 @@ extern "C" const char* run(int blocks, int threads, int cluster, int seed, void*
     static std::string why;
     try {{
         machine::grid.x = blocks, machine::cta_threads = threads, machine::ranks = cluster;
-        machine::random.seed(seed), machine::eager = seed % 2, machine::moved = 0;
+        machine::random.seed(seed), machine::eager = seed % 2, machine::uneven = seed >= 4;
+        machine::moved = 0;
         machine::kernel = [&] {{ {name}({call}); }};
         for (int first = 0; first < blocks; first += cluster) machine::run_cluster(first);
         return nullptr;

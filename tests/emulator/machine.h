@@ -105,7 +105,7 @@ inline std::map<int, Barrier> barriers;  // by rank and number; cluster's: -1
 inline std::vector<Warp> warps;
 inline std::vector<Copy> copies;
 inline std::mt19937 random;
-inline bool eager;
+inline bool eager, uneven;  // uneven: again and again a block stands still for a while
 inline long moved, rounds;  // moved: counts all that lets somebody go on
 inline std::function<void()> kernel;
 
@@ -301,14 +301,17 @@ inline void run_cluster(int first) {
         t.context.uc_stack.ss_sp = t.stack.get(), t.context.uc_stack.ss_size = 128 * 1024, t.context.uc_link = nullptr;
         makecontext(&t.context, run_thread, 0);
     }
-    int idle = 0;
+    int idle = 0, slow = -1;
+    long until = 0;
     for (bool left = true; left;) {
         const long before = moved;
+        if (uneven && rounds >= until) slow = int(random() % (ranks + 1)) - 1, until = rounds + random() % 200;
         left = false;
         std::shuffle(order.begin(), order.end(), random);
         for (int i : order) {
             if (threads[i].ended) continue;
             left = true, now = &threads[i];
+            if (now->rank == slow) continue;
             swapcontext(&scheduler, &now->context);
             if (!fault.empty()) throw std::runtime_error(fault);
         }
@@ -319,6 +322,7 @@ inline void run_cluster(int first) {
                 copies.erase(copies.begin() + i), make(c);
             }
         idle = moved == before ? idle + 1 : 0, ++rounds;
+        if (moved == before) until = 0;  // all others wait for the one that stands still
         if (left && idle == 100) throw std::runtime_error("everybody waits for somebody else");
     }
 }
