@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 from emulator import emulate
-from kernel_turns.problems import Problem, ordinary_bf16, plain, problem, relative
+from kernel_turns.problems import Problem, input_scales, ordinary_bf16, plain, problem, relative
 from torch import Tensor
 
 from turbopi.kernels.arguments import Parameter, Parameters

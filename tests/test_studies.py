@@ -29,6 +29,7 @@ from turbopi.studies import (
     report,
     solvers,
     steps,
+    steps_libero,
 )
 from turbopi.studies.report import Control, Grid, Report
 from turbopi.studies.rollouts import CHASE, Call, met, open_policy, play, sampled

@@ -22,9 +22,11 @@ from compile_for_all.calls import all_calls
 from compile_for_all.cubin import used
 from compile_for_all.document import Compiled
 from compile_for_all.launches import Launch, launches
-from compile_for_all.targets import Target, over_limit
+from compile_for_all.targets import MULTIPROCESSORS, Target, over_limit
+from turbopi.config import preset
 from turbopi.errors import BackendError
 from turbopi.kernels import portable
+from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.gemm.tiles import fp8_refusal
 
 HOPPER = (9, 0)
@@ -82,14 +84,26 @@ def compiled_cuda(target: Target, name: str, make: Callable[[Path | None], bytes
 
 
 def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], bytes]]]:
-    """(name, what compiles it): Hopper's for 9.0, and those that modules below kernels/portable offer.
-
-    Such a module has `for_all(arch)`: pairs as these, with the cubin made by `nvrtc.compile_cubin` for that arch.
-    """
+    """(name, what compiles it): Hopper's for 9.0, and the portable denoising loop of 10 and of 50 actions."""
     if target.capability == HOPPER:
         yield from ((f"sm90: {name}", make) for name, make in machine_code.SHAPES.items())
-    for module in portable_modules():
-        yield from getattr(module, "for_all", lambda arch: ())(target.arch)
+    for suffix in (10, 50):
+        for fp8 in (False, True) if fp8_refusal(target.capability) is None else (False,):
+            name = f"denoise.kernel, H={suffix}, {'FP8' if fp8 else 'bf16'}"
+            yield name, partial(_denoising, target, suffix, fp8)
+
+
+def _denoising(target: Target, suffix: int, fp8: bool, folder: Path | None) -> bytes:
+    sizes = denoise.kernel_sizes(
+        preset("pi05_libero").model,
+        blocks=MULTIPROCESSORS[target.capability],
+        cache_rows=machine_code.CACHE_ROWS,
+        suffix=suffix,
+        fp8=fp8,
+        choice=denoise.choices(suffix),
+    )
+    assert target.shared >= denoise.SHARED_BYTES, target
+    return denoise.compiled(target.arch, sizes, folder=folder)
 
 
 def portable_modules() -> list[Any]:
