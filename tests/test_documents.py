@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from doc_tables import blocks, drawn, peers
+from doc_tables import blocks, drawn, peers, studies
 from doc_tables.__main__ import main
 from doc_tables.reference import DOCUMENT, reference, stale_reference, write_reference
 from doc_tables.tables import TABLES, headline, whole_calls
@@ -104,6 +104,19 @@ def test_a_figure_that_was_changed_by_hand_is_found(tmp_path: Path) -> None:
 def test_a_place_that_names_nothing_is_refused(tmp_path: Path, table: str, said: str) -> None:
     with pytest.raises(blocks.TableError, match=said):
         blocks.fill(project(tmp_path, table))
+
+
+def test_a_report_of_a_study_that_was_changed_by_hand_is_found_and_written_anew(tmp_path: Path) -> None:
+    folder = tmp_path / "benchmarks" / "results" / "some" / "mask"
+    folder.mkdir(parents=True)
+    for file in (RESULT.parents[1] / "cpu_2026-11-24_studies" / "mask").iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    assert studies.stale_reports(tmp_path) == [] == studies.write_reports(tmp_path)
+    text = folder / "report.md"
+    text.write_text(text.read_text().replace("held", "nearly held"))
+    (folder / "mask.png").unlink()
+    assert len(studies.stale_reports(tmp_path)) == 2
+    assert text in studies.write_reports(tmp_path) and studies.stale_reports(tmp_path) == []
 
 
 def test_a_table_without_an_end_is_refused(tmp_path: Path) -> None:

@@ -71,7 +71,8 @@ def study(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Of steps_libero: simulators at a time; half of the CPUs.")
+        int | None,
+        typer.Option(metavar="N", min=1, help="Processes at a time: a policy each, or of steps_libero a simulator."),
     ] = None,
     observation: Annotated[
         Path | None,

@@ -1,12 +1,13 @@
 """What do numbers of eight and four bits do to actions, and to success?
 
 Emulated exactly in float32 (engine/emulate.py, formats.py): on trained policies, in closed loop on toy tasks, and on
-three kinds of random weights (weights.py), full size on a GPU and tiny on a CPU.
+two kinds of random weights (weights.py), full size on a GPU and tiny on a CPU.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
+from pathlib import Path
 
 import torch
 from msgspec import Struct
@@ -46,7 +47,7 @@ from turbopi.studies.fp4_products import (
 from turbopi.studies.problems import libero_batches
 from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
 from turbopi.studies.rollouts import ToyPolicy, met, open_policy, play, sampled
-from turbopi.studies.study import Setup, Study
+from turbopi.studies.study import Setup, Study, Tell
 from turbopi.studies.weights import WEIGHTS, studied_checkpoint
 
 WRONG = "NVFP4, scales ignored"
@@ -184,19 +185,27 @@ def _actions(model: Pi0Model, made: list[Batch], steps: int) -> Tensor:
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
+def judge(
+    tell: Tell, name: str, folder: Path, *, count: int, small: bool
+) -> tuple[dict[str, FormatError], list[FormatSuccess]]:
+    """A policy of a toy task: errors of its actions, and successes."""
+    policy = open_policy(name, folder)
+    met_in, actor = 2 if small else 12, sampled(policy.model, STEPS)
+    made, seen = ([met(policy, range(first, first + met_in), actor)] for first in (_JUDGED, _SEEN))
+    found = dict(errors(policy.model, made, seen, STEPS, IN_CLOSED_LOOP if small else None))
+    return found, _successes(policy, made, seen, count, small, tell)
+
+
 def run(setup: Setup) -> Report:
     found: dict[str, dict[str, FormatError]] = {}
     products = {NORMAL: product_cosines(normal_matrices())}
-    successes: list[FormatSuccess] = []
     for name, (model, made, seen) in _problems(setup).items():
         found[name] = dict(errors(model, made, seen, setup.steps, IN_CLOSED_LOOP if setup.small else None))
         products[name] = product_cosines(matrices(model))
         setup.tell(f"{name}: {len(found[name])} formats")
-    for policy in [open_policy("chase"), *(open_policy(name, folder) for name, folder in setup.policies.items())]:
-        count, actor = 2 if setup.small else 12, sampled(policy.model, STEPS)
-        made, seen = ([met(policy, range(first, first + count), actor)] for first in (_JUDGED, _SEEN))
-        found[policy.name] = dict(errors(policy.model, made, seen, STEPS, IN_CLOSED_LOOP if setup.small else None))
-        successes += _successes(policy, made, seen, setup)
+    every = setup.each(partial(judge, count=setup.cell_episodes, small=setup.small), setup.toy_policies)
+    found |= {name: of for name, (of, _) in zip(setup.toy_policies, every, strict=True)}
+    successes = [cell for _, own in every for cell in own]
     return setup.report(
         STUDY,
         method=METHOD,
@@ -224,26 +233,28 @@ def _problems(setup: Setup) -> dict[str, tuple[Pi0Model, list[Batch], list[Batch
     size = "pi05_libero" if setup.device.type == "cuda" else "pi05_tiny"
     checkpoints = {"small policy": open_checkpoint(shipped.SMALL_POLICY)}
     if not setup.small:
-        for kind in WEIGHTS:
+        for kind in WEIGHTS[1:]:
             drawn = studied_checkpoint(kind, size, setup.device)
             checkpoints[f"{size}, {kind}"] = shipped.with_libero_stats(drawn)
     problems = {}
     for name, checkpoint in checkpoints.items():
-        model, seen, made = libero_batches(checkpoint, setup.device, setup.small)
+        model, seen, made = libero_batches(checkpoint, setup.device, setup.small, one_prompt=True)
         problems[name] = model, [made], [seen]
     return problems
 
 
-def _successes(policy: ToyPolicy, made: list[Batch], seen: list[Batch], setup: Setup) -> list[FormatSuccess]:
-    episodes, actor = range(setup.cell_episodes), sampled(policy.model, STEPS)
+def _successes(
+    policy: ToyPolicy, made: list[Batch], seen: list[Batch], count: int, small: bool, tell: Tell
+) -> list[FormatSuccess]:
+    episodes, actor = range(count), sampled(policy.model, STEPS)
     exact = play(policy, episodes, actor)
     chosen = cases(policy.model, made, seen, STEPS)
     cells = []
-    for name in ("float32", *(("W4A8", WRONG) if setup.small else IN_CLOSED_LOOP)):
+    for name in ("float32", *(("W4A8", WRONG) if small else IN_CLOSED_LOOP)):
         with chosen.get(name, nullcontext)():
             played = play(policy, episodes, actor)
         cells.append(FormatSuccess(policy.name, name, played.rate.document, played.against(exact).document))
-        setup.tell(f"{policy.name}: {name}: {played.rate}")
+        tell(f"{policy.name}: {name}: {played.rate}")
     return cells
 
 

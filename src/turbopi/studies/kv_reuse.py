@@ -15,6 +15,8 @@ policies here have one instruction and read no state.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -33,7 +35,7 @@ from turbopi.observation import Observation
 from turbopi.reading import plain_document
 from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
 from turbopi.studies.rollouts import Call, Played, ToyPolicy, open_policy, play, sampled
-from turbopi.studies.study import Setup, Study
+from turbopi.studies.study import Setup, Study, Tell
 
 NOTHING = 1.5  # θ above any cosine: nothing is ever reused
 STEPS = 5
@@ -56,7 +58,7 @@ class Reuse:
 def cells(small: bool) -> list[Reuse]:
     if small:
         return [Reuse("full", 0.9), Reuse("patch", 0.9), Reuse("camera", 0.9), Reuse("every", 2)]
-    thresholds = (0.995, 0.985, 0.97, 0.95, 0.9, 0.8)
+    thresholds = (0.985, 0.95, 0.9, 0.8)
     found = [Reuse(what, theta) for what in ("full", "camera", "patch") for theta in thresholds]
     return found + [Reuse("every", k) for k in (2, 3, 4)]
 
@@ -67,7 +69,7 @@ class ReuseCell(Struct, frozen=True):
     value: float
     rate: RateDocument
     against_plain: PairedDocument
-    reused: float  # share of the image tokens, of all calls, whose keys and values (or embeddings) are old
+    reused: float  # share of the image tokens, of all calls until an episode is decided, that are old
     reused_calls: float  # share of the calls in which all are
     action_error: float  # rms of the chunks' difference to fresh ones, over calls that reuse, relative to those
 
@@ -81,6 +83,9 @@ class Memory:
     k: Tensor  # [layer, B, G, S, K]
     v: Tensor
 
+    def rows(self, rows: list[int]) -> "Memory":
+        return Memory(self.hidden[rows], self.embs[rows], self.k[:, rows], self.v[:, rows])
+
 
 @dataclass
 class Reusing:
@@ -90,13 +95,17 @@ class Reusing:
     reuse: Reuse
     roll: int = 0
     memory: Memory | None = None
-    shares: list[float] = field(default_factory=list)
-    whole: list[float] = field(default_factory=list)
+    episodes: Sequence[int] = ()  # of the memory's rows
+    shares: list[float] = field(default_factory=list)  # of each episode's call: image tokens that are reused
     errors: list[tuple[float, float]] = field(default_factory=list)
 
     def __call__(self, call: Call) -> Tensor:
         if call.number == 0:
             self.memory = None
+        elif self.memory is not None and len(call.episodes) < len(self.episodes):  # others are decided
+            place = {episode: row for row, episode in enumerate(self.episodes)}
+            self.memory = self.memory.rows([place[episode] for episode in call.episodes])
+        self.episodes = call.episodes
         embedded, hidden = embed(self.model, call.observation)
         old = self._stale(call, hidden)
         if self.memory is None or not bool(old.any()):
@@ -108,8 +117,7 @@ class Reusing:
             chunk = self.model.denoise(cache, call.noise, STEPS)
             self._compare(call, embedded, chunk, old)
         self._remember(hidden, embedded, cache, keep)
-        self.shares.append(float(old.float().mean()))
-        self.whole.append(float(old.all(1).float().mean()))
+        self.shares += old.float().mean(1).tolist()
         return chunk
 
     def _stale(self, call: Call, hidden: Tensor) -> Tensor:
@@ -130,8 +138,8 @@ class Reusing:
         assert self.memory is not None
         memory = self.memory
         if self.roll:
-            memory = Memory(*(torch.roll(x, self.roll, 0) for x in (memory.hidden, memory.embs)),
-                            *(torch.roll(x, self.roll, 1) for x in (memory.k, memory.v)))  # fmt: skip
+            count = len(memory.hidden)
+            memory = memory.rows([(row - self.roll) % count for row in range(count)])
         text = embedded.embs.shape[1] - old.shape[1]
         if self.reuse.what == "camera":
             stale = F.pad(old, (0, text))
@@ -226,23 +234,26 @@ def speed_ups(reuse: Reuse, reused: float, whole: float) -> tuple[float, float, 
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
+def judge(tell: Tell, name: str, folder: Path, *, count: int, small: bool) -> tuple[Played, list[ReuseCell]]:
+    """A policy without reuse, and in every cell."""
+    policy, episodes = open_policy(name, folder), range(count)
+    baseline = play(policy, episodes, sampled(policy.model, STEPS))
+    found = []
+    for reuse in cells(small):
+        actor = Reusing(policy.model, reuse)
+        found.append(_cell(policy, reuse, play(policy, episodes, actor), baseline, actor))
+        tell(f"{name}: {reuse}: {found[-1].rate.rate}, reused {found[-1].reused:.2f}")
+    return baseline, found
+
+
 def run(setup: Setup) -> Report:
-    policies = [open_policy("chase"), *(open_policy(name, folder) for name, folder in setup.policies.items())]
-    episodes = range(setup.cell_episodes)
-    found: list[ReuseCell] = []
-    baselines: dict[str, Played] = {}
-    for policy in policies:
-        baselines[policy.name] = play(policy, episodes, sampled(policy.model, STEPS), everyone=True)
-        for reuse in cells(setup.small):
-            actor = Reusing(policy.model, reuse)
-            found.append(
-                _cell(policy, reuse, play(policy, episodes, actor, everyone=True), baselines[policy.name], actor)
-            )
-            setup.tell(f"{policy.name}: {reuse}: {found[-1].rate.rate}, reused {found[-1].reused:.2f}")
+    every = setup.each(partial(judge, count=setup.cell_episodes, small=setup.small), setup.toy_policies)
+    baselines = {name: played for name, (played, _) in zip(setup.toy_policies, every, strict=True)}
+    found = [cell for _, own in every for cell in own]
     return setup.report(
         STUDY,
         method=METHOD,
-        controls=_controls(policies[0], episodes, baselines["chase"]),
+        controls=_controls(open_policy("chase"), range(setup.cell_episodes), baselines["chase"]),
         tables=[_table(name, played, found) for name, played in baselines.items()],
         plots=[_plot(found)],
         verdict=verdict(found),
@@ -267,7 +278,7 @@ def _cell(policy: ToyPolicy, reuse: Reuse, played: Played, baseline: Played, act
         played.rate.document,
         played.against(baseline).document,
         float(np.mean(actor.shares)),
-        float(np.mean(actor.whole)),
+        float(np.mean([share == 1 for share in actor.shares])),
         actor.error,
     )
 
@@ -287,14 +298,10 @@ CLAIMED = (
 
 def _controls(policy: ToyPolicy, episodes: Sequence[int], baseline: Played) -> list[Control]:
     few = range(min(16, len(episodes)))
-    expected = play(policy, few, sampled(policy.model, STEPS), everyone=True).paths
+    expected = play(policy, few, sampled(policy.model, STEPS)).paths
     never = [Reuse("every", 1), *(Reuse(what, NOTHING) for what in ("full", "camera", "patch"))]
-    equal = all(
-        np.array_equal(play(policy, few, Reusing(policy.model, one), everyone=True).paths, expected) for one in never
-    )
-    own, others = (
-        play(policy, episodes, Reusing(policy.model, Reuse("every", 2), roll), everyone=True) for roll in (0, 1)
-    )
+    equal = all(np.array_equal(play(policy, few, Reusing(policy.model, one)).paths, expected) for one in never)
+    own, others = (play(policy, episodes, Reusing(policy.model, Reuse("every", 2), roll)) for roll in (0, 1))
     rates = f"{others.rate} with another's, {own.rate} with the episode's own, {baseline.rate} plain."
     return [
         Control("With θ above any cosine the run is the plain one, bit for bit, in every form.", equal, ""),

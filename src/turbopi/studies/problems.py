@@ -107,8 +107,13 @@ def errors(name: str, problem: Problem, learned: Learned, small: bool) -> list[E
     return cells
 
 
-def libero_batches(checkpoint: Checkpoint, device: torch.device, small: bool) -> tuple[Pi0Model, Batch, Batch]:
-    """The model in float32, and two batches on LIBERO pictures: to learn on, and others to judge on."""
+def libero_batches(
+    checkpoint: Checkpoint, device: torch.device, small: bool, *, one_prompt: bool = False
+) -> tuple[Pi0Model, Batch, Batch]:
+    """The model in float32, and two batches on LIBERO pictures: to learn on, and others to judge on.
+
+    `one_prompt`: all pictures with the first one's prompt and state, as calibration needs it of a batch.
+    """
     config = checkpoint.config
     tokenizer = load_tokenizer(TINY_TOKENIZER, vocab_size=config.model.vocab_size)
     pipeline = Pipeline(config, checkpoint.norm_stats, tokenizer)
@@ -121,8 +126,8 @@ def libero_batches(checkpoint: Checkpoint, device: torch.device, small: bool) ->
             {
                 "observation/image": frame.base,
                 "observation/wrist_image": frame.wrist,
-                "observation/state": frame.state,
-                "prompt": frame.prompt,
+                "observation/state": (frames[0] if one_prompt else frame).state,
+                "prompt": (frames[0] if one_prompt else frame).prompt,
             }
             for frame in chosen
             for _ in range(repeats)

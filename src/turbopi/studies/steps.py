@@ -7,8 +7,12 @@ nothing. A single step from noise gives the mean of all ways: between two ways a
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 
 import numpy as np
+import torch
 from msgspec import Struct
 from torch import Tensor
 
@@ -22,7 +26,7 @@ from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Ser
 from turbopi.studies.rollouts import POST, Call, Played, ToyPolicy, met, open_policy, play, seeds_of
 from turbopi.studies.solvers import BASELINE, Learned, Way, grid_times, ways
 from turbopi.studies.spread import UNIFORM, Spread, spread
-from turbopi.studies.study import Setup, Study
+from turbopi.studies.study import Setup, Study, Tell
 
 WARM = 0.6  # where a warm start begins: that much noise, and the rest is the chunk of before
 MARGIN = 0.05  # a cell is as good as the baseline if it is worse by less than this, with 95 % confidence
@@ -71,14 +75,14 @@ def practice(policy: ToyPolicy, episodes: int) -> Problem:
     return Problem.of(policy.model, *met(policy, numbers, actor(policy, BASELINE, {})), 2)
 
 
-def successes(policy: ToyPolicy, learned: Learned, setup: Setup) -> list[SuccessCell]:
-    episodes = range(setup.cell_episodes)
+def successes(policy: ToyPolicy, learned: Learned, count: int, small: bool, tell: Tell) -> list[SuccessCell]:
+    episodes = range(count)
     baseline = play(policy, episodes, actor(policy, BASELINE, learned))
     cells = []
-    for way in ways(setup.small):
+    for way in ways(small):
         played = baseline if way == BASELINE else play(policy, episodes, actor(policy, way, learned))
         cells.append(_cell(policy, way, played, baseline))
-        setup.tell(f"{policy.name}: {way}: {played.rate}, {cells[-1].verdict}")
+        tell(f"{policy.name}: {way}: {played.rate}, {cells[-1].verdict}")
     return cells
 
 
@@ -106,38 +110,53 @@ def loop_is_the_models(policy: ToyPolicy) -> float:
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Judged:
+    """What is found of a policy, or of weights without a task."""
+
+    name: str
+    errors: list[ErrorCell]
+    halved: float  # what half as many steps of the exact solution's solver change
+    spread: Spread | None = None
+    cells: list[SuccessCell] = field(default_factory=list)
+
+
+def judge(tell: Tell, name: str, folder: Path, *, count: int, small: bool) -> Judged:
+    """A policy of a toy task."""
+    policy = open_policy(name, folder)
+    learned = learned_grids(practice(policy, 2 if small else 24), small)
+    judged = beginnings(policy, 4 if small else 64)
+    broad = None
+    if policy.toy is POST:
+        broad = spread(policy, range(count), 16 if small else 64)
+        tell(f"{name}: bimodality {broad.bimodality:.3f}, rarer side {broad.minority:.3f}")
+    cells = successes(policy, learned, count, small, tell)
+    return Judged(name, errors(name, judged, learned, small), judged.halved, broad, cells)
+
+
+def judge_errors(tell: Tell, name: str, folder: Path, *, small: bool) -> Judged:
+    """A checkpoint for LIBERO, by its errors alone; RANDOM needs no folder."""
+    checkpoint = random_checkpoint("pi05_tiny") if name == RANDOM else open_checkpoint(folder)
+    learning, judged = libero_problems(checkpoint, torch.device("cpu"), small)
+    found = errors(name, judged, learned_grids(learning, small), small)
+    tell(f"{name}: errors measured")
+    return Judged(name, found, judged.halved)
+
+
 def run(setup: Setup) -> Report:
-    policies = [open_policy("chase"), *(open_policy(name, folder) for name, folder in setup.policies.items())]
-    found: list[ErrorCell] = []
-    cells: list[SuccessCell] = []
-    spreads: list[Spread] = []
-    halved: dict[str, float] = {}  # by weights: what half as many steps of the exact solution's solver change
-    weights = {LIBERO: open_checkpoint(shipped.SMALL_POLICY)}
-    if not setup.small:
-        weights[RANDOM] = random_checkpoint("pi05_tiny")
-    for name, checkpoint in weights.items():
-        learning, judged = libero_problems(checkpoint, setup.device, setup.small)
-        found += errors(name, judged, learned_grids(learning, setup.small), setup.small)
-        halved[name] = judged.halved
-        setup.tell(f"{name}: errors measured")
-    for policy in policies:
-        problem = practice(policy, 2 if setup.small else 24)
-        learned = learned_grids(problem, setup.small)
-        judged = beginnings(policy, 4 if setup.small else 64)
-        found += errors(policy.name, judged, learned, setup.small)
-        halved[policy.name] = judged.halved
-        if policy.toy is POST:
-            spreads.append(spread(policy, range(setup.cell_episodes), 16 if setup.small else 64))
-            setup.tell(f"{policy.name}: bimodality {spreads[-1].bimodality:.3f}, minority {spreads[-1].minority:.3f}")
-        cells += successes(policy, learned, setup)
+    weights = {LIBERO: shipped.SMALL_POLICY} if setup.small else {LIBERO: shipped.SMALL_POLICY, RANDOM: Path()}
+    every = setup.each(partial(_judge_any, count=setup.cell_episodes, small=setup.small), weights | setup.toy_policies)
+    found = [error for one in every for error in one.errors]
+    cells = [cell for one in every for cell in one.cells]
+    spreads = [one.spread for one in every if one.spread is not None]
     parts: dict[str, Sequence[Struct]] = {"errors": found, "successes": cells, "spread": spreads}
     return setup.report(
         STUDY,
         method=METHOD,
-        controls=_controls(policies[0], spreads, halved, setup.small),
+        controls=_controls(open_policy("chase"), spreads, {one.name: one.halved for one in every}, setup.small),
         tables=[
             *([_spread_table(spreads)] if spreads else []),
-            *(_success_table(policy.name, cells) for policy in policies),
+            *(_success_table(name, cells) for name in setup.toy_policies),
             _error_table(found),
         ],
         plots=[_plot(cells, found)] + ([_spread_plot(spreads)] if spreads else []),
@@ -146,6 +165,12 @@ def run(setup: Setup) -> Report:
         not_run=_not_run(setup),
         data={name: [plain_document(one) for one in some] for name, some in parts.items()},
     )
+
+
+def _judge_any(tell: Tell, name: str, folder: Path, *, count: int, small: bool) -> Judged:
+    if name in (LIBERO, RANDOM):
+        return judge_errors(tell, name, folder, small=small)
+    return judge(tell, name, folder, count=count, small=small)
 
 
 def beginnings(policy: ToyPolicy, episodes: int) -> Problem:

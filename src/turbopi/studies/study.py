@@ -1,8 +1,12 @@
 """What a study is, and what it is given. Each file of one has a `STUDY`."""
 
+import multiprocessing
+import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -17,8 +21,17 @@ FEWEST_EPISODES = 200  # of a cell that a conclusion rests on
 SMALL_EPISODES = 8
 
 
+Done = TypeVar("Done")
+Tell = Callable[[str], None]
+
+
 def _silent(line: str) -> None:
     return None
+
+
+def tell_on_stderr(line: str) -> None:
+    """Progress of another process."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def _packaged(policy: UnifiedPolicy) -> tuple[list[dict[str, object]], str]:
@@ -46,12 +59,28 @@ class Setup:
     simulator: str = "libero"  # of the studies in a simulator
     ways: Sequence[str] = ()  # which of their cells; none: all
     folder: Path | None = None  # where they keep episodes, so that they can go on; None: nowhere
-    workers: int | None = None  # simulators at a time
+    workers: int | None = None  # simulators, or processes with a policy each, at a time
     episodes: int | None = None  # of a cell; None: the form's own number
     steps: int = 10  # of denoising
     calls: int = 100
     seed: int = 0
-    tell: Callable[[str], None] = _silent
+    tell: Tell = _silent
+
+    def each(self, work: Callable[[Tell, str, Path], Done], policies: Mapping[str, Path]) -> list[Done]:
+        """`work`(tell, name, folder) for each policy, one after the other, or in as many processes as `workers` says.
+
+        `work` is a function of a module, or a partial of one, so that another process can be given it.
+        """
+        if (self.workers or 1) == 1:
+            return [work(self.tell, name, folder) for name, folder in policies.items()]
+        with ProcessPoolExecutor(min(self.workers or 1, len(policies)), multiprocessing.get_context("spawn")) as pool:
+            waiting = [pool.submit(work, tell_on_stderr, name, folder) for name, folder in policies.items()]
+            return [future.result() for future in waiting]
+
+    @property
+    def toy_policies(self) -> dict[str, Path]:
+        """Folders by name: the one that ships, and those that were given."""
+        return {"chase": shipped.CHASE_POLICY, **self.policies}
 
     @property
     def cell_episodes(self) -> int:
