@@ -196,6 +196,9 @@ def test_an_unknown_error_asks_the_device(
 
 def test_the_denoising_kernel_says_why_it_trapped(policy: UnifiedPolicy) -> None:
     class Kernel:
+        def clock_mhz(self) -> float | None:
+            return None
+
         def why_it_trapped(self) -> str | None:
             return "blocks of the denoising kernel waited for seconds: layer 3 for queries"
 

@@ -169,7 +169,9 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     assert plan["prefix.down"] == "fp8"
     assert plan["expert.qkv"] == plan["expert"] == "bf16, as operations denoise"
     clock: list[float | None] = [None]
-    backend._denoisers = {(Loop(10, 10), 968): cast(Any, SimpleNamespace(clock_mhz=lambda: clock[0]))}
+    backend._denoisers = {
+        (Loop(10, 10), 968): cast(Any, SimpleNamespace(clock_mhz=lambda: clock[0], why_it_trapped=lambda: None))
+    }
     assert "denoising_clock_mhz" not in backend.describe()  # it hasn't run
     clock[0] = 1795.4
     assert backend.describe()["denoising_clock_mhz"] == {"H=10, 10 steps": 1795}

@@ -209,19 +209,15 @@ class FusedBackend(CudaGraphBackend):
 
     def _denoising_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Denoiser:
         """Raises BackendUnavailable for what it doesn't cover."""
-        if table is None:
-            raise BackendUnavailable("there is no modulation")
-        if loop.form == "jacobian":
-            raise BackendUnavailable("the denoising kernel has no way back, which the true Jacobian takes")
         kernel = self._hopper_kernel(loop, rows, table) if self._on_hopper else self._portable_kernel(loop, rows, table)
         self._put_expert_away()
         return kernel
 
-    def _hopper_kernel(self, loop: Loop, rows: int, table: Tensor) -> Denoiser:
+    def _hopper_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Denoiser:
         from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, DenoiseKernel, unavailable
         from turbopi.kernels.sm90.denoise.packing import PackedExpert, refusal
 
-        self._check_kernel(unavailable(self.device) or refusal(self.config), loop, MAX_SUFFIX)
+        table = self._covered(unavailable(self.device) or refusal(self.config), loop, MAX_SUFFIX, table)
         by_token = loop.form != "plain"
         return DenoiseKernel(
             *(self.config, self._packed(PackedExpert), self._weights.small, table),
@@ -232,12 +228,12 @@ class FusedBackend(CudaGraphBackend):
             by_token=by_token,
         )
 
-    def _portable_kernel(self, loop: Loop, rows: int, table: Tensor) -> Denoiser:
+    def _portable_kernel(self, loop: Loop, rows: int, table: Tensor | None) -> Denoiser:
         from turbopi.kernels.portable.denoise.kernel import MAX_SUFFIX, PortableDenoiser, unavailable
         from turbopi.kernels.portable.denoise.packing import PackedExpert, refusal
 
         in_fp8 = self._expert_inputs() is not None
-        self._check_kernel(unavailable(self.device, in_fp8) or refusal(self.config), loop, MAX_SUFFIX)
+        table = self._covered(unavailable(self.device, in_fp8) or refusal(self.config), loop, MAX_SUFFIX, table)
         if loop.form != "plain":
             raise BackendUnavailable("the portable denoising kernel has one time for all actions")
         return PortableDenoiser(
@@ -247,11 +243,15 @@ class FusedBackend(CudaGraphBackend):
             device=self.device,
         )
 
-    def _check_kernel(self, reason: str | None, loop: Loop, most: int) -> None:
+    def _covered(self, reason: str | None, loop: Loop, most: int, table: Tensor | None) -> Tensor:
+        """The table, of a loop that a denoising kernel takes. `reason`: why it doesn't, whatever the loop."""
         if reason is None and loop.horizon > most:
             reason = f"the denoising kernel takes up to {most} actions"
-        if reason is not None:
-            raise BackendUnavailable(reason)
+        if reason is None and loop.form == "jacobian":
+            reason = "the denoising kernel has no way back, which the true Jacobian takes"
+        if reason is not None or table is None:
+            raise BackendUnavailable(reason or "there is no modulation")
+        return table
 
     def _packed(self, kind: Any) -> Any:
         """The expert's matrices as a denoising kernel has them."""
