@@ -127,7 +127,7 @@ class BatchRunner(GraphRunner):
     ) -> Trace:
         """Of a batched call where the observations are one; else, and with a conditioning, one by one."""
         count = observation.batch_size
-        if self._calls_of(count) != [count] or not _plain(conditioning, count):
+        if count == 1 or self._calls_of(count) != [count] or not _plain(conditioning, count):
             return super().intermediates(observation, noise, num_steps, conditioning=conditioning)
         self.sample(observation, noise, num_steps)
         size = self._batches.size(
