@@ -76,6 +76,14 @@ def test_a_study_writes_a_report_that_reads_back_and_shows_every_part(small_step
     assert all((small_steps / f"{plot.name}.png").is_file() for plot in found.plots)
 
 
+@pytest.mark.parametrize("name", ["kv_reuse", "fp8_and_fp4", "pipelining"])
+def test_a_study_runs_in_its_small_form_and_its_controls_hold(name: str, tmp_path: Path) -> None:
+    result = turbopi("study", name, "--small", "--device", "cpu", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    found = read_document(tmp_path / name / report.JSON, Report)
+    assert found.small and found.sound and len(found.controls) >= 2 and "small form" in report.markdown(found)
+
+
 def test_a_failed_control_voids_the_verdict_and_the_exit_code_says_so(
     small_steps: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

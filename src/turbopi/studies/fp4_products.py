@@ -60,10 +60,11 @@ HOW = {
 }
 
 
-def matrices(model: Pi0Model) -> list[Tensor]:
-    """Those of the model's sites whose inputs fit blocks of 32."""
-    found = [linear.weight.float().cpu() for site in sites(model.config) for linear in linears(model, site)]
-    return [weight for weight in found if weight.shape[1] % 32 == 0]
+def matrices(model: Pi0Model, most: int = 24) -> list[Tensor]:
+    """Those of the model's sites whose inputs fit blocks of 32, from the first to the last, at most so many."""
+    found = [linear.weight for site in sites(model.config) for linear in linears(model, site)]
+    found = [weight for weight in found if weight.shape[1] % 32 == 0]
+    return [weight.float().cpu() for weight in found[:: -(-len(found) // most)]]
 
 
 def normal_matrices(count: int = 4) -> list[Tensor]:

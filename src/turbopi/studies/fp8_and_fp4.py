@@ -56,6 +56,7 @@ IN_CLOSED_LOOP = (
     *("FP8", "FP8, rounded for directions", "NVFP4", "NVFP4, rounded for directions", "NVFP4, weights alone"),
     *("W4A8", "W4A8, rounded for directions", "W4A8 (MXFP4)", WRONG),
 )
+IN_SMALL = ("FP8", "NVFP4", "W4A8", WRONG)
 _JUDGED, _SEEN = 30_000, 40_000  # numbers of the first episodes that errors are measured on, that give directions
 STEPS = 5  # in closed loop, as these policies were judged
 
@@ -192,7 +193,7 @@ def judge(
     policy = open_policy(name, folder)
     met_in, actor = 2 if small else 12, sampled(policy.model, STEPS)
     made, seen = ([met(policy, range(first, first + met_in), actor)] for first in (_JUDGED, _SEEN))
-    found = dict(errors(policy.model, made, seen, STEPS, IN_CLOSED_LOOP if small else None))
+    found = dict(errors(policy.model, made, seen, STEPS, IN_SMALL if small else None))
     return found, _successes(policy, made, seen, count, small, tell)
 
 
@@ -200,7 +201,7 @@ def run(setup: Setup) -> Report:
     found: dict[str, dict[str, FormatError]] = {}
     products = {NORMAL: product_cosines(normal_matrices())}
     for name, (model, made, seen) in _problems(setup).items():
-        found[name] = dict(errors(model, made, seen, setup.steps, IN_CLOSED_LOOP if setup.small else None))
+        found[name] = dict(errors(model, made, seen, setup.steps, IN_SMALL if setup.small else None))
         products[name] = product_cosines(matrices(model))
         setup.tell(f"{name}: {len(found[name])} formats")
     every = setup.each(partial(judge, count=setup.cell_episodes, small=setup.small), setup.toy_policies)
@@ -250,7 +251,7 @@ def _successes(
     exact = play(policy, episodes, actor)
     chosen = cases(policy.model, made, seen, STEPS)
     cells = []
-    for name in ("float32", *(("W4A8", WRONG) if small else IN_CLOSED_LOOP)):
+    for name in ("float32", *(IN_SMALL[-2:] if small else IN_CLOSED_LOOP)):
         with chosen.get(name, nullcontext)():
             played = play(policy, episodes, actor)
         cells.append(FormatSuccess(policy.name, name, played.rate.document, played.against(exact).document))

@@ -210,6 +210,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         axes.set_xscale("log")
     if panel.log_y:
         axes.set_yscale("log")
+    if panel.y_label.startswith("%"):
+        axes.set_ylim(0, 103)  # a rate looks as large as it is
     if panel.ticks is not None:
         axes.xaxis.set_major_locator(FixedLocator(panel.ticks))
         axes.xaxis.set_minor_locator(NullLocator())
