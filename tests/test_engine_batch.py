@@ -171,6 +171,12 @@ class TestBackend:
             torch.testing.assert_close(ours[name], theirs.view_as(ours[name]), atol=1e-4, rtol=1e-4)
         assert len(backend.describe()["batches"]) == 1
 
+    def test_one_observation_is_the_runners_own_call(self, backend: OnCpu) -> None:
+        made, noise = observations("pi05", [2], [7], horizon=5)
+        trace = backend.intermediates(made, noise, 2)
+        assert torch.equal(trace["actions"], backend.sample(made, noise, 2).actions)
+        assert backend.describe()["batches"] == []
+
     def test_strict_takes_what_is_captured(self, backend: OnCpu) -> None:
         backend.strict = True
         four, noise = observations("pi05", [2, 2, 2, 2], [7, 12, 3, 1], horizon=5)

@@ -34,6 +34,7 @@ class _Timed(Struct, frozen=True):
     job: Job
     seconds: float
     source: str
+    kernels: str = ""  # a backend with other kernels is another one
 
 
 def published_table(gpu: str, precision: str, horizon: int) -> BatchTable:
@@ -43,7 +44,7 @@ def published_table(gpu: str, precision: str, horizon: int) -> BatchTable:
     """
     spec = find_gpu(gpu)
     measured = [
-        _Timed(call.backend, call.job, slow(call.milliseconds["total"]), call.source)
+        _Timed(call.backend, call.job, slow(call.milliseconds["total"]), call.source, call.kernels)
         for call in measured_calls()
         if (call.gpu, call.precision) == (spec.key, precision)
     ]
@@ -111,7 +112,11 @@ def _table(gpu: str, precision: str, horizon: int, timed: Sequence[_Timed]) -> B
         )
     shortest = min(one.job.horizon for one in alone)
     best = min((one for one in alone if one.job.horizon == shortest), key=lambda one: one.seconds)
-    same = [one for one in timed if one.backend == best.backend and replace(one.job, batch=1) == best.job]
+    same = [
+        one
+        for one in timed
+        if (one.backend, one.kernels) == (best.backend, best.kernels) and replace(one.job, batch=1) == best.job
+    ]
     return BatchTable(
         gpu=gpu,
         backend=best.backend,

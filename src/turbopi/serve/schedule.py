@@ -29,6 +29,7 @@ OVERTAKEN = 16
 ACTIVE_SECONDS = 1.0  # who asked within it may ask again soon: company to wait for
 TIGHT_SECONDS = 10.0  # for so long a robot's deadline limits how long a turn of others may be
 GAPS = 32  # between arrivals, that tell how soon company comes
+LATE_TIMER = 0.0005  # seconds that a wait ends before the last moment: a late timer must not shrink the batch
 PATIENCE = 4.0  # usual gaps without an arrival, after which no more company is waited for
 LATER = 1e-4  # seconds after the moment from which a deadline can't be met, so that rounding doesn't matter
 
@@ -359,7 +360,7 @@ class Schedule:
             saving = together + more * alone - self.times.total(rows + more, now)
             safe = self.times.seconds(rows + more, now, SAFE)
             if saving > more * gap and safe is not None:
-                until = max(until, min(opened + saving, deadline - safe))
+                until = max(until, min(opened + saving, deadline - safe - LATE_TIMER))
         return min(until, self._last_arrival + PATIENCE * gap)
 
 

@@ -15,7 +15,7 @@ from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.portable.shared_memory import roomy
 
 # Keys at a time, warps, stages; queries: as `Segments.tiles` says. The second one of each pair: for less shared memory.
-PACKED_TILE, NARROW_PACKED_TILE = (64, 4, 3), (32, 8, 2)
+PACKED_TILE, NARROW_PACKED_TILE = (64, 8, 2), (32, 8, 2)
 QUERIES = 64
 SUFFIX_TILE, NARROW_SUFFIX_TILE = (16, 64, 4, 2), (16, 32, 4, 2)  # queries, keys at a time, warps, stages
 BLOCKS_AT_ONCE = 264  # of suffix attention, two a multiprocessor of Hopper: keys are split over blocks up to so many

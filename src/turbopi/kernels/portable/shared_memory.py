@@ -13,5 +13,5 @@ LEAST_SHARED = min(BLOCK_SHARED.values())  # of GPUs that aren't known
 
 
 def roomy(x: Tensor) -> bool:
-    """Whether blocks on x's GPU have 163 KB or more. On a CPU: yes."""
-    return not x.is_cuda or BLOCK_SHARED.get(capability(x.device), LEAST_SHARED) > LEAST_SHARED
+    """Whether blocks on x's GPU have 227 KB. On a CPU: yes."""
+    return not x.is_cuda or BLOCK_SHARED.get(capability(x.device), LEAST_SHARED) >= 227 * 1024
