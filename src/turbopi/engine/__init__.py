@@ -1,1 +1,1 @@
-"""The engine: Pi0.5 for batch 1 with static shapes and packed weights, made to be captured in a CUDA graph."""
+"""The engine: Pi0.5 for one observation or several, with static shapes and packed weights, captured as CUDA graphs."""
