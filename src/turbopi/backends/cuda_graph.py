@@ -50,7 +50,12 @@ class CudaGraphBackend(BatchRunner):
         return pack(self.config, load(self.device, "f32" if self.precision == "f32" else "bf16"))
 
     def _make_ops(self) -> Ops:
-        return compiled() if PyTorchCompileBackend.unavailable(self.device) is None else without_compiler.OPS
+        if PyTorchCompileBackend.unavailable(self.device) is not None:
+            return without_compiler.OPS
+        ops = compiled()
+        if self.precision == "f32":  # the kernels' tiles of float32 don't fit shared memory at full size
+            return dataclasses.replace(ops, batch=None)
+        return ops
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """None: the engine's operations one by one."""
