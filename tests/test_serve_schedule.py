@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbopi.serve.batch_times import FRESH_SECONDS, GAIN, KEPT, BatchTimes
-from turbopi.serve.schedule import OVERTAKEN, Priority, Refused, Request, Schedule
+from turbopi.serve.schedule import LATE_TIMER, OVERTAKEN, Priority, Refused, Request, Schedule
 
 T1 = 0.01
 PAYING = {1: 0.010, 2: 0.014, 4: 0.022, 8: 0.038}  # seconds by size, of an engine that batches
@@ -530,6 +530,19 @@ def test_company_that_comes_at_once_is_waited_for_and_then_no_longer() -> None:
         assert not decision.turn and decision.wake is not None and now < decision.wake < now + 0.002
     schedule.add(request(now, source=3), now)
     assert len(begin(schedule, now)) == 4  # all are there
+
+
+def test_a_late_timer_does_not_shrink_the_batch_that_was_waited_for() -> None:
+    schedule = Schedule(16, table(PAYING))
+    now = cohort(schedule)
+    asked = [request(now, source=robot, within=0.0229, firm=True) for robot in range(2)]
+    for one in asked:
+        schedule.add(one, now)
+    wake = schedule.decide(now).wake
+    assert wake is not None and now < wake
+    asked.append(request(wake, source=2))
+    schedule.add(asked[-1], wake)
+    assert begin(schedule, wake + 0.9 * LATE_TIMER) == asked, "three take 22 ms, and the first two have 22.9"
 
 
 def test_company_that_does_not_come_is_waited_for_a_few_gaps_alone() -> None:
