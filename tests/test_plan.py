@@ -213,10 +213,20 @@ def test_robots_without_deadlines_wait_no_longer_either(seconds: dict[int, float
 
 def test_measured_times_are_the_slow_calls_of_the_measurement() -> None:
     for call in measured_calls():
-        if call.backend == "fused" and call.job.batch == 1:
+        if (call.backend, call.kernels, call.job.batch) == ("fused", "hopper", 1):
             found = published_table(call.gpu, call.precision, call.job.horizon)
-            assert not found.predicted and found.job == call.job and found.source == call.source
-            assert found.seconds[1] == slow(call.milliseconds["total"]) > call.milliseconds["total"].p50 / 1e3
+            assert not found.predicted and found.job == call.job
+            if found.source == call.source:
+                assert found.seconds[1] == slow(call.milliseconds["total"]) > call.milliseconds["total"].p50 / 1e3
+            assert found.seconds[1] <= slow(call.milliseconds["total"]), "of several measurements the soonest"
+
+
+def test_a_gpus_fastest_kernels_count_and_no_others() -> None:
+    """The H200 was measured with kernels for all GPUs, too."""
+    assert {call.kernels for call in measured_calls() if call.backend == "fused"} == {"hopper", "portable"}
+    for precision in ("bf16", "fp8"):
+        seconds = published_table("h200", precision, 10).seconds
+        assert seconds[1] < 0.008 and list(seconds) == [1, 2, 4, 8, 16]
 
 
 def test_a_horizon_between_those_measured_counts_as_the_longer_one() -> None:
@@ -228,7 +238,7 @@ def test_beyond_what_was_measured_it_is_a_prediction_and_says_so() -> None:
     long = published_table("h200", "bf16", 100)
     assert long.predicted and long.job.horizon == 100
     other = published_table("rtx4090", "bf16", 10)
-    assert other.predicted and other.backend == "cuda_graph" and other.seconds[1] > 0.03
+    assert other.predicted and other.backend == "fused" and other.seconds[1] > 0.02
     with pytest.raises(ConfigError, match="nothing that runs in fp8 on A100 80 GB SXM was measured"):
         published_table("a100", "fp8", 10)
     with pytest.raises(ConfigError, match="'fp7' is neither measured"):
@@ -237,13 +247,14 @@ def test_beyond_what_was_measured_it_is_a_prediction_and_says_so() -> None:
 
 def test_measured_batches_are_taken_as_soon_as_there_are_some(monkeypatch: pytest.MonkeyPatch) -> None:
     """What exchanging data/measured_calls.json does."""
-    (one,) = (call for call in measured_calls() if (call.backend, call.precision, call.job) == ("fused", "fp8", Job()))
+    known = [call for call in measured_calls() if call.job.batch == 1 and call.kernels == "hopper"]
+    one = next(call for call in known if (call.backend, call.precision, call.job) == ("fused", "fp8", Job()))
 
     def slower(batch: int) -> Any:
         times = {name: Times(p50=v.p50 * batch**0.7, p95=v.p95 * batch**0.7) for name, v in one.milliseconds.items()}
         return replace(one, job=replace(one.job, batch=batch), milliseconds=times)
 
-    calls = (*measured_calls(), *map(slower, (2, 4, 8, 16)))
+    calls = (*known, *map(slower, (2, 4, 8, 16)))
     monkeypatch.setattr(batch_table, "measured_calls", lambda: calls)
     found = published_table("h200", "fp8", 10)
     assert list(found.seconds) == [1, 2, 4, 8, 16]
@@ -301,7 +312,7 @@ def test_the_command_to_serve_parses_and_has_as_many_replicas() -> None:
     (gpus,) = (line.split()[1].rstrip(",") for line in said.splitlines() if line.startswith("GPUs"))
     assert words[0] == "turbopi" and words[-2:] == ["--replicas", gpus] and int(gpus) > 1
     check_parses(words[1:], "turbopi plan")
-    assert max(map(len, said.splitlines())) <= 100
+    assert max(map(len, said.splitlines())) <= 110
 
 
 @pytest.mark.parametrize(

@@ -534,15 +534,15 @@ def test_company_that_comes_at_once_is_waited_for_and_then_no_longer() -> None:
 
 def test_a_late_timer_does_not_shrink_the_batch_that_was_waited_for() -> None:
     schedule = Schedule(16, table(PAYING))
-    now = cohort(schedule)
-    asked = [request(now, source=robot, within=0.0229, firm=True) for robot in range(2)]
+    now = cohort(schedule, apart=0.001)
+    asked = [request(now, source=robot, within=0.0245, firm=True) for robot in range(3)]
     for one in asked:
-        schedule.add(one, now)
+        assert not schedule.add(one, now)
     wake = schedule.decide(now).wake
     assert wake is not None and now < wake
-    asked.append(request(wake, source=2))
-    schedule.add(asked[-1], wake)
-    assert begin(schedule, wake + 0.9 * LATE_TIMER) == asked, "three take 22 ms, and the first two have 22.9"
+    asked.append(request(wake, source=3))
+    assert not schedule.add(asked[-1], wake)
+    assert begin(schedule, wake + 0.9 * LATE_TIMER) == asked, "four take 22 ms, and the first three had 24.5"
 
 
 def test_company_that_does_not_come_is_waited_for_a_few_gaps_alone() -> None:

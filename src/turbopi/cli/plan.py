@@ -86,7 +86,9 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
     """The plan for people."""
     each = ", ".join(f"T({size}) {seconds * 1e3:.1f}" for size, seconds in table.seconds.items())
     kind = "PREDICTED, never measured there" if table.predicted else "measured"
-    serve = f"turbopi serve CHECKPOINT --precision {table.precision} --max-batch {planned.batch}"
+    serve = (
+        f"turbopi serve CHECKPOINT --backend {table.backend} --precision {table.precision} --max-batch {planned.batch}"
+    )
     a_second = fleet.robots * fleet.hz / fleet.steps
     return [
         f"{fleet.robots} robots at {fleet.hz:g} Hz, chunks of {fleet.horizon}, a new one every {fleet.steps} steps:",
