@@ -63,8 +63,8 @@ def test_fused_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, package: st
     [
         ((9, 0), "cuda", "cuda.bindings, which isn't installed; `pip install cuda-python`", "9.0"),
         ((9, 0), "triton", "Triton, which isn't installed", "9.0"),
-        ((8, 9), "cuda", "written for compute capability 9.0, this GPU has 8.9", "cuda.bindings"),
-        ((8, 6), None, "have no FP8: that begins with 8.9, this GPU has 8.6", "9.0"),
+        ((8, 9), "cuda", "cuda.bindings, which isn't installed; `pip install cuda-python`", "8.9"),
+        ((8, 6), None, "from compute capability 8.9 on; this GPU has 8.6", "9.0"),
     ],
 )
 def test_fp8_names_what_is_truly_missing(

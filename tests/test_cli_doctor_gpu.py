@@ -71,11 +71,11 @@ def rows() -> dict[str, Row]:
 
 
 def measured_gb(backend: str, precision: str) -> float | None:
-    """The most that such calls were measured to reserve on a GPU."""
+    """The most that such calls of one observation were measured to reserve on a GPU."""
     found = [
         call.device_bytes / 1e9
         for call in measured_calls()
-        if (call.backend, call.precision) == (backend, precision) and call.device_bytes
+        if (call.backend, call.precision, call.job.batch) == (backend, precision, 1) and call.device_bytes
     ]
     return max(found, default=None)
 

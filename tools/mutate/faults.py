@@ -47,7 +47,7 @@ FAULTS = (
     ),
     Fault(
         "two pointers swapped in the denoising kernel's struct",
-        "turbopi.kernels",
+        "turbopi.kernels.sm90.denoise",
         '"cache_k": cache_k, "cache_v": cache_v,',
         '"cache_k": cache_v, "cache_v": cache_k,',
         "queries meet values: actions are noise",
@@ -55,7 +55,7 @@ FAULTS = (
     ),
     Fault(
         "the denoising kernel's results swapped",
-        "turbopi.kernels",
+        "turbopi.kernels.sm90.denoise",
         '"x_t": x_t, "v_t": v_t}',
         '"x_t": v_t, "v_t": x_t}',
         "velocities leave as actions, and memory behind v_t is overwritten",
@@ -112,7 +112,7 @@ FAULTS = (
     Fault(
         "the expert put away from under a graph of operations",
         "turbopi.backends",
-        "if not self._refused:\n            self._keep_expert_on(",
+        "if not self._refused and not self._batches_denoise_in_bf16:\n            self._keep_expert_on(",
         "if True:\n            self._keep_expert_on(",
         "replays read freed memory",
         (CHOICE,),
@@ -120,8 +120,8 @@ FAULTS = (
     Fault(
         "a horizon's bound off by one",
         "turbopi.backends",
-        "if reason is None and loop.horizon > MAX_SUFFIX:",
-        "if reason is None and loop.horizon > MAX_SUFFIX + 1:",
+        "if reason is None and loop.horizon > most:",
+        "if reason is None and loop.horizon > most + 1:",
         "a horizon of 57 stops the server instead of taking operations",
         (CHOICE,),
     ),
@@ -160,8 +160,8 @@ FAULTS = (
     Fault(
         "keys and values swapped in the prefix's cache",
         "turbopi.engine",
-        "q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, k, v)",
-        "q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, v, k)",
+        "        return cache_k[i, :slots], cache_v[i, :slots]",
+        "        return cache_v[i, :slots], cache_k[i, :slots]",
         "actions ignore what the cameras see",
         (ENGINE,),
     ),
