@@ -46,8 +46,8 @@ class FusedBackend(CudaGraphBackend):
     """As `cuda_graph`, in bfloat16 or, as a calibration says, partly in FP8; `describe()` says what runs where."""
 
     name: ClassVar[str] = "fused"
-    # measured on an H200 with two cameras in bfloat16 (benchmarks/results/h200_2026-11-24_batches.json, and docs/dev/log.md
-    # for 2); in FP8 four take 3.4, eight 5.3, sixteen 9.9
+    # measured on an H200 with two cameras in bfloat16: benchmarks/results/h200_2026-11-24_batches.json, of 2 see
+    # docs/dev/log.md; in FP8 four take 3.4, eight 5.3, sixteen 9.9
     batch_costs: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.2, 8: 5.4, 16: 10.6}
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
