@@ -28,9 +28,8 @@ from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.fp8 import Directions, Matrix
 from turbopi.quantization.plan import TIERS
+from turbopi.quantization.sites import KINDS
 from turbopi.toolchain import missing_for_c
-
-KINDS = ("qkv", "out", "gate_up", "down")  # an expert layer's matrices
 
 
 @runtime_checkable
@@ -190,7 +189,7 @@ class FusedBackend(CudaGraphBackend):
             self._fp8_expert = []
             for i, layer in enumerate(self._weights.expert):
                 made: dict[str, Any] = {
-                    kind: self._quantized(f"expert.{i}.{kind}", getattr(layer, kind)) for kind in KINDS
+                    kind: self._quantized(f"expert.{i}.{kind}", getattr(layer, kind)) for kind in KINDS["expert"]
                 }
                 self._fp8_expert.append(replace(layer, **made))
             self._put_expert_away()
@@ -279,4 +278,4 @@ class FusedBackend(CudaGraphBackend):
         layers = self._weights.expert
         for i, layer in enumerate(layers):
             if layer.qkv.device != device:
-                layers[i] = replace(layer, **{name: getattr(layer, name).to(device) for name in KINDS})
+                layers[i] = replace(layer, **{name: getattr(layer, name).to(device) for name in KINDS["expert"]})

@@ -178,18 +178,12 @@ class BatchRunner(GraphRunner):
             for count, prompt in zip(cameras, tokens, strict=True):
                 self._check_tokens(count, len(prompt))
             self._recent.use(loop)
-            try:
+            with self._explaining():
                 return self._batches.finish(size, loop, cameras, tokens, state, noise)
-            except RuntimeError as error:
-                self._explain(error)
-                raise
 
         self._begun = None  # its pictures' buffers stay, but nobody gets what becomes of them
-        try:
+        with self._explaining():
             self._batches.launch_vision(size, [picture for one in pictures for picture in one], resize)
-        except RuntimeError as error:
-            self._explain(error)
-            raise
         return finish
 
     def _forget(self, loop: Loop) -> None:

@@ -73,8 +73,7 @@ class Batches:
     def warm(self, size: BatchSize, loop: Loop, resized: bool) -> None:
         """Capture the calls of a size, for prompts of any length."""
         step = self._bucket * size.batch
-        most = self.slots(size.batch, [self._config.max_prompt_tokens] * size.batch)
-        for slots in range(step, most + 1, step):
+        for slots in range(step, self._most_slots(size) + 1, step):
             self._prefix_graph(size, slots)
         self._vision_graph(size, False)
         if resized:
@@ -144,6 +143,9 @@ class Batches:
         if self._marks:
             self._marks[place].record(torch.cuda.current_stream(self._device))
 
+    def _most_slots(self, size: BatchSize) -> int:
+        return self.slots(size.batch, [self._config.max_prompt_tokens] * size.batch)
+
     def _pictures_of(self, size: BatchSize) -> Pictures:
         key = (size.pictures, size.float_images)
         if key not in self._pictures:
@@ -152,8 +154,7 @@ class Batches:
 
     def _buffers_of(self, size: BatchSize) -> BatchBuffers:
         if size not in self._buffers:
-            most = self.slots(size.batch, [self._config.max_prompt_tokens] * size.batch)
-            pictures = self._pictures_of(size)
+            pictures, most = self._pictures_of(size), self._most_slots(size)
             self._buffers[size] = BatchBuffers(self._config, self._weights, self._ops, size, pictures, most)
         return self._buffers[size]
 

@@ -10,7 +10,8 @@ last are kept, see recent_loops.py. Observations run one after the other here; b
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -169,13 +170,10 @@ class GraphRunner:
         begun = Begun(self, len(pictures), floats(pictures, resize))
         buffers = self._pictures_of(begun.cameras, begun.float_images)
         self._begun = None  # one given up may still be read from the buffers, but nobody gets what becomes of it
-        try:
+        with self._explaining():
             resized = resize is not None and self._ops.resize_pictures is not None and buffers.resizes(pictures)
             vision = self._graph(buffers, RESIZED if resized else "vision")
             vision.launch(lambda: buffers.upload(pictures, resize))
-        except RuntimeError as error:
-            self._explain(error)
-            raise
         self._begun = begun
         return begun
 
@@ -248,15 +246,21 @@ class GraphRunner:
         self._check_tokens(cameras, len(tokens))
         loop = conditioned_loop(conditioning, num_steps, len(noise), self.config)
         shape = CallShape(cameras, bucket(len(tokens)), loop, begun.float_images)
-        try:
+        with self._explaining():
             graph, call = self._graph(shape, part), self._calls[shape]
             call.write_inputs(noise, state, tokens, conditioning)
             graph.replay()
+        self._begun = None
+        return call, graph
+
+    @contextmanager
+    def _explaining(self) -> Iterator[None]:
+        """Around whatever runs on the GPU: see `_explain`."""
+        try:
+            yield
         except RuntimeError as error:
             self._explain(error)
             raise
-        self._begun = None
-        return call, graph
 
     def _explain(self, error: RuntimeError) -> None:
         """A subclass that knows why the GPU failed for good raises a DeviceLost that says so."""

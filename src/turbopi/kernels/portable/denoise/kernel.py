@@ -17,6 +17,7 @@ from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct
 from turbopi.kernels.interface import State, TokenInputs
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
+from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
 from turbopi.kernels.portable.denoise.packing import CHUNK_BYTES, PackedExpert, Tables
 
 PARTS = ("primitives", "product", "finish", "attention", "kernel")  # behind sizes.cu and the arguments
@@ -206,12 +207,10 @@ class PortableDenoiser:
         noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], the first `length` (int64[1], on the device) rows
         valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A].
         """
-        steps, g, chunk = self._steps, self._config.expert, (self._suffix, self._config.action_dim)
+        steps, g = self._steps, self._config.expert
         assert tokens is None, "this kernel has no times by token"
-        assert noise.shape == chunk and x_t.shape == (steps + 1, *chunk) and v_t.shape == (steps, *chunk)
-        assert cache_k.stride() == cache_v.stride() and cache_k.stride()[1:] == (g.head_dim, 1), cache_k.stride()
-        assert cache_k.dtype == cache_v.dtype == torch.bfloat16 and length.dtype == torch.int64
-        assert all(t.is_contiguous() and t.dtype == torch.float32 for t in (noise, x_t, v_t))
+        chunk = (steps, self._suffix, self._config.action_dim)
+        check_launch(noise, cache_k, cache_v, length, x_t, v_t, chunk=chunk, head_dim=g.head_dim)
         named = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "length": length, "noise": noise}
         pointers = {name: t.data_ptr() for name, t in {**named, "x_t": x_t, "v_t": v_t}.items()}
         args = ARGS.value(
@@ -262,9 +261,6 @@ def tensors(packed: PackedExpert, small: State, table: Tensor, sizes: dict[str, 
         chunk = CHUNK_BYTES // packed.weights.element_size()
         return scratch(-(-columns // chunk), suffix, CHUNK_BYTES, dtype=torch.uint8)
 
-    exponents = torch.arange(0, g.head_dim, 2, dtype=torch.float32, device=device) / g.head_dim
-    weight, bias = small["action_out_proj.weight"], small["action_out_proj.bias"]
-    out_shift = table[:, -1, 1].double() @ weight.double().T + bias.double()
     shares = -(-suffix * g.num_heads // 16) * sizes["TP_SPLITS"]
     return {
         "weights": packed.weights,
@@ -272,11 +268,11 @@ def tensors(packed: PackedExpert, small: State, table: Tensor, sizes: dict[str, 
         "shifted": made.shifted,
         "row_scales": made.row_scales,
         "attended_times": made.attended_times,
-        "out_w": weight.float().contiguous(),
-        "out_shift": out_shift.float().contiguous(),
+        "out_w": small["action_out_proj.weight"].float().contiguous(),
+        "out_shift": affine(small, "action_out_proj", table[:, -1, 1].double()).float().contiguous(),
         "in_w": small["action_in_proj.weight"].float().T.contiguous(),
         "in_b": small["action_in_proj.bias"].float().contiguous(),
-        "inv_freq": 1.0 / packed.config.rope_base**exponents,  # as `model.layers.rope_tables` computes them
+        "inv_freq": inverse_frequencies(packed.config, device),
         "x": scratch(suffix, g.width),
         "squares": scratch(suffix, g.width // 8),
         "stream": activation(g.width),

@@ -13,11 +13,12 @@ from turbopi.config import GemmaConfig, ModelConfig
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.portable.quantize import quantize
+from turbopi.quantization import sites
 from turbopi.quantization.fp8 import E4M3, Directions
 
 TILE = 8  # output channels
 CHUNK_BYTES = 64  # of a channel: the part of the reduction of which a lane has 16 bytes
-KINDS = ("qkv", "out", "gate_up", "down")  # a layer's matrices, in the order in which they are read
+KINDS = sites.KINDS["expert"]  # a layer's matrices, in the order in which they are read
 
 
 def refusal(config: ModelConfig) -> str | None:
@@ -34,7 +35,7 @@ def refusal(config: ModelConfig) -> str | None:
     return None
 
 
-def shapes(g: GemmaConfig) -> list[tuple[int, int]]:
+def matrix_shapes(g: GemmaConfig) -> list[tuple[int, int]]:
     """(rows, columns) of a layer's qkv, out, gate|up and down."""
     heads = g.num_heads * g.head_dim
     return [(heads + 2 * g.head_dim, g.width), (g.width, heads), (2 * g.mlp_dim, g.width), (g.width, g.mlp_dim)]
@@ -92,12 +93,12 @@ class PackedExpert:
         orders = [None if order is None else order.to(layers[0].qkv.device) for order in _orders(config.expert)]
         for i, layer in enumerate(layers):
             parts = [layer.qkv, layer.out, layer.gate_up, layer.down]
-            sites = [f"expert.{i}.{kind}" for kind in KINDS]
+            places = [f"expert.{i}.{kind}" for kind in KINDS]
             if inputs is not None:
-                made = [quantize(m, 1.0, (directions or {}).get(s)) for m, s in zip(parts, sites, strict=True)]
+                made = [quantize(m, 1.0, (directions or {}).get(s)) for m, s in zip(parts, places, strict=True)]
                 parts = [matrix.data.view(torch.uint8) for matrix in made]
                 scales.append(torch.cat([matrix.scale for matrix in made]))
-                of_inputs.append([inputs[site] for site in sites])
+                of_inputs.append([inputs[place] for place in places])
             else:
                 parts = [part.to(torch.bfloat16) for part in parts]
             ordered = [m if order is None else m[order] for m, order in zip(parts, orders, strict=True)]
@@ -117,7 +118,7 @@ class PackedExpert:
 
     def row_scales(self, layer: int) -> tuple[Tensor, ...]:
         """float32 of the output channels of a layer's qkv, out, gate|up and down; E4M3 weights alone have them."""
-        return torch.split(self.scales[layer], [rows for rows, _ in shapes(self.config.expert)])
+        return torch.split(self.scales[layer], [rows for rows, _ in matrix_shapes(self.config.expert)])
 
     def matrices(self, layer: int) -> tuple[Tensor, ...]:
         """A layer's qkv, out, gate|up and down as they were before packing; of E4M3 weights what they stand for, in
@@ -126,7 +127,7 @@ class PackedExpert:
         g, found, at = self.config.expert, [], 0
         chunk = CHUNK_BYTES // self.weights.element_size()
         flat = self.weights[layer].float() if self.fp8 else self.weights[layer]
-        for k, ((rows, columns), order) in enumerate(zip(shapes(g), _orders(g), strict=True)):
+        for k, ((rows, columns), order) in enumerate(zip(matrix_shapes(g), _orders(g), strict=True)):
             size = rows * -(-columns // chunk) * chunk
             part = flat[at : at + size].view(rows // TILE, -1, TILE, chunk)
             ordered = part.transpose(1, 2).reshape(rows, -1)[:, :columns]

@@ -19,6 +19,7 @@ from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct, enumeration
 from turbopi.kernels.interface import State, TokenInputs
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
+from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.denoise.packing import (
     BLOCK,
@@ -29,7 +30,6 @@ from turbopi.kernels.sm90.denoise.packing import (
     Tables,
     most,
 )
-from turbopi.kernels.sm90.denoise.small import affine, inverse_frequencies
 
 FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
 PARTS = (  # of the kernel, in their order; {form}: "few" or "many" tokens; {times}: "one_time" or "token_times"
@@ -328,11 +328,9 @@ class DenoiseKernel:
         noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], the first `length` (int64[1], on the device) rows
         valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A]. `tokens`: by token.
         """
-        steps, g, chunk = self._steps, self._config.expert, (self._suffix, self._config.action_dim)
-        assert noise.shape == chunk and x_t.shape == (steps + 1, *chunk) and v_t.shape == (steps, *chunk)
-        assert cache_k.stride() == cache_v.stride() and cache_k.stride()[1:] == (g.head_dim, 1), cache_k.stride()
-        assert cache_k.dtype == cache_v.dtype == torch.bfloat16 and length.dtype == torch.int64
-        assert all(t.is_contiguous() and t.dtype == torch.float32 for t in (noise, x_t, v_t))
+        steps, g = self._steps, self._config.expert
+        chunk = (steps, self._suffix, self._config.action_dim)
+        check_launch(noise, cache_k, cache_v, length, x_t, v_t, chunk=chunk, head_dim=g.head_dim)
         named = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "length": length, "noise": noise}
         pointers = {name: t.data_ptr() for name, t in {**named, "x_t": x_t, "v_t": v_t}.items()}
         numbers = {

@@ -14,14 +14,14 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import GemmaLayer
+from turbopi.kernels.portable.denoise.packing import KINDS as KINDS
+from turbopi.kernels.portable.denoise.packing import matrix_shapes
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization.fp8 import E4M3, Directions
 
 BLOCK = 16  # rows of a tile, columns of a block
 WARPS = 16  # that multiply
 RANKS = 8  # CTAs of a cluster
-
-KINDS = ("qkv", "out", "gate_up", "down")  # a layer's matrices, in the order in which they are read
 
 Precision = Literal["bf16", "fp8"]
 
@@ -199,13 +199,13 @@ class PackedExpert:
 
     def row_scales(self, layer: int) -> tuple[Tensor, ...]:
         """float32 of the output channels of a layer's qkv, out, gate|up and down; E4M3 weights alone have them."""
-        return torch.split(self.scales[layer], [rows for rows, _ in _shapes(self.arrangement.config)])
+        return torch.split(self.scales[layer], [rows for rows, _ in matrix_shapes(self.arrangement.config.expert)])
 
     def matrices(self, layer: int) -> tuple[Tensor, ...]:
         """A layer's qkv, out, gate|up and down as they were before packing; of E4M3 weights what they stand for, in
         float32.
         """
-        shapes = _shapes(self.arrangement.config)
+        shapes = matrix_shapes(self.arrangement.config.expert)
         sizes = [rows * columns for rows, columns in shapes]
         values = self.weights[layer].float() if self.fp8 else self.weights[layer]
         flat = values.new_zeros(sum(sizes) + 1)
@@ -216,15 +216,9 @@ class PackedExpert:
         return tuple(parts)
 
 
-def _shapes(config: ModelConfig) -> list[tuple[int, int]]:
-    g = config.expert
-    width = g.num_heads * g.head_dim
-    return [(width + 2 * g.head_dim, g.width), (g.width, width), (2 * g.mlp_dim, g.width), (g.width, g.mlp_dim)]
-
-
 def _streams(a: Arrangement, weights: Precision) -> list[Tensor]:
     """int32 of each CTA: the elements of qkv, out, gate|up, down in the order in which it reads them."""
-    shapes = _shapes(a.config)
+    shapes = matrix_shapes(a.config.expert)
     offsets = np.cumsum([0, *(rows * columns for rows, columns in shapes)]).tolist()
     padding = offsets[-1]
     qkv, out, gate_up, down = (
@@ -251,7 +245,7 @@ def _streams(a: Arrangement, weights: Precision) -> list[Tensor]:
 def _row_index(a: Arrangement) -> Tensor:
     """int64[CTAs, tiles, 16]: which row of qkv, then of gate|up, a CTA's rows are; those it lacks are beyond both."""
     queries, keys_values, gates, _ = a.max_tiles
-    num_qkv = _shapes(a.config)[0][0]
+    num_qkv = matrix_shapes(a.config.expert)[0][0]
     index = torch.full((a.blocks, queries + keys_values + gates, BLOCK), num_qkv + 2 * a.config.expert.mlp_dim)
     for cta in range(a.blocks):
         cluster, rank = divmod(cta, RANKS)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.kernels.interface import GemmaLayer, State, TokenInputs
-from turbopi.kernels.sm90.denoise.small import affine
+from turbopi.kernels.portable.denoise.host import affine
 from turbopi.model.denoise import euler_step
 from turbopi.model.layers import rope_tables
 from turbopi.quantization.fp8 import to_e4m3
