@@ -38,8 +38,9 @@ def checked_in() -> list[tuple[str, str, Result]]:
 
 
 def test_predictions_are_near_all_that_was_measured_on_hopper() -> None:
-    """Of 1 to 3 cameras, 48 and 200 tokens, 1 to 10 steps and both horizons, from the main job's calls alone."""
-    own = [one for one in measured_calls() if one.kernels != "portable"]  # as in the files, but for the portable ones'
+    """Of 1 to 3 cameras, 48 and 200 tokens, 1 to 10 steps, both horizons, from the main job on an H200 alone."""
+    h200 = [one for one in measured_calls() if one.gpu == "h200"]
+    own = [one for one in h200 if one.kernels != "portable"]  # as in the files, but for the portable ones'
     by_main_job = {(one.backend, one.precision): one for one in own if one.job == Job()}
     judged = 0
     for file, key, result in checked_in():
@@ -65,6 +66,12 @@ def test_on_the_measured_gpu_and_job_the_prediction_is_the_measurement() -> None
         call = predicted_call(find_gpu(one.gpu), FULL, one.job, one)
         took = one.milliseconds["total"].p50
         assert call.low_ms == pytest.approx(took) and call.high_ms == pytest.approx(took)
+
+
+def test_where_a_gpu_was_measured_itself_no_other_ones_calls_are_taken() -> None:
+    for gpu in {one.gpu for one in measured_calls()}:
+        for precision in predict(find_gpu(gpu), FULL, Job()):
+            assert {call.measured_on for call in precision.calls if call.kernels == "hopper"} <= {gpu}
 
 
 @pytest.mark.parametrize("key", list(published_gpus()))

@@ -111,7 +111,8 @@ def _calls(gpu: GpuSpec, config: ModelConfig, job: Job, precision: str) -> Itera
         if call.precision == precision and call.job.batch == job.batch and runs_on(call.kernels, gpu):
             by_backend.setdefault((call.backend, call.kernels), []).append(call)
     for calls in by_backend.values():
-        yield predicted_call(gpu, config, job, nearest(calls, job))
+        own = [call for call in calls if call.gpu == gpu.key]
+        yield predicted_call(gpu, config, job, nearest(own or calls, job))
 
 
 def nearest(calls: Sequence[MeasuredCall], job: Job) -> MeasuredCall:
