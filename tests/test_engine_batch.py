@@ -1,5 +1,7 @@
 """A batch in the engine: several observations' rows in the same products, each with what it gets alone."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from conftest import golden_cases, golden_model
 from hypothesis import given
 from hypothesis import strategies as st
 from test_begin import OnCpu, on_cpu
+from torch import Tensor
 
 from turbopi.config import Kind
 from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix
@@ -16,7 +19,10 @@ from turbopi.engine.recent_loops import MOST_LOOPS, Loop
 from turbopi.engine.runner import HostRow
 from turbopi.engine.weights import modulation, pack
 from turbopi.errors import ObservationError
+from turbopi.kernels.interface import PairDenoiser
 from turbopi.kernels.plain import PLAIN
+from turbopi.kernels.sm90.denoise.plain import denoise_plain
+from turbopi.model.denoise import euler_step
 from turbopi.model.reference import Trace
 from turbopi.observation import Observation
 
@@ -91,7 +97,15 @@ def observations(kind: Kind, cameras: list[int], tokens: list[int], horizon: int
     return made, torch.randn(count, horizon, config.action_dim, generator=g)
 
 
-def batched(kind: Kind, observation: Observation, noise: torch.Tensor, batch: int, slots: int, steps: int) -> BatchLoop:
+def batched(
+    kind: Kind,
+    observation: Observation,
+    noise: torch.Tensor,
+    batch: int,
+    slots: int,
+    steps: int,
+    by: PairDenoiser | None = None,
+) -> BatchLoop:
     """A batched call that has run."""
     model = golden_model(kind)
     weights = pack(model.config, dict(model.state_dict()))
@@ -103,7 +117,7 @@ def batched(kind: Kind, observation: Observation, noise: torch.Tensor, batch: in
     prefix = PackedPrefix(buffers, slots)
     prefix.write([len(row.images) for row in rows], [row.tokens for row in rows])
     table = modulation(model.config, weights.conditioning, steps)
-    loop = BatchLoop(buffers, Loop(steps, noise.shape[1]), weights, table)
+    loop = BatchLoop(buffers, Loop(steps, noise.shape[1]), by or weights, table)
     loop.write(noise.numpy(), observation.state.numpy())
     pictures.upload(shown)
     pictures.run()
@@ -119,6 +133,45 @@ def test_each_observation_gets_what_it_gets_alone(kind: Kind) -> None:
     exact = golden_model(kind).sample(observation, noise, 3)
     torch.testing.assert_close(ours.actions[:4], exact, atol=2e-5, rtol=2e-5)
     assert bool(ours.actions.isfinite().all()), "an empty place's numbers stay numbers"
+
+
+class Pairs:
+    """In place of the kernel that denoises two observations: each alone, by the plain loop."""
+
+    def __init__(self, kind: Kind, steps: int) -> None:
+        model = golden_model(kind)
+        self._config, self._weights = model.config, pack(model.config, dict(model.state_dict()))
+        table = modulation(self._config, self._weights.conditioning, steps)
+        assert table is not None
+        self._table = table
+
+    def launch_pair(self, noise: Tensor, k: Tensor, v: Tensor, segments: Tensor, x_t: Tensor, v_t: Tensor) -> None:
+        for row, (start, end) in enumerate(itertools.pairwise(segments.tolist())):
+            x_t[:, row], v_t[:, row] = denoise_plain(
+                self._config,
+                self._weights.expert,
+                self._weights.small,
+                self._table,
+                noise[row],
+                k[:, start:],
+                v[:, start:],
+                end - start,
+            )
+
+
+@pytest.mark.parametrize(("batch", "missing"), [(2, 0), (4, 0), (4, 1), (4, 3)])
+def test_a_batch_denoised_in_pairs_is_what_each_gets_alone(batch: int, missing: int) -> None:
+    cameras, tokens = [2, 0, 3, 1][: batch - missing], [7, 12, 3, 0][: batch - missing]
+    observation, noise = observations("pi05", cameras, tokens, horizon=5)
+    ours = batched("pi05", observation, noise, batch=batch, slots=32, steps=3, by=Pairs("pi05", 3))
+    model = golden_model("pi05")
+    exact = model.sample(observation, noise, 3)
+    torch.testing.assert_close(ours.actions[: len(exact)], exact, atol=2e-5, rtol=2e-5)
+    assert bool(ours.actions.isfinite().all())
+    for row in range(len(exact)):
+        x_t, v_t = ours.trace(row)
+        torch.testing.assert_close(x_t[-1], exact[row], atol=2e-5, rtol=2e-5)
+        torch.testing.assert_close(x_t[1:], euler_step(x_t[:-1], v_t, 3))
 
 
 def test_another_observation_beside_it_changes_nothing(kind: Kind) -> None:

@@ -23,19 +23,23 @@ from turbopi.kernels.sm90.instructions import SHARED_BYTES
 
 ARCH = "sm_90a"
 CACHE_ROWS = 976  # of `fused` with three cameras and prompts of up to 200 tokens
+ROWS_OF_TWO = 1440  # of two observations with two cameras each
 # Sections of a cubin that say what runs, and with how many registers, constants and barriers.
 SECTIONS = (".text.", ".nv.constant", ".nv.info.", ".nv.shared.")
 
 
-def _denoising(suffix: int, in_fp8: bool, by_token: bool, folder: Path | None) -> bytes:
+def _denoising(
+    suffix: int, in_fp8: bool, by_token: bool, folder: Path | None, *, rows: int = CACHE_ROWS, pair: bool = False
+) -> bytes:
     arrangement = Arrangement(preset("pi05_libero").model)
     sizes = denoise.kernel_sizes(
         arrangement,
-        cache_rows=CACHE_ROWS,
+        cache_rows=rows,
         suffix=suffix,
         shared_bytes=SHARED_BYTES,
         fp8=in_fp8,
         by_token=by_token,
+        pair=pair,
     )
     return denoise.compiled(ARCH, sizes, folder=folder)
 
@@ -63,6 +67,12 @@ SHAPES: dict[str, Callable[[Path | None], bytes]] = {
         )
         for by_token in (False, True)
         for suffix in (10, 50)
+        for in_fp8 in (False, True)
+    },
+    **{
+        f"denoising of two observations, H=10, {'fp8' if in_fp8 else 'bf16'}": partial(
+            _denoising, 20, in_fp8, False, rows=ROWS_OF_TWO, pair=True
+        )
         for in_fp8 in (False, True)
     },
     "product of vision's qkv, bf16": partial(_product, Tile(1, 112, cluster_m=2), "bias", False),

@@ -133,7 +133,8 @@ class RunsBatches(Protocol):
         split into these
     """
 
-    batch_costs: ClassVar[Mapping[int, float]]
+    @property
+    def batch_costs(self) -> Mapping[int, float]: ...
 
     def begin_batch(self, pictures: Sequence[Sequence[np.ndarray]], resize: ImageResize | None = None) -> BegunBatch:
         """`Begins.begin` of several observations: each one's valid pictures, perhaps none."""

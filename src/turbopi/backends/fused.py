@@ -7,6 +7,7 @@ don't cover takes the engine's operations one by one. `describe()` says what run
 """
 
 import importlib.util
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -23,13 +24,17 @@ from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import MAX_CAMERAS, bucket
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
-from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.kernels.interface import Denoiser, Ops, PairDenoiser
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.fp8 import Directions, Matrix
 from turbopi.quantization.plan import TIERS
 from turbopi.quantization.sites import KINDS
 from turbopi.toolchain import missing_for_c
+
+logger = logging.getLogger(__name__)
+
+MOST_IN_PAIRS = 4  # observations of a batch that are denoised two at a time: for more, operations are as fast
 
 
 @runtime_checkable
@@ -47,7 +52,8 @@ class FusedBackend(CudaGraphBackend):
     name: ClassVar[str] = "fused"
     # measured on an H200 with two cameras in bfloat16: benchmarks/results/h200_2026-11-24_batches.json, of 2 see
     # docs/dev/log.md; in FP8 four take 3.4, eight 5.3, sixteen 9.9
-    batch_costs: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.2, 8: 5.4, 16: 10.6}
+    COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.2, 8: 5.4, 16: 10.6}
+    COSTS_WITH_PAIRS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.6, 4: 3.1, 8: 5.4, 16: 10.6}  # of 2 and 4 estimated
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
     _fp8_expert: list[Any] | None = None  # layers with `Fp8Matrix`, of batches
@@ -67,6 +73,7 @@ class FusedBackend(CudaGraphBackend):
         self._plan = None if quantization is None else quantization.plan(config, precision)
         self._packed_expert: Any = None  # as the denoising kernels have it
         self._denoisers: dict[tuple[Loop, int], Denoiser] = {}  # by loop and cache rows
+        self._pair_denoisers: dict[tuple[Loop, int], PairDenoiser] = {}  # of two observations, for batches
         self._refused: dict[tuple[Loop, int], str] = {}  # what operations denoise, and why
         super().__init__(config, load, device=device, precision=precision)
 
@@ -115,6 +122,8 @@ class FusedBackend(CudaGraphBackend):
                 calls.append(str(loop))
         kernel = "one CUDA kernel" if self._on_hopper else "one portable CUDA kernel"
         described["denoising"] = ({kernel: by_kernel} if by_kernel else {}) | by_operations
+        if pairs := sorted({str(loop) for loop, _ in list(self._pair_denoisers)}):
+            described["denoising"]["one CUDA kernel for two observations, of batches up to four"] = pairs
         clocks = {
             str(loop): round(clock)
             for (loop, _), kernel in list(self._denoisers.items())
@@ -177,8 +186,50 @@ class FusedBackend(CudaGraphBackend):
         self._keep_expert_on(self.device)  # while such a graph is kept, as it points to it
         return None
 
+    @property
+    def batch_costs(self) -> Mapping[int, float]:
+        return self.COSTS_WITH_PAIRS if self._denoises_pairs(self.config.action_horizon) else self.COSTS
+
+    def _denoises_pairs(self, horizon: int) -> bool:
+        """Whether Hopper's kernel denoises two observations of such a horizon at once."""
+        if not self._on_hopper:
+            return False
+        from turbopi.kernels.sm90.denoise.kernel import FEW, MAX_SUFFIX
+        from turbopi.kernels.sm90.denoise.packing import refusal
+
+        return FEW < 2 * horizon <= MAX_SUFFIX and refusal(self.config) is None
+
+    def _batch_denoises_by(self, loop: Loop, batch: int, rows: int) -> Weights | PairDenoiser:
+        """Hopper's kernel, two observations at a time, where they are few; else operations in its precision."""
+        if batch > MOST_IN_PAIRS or not self._denoises_pairs(loop.horizon):
+            return self._batch_weights()
+        key = (loop, rows)
+        if key not in self._pair_denoisers:
+            try:
+                self._pair_denoisers[key] = self._pair_kernel(loop, rows)
+            except BackendUnavailable as e:  # more keys than fit, or fewer multiprocessors than it needs
+                logger.info("operations denoise %d observations: %s", batch, e)
+                return self._batch_weights()
+        return self._pair_denoisers[key]
+
+    def _pair_kernel(self, loop: Loop, rows: int) -> PairDenoiser:
+        """Raises BackendUnavailable where it can't run."""
+        from turbopi.kernels.sm90.denoise.kernel import DenoiseKernel
+        from turbopi.kernels.sm90.denoise.packing import PackedExpert
+
+        table = self._table(loop)
+        assert table is not None, "the kernel takes Pi0.5 alone"
+        kernel = DenoiseKernel(
+            *(self.config, self._packed(PackedExpert), self._weights.small, table),
+            cache_rows=rows,
+            suffix=2 * loop.horizon,
+            device=self.device,
+            pair=True,
+        )
+        self._put_expert_away()
+        return kernel
+
     def _batch_weights(self) -> Weights:
-        """Operations denoise batches, in the precision of the denoising kernel."""
         inputs = self._expert_inputs()
         if inputs is None:
             self._batches_denoise_in_bf16 = True
@@ -201,7 +252,7 @@ class FusedBackend(CudaGraphBackend):
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
         kept: dict[tuple[Loop, int], Any]
-        for kept in (self._denoisers, self._refused):
+        for kept in (self._denoisers, self._pair_denoisers, self._refused):
             for key in [key for key in kept if key[0] == loop]:
                 del kept[key]
         if self._denoisers:  # if no graph of operations is left, none points to the matrices on the device
@@ -263,7 +314,7 @@ class FusedBackend(CudaGraphBackend):
         return self._packed_expert
 
     def _explain(self, error: RuntimeError) -> None:
-        for kernel in self._denoisers.values():
+        for kernel in (*self._denoisers.values(), *self._pair_denoisers.values()):
             if isinstance(kernel, Watched) and (why := kernel.why_it_trapped()) is not None:
                 raise DeviceLost(
                     f"{why}; {ADVICE}, and free the GPU of other work; if that doesn't help, use backend 'cuda_graph'"

@@ -23,7 +23,7 @@ from turbopi.engine.flat import allocate
 from turbopi.engine.packing import most_tiles, pack_rows
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.weights import Weights
-from turbopi.kernels.interface import Ops, Segments
+from turbopi.kernels.interface import Ops, PairDenoiser, Segments
 from turbopi.kernels.plain_batch import PLAIN_BATCH
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 
@@ -118,11 +118,11 @@ class BatchLoop:
         self,
         buffers: BatchBuffers,
         loop: Loop,
-        weights: Weights,  # their expert's matrices may be others than those of `buffers`
+        by: Weights | PairDenoiser,  # what denoises; operations' matrices may be others than those of `buffers`
         table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation
     ) -> None:
         assert loop.form == "plain", loop
-        self._buffers, self._weights, self._table = buffers, weights, table
+        self._buffers, self._by, self._table = buffers, by, table
         config, device, batch = buffers.config, buffers.device, buffers.size.batch
         on_gpu = device.type == "cuda"
         self._steps, self._horizon = loop.steps, loop.horizon
@@ -137,8 +137,11 @@ class BatchLoop:
         self._noise, self._state = inputs["noise"], inputs["state"]
         self._offsets = torch.arange(self._tokens, device=device)
         self._rope = forward.rope_of_all_positions(config, buffers.rows + self._tokens, device)
-        self.x_t = torch.empty(loop.steps + 1, *chunk, device=device)
-        self.v_t = torch.empty(loop.steps, *chunk, device=device)
+        per = batch if isinstance(by, Weights) else 2  # observations that are denoised together
+        assert batch % per == 0, (batch, per)
+        together = (per, *chunk[1:])
+        self._x_t = torch.empty(batch // per, loop.steps + 1, *together, device=device)
+        self._v_t = torch.empty(batch // per, loop.steps, *together, device=device)
         size, dtype = (batch * self._tokens, config.vlm.head_dim), buffers.weights.embed_tokens.dtype
         self._keys, self._values = (torch.empty(size, device=device, dtype=dtype) for _ in range(2))
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
@@ -150,22 +153,40 @@ class BatchLoop:
             array[: len(given)] = given
             array[len(given) :] = 0
 
+    def trace(self, row: int) -> tuple[Tensor, Tensor]:
+        """x_t [N + 1, H, A] and v_t [N, H, A] of one observation of the last call."""
+        group, own = divmod(row, self._x_t.shape[2])
+        return self._x_t[group, :, own], self._v_t[group, :, own]
+
     def run(self, *_: Any) -> None:
         self._flat.copy_(self._host, non_blocking=True)
+        if isinstance(self._by, Weights):
+            self._run_operations(self._by)
+        else:
+            self._run_pairs(self._by)
+        self.actions.view_as(self._x_t[:, -1]).copy_(self._x_t[:, -1], non_blocking=True)
+
+    def _run_pairs(self, kernel: PairDenoiser) -> None:
+        cache, starts = self._buffers.cache, self._buffers.segments[0]
+        for pair, (x_t, v_t) in enumerate(zip(self._x_t, self._v_t, strict=True)):
+            first = 2 * pair
+            segments = starts[first : first + 3]  # behind the last observation comes the padding
+            kernel.launch_pair(self._noise[first : first + 2], cache.k, cache.v, segments, x_t, v_t)
+
+    def _run_operations(self, weights: Weights) -> None:
         lengths = self._buffers.segments[1, :-1].long()
         positions = (lengths[:, None] + self._offsets).flatten()
         rope = (self._rope[0][positions], self._rope[1][positions])
-        self.x_t[0] = self._noise
+        (x_t,), (v_t,) = self._x_t, self._v_t
+        x_t[0] = self._noise
         for step in range(self._steps):
-            v_t = self._velocity(step, rope)
-            self.x_t[step + 1] = euler_step(self.x_t[step], v_t, self._steps)
-            self.v_t[step] = v_t
-        self.actions.copy_(self.x_t[-1], non_blocking=True)
+            v_t[step] = self._velocity(weights, x_t[step], step, rope)
+            x_t[step + 1] = euler_step(x_t[step], v_t[step], self._steps)
 
-    def _velocity(self, step: int, rope: forward.Rope) -> Tensor:
+    def _velocity(self, weights: Weights, x_t: Tensor, step: int, rope: forward.Rope) -> Tensor:
         """v_t float32[B, H, A]"""
         buffers = self._buffers
-        config, weights, ops = buffers.config, self._weights, buffers.ops
+        config, ops = buffers.config, buffers.ops
         batched, heads = ops.batch or PLAIN_BATCH, config.expert.num_heads
 
         def places(i: int) -> tuple[Tensor, Tensor]:
@@ -177,7 +198,7 @@ class BatchLoop:
                 q, *prefix, *suffix, *buffers.segments, heads, config.kind == "pi0", **input
             )
 
-        tokens = forward.suffix_tokens(config, weights.small, self.x_t[step], self._time_embs[step], self._state)
+        tokens = forward.suffix_tokens(config, weights.small, x_t, self._time_embs[step], self._state)
         tokens = tokens.flatten(0, 1).to(weights.embed_tokens.dtype)
         table = None if self._table is None else self._table[step]
         out = forward.expert_layers(config, weights, ops, tokens, table, rope, places, attend)

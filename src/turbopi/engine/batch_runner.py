@@ -21,7 +21,7 @@ from turbopi.engine.packing import split
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import BUCKET, GraphRunner, HostRow, floats, padded_trace
 from turbopi.engine.weights import Weights
-from turbopi.kernels.interface import Ops
+from turbopi.kernels.interface import Ops, PairDenoiser
 from turbopi.model.conditioning import Conditionings, of_rows
 from turbopi.model.reference import Trace
 from turbopi.model.sample import Sample
@@ -59,13 +59,10 @@ class BegunBatch:
 
 
 class BatchRunner(GraphRunner):
-    """`GraphRunner` whose batches are batched calls.
-
-    batch_costs  how long a call of so many observations takes, in calls of one
-    """
+    """`GraphRunner` whose batches are batched calls."""
 
     # estimated from single calls: without the denoising kernel, whose time a batch of two doubles, sharing pays sooner
-    batch_costs: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.6, 4: 2.9, 8: 5.5, 16: 10.7}
+    COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.6, 4: 2.9, 8: 5.5, 16: 10.7}
 
     def __init__(
         self, config: ModelConfig, weights: Weights, ops: Ops, device: torch.device, *, joint: bool = False
@@ -76,9 +73,14 @@ class BatchRunner(GraphRunner):
             bucket=BUCKET,
             capture=lambda run, like: self._capture(run, None, like),
             table=self._table,
-            denoising_weights=self._batch_weights,
+            denoises_by=self._batch_denoises_by,
             refuse=self._refuse_batch_if_cold,
         )
+
+    @property
+    def batch_costs(self) -> Mapping[int, float]:
+        """See `turbopi.backends.base.RunsBatches`."""
+        return self.COSTS
 
     def warmup_batches(
         self, observation: Observation, num_steps: int, horizon: int | None, batches: Sequence[int]
@@ -154,8 +156,10 @@ class BatchRunner(GraphRunner):
             raise not_warm(self.name, f"{count} observations at once", self._batches.describe(), batches=count)
         return split(count, {size: cost for size, cost in self.batch_costs.items() if size in warm})
 
-    def _batch_weights(self) -> Weights:
-        """What batches denoise with; they go on pointing to it."""
+    def _batch_denoises_by(self, loop: Loop, batch: int, rows: int) -> Weights | PairDenoiser:
+        """What a batch with up to so many prefix rows is denoised by, operations with weights or a kernel for two
+        observations at a time. Its graph goes on pointing to it.
+        """
         return self._weights
 
     def _begin_one(self, pictures: Sequence[np.ndarray], resize: ImageResize | None) -> Finish:

@@ -20,7 +20,7 @@ from turbopi.engine.call import Pictures
 from turbopi.engine.graph import Graph, Mark
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.weights import Weights
-from turbopi.kernels.interface import Ops
+from turbopi.kernels.interface import Ops, PairDenoiser
 from turbopi.model.sample import Sample
 
 logger = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ class Batches:
 
     capture     makes a graph of a function, see `GraphRunner`
     table       a loop's modulation
-    denoising_weights  those of a batch's denoising, when it is first captured
+    denoises_by  what denoises so many observations, of at most so many rows, when that is first captured
     refuse      is told what a call needs that isn't captured, and raises if that isn't allowed now
     """
 
@@ -48,12 +48,12 @@ class Batches:
         bucket: int,
         capture: Capture,
         table: Callable[[Loop], Tensor | None],
-        denoising_weights: Callable[[], Weights],
+        denoises_by: Callable[[Loop, int, int], Weights | PairDenoiser],
         refuse: Callable[[str, int], None],
     ) -> None:
         self._config, self._weights, self._ops, self._device = config, weights, ops, device
         self._bucket, self._capture, self._table = bucket, capture, table
-        self._denoising_weights, self._refuse = denoising_weights, refuse
+        self._denoises_by, self._refuse = denoises_by, refuse
         self._pictures: dict[tuple[int, bool], Pictures] = {}
         self._buffers: dict[BatchSize, BatchBuffers] = {}
         self._prefixes: dict[tuple[BatchSize, int], PackedPrefix] = {}
@@ -120,7 +120,7 @@ class Batches:
         buffers, run = self._buffers[size], self._loops[size, loop]
         start, length = (int(one) for one in buffers.segments[:, row])
         rows = slice(start, start + length)
-        return buffers.cache.k[:, rows], buffers.cache.v[:, rows], run.x_t[:, row], run.v_t[:, row]
+        return buffers.cache.k[:, rows], buffers.cache.v[:, rows], *run.trace(row)
 
     def forget(self, loop: Loop) -> None:
         """Let go of all that is a denoising loop's alone."""
@@ -178,7 +178,8 @@ class Batches:
     def _loop_graph(self, size: BatchSize, loop: Loop) -> Graph:
         def capture() -> Graph:
             table, buffers = self._table(loop), self._buffers_of(size)
-            run = self._loops[size, loop] = BatchLoop(buffers, loop, self._denoising_weights(), table)
+            by = self._denoises_by(loop, size.batch, buffers.rows)
+            run = self._loops[size, loop] = BatchLoop(buffers, loop, by, table)
             return self._capture(run.run, None)
 
         return self._graph(size, ("denoise", size, loop), capture)

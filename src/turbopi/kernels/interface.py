@@ -158,3 +158,16 @@ class Denoiser(Protocol):
 
         `tokens` of a loop that was made for them, and of no other; v_t then is the guided v that was integrated.
         """
+
+
+class PairDenoiser(Protocol):
+    """All denoising steps of two observations beside each other in one launch: their weights are read once."""
+
+    def launch_pair(
+        self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, segments: Tensor, x_t: Tensor, v_t: Tensor
+    ) -> None:
+        """From noise float32[2, H, A]: x_t float32[N + 1, 2, H, A], v_t float32[N, 2, H, A].
+
+        The observations' rows of the cache bfloat16[L, rows, K] lie one behind the other. segments int32[3], on the
+        device: the first row of either, and the first one behind them; one may have none.
+        """

@@ -22,7 +22,6 @@ def check_launch(
     noise: Tensor,
     cache_k: Tensor,
     cache_v: Tensor,
-    length: Tensor,
     x_t: Tensor,
     v_t: Tensor,
     *,
@@ -33,5 +32,5 @@ def check_launch(
     steps, *shape = chunk
     assert noise.shape == (*shape,) and x_t.shape == (steps + 1, *shape) and v_t.shape == (steps, *shape)
     assert cache_k.stride() == cache_v.stride() and cache_k.stride()[1:] == (head_dim, 1), cache_k.stride()
-    assert cache_k.dtype == cache_v.dtype == torch.bfloat16 and length.dtype == torch.int64
+    assert cache_k.dtype == cache_v.dtype == torch.bfloat16
     assert all(t.is_contiguous() and t.dtype == torch.float32 for t in (noise, x_t, v_t))

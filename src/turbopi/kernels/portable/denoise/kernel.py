@@ -210,7 +210,8 @@ class PortableDenoiser:
         steps, g = self._steps, self._config.expert
         assert tokens is None, "this kernel has no times by token"
         chunk = (steps, self._suffix, self._config.action_dim)
-        check_launch(noise, cache_k, cache_v, length, x_t, v_t, chunk=chunk, head_dim=g.head_dim)
+        assert length.dtype == torch.int64, length.dtype
+        check_launch(noise, cache_k, cache_v, x_t, v_t, chunk=chunk, head_dim=g.head_dim)
         named = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "length": length, "noise": noise}
         pointers = {name: t.data_ptr() for name, t in {**named, "x_t": x_t, "v_t": v_t}.items()}
         args = ARGS.value(

@@ -33,7 +33,7 @@ __device__ __forceinline__ void attend_by_warps(Cta& b, const float* kv, u32 bit
     __syncwarp();
     if (suffix > 0) score_suffix(b, suffix, c[0]);
     if (b.warp() == SUFFIX_WARP)
-      weigh_suffix(b, c, suffix);
+      weigh_suffix(b, c, suffix OF_PAIR(, Mask::of_suffix(suffix0)));
     else
       sync<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
   };
@@ -115,7 +115,7 @@ __device__ __forceinline__ void attend_by_warps(Cta& b, const float* kv, u32 bit
         give_slot(b, mine, seen);
       }
       MARK(MARK_PREFIX_SCORED)
-      weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16);
+      weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16 OF_PAIR(, Mask()));  // never a pair
       arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
       if (b.warp() == LEADER) {
         sync<WEIGHTS, SCORERS + 4>();
@@ -206,7 +206,7 @@ __device__ __forceinline__ void attend_by_warps(Cta& b, const float* kv, u32 bit
       }
     MARK(MARK_PREFIX_SCORED)
     if (scorer) {
-      weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16);
+      weigh_prefix(b, c, b.warp(), prefix - b.warp() * 16 OF_PAIR(, Mask::of_prefix(b, keys.first + b.warp())));
       arrive<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
     }
     ask_suffix();

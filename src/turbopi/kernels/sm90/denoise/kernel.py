@@ -9,6 +9,7 @@ Shapes: N steps, L layers, T suffix tokens, D width, n query heads of K columns,
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,8 +33,10 @@ from turbopi.kernels.sm90.denoise.packing import (
 )
 
 FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
-PARTS = (  # of the kernel, in their order; {form}: "few" or "many" tokens; {times}: "one_time" or "token_times"
-    *("sizes", "{form}/memory", "cta", "primitives", "wgmma", "producer", "product"),
+# Of the kernel, in their order; {form}: "few" or "many" tokens; {times}: "one_time" or "token_times"; {observations}:
+# "alone" or a "pair".
+PARTS = (
+    *("sizes", "{form}/memory", "cta", "{observations}", "primitives", "wgmma", "producer", "product"),
     *("stream", "{form}/stream", "residual", "project", "feed_forward", "{times}"),
     *("{form}/project", "{form}/feed_forward", "score", "attention", "{form}/attention", "combine"),
     *("layer", "step", "{form}/step", "watch", "{form}/loop", "kernel"),
@@ -131,6 +134,16 @@ ARGS = Struct(
     ),
 )
 
+ARGS_OF_PAIR = Struct(
+    "Args",
+    tuple(
+        Parameter("const int*", "segments", "[3]: first row of either observation, and the first behind them")
+        if parameter.name == "length"
+        else parameter
+        for parameter in ARGS.fields
+    ),
+)
+
 ARGS_BY_TOKEN = Struct(
     "Args",
     (
@@ -152,8 +165,13 @@ def kernel_sizes(
     shared_bytes: int,
     fp8: bool = False,
     by_token: bool = False,
+    pair: bool = False,
 ) -> dict[str, int]:
-    """The kernel's compile-time constants. by_token: every token has its own time (token_times.cu)."""
+    """The kernel's compile-time constants.
+
+    by_token  every token has its own time (token_times.cu)
+    pair      the suffix is that of two observations (pair.cu), the cache's rows, too
+    """
     config, g = arrangement.config, arrangement.config.expert
     groups = most(suffix, 8)
     stream = arrangement.clusters // 2 * (g.width // BLOCK) * groups * 32
@@ -179,10 +197,11 @@ def kernel_sizes(
         "TP_SHARED_BYTES": shared_bytes,
         "TP_SCRATCH_WORDS": scratch,
         **({"TP_BY_TOKEN": 1} if by_token else {}),
+        **({"TP_PAIR": 1} if pair else {}),
     }
 
 
-def source(suffix: int, fp8: bool, by_token: bool = False) -> str:
+def source(suffix: int, fp8: bool, by_token: bool = False, pair: bool = False) -> str:
     columns = most(suffix, 8) * 8
     numbers: instructions.Numbers = "e4m3" if fp8 else "bf16"
     products = (
@@ -191,9 +210,13 @@ def source(suffix: int, fp8: bool, by_token: bool = False) -> str:
         instructions.wgmma("add_rows", columns, from_registers=True),
         instructions.wgmma("add_keys", 2 * 8),
     )
-    args = ARGS_BY_TOKEN if by_token else ARGS
+    args = ARGS_BY_TOKEN if by_token else ARGS_OF_PAIR if pair else ARGS
     generated = (*products, enumeration("What", tuple(WAITS)), enumeration("Mark", tuple(MARKS)), args.source)
-    which = {"form": "few" if suffix <= FEW else "many", "times": "token_times" if by_token else "one_time"}
+    which = {
+        "form": "few" if suffix <= FEW else "many",
+        "times": "token_times" if by_token else "one_time",
+        "observations": "pair" if pair else "alone",
+    }
     files = (f"denoise/{part.format(**which)}.cu" for part in PARTS)
     return instructions.source(*files, generated="\n".join(generated) + "\n", folder=FOLDER)
 
@@ -201,9 +224,8 @@ def source(suffix: int, fp8: bool, by_token: bool = False) -> str:
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
     """The kernel's machine code. Raises BackendUnavailable if a block has too little shared memory for these sizes."""
     try:
-        return compile_cubin(
-            source(sizes["TP_TOKENS"], bool(sizes["TP_FP8"]), "TP_BY_TOKEN" in sizes), arch, sizes, folder=folder
-        )
+        text = source(sizes["TP_TOKENS"], bool(sizes["TP_FP8"]), "TP_BY_TOKEN" in sizes, "TP_PAIR" in sizes)
+        return compile_cubin(text, arch, sizes, folder=folder)
     except BackendError as e:
         if "too little shared memory" not in str(e):
             raise
@@ -241,6 +263,7 @@ class DenoiseKernel:
 
     by_token  every token has a time of its own in each of `num_steps` steps: a launch then takes `TokenInputs`, and
         `table` float32[U, 2L + 1, 3, D] has a row for each time that occurs
+    pair  the suffix is that of two observations, half of it each, and so are the cache's rows: for `launch_pair`
     """
 
     def __init__(
@@ -255,14 +278,18 @@ class DenoiseKernel:
         device: torch.device,
         num_steps: int | None = None,
         by_token: bool = False,
+        pair: bool = False,
     ) -> None:
         assert by_token == (num_steps is not None), "by token the table doesn't tell the number of steps"
+        assert not (pair and by_token), "two observations have one time"
         assert not by_token or len(table) <= MAX_ROWS, len(table)
         reason = unavailable(device)
         if reason is not None:
             raise BackendUnavailable(reason)
         if not 1 <= suffix <= MAX_SUFFIX:
             raise BackendError(f"the denoising kernel takes 1 to {MAX_SUFFIX} suffix tokens, not {suffix}")
+        if pair and (suffix <= FEW or suffix % 2):
+            raise BackendError(f"two observations have an even number of tokens above {FEW}, not {suffix}")
         self._config = config
         self._packed = packed
         arrangement = self._packed.arrangement
@@ -275,6 +302,7 @@ class DenoiseKernel:
             fp8=self._packed.fp8,
             shared_bytes=properties.shared_memory_per_block_optin,  # type: ignore[attr-defined]
             by_token=by_token,
+            pair=pair,
         )
         with torch.cuda.device(device):
             arch = f"sm_{properties.major}{properties.minor}a"
@@ -288,7 +316,7 @@ class DenoiseKernel:
                     f"the denoising kernel needs {arrangement.clusters} clusters of {RANKS} multiprocessors at once, "
                     f"{torch.cuda.get_device_name(device)} holds {fitting}"
                 )
-        self._suffix, self._blocks, self._by_token = suffix, arrangement.blocks, by_token
+        self._suffix, self._blocks, self._by_token, self._pair = suffix, arrangement.blocks, by_token, pair
         self._steps = len(table) if num_steps is None else num_steps
         self._table = table.to(device).float().contiguous()
         tables = Tables.make(self._packed, self._table)
@@ -328,12 +356,34 @@ class DenoiseKernel:
         noise float32[T, A]; cache_k, cache_v bfloat16[L, rows, K], the first `length` (int64[1], on the device) rows
         valid and the others never read; written: x_t float32[N + 1, T, A], v_t float32[N, T, A]. `tokens`: by token.
         """
+        assert not self._pair and length.dtype == torch.int64, (self._pair, length.dtype)
+        assert (tokens is not None) == self._by_token, "a kernel by token takes `tokens`, another doesn't"
+        values = self._values(noise, cache_k, cache_v, x_t, v_t) | {"length": length.data_ptr()}
+        if tokens is None:
+            self._launch(ARGS.value(values))
+        else:
+            self._launch(ARGS_BY_TOKEN.value(values | self._token_pointers(tokens)))
+
+    def launch_pair(
+        self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, segments: Tensor, x_t: Tensor, v_t: Tensor
+    ) -> None:
+        """See `kernels.interface.PairDenoiser`."""
+        assert self._pair and segments.shape == (3,) and segments.dtype == torch.int32 and segments.is_contiguous()
+        beside = noise.flatten(0, 1), cache_k, cache_v, x_t.flatten(1, 2), v_t.flatten(1, 2)
+        assert all(t.is_contiguous() for t in (noise, x_t, v_t)), "the kernel writes where they lie"
+        self._launch(ARGS_OF_PAIR.value(self._values(*beside) | {"segments": segments.data_ptr()}))
+
+    def _launch(self, args: Any) -> None:
+        self._prepare.launch(self._tiles, 256, args)
+        self._kernel.launch_cooperative(self._blocks, THREADS, args)  # clusters wait for one another
+
+    def _values(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, x_t: Tensor, v_t: Tensor) -> dict[str, Any]:
+        """Of the kernel's arguments those that all forms have."""
         steps, g = self._steps, self._config.expert
         chunk = (steps, self._suffix, self._config.action_dim)
-        check_launch(noise, cache_k, cache_v, length, x_t, v_t, chunk=chunk, head_dim=g.head_dim)
-        named = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "length": length, "noise": noise}
-        pointers = {name: t.data_ptr() for name, t in {**named, "x_t": x_t, "v_t": v_t}.items()}
-        numbers = {
+        check_launch(noise, cache_k, cache_v, x_t, v_t, chunk=chunk, head_dim=g.head_dim)
+        tensors = {**self._tensors, "cache_k": cache_k, "cache_v": cache_v, "noise": noise, "x_t": x_t, "v_t": v_t}
+        return {name: t.data_ptr() for name, t in tensors.items()} | {
             "layer_stride": cache_k.stride(0) * 2,
             "layer_bytes": self._packed.layer_bytes,
             "steps": steps,
@@ -341,13 +391,6 @@ class DenoiseKernel:
             "eps": self._config.rms_norm_eps,
             "zero": 0,
         }
-        assert (tokens is not None) == self._by_token, "a kernel by token takes `tokens`, another doesn't"
-        if tokens is None:
-            args = ARGS.value(pointers | numbers)
-        else:
-            args = ARGS_BY_TOKEN.value(pointers | numbers | self._token_pointers(tokens))
-        self._prepare.launch(self._tiles, 256, args)
-        self._kernel.launch_cooperative(self._blocks, THREADS, args)  # clusters wait for one another
 
     def _token_pointers(self, tokens: TokenInputs) -> dict[str, int]:
         by_step = self._steps, self._suffix

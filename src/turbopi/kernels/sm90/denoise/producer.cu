@@ -38,7 +38,7 @@ struct Producer {
     for (int k = 0; k < count; k += SLOT_TILES) add(from + k * KEY_TILE, min(SLOT_TILES, count - k) * KEY_TILE, true);
   }
   __device__ void run() {
-    const PrefixShare mine(int(*b.a.length), b.rank());
+    const PrefixShare mine(PREFIX_ROWS(b.a), b.rank());
     const int first = mine.first, count = mine.tiles;
     product<QTL + KVL>(D16, b.qn() + b.kvn());
     keys(0, count);
@@ -101,11 +101,11 @@ extern "C" __global__ void __launch_bounds__(256) turbopi_denoise_prepare(const 
     const u32 v = word_at_start(at);
     a.scratch[at] = make_uint4(v, v, v, v);
   }
-  const int l = blockIdx.x / KEY_TILES, tile = blockIdx.x % KEY_TILES, length = int(*a.length);
+  const int l = blockIdx.x / KEY_TILES, tile = blockIdx.x % KEY_TILES, length = PREFIX_ROWS(a);
   if (tile * 16 >= length) return;
   typedef unsigned short half;
-  const half* k = (const half*)(a.cache_k + l * a.layer_stride);
-  const half* v = (const half*)(a.cache_v + l * a.layer_stride);
+  const half* k = (const half*)(a.cache_k + l * a.layer_stride)FIRST_ROW(a);
+  const half* v = (const half*)(a.cache_v + l * a.layer_stride)FIRST_ROW(a);
   uint4* to = (uint4*)(a.keys + (size_t(2 * l) * KEY_TILES + tile) * KEY_TILE);
 #pragma unroll 4
   for (int i = threadIdx.x; i < QT * 32; i += 256) {

@@ -22,7 +22,7 @@ __device__ __forceinline__ float4 rope_of(const Cta& b, int prefix, QkvItem item
   float4 turn = make_float4(1, 0, 1, 0);
   const int tile = item.k < 0 ? b.q0() + item.at : b.kv0() + item.kv_tile;
   if (!item.mine || item.k >= 0 && tile >= QT) return turn;
-  auto angle = [&](int h) { return float(prefix + item.n * 8 + 2 * b.t() + h) * b.a.inv_freq[tile * 8 + b.g()]; };
+  auto angle = [&](int h) { return float(POSITION(b.a, prefix, item.n * 8 + 2 * b.t() + h)) * b.a.inv_freq[tile * 8 + b.g()]; };
   sincosf(angle(0), &turn.y, &turn.x), sincosf(angle(1), &turn.w, &turn.z);
   return turn;
 }

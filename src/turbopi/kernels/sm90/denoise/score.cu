@@ -128,9 +128,11 @@ __device__ __forceinline__ void score_suffix(const Cta& b, int count, float (&c)
 
 __device__ __forceinline__ float no_logit() { return __int_as_float(0xff800000); }  // of a key that doesn't exist
 __device__ __forceinline__ float logit_scale() { return rsqrtf(float(HD)) * 1.4426950408889634f; }  // and log2 e
-// Logits times the scale, or none in rows that don't exist; the largest of each token.
+// Logits times the scale, or none in rows that don't exist (or that a token of a pair doesn't see); the largest of each
+// token.
 template <int R>
-__device__ __forceinline__ void scale_logits(const Cta& b, float (&c)[R][NT][4], int rows, float2 (&top)[NT]) {
+__device__ __forceinline__ void scale_logits(const Cta& b, float (&c)[R][NT][4], int rows OF_PAIR(, Mask mask),
+                                             float2 (&top)[NT]) {
   const float scale = logit_scale(), none = no_logit();
 #pragma unroll
   for (int n = 0; n < NT; ++n) {
@@ -139,7 +141,10 @@ __device__ __forceinline__ void scale_logits(const Cta& b, float (&c)[R][NT][4],
     for (int r = 0; r < R; ++r) {
 #pragma unroll
       for (int i = 0; i < 4; ++i)
-        c[r][n][i] = b.g() + (i >> 1) * 8 < rows - r * SCORERS * 16 ? c[r][n][i] * scale : none;
+        c[r][n][i] = b.g() + (i >> 1) * 8 < rows - r * SCORERS * 16 OF_PAIR(
+                         && mask.sees(r * SCORERS * 16 + b.g() + (i >> 1) * 8, n * 8 + 2 * b.t() + (i & 1)))
+                         ? c[r][n][i] * scale
+                         : none;
       top[n].x = fmaxf(top[n].x, fmaxf(c[r][n][0], c[r][n][2]));
       top[n].y = fmaxf(top[n].y, fmaxf(c[r][n][1], c[r][n][3]));
     }
@@ -174,12 +179,14 @@ __device__ __forceinline__ void load_tops(const Cta& b, float2 (&top)[NT], float
     top[n] = make_float2(__int_as_float(ordered(v.x)) * scale, __int_as_float(ordered(v.y)) * scale);
   }
 }
-// Warps that score: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist.
+// Warps that score: weights of tiles `tile`, tile + SCORERS.., of whose rows `rows`, rows - 16 SCORERS.. exist. The
+// mask is that of the first one.
 template <int R>
-__device__ __forceinline__ void weigh_prefix(const Cta& b, float (&c)[R][NT][4], int tile, int rows) {
+__device__ __forceinline__ void weigh_prefix(const Cta& b, float (&c)[R][NT][4], int tile,
+                                             int rows OF_PAIR(, Mask mask)) {
   float2 top[NT];
   if (rows > 0) {
-    scale_logits(b, c, rows, top);
+    scale_logits(b, c, rows OF_PAIR(, mask), top);
 #pragma unroll
     for (int n = 0; n < NT; ++n)
       if (b.g() < 2)
@@ -202,9 +209,9 @@ __device__ __forceinline__ void send_by_token(const Cta& b, const float2 (&v)[NT
 constexpr u32 TOPS_EXPECT = S * ((T + 1) / 2) * 8;
 // The suffix's keys come last. Their weights go by the prefix's largest logits, too, unless theirs are
 // so much larger (2^64) that the prefix's weights count for nothing: then those are dropped, which `X_KEEP` says.
-__device__ __forceinline__ void weigh_suffix(const Cta& b, float (&c)[1][NT][4], int rows) {
+__device__ __forceinline__ void weigh_suffix(const Cta& b, float (&c)[1][NT][4], int rows OF_PAIR(, Mask mask)) {
   float2 own[NT], top[NT];
-  scale_logits(b, c, rows, own);
+  scale_logits(b, c, rows OF_PAIR(, mask), own);
   sync<WEIGHTS_FOR_SUFFIX, SCORERS + 4>();
   load_tops(b, top);
 #pragma unroll

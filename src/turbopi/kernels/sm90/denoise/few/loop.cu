@@ -7,7 +7,7 @@ __device__ __forceinline__ u32 hidden_bytes(const Cta& b) {
 // The warps that multiply.
 __device__ __forceinline__ void consume(Cta& b) {
   const Args& a = b.a;
-  const int prefix = int(*a.length);
+  const int prefix = PREFIX_ROWS(a);
   for (int i = b.thread; i < T * A; i += CONSUMERS) {
     ((float*)(b.smem + M_XT))[i] = a.noise[i];
     if (b.cta == 0) a.x_t[i] = a.noise[i];

@@ -8,7 +8,7 @@ __device__ __forceinline__ u32 hidden_bytes(const Cta& b) {
 // The warps that multiply.
 __device__ __forceinline__ void consume(Cta& b) {
   const Args& a = b.a;
-  const int prefix = int(*a.length);
+  const int prefix = PREFIX_ROWS(a);
   Actions actions(b);
   float4 rope[ITEMS_Q], x[ITEMS_X];
 #pragma unroll

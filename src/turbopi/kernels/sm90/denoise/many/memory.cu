@@ -52,7 +52,11 @@ static_assert(!COPY_HIDDEN || X_OWN_HIDDEN + GTL / 2 * NT * OPERAND <= X_SIZE, "
 constexpr bool PARTIALS_OVER_OPERAND = false;
 __host__ __device__ constexpr int partials_place(int region) { return region; }
 // Prefix keys are scored by wgmma: see attention.cu of this folder.
+#ifdef TP_PAIR
+constexpr bool ASYNC = false;  // its products mask nothing
+#else
 constexpr bool ASYNC = ROUNDS == 1 && most(KT, SLOT_TILES) <= STAGES;
+#endif
 constexpr bool HOLD = false;  // of few tokens: see score.cu
 // Where 8 columns of a key among the rows lie (ASYNC); four columns of suffix key (kind 0) or value (1) `row`.
 __device__ __forceinline__ int key_row(int row, int eight) {
