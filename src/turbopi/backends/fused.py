@@ -34,8 +34,6 @@ from turbopi.toolchain import missing_for_c
 
 logger = logging.getLogger(__name__)
 
-MOST_IN_PAIRS = 4  # observations of a batch that are denoised two at a time: for more, operations are as fast
-
 
 @runtime_checkable
 class Watched(Protocol):
@@ -53,7 +51,7 @@ class FusedBackend(CudaGraphBackend):
     # measured on an H200 with two cameras in bfloat16: benchmarks/results/h200_2026-11-24_batches.json, of 2 see
     # docs/dev/log.md; in FP8 four take 3.4, eight 5.3, sixteen 9.9
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.2, 8: 5.4, 16: 10.6}
-    COSTS_WITH_PAIRS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.6, 4: 3.1, 8: 5.4, 16: 10.6}  # of 2 and 4 estimated
+    COSTS_WITH_PAIRS: ClassVar[Mapping[int, float]] = {**COSTS, 2: 1.75}
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
     _fp8_expert: list[Any] | None = None  # layers with `Fp8Matrix`, of batches
@@ -123,7 +121,7 @@ class FusedBackend(CudaGraphBackend):
         kernel = "one CUDA kernel" if self._on_hopper else "one portable CUDA kernel"
         described["denoising"] = ({kernel: by_kernel} if by_kernel else {}) | by_operations
         if pairs := sorted({str(loop) for loop, _ in list(self._pair_denoisers)}):
-            described["denoising"]["one CUDA kernel for two observations, of batches up to four"] = pairs
+            described["denoising"]["one CUDA kernel for two observations"] = pairs
         clocks = {
             str(loop): round(clock)
             for (loop, _), kernel in list(self._denoisers.items())
@@ -200,15 +198,15 @@ class FusedBackend(CudaGraphBackend):
         return FEW < 2 * horizon <= MAX_SUFFIX and refusal(self.config) is None
 
     def _batch_denoises_by(self, loop: Loop, batch: int, rows: int) -> Weights | PairDenoiser:
-        """Hopper's kernel, two observations at a time, where they are few; else operations in its precision."""
-        if batch > MOST_IN_PAIRS or not self._denoises_pairs(loop.horizon):
+        """Hopper's kernel for two observations; of more, operations in its precision, which are as fast."""
+        if batch != 2 or not self._denoises_pairs(loop.horizon):
             return self._batch_weights()
         key = (loop, rows)
         if key not in self._pair_denoisers:
             try:
                 self._pair_denoisers[key] = self._pair_kernel(loop, rows)
             except BackendUnavailable as e:  # more keys than fit, or fewer multiprocessors than it needs
-                logger.info("operations denoise %d observations: %s", batch, e)
+                logger.info("operations denoise two observations: %s", e)
                 return self._batch_weights()
         return self._pair_denoisers[key]
 

@@ -118,7 +118,8 @@ class BatchLoop:
         self,
         buffers: BatchBuffers,
         loop: Loop,
-        by: Weights | PairDenoiser,  # what denoises; operations' matrices may be others than those of `buffers`
+        by: Weights
+        | PairDenoiser,  # operations with these, perhaps others than those of `buffers`; or, of two, a kernel
         table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation
     ) -> None:
         assert loop.form == "plain", loop
@@ -137,11 +138,8 @@ class BatchLoop:
         self._noise, self._state = inputs["noise"], inputs["state"]
         self._offsets = torch.arange(self._tokens, device=device)
         self._rope = forward.rope_of_all_positions(config, buffers.rows + self._tokens, device)
-        per = batch if isinstance(by, Weights) else 2  # observations that are denoised together
-        assert batch % per == 0, (batch, per)
-        together = (per, *chunk[1:])
-        self._x_t = torch.empty(batch // per, loop.steps + 1, *together, device=device)
-        self._v_t = torch.empty(batch // per, loop.steps, *together, device=device)
+        self.x_t = torch.empty(loop.steps + 1, *chunk, device=device)
+        self.v_t = torch.empty(loop.steps, *chunk, device=device)
         size, dtype = (batch * self._tokens, config.vlm.head_dim), buffers.weights.embed_tokens.dtype
         self._keys, self._values = (torch.empty(size, device=device, dtype=dtype) for _ in range(2))
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
@@ -153,37 +151,27 @@ class BatchLoop:
             array[: len(given)] = given
             array[len(given) :] = 0
 
-    def trace(self, row: int) -> tuple[Tensor, Tensor]:
-        """x_t [N + 1, H, A] and v_t [N, H, A] of one observation of the last call."""
-        group, own = divmod(row, self._x_t.shape[2])
-        return self._x_t[group, :, own], self._v_t[group, :, own]
-
     def run(self, *_: Any) -> None:
         self._flat.copy_(self._host, non_blocking=True)
+        buffers = self._buffers
         if isinstance(self._by, Weights):
             self._run_operations(self._by)
         else:
-            self._run_pairs(self._by)
-        self.actions.view_as(self._x_t[:, -1]).copy_(self._x_t[:, -1], non_blocking=True)
-
-    def _run_pairs(self, kernel: PairDenoiser) -> None:
-        cache, starts = self._buffers.cache, self._buffers.segments[0]
-        for pair, (x_t, v_t) in enumerate(zip(self._x_t, self._v_t, strict=True)):
-            first = 2 * pair
-            segments = starts[first : first + 3]  # behind the last observation comes the padding
-            kernel.launch_pair(self._noise[first : first + 2], cache.k, cache.v, segments, x_t, v_t)
+            cache, starts = buffers.cache, buffers.segments[0]
+            self._by.launch_pair(self._noise, cache.k, cache.v, starts, self.x_t, self.v_t)
+        self.actions.copy_(self.x_t[-1], non_blocking=True)
 
     def _run_operations(self, weights: Weights) -> None:
         lengths = self._buffers.segments[1, :-1].long()
         positions = (lengths[:, None] + self._offsets).flatten()
         rope = (self._rope[0][positions], self._rope[1][positions])
-        (x_t,), (v_t,) = self._x_t, self._v_t
-        x_t[0] = self._noise
+        self.x_t[0] = self._noise
         for step in range(self._steps):
-            v_t[step] = self._velocity(weights, x_t[step], step, rope)
-            x_t[step + 1] = euler_step(x_t[step], v_t[step], self._steps)
+            v_t = self._velocity(weights, step, rope)
+            self.x_t[step + 1] = euler_step(self.x_t[step], v_t, self._steps)
+            self.v_t[step] = v_t
 
-    def _velocity(self, weights: Weights, x_t: Tensor, step: int, rope: forward.Rope) -> Tensor:
+    def _velocity(self, weights: Weights, step: int, rope: forward.Rope) -> Tensor:
         """v_t float32[B, H, A]"""
         buffers = self._buffers
         config, ops = buffers.config, buffers.ops
@@ -198,7 +186,7 @@ class BatchLoop:
                 q, *prefix, *suffix, *buffers.segments, heads, config.kind == "pi0", **input
             )
 
-        tokens = forward.suffix_tokens(config, weights.small, x_t, self._time_embs[step], self._state)
+        tokens = forward.suffix_tokens(config, weights.small, self.x_t[step], self._time_embs[step], self._state)
         tokens = tokens.flatten(0, 1).to(weights.embed_tokens.dtype)
         table = None if self._table is None else self._table[step]
         out = forward.expert_layers(config, weights, ops, tokens, table, rope, places, attend)

@@ -157,8 +157,8 @@ class BatchRunner(GraphRunner):
         return split(count, {size: cost for size, cost in self.batch_costs.items() if size in warm})
 
     def _batch_denoises_by(self, loop: Loop, batch: int, rows: int) -> Weights | PairDenoiser:
-        """What a batch with up to so many prefix rows is denoised by, operations with weights or a kernel for two
-        observations at a time. Its graph goes on pointing to it.
+        """What a batch with up to so many prefix rows is denoised by: operations with weights, or a kernel for two
+        observations. Its graph goes on pointing to it.
         """
         return self._weights
 

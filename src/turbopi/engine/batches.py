@@ -120,7 +120,7 @@ class Batches:
         buffers, run = self._buffers[size], self._loops[size, loop]
         start, length = (int(one) for one in buffers.segments[:, row])
         rows = slice(start, start + length)
-        return buffers.cache.k[:, rows], buffers.cache.v[:, rows], *run.trace(row)
+        return buffers.cache.k[:, rows], buffers.cache.v[:, rows], run.x_t[:, row], run.v_t[:, row]
 
     def forget(self, loop: Loop) -> None:
         """Let go of all that is a denoising loop's alone."""
