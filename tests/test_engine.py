@@ -146,6 +146,33 @@ def test_rows_between_prefix_and_suffix_are_seen_by_nobody(horizon: int, ops: Op
         torch.testing.assert_close(answer(call, observation, noise), expected, atol=5e-6, rtol=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["pi05", "pi0"])
+def test_packing_brings_each_tensor_to_its_device_and_leaves_none_behind(kind: Kind) -> None:
+    """The checkpoint on the host, all but the expert elsewhere: "meta" stands for a GPU."""
+    model, elsewhere, host = golden_model(kind), torch.device("meta"), torch.device("cpu")
+    state, seen = dict(model.state_dict()), []
+
+    def make(place: str, matrix: Tensor) -> Tensor:
+        seen.append((place, matrix.device.type))
+        return matrix
+
+    weights = pack(model.config, state, make, device=elsewhere, expert_device=host)
+    assert not state and {device for _, device in seen} == {"meta"}
+    layers = [*weights.vision, *weights.vlm]
+    tensors = [one for layer in layers for field in vars(layer).values() for one in _tensors(field)]
+    tensors += [weights.patch, weights.position, weights.embed_tokens, *weights.projector, *weights.small.values()]
+    assert {one.device.type for one in tensors} == {"meta"}
+    expert = [one for layer in weights.expert for field in vars(layer).values() for one in _tensors(field)]
+    assert {one.device.type for one in (*expert, *weights.conditioning.values())} == {"cpu"}
+    same = pack(model.config, dict(model.state_dict())).expert
+    for moved, kept in zip(weights.expert, same, strict=True):
+        assert all(torch.equal(getattr(moved, name), getattr(kept, name)) for name in ("qkv", "out", "gate_up", "down"))
+
+
+def _tensors(field: Any) -> list[Tensor]:
+    return [] if field is None else [field] if isinstance(field, Tensor) else [one for one in field if one is not None]
+
+
 def test_every_valid_picture_must_be_given() -> None:
     observation, noise = made_up("pi05", 2, 5)
     call = static_call("pi05", shape_of(observation, noise, 1))

@@ -34,6 +34,8 @@ from turbopi.toolchain import missing_for_c
 
 logger = logging.getLogger(__name__)
 
+HOST = torch.device("cpu")
+
 
 @runtime_checkable
 class Watched(Protocol):
@@ -139,7 +141,9 @@ class FusedBackend(CudaGraphBackend):
                 return matrix
             return quantize(matrix, scales[place], self._directions.get(place))
 
-        return pack(self.config, load(self.device, "bf16"), make)
+        # what is rounded comes to the GPU a matrix at a time, which then never holds the checkpoint in bfloat16
+        whole = self.device if self._plan is None else HOST
+        return pack(self.config, load(whole, "bf16"), make, device=self.device, expert_device=HOST)
 
     @property
     def _directions(self) -> Mapping[str, Directions]:
@@ -305,9 +309,12 @@ class FusedBackend(CudaGraphBackend):
     def _packed(self, kind: Any) -> Any:
         """The expert's matrices as a denoising kernel has them."""
         if self._packed_expert is None:
-            self._keep_expert_on(self.device)
             self._packed_expert = kind.pack(
-                self.config, self._weights.expert, inputs=self._expert_inputs(), directions=self._directions
+                self.config,
+                self._weights.expert,
+                inputs=self._expert_inputs(),
+                directions=self._directions,
+                device=self.device,
             )
         return self._packed_expert
 
@@ -321,10 +328,11 @@ class FusedBackend(CudaGraphBackend):
     def _put_expert_away(self) -> None:
         """A kernel has its own copy of the expert's matrices; the first one, 0.6 GB, waits on the host."""
         if not self._refused and not self._batches_denoise_in_bf16:
-            self._keep_expert_on(torch.device("cpu"))
+            self._keep_expert_on(HOST)
 
     def _keep_expert_on(self, device: torch.device) -> None:
         layers = self._weights.expert
         for i, layer in enumerate(layers):
             if layer.qkv.device != device:
-                layers[i] = replace(layer, **{name: getattr(layer, name).to(device) for name in KINDS["expert"]})
+                tensors = {name: value for name, value in vars(layer).items() if value is not None}
+                layers[i] = replace(layer, **{name: tensor.to(device) for name, tensor in tensors.items()})

@@ -1,9 +1,10 @@
 """A checkpoint's tensors as the engine wants them: matrices that share an input are packed into one, layer by layer.
 
-Packing takes tensors out of the state as it goes, so that the device never holds more than one layer twice.
+Packing takes tensors out of the state as it goes, so that the device never holds more than one layer twice; and if the
+state is the host's, no more than one layer as the checkpoint has it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,89 +38,116 @@ class Weights:
     conditioning: State  # Pi0.5: time MLP and adaRMS matrices, float32, on the host: see `modulation`
 
 
-def pack(config: ModelConfig, state: State, make: MakeMatrix = lambda place, matrix: matrix) -> Weights:
+def _as_it_is(place: str, matrix: Tensor) -> Tensor:
+    return matrix
+
+
+class _Tensors:
+    """A checkpoint's, each of which is taken once, and then lies on the device."""
+
+    def __init__(self, state: State, device: torch.device | None) -> None:
+        self._state, self._device = state, device
+
+    def __call__(self, name: str) -> Tensor:
+        tensor = self._state.pop(name)
+        return tensor if self._device is None else tensor.to(self._device)
+
+    def affine(self, name: str) -> Affine:
+        return self(f"{name}.weight"), self(f"{name}.bias")
+
+    def joined(self, names: Sequence[str]) -> Tensor:
+        return torch.cat([self(name) for name in names])
+
+    def scale(self, name: str) -> Tensor | None:
+        """1 + a norm's weight, float32; None for adaRMS, which has none."""
+        return 1 + self(f"{name}.weight").float() if f"{name}.weight" in self._state else None
+
+
+def pack(
+    config: ModelConfig,
+    state: State,
+    make: MakeMatrix = _as_it_is,
+    *,
+    device: torch.device | None = None,
+    expert_device: torch.device | None = None,
+) -> Weights:
     """Pack a checkpoint's tensors (canonical names); `state` is emptied.
 
-    `make` may turn the vision tower's and the prefix's packed matrices into others, one by one.
+    make    may turn the vision tower's and the prefix's packed matrices, on the device, into others, one by one
+    device  where they shall lie; None: where they are
+    expert_device  the same for the action expert's layers
     """
-
-    def affine(name: str) -> Affine:
-        return state.pop(f"{name}.weight"), state.pop(f"{name}.bias")
-
+    take = _Tensors(state, device)
     conditioning = {
         name: state.pop(name).cpu()
         for name in sorted(state)
         if ".dense." in name or (config.kind == "pi05" and name.startswith("time_mlp_"))
     }
-    patch_weight, patch_bias = affine("vision.patch_embedding")
+    patch_weight, patch_bias = take.affine("vision.patch_embedding")
     state.pop("vlm.norm.weight")  # would change no key and no value
     weights = Weights(
         patch=patch_weight.flatten(1),
-        position=state.pop("vision.position_embedding.weight") + patch_bias,
-        vision=list(_vision_layers(config, state, make)),
-        post_layernorm=affine("vision.post_layernorm"),
-        projector=affine("projector"),
-        embed_tokens=state.pop("vlm.embed_tokens.weight"),
-        vlm=list(_gemma_layers(config, state, "vlm", make)),
-        expert=list(_gemma_layers(config, state, "expert", lambda place, matrix: matrix)),
-        expert_norm=_scale(state, "expert.norm"),
-        small={name: state.pop(name) for name in list(state) if name.startswith(("action_", "state_proj."))},
+        position=take("vision.position_embedding.weight") + patch_bias,
+        vision=list(_vision_layers(config, take, make)),
+        post_layernorm=take.affine("vision.post_layernorm"),
+        projector=take.affine("projector"),
+        embed_tokens=take("vlm.embed_tokens.weight"),
+        vlm=list(_gemma_layers(config, take, state, "vlm", make)),
+        expert=list(_gemma_layers(config, _Tensors(state, expert_device or device), state, "expert", _as_it_is)),
+        expert_norm=take.scale("expert.norm"),
+        small={name: take(name) for name in list(state) if name.startswith(("action_", "state_proj."))},
         conditioning=conditioning,
     )
     assert not state, f"tensors that the engine doesn't know: {sorted(state)}"
     return weights
 
 
-def _vision_layers(config: ModelConfig, state: State, make: MakeMatrix) -> Iterator[VisionLayer]:
+def _vision_layers(config: ModelConfig, take: _Tensors, make: MakeMatrix) -> Iterator[VisionLayer]:
     for i in range(config.vision.depth):
         prefix = f"vision.layers.{i}"
         projections = [f"{prefix}.self_attn.{p}_proj" for p in "qkv"]
 
-        def affine(name: str, prefix: str = prefix) -> Affine:
-            return state.pop(f"{prefix}.{name}.weight"), state.pop(f"{prefix}.{name}.bias")
-
-        def matrix(kind: str, name: str, i: int = i) -> AffineMatrix:
-            weight, bias = affine(name)
+        def matrix(kind: str, name: str, i: int = i, prefix: str = prefix) -> AffineMatrix:
+            weight, bias = take.affine(f"{prefix}.{name}")
             return make(f"vision.{i}.{kind}", weight), bias
 
         yield VisionLayer(
-            norm1=affine("layer_norm1"),
+            norm1=take.affine(f"{prefix}.layer_norm1"),
             qkv=(
-                make(f"vision.{i}.qkv", torch.cat([state.pop(f"{p}.weight") for p in projections])),
-                torch.cat([state.pop(f"{p}.bias") for p in projections]),
+                make(f"vision.{i}.qkv", take.joined([f"{p}.weight" for p in projections])),
+                take.joined([f"{p}.bias" for p in projections]),
             ),
             out=matrix("out", "self_attn.out_proj"),
-            norm2=affine("layer_norm2"),
+            norm2=take.affine(f"{prefix}.layer_norm2"),
             fc1=matrix("fc1", "mlp.fc1"),
             fc2=matrix("fc2", "mlp.fc2"),
         )
 
 
 def _gemma_layers(
-    config: ModelConfig, state: State, stack: str, make: Callable[[str, Tensor], AnyMatrix]
+    config: ModelConfig,
+    take: _Tensors,
+    state: State,
+    stack: str,
+    make: Callable[[str, Tensor], AnyMatrix],
 ) -> Iterator[GemmaLayer[AnyMatrix]]:
     for i in range(config.vlm.depth):
         prefix, place = f"{stack}.layers.{i}", f"prefix.{i}"
         if stack == "vlm" and i + 1 == config.vlm.depth:  # nothing but its keys and values is ever used: 0.2 GB
             for name in ("self_attn.o_proj", "mlp.gate_proj", "mlp.up_proj", "mlp.down_proj"):
                 state[f"{prefix}.{name}.weight"] = state[f"{prefix}.{name}.weight"][:0].clone()
-        qkv = torch.cat([state.pop(f"{prefix}.self_attn.{p}_proj.weight") for p in "qkv"])
-        gate_up = torch.cat([state.pop(f"{prefix}.mlp.{p}_proj.weight") for p in ("gate", "up")])
+        qkv = take.joined([f"{prefix}.self_attn.{p}_proj.weight" for p in "qkv"])
+        gate_up = take.joined([f"{prefix}.mlp.{p}_proj.weight" for p in ("gate", "up")])
         yield GemmaLayer(
             qkv=make(f"{place}.qkv", qkv),
-            out=make(f"{place}.out", state.pop(f"{prefix}.self_attn.o_proj.weight")),
+            out=make(f"{place}.out", take(f"{prefix}.self_attn.o_proj.weight")),
             gate_up=make(f"{place}.gate_up", gate_up),
-            down=make(f"{place}.down", state.pop(f"{prefix}.mlp.down_proj.weight")),
-            norm1=_scale(state, f"{prefix}.input_layernorm"),
-            norm2=_scale(state, f"{prefix}.post_attention_layernorm"),
+            down=make(f"{place}.down", take(f"{prefix}.mlp.down_proj.weight")),
+            norm1=take.scale(f"{prefix}.input_layernorm"),
+            norm2=take.scale(f"{prefix}.post_attention_layernorm"),
         )
         # gate and up leave two holes that the packed matrix, twice their size, can't fill: 2.4 GB at full size
         empty_cache()
-
-
-def _scale(state: State, name: str) -> Tensor | None:
-    weight = state.pop(f"{name}.weight", None)
-    return None if weight is None else 1 + weight.float()
 
 
 def modulation(config: ModelConfig, conditioning: State, num_steps: int) -> Tensor | None:

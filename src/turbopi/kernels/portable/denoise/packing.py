@@ -80,9 +80,10 @@ class PackedExpert:
         layers: list[GemmaLayer],
         inputs: Mapping[str, float] | None = None,
         directions: Mapping[str, Directions] | None = None,
+        device: torch.device | None = None,
     ) -> "PackedExpert":
         """`inputs`: the activations' scales by site, and weights become E4M3 with a scale for each output channel,
-        rounded for `directions` by site.
+        rounded for `directions` by site. The layers come to the `device`, if one is named, one at a time.
 
         Raises BackendError for sizes that the kernel doesn't cover.
         """
@@ -90,9 +91,10 @@ class PackedExpert:
         if reason is not None:
             raise BackendError(f"the portable denoising kernel can't run this model: {reason}")
         packed, scales, of_inputs = [], [], []
-        orders = [None if order is None else order.to(layers[0].qkv.device) for order in _orders(config.expert)]
+        device = device or layers[0].qkv.device
+        orders = [None if order is None else order.to(device) for order in _orders(config.expert)]
         for i, layer in enumerate(layers):
-            parts = [layer.qkv, layer.out, layer.gate_up, layer.down]
+            parts = [matrix.to(device) for matrix in (layer.qkv, layer.out, layer.gate_up, layer.down)]
             places = [f"expert.{i}.{kind}" for kind in KINDS]
             if inputs is not None:
                 made = [quantize(m, 1.0, (directions or {}).get(s)) for m, s in zip(parts, places, strict=True)]

@@ -143,7 +143,7 @@ class PackedExpert:
 
     arrangement: Arrangement
     weights: Tensor  # bfloat16 or e4m3[L, elements]: of a layer each CTA's qkv, out, gate|up, down
-    index: Tensor  # int32[elements]: which element of qkv, out, gate|up, down, 0 each is
+    index: Tensor  # int32[elements], on the host: which element of qkv, out, gate|up, down, 0 each is
     starts: Tensor  # int64[CTAs + 1]: where a CTA's begin in a layer, bytes, and the layer's end
     scales: Tensor  # float32[L, rows of qkv, out, gate|up, down] of E4M3 weights; [L, 0] of others
     inputs: Tensor  # float32[L, 4] of the activations that meet E4M3 weights, out's a power of two; [L, 0] of others
@@ -155,9 +155,10 @@ class PackedExpert:
         layers: list[GemmaLayer],
         inputs: Mapping[str, float] | None = None,
         directions: Mapping[str, Directions] | None = None,
+        device: torch.device | None = None,
     ) -> "PackedExpert":
         """`inputs`: the activations' scales by site, and weights become E4M3 with a scale for each output channel,
-        rounded for `directions` by site.
+        rounded for `directions` by site. The layers come to the `device`, if one is named, one at a time.
 
         Raises BackendError for sizes that the kernel doesn't cover.
         """
@@ -166,12 +167,12 @@ class PackedExpert:
             raise BackendError(f"the denoising kernel can't run this model: {reason}")
         arrangement = Arrangement(config)
         streams = _streams(arrangement, "bf16" if inputs is None else "fp8")
-        device, size = layers[0].qkv.device, 2 if inputs is None else 1
+        device, size = device or layers[0].qkv.device, 2 if inputs is None else 1
         index = torch.cat(streams).to(device)
         starts = np.cumsum([0, *(size * len(stream) for stream in streams)])
         packed, scales = torch.empty(len(layers), len(index) * size, dtype=torch.uint8, device=device), []
         for i, (row, layer) in enumerate(zip(packed, layers, strict=True)):
-            parts = layer.qkv, layer.out, layer.gate_up, layer.down
+            parts = [matrix.to(device) for matrix in (layer.qkv, layer.out, layer.gate_up, layer.down)]
             if inputs is not None:
                 common = [(directions or {}).get(f"expert.{i}.{kind}") for kind in KINDS]
                 made = [quantize(m, 1.0, d) for m, d in zip(parts, common, strict=True)]
@@ -187,7 +188,7 @@ class PackedExpert:
         of_inputs = torch.tensor(given, dtype=torch.float32, device=device)
         if inputs is not None:  # exact, as the kernel applies it to values in bfloat16
             of_inputs[:, 1] = torch.exp2(torch.log2(of_inputs[:, 1]).ceil())
-        return cls(arrangement, typed, index, torch.from_numpy(starts).to(device), torch.stack(scales), of_inputs)
+        return cls(arrangement, typed, index.cpu(), torch.from_numpy(starts).to(device), torch.stack(scales), of_inputs)
 
     @property
     def layer_bytes(self) -> int:
@@ -209,7 +210,7 @@ class PackedExpert:
         sizes = [rows * columns for rows, columns in shapes]
         values = self.weights[layer].float() if self.fp8 else self.weights[layer]
         flat = values.new_zeros(sum(sizes) + 1)
-        flat[self.index] = values
+        flat[self.index.to(flat.device)] = values
         parts = [part.view(shape) for part, shape in zip(torch.split(flat[:-1], sizes), shapes, strict=True)]
         if self.fp8:
             parts = [part * scale[:, None] for part, scale in zip(parts, self.row_scales(layer), strict=True)]
