@@ -13,7 +13,7 @@ import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import torch
 from msgspec import Meta, Struct
@@ -141,18 +141,21 @@ def tiles_of(device: torch.device) -> Tiles:
     return tiles
 
 
-def find_tiles(machine: Machine, *, cache: Path | None = None, shipped: Path = SHIPPED) -> Tiles:
-    """What the user's own file and the shipped ones have for this GPU. Damaged and stale files are named, not used."""
+def find_tiles(machine: Machine, *, cache: Path | None = None, shipped: Path = SHIPPED, own: bool = True) -> Tiles:
+    """What the user's own file (unless not `own`) and the shipped ones have for this GPU.
+
+    Damaged and stale files are named, not used.
+    """
     table: dict[TileKey, Knobs] = {}
     used: list[str] = []
     unused: list[str] = []
-    own = own_file(machine.gpu, cache)
-    for file in (*sorted(shipped.glob("*.json")), own):  # what comes last goes before the others
-        ships = file != own
+    users = own_file(machine.gpu, cache)
+    for file in (*sorted(shipped.glob("*.json")), *((users,) if own else ())):  # the last one goes before the others
+        ships = file != users
         if not file.is_file():
             continue
         try:
-            document = read_tile_file(file, machine.capability if not ships else None)
+            document = read_tile_file(file)
         except ConfigError as error:
             unused.append(f"tiles aren't used: {error}; measure them again with {COMMAND}, or delete the file")
             continue
@@ -195,21 +198,22 @@ def fingerprint(kernels: Kernels) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def read_tile_file(file: Path, capability: tuple[int, int] | None = None) -> TileFile:
-    """Raises ConfigError for another file, and for a tile that these kernels don't have.
+def read_tile_file(file: Path) -> TileFile:
+    """Raises ConfigError for another file, and for a tile that its GPU doesn't take.
 
-    capability  of the GPU that its tiles are to fit; None: the file's own
+    Tiles of kernels that have changed since aren't looked at: they aren't used.
     """
     document = read_document(file, TileFile, ConfigError)
-    known: Any = tuple(int(part) for part in document.compute_capability.split("."))
     from turbopi.kernels.tile_checks import why_not
 
+    major, minor = document.compute_capability.split(".")
     for i, one in enumerate(document.tiles):
+        if document.fingerprints.get(one.kernels) != fingerprint(one.kernels):
+            continue
         for field in ("tile", "usual"):
-            knobs = getattr(one, field)
-            current = document.fingerprints.get(one.kernels) == fingerprint(one.kernels)
-            if current and (why := why_not(one.key, knobs, capability or known)) is not None:
-                raise ConfigError(f"{file}: tiles[{i}].{field} is {knobs}: {why}")
+            knobs: Knobs = getattr(one, field)
+            if (why := why_not(one.key, knobs, (int(major), int(minor)))) is not None:
+                raise ConfigError(f"{file}: tiles[{i}].{field} is {dict(knobs)}: {why}")
     return document
 
 
