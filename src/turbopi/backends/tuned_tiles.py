@@ -167,7 +167,7 @@ def find_tiles(machine: Machine, *, cache: Path | None = None, shipped: Path = S
         if found:
             table |= {one.key: one.tile for one in found}
             origin = "shipped" if ships else f"measured here, {file}"
-            used.append(f"{len(found)} tiles of {document.date} ({origin})")
+            used.append(f"{len(found)} tile{'s' * (len(found) > 1)} of {document.date} ({origin})")
     about = "; ".join(reversed(used)) or BY_MODEL
     return Tiles(TileTable(table), about, tuple(unused))
 
