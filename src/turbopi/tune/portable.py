@@ -108,7 +108,7 @@ class Product(GpuBench):
             return None
         shape = (self.operation.rows, self.operation.columns)
         split = () if knobs["splits"] == 1 else (knobs["splits"],)
-        return poisoned((*split, *shape), E4M3 if self.operation.out_fp8 else torch.bfloat16, self.device)
+        return poisoned((*split, *shape), E4M3 if self.operation.out_fp8 else self.weights[0].dtype, self.device)
 
 
 def activated(operation: str, sums: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from turbopi.kernels.portable.gemm.tiles import by_mma_sync
 from turbopi.kernels.portable.shared_memory import BLOCK_SHARED, LEAST_SHARED
 from turbopi.kernels.tile_table import TileTable
 
@@ -23,10 +24,11 @@ class AttentionTile:
         """Whether queries, keys and values of so many columns fit shared memory, and the sums registers."""
         shared = (self.rows + 2 * self.stages * self.keys) * columns * 2
         sums = self.rows * (columns + self.keys) // (32 * self.warps)
-        return shared <= BLOCK_SHARED.get(capability, LEAST_SHARED) and sums <= MOST_SUMS
+        most = MOST_BY_MMA_SYNC if by_mma_sync(capability) else MOST_SUMS
+        return shared <= BLOCK_SHARED.get(capability, LEAST_SHARED) and sums <= most
 
 
-MOST_SUMS = 160  # a thread: with more it spills
+MOST_SUMS, MOST_BY_MMA_SYNC = 160, 100  # a thread: with more it spills
 ROOMY = 227 * 1024  # bytes of shared memory that the first of two usual tiles is for
 PACKED_ROWS = 64  # as `Segments.tiles` says
 USUAL: dict[Attention, tuple[AttentionTile, AttentionTile]] = {  # the second for less shared memory
