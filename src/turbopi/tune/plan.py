@@ -23,7 +23,7 @@ KERNELS = ("auto", "portable", "hopper", "all")
 
 @dataclass(frozen=True)
 class Plan:
-    """calls: the operations of each, for what it gains; planned: what is measured, each once."""
+    """calls: the operations of each, for what it gains; planned: what has a choice and is measured, each once."""
 
     calls: Mapping[tuple[Call, Precision, Kernels], Sequence[Operation]]
     planned: Sequence[Planned]
@@ -78,7 +78,8 @@ def plan(
                 all_of = operations(config, call, precision, which, steps=steps, horizon=config.action_horizon)
                 found[call, precision, which] = [hopper.resolved(one, sms) for one in all_of]
     wanted = distinct([one for several in found.values() for one in several])
-    return Plan(found, [planned(one, machine, shipped) for one in wanted if one.key not in known.tiles])
+    rows = [planned(one, machine, shipped) for one in wanted if one.key not in known.tiles]
+    return Plan(found, [one for one in rows if len(one.candidates) > 1])
 
 
 def planned(one: Operation, machine: Machine, shipped: TileTable) -> Planned:
