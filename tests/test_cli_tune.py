@@ -172,7 +172,7 @@ def test_a_shipped_tile_is_what_the_new_one_is_compared_with(
     fake: FakeGpu, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     turbopi("tune", *USUAL, "--precision", "fp8", "--out", tmp_path / "shipped" / "a.json")
-    monkeypatch.setattr(find_tiles, "__kwdefaults__", find_tiles.__kwdefaults__ | {"shipped": tmp_path / "shipped"})
+    monkeypatch.setattr(tuned_tiles, "SHIPPED", tmp_path / "shipped")
     result = turbopi("tune", *USUAL, "--precision", "fp8", "--json")
     for one in json.loads(result.stdout)["measured"]:
         assert one["best"]["tile"] == one["usual"]["tile"], "what ships is the fastest already"

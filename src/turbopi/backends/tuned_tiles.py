@@ -141,7 +141,7 @@ def tiles_of(device: torch.device) -> Tiles:
     return tiles
 
 
-def find_tiles(machine: Machine, *, cache: Path | None = None, shipped: Path = SHIPPED, own: bool = True) -> Tiles:
+def find_tiles(machine: Machine, *, cache: Path | None = None, shipped: Path | None = None, own: bool = True) -> Tiles:
     """What the user's own file (unless not `own`) and the shipped ones have for this GPU.
 
     Damaged and stale files are named, not used.
@@ -150,7 +150,10 @@ def find_tiles(machine: Machine, *, cache: Path | None = None, shipped: Path = S
     used: list[str] = []
     unused: list[str] = []
     users = own_file(machine.gpu, cache)
-    for file in (*sorted(shipped.glob("*.json")), *((users,) if own else ())):  # the last one goes before the others
+    for file in (
+        *sorted((shipped or SHIPPED).glob("*.json")),
+        *((users,) if own else ()),
+    ):  # the last one goes before the others
         ships = file != users
         if not file.is_file():
             continue

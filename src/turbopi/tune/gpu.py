@@ -70,6 +70,8 @@ class GpuBench(ABC):
         with self._guard, ThreadPoolExecutor(workers(), initializer=self._enter) as pool:
             found = list(pool.map(compiled, candidates))
             torch.cuda.synchronize(self.device)
+        # once more one by one, should a compiler not have liked the company
+        found = [why and compiled(knobs) for why, knobs in zip(found, candidates, strict=True)]
         return {place: why for place, why in enumerate(found) if why is not None}
 
     def error(self, knobs: Knobs) -> float:
@@ -138,12 +140,13 @@ def cold_copies(weight_bytes: int, device: torch.device) -> int:
 def poison(size: int, device: torch.device) -> None:
     """Fill free memory with NaN, so that what an operation leaves out of its result shows.
 
-    What was freed goes back to the driver first; the next allocations of up to `size` bytes take the poisoned blocks.
+    What was freed goes back to the driver first; the next allocations, up to four times `size` bytes, take the poisoned
+    blocks.
     0xFF is NaN in E4M3, and in any float whose bytes are all 0xFF.
     """
     torch.cuda.synchronize(device)
     torch.cuda.empty_cache()
-    blocks = [torch.full((max(size, 2 << 20) * 2,), 0xFF, dtype=torch.uint8, device=device)]
+    blocks = [torch.full((max(size, 2 << 20) * 4,), 0xFF, dtype=torch.uint8, device=device)]
     blocks += [torch.full((1 << 20,), 0xFF, dtype=torch.uint8, device=device) for _ in range(8)]  # of small ones' pool
     torch.cuda.synchronize(device)
     del blocks

@@ -1,5 +1,6 @@
 """What is measured on a GPU: the operations of the calls that were asked for, each with its candidates."""
 
+import gc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -93,6 +94,7 @@ def planned(one: Operation, machine: Machine, shipped: TileTable) -> Planned:
 
 def bench_maker(device: torch.device) -> Callable[[Operation], GpuBench]:
     """What puts an operation's inputs on the device."""
+    gc.freeze()  # capturing a graph may collect garbage, each time through all that is imported
 
     def make(one: Operation) -> GpuBench:
         try:
