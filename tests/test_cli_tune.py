@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +167,10 @@ def test_out_writes_elsewhere(fake: FakeGpu, tmp_path: Path) -> None:
     assert turbopi("tune", *USUAL, "--precision", "bf16", "--out", file).exit_code == 0
     assert len(read_tile_file(file).tiles) == 3 and not fake.file.exists()
     assert [one.name for one in file.parent.iterdir()] == [file.name]
+    measured = len(fake.measured)
+    fake.machine = replace(ADA, driver="590.1")  # what ships holds for any driver
+    turbopi("tune", *USUAL, "--only-missing", "--out", file)
+    assert len(read_tile_file(file).tiles) == len(fake.measured) > measured
 
 
 def test_a_shipped_tile_is_what_the_new_one_is_compared_with(

@@ -16,7 +16,7 @@ from turbopi.errors import BackendError, BackendUnavailable, ConfigError, Output
 if TYPE_CHECKING:
     import torch
 
-    from turbopi.backends.tuned_tiles import Machine
+    from turbopi.backends.tuned_tiles import Machine, TileFile
     from turbopi.config import ModelConfig
     from turbopi.tune.plan import Plan
     from turbopi.tune.run import Measured, Outcome
@@ -87,7 +87,7 @@ def tune(
     machine = Machine.of(resolved)
     file = out or own_file(machine.gpu)
     check_writable(file)
-    before = still_good(file, machine)
+    before = still_good(file, machine, ships=out is not None)
     known = TileTable({} if before is None else {one.key: one.tile for one in before.tiles})
     plan = planning.plan(
         config,
@@ -110,7 +110,7 @@ def tune(
         output.document({"file": file, "measured": []})
         return
     refuse_if_busy(resolved, noisy)
-    outcome = measure(plan, resolved, machine, file, seconds, output)
+    outcome = measure(plan, resolved, machine, file, before, seconds, output)
     show(plan, outcome, file, output)
     output.document(document(machine, outcome, file))
     if not outcome.measured:
@@ -177,15 +177,19 @@ def refuse_if_busy(device: "torch.device", noisy: bool) -> None:
 
 
 def measure(
-    plan: "Plan", device: "torch.device", machine: "Machine", file: Path, seconds: float | None, output: Output
+    plan: "Plan",
+    device: "torch.device",
+    machine: "Machine",
+    file: Path,
+    before: "TileFile | None",
+    seconds: float | None,
+    output: Output,
 ) -> "Outcome":
-    """Everything that is planned; the file is written after each operation."""
+    """Everything that is planned; the file is written after each operation, with what it had before."""
     from turbopi.backends.tuned_tiles import write_tile_file
     from turbopi.tune.plan import bench_maker
-    from turbopi.tune.run import Progress, still_good, tile_file
+    from turbopi.tune.run import Progress, tile_file
     from turbopi.tune.run import tune as run
-
-    before = still_good(file, machine)
 
     def keep(measured: "Sequence[Measured]") -> None:
         write_tile_file(tile_file(machine, measured, before), file)

@@ -128,15 +128,15 @@ def _row(one: Measured) -> TunedTile:
     )
 
 
-def still_good(file: Path, machine: Machine) -> TileFile | None:
-    """What a file has that holds on this GPU and for these kernels; None if there is nothing."""
+def still_good(file: Path, machine: Machine, *, ships: bool = False) -> TileFile | None:
+    """What a file has that holds on this GPU, for these kernels and driver (`ships`: any driver); None: nothing."""
     if not file.is_file():
         return None
     try:
         document = read_tile_file(file)
     except ConfigError:
         return None  # it is replaced
-    found = usable(document, machine)[0]
+    found = usable(document, machine, ships=ships)[0]
     return replace(document, tiles=found) if found else None
 
 
