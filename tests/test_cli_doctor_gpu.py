@@ -2,13 +2,15 @@
 
 import types
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from tile_helpers import tile_document
 
 from turbopi import backends
-from turbopi.backends import Precision
+from turbopi.backends import Precision, tuned_tiles
 from turbopi.bench.measured import measured_calls
 from turbopi.cli import gpu_checkups
 from turbopi.cli.checkup import Row
@@ -20,7 +22,13 @@ Fake = Callable[..., None]
 
 
 @pytest.fixture
-def fake(monkeypatch: pytest.MonkeyPatch) -> Fake:
+def cache(tmp_path: Path) -> Path:
+    """In place of the user's."""
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch, cache: Path) -> Fake:
     """Pretends that there is one NVIDIA GPU, and all that PyTorch and Triton need to run on it."""
 
     def pretend(
@@ -41,6 +49,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Fake:
             major=capability[0],
             minor=capability[1],
             total_memory=memory_gb * 1e9,
+            multi_processor_count=100,
             is_integrated=integrated,
         )
         monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -58,6 +67,8 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Fake:
         monkeypatch.setattr("importlib.util.find_spec", find)
         monkeypatch.setattr("shutil.which", lambda name: f"/usr/bin/{name}")
         monkeypatch.setattr("turbopi.toolchain._missing_headers", lambda: None)
+        monkeypatch.setattr(tuned_tiles, "driver_version", lambda: driver)
+        monkeypatch.setattr(tuned_tiles, "cache_folder", lambda: cache)
 
     return pretend
 
@@ -107,7 +118,7 @@ def test_what_runs_is_what_the_backends_say(capability: tuple[int, int], fake: F
 def test_every_tier_but_the_small_ones_has_a_row(fake: Fake) -> None:
     fake((9, 0))
     told = {name.removeprefix("GPU 0 ") for name in rows() if name.startswith("GPU 0 ")}
-    assert told == {tier for tier in backends.PRECISIONS if tier not in ("f32", "fp8-mlp")}
+    assert told == {"tiles", *(tier for tier in backends.PRECISIONS if tier not in ("f32", "fp8-mlp"))}
 
 
 @pytest.mark.parametrize(
@@ -285,3 +296,30 @@ def test_a_jetson_is_known_by_its_device_tree(tmp_path: Any) -> None:
 )
 def test_the_command_of_a_reason_is_found(reason: str, command: str) -> None:
     assert gpu_checkups.command_in(reason) == command
+
+
+# --- tiles ------------------------------------------------------------------------------------------------------------
+
+
+def test_doctor_says_whose_tiles_are_in_use_and_from_when(
+    fake: Fake, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake((8, 9))
+    assert "the kernels' own tables and cost model choose; `turbopi tune` measures" in rows()["GPU 0 tiles"].found
+    machine = tuned_tiles.Machine("NVIDIA Fake", (8, 9), 100, "580.95.05")
+    file = tuned_tiles.own_file(machine.gpu)
+    document = tile_document(machine)
+    tuned_tiles.write_tile_file(document, file)
+    found = rows()["GPU 0 tiles"]
+    assert found.level == "OK" and found.found == f"1 tile of {document.date} (measured here, {file})"
+    monkeypatch.setenv("TURBOPI_TUNED", "off")
+    assert rows()["GPU 0 tiles"].found.endswith("but TURBOPI_TUNED=off has them ignored")
+
+
+def test_doctor_names_a_file_of_another_driver_and_the_command(fake: Fake) -> None:
+    fake((8, 9), driver="580.95.05")
+    before = tuned_tiles.Machine("NVIDIA Fake", (8, 9), 100, "570.1")
+    tuned_tiles.write_tile_file(tile_document(before), tuned_tiles.own_file(before.gpu))
+    found = rows()["GPU 0 tiles"]
+    assert (found.level, found.fix) == ("WARN", "turbopi tune")
+    assert "measured with driver 570.1, and here it is 580.95.05" in found.found

@@ -36,6 +36,7 @@ COMMANDS = (
         "convert",
         "calibrate",
         "build",
+        "tune",
         "export",
         "verify",
         "bench",

@@ -5,7 +5,7 @@ product is held against the float32 sums of its numbers.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -18,12 +18,13 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 from turbopi.errors import ConfigError  # noqa: E402
 from turbopi.kernels import ops as kernels_ops  # noqa: E402
 from turbopi.kernels import plain  # noqa: E402
-from turbopi.kernels.portable import activations, norms, products  # noqa: E402
+from turbopi.kernels.portable import activations, norms  # noqa: E402
 from turbopi.kernels.portable.gemm import tiles  # noqa: E402
 from turbopi.kernels.portable.gemm.kernel import gpu, product  # noqa: E402
 from turbopi.kernels.portable.gemm.tiles import Capability, Epilogue, Tile  # noqa: E402
 from turbopi.kernels.portable.ops import portable_ops  # noqa: E402
 from turbopi.kernels.portable.quantize import quantize  # noqa: E402
+from turbopi.kernels.tile_table import LIBRARY, TileKey, TileTable  # noqa: E402
 from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Fp8Matrix, to_e4m3  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
@@ -198,11 +199,25 @@ def test_a_gpu_nobody_has_seen_gets_tiles_that_fit_the_smallest() -> None:
             assert tile.shared_bytes((12, 9)) <= 99 * 1024
 
 
-def test_a_measured_tile_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(tiles.MEASURED, ((9, 0), True, "plain", 576, 2560, 2048), Tile(32, 64, 4, 6))
-    tiles.best_tile.cache_clear()
-    assert tiles.best_tile((9, 0), True, "plain", 560, 2560, 2048, 132) == Tile(32, 64, 4, 6)
-    tiles.best_tile.cache_clear()
+def test_a_measured_tile_is_taken() -> None:
+    """In 24 columns of 33 rows: the cost model's tile would give parts of another number."""
+    x, matrix = operands(33, 24, 800)
+    table = TileTable({TileKey("portable", "parts", "fp8", 64, 24, 800): asdict(Tile(32, 64, 4, 6, splits=3))})
+    ours = portable_ops(table).residual_linear(x, matrix)
+    assert ours.shape == (3, 33, 24)
+    assert relative(ours.float().sum(0), matrix.product(x)) < (0.006 if ON_GPU else 1e-6)
+
+
+def test_bfloat16_takes_geglu_into_the_epilogue_where_that_was_measured_to_be_faster() -> None:
+    table = TileTable({TileKey("portable", "geglu", "bf16", 64, 24, 32): asdict(SMALL[0])})
+    tuned = portable_ops(table)
+    assert tuned.origin["GeGLU of the prefix"] == "Triton, in its product's epilogue for 64 rows, else behind cuBLAS"
+    x, gate_up = random(5, 32), random(48, 32)
+    ours, usual = tuned.linear_geglu(x, gate_up), portable_ops().linear_geglu(x, gate_up)
+    assert relative(ours, usual) < (0.01 if ON_GPU else 1e-6)
+    with pytest.MonkeyPatch.context() as patched:  # a product that isn't made by the library
+        patched.setattr("turbopi.kernels.portable.products.F.linear", None)
+        assert torch.equal(tuned.linear_geglu(x, gate_up), ours)
 
 
 def test_few_rows_do_not_take_the_tallest_tile_and_long_sums_are_split() -> None:
@@ -223,7 +238,9 @@ def test_fp8_is_refused_below_8_9_and_says_why() -> None:
 @pytest.fixture
 def hopper(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernels_ops, "capability", lambda device: (9, 0))
-    monkeypatch.setattr(kernels_ops, "hopper_ops", lambda device: replace(portable_ops(), origin={"all": "Hopper's"}))
+    monkeypatch.setattr(
+        kernels_ops, "hopper_ops", lambda device, tiles: replace(portable_ops(tiles), origin={"all": "Hopper's"})
+    )
 
 
 def test_the_variable_forces_the_portable_kernels(hopper: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,8 +265,9 @@ def test_another_value_is_an_error_that_names_it(hopper: None, value: str, monke
 
 
 def test_the_origin_says_where_geglu_is() -> None:
-    where = portable_ops().origin["GeGLU of the prefix"]
-    assert ("epilogue" in where) == products.BF16_GEGLU_IN_EPILOGUE
+    by_library = TileTable({TileKey("portable", "geglu", "bf16", 576, 16384, 2048): {LIBRARY: 1}})
+    for ops in (portable_ops(), portable_ops(by_library)):
+        assert ops.origin["GeGLU of the prefix"] == "Triton behind cuBLAS"
 
 
 def test_the_interpreter_chooses_as_one_gpu_would() -> None:

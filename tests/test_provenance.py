@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from turbopi import provenance as module
-from turbopi.provenance import provenance
+from turbopi.provenance import driver_version, provenance
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git isn't installed")
 
@@ -75,3 +75,23 @@ def test_a_repository_that_the_environment_names_is_no_matter(tmp_path: Path, mo
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "theirs" / ".git"))
     monkeypatch.setenv("GIT_WORK_TREE", str(tmp_path / "theirs"))
     assert told(monkeypatch, tmp_path / "ours" / name) == commit
+
+
+@pytest.mark.parametrize(
+    ("text", "version"),
+    [
+        ("NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.95.05  Tue Sep 23 10:11:16 UTC 2025\n", "580.95.05"),
+        ("NVRM version: NVIDIA UNIX Open Kernel Module for aarch64  540.4  Release Build  (x@y)\n", "540.4"),
+    ],
+)
+def test_the_driver_is_told_by_the_kernel(
+    text: str, version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "version").write_text(text)
+    monkeypatch.setattr(module, "DRIVER_FILE", tmp_path / "version")
+    monkeypatch.setattr(module, "_output", lambda command: "570.1\n570.1\n")
+    assert driver_version() == version
+    monkeypatch.setattr(module, "DRIVER_FILE", tmp_path / "none")
+    assert driver_version() == "570.1"
+    monkeypatch.setattr(module, "_output", lambda command: "")
+    assert driver_version() == "unknown"

@@ -7,9 +7,7 @@ lines don't count.
 
 import ast
 import hashlib
-import io
 import re
-import tokenize
 from pathlib import Path
 
 from msgspec import UNSET, Struct, UnsetType
@@ -17,6 +15,7 @@ from msgspec import UNSET, Struct, UnsetType
 from turbopi.errors import ConfigError
 from turbopi.provenance import Provenance
 from turbopi.reading import read_document
+from turbopi.source_code import code_of
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULT = ROOT / "benchmarks/results/gpu_check.json"
@@ -41,6 +40,7 @@ HOST_ONLY = (
     *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.shipped"),
     *("turbopi.export", "turbopi.tensorrt", "turbopi.errors", "turbopi.files", "turbopi.reading", "turbopi.arguments"),
     *("turbopi.provenance", "turbopi.toolchain", "turbopi.recordings", "turbopi.examples", "turbopi.verify.golden"),
+    "turbopi.source_code",
     "turbopi.backends.onnx",  # refuses every device but the CPU
 )
 MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
@@ -105,38 +105,6 @@ def fingerprint() -> dict[str, str]:
     files = [*product_files(), *gpu_test_files(), ROOT / "tests/conftest.py", ROOT / "tools/kernel_turns/problems.py"]
     code = {str(path.relative_to(ROOT)): code_of(path) for path in files}
     return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in code.items()}
-
-
-def code_of(path: Path) -> str:
-    """A file's text without comments, docstrings, blank lines and spaces at the ends of lines.
-
-    Cut out of the text, since the tokens and syntax trees of one file differ between Python versions.
-    """
-    text = path.read_text(encoding="utf-8")
-    text = _without_cuda_comments(text) if path.suffix == ".cu" else _without_python_comments(text)
-    return "\n".join(line.rstrip() for line in text.splitlines() if line.strip())
-
-
-def _without_cuda_comments(text: str) -> str:
-    strings_or_comments = r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/'
-    return re.sub(strings_or_comments, lambda m: m[0] if m[0][0] == '"' else " ", text, flags=re.DOTALL)
-
-
-def _without_python_comments(text: str) -> str:
-    lines = text.splitlines(keepends=True)
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type == tokenize.COMMENT:
-            row, column = token.start
-            lines[row - 1] = lines[row - 1][:column] + "\n"
-    for node in ast.walk(ast.parse(text)):
-        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) or not node.body:
-            continue
-        first = node.body[0]
-        if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str):
-            assert first.end_lineno is not None
-            for row in range(first.lineno, first.end_lineno + 1):
-                lines[row - 1] = "\n"
-    return "".join(lines)
 
 
 def imported_by(path: Path) -> set[str]:

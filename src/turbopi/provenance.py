@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import subprocess
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
@@ -12,6 +13,7 @@ from msgspec import UNSET, Struct, UnsetType, field
 
 from turbopi.version import turbopi_version
 
+DRIVER_FILE = Path("/proc/driver/nvidia/version")
 _GPU_FIELDS = ("name", "driver_version", "clocks.sm", "clocks.mem", "clocks_throttle_reasons.active", "temperature.gpu")
 
 
@@ -74,6 +76,18 @@ def provenance(device: torch.device) -> Provenance:
         gpu=_gpu(device) if device.type == "cuda" else UNSET,
         cpu=Cpu(platform.machine(), _cpu_name(), torch.get_num_threads()) if device.type != "cuda" else UNSET,
     )
+
+
+def driver_version() -> str:
+    """NVIDIA's driver, such as "580.95.05": as the kernel tells it, else nvidia-smi; "unknown" where neither does."""
+    try:
+        found = re.search(r"\s(\d+\.\d+(?:\.\d+)?)\s", DRIVER_FILE.read_text())
+    except OSError:
+        found = None
+    if found is not None:
+        return found[1]
+    lines = _output(["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]).splitlines()
+    return lines[0].strip() if lines else "unknown"
 
 
 def _gpu(device: torch.device) -> Gpu:

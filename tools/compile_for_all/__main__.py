@@ -3,9 +3,10 @@
     PYTHONPATH=src:tools python -m compile_for_all --json benchmarks/results/compiled_for_all.json
     PYTHONPATH=src:tools python -m compile_for_all --targets 89,120 --kernels gemm
 
-Triton's kernels in each variant that the full model launches there, products in each tile of their table; CUDA C++
-kernels by NVRTC: those below kernels/portable for each target, Hopper's for 90a. Exit code 1 if one doesn't compile,
-spills or takes more than a block may have. That it compiles doesn't say that it was run.
+Triton's kernels in each variant that the full model launches there, products and attention in each tile that
+`turbopi tune` may choose; CUDA C++ kernels by NVRTC: those below kernels/portable for each target, Hopper's for 90a.
+Exit code 1 if one doesn't compile, spills or takes more than a block may have. That it compiles doesn't say that it was
+run.
 """
 
 import argparse

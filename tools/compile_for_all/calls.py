@@ -10,6 +10,8 @@ from torch import Tensor
 from compile_for_all.targets import Target
 from turbopi.kernels.interface import SOURCE, Segments
 from turbopi.kernels.portable import activations, attention, backward, batch, embedding, norms, resize, rope, rounding
+from turbopi.kernels.portable.attention_tiles import Attention, AttentionTile
+from turbopi.kernels.portable.attention_tiles import candidates as attention_candidates
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
 from turbopi.quantization.fp8 import E4M3, Fp8Matrix
@@ -41,7 +43,7 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
     """Every variant that the product can launch there at full size; E4M3 where the GPU has it. chosen: see below."""
     fp8 = tiles.fp8_refusal(target.capability) is None
     inverses: tuple[float | None, ...] = (None, 30.0) if fp8 else (None,)
-    calls = [*_norms(inverses), *_attention(inverses), *_batch(inverses), *_rest(), *_backward()]
+    calls = [*_norms(inverses), *_attention(target, inverses), *_batch(target, inverses), *_rest(), *_backward()]
     calls += [partial(lambda inverse: activations.geglu(of(PREFIX, 2 * 16384), inverse), one) for one in inverses]
     if fp8:
         calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152))]
@@ -105,43 +107,56 @@ def _layer_norm(rows: int, width: int, y: tuple[int, ...] | None, inverse: float
     return norms.residual_layer_norm(of(rows, width), given, of(width), of(width), 1e-6, inverse)
 
 
-def _attention(inverses: tuple[float | None, ...]) -> Calls:
-    def prefix(inverse: float | None) -> Tensor:
+def _attention(target: Target, inverses: tuple[float | None, ...]) -> Calls:
+    """In every tile that this GPU takes."""
+
+    def vision(tile: AttentionTile, inverse: float | None) -> Tensor:
+        return attention.vision_attention(of(ROWS, 3456), 2, 16, inverse, tile=tile)
+
+    def prefix(tile: AttentionTile, inverse: float | None) -> Tensor:
         k = of(PREFIX, 256)
-        return attention.prefix_attention(of(PREFIX * 8, 256), k, k, of(1, dtype=torch.int64), 8, inverse)
+        length = of(1, dtype=torch.int64)
+        return attention.prefix_attention(of(PREFIX * 8, 256), k, k, length, 8, inverse, tile=tile)
 
     def softmax(state_token: bool) -> Tensor:
         length = of(1, dtype=torch.int64)
         return attention.masked_softmax(of(SUFFIX * 8, 1026, dtype=F32), length, 976, 8, state_token, 0.06, BF16)
 
     return [
-        *(partial(lambda one: attention.vision_attention(of(ROWS, 3456), 2, 16, one), one) for one in inverses),
-        *(partial(prefix, one) for one in inverses),
+        *(partial(vision, *one) for one in _in_tiles(target, "vision_attention", 72, inverses)),
+        *(partial(prefix, *one) for one in _in_tiles(target, "prefix_attention", 256, inverses)),
         *(partial(softmax, state_token) for state_token in (False, True)),
     ]
 
 
-def _batch(inverses: tuple[float | None, ...]) -> Calls:
-    """Of two and sixteen observations: keys of a suffix split over blocks, and in one."""
+def _in_tiles(
+    target: Target, kind: Attention, dim: int, inverses: tuple[float | None, ...]
+) -> list[tuple[AttentionTile, float | None]]:
+    return [(tile, one) for tile in attention_candidates(kind, target.capability, dim) for one in inverses]
 
-    def packed(inverse: float | None) -> Tensor:
+
+def _batch(target: Target, inverses: tuple[float | None, ...]) -> Calls:
+    """Of two and sixteen observations: keys of a suffix split over blocks, and in one. In every tile."""
+
+    def packed(tile: AttentionTile, inverse: float | None) -> Tensor:
         k, rows = of(2 * PREFIX, 256), of(3, dtype=torch.int32)
         segments = Segments(rows, rows, of(143, 4, dtype=torch.int32))
-        return batch.packed_attention(of(2 * PREFIX * 8, 256), k, k, segments, 8, inverse)
+        return batch.packed_attention(of(2 * PREFIX * 8, 256), k, k, segments, 8, inverse, tile=tile)
 
-    def suffix(count: int, state_token: bool, inverse: float | None) -> Tensor:
+    def suffix(count: int, state_token: bool, tile: AttentionTile, inverse: float | None) -> Tensor:
         prefix, own, rows = of(count * PREFIX, 256), of(count * SUFFIX, 256), of(count + 1, dtype=torch.int32)
         queries = of(count * SUFFIX * 8, 256)
-        return batch.suffix_attention(queries, prefix, prefix, own, own, rows, rows, 8, state_token, inverse)
+        return batch.suffix_attention(queries, prefix, prefix, own, own, rows, rows, 8, state_token, inverse, tile=tile)
 
     def embed() -> None:
         batch.embed_rows(of(2 * PREFIX, dtype=torch.int64), of(4 * 256, 2048), of(257152, 2048), of(2 * PREFIX, 2048))
 
+    suffixes = _in_tiles(target, "suffix_attention", 256, inverses)
     return [
         embed,
-        *(partial(packed, one) for one in inverses),
-        *(partial(suffix, count, False, one) for count in (2, 16) for one in inverses),
-        *(partial(suffix, count, True, None) for count in (2, 16)),
+        *(partial(packed, *one) for one in _in_tiles(target, "packed_attention", 256, inverses)),
+        *(partial(suffix, count, False, *one) for count in (2, 16) for one in suffixes),
+        *(partial(suffix, count, True, *one) for count in (2, 16) for one in suffixes if one[1] is None),
     ]
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.backends.lost import ADVICE
+from turbopi.backends.tuned_tiles import BY_MODEL, Tiles, tiles_of
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
 from turbopi.engine.recent_loops import Loop
@@ -26,6 +27,7 @@ from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
 from turbopi.kernels.interface import Denoiser, Ops, PairDenoiser
 from turbopi.kernels.portable.quantize import quantize
+from turbopi.kernels.tile_table import NO_TILES
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.fp8 import Directions, Matrix
 from turbopi.quantization.plan import TIERS
@@ -54,6 +56,7 @@ class FusedBackend(CudaGraphBackend):
     # docs/dev/log.md; in FP8 four take 3.4, eight 5.3, sixteen 9.9
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.2, 8: 5.4, 16: 10.6}
     COSTS_WITH_PAIRS: ClassVar[Mapping[int, float]] = {**COSTS, 2: 1.75}
+    _tiles = Tiles(NO_TILES, BY_MODEL)  # measured ones, as they were when this backend was made
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
     _fp8_expert: list[Any] | None = None  # layers with `Fp8Matrix`, of batches
@@ -103,7 +106,7 @@ class FusedBackend(CudaGraphBackend):
         return None if reason is None else f"{reason}; use 'bf16'"
 
     def describe(self) -> dict[str, Any]:
-        described = super().describe()
+        described = super().describe() | {"tiles": self._tiles.about}
         if self._plan is not None and self._quantization is not None:
             described["fp8"] = self._quantization.describe(self._plan)
             expert, plan = self._expert_precision(), described["fp8"]["plan"]
@@ -168,8 +171,8 @@ class FusedBackend(CudaGraphBackend):
     def _make_ops(self) -> Ops:
         from turbopi.kernels.ops import fused_ops, hopper_kernels  # Triton isn't imported for other backends
 
-        self._on_hopper = hopper_kernels(self.device)
-        return fused_ops(self.device)
+        self._on_hopper, self._tiles = hopper_kernels(self.device), tiles_of(self.device)
+        return fused_ops(self.device, self._tiles.table)
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, loop or GPU."""

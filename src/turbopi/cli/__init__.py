@@ -1,7 +1,7 @@
 """The command line.
 
 turbopi demo | infer | serve | view | bench | plan | calibrate | verify | eval |
-    compare | inspect | convert | export | build | study | backends | doctor
+    compare | inspect | convert | export | build | tune | study | backends | doctor
 """
 
 from importlib import metadata
@@ -25,6 +25,7 @@ from turbopi.cli import (  # noqa: F401
     checkpoints,
     export,
     build,
+    tune,
     study,
     backends,
     doctor,

@@ -124,6 +124,8 @@ def what_runs(index: int, capability: tuple[int, int], memory_gb: float) -> Iter
     }
     for tier in tiers:
         yield judge_precision(f"GPU {index} {tier}", device, tier, memory_gb, fitting)
+    if backends.availability("fused", device) is None:
+        yield judge_tiles(f"GPU {index} tiles", device)
 
 
 def judge_precision(name: str, device: Any, precision: Any, memory_gb: float, fitting: Mapping[str, float]) -> Row:
@@ -148,6 +150,21 @@ def judge_precision(name: str, device: Any, precision: Any, memory_gb: float, fi
     faster = backends.availability("fused", device) if chosen != "fused" else None
     fix = "" if faster is None else command_in(faster)
     return Row("WARN" if fix else "OK", name, found, fix)
+
+
+def judge_tiles(name: str, device: Any) -> Row:
+    """Which tiles the kernels of `fused` take: measured ones, and from when, or those of their cost model."""
+    from turbopi.backends.tuned_tiles import Machine, find_tiles, tuned_off
+
+    try:
+        off = tuned_off()
+    except TurboPiError as error:
+        return Row("WARN", name, as_typed(str(error)), "unset TURBOPI_TUNED")
+    tiles = find_tiles(Machine.of(device))
+    if tiles.unused:
+        return Row("WARN", name, as_typed("; ".join(tiles.unused)), "turbopi tune")
+    found = f"{tiles.about}, but TURBOPI_TUNED=off has them ignored" if off and len(tiles.table) else tiles.about
+    return Row("OK", name, found if len(tiles.table) else f"{found}; `turbopi tune` measures")
 
 
 def needed_gb(device: Any, precision: Any) -> float | None:

@@ -10,6 +10,7 @@ from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90.ops import hopper_ops
+from turbopi.kernels.tile_table import NO_TILES, TileTable
 
 KERNELS_VARIABLE = "TURBOPI_KERNELS"
 
@@ -30,13 +31,14 @@ def hopper_kernels(device: torch.device) -> bool:
     return capability(device) == (9, 0) and not forced_portable()
 
 
-def fused_ops(device: torch.device) -> Ops:
+def fused_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     """Activations are bfloat16; with an `Fp8Matrix` (from compute capability 8.9) E4M3 between it and the operation
-    before it. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor "portable".
+    before it. `tiles` were measured on this GPU. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor
+    "portable".
     """
     if not hopper_kernels(device):
-        return portable_ops()
-    ops = hopper_ops(device)
+        return portable_ops(tiles)
+    ops = hopper_ops(device, tiles)
     return replace(
         ops, origin={**ops.origin, "FP8 products": "CUDA, with bias, GELU, GeGLU and rounding in the epilogue"}
     )

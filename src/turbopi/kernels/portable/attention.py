@@ -10,7 +10,9 @@ import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
-from turbopi.kernels.portable.shared_memory import roomy
+from turbopi.kernels.portable.attention_tiles import AttentionTile, chosen_tile
+from turbopi.kernels.portable.shared_memory import capability_of
+from turbopi.kernels.tile_table import NO_TILES, TileTable
 
 LOG2_E = 1.4426950408889634
 
@@ -66,10 +68,19 @@ def _vision_kernel(
         tl.store(to + b[None, :], (acc_b / total[:, None]).to(dtype), stored)
 
 
-def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:
+def vision_attention(
+    qkv: Tensor,
+    images: int,
+    heads: int,
+    inverse: float | None = None,
+    *,
+    tile: AttentionTile | None = None,
+    tiles: TileTable = NO_TILES,
+) -> Tensor:
     """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
 
-    With `inverse` the result leaves as E4M3: see `quantization.fp8`.
+    With `inverse` the result leaves as E4M3: see `quantization.fp8`. Without a `tile`, that of `tiles`, else the usual
+    one.
     """
     assert qkv.is_contiguous(), "qkv is read as it lies in memory"
     rows, width = qkv.shape[0], qkv.shape[1] // 3
@@ -78,16 +89,13 @@ def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None
     assert block_a >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     block_b = 0 if block_a == dim else max(16, triton.next_power_of_2(dim - block_a))
     out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse))
-    block_m, block_n, warps, stages = VISION_TILE
+    tile = tile or chosen_tile(tiles, "vision_attention", capability_of(qkv), rows, heads, dim)
     # launched early, several blocks would crowd onto each of the few SMs that the product before leaves idle
-    _vision_kernel[(triton.cdiv(tokens, block_m), images * heads)](
+    _vision_kernel[(triton.cdiv(tokens, tile.rows), images * heads)](
         qkv, out, tokens, heads, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim, BLOCK_A=block_a, BLOCK_B=block_b,
-        BLOCK_M=block_m, BLOCK_N=block_n, SCALED=inverse is not None, num_warps=warps, num_stages=stages,
+        BLOCK_M=tile.rows, BLOCK_N=tile.keys, SCALED=inverse is not None, num_warps=tile.warps, num_stages=tile.stages,
     )  # fmt: skip
     return out
-
-
-VISION_TILE = (64, 64, 4, 3)
 
 
 @triton.jit
@@ -127,26 +135,32 @@ def _prefix_kernel(
 
 
 def prefix_attention(
-    q: Tensor, k: Tensor, v: Tensor, length: Tensor, heads: int, inverse: float | None = None
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    length: Tensor,
+    heads: int,
+    inverse: float | None = None,
+    *,
+    tile: AttentionTile | None = None,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """Rows q [tokens * n, K] over the first `length` (int64[1], on the device, at least 1) keys -> [tokens, n * K].
 
-    k, v [keys, K]; what lies beyond `length` is never read. With `inverse` the result leaves as E4M3.
+    k, v [keys, K]; what lies beyond `length` is never read. With `inverse` the result leaves as E4M3. The tile is
+    chosen as in `vision_attention`.
     """
     assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
-    block_m, block_n, warps, stages = PREFIX_TILE if roomy(q) else NARROW_PREFIX_TILE
-    _prefix_kernel[(triton.cdiv(rows, block_m),)](
+    tile = tile or chosen_tile(tiles, "prefix_attention", capability_of(q), rows // heads, heads, dim)
+    _prefix_kernel[(triton.cdiv(rows, tile.rows),)](
         q, k, v, length, out, rows, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim, BLOCK_D=triton.next_power_of_2(dim),
-        BLOCK_M=block_m, BLOCK_N=block_n, SCALED=inverse is not None, num_warps=warps, num_stages=stages,
+        BLOCK_M=tile.rows, BLOCK_N=tile.keys, SCALED=inverse is not None, num_warps=tile.warps, num_stages=tile.stages,
         **dependent_launch(q),
     )  # fmt: skip
     return out
-
-
-PREFIX_TILE, NARROW_PREFIX_TILE = (64, 64, 4, 2), (64, 32, 8, 2)  # the second for less shared memory
 
 
 @triton.jit

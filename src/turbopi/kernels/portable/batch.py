@@ -4,6 +4,8 @@ Twins: `kernels.plain_batch`. Logits, softmax and sums are float32; probabilitie
 their product, as in the twins.
 """
 
+from functools import partial
+
 import torch
 import triton
 import triton.language as tl
@@ -12,12 +14,10 @@ from torch import Tensor
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 from turbopi.kernels.interface import BatchOps, Segments
 from turbopi.kernels.portable.attention import LOG2_E
-from turbopi.kernels.portable.shared_memory import roomy
+from turbopi.kernels.portable.attention_tiles import PACKED_ROWS, AttentionTile, chosen_tile
+from turbopi.kernels.portable.shared_memory import capability_of
+from turbopi.kernels.tile_table import NO_TILES, TileTable
 
-# Keys at a time, warps, stages; queries: as `Segments.tiles` says. The second one of each pair: for less shared memory.
-PACKED_TILE, NARROW_PACKED_TILE = (64, 8, 2), (32, 8, 2)
-QUERIES = 64
-SUFFIX_TILE, NARROW_SUFFIX_TILE = (16, 64, 4, 2), (16, 32, 4, 2)  # queries, keys at a time, warps, stages
 BLOCKS_AT_ONCE = 264  # of suffix attention, two a multiprocessor of Hopper: keys are split over blocks up to so many
 
 
@@ -89,18 +89,27 @@ def _packed_kernel(
 
 
 def packed_attention(
-    q: Tensor, k: Tensor, v: Tensor, segments: Segments, heads: int, inverse: float | None = None
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    segments: Segments,
+    heads: int,
+    inverse: float | None = None,
+    *,
+    tile: AttentionTile | None = None,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """See `kernels.plain_batch.packed_attention`. With `inverse` the result leaves as E4M3."""
     assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
-    block_n, warps, stages = PACKED_TILE if roomy(q) else NARROW_PACKED_TILE
+    tile = tile or chosen_tile(tiles, "packed_attention", capability_of(q), rows // heads, heads, dim)
+    assert tile.rows == PACKED_ROWS, f"{tile}: `segments.tiles` have {PACKED_ROWS} rows"
     _packed_kernel[(len(segments.tiles),)](
         q, k, v, segments.tiles, out, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim,
-        BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=QUERIES, BLOCK_N=block_n, SCALED=inverse is not None,
-        num_warps=warps, num_stages=stages, **dependent_launch(q),
+        BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=tile.rows, BLOCK_N=tile.keys, SCALED=inverse is not None,
+        num_warps=tile.warps, num_stages=tile.stages, **dependent_launch(q),
     )  # fmt: skip
     return out
 
@@ -189,25 +198,28 @@ def suffix_attention(
     heads: int,
     state_token: bool = False,
     inverse: float | None = None,
+    *,
+    tile: AttentionTile | None = None,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """See `kernels.plain_batch.suffix_attention`. All contiguous. With `inverse` the result leaves as E4M3."""
     assert all(t.is_contiguous() for t in (q, prefix_k, prefix_v, k, v, starts, lengths)), "rows are read as they lie"
     batch, (count, dim) = len(starts) - 1, k.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     rows = count // batch * heads  # of queries of an observation
-    block_m, block_n, warps, stages = SUFFIX_TILE if roomy(q) else NARROW_SUFFIX_TILE
-    tiles = triton.cdiv(rows, block_m)
-    splits = suffix_splits(tiles * batch, len(prefix_k) // batch, block_n)
+    tile = tile or chosen_tile(tiles, "suffix_attention", capability_of(q), count, heads, dim)
+    along = triton.cdiv(rows, tile.rows)
+    splits = suffix_splits(along * batch, len(prefix_k) // batch, tile.keys)
     out = q.new_empty(count, heads * dim, dtype=result_dtype(q, inverse))
     parts = torch.empty(splits, batch * rows, dim, device=q.device) if splits > 1 else out
     weights = torch.empty(splits, batch * rows, 2, device=q.device) if splits > 1 else out
     sizes = {
         "DIM": dim, "BLOCK_D": triton.next_power_of_2(dim), "SPLITS": splits, "SCALED": inverse is not None,
     }  # fmt: skip
-    _suffix_kernel[(tiles, batch, splits)](
+    _suffix_kernel[(along, batch, splits)](
         q, prefix_k, prefix_v, k, v, starts, lengths, out, parts, weights, rows, count // batch, heads,
-        dim**-0.5 * LOG2_E, inverse or 1.0, BLOCK_M=block_m, BLOCK_N=block_n, STATE_TOKEN=state_token,
-        num_warps=warps, num_stages=stages, **sizes, **dependent_launch(q),
+        dim**-0.5 * LOG2_E, inverse or 1.0, BLOCK_M=tile.rows, BLOCK_N=tile.keys, STATE_TOKEN=state_token,
+        num_warps=tile.warps, num_stages=tile.stages, **sizes, **dependent_launch(q),
     )  # fmt: skip
     if splits > 1:
         _combine_kernel[(batch * rows,)](
@@ -222,6 +234,14 @@ def suffix_splits(blocks: int, keys: int, block_n: int) -> int:
     return max(1, min(BLOCKS_AT_ONCE // blocks, triton.cdiv(keys, 2 * block_n)))
 
 
-BATCH = BatchOps(
-    embed_rows=embed_rows, packed_attention=packed_attention, suffix_attention=suffix_attention, origin="Triton"
-)
+def batch_ops(tiles: TileTable = NO_TILES) -> BatchOps:
+    """With attention in these tiles."""
+    return BatchOps(
+        embed_rows=embed_rows,
+        packed_attention=partial(packed_attention, tiles=tiles),
+        suffix_attention=partial(suffix_attention, tiles=tiles),
+        origin="Triton",
+    )
+
+
+BATCH = batch_ops()

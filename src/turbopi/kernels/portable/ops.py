@@ -1,5 +1,6 @@
 """The engine's operations for any NVIDIA GPU: Triton's kernels between cuBLAS's products; FP8 products are Triton's."""
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -9,31 +10,31 @@ from torch import Tensor
 from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.portable import attention, backward, batch, embedding, norms, products, resize, rope
+from turbopi.kernels.tile_table import LIBRARY, NO_TILES, TileTable
 
-GEGLU_ORIGIN = "Triton, in its product's epilogue" if products.BF16_GEGLU_IN_EPILOGUE else "Triton behind cuBLAS"
 
-
-def portable_ops() -> Ops:
+def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
+    """With these measured tiles."""
     return Ops(
         embed_patches=EmbedPatches(),
         embed_prompt=embedding.embed_prompt,
         residual_rms_norm=norms.residual_rms_norm,
         residual_layer_norm=norms.residual_layer_norm,
-        linear=products.linear,
-        residual_linear=products.residual_linear,
-        linear_gelu=products.linear_gelu,
-        linear_geglu=products.linear_geglu,
+        linear=partial(products.linear, tiles=tiles),
+        residual_linear=partial(products.residual_linear, tiles=tiles),
+        linear_gelu=partial(products.linear_gelu, tiles=tiles),
+        linear_geglu=partial(products.linear_geglu, tiles=tiles),
         rope_split=rope.rope_split,
-        vision_attention=attention.vision_attention,
-        attention=attend,
+        vision_attention=partial(attention.vision_attention, tiles=tiles),
+        attention=partial(attend, tiles=tiles),
         resize_pictures=resize.resize_pictures,
         backward=backward.BACKWARD,
-        batch=batch.BATCH,
+        batch=batch.batch_ops(tiles),
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
             "FP8 products": "Triton, with bias, GELU, GeGLU and rounding in the epilogue",
             "vision products": "cuBLAS",
-            "GeGLU of the prefix": GEGLU_ORIGIN,
+            "GeGLU of the prefix": geglu_origin(tiles),
             "product behind the prefix's GeGLU": "cuBLAS",
             "vision and prefix attention": "Triton",
             "suffix attention": "cuBLAS and Triton's softmax",
@@ -41,6 +42,15 @@ def portable_ops() -> Ops:
             "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding, pictures' sizes": "Triton",
         },
     )
+
+
+def geglu_origin(tiles: TileTable) -> str:
+    """Where GeGLU behind bfloat16's products is."""
+    measured = [key for key, knobs in tiles.tiles.items() if LIBRARY not in knobs and key.operation == "geglu"]
+    rows = sorted({key.rows for key in measured if (key.kernels, key.numbers) == ("portable", "bf16")})
+    if not rows:
+        return "Triton behind cuBLAS"
+    return f"Triton, in its product's epilogue for {', '.join(map(str, rows))} rows, else behind cuBLAS"
 
 
 class EmbedPatches:
@@ -70,8 +80,9 @@ def attend(
     heads: int,
     *state_token: Any,
     inverse: float | None = None,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
     if k.shape[0] == slots:  # no suffix behind the prefix
-        return attention.prefix_attention(q, k, v, length, heads, inverse)
+        return attention.prefix_attention(q, k, v, length, heads, inverse, tiles=tiles)
     assert inverse is None, "the suffix's activations stay as they are"
     return plain.attention(q, k, v, length, slots, heads, *state_token, softmax=attention.masked_softmax)

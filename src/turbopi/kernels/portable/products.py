@@ -1,6 +1,6 @@
 """Matrix products: an `Fp8Matrix`'s in Triton, bfloat16's by the library, with what its epilogues can do.
 
-Twins: `kernels.plain`.
+Twins: `kernels.plain`. `tiles` are those that were measured on this GPU.
 """
 
 import torch
@@ -9,34 +9,40 @@ from torch import Tensor
 
 from turbopi.kernels.portable import activations
 from turbopi.kernels.portable.gemm.kernel import product
+from turbopi.kernels.portable.gemm.tiles import tuned_tile
+from turbopi.kernels.tile_table import NO_TILES, TileTable
 from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
 
-# Whether the bfloat16 product of GeGLU is Triton's, with GeGLU in its epilogue, or cuBLAS's with a kernel behind it.
-# Set by what `python -m product_tiles` measures.
-BF16_GEGLU_IN_EPILOGUE = False
 
-
-def linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+def linear(
+    x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None, *, tiles: TileTable = NO_TILES
+) -> Tensor:
     if isinstance(weight, Fp8Matrix):
-        return product(x, weight, bias=bias, out=out)
+        return product(x, weight, bias=bias, out=out, tiles=tiles)
     if out is None:
         return F.linear(x, weight, bias)
     return torch.mm(x, weight.t(), out=out) if bias is None else torch.addmm(bias, x, weight.t(), out=out)
 
 
-def residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor:
+def residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, *, tiles: TileTable = NO_TILES) -> Tensor:
     """As `linear`; of an Fp8Matrix perhaps as parts [splits, tokens, out], which the norms add up."""
-    return product(x, weight, "parts", bias) if isinstance(weight, Fp8Matrix) else F.linear(x, weight, bias)
-
-
-def linear_gelu(x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None) -> Tensor:
     if isinstance(weight, Fp8Matrix):
-        return product(x, weight, "gelu", bias, inverse=inverse)
+        return product(x, weight, "parts", bias, tiles=tiles)
+    return F.linear(x, weight, bias)
+
+
+def linear_gelu(
+    x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None, *, tiles: TileTable = NO_TILES
+) -> Tensor:
+    if isinstance(weight, Fp8Matrix):
+        return product(x, weight, "gelu", bias, inverse=inverse, tiles=tiles)
     result = torch._addmm_activation(bias, x, weight.t(), use_gelu=True)  # on CUDA: tanh's GELU, in the epilogue
     return result if inverse is None else to_e4m3(result, inverse)
 
 
-def linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None) -> Tensor:
-    if isinstance(gate_up, Fp8Matrix) or BF16_GEGLU_IN_EPILOGUE:
-        return product(x, gate_up, "geglu", inverse=inverse)
+def linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None, *, tiles: TileTable = NO_TILES) -> Tensor:
+    """In bfloat16 with GeGLU in the epilogue of a tile that was measured to be faster, else behind cuBLAS."""
+    shape = x.shape[0], gate_up.shape[0] // 2, x.shape[1]
+    if isinstance(gate_up, Fp8Matrix) or tuned_tile(tiles, "bf16", "geglu", *shape) is not None:
+        return product(x, gate_up, "geglu", inverse=inverse, tiles=tiles)
     return activations.geglu(F.linear(x, gate_up), inverse)

@@ -12,6 +12,6 @@ BLOCK_SHARED = {  # bytes, by compute capability (CUDA C++ programming guide, ta
 LEAST_SHARED = min(BLOCK_SHARED.values())  # of GPUs that aren't known
 
 
-def roomy(x: Tensor) -> bool:
-    """Whether blocks on x's GPU have 227 KB. On a CPU: yes."""
-    return not x.is_cuda or BLOCK_SHARED.get(capability(x.device), LEAST_SHARED) >= 227 * 1024
+def capability_of(x: Tensor) -> tuple[int, int]:
+    """Of x's GPU; on a CPU, where Triton interprets, that of one with 227 KB."""
+    return capability(x.device) if x.is_cuda else (9, 0)

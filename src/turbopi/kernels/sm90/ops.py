@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from turbopi.kernels.interface import Ops, Segments
 from turbopi.kernels.portable import attention as portable_attention
-from turbopi.kernels.portable.batch import BATCH
+from turbopi.kernels.portable import batch as portable_batch
 from turbopi.kernels.portable.ops import attend as attend_portably
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90.attention import kernel as attention
@@ -18,10 +19,12 @@ from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
 from turbopi.kernels.sm90.gemm.tiles import PARTS_TILES, RESIDUAL_TILES, VISION_TILES
 from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
+from turbopi.kernels.tile_table import NO_TILES, TileTable
 
 
-def hopper_ops(device: torch.device) -> Ops:
-    portable, vision = portable_ops(), VisionProducts()
+def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
+    """With these measured tiles, and in sizes that they don't have those of gemm/tiles.py."""
+    portable, vision, batch = portable_ops(tiles), VisionProducts(tiles), portable_batch.batch_ops(tiles)
     origin = {
         "vision products": f"CUDA for {_rows(VISION_TILES)} rows, else cuBLAS",
         "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS",
@@ -38,10 +41,14 @@ def hopper_ops(device: torch.device) -> Ops:
         linear=vision.linear,
         residual_linear=vision.residual_linear,
         linear_gelu=vision.linear_gelu,
-        linear_geglu=products.tuned_linear_geglu,
-        vision_attention=vision_attention,
-        attention=attend,
-        batch=replace(BATCH, packed_attention=packed_attention, origin="CUDA for prefixes, Triton for suffixes"),
+        linear_geglu=partial(products.tuned_linear_geglu, tiles=tiles),
+        vision_attention=partial(vision_attention, tiles=tiles),
+        attention=partial(attend, tiles=tiles),
+        batch=replace(
+            batch,
+            packed_attention=partial(packed_attention, tiles=tiles),
+            origin="CUDA for prefixes, Triton for suffixes",
+        ),
         origin={**portable.origin, **origin},
     )
 
@@ -59,19 +66,30 @@ def attend(
     heads: int,
     *state_token: Any,
     inverse: float | None = None,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
     if k.shape[0] == slots and attention.takes(q.shape[1]):  # no suffix behind the prefix
         return attention.prefix_attention(q, k, v, length, heads, inverse)
-    return attend_portably(q, k, v, length, slots, heads, *state_token, inverse=inverse)
+    return attend_portably(q, k, v, length, slots, heads, *state_token, inverse=inverse, tiles=tiles)
 
 
 def packed_attention(
-    q: Tensor, k: Tensor, v: Tensor, segments: Segments, heads: int, inverse: float | None = None
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    segments: Segments,
+    heads: int,
+    inverse: float | None = None,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
-    ours = attention.packed_attention if attention.takes(q.shape[1]) else BATCH.packed_attention
-    return ours(q, k, v, segments, heads, inverse)
+    if attention.takes(q.shape[1]):
+        return attention.packed_attention(q, k, v, segments, heads, inverse)
+    return portable_batch.packed_attention(q, k, v, segments, heads, inverse, tiles=tiles)
 
 
-def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:
-    ours = attention if attention.takes(qkv.shape[1] // 3 // heads) else portable_attention
-    return ours.vision_attention(qkv, images, heads, inverse)
+def vision_attention(
+    qkv: Tensor, images: int, heads: int, inverse: float | None = None, tiles: TileTable = NO_TILES
+) -> Tensor:
+    if attention.takes(qkv.shape[1] // 3 // heads):
+        return attention.vision_attention(qkv, images, heads, inverse)
+    return portable_attention.vision_attention(qkv, images, heads, inverse, tiles=tiles)

@@ -19,7 +19,8 @@ from turbopi.kernels.dependent_launch import (
     wait_for_producer,
 )
 from turbopi.kernels.portable.activations import gelu_tanh
-from turbopi.kernels.portable.gemm.tiles import STEP_BYTES, Epilogue, Tile, best_tile, promotes
+from turbopi.kernels.portable.gemm.tiles import STEP_BYTES, Epilogue, Tile, best_tile, promotes, tuned_tile
+from turbopi.kernels.tile_table import NO_TILES, TileTable
 from turbopi.quantization.fp8 import ALIGNMENT, E4M3, Fp8Matrix, Matrix
 
 GROUP = 8  # rows of tiles that are computed together, so that they read the same weights from the L2 cache
@@ -98,11 +99,13 @@ def product(
     out: Tensor | None = None,
     inverse: float | None = None,
     tile: Tile | None = None,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """x [M, K] @ weightᵀ + bias, then the epilogue -> [M, N] in the weight's dtype, or with `inverse` E4M3.
 
     x is E4M3 with an `Fp8Matrix`, else as the weight. weight [N, K], of "geglu" [2N, K], gate rows before up rows; bias
     [N]. "parts" -> [splits, M, N], whose sum is the result; of one split [M, N]. All contiguous, K a multiple of 16.
+    Without a `tile`, that of `tiles`, else the cost model's.
     """
     data = weight.data if isinstance(weight, Fp8Matrix) else weight
     m, k = x.shape
@@ -111,6 +114,7 @@ def product(
     assert x.dtype == data.dtype and x.is_contiguous() and data.is_contiguous(), "rows are read as they lie in memory"
     assert bias is None or (epilogue != "geglu" and bias.shape == (n,))
     fp8, on = isinstance(weight, Fp8Matrix), gpu(x.device)
+    tile = tile or tuned_tile(tiles, "fp8" if fp8 else "bf16", epilogue, m, n, k)
     tile = tile or best_tile(on[0], fp8, epilogue, m, n, k, on[1])
     assert tile.splits == 1 or epilogue == "parts"
     assert max(x.numel(), data.numel(), tile.splits * m * n) < 1 << 31, "places are counted in 32 bits"

@@ -1,6 +1,6 @@
-"""Which tile a product is computed with: one that fits the GPU and costs least by a model, or one that was measured.
+"""Which tile a product is computed with: one that was measured, else one that fits the GPU and costs least by a model.
 
-Nothing is tried out inside a call.
+Nothing is tried out inside a call: `turbopi tune` measures.
 """
 
 from dataclasses import dataclass, replace
@@ -8,6 +8,7 @@ from functools import cache
 from typing import Literal
 
 from turbopi.kernels.portable.shared_memory import BLOCK_SHARED, LEAST_SHARED
+from turbopi.kernels.tile_table import LIBRARY, Numbers, TileTable
 
 Epilogue = Literal["plain", "gelu", "geglu", "parts"]
 Capability = tuple[int, int]
@@ -51,11 +52,6 @@ TILES = (
 )
 BARRIERS = 128  # bytes beside the operands
 WIDE = 64  # sums a thread: with more, those that are promoted spill, and so do mma.sync's GeGLU and tcgen05's others
-
-# Measured tiles, made by `python -m product_tiles`: (capability, E4M3?, epilogue, rows rounded up to 64, out, in) ->
-# tile; of "geglu", out is the hidden width.
-Shape = tuple[Capability, bool, Epilogue, int, int, int]
-MEASURED: dict[Shape, Tile] = {}
 
 
 def by_mma_sync(capability: Capability) -> bool:
@@ -129,10 +125,13 @@ def _resident(tile: Tile, capability: Capability) -> int:
 
 @cache
 def best_tile(capability: Capability, fp8: bool, epilogue: Epilogue, m: int, n: int, k: int, sms: int) -> Tile:
-    """The measured tile, else that of least estimated cost."""
+    """The tile of least estimated cost."""
     m = -(-m // 64) * 64
-    measured = MEASURED.get((capability, fp8, epilogue, m, n, k))
-    if measured is not None:
-        return measured
     fitting = candidates(capability, fp8, epilogue, k)
     return min(fitting, key=lambda tile: cost(tile, capability, fp8, epilogue, m, n, k, sms))
+
+
+def tuned_tile(table: TileTable, numbers: Numbers, epilogue: Epilogue, m: int, n: int, k: int) -> Tile | None:
+    """The measured tile; None if nobody measured one, or the library was faster."""
+    knobs = table.find("portable", epilogue, numbers, m, n, k)
+    return None if knobs is None or LIBRARY in knobs else Tile(**knobs)

@@ -1,6 +1,11 @@
-"""Matrix products, each by the kernel that is fastest for it: ours for what was measured so, cuBLAS's else."""
+"""Matrix products, each by the kernel that is fastest for it: ours for what was measured so, cuBLAS's else.
 
+`tiles` are those that `turbopi tune` measured on this GPU; gemm/tiles.py and best_tile choose what they don't have.
+"""
+
+from dataclasses import asdict
 from functools import lru_cache
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -8,44 +13,96 @@ from torch import Tensor
 from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
 from turbopi.kernels.sm90.gemm.bf16 import DEPTH, SPLIT, Epilogue, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import best_tile, matmul_fp8
-from turbopi.kernels.sm90.gemm.tiles import FEW_GEGLU_TILES, FEW_TILES, GEGLU_TILES, PARTS_TILES, VISION_TILES
+from turbopi.kernels.sm90.gemm.tiles import (
+    FEW_GEGLU_TILES,
+    FEW_TILES,
+    GEGLU_TILES,
+    PARTS_TILES,
+    RESIDUAL_TILES,
+    RESIDUAL_TILES_FP8,
+    VISION_TILES,
+)
+from turbopi.kernels.tile_table import LIBRARY, NO_TILES, Knobs, TileTable
 from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
 
 GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
 
 
-def vision_tile(x: Tensor, weight: Tensor) -> Tile | None:
-    return VISION_TILES.get((x.shape[0], weight.shape[0], weight.shape[1]))
+Operation = Literal["plain", "bias", "gelu", "geglu", "partial", "parts", "residual"]
+Chosen = Tile | int | None  # the library: over so many parts of the inner axis at once, or None
 
 
-def tuned_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
+def chosen(tiles: TileTable, operation: Operation, m: int, n: int, k: int) -> Chosen:
+    """How a bfloat16 product [m, k] x [n, k] is made, but for "geglu". "residual" by the library: not that way."""
+    knobs = tiles.find("hopper", operation, "bf16", m, n, k)
+    if knobs is not None:
+        return from_knobs(knobs)
+    if operation in ("plain", "parts"):
+        return (FEW_TILES if operation == "plain" else PARTS_TILES).get((-(-m // 64) * 64, n, k))
+    return (RESIDUAL_TILES if operation == "residual" else VISION_TILES).get((m, n, k))
+
+
+def chosen_fp8(tiles: TileTable, operation: Operation, m: int, n: int, k: int, sms: int) -> Tile | None:
+    """The tile of a product of E4M3 numbers; None: "residual" isn't made that way."""
+    knobs = tiles.find("hopper", operation, "fp8", m, n, k)
+    if knobs is not None:
+        tile = from_knobs(knobs)
+        return tile if isinstance(tile, Tile) else None
+    if operation == "residual":
+        return RESIDUAL_TILES_FP8.get((m, n, k))
+    return best_tile(m, n, k, operation, sms)
+
+
+def from_knobs(knobs: Knobs) -> Chosen:
+    if LIBRARY in knobs:
+        return knobs[LIBRARY] if knobs[LIBRARY] > 1 else None
+    fields: dict[str, Any] = dict(knobs)
+    return Tile(**fields | {name: bool(knobs[name]) for name in ("overlap", "gather") if name in knobs})
+
+
+def to_knobs(chosen: Chosen) -> dict[str, int]:
+    """What `from_knobs` reads."""
+    if not isinstance(chosen, Tile):
+        return {LIBRARY: chosen or 1}
+    return {name: int(value) for name, value in asdict(chosen).items()}
+
+
+def bf16_tile(tiles: TileTable, operation: Operation, x: Tensor, weight: Tensor) -> Tile | None:
+    tile = chosen(tiles, operation, x.shape[0], *weight.shape)
+    return tile if isinstance(tile, Tile) else None
+
+
+def tuned_linear(
+    x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None, *, tiles: TileTable = NO_TILES
+) -> Tensor:
     if isinstance(weight, Fp8Matrix):
-        return _fp8(x, weight, "plain" if bias is None else "bias", bias, out)
-    if bias is None and (few := FEW_TILES.get(_in_whole_64(x, weight))) is not None:
-        return matmul(x, weight, few, "plain", out=out)
-    tile = vision_tile(x, weight)
-    if tile is None or bias is None:
+        return _fp8(x, weight, "plain" if bias is None else "bias", bias, out, tiles=tiles)
+    tile = bf16_tile(tiles, "plain" if bias is None else "bias", x, weight)
+    if tile is None:
         return linear(x, weight, bias, out)
-    return matmul(x, weight, tile, "bias", bias, out)
+    return matmul(x, weight, tile, "plain" if bias is None else "bias", bias, out)
 
 
-def _in_whole_64(x: Tensor, weight: Tensor) -> tuple[int, int, int]:
-    return -(-x.shape[0] // 64) * 64, weight.shape[0], weight.shape[1]
-
-
-def tuned_residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, ahead: Tensor | None = None) -> Tensor:
+def tuned_residual_linear(
+    x: Tensor,
+    weight: Matrix,
+    bias: Tensor | None = None,
+    ahead: Tensor | None = None,
+    *,
+    tiles: TileTable = NO_TILES,
+) -> Tensor:
     """The product, or parts of it that the norms add up."""
     if isinstance(weight, Fp8Matrix):
-        return _fp8(x, weight, "parts" if bias is None else "partial", bias, ahead=ahead)
+        return _fp8(x, weight, "parts" if bias is None else "partial", bias, ahead=ahead, tiles=tiles)
     if bias is None:
-        cut = PARTS_TILES.get(_in_whole_64(x, weight))
+        cut = chosen(tiles, "parts", x.shape[0], *weight.shape)
         if isinstance(cut, Tile):
             return matmul(x, weight, cut, "parts", ahead=ahead)
         return linear(x, weight) if cut is None else parts_at_once(x, weight, cut)
-    tile = vision_tile(x, weight)
+    tile = bf16_tile(tiles, "partial", x, weight)
     if tile is None:
         return linear(x, weight, bias)
-    return matmul(x, weight, tile, "partial" if tile.splits > 1 else "bias", bias, ahead=ahead)
+    return matmul(x, weight, tile, "partial" if tile.splits > 1 and not tile.gather else "bias", bias, ahead=ahead)
 
 
 def parts_at_once(x: Tensor, weight: Tensor, count: int) -> Tensor:
@@ -56,19 +113,27 @@ def parts_at_once(x: Tensor, weight: Tensor, count: int) -> Tensor:
 
 
 def tuned_linear_gelu(
-    x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None, ahead: Tensor | None = None
+    x: Tensor,
+    weight: Matrix,
+    bias: Tensor,
+    inverse: float | None = None,
+    ahead: Tensor | None = None,
+    *,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
     if isinstance(weight, Fp8Matrix):
-        return _fp8(x, weight, "gelu", bias, inverse=inverse, ahead=ahead)
-    tile = vision_tile(x, weight)
+        return _fp8(x, weight, "gelu", bias, inverse=inverse, ahead=ahead, tiles=tiles)
+    tile = bf16_tile(tiles, "gelu", x, weight)
     result = linear_gelu(x, weight, bias) if tile is None else matmul(x, weight, tile, "gelu", bias, ahead=ahead)
     return as_input(result, inverse)
 
 
-def tuned_linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None) -> Tensor:
+def tuned_linear_geglu(
+    x: Tensor, gate_up: Matrix, inverse: float | None = None, *, tiles: TileTable = NO_TILES
+) -> Tensor:
     if isinstance(gate_up, Fp8Matrix):
-        return _fp8(x, gate_up, "geglu", inverse=inverse)
-    tile = _geglu_tile(x.shape[0], gate_up.shape[0] // 2, x.shape[1], x.device)
+        return _fp8(x, gate_up, "geglu", inverse=inverse, tiles=tiles)
+    tile = chosen_geglu(tiles, x.shape[0], gate_up.shape[0] // 2, x.shape[1], num_sms(x.device))
     return as_input(linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu"), inverse)
 
 
@@ -85,9 +150,12 @@ def _fp8(
     out: Tensor | None = None,
     inverse: float | None = None,
     ahead: Tensor | None = None,
+    *,
+    tiles: TileTable,
 ) -> Tensor:
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
-    tile = best_tile(x.shape[0], n, weight.shape[1], epilogue, num_sms(x.device))
+    tile = chosen_fp8(tiles, epilogue, x.shape[0], n, weight.shape[1], num_sms(x.device))
+    assert tile is not None, "the library has no such product"
     if epilogue in SPLIT and (tile.splits == 1 or tile.gather):
         epilogue = "bias"
     return matmul_fp8(x, weight, tile, epilogue, bias, out, inverse, ahead=ahead)
@@ -98,12 +166,20 @@ def num_sms(device: torch.device) -> int:
     return torch.cuda.get_device_properties(device).multi_processor_count
 
 
+def chosen_geglu(tiles: TileTable, rows: int, hidden: int, inner: int, sms: int) -> Tile | None:
+    """As `chosen`, of "geglu"; None: the library, and GeGLU behind it."""
+    knobs = tiles.find("hopper", "geglu", "bf16", rows, hidden, inner)
+    if knobs is not None:
+        tile = from_knobs(knobs)
+        return tile if isinstance(tile, Tile) else None
+    return _geglu_tile(rows, hidden, inner, sms)
+
+
 @lru_cache
-def _geglu_tile(rows: int, hidden: int, inner: int, device: torch.device) -> Tile | None:
+def _geglu_tile(rows: int, hidden: int, inner: int, sms: int) -> Tile | None:
     """The first tile to waste least on the matrix's ragged edges and on the last wave of tiles, if that is little."""
     if (few := FEW_GEGLU_TILES.get((-(-rows // 64) * 64, hidden, inner))) is not None:
         return few
-    sms = num_sms(device)
 
     def fill(tile: Tile) -> float:
         tiles = -(-rows // tile.rows) * -(-2 * hidden // tile.columns)

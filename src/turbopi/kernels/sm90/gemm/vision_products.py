@@ -7,16 +7,17 @@ from torch import Tensor
 
 from turbopi.kernels.portable import norms
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Epilogue, Folded, Sums, Tile, matmul
-from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
+from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, matmul_fp8
 from turbopi.kernels.sm90.gemm.products import (
     as_input,
+    bf16_tile,
+    chosen_fp8,
     num_sms,
     tuned_linear,
     tuned_linear_gelu,
     tuned_residual_linear,
-    vision_tile,
 )
-from turbopi.kernels.sm90.gemm.tiles import RESIDUAL_TILES, RESIDUAL_TILES_FP8
+from turbopi.kernels.tile_table import NO_TILES, TileTable
 from turbopi.quantization.fp8 import E4M3, Fp8Matrix, Matrix
 
 
@@ -57,7 +58,8 @@ class NormedCopy:
 class VisionProducts:
     """The tower's products: those in front of a LayerNorm add the residual stream themselves, those behind norm it."""
 
-    def __init__(self) -> None:
+    def __init__(self, tiles: TileTable = NO_TILES) -> None:
+        self._tiles = tiles  # measured on this GPU
         # by the weight's address; the weight stays with it, so that no other one can come to lie there
         self._folded: dict[int, tuple[Tensor, Folded]] = {}
         self._folded_fp8: dict[int, FoldedFp8] = {}
@@ -67,10 +69,14 @@ class VisionProducts:
         self._last: Tensor | None = None
 
     def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
-        tiles = RESIDUAL_TILES_FP8 if isinstance(weight, Fp8Matrix) else RESIDUAL_TILES
-        tile = tiles.get((x.shape[0], weight.shape[0], weight.shape[1]))
-        if tile is None or bias is None or num_sms(x.device) < GATHERING_SMS:
-            return tuned_residual_linear(x, weight, bias)
+        sms, tile = num_sms(x.device), None
+        if bias is not None and sms >= GATHERING_SMS:
+            if isinstance(weight, Fp8Matrix):
+                tile = chosen_fp8(self._tiles, "residual", x.shape[0], weight.shape[0], weight.shape[1], sms)
+            else:
+                tile = bf16_tile(self._tiles, "residual", x, weight)
+        if tile is None or bias is None:
+            return tuned_residual_linear(x, weight, bias, tiles=self._tiles)
         return Product(x, weight, bias, tile)
 
     def residual_layer_norm(
@@ -112,7 +118,7 @@ class VisionProducts:
             if (made := self._normed(x, weight, bias, "bias", out)) is not None:
                 return made
             x = x.made()
-        return tuned_linear(x, weight, bias, out)
+        return tuned_linear(x, weight, bias, out, tiles=self._tiles)
 
     def linear_gelu(
         self, x: Tensor | Normed | NormedCopy, weight: Matrix, bias: Tensor, inverse: float | None = None
@@ -123,7 +129,7 @@ class VisionProducts:
             if (made := self._normed(x, weight, bias, "gelu")) is not None:
                 return as_input(made, inverse)
             x = x.made()
-        return tuned_linear_gelu(x, weight, bias, inverse, self._next(weight))
+        return tuned_linear_gelu(x, weight, bias, inverse, self._next(weight), tiles=self._tiles)
 
     def _normed(
         self, x: Normed, weight: Matrix, bias: Tensor | None, epilogue: Epilogue, out: Tensor | None = None
@@ -131,7 +137,7 @@ class VisionProducts:
         if (
             isinstance(weight, Fp8Matrix)
             or bias is None
-            or (tile := vision_tile(x.x, weight)) is None
+            or (tile := bf16_tile(self._tiles, epilogue, x.x, weight)) is None
             or tile.splits > 1
         ):
             return None
@@ -166,7 +172,8 @@ class VisionProducts:
         if key not in self._folded_fp8:
             self._folded_fp8[key] = FoldedFp8.fold(weight, x.scale, x.shift)
         rows, (columns, inner) = x.copy.shape[0], weight.shape
-        tile = best_tile(rows, columns, inner, epilogue, num_sms(x.copy.device))
+        tile = chosen_fp8(self._tiles, epilogue, rows, columns, inner, num_sms(x.copy.device))
+        assert tile is not None and tile.splits == 1, "a norm is multiplied whole"
         ahead = self._next(weight)
         return matmul_fp8(x.copy, self._folded_fp8[key], tile, epilogue, bias, out, inverse, sums=x.sums, ahead=ahead)
 

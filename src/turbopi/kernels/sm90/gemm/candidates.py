@@ -1,0 +1,87 @@
+"""Tiles of Hopper's products that are worth measuring: `turbopi tune` takes the cheapest by the cost model, and kin."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from turbopi.kernels.sm90.gemm import bf16, fp8
+from turbopi.kernels.sm90.gemm.bf16 import SPLIT, Epilogue, Tile
+from turbopi.kernels.sm90.gemm.products import Chosen, Operation
+
+CHEAPEST, WITH_KIN = 10, 5  # tiles by the cost model; of so many also clusters and shorter rings
+MOST_SUMS, MOST_OVERLAPPED = 192 * 192, 192 * 128  # numbers of a tile, and of one whose GeGLU overlaps
+MOST_CLUSTER = 8
+LEAST_STAGES = 3
+SHORT_RING = 5
+LIBRARY_PARTS = (2, 4)  # parts of the inner axis that cuBLAS multiplies at once
+
+
+def epilogue_of(operation: Operation) -> Epilogue:
+    """What the kernel is compiled with; "partial" and "residual" of a whole sum are "bias"."""
+    return "bias" if operation == "residual" else operation
+
+
+def possible(tile: Tile, operation: Operation, in_fp8: bool, k: int) -> bool:
+    """Whether the kernel takes this tile: shares of a cluster in whole groups, registers, shared memory, splits."""
+    geglu, steps = operation == "geglu", -(-k // (fp8.DEPTH if in_fp8 else bf16.DEPTH))
+    share = 8 * tile.cluster_m * (2 if geglu else 1)
+    if tile.warpgroups not in (1, 2, 3) or not 16 <= tile.columns <= 256 or tile.columns % share:
+        return False
+    if not 1 <= tile.cluster <= MOST_CLUSTER or tile.rows % (8 * tile.cluster_n) or not 1 <= tile.splits <= steps:
+        return False
+    whole = tile.splits == 1 or tile.gather
+    if (tile.gather and (operation not in ("residual", "partial") or tile.splits == 1)) or (
+        not whole and operation not in SPLIT
+    ):
+        return False
+    if tile.rows * tile.columns > (MOST_OVERLAPPED if tile.overlap else MOST_SUMS):
+        return False
+    if in_fp8 and steps > fp8.UNPROMOTED_STEPS * tile.splits and not fp8.promotion(tile, k):
+        return False
+    stages = tile.stages(factors=2 if in_fp8 else 1, lines=operation == "parts")
+    return tile.takes(epilogue_of(operation), steps) and stages >= LEAST_STAGES
+
+
+def candidates(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int, usual: Chosen) -> list[Chosen]:
+    """The usual choice, the library's in bfloat16, and tiles: the first is the usual one."""
+    found: list[Chosen] = [usual]
+    if not in_fp8 and operation != "residual":
+        found += [None, *(LIBRARY_PARTS if operation == "parts" else ())]
+    found += _tiles(operation, in_fp8, m, n, k, sms)
+    return list(dict.fromkeys(found))
+
+
+def _tiles(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int) -> list[Tile]:
+    epilogue, wide = epilogue_of(operation), k if in_fp8 else 2 * k  # the cost model counts bytes along the inner axis
+    plain = [tile for tile in _plain(operation, m) if possible(tile, operation, in_fp8, k)]
+
+    def price(tile: Tile) -> float:
+        return fp8.cost(tile, m, n, wide, epilogue, sms)
+
+    cheapest = sorted(plain, key=price)[:CHEAPEST]
+    kin = [other for tile in cheapest[:WITH_KIN] for other in _kin(tile, operation, m, n)]
+    return cheapest + [tile for tile in kin if possible(tile, operation, in_fp8, k)]
+
+
+def _plain(operation: Operation, m: int) -> list[Tile]:
+    found = fp8.candidates(epilogue_of(operation), m)
+    if operation not in ("residual", "partial"):
+        return found
+    whole = [tile for tile in found if tile.splits == 1]
+    gathered = [replace(tile, splits=splits, gather=True) for tile in whole for splits in (2, 3, 4)]
+    return [*found, *gathered]
+
+
+def _kin(tile: Tile, operation: Operation, m: int, n: int) -> Iterator[Tile]:
+    """Clusters that share rows, where there are tiles enough for them, and a ring of fewer steps."""
+    columns = tile.columns // 2 if operation == "geglu" else tile.columns
+    pairs_m, pairs_n = m > tile.rows, n > columns
+    if pairs_m:
+        yield replace(tile, cluster_m=2)
+    if pairs_n:
+        yield replace(tile, cluster_n=2)
+    if pairs_m and pairs_n and operation != "geglu":
+        yield replace(tile, cluster_m=2, cluster_n=2)
+    if operation == "geglu":
+        yield replace(tile, overlap=True)
+        yield replace(tile, cluster_n=2, overlap=True)
+    yield replace(tile, ring=SHORT_RING)

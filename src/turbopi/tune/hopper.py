@@ -1,0 +1,254 @@
+"""Hopper's products with their inputs, as the tuner measures them: as the vision tower and the prefix run them.
+
+Between two of the tower's products no kernel runs: one adds the residual stream, the next one takes the LayerNorm of
+its input from the sums of each row. So they are measured in these forms, where they have them.
+"""
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from turbopi.kernels import plain
+from turbopi.kernels.portable import norms
+from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
+from turbopi.kernels.portable.quantize import quantize
+from turbopi.kernels.sm90.gemm import candidates as hopper_candidates
+from turbopi.kernels.sm90.gemm.bf16 import SPLIT, Copy, Folded, Sums, Tile, matmul
+from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, matmul_fp8
+from turbopi.kernels.sm90.gemm.products import (
+    Chosen,
+    Operation,
+    as_input,
+    chosen,
+    chosen_fp8,
+    chosen_geglu,
+    from_knobs,
+    parts_at_once,
+    to_knobs,
+)
+from turbopi.kernels.tile_table import NO_TILES, Knobs
+from turbopi.quantization.fp8 import E4M3, Fp8Matrix, Matrix, to_e4m3
+from turbopi.tune.gpu import INVERSE, GpuBench, cold_copies, poisoned, relative
+from turbopi.tune.portable import EPS, activated, clone
+from turbopi.tune.shapes import Operation as Wanted
+
+STREAM_PARTS = 16  # of the sums of the stream's rows: as many as the product before has tiles along its columns
+COPY_SCALE = 20.0
+
+
+def resolved(one: Wanted, sms: int) -> Wanted:
+    """As the tower runs it: into the residual stream, and behind a norm, where its sizes have that."""
+    if one.kernels != "hopper" or not one.name.startswith(("vision", "projector")):
+        return one
+    if one.operation == "residual":
+        return one if sms >= GATHERING_SMS and usual_choice(one, sms) is not None else replace(one, operation="partial")
+    before = replace(one, operation="residual", columns=one.inner)  # as the tower's product that leaves the stream
+    return replace(one, normed=one.normed and sms >= GATHERING_SMS and usual_choice(before, sms) is not None)
+
+
+def usual_choice(one: Wanted, sms: int) -> Chosen:
+    operation: Operation = one.operation  # type: ignore[assignment]
+    sizes = one.rows, one.columns, one.inner
+    if one.numbers == "fp8":
+        return chosen_fp8(NO_TILES, operation, *sizes, sms)
+    return chosen_geglu(NO_TILES, *sizes, sms) if operation == "geglu" else chosen(NO_TILES, operation, *sizes)
+
+
+def candidates(one: Wanted, sms: int) -> list[Knobs]:
+    """The usual choice first."""
+    operation: Operation = one.operation  # type: ignore[assignment]
+    sizes, usual = (one.rows, one.columns, one.inner), usual_choice(one, sms)
+    found = hopper_candidates.candidates(operation, one.numbers == "fp8", *sizes, sms, usual)
+    if one.normed:  # a norm is multiplied whole
+        found = [cut for cut in found if not isinstance(cut, Tile) or cut.splits == 1]
+    return [to_knobs(cut) for cut in found]
+
+
+class Product(GpuBench):
+    """One of them, in bfloat16 or E4M3."""
+
+    def __init__(self, operation: Wanted, device: torch.device) -> None:
+        super().__init__(operation, device)
+        one, self.fp8 = operation, operation.numbers == "fp8"
+        rows = one.columns * (2 if one.operation == "geglu" else 1)
+        weight = self.random(rows, one.inner) / one.inner**0.5
+        self.bias = self.random(one.columns) if one.bias else None
+        self.copies = cold_copies(weight.numel() * (1 if self.fp8 else 2), device)
+        self.inverse = INVERSE if one.out_fp8 else None
+        self.stream = self.random(one.rows, one.columns) if one.norm_behind else None
+        self.scale = torch.ones(one.columns, device=device)
+        self.norm = self.random(one.columns), self.random(one.columns)
+        if self.stream is not None:
+            self.stream_sums = sums_of(self.stream)
+            self.for_copy = self.norm[0].float() * COPY_SCALE, self.norm[1].float() * COPY_SCALE
+        first: Matrix = quantize(weight, 0.02) if self.fp8 else weight
+        self.weights = [first, *(clone(first) for _ in range(self.copies - 1))]
+        self.raw = self.random(one.rows, one.inner)  # what a norm stands before
+        if one.normed:
+            self._norm_in_front(first)
+        else:
+            self.x = to_e4m3(self.raw, first.inverse) if isinstance(first, Fp8Matrix) else self.raw
+            self.exact, twin = self._products(self.x.float() if not self.fp8 else self.x, self.x, first)
+            self.twin_error = relative(self.whole(twin), self.exact)
+
+    def _norm_in_front(self, first: Matrix) -> None:
+        """The norm's weights, the sums of the rows that it is made of, and matrices that take it."""
+        one, assert_bias = self.operation, self.bias
+        assert assert_bias is not None, "the tower's products have biases"
+        scale, shift = self.random(one.inner), self.random(one.inner)
+        self.front = scale, shift
+        normed = F.layer_norm(self.raw.float(), (one.inner,), scale.float(), shift.float(), EPS)
+        if isinstance(first, Fp8Matrix):
+            self._copied(first, scale, shift)
+            wide = normed @ first.dequantized().T + assert_bias.float()
+            twin = first.product(to_e4m3(normed, first.inverse), assert_bias)
+        else:
+            self.sums = sums_of(self.raw)
+            made = Folded.fold(first, assert_bias, scale, shift)
+            self.folded: list[Folded] = [replace(made, data=made.data.clone()) for _ in range(self.copies)]
+            wide = normed @ first.float().T + assert_bias.float()
+            twin = F.linear(normed.to(torch.bfloat16), first, assert_bias).float()
+        self.exact = activated(one.operation, wide)
+        twin = plain.as_input(activated(one.operation, twin), torch.bfloat16, self.inverse)
+        self.twin_error = relative(self.whole(twin), self.exact)
+
+    def _copied(self, first: Fp8Matrix, scale: Tensor, shift: Tensor) -> None:
+        """The copy of the stream in the units of another one's rows, as `bf16.Copy` says."""
+        before = self.random(*self.raw.shape).float()
+        mean = before.mean(1, keepdim=True)
+        factor = (before.var(1, correction=0, keepdim=True) + EPS).rsqrt()
+        units = (self.raw.float() - mean) * factor
+        by = first.inverse / HEADROOM
+        self.copy = to_e4m3(units * scale.float() + shift.float(), by)
+        sums = sums_of(units)
+        sums.parts[0, :, 1] += units.shape[1] * EPS * factor[:, 0].square()
+        self.sums = sums
+        self.folded_fp8 = [FoldedFp8.fold(one, scale, shift) for one in self.weights if isinstance(one, Fp8Matrix)]
+
+    def _products(self, wide: Tensor, x: Tensor, weight: Matrix) -> tuple[Tensor, Tensor]:
+        """(the exact result float32, the plain twin's)"""
+        one = self.operation
+        bias = None if self.bias is None else self.bias.float()
+        sums = weight.product(x, self.bias) if isinstance(weight, Fp8Matrix) else F.linear(wide, weight.float(), bias)
+        exact = activated(one.operation, sums)
+        if one.operation == "residual":
+            assert self.stream is not None
+            exact = exact + self.stream.float()
+        return exact, plain.as_input(exact, torch.bfloat16, self.inverse) if self.fp8 else self._twin(x, weight)
+
+    def _twin(self, x: Tensor, weight: Matrix) -> Tensor:
+        if self.operation.operation == "geglu":
+            return plain.linear_geglu(x, weight, self.inverse)
+        if self.operation.operation == "gelu" and self.bias is not None:
+            return plain.linear_gelu(x, weight, self.bias, self.inverse)
+        result = plain.linear(x, weight, self.bias)
+        return result + self.stream if self.operation.operation == "residual" and self.stream is not None else result
+
+    def run(self, knobs: Knobs, copy: int, out: Tensor | None = None) -> Tensor:
+        cut = from_knobs(knobs)
+        if not isinstance(cut, Tile):
+            return self._by_library(cut, copy)
+        one, weight = self.operation, self.weights[copy]
+        operation: Operation = one.operation  # type: ignore[assignment]
+        epilogue = hopper_candidates.epilogue_of(operation)
+        if epilogue in SPLIT and (cut.splits == 1 or cut.gather) and (self.fp8 or epilogue == "partial"):
+            epilogue = "bias"
+        if one.operation == "residual":
+            return self._into_stream(cut, copy, out)
+        ahead = self._ahead(copy)
+        if one.normed and self.fp8:
+            folded = self.folded_fp8[copy]
+            return matmul_fp8(
+                self.copy, folded, cut, epilogue, self.bias, out, self.inverse, sums=self.sums, ahead=ahead
+            )
+        if one.normed:
+            given = self.folded[copy]
+            return as_input(
+                matmul(self.raw, given, cut, epilogue, out=out, sums=self.sums, eps=EPS, ahead=ahead), self.inverse
+            )
+        if isinstance(weight, Fp8Matrix):
+            return matmul_fp8(self.x, weight, cut, epilogue, self.bias, out, self.inverse, ahead=ahead)
+        return as_input(matmul(self.x, weight, cut, epilogue, self.bias, out, ahead=ahead), self.inverse)
+
+    def _into_stream(self, tile: Tile, copy: int, out: Tensor | None) -> Tensor:
+        one, weight, stream = self.operation, self.weights[copy], self.stream
+        assert stream is not None
+        sums = Sums.allocate(tile, one.rows, one.columns, self.device)
+        if not isinstance(weight, Fp8Matrix):
+            return matmul(
+                self.x,
+                weight,
+                tile,
+                "bias",
+                self.bias,
+                out,
+                residual=stream,
+                sums_out=sums,
+                ahead=self._ahead(copy),
+            )
+        copied = Copy(
+            torch.empty(one.rows, one.columns, dtype=E4M3, device=self.device),
+            self.stream_sums,
+            self.for_copy[0],
+            self.for_copy[1],
+            EPS,
+            Sums.allocate(tile, one.rows, one.columns, self.device),
+        )
+        return matmul_fp8(
+            self.x,
+            weight,
+            tile,
+            "bias",
+            self.bias,
+            out,
+            residual=stream,
+            sums_out=sums,
+            copy=copied,
+            ahead=self._ahead(copy),
+        )
+
+    def _by_library(self, parts: int | None, copy: int) -> Tensor:
+        one, weight, bias = self.operation, self.weights[copy], self.bias
+        x = norms.residual_layer_norm(self.raw, None, *self.front, EPS)[1] if one.normed else self.x
+        if parts is not None:
+            assert isinstance(weight, Tensor)
+            return parts_at_once(x, weight, parts)
+        if one.operation == "geglu":
+            return linear_geglu(x, weight, self.inverse)
+        if one.operation == "gelu":
+            assert bias is not None
+            return linear_gelu(x, weight, bias, self.inverse)
+        return linear(x, weight, bias)
+
+    def behind(self, result: Tensor) -> object:
+        one, inverse = self.operation, INVERSE if self.fp8 else None
+        if self.stream is None or one.operation == "residual":
+            return result
+        if one.norm_behind == "layer":
+            return norms.residual_layer_norm(self.stream, result, *self.norm, EPS, inverse)
+        return norms.residual_rms_norm(self.stream, result, None, self.scale, None, EPS, inverse)
+
+    def out_for(self, knobs: Knobs) -> Tensor | None:
+        one, cut = self.operation, from_knobs(knobs)
+        if not isinstance(cut, Tile) or one.operation in ("partial", "parts") or (one.out_fp8 and not self.fp8):
+            return None
+        dtype = E4M3 if one.out_fp8 else torch.bfloat16
+        return poisoned((one.rows, one.columns), dtype, self.device)
+
+    def _ahead(self, copy: int) -> Tensor | None:
+        """The next product's weight, which the tower's products fetch into the L2 cache."""
+        if not self.operation.name.startswith("vision"):
+            return None
+        at = (copy + 1) % self.copies
+        if self.operation.normed and not self.fp8:
+            return self.folded[at].data
+        weight = self.weights[at]
+        return weight.data if isinstance(weight, Fp8Matrix) else weight
+
+
+def sums_of(x: Tensor) -> Sums:
+    """Each row's sum and sum of squares, by parts of its columns."""
+    parts = x.float().tensor_split(STREAM_PARTS, 1)
+    return Sums(torch.stack([torch.stack((part.sum(1), part.square().sum(1)), -1) for part in parts]).contiguous())

@@ -1,0 +1,105 @@
+"""What is measured on a GPU: the operations of the calls that were asked for, each with its candidates."""
+
+import gc
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from turbopi.backends.tuned_tiles import Machine
+from turbopi.config import ModelConfig
+from turbopi.errors import ConfigError
+from turbopi.kernels.ops import forced_portable
+from turbopi.kernels.portable.gemm.tiles import fp8_refusal
+from turbopi.kernels.tile_checks import HOPPER
+from turbopi.kernels.tile_table import Kernels, TileKey, TileTable
+from turbopi.tune import hopper, portable
+from turbopi.tune.gpu import GpuBench
+from turbopi.tune.race import UsualFails
+from turbopi.tune.run import Planned, usual_first
+from turbopi.tune.shapes import Call, Operation, Precision, distinct, operations
+
+KERNELS = ("auto", "portable", "hopper", "all")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """calls: the operations of each, for what it gains; planned: what has a choice and is measured, each once."""
+
+    calls: Mapping[tuple[Call, Precision, Kernels], Sequence[Operation]]
+    planned: Sequence[Planned]
+
+
+def kernels_to_tune(asked: str, capability: tuple[int, int]) -> list[Kernels]:
+    """Whose tiles: "auto" those of the kernels that `fused` takes here. Raises ConfigError."""
+    if asked not in KERNELS:
+        raise ConfigError(f"--kernels is {asked!r}; expected one of {', '.join(KERNELS)}")
+    on_hopper = capability == HOPPER
+    if asked == "hopper" and not on_hopper:
+        arch = f"{capability[0]}.{capability[1]}"
+        raise ConfigError(f"--kernels hopper is for compute capability 9.0; this GPU has {arch}: leave it out")
+    if asked == "all":
+        return ["hopper", "portable"] if on_hopper else ["portable"]
+    if asked == "auto":
+        return ["hopper"] if on_hopper and not forced_portable() else ["portable"]
+    return ["hopper"] if asked == "hopper" else ["portable"]
+
+
+def precisions_to_tune(asked: Sequence[str], capability: tuple[int, int]) -> list[Precision]:
+    """None asked for: all that this GPU multiplies. Raises ConfigError for others."""
+    refusal = fp8_refusal(capability)
+    if not asked:
+        return ["bf16"] if refusal else ["bf16", "fp8"]
+    found: list[Precision] = []
+    for name in dict.fromkeys(asked):
+        if name not in ("bf16", "fp8"):
+            raise ConfigError(f"--precision has {name!r}; tiles are measured for bf16 and fp8")
+        if name == "fp8" and refusal:
+            raise ConfigError(f"--precision fp8: {refusal}")
+        found.append("fp8" if name == "fp8" else "bf16")
+    return found
+
+
+def plan(
+    config: ModelConfig,
+    calls: Sequence[Call],
+    precisions: Sequence[Precision],
+    kernels: Sequence[Kernels],
+    machine: Machine,
+    *,
+    shipped: TileTable,
+    known: TileTable,
+    steps: int = 10,
+) -> Plan:
+    """shipped: tiles that run without a file of one's own; known: what needn't be measured again."""
+    sms, found = machine.multiprocessors, dict[tuple[Call, Precision, Kernels], Sequence[Operation]]()
+    for call in calls:
+        for which in kernels:
+            for precision in precisions:
+                all_of = operations(config, call, precision, which, steps=steps, horizon=config.action_horizon)
+                found[call, precision, which] = [hopper.resolved(one, sms) for one in all_of]
+    wanted = distinct([one for several in found.values() for one in several])
+    rows = [planned(one, machine, shipped) for one in wanted if one.key not in known.tiles]
+    return Plan(found, [one for one in rows if len(one.candidates) > 1])
+
+
+def planned(one: Operation, machine: Machine, shipped: TileTable) -> Planned:
+    if one.kernels == "hopper":
+        candidates = hopper.candidates(one, machine.multiprocessors)
+    else:
+        candidates = portable.candidates(one, machine.capability, machine.multiprocessors)
+    key: TileKey = one.key
+    return Planned(one, usual_first(candidates, key, shipped))
+
+
+def bench_maker(device: torch.device) -> Callable[[Operation], GpuBench]:
+    """What puts an operation's inputs on the device."""
+    gc.freeze()  # capturing a graph may collect garbage, each time through all that is imported
+
+    def make(one: Operation) -> GpuBench:
+        try:
+            return hopper.Product(one, device) if one.kernels == "hopper" else portable.bench(one, device)
+        except torch.OutOfMemoryError as failure:
+            raise UsualFails("its inputs don't fit the GPU's free memory") from failure
+
+    return make

@@ -1,0 +1,164 @@
+"""The operations of a model's calls that have a choice of tiles, with their sizes and how often a call runs them.
+
+Kept apart from kernels and GPUs. Shapes as in engine/forward.py: D width, F hidden width of an MLP, K head_dim.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from turbopi.config import ModelConfig
+from turbopi.kernels.tile_table import Kernels, Numbers, TileKey, whole_64
+
+BUCKET = 16  # prompt tokens, as engine/runner.py rounds them up
+Precision = Literal["bf16", "fp8"]
+
+
+@dataclass(frozen=True)
+class Call:
+    """A policy's call. prompt_tokens: of each observation, already rounded up to its bucket."""
+
+    cameras: int
+    prompt_tokens: int
+    batch: int = 1
+
+    def __str__(self) -> str:
+        several = f", {self.batch} observations" if self.batch > 1 else ""
+        return f"{self.cameras} cameras, {self.prompt_tokens} tokens{several}"
+
+
+@dataclass(frozen=True)
+class Operation:
+    """One operation of a call.
+
+    rows       of its result; of attention tokens
+    uses       how often a call runs it
+    out_fp8    whether its result leaves in E4M3
+    images     of vision's attention
+    batch, prefix_rows  of attention in a batch: observations, and rows of each one's prefix
+    norm_behind  adds the result to the residual stream
+    normed     whether a LayerNorm stands in front of it
+    """
+
+    name: str
+    kernels: Kernels
+    operation: str
+    numbers: Numbers
+    rows: int
+    columns: int
+    inner: int
+    uses: int
+    bias: bool = False
+    out_fp8: bool = False
+    images: int = 0
+    batch: int = 1
+    prefix_rows: int = 0
+    norm_behind: Literal["layer", "rms"] | None = None
+    normed: bool = False
+
+    @property
+    def key(self) -> TileKey:
+        return TileKey(self.kernels, self.operation, self.numbers, whole_64(self.rows), self.columns, self.inner)
+
+    @property
+    def size(self) -> str:
+        return f"{self.rows} x {self.columns} x {self.inner}"
+
+
+def calls(config: ModelConfig, cameras: Sequence[int], prompts: Sequence[int], batches: Sequence[int]) -> list[Call]:
+    """Every combination, the first prompt length of all of them first: what matters most.
+
+    Without `prompts` those of one observation are of every length, those of batches of the usual one.
+    """
+    lengths = dict.fromkeys(bucket(tokens) for tokens in prompts) or every_prompt(config)
+    return [
+        Call(count, tokens, batch)
+        for place, tokens in enumerate(lengths)
+        for batch in batches
+        for count in cameras
+        if prompts or place == 0 or batch == 1
+    ]
+
+
+def every_prompt(config: ModelConfig) -> list[int]:
+    """All buckets, that of the usual 48 tokens first."""
+    longest = bucket(config.max_prompt_tokens)
+    usual = min(48, longest)
+    return [usual, *(tokens for tokens in range(BUCKET, longest + 1, BUCKET) if tokens != usual)]
+
+
+def bucket(tokens: int) -> int:
+    return max(BUCKET, -(-tokens // BUCKET) * BUCKET)
+
+
+def operations(
+    config: ModelConfig, call: Call, precision: Precision, kernels: Kernels, *, steps: int = 10, horizon: int = 10
+) -> list[Operation]:
+    """Those of one call whose tiles can be chosen. `horizon` and `steps` matter to batches alone."""
+    found = [*_vision(config, call, precision, kernels), *_prefix(config, call, precision, kernels)]
+    if call.batch > 1:
+        found += _expert(config, call, precision, kernels, steps, horizon + (config.kind == "pi0"))
+    return [one for one in found if _has_choice(one)]
+
+
+def distinct(found: Sequence[Operation]) -> list[Operation]:
+    """Each key once, as it first came."""
+    return list({one.key: one for one in reversed(found)}.values())[::-1]
+
+
+def _has_choice(one: Operation) -> bool:
+    """The portable kernels leave bfloat16's products to the library, but for GeGLU. Sizes must be whole 16."""
+    if one.operation.endswith("_attention"):
+        return one.inner >= 16
+    aligned = one.columns % 16 == 0 and one.inner % 16 == 0
+    return aligned and (one.kernels == "hopper" or one.numbers != "bf16" or one.operation == "geglu")
+
+
+def _vision(config: ModelConfig, call: Call, precision: Precision, kernels: Kernels) -> Iterator[Operation]:
+    v, fp8, images = config.vision, precision == "fp8", call.cameras * call.batch
+    rows = images * v.num_tokens
+    if not rows:
+        return
+    hopper = kernels == "hopper"
+    linear, residual = ("bias", "residual") if hopper else ("plain", "parts")
+    usual = Operation("", kernels, linear, precision, rows, v.width, v.width, v.depth, bias=True)
+    yield replace(usual, name="vision qkv", columns=3 * v.width, normed=True)
+    attention = Operation("vision attention", "portable", "vision_attention", "bf16", rows, v.num_heads, v.head_dim, 0)
+    if not hopper:
+        yield replace(attention, uses=v.depth, images=images, out_fp8=fp8)
+    yield replace(usual, name="vision out", operation=residual, norm_behind="layer")
+    yield replace(usual, name="vision fc1", operation="gelu", columns=v.mlp_dim, out_fp8=fp8, normed=True)
+    yield replace(usual, name="vision fc2", operation=residual, inner=v.mlp_dim, norm_behind="layer")
+    yield replace(usual, name="projector", numbers="bf16", columns=config.vlm.width, uses=1, normed=True)
+
+
+def _prefix(config: ModelConfig, call: Call, precision: Precision, kernels: Kernels) -> Iterator[Operation]:
+    g, fp8 = config.vlm, precision == "fp8"
+    rows = call.batch * (call.cameras * config.vision.num_tokens + call.prompt_tokens)
+    heads, width = g.num_heads * g.head_dim, g.width
+    usual = Operation("", kernels, "plain", precision, rows, heads + 2 * g.head_dim, width, g.depth - 1)
+    yield replace(usual, name="prefix qkv")
+    yield replace(usual, name="prefix last k, v", columns=2 * g.head_dim, uses=1)
+    if kernels == "portable":
+        kind = "prefix_attention" if call.batch == 1 else "packed_attention"
+        attention = replace(usual, operation=kind, numbers="bf16", columns=g.num_heads, inner=g.head_dim)
+        yield replace(attention, name="prefix attention", batch=call.batch, out_fp8=fp8)
+    yield replace(usual, name="prefix out", operation="parts", columns=width, inner=heads, norm_behind="rms")
+    yield replace(usual, name="prefix gate, up", operation="geglu", columns=g.mlp_dim, out_fp8=fp8)
+    yield replace(usual, name="prefix down", operation="parts", columns=width, inner=g.mlp_dim, norm_behind="rms")
+
+
+def _expert(
+    config: ModelConfig, call: Call, precision: Precision, kernels: Kernels, steps: int, tokens: int
+) -> Iterator[Operation]:
+    """Of a batch, whose denoising is operations."""
+    g, fp8, rows = config.expert, precision == "fp8", call.batch * tokens
+    heads, width, uses = g.num_heads * g.head_dim, g.width, g.depth * steps
+    usual = Operation("", kernels, "plain", precision, rows, heads + 2 * g.head_dim, width, uses, batch=call.batch)
+    yield replace(usual, name="expert qkv")
+    attention = replace(usual, kernels="portable", operation="suffix_attention", numbers="bf16", out_fp8=fp8)
+    prefix = call.cameras * config.vision.num_tokens + call.prompt_tokens
+    yield replace(attention, name="expert attention", columns=g.num_heads, inner=g.head_dim, prefix_rows=prefix)
+    yield replace(usual, name="expert out", operation="parts", columns=width, inner=heads, norm_behind="rms")
+    yield replace(usual, name="expert gate, up", operation="geglu", columns=g.mlp_dim, out_fp8=fp8)
+    yield replace(usual, name="expert down", operation="parts", columns=width, inner=g.mlp_dim, norm_behind="rms")

@@ -1,0 +1,84 @@
+"""The tuner on a GPU: small operations of every kind, really compiled, checked and timed."""
+
+from dataclasses import replace
+from typing import Literal
+
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="Triton isn't installed")
+
+from conftest import on_hopper
+
+from turbopi.config import preset
+from turbopi.kernels.portable.gemm.tiles import fp8_refusal
+from turbopi.kernels.tile_table import Numbers
+from turbopi.tune import hopper, portable
+from turbopi.tune.gpu import steadiness
+from turbopi.tune.plan import bench_maker
+from turbopi.tune.race import Raced, race
+from turbopi.tune.shapes import Call, Operation, Precision, operations
+
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")]
+DEVICE = torch.device("cuda", 0)
+FEW = 6  # candidates of each
+
+
+def raced(one: Operation) -> Raced:
+    properties = torch.cuda.get_device_properties(DEVICE)
+    sms = properties.multi_processor_count
+    if one.kernels == "hopper":
+        candidates = hopper.candidates(one, sms)
+    else:
+        candidates = portable.candidates(one, (properties.major, properties.minor), sms)
+    return race(bench_maker(DEVICE)(one), candidates[:FEW])
+
+
+def check(one: Operation) -> None:
+    found = raced(one)
+    assert not [why for why in found.refused.values() if why.startswith("its ")], "no result of ours is wrong"
+    assert 0 < found.best.microseconds <= found.usual.microseconds < 1e4 and found.timed > 1
+
+
+@pytest.mark.parametrize("kind", ["vision_attention", "prefix_attention", "packed_attention", "suffix_attention"])
+@pytest.mark.parametrize("out_fp8", [False, True])
+def test_portable_attention(kind: str, out_fp8: bool) -> None:
+    if out_fp8 and fp8_refusal(torch.cuda.get_device_capability(DEVICE)):
+        pytest.skip("has no FP8")
+    rows, heads, dim = (512, 16, 72) if kind == "vision_attention" else (512, 8, 256)
+    one = Operation(kind, "portable", kind, "bf16", rows, heads, dim, 1, out_fp8=out_fp8, images=2, batch=2)
+    if kind == "suffix_attention":
+        one = Operation(kind, "portable", kind, "bf16", 20, heads, dim, 1, out_fp8=out_fp8, batch=2, prefix_rows=560)
+    found = raced(one)
+    assert not [why for why in found.refused.values() if why.startswith("its ")]
+    assert 0 < found.best.microseconds <= found.usual.microseconds
+
+
+@pytest.mark.parametrize(
+    ("operation", "numbers", "norm"),
+    [
+        *(("geglu", "bf16", None), ("plain", "fp8", None), ("gelu", "fp8", None), ("geglu", "fp8", None)),
+        *(("parts", "fp8", "rms"), ("parts", "fp8", "layer")),
+    ],
+)
+def test_portable_products(operation: str, numbers: Numbers, norm: Literal["rms", "layer"] | None) -> None:
+    if numbers == "fp8" and fp8_refusal(torch.cuda.get_device_capability(DEVICE)):
+        pytest.skip("has no FP8")
+    out_fp8, bias = numbers == "fp8" and operation in ("gelu", "geglu"), norm == "layer" or operation == "gelu"
+    usual = Operation(operation, "portable", operation, numbers, 500, 1024, 1152, 1, bias=bias, out_fp8=out_fp8)
+    check(replace(usual, norm_behind=norm))
+
+
+@on_hopper
+@pytest.mark.parametrize("batch", [1, 4])
+@pytest.mark.parametrize("precision", ["bf16", "fp8"])
+def test_hoppers_products(precision: Precision, batch: int) -> None:
+    found = operations(preset("pi05_libero").model, Call(1, 48, batch), precision, "hopper", horizon=10)
+    sms = torch.cuda.get_device_properties(DEVICE).multi_processor_count
+    for one in found:
+        if one.kernels == "hopper":
+            check(hopper.resolved(one, sms))
+
+
+def test_an_idle_gpu_is_steady() -> None:
+    assert all(taken > 0 for taken in steadiness(DEVICE))

@@ -1,1 +1,0 @@
-"""Times the tiles of the portable products."""
