@@ -63,7 +63,8 @@ class Recording:
     def __call__(self, job: Job, step: int, observation: dict[str, object], seed: int, answer: Answer) -> None:
         size = sum(value.nbytes for value in observation.values() if isinstance(value, np.ndarray))
         where = {"task": job.task.index, "initial_state": job.initial_state, "step": step, "seed": str(seed)}
-        self._recorder.put(observation, {"actions": answer.actions, "episode": where}, size=size)
+        timing = {} if answer.infer_ms is None else {"policy_timing": {"infer_ms": answer.infer_ms}}
+        self._recorder.put(observation, {"actions": answer.actions, **timing, "episode": where}, size=size)
 
     def close(self) -> str:
         """Write what waits. Returns what to tell."""

@@ -104,17 +104,20 @@ class Drawing:
             return "/".join(_escaped(_path(call, *parts)))
 
         groups = [] if call.actions is None else action_groups(self._robot, call.actions.shape[1])
+        for key, values in call.numbers.items():
+            self._stream.log(_path(call, "state", key), rr.SeriesLines(colors=_colors(len(values))), static=True)
         if self._rate is not None:
             for group in groups:
-                names = rr.SeriesLines(names=list(group.names.values()))
-                self._stream.log(_path(call, "executed", group.title), names, static=True)
+                lines = rr.SeriesLines(names=list(group.names.values()), colors=_colors(len(group.names)))
+                self._stream.log(_path(call, "executed", group.title), lines, static=True)
         cameras = [rrb.Spatial2DView(origin=origin("cameras", camera), name=camera) for camera in call.pictures]
         bounds = rrb.VisualBounds2D(x_range=(0, WIDTH), y_range=(-0.05 * HEIGHT, 1.05 * HEIGHT))
         drawn = [
             rrb.Spatial2DView(origin=origin("chunk", group.title), name=_title(group), visual_bounds=bounds)
             for group in groups
         ]
-        series = ["state", "latency", *(["executed"] if self._rate is not None else [])]
+        there = {"state": bool(call.numbers), "latency": bool(call.timing), "executed": self._rate is not None}
+        series = [name for name, any_of_it in there.items() if any_of_it]
         self._views[call.robot] = rrb.Vertical(
             rrb.Horizontal(rrb.TextDocumentView(origin=origin("prompt"), name="prompt"), *cameras),
             rrb.Horizontal(*drawn),
@@ -138,8 +141,10 @@ def _escaped(path: Sequence[object]) -> list[str]:
 
 
 def _title(group: ActionGroup) -> str:
-    low, high = group.limits or (None, None)
-    return f"{group.title}, {group.unit}" + ("" if low is None else f", {low:.3g} to {high:.3g}")
+    if group.limits is None:
+        return f"{group.title}, {group.unit}, from its least value to its greatest"
+    low, high = group.limits
+    return f"{group.title}, {group.unit}, {low:.3g} to {high:.3g}"
 
 
 def _drawn(group: ActionGroup, actions: np.ndarray) -> rr.LineStrips2D:
@@ -149,5 +154,10 @@ def _drawn(group: ActionGroup, actions: np.ndarray) -> rr.LineStrips2D:
     x = np.linspace(0, WIDTH, len(values))
     y = HEIGHT * (1 - (values - low) / max(high - low, 1e-9))
     strips = [np.column_stack([x, column]) for column in y.T]
-    colors = [COLORS[number % len(COLORS)] for number in range(len(strips))]
-    return rr.LineStrips2D(strips, colors=colors, labels=list(group.names.values()), show_labels=False)
+    names = list(group.names.values())
+    return rr.LineStrips2D(strips, colors=_colors(len(strips)), labels=names, show_labels=False)
+
+
+def _colors(count: int) -> list[tuple[int, int, int]]:
+    """Of so many dimensions: the same for a dimension wherever it is drawn."""
+    return [COLORS[number % len(COLORS)] for number in range(count)]
