@@ -20,7 +20,7 @@ from turbopi.errors import BackendUnavailable
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.observation import Observation
-from turbopi.quantization.fp8 import Fp8Matrix, Matrix
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix
 from turbopi.quantization.sites import Site, sites
 from turbopi.verify.check_golden import golden_calibration
 
@@ -145,7 +145,7 @@ def test_batches_denoise_by_operations_in_the_kernels_precision() -> None:
     for i, (ours, bf16) in enumerate(zip(expert, backend._weights.expert, strict=True)):
         for kind in ("qkv", "out", "gate_up", "down"):
             made, was, scale = getattr(ours, kind), getattr(bf16, kind), backend._plan.scales[f"expert.{i}.{kind}"]
-            assert isinstance(made, Fp8Matrix) and made.inverse == 1 / scale
+            assert isinstance(made, ScaledMatrix) and made.inverse == 1 / scale
             assert float((made.dequantized() - was).norm() / was.norm()) < 0.05
     assert backend._batch_weights().expert is expert
 

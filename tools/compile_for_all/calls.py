@@ -12,7 +12,7 @@ from turbopi.kernels.interface import SOURCE, Segments
 from turbopi.kernels.portable import activations, attention, backward, batch, embedding, norms, resize, rope, rounding
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
-from turbopi.quantization.fp8 import E4M3, Fp8Matrix
+from turbopi.quantization.fp8 import E4M3, ScaledMatrix
 
 BF16, F32 = torch.bfloat16, torch.float32
 Calls = list[Callable[[], Any]]
@@ -68,7 +68,7 @@ def _product(
     fp8: bool, epilogue: tiles.Epilogue, m: int, n: int, k: int, bias: bool, out_fp8: bool, tile: tiles.Tile | None
 ) -> Tensor:
     rows = 2 * n if epilogue == "geglu" else n
-    weight = Fp8Matrix(of(rows, k, dtype=E4M3), of(rows, dtype=F32), 50.0, BF16) if fp8 else of(rows, k)
+    weight = ScaledMatrix(of(rows, k, dtype=E4M3), of(rows, dtype=F32), 50.0, BF16) if fp8 else of(rows, k)
     x = of(m, k, dtype=E4M3 if fp8 else BF16)
     return product(x, weight, epilogue, of(n) if bias else None, inverse=30.0 if out_fp8 else None, tile=tile)
 

@@ -17,7 +17,7 @@ from turbopi.kernels.portable import activations
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import gpu, product
 from turbopi.kernels.portable.quantize import quantize
-from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix, to_e4m3
 
 DEVICE = torch.device("cuda", 0)
 STREAMED = 120e6  # bytes of a weight's copies that take turns, so that none is found in the L2 cache, as in a call
@@ -80,7 +80,7 @@ class Operands:
 
     def sums(self, given: Product) -> Tensor:
         first = self.weights[0]
-        sums = first.product(self.x, self.bias) if isinstance(first, Fp8Matrix) else self.x.float() @ first.float().T
+        sums = first.product(self.x, self.bias) if isinstance(first, ScaledMatrix) else self.x.float() @ first.float().T
         if given.epilogue == "gelu":
             return plain.gelu(sums)
         return plain.geglu(sums) if given.epilogue == "geglu" else sums
@@ -130,7 +130,7 @@ def timed(given: Product, workers: int) -> TimedProduct:
 
 def by_library(given: Product, operands: Operands, weight: Matrix) -> Callable[[], Tensor] | None:
     """The same by cuBLAS and, where its epilogue can't, a kernel of PyTorch or of ours behind it."""
-    if not isinstance(weight, Fp8Matrix):
+    if not isinstance(weight, ScaledMatrix):
         return lambda: activations.geglu(F.linear(operands.x, weight))
     scale = torch.ones(given.rows, 1, device=DEVICE)
     fast = not tiles.promotes(gpu(DEVICE)[0], given.inner)

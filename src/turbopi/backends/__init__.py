@@ -87,6 +87,12 @@ _SPECS = (
         "the reference with a calibration's FP8 roundings, exact and slow, to judge FP8 by: any device",
     ),
     BackendSpec(
+        "emulated_int8",
+        "turbopi.backends.emulated_fp8",
+        "EmulatedInt8Backend",
+        "the reference with a calibration's INT8 roundings, exact and slow, to judge INT8 by: any device",
+    ),
+    BackendSpec(
         "onnx",
         "turbopi.backends.onnx",
         "OnnxBackend",

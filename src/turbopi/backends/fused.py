@@ -27,7 +27,7 @@ from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization.calibration_file import Quantization, check_given
 from turbopi.quantization.fp8 import Directions, Matrix
-from turbopi.quantization.plan import TIERS
+from turbopi.quantization.plan import FP8_TIERS, TIERS
 from turbopi.quantization.sites import KINDS
 from turbopi.toolchain import missing_for_c
 
@@ -50,8 +50,8 @@ class FusedBackend(CudaGraphBackend):
     batch_costs: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.2, 8: 5.4, 16: 10.6}
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
-    _fp8_expert: list[Any] | None = None  # layers with `Fp8Matrix`, of batches
-    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
+    _fp8_expert: list[Any] | None = None  # layers with `ScaledMatrix`, of batches
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *FP8_TIERS)
 
     def __init__(
         self,
@@ -232,8 +232,8 @@ class FusedBackend(CudaGraphBackend):
         from turbopi.kernels.portable.denoise.kernel import MAX_SUFFIX, PortableDenoiser, unavailable
         from turbopi.kernels.portable.denoise.packing import PackedExpert, refusal
 
-        in_fp8 = self._expert_inputs() is not None
-        table = self._covered(unavailable(self.device, in_fp8) or refusal(self.config), loop, MAX_SUFFIX, table)
+        weights = "bf16" if self._plan is None else self._plan.expert
+        table = self._covered(unavailable(self.device, weights) or refusal(self.config), loop, MAX_SUFFIX, table)
         if loop.form != "plain":
             raise BackendUnavailable("the portable denoising kernel has one time for all actions")
         return PortableDenoiser(

@@ -31,7 +31,7 @@ def hopper_kernels(device: torch.device) -> bool:
 
 
 def fused_ops(device: torch.device) -> Ops:
-    """Activations are bfloat16; with an `Fp8Matrix` (from compute capability 8.9) E4M3 between it and the operation
+    """Activations are bfloat16; with a `ScaledMatrix` (from compute capability 8.9) E4M3 between it and the operation
     before it. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor "portable".
     """
     if not hopper_kernels(device):

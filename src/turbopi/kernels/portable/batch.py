@@ -12,7 +12,9 @@ from torch import Tensor
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 from turbopi.kernels.interface import BatchOps, Segments
 from turbopi.kernels.portable.attention import LOG2_E
+from turbopi.kernels.portable.rounding import as_stored
 from turbopi.kernels.portable.shared_memory import roomy
+from turbopi.quantization.fp8 import E4M3
 
 # Keys at a time, warps, stages; queries: as `Segments.tiles` says. The second one of each pair: for less shared memory.
 PACKED_TILE, NARROW_PACKED_TILE = (64, 8, 2), (32, 8, 2)
@@ -85,17 +87,23 @@ def _packed_kernel(
             acc, top, total = _keys(queries, k, v, at, loaded, valid[None, :], acc, top, total, scale)
         if SCALED:
             total /= inverse
-        tl.store(out + m[:, None] * DIM + d[None, :], (acc / total[:, None]).to(out.dtype.element_ty), inside)
+        tl.store(out + m[:, None] * DIM + d[None, :], as_stored(acc / total[:, None], out), inside)
 
 
 def packed_attention(
-    q: Tensor, k: Tensor, v: Tensor, segments: Segments, heads: int, inverse: float | None = None
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    segments: Segments,
+    heads: int,
+    inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
 ) -> Tensor:
-    """See `kernels.plain_batch.packed_attention`. With `inverse` the result leaves as E4M3."""
+    """See `kernels.plain_batch.packed_attention`. With `inverse` the result leaves as `numbers`, E4M3 or int8."""
     assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
-    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse, numbers))
     block_n, warps, stages = PACKED_TILE if roomy(q) else NARROW_PACKED_TILE
     _packed_kernel[(len(segments.tiles),)](
         q, k, v, segments.tiles, out, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim,

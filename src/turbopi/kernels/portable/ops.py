@@ -1,4 +1,5 @@
-"""The engine's operations for any NVIDIA GPU: Triton's kernels between cuBLAS's products; FP8 products are Triton's."""
+"""The engine's operations for any NVIDIA GPU: Triton's kernels between cuBLAS's products; FP8 and INT8
+products are Triton's."""
 
 from typing import Any
 
@@ -9,6 +10,7 @@ from torch import Tensor
 from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.portable import attention, backward, batch, embedding, norms, products, resize, rope
+from turbopi.quantization.fp8 import E4M3
 
 GEGLU_ORIGIN = "Triton, in its product's epilogue" if products.BF16_GEGLU_IN_EPILOGUE else "Triton behind cuBLAS"
 
@@ -32,6 +34,7 @@ def portable_ops() -> Ops:
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
             "FP8 products": "Triton, with bias, GELU, GeGLU and rounding in the epilogue",
+            "INT8 products": "Triton, the same",
             "vision products": "cuBLAS",
             "GeGLU of the prefix": GEGLU_ORIGIN,
             "product behind the prefix's GeGLU": "cuBLAS",
@@ -70,8 +73,9 @@ def attend(
     heads: int,
     *state_token: Any,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
 ) -> Tensor:
     if k.shape[0] == slots:  # no suffix behind the prefix
-        return attention.prefix_attention(q, k, v, length, heads, inverse)
+        return attention.prefix_attention(q, k, v, length, heads, inverse, numbers)
     assert inverse is None, "the suffix's activations stay as they are"
     return plain.attention(q, k, v, length, slots, heads, *state_token, softmax=attention.masked_softmax)

@@ -12,7 +12,7 @@ from turbopi.kernels.portable.shared_memory import BLOCK_SHARED, LEAST_SHARED
 Epilogue = Literal["plain", "gelu", "geglu", "parts"]
 Capability = tuple[int, int]
 
-STEP_BYTES = 128  # of a row along the inner axis in one step: 128 E4M3 or 64 bfloat16
+STEP_BYTES = 128  # of a row along the inner axis in one step: 128 E4M3 or int8, or 64 bfloat16
 SPLITS = (1, 2, 3, 4)
 UNPROMOTED = 2176  # longest sum of E4M3 products that stays in the tensor cores, as in sm90/gemm/fp8.py
 
@@ -52,8 +52,8 @@ TILES = (
 BARRIERS = 128  # bytes beside the operands
 WIDE = 64  # sums a thread: with more, those that are promoted spill, and so do mma.sync's GeGLU and tcgen05's others
 
-# Measured tiles, made by `python -m product_tiles`: (capability, E4M3?, epilogue, rows rounded up to 64, out, in) ->
-# tile; of "geglu", out is the hidden width.
+# Measured tiles, made by `python -m product_tiles`: (capability, E4M3 or int8?, epilogue, rows rounded up to 64, out,
+# in) -> tile; of "geglu", out is the hidden width.
 Shape = tuple[Capability, bool, Epilogue, int, int, int]
 MEASURED: dict[Shape, Tile] = {}
 
@@ -76,11 +76,11 @@ def promotes(capability: Capability, inner: int) -> bool:
     Tensor cores of 8.9 and 9.0 keep some 14 bits of a running sum. Those of 10.x and 11.0 keep float32. 12.x is taken
     for an 8.9 until somebody measures it.
     """
-    return inner > UNPROMOTED and capability[0] not in (10, 11)
+    return inner > UNPROMOTED and capability >= (8, 9) and capability[0] not in (10, 11)
 
 
 def candidates(capability: Capability, fp8: bool, epilogue: Epilogue, inner: int) -> list[Tile]:
-    """All tiles that this GPU takes."""
+    """All tiles that this GPU takes. fp8: of numbers of eight bits, INT8 too where the GPU has no FP8."""
     promoted = fp8 and promotes(capability, inner)
     fitting = [tile for tile in TILES if tile.takes(capability, epilogue, promoted)]
     if epilogue != "parts":

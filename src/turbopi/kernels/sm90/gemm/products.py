@@ -9,7 +9,7 @@ from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
 from turbopi.kernels.sm90.gemm.bf16 import DEPTH, SPLIT, Epilogue, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import best_tile, matmul_fp8
 from turbopi.kernels.sm90.gemm.tiles import FEW_GEGLU_TILES, FEW_TILES, GEGLU_TILES, PARTS_TILES, VISION_TILES
-from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix, to_e4m3
 
 GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
 
@@ -19,7 +19,7 @@ def vision_tile(x: Tensor, weight: Tensor) -> Tile | None:
 
 
 def tuned_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
-    if isinstance(weight, Fp8Matrix):
+    if isinstance(weight, ScaledMatrix):
         return _fp8(x, weight, "plain" if bias is None else "bias", bias, out)
     if bias is None and (few := FEW_TILES.get(_in_whole_64(x, weight))) is not None:
         return matmul(x, weight, few, "plain", out=out)
@@ -35,7 +35,7 @@ def _in_whole_64(x: Tensor, weight: Tensor) -> tuple[int, int, int]:
 
 def tuned_residual_linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, ahead: Tensor | None = None) -> Tensor:
     """The product, or parts of it that the norms add up."""
-    if isinstance(weight, Fp8Matrix):
+    if isinstance(weight, ScaledMatrix):
         return _fp8(x, weight, "parts" if bias is None else "partial", bias, ahead=ahead)
     if bias is None:
         cut = PARTS_TILES.get(_in_whole_64(x, weight))
@@ -58,7 +58,7 @@ def parts_at_once(x: Tensor, weight: Tensor, count: int) -> Tensor:
 def tuned_linear_gelu(
     x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None, ahead: Tensor | None = None
 ) -> Tensor:
-    if isinstance(weight, Fp8Matrix):
+    if isinstance(weight, ScaledMatrix):
         return _fp8(x, weight, "gelu", bias, inverse=inverse, ahead=ahead)
     tile = vision_tile(x, weight)
     result = linear_gelu(x, weight, bias) if tile is None else matmul(x, weight, tile, "gelu", bias, ahead=ahead)
@@ -66,7 +66,7 @@ def tuned_linear_gelu(
 
 
 def tuned_linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None) -> Tensor:
-    if isinstance(gate_up, Fp8Matrix):
+    if isinstance(gate_up, ScaledMatrix):
         return _fp8(x, gate_up, "geglu", inverse=inverse)
     tile = _geglu_tile(x.shape[0], gate_up.shape[0] // 2, x.shape[1], x.device)
     return as_input(linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu"), inverse)
@@ -79,7 +79,7 @@ def as_input(x: Tensor, inverse: float | None) -> Tensor:
 
 def _fp8(
     x: Tensor,
-    weight: Fp8Matrix,
+    weight: ScaledMatrix,
     epilogue: Epilogue,
     bias: Tensor | None = None,
     out: Tensor | None = None,

@@ -17,7 +17,7 @@ from turbopi.kernels.sm90.gemm.products import (
     vision_tile,
 )
 from turbopi.kernels.sm90.gemm.tiles import RESIDUAL_TILES, RESIDUAL_TILES_FP8
-from turbopi.quantization.fp8 import E4M3, Fp8Matrix, Matrix
+from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class VisionProducts:
         self._last: Tensor | None = None
 
     def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
-        tiles = RESIDUAL_TILES_FP8 if isinstance(weight, Fp8Matrix) else RESIDUAL_TILES
+        tiles = RESIDUAL_TILES_FP8 if isinstance(weight, ScaledMatrix) else RESIDUAL_TILES
         tile = tiles.get((x.shape[0], weight.shape[0], weight.shape[1]))
         if tile is None or bias is None or num_sms(x.device) < GATHERING_SMS:
             return tuned_residual_linear(x, weight, bias)
@@ -92,7 +92,7 @@ class VisionProducts:
             copy = Copy(
                 torch.empty_like(x, dtype=E4M3), before.sums, *self._for_copies(weight, bias, inverse), eps, plain
             )
-        if isinstance(y.weight, Fp8Matrix):
+        if isinstance(y.weight, ScaledMatrix):
             x = matmul_fp8(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, copy=copy, ahead=ahead)
         else:
             x = matmul(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, copy=copy, ahead=ahead)
@@ -129,7 +129,7 @@ class VisionProducts:
         self, x: Normed, weight: Matrix, bias: Tensor | None, epilogue: Epilogue, out: Tensor | None = None
     ) -> Tensor | None:
         if (
-            isinstance(weight, Fp8Matrix)
+            isinstance(weight, ScaledMatrix)
             or bias is None
             or (tile := vision_tile(x.x, weight)) is None
             or tile.splits > 1
@@ -161,7 +161,7 @@ class VisionProducts:
         out: Tensor | None = None,
         inverse: float | None = None,
     ) -> Tensor:
-        assert isinstance(weight, Fp8Matrix), "only such a matrix's input is asked for in E4M3"
+        assert isinstance(weight, ScaledMatrix), "only such a matrix's input is asked for in E4M3"
         key = weight.data.data_ptr()
         if key not in self._folded_fp8:
             self._folded_fp8[key] = FoldedFp8.fold(weight, x.scale, x.shift)
@@ -172,7 +172,7 @@ class VisionProducts:
 
     def _next(self, matrix: Matrix) -> Tensor | None:
         """What may be fetched into L2 during a product: the matrix that came behind this one last time."""
-        data = matrix.data if isinstance(matrix, Fp8Matrix) else matrix
+        data = matrix.data if isinstance(matrix, ScaledMatrix) else matrix
         if self._last is not None:
             self._behind[self._last.data_ptr()] = data
         self._last = data
