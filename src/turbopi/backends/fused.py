@@ -26,8 +26,9 @@ from turbopi.errors import BackendUnavailable, DeviceLost
 from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization.calibration_file import Quantization, check_given
+from turbopi.quantization.formats import INT8
 from turbopi.quantization.fp8 import Directions, Matrix
-from turbopi.quantization.plan import FP8_TIERS, TIERS
+from turbopi.quantization.plan import TIERS
 from turbopi.quantization.sites import KINDS
 from turbopi.toolchain import missing_for_c
 
@@ -42,7 +43,7 @@ class Watched(Protocol):
 
 
 class FusedBackend(CudaGraphBackend):
-    """As `cuda_graph`, in bfloat16 or, as a calibration says, partly in FP8; `describe()` says what runs where."""
+    """As `cuda_graph`, in bfloat16 or, as a calibration says, partly in FP8 or INT8: `describe()` says what runs."""
 
     name: ClassVar[str] = "fused"
     # measured on an H200 with two cameras in bfloat16: benchmarks/results/h200_2026-11-24_batches.json, of 2 see
@@ -51,7 +52,7 @@ class FusedBackend(CudaGraphBackend):
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
     _fp8_expert: list[Any] | None = None  # layers with `ScaledMatrix`, of batches
-    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *FP8_TIERS)
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
 
     def __init__(
         self,
@@ -88,24 +89,33 @@ class FusedBackend(CudaGraphBackend):
     @classmethod
     def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
         """Why this precision, besides the backend, can't run on a GPU that the backend runs on; or None."""
-        if precision not in TIERS:
+        if precision not in TIERS or importlib.util.find_spec("triton") is None:  # which `unavailable` tells
             return None
-        from turbopi.kernels.portable.gemm.tiles import fp8_refusal
+        from turbopi.kernels.ops import forced_portable
+        from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
 
-        reason = fp8_refusal(torch.cuda.get_device_capability(device))
-        return None if reason is None else f"{reason}; use 'bf16'"
+        capability = torch.cuda.get_device_capability(device)
+        if precision == "int8":
+            reason = int8_refusal(capability)
+            measured_here = capability == (9, 0) and forced_portable()
+            return None if reason is None or measured_here else f"{reason}; use 'fp8'"
+        reason = fp8_refusal(capability)
+        return None if reason is None else f"{reason}; use 'bf16', or 'int8'"
 
     def describe(self) -> dict[str, Any]:
         described = super().describe()
         if self._plan is not None and self._quantization is not None:
-            described["fp8"] = self._quantization.describe(self._plan)
-            expert, plan = self._expert_precision(), described["fp8"]["plan"]
+            numbers = self._plan.format.name
+            described[numbers] = self._quantization.describe(self._plan)
+            expert, plan = self._expert_precision(), described[numbers]["plan"]
             for name, what in plan.items():
-                if name.startswith("expert.") and what == "fp8" and not expert.startswith("fp8"):
+                if name.startswith("expert.") and what == numbers and not expert.startswith(numbers):
                     plan[name] = expert  # its kernel takes one precision
             plan["expert"] = expert
             if self._fp8_expert is not None:
-                plan["expert of batches"] = "fp8"
+                plan["expert of batches"] = numbers
+            elif self._batches_denoise_in_bf16 and self._plan.expert != "bf16":
+                plan["expert of batches"] = "bf16, as operations denoise"
 
         by_kernel = sorted({str(loop) for loop, _ in list(self._denoisers)})
         by_operations: dict[str, list[str]] = {}
@@ -130,7 +140,7 @@ class FusedBackend(CudaGraphBackend):
         def make(place: str, matrix: Tensor) -> Matrix:
             if place not in scales:
                 return matrix
-            return quantize(matrix, scales[place], self._directions.get(place))
+            return self._quantized(place, matrix)
 
         return pack(self.config, load(self.device, "bf16"), make)
 
@@ -139,7 +149,7 @@ class FusedBackend(CudaGraphBackend):
         return {} if self._plan is None else self._plan.directions
 
     def _expert_inputs(self) -> Mapping[str, float] | None:
-        """The scales of the expert's activations where the denoising kernel is to run in FP8."""
+        """The scales of the expert's activations where the denoising kernel is to run in FP8 or with INT8 weights."""
         return None if self._plan is None or self._plan.expert == "bf16" else self._plan.scales
 
     def _expert_precision(self) -> str:
@@ -148,11 +158,12 @@ class FusedBackend(CudaGraphBackend):
             kept = {} if self._plan is None else self._plan.kept
             why = next((reason for site, reason in kept.items() if site.startswith("expert.")), "it isn't planned")
             return f"bf16, all of it, as its kernel takes one precision; {why}"
+        numbers = self._plan.expert
         if not self._refused:
-            return "fp8"
+            return numbers
         if not self._denoisers:
             return "bf16, as operations denoise"
-        return "fp8 in the denoising kernel; bf16 where operations denoise"
+        return f"{numbers} in the denoising kernel; bf16 where operations denoise"
 
     def _make_ops(self) -> Ops:
         from turbopi.kernels.ops import fused_ops, hopper_kernels  # Triton isn't imported for other backends
@@ -178,9 +189,8 @@ class FusedBackend(CudaGraphBackend):
         return None
 
     def _batch_weights(self) -> Weights:
-        """Operations denoise batches, in the precision of the denoising kernel."""
-        inputs = self._expert_inputs()
-        if inputs is None:
+        """Operations denoise batches: where the denoising kernel runs in FP8, they do, else in bfloat16."""
+        if self._plan is None or self._plan.expert != "fp8":
             self._batches_denoise_in_bf16 = True
             self._keep_expert_on(self.device)
             return self._weights
@@ -196,7 +206,9 @@ class FusedBackend(CudaGraphBackend):
         return replace(self._weights, expert=self._fp8_expert)
 
     def _quantized(self, place: str, matrix: Tensor) -> Matrix:
-        return quantize(matrix, self._plan.scales[place], self._directions.get(place)) if self._plan else matrix
+        if self._plan is None:
+            return matrix
+        return quantize(matrix, self._plan.scales[place], self._directions.get(place), self._plan.format)
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
@@ -257,8 +269,13 @@ class FusedBackend(CudaGraphBackend):
         """The expert's matrices as a denoising kernel has them."""
         if self._packed_expert is None:
             self._keep_expert_on(self.device)
+            int8 = self._plan is not None and self._plan.expert == "int8"  # which the portable kernel alone has
             self._packed_expert = kind.pack(
-                self.config, self._weights.expert, inputs=self._expert_inputs(), directions=self._directions
+                self.config,
+                self._weights.expert,
+                inputs=self._expert_inputs(),
+                directions=self._directions,
+                **({"format": INT8} if int8 else {}),
             )
         return self._packed_expert
 

@@ -70,6 +70,13 @@ def fp8_refusal(capability: Capability) -> str | None:
     return f"tensor cores multiply E4M3 from compute capability 8.9 on; this GPU has {capability[0]}.{capability[1]}"
 
 
+def int8_refusal(capability: Capability) -> str | None:
+    """Why INT8 isn't for this GPU; None if it is."""
+    if capability < (8, 9):
+        return None
+    return f"INT8 is for GPUs without FP8, up to compute capability 8.7; this GPU has {capability[0]}.{capability[1]}"
+
+
 def promotes(capability: Capability, inner: int) -> bool:
     """Whether sums over `inner` E4M3 products are added up in float32 after each step.
 
