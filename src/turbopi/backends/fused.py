@@ -135,14 +135,7 @@ class FusedBackend(CudaGraphBackend):
         return described
 
     def _pack(self, load: LoadState) -> Weights:
-        scales = {} if self._plan is None else self._plan.scales
-
-        def make(place: str, matrix: Tensor) -> Matrix:
-            if place not in scales:
-                return matrix
-            return self._quantized(place, matrix)
-
-        return pack(self.config, load(self.device, "bf16"), make)
+        return pack(self.config, load(self.device, "bf16"), self._quantized)
 
     @property
     def _directions(self) -> Mapping[str, Directions]:
@@ -206,7 +199,7 @@ class FusedBackend(CudaGraphBackend):
         return replace(self._weights, expert=self._fp8_expert)
 
     def _quantized(self, place: str, matrix: Tensor) -> Matrix:
-        if self._plan is None:
+        if self._plan is None or place not in self._plan.scales:
             return matrix
         return quantize(matrix, self._plan.scales[place], self._directions.get(place), self._plan.format)
 
