@@ -170,6 +170,7 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
     backend._weights = pack(backend.config, state, backend._quantized)
     assert {layer.qkv.numbers for layer in backend._weights.vlm} == {torch.int8}  # type: ignore[union-attr]
     backend._calls, backend._ops, backend._denoisers, backend._refused = {}, PLAIN, {}, {}
+    backend._packed_expert = None
     backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
     backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
     told = backend.describe()["int8"]["plan"]

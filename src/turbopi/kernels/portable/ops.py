@@ -33,8 +33,7 @@ def portable_ops() -> Ops:
         batch=batch.BATCH,
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
-            "FP8 products": "Triton, with bias, GELU, GeGLU and rounding in the epilogue",
-            "INT8 products": "Triton, the same",
+            "FP8 products": "Triton, with bias, GELU, GeGLU and rounding in the epilogue, and so INT8's",
             "vision products": "cuBLAS",
             "GeGLU of the prefix": GEGLU_ORIGIN,
             "product behind the prefix's GeGLU": "cuBLAS",
