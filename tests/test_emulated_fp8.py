@@ -88,8 +88,8 @@ def test_in_int8_the_experts_activations_stay_and_products_err_less_than_in_fp8(
     entries = {numbers: calibrated("pi05", numbers).sites for numbers in FORMATS}
     experts = [entry for name, entry in entries["int8"].items() if name.startswith("expert.")]
     assert {entry.scale for entry in experts} == {1.0} and {entry.saturated for entry in experts} == {0.0}
-    for name, site in entries["int8"].items():
-        assert site.error < (0.2 if name.startswith("expert.") else 0.9) * entries["fp8"][name].error, name
+    for name, entry in entries["int8"].items():
+        assert entry.error < (0.2 if name.startswith("expert.") else 0.9) * entries["fp8"][name].error, name
     model, site = golden_model("pi05"), next(s for s in sites(golden_model("pi05").config) if s.part == "expert")
     x = torch.randn(3, site.width, generator=torch.Generator().manual_seed(0))
     assert torch.equal(input_rounding(site, 0.1, INT8)(x), x)

@@ -31,8 +31,8 @@ def hopper_kernels(device: torch.device) -> bool:
 
 
 def fused_ops(device: torch.device) -> Ops:
-    """Activations are bfloat16; with a `ScaledMatrix` (from compute capability 8.9) E4M3 between it and the operation
-    before it. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor "portable".
+    """Activations are bfloat16; between a `ScaledMatrix` and the operation before it E4M3 (from compute capability 8.9)
+    or int8. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor "portable".
     """
     if not hopper_kernels(device):
         return portable_ops()
