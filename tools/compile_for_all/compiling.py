@@ -28,7 +28,7 @@ from turbopi.errors import BackendError
 from turbopi.kernels import portable
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise.packing import WeightNumbers
-from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
+from turbopi.kernels.portable.gemm.tiles import fp8_refusal
 
 HOPPER = (9, 0)
 
@@ -42,8 +42,6 @@ def compile_target(target: Target, only: str = "", chosen: bool = False) -> list
             rows.append(compiled_cuda(target, name, make))
     if (why := fp8_refusal(target.capability)) is not None and only in "gemm.kernel.product":
         rows.append(Compiled("gemm.kernel.product, FP8", "", target.arch, refused=why))
-    if (why := int8_refusal(target.capability)) is not None and only in "gemm.kernel.product":
-        rows.append(Compiled("gemm.kernel.product, INT8", "", target.arch, refused=why))
     return rows
 
 
