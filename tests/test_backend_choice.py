@@ -1,5 +1,7 @@
 """What "auto" stands for, and that it says why."""
 
+import re
+
 import pytest
 import torch
 
@@ -77,3 +79,33 @@ def test_fp8_names_what_is_truly_missing(
     with pytest.raises(BackendUnavailable) as refused:
         backends.check("fused", GPU, "fp8")
     assert says in str(refused.value) and doesnt_say not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("capability", "kernels", "reason"),
+    [
+        *(((8, minor), "auto", None) for minor in (0, 6, 7)),
+        ((8, 9), "auto", "up to compute capability 8.7; this GPU has 8.9; use 'fp8'"),
+        ((9, 0), "auto", "this GPU has 9.0; use 'fp8'"),
+        ((9, 0), "portable", None),  # to be measured there
+        ((12, 0), "portable", "this GPU has 12.0; use 'fp8'"),
+    ],
+)
+def test_int8_runs_where_fp8_does_not(
+    monkeypatch: pytest.MonkeyPatch, capability: tuple[int, int], kernels: str, reason: str | None
+) -> None:
+    monkeypatch.setenv("TURBOPI_KERNELS", kernels)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/gcc")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+    assert backends.choose(GPU, "int8")[0] == "fused"
+    if reason is None:
+        backends.check("fused", GPU, "int8")
+    else:
+        with pytest.raises(BackendUnavailable, match=re.escape(reason)):
+            backends.check("fused", GPU, "int8")
+
+
+def test_int8_on_a_cpu_names_the_emulation() -> None:
+    with pytest.raises(BackendUnavailable, match=r"compute capability 8\.0 to 8\.7; .* backend 'emulated_int8'"):
+        backends.check("fused", torch.device("cpu"), "int8")

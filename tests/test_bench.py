@@ -449,7 +449,7 @@ def test_a_run_that_is_ended_has_kept_what_it_measured(tmp_path: Path, monkeypat
         (["--precisions", "fp7"], "unknown precision 'fp7'"),
         (["--precisions", ""], "name a backend and a precision"),
         (["--backends", ","], "name a backend and a precision"),
-        (["--precisions", "bf16,fp8"], "fp8 needs an NVIDIA GPU of compute capability 9.0"),
+        (["--precisions", "bf16,fp8"], "fp8 needs an NVIDIA GPU of compute capability 8.9 or newer"),
         (["--backends", "pytorch", "--precisions", "bf16,fp8"], "none of pytorch runs in fp8"),
         (["--quantization", "x.json"], "a calibration was given, but none of the precisions"),
         (["--report", __file__], "is a file"),

@@ -31,7 +31,8 @@ from turbopi.model.sites import linears
 from turbopi.observation import ModelInputs
 from turbopi.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import VERSION, Quantization, SiteScale, shapes_of
-from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Directions, to_e4m3
+from turbopi.quantization.formats import FORMATS, FP8, Format
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Directions
 from turbopi.quantization.sites import PARTS, sites
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.studies import formats
@@ -74,18 +75,20 @@ def test_a_site_of_odd_width_says_why_it_cannot() -> None:
     assert refusals["vision.0.qkv"] is None
 
 
-def histogram_of(x: torch.Tensor) -> Histogram:
+def histogram_of(x: torch.Tensor, format: Format = FP8) -> Histogram:
     bins = torch.bincount(x.abs().view(torch.int32) >> 16, minlength=0x8000)
-    return Histogram(bins[:0x7F80].double(), float(x.abs().max()))
+    return Histogram(bins[:0x7F80].double(), float(x.abs().max()), format)
 
 
+@pytest.mark.parametrize("format", FORMATS.values(), ids=FORMATS)
 @pytest.mark.parametrize("scale", [1.0, 0.01, 0.0037, 1e-3])
-def test_a_histogram_knows_the_error_of_rounding(scale: float) -> None:
+def test_a_histogram_knows_the_error_of_rounding(scale: float, format: Format) -> None:
     x = torch.randn(200_000, generator=torch.Generator().manual_seed(0))
-    exact = to_e4m3(x, 1 / scale).float() * scale
-    error, beyond = histogram_of(x).error(scale)
+    scale *= E4M3_MAX / format.largest
+    exact = format.held(x, scale)
+    error, beyond = histogram_of(x, format).error(scale)
     assert error == pytest.approx(float((exact - x).norm() / x.norm()), rel=0.03)
-    assert beyond == pytest.approx(float((x.abs() > E4M3_MAX * scale).float().mean()), abs=0.003)
+    assert beyond == pytest.approx(float((x.abs() > format.largest * scale).float().mean()), abs=0.003)
 
 
 def test_histograms_add_up() -> None:
@@ -366,11 +369,11 @@ def test_a_calibration_that_leaves_nothing_in_fp8_is_refused(tmp_path: Path) -> 
 def test_a_policy_finds_the_file_beside_its_weights(tmp_path: Path) -> None:
     checkpoint = dataclasses.replace(random_checkpoint("pi05_tiny"), path=tmp_path)
     assert for_policy(None, "bf16", checkpoint) is None
-    with pytest.raises(ConfigError, match="needs a calibration: run `turbopi calibrate`"):
+    with pytest.raises(ConfigError, match="needs a calibration: run `turbopi calibrate --precision fp8`"):
         for_policy(None, "fp8", checkpoint)
-    made_up().save(tmp_path / BESIDE)
+    made_up().save(tmp_path / BESIDE["fp8"])
     found = for_policy(None, "fp8", checkpoint)
-    assert found is not None and found.source == str(tmp_path / BESIDE)
+    assert found is not None and found.source == str(tmp_path / BESIDE["fp8"])
     with pytest.raises(CalibrationError, match="other weights"):
         for_policy(made_up(fingerprint="0" * 64), "fp8", checkpoint)
 
@@ -431,6 +434,31 @@ def test_files_of_versions_1_and_2_round_to_nearest_and_leave_the_expert_in_bf16
 # The plan
 
 
+def test_a_file_for_int8_says_so_and_one_for_fp8_is_read_by_older_turbo_pis(tmp_path: Path) -> None:
+    fp8, int8 = made_up(), made_up(numbers="int8")
+    assert fp8.as_json()["version"] == 3 and "numbers" not in fp8.as_json()
+    int8.save(tmp_path / "q.json")
+    read = Quantization.load(tmp_path / "q.json")
+    assert read == int8 and read.identity == int8.identity != fp8.identity
+    assert set(read.plan(TINY, "int8").describe().values()) == {"int8"} and read.plan(TINY, "int8").expert == "int8"
+    vision = read.only(["vision"]).plan(TINY, "int8")
+    assert vision.kept["prefix.0.qkv"] == "INT8 is switched off in the prefix" and vision.expert == "bf16"
+    for numbers in ("int4", 8):
+        (tmp_path / "q.json").write_text(json.dumps(int8.as_json() | {"numbers": numbers}))
+        with pytest.raises(CalibrationError, match=r"numbers .* should be one of fp8, int8"):
+            Quantization.load(tmp_path / "q.json")
+
+
+def test_each_precision_finds_its_own_file_beside_the_weights(tmp_path: Path) -> None:
+    checkpoint = dataclasses.replace(random_checkpoint("pi05_tiny"), path=tmp_path)
+    made_up().save(tmp_path / BESIDE["fp8"])
+    with pytest.raises(ConfigError, match=r"run `turbopi calibrate --precision int8` .* as turbopi_int8\.json beside"):
+        for_policy(None, "int8", checkpoint)
+    made_up(numbers="int8").save(tmp_path / BESIDE["int8"])
+    found = for_policy(None, "int8", checkpoint)
+    assert found is not None and found.numbers == "int8"
+
+
 def test_tiers_and_parts_choose_sites_and_say_why_not() -> None:
     whole = made_up().plan(TINY, "fp8")
     assert len(whole.scales) == len(sites(TINY)) and not whole.kept
@@ -447,7 +475,7 @@ def test_tiers_and_parts_choose_sites_and_say_why_not() -> None:
     assert vision.kept["prefix.0.qkv"] == "FP8 is switched off in the prefix"
     with pytest.raises(ConfigError, match="unknown part 'head'"):
         made_up().only(["head"])
-    with pytest.raises(ConfigError, match="is no FP8 tier"):
+    with pytest.raises(ConfigError, match="is no calibrated precision"):
         made_up().plan(TINY, "bf16")
 
 
@@ -488,9 +516,9 @@ def test_fp8_without_a_calibration_and_the_reverse_are_refused() -> None:
         raise AssertionError("nothing should be loaded")
 
     device = torch.device("cpu")
-    with pytest.raises(ConfigError, match="precision 'fp8' needs FP8 calibration"):
+    with pytest.raises(ConfigError, match="precision 'fp8' needs a calibration"):
         FusedBackend(TINY, load, device=device, precision="fp8")
-    with pytest.raises(ConfigError, match="precision 'bf16' takes no FP8 calibration"):
+    with pytest.raises(ConfigError, match="precision 'bf16' takes no calibration"):
         FusedBackend(TINY, load, device=device, precision="bf16", quantization=made_up())
 
 
@@ -641,8 +669,27 @@ def test_the_command_writes_a_file_that_this_checkpoint_alone_takes(tmp_path: Pa
         UnifiedPolicy(random_checkpoint("pi05_tiny"), **arguments)  # type: ignore[arg-type]
     with pytest.raises(CalibrationError, match="made for other weights"):
         UnifiedPolicy(random_checkpoint("pi05_tiny", 1), backend="emulated_fp8", **arguments)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="precision 'bf16' takes no FP8 calibration; with one take fp8 or fp8-mlp"):
+    with pytest.raises(ConfigError, match="precision 'bf16' takes no calibration; with one take fp8 or fp8-mlp or"):
         UnifiedPolicy(random_checkpoint("pi05_tiny"), **arguments | {"precision": "bf16"})  # type: ignore[arg-type]
+
+
+def test_the_command_calibrates_for_int8(tmp_path: Path) -> None:
+    out = tmp_path / "int8.json"
+    quick = ("--count", 2, "--steps", 1, "--device", "cpu", "--target", 0, "--json")
+    result = turbopi("calibrate", "--random-weights", "pi05_tiny", "--precision", "int8", "--out", out, *quick)
+    assert result.exit_code == 0, (result.output, result.exception)
+    held_out = json.loads(result.stdout)["report"]["held_out"]
+    assert set(held_out) == {
+        "int8",
+        *(f"int8 in the {part} alone" for part in PARTS),
+        "bf16",
+        "int8 against bf16",
+        "worst",
+    }
+    calibration = Quantization.load(out)
+    assert calibration.numbers == "int8" and not calibration.plan(TINY, "int8").kept
+    said = refusal(turbopi("calibrate", "--random-weights", "pi05_tiny", "--precision", "bf16", "--out", out, *quick))
+    assert "--precision 'bf16' isn't what calibration is for; choose fp8 or int8" in said
 
 
 def test_the_command_replaces_nothing_but_a_calibration(tmp_path: Path) -> None:
@@ -671,7 +718,7 @@ def test_a_certificate_tells_which_observations_were_calibrated_on(tmp_path: Pat
     plan = VerifyPlan(arguments | {"quantization": made_up(report=report)}, tmp_path, noises=1)
     document = verify(checkpoint, plan)
     assert document.observations.calibrated_on == 1
-    assert document.fp8 is not None and document.fp8["observations"] == "x"
+    assert document.calibrated is not None and document.calibrated["observations"] == "x"
 
 
 def test_held_out_observations_that_are_none_are_warned_of(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
-"""Backend `emulated_fp8`: a calibration's roundings in the float32 reference, behind the same doors as the engine."""
+"""Backends `emulated_fp8`, `emulated_int8`: a calibration's roundings in the float32 reference."""
 
 import json
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -11,12 +12,13 @@ from torch import Tensor
 
 from turbopi import backends
 from turbopi.config import Kind
-from turbopi.engine.emulate import RoundedWeights, rounded
+from turbopi.engine.emulate import RoundedWeights, input_rounding, rounded
 from turbopi.errors import ConfigError
 from turbopi.evaluate.sources import LocalPolicy
 from turbopi.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import Quantization
-from turbopi.quantization.plan import TIERS, Fp8Tier
+from turbopi.quantization.formats import FORMATS, FP8, INT8, Format, Numbers
+from turbopi.quantization.plan import TIERS, Tier, format_of
 from turbopi.quantization.sites import sites
 from turbopi.verify.check_golden import check_folder, golden_calibration
 from turbopi.verify.golden import GoldenFolder
@@ -26,15 +28,20 @@ CASE = "b_third_masked"
 STEPS = 2
 
 
-@pytest.fixture(scope="module")
+@lru_cache
+def calibrated(kind: Kind, numbers: Numbers) -> Quantization:
+    return golden_calibration(golden_folder(), kind, CPU, format=FORMATS[numbers])
+
+
+@pytest.fixture
 def calibration() -> Quantization:
-    return golden_calibration(golden_folder(), "pi05", CPU)
+    return calibrated("pi05", "fp8")
 
 
-def emulated(quantization: Quantization, tier: Fp8Tier) -> backends.Backend:
+def emulated(quantization: Quantization, tier: Tier) -> backends.Backend:
     checkpoint = golden_folder().checkpoint("pi05")
     return backends.create(
-        "emulated_fp8",
+        f"emulated_{format_of(tier).name}",
         checkpoint.config.model,
         lambda to, mode: checkpoint.load(to, mode).state,
         device=CPU,
@@ -49,12 +56,13 @@ def actions(backend: backends.Backend) -> Tensor:
 
 
 @pytest.mark.parametrize("tier", TIERS)
-def test_it_rounds_what_the_plan_says_and_nothing_else(calibration: Quantization, tier: Fp8Tier) -> None:
+def test_it_rounds_what_the_plan_says_and_nothing_else(tier: Tier) -> None:
     case, model = golden_cases()[CASE], golden_model("pi05")
+    calibration = calibrated("pi05", format_of(tier).name)
     plan = calibration.plan(model.config, tier)
     scales = {site: plan.scales[str(site)] for site in sites(model.config) if str(site) in plan.scales}
-    assert 0 < len(scales) < len(sites(model.config)) or tier == "fp8"
-    weights = RoundedWeights({site: plan.directions[str(site)] for site in scales})
+    assert 0 < len(scales) < len(sites(model.config)) or tier != "fp8-mlp"
+    weights = RoundedWeights({site: plan.directions[str(site)] for site in scales}, plan.format)
     with rounded(model, scales, weights):
         expected = model.sample(case.observation, case.noise, STEPS)[0]
     ours = actions(emulated(calibration, tier))
@@ -63,15 +71,37 @@ def test_it_rounds_what_the_plan_says_and_nothing_else(calibration: Quantization
     assert 1e-3 < float((ours[0] - exact).norm() / exact.norm()) < 0.1
 
 
-def test_golden_cases_hold(calibration: Quantization, monkeypatch: pytest.MonkeyPatch) -> None:
-    def calibrated(folder: GoldenFolder, kind: Kind, device: torch.device) -> Quantization:
-        return calibration if kind == "pi05" else golden_calibration(folder, kind, device)  # measured once
+@pytest.mark.parametrize("numbers", FORMATS)
+def test_golden_cases_hold(numbers: Numbers, monkeypatch: pytest.MonkeyPatch) -> None:
+    def known(folder: GoldenFolder, kind: Kind, device: torch.device, format: Format) -> Quantization:
+        return calibrated(kind, format.name)  # measured once
 
-    monkeypatch.setattr("turbopi.verify.check_golden.golden_calibration", calibrated)
-    compared = [one for many in check_folder(golden_folder(), "emulated_fp8", ("fp8",), CPU) for one in many]
+    monkeypatch.setattr("turbopi.verify.check_golden.golden_calibration", known)
+    checked = check_folder(golden_folder(), f"emulated_{numbers}", (numbers,), CPU)
+    compared = [one for many in checked for one in many]
     judged = [one for one in compared if one.ok is not None]
     assert len(judged) >= 7 and {one.tensor for one in judged} == {"actions"}
     assert all(one.ok for one in judged), [one for one in judged if not one.ok]
+
+
+def test_in_int8_the_experts_activations_stay_and_products_err_less_than_in_fp8() -> None:
+    entries = {numbers: calibrated("pi05", numbers).sites for numbers in FORMATS}
+    experts = [entry for name, entry in entries["int8"].items() if name.startswith("expert.")]
+    assert {entry.scale for entry in experts} == {1.0} and {entry.saturated for entry in experts} == {0.0}
+    for name, entry in entries["int8"].items():
+        assert entry.error < (0.2 if name.startswith("expert.") else 0.9) * entries["fp8"][name].error, name
+    model, site = golden_model("pi05"), next(s for s in sites(golden_model("pi05").config) if s.part == "expert")
+    x = torch.randn(3, site.width, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(input_rounding(site, 0.1, INT8)(x), x)
+    assert not torch.equal(input_rounding(site, 0.1, FP8)(x), x)
+    assert model.config.expert.depth * 4 == len(experts)
+
+
+def test_a_calibration_for_other_numbers_is_refused() -> None:
+    for numbers, tier in (("fp8", "int8"), ("int8", "fp8-mlp")):
+        wanted = format_of(tier).name
+        with pytest.raises(ConfigError, match=f"is for {numbers}, the precision is '{tier}'; .*--precision {wanted}`"):
+            emulated(calibrated("pi05", numbers), tier)  # type: ignore[arg-type]
 
 
 def test_metadata_tells_the_plan_and_that_it_is_emulated(calibration: Quantization) -> None:
@@ -100,10 +130,14 @@ def test_evaluations_know_the_calibration(calibration: Quantization) -> None:
 
 
 def test_it_needs_a_calibration_and_runs_in_nothing_but_fp8(calibration: Quantization) -> None:
-    with pytest.raises(ConfigError, match="precision 'fp8' needs FP8 calibration; make one with `turbopi calibrate`"):
+    with pytest.raises(
+        ConfigError, match="precision 'fp8' needs a calibration; make one with `turbopi calibrate --prec"
+    ):
         emulated(None, "fp8")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="backend 'emulated_fp8' runs in fp8 or fp8-mlp, not in 'bf16'"):
         backends.check("emulated_fp8", CPU, "bf16")
+    with pytest.raises(ConfigError, match="backend 'emulated_int8' runs in int8, not in 'fp8'"):
+        backends.check("emulated_int8", CPU, "fp8")
 
 
 def test_auto_never_takes_it() -> None:
@@ -111,19 +145,21 @@ def test_auto_never_takes_it() -> None:
         assert backends.choose(CPU, tier)[0] == "fused"
 
 
-def test_verify_and_bench_run_it(calibration: Quantization, tmp_path: Path) -> None:
+@pytest.mark.parametrize("numbers", FORMATS)
+def test_verify_and_bench_run_it(numbers: str, tmp_path: Path) -> None:
     small = "src/turbopi/data/small_policy"
-    file = tmp_path / "fp8.json"
-    made = turbopi("calibrate", small, "--observations", "random-noise", "--count", 2, "--steps", 2, "--out", file)
+    file, backend = tmp_path / "calibration.json", f"emulated_{numbers}"
+    noise = ("--observations", "random-noise", "--count", 2, "--steps", 2)
+    made = turbopi("calibrate", small, "--precision", numbers, *noise, "--out", file)
     assert made.exit_code == 0, made.output
-    options = ("--precisions", "fp8", "--quantization", file, "--device", "cpu", "--json")
+    options = ("--precisions", numbers, "--quantization", file, "--device", "cpu", "--json")
     few = ("--count", 1, "--noises", 1, "--steps", 2)
-    verified = turbopi("verify", small, "--backend", "emulated_fp8", "--precision", "fp8", *few, *options[2:])
+    verified = turbopi("verify", small, "--backend", backend, "--precision", numbers, *few, *options[2:])
     document = json.loads(verified.stdout)
     assert verified.exit_code == (0 if document["ok"] else 1), verified.output
-    assert (document["backend"], document["precision"]) == ("emulated_fp8", "fp8")
+    assert (document["backend"], document["precision"]) == (backend, numbers)
     assert document["actions"]["relative_rms"] > 0, "nothing was rounded"
     quick = ("--calls", 1, "--main-calls", 1, "--steps", 1)
-    benched = turbopi("bench", small, "--backends", "emulated_fp8", *quick, *options)
+    benched = turbopi("bench", small, "--backends", backend, *quick, *options)
     assert benched.exit_code == 0, benched.output
-    assert json.loads(benched.stdout)["results"][0]["precision"] == "fp8"
+    assert json.loads(benched.stdout)["results"][0]["precision"] == numbers

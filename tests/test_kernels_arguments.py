@@ -14,7 +14,7 @@ from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.gemm import bf16 as gemm
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8
-from turbopi.quantization.fp8 import E4M3, Fp8Matrix
+from turbopi.quantization.fp8 import E4M3, ScaledMatrix
 
 PAIR = (Parameter("const float*", "values"), Parameter("int", "count", "of them"))
 
@@ -131,7 +131,7 @@ def test_a_products_launch_says_what_its_operands_are(launched: Launched) -> Non
 
 def test_an_fp8_products_launch_says_what_its_operands_are(launched: Launched) -> None:
     a, bias = torch.zeros(M, K).to(E4M3), torch.zeros(N, dtype=torch.bfloat16)
-    weight = Fp8Matrix(torch.zeros(N, K).to(E4M3), torch.rand(N), 1.0, torch.bfloat16)
+    weight = ScaledMatrix(torch.zeros(N, K).to(E4M3), torch.rand(N), 1.0, torch.bfloat16)
     residual, made, copy = torch.zeros(M, N, dtype=torch.bfloat16), sums(), fp8_copy()
     out = gemm_fp8.matmul_fp8(a, weight, TILE, "bias", bias, residual=residual, sums_out=made, copy=copy)
     expect_product(launched, a, weight.data, out, gemm_fp8.DEPTH)

@@ -4,6 +4,7 @@ In float32 through Triton's interpreter, or on a GPU in bfloat16: see test_kerne
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,6 +49,18 @@ LENGTHS = pytest.mark.parametrize(
 @LENGTHS
 def test_packed_attention(lengths: list[int], spare: int, batch: int) -> None:
     check_packed(portable_batch.packed_attention, lengths, spare, batch)
+
+
+@LENGTHS
+def test_packed_attention_leaves_in_int8(lengths: list[int], spare: int, batch: int) -> None:
+    segments, _ = packed(lengths, spare, batch)
+    rows = sum(lengths)
+    q, k, v = random((rows + spare) * HEADS, DIM), random(rows + spare, DIM, seed=1), random(rows + spare, DIM, seed=2)
+    to: dict[str, Any] = {"inverse": 40.0, "numbers": torch.int8}
+    ours = portable_batch.packed_attention(q, k, v, segments, HEADS, **to)[:rows]
+    twin = plain_batch.packed_attention(q, k, v, segments, HEADS, **to)[:rows]
+    assert ours.dtype == twin.dtype == torch.int8 and int(twin.abs().max()) > 30
+    assert int((ours.int() - twin.int()).abs().max()) <= 1 and float((ours != twin).float().mean()) < 0.02
 
 
 @on_hopper

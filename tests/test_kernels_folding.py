@@ -15,7 +15,7 @@ from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Folded, Sums, Tile, clusters, matmul
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
-from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Fp8Matrix, to_e4m3
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, ScaledMatrix, to_e4m3
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 EPS = 1e-6
@@ -303,9 +303,9 @@ def test_two_layers_and_the_projector_in_fused_operations(fp8: str, rows: int) -
     start, out = stream("outliers", rows), torch.full((rows, 2048), torch.nan, device=DEVICE, dtype=torch.bfloat16)
 
     def tower(o: plain.Ops, dtype: torch.dtype, into: Tensor) -> Tensor:
-        def product(i: int, name: str) -> tuple[Tensor | Fp8Matrix, Tensor]:
+        def product(i: int, name: str) -> tuple[Tensor | ScaledMatrix, Tensor]:
             matrix, bias = makers[i][name]
-            if isinstance(matrix, Fp8Matrix):
+            if isinstance(matrix, ScaledMatrix):
                 return (matrix if dtype == torch.bfloat16 else matrix.dequantized()), bias.to(dtype)
             return matrix.to(dtype), bias.to(dtype)
 
@@ -315,7 +315,7 @@ def test_two_layers_and_the_projector_in_fused_operations(fp8: str, rows: int) -
 
         def inverse(i: int, name: str) -> float | None:
             matrix = product(i, name)[0]
-            return matrix.inverse if isinstance(matrix, Fp8Matrix) else None
+            return matrix.inverse if isinstance(matrix, ScaledMatrix) else None
 
         x, y = start.to(dtype), None
         for i in range(depth):
@@ -349,13 +349,13 @@ def test_layers_of_the_vision_tower_in_fused_operations(fp8: str, rows: int) -> 
     x, attended = stream("outliers", rows), random(rows, WIDTH)
 
     def layer(o: plain.Ops, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        def affine(name: str) -> tuple[Tensor | Fp8Matrix, Tensor]:
+        def affine(name: str) -> tuple[Tensor | ScaledMatrix, Tensor]:
             matrix = matrices[name]
-            return matrix if isinstance(matrix, Fp8Matrix) else matrix.to(dtype), biases[name].to(dtype)
+            return matrix if isinstance(matrix, ScaledMatrix) else matrix.to(dtype), biases[name].to(dtype)
 
         def inverse(name: str) -> float | None:
             matrix = matrices[name]
-            return matrix.inverse if isinstance(matrix, Fp8Matrix) else None
+            return matrix.inverse if isinstance(matrix, ScaledMatrix) else None
 
         scale, shift = [s.to(dtype) for s in scales], [s.to(dtype) for s in shifts]
         y = o.residual_linear(attended.to(dtype), *affine("out"))

@@ -22,7 +22,7 @@ from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8  # noqa: E402
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402
 from turbopi.kernels.sm90.instructions import SHARED_BYTES  # noqa: E402
-from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Fp8Matrix, input_of, to_e4m3  # noqa: E402
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, ScaledMatrix, input_of, to_e4m3  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32
@@ -169,7 +169,7 @@ def test_attention_of_hopper_leaves_in_e4m3(tokens: int, heads: int, head_dim: i
 TILES = [Tile(2, 112), Tile(3, 192), Tile(2, 256), Tile(1, 80), Tile(3, 96), Tile(2, 96, cluster_m=2, cluster_n=2)]
 
 
-def operands(m: int, n: int, k: int) -> tuple[Tensor, Fp8Matrix]:
+def operands(m: int, n: int, k: int) -> tuple[Tensor, ScaledMatrix]:
     matrix = quantize(random(n, k) / k**0.5, 0.01)
     return to_e4m3(random(m, k), matrix.inverse), matrix
 

@@ -12,20 +12,23 @@ from kernel_turns.problems import (
     Problem,
     has_nvrtc,
     input_scales,
+    int8_inputs,
     ordinary_bf16,
     plain,
     problem,
     relative,
+    standing_for,
 )
 from torch import Tensor
 
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise import packing
-from turbopi.kernels.portable.denoise.packing import KINDS, PackedExpert
+from turbopi.kernels.portable.denoise.packing import PackedExpert, WeightNumbers
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.sm90.denoise.plain import in_e4m3
 from turbopi.model.denoise import euler_step
+from turbopi.quantization.formats import FORMATS, INT8, Format
 
 CPU = torch.device("cpu")
 SMALL = pytest.mark.parametrize("name", ["golden", "tiny", "odd", "uneven"])
@@ -41,13 +44,14 @@ def test_packing_keeps_every_weight(name: str) -> None:
 
 
 @SMALL
-def test_packing_in_fp8_keeps_every_weight_as_e4m3_rounds_it(name: str) -> None:
+@pytest.mark.parametrize("format", FORMATS.values(), ids=FORMATS)
+def test_packing_in_eight_bits_keeps_every_weight_as_it_is_rounded(name: str, format: Format) -> None:
     p = problem(name, 1, 1, 3, 0, CPU, outliers=True)
-    ones = {f"expert.{i}.{kind}": 1.0 for i in range(p.config.expert.depth) for kind in KINDS}
-    packed = PackedExpert.pack(p.config, p.layers, ones)
+    packed = PackedExpert.pack(p.config, p.layers, int8_inputs(p), format=format)
+    assert packed.numbers == format.name and packed.weights.dtype == format.dtype
     for i, layer in enumerate(p.layers):
         for found, matrix in zip(packed.matrices(i), (layer.qkv, layer.out, layer.gate_up, layer.down), strict=True):
-            torch.testing.assert_close(found, quantize(matrix, 1.0).dequantized(), rtol=1e-6, atol=0)
+            torch.testing.assert_close(found, quantize(matrix, 1.0, format=format).dequantized(), rtol=1e-6, atol=0)
 
 
 def test_a_lane_has_16_bytes_of_one_channel_side_by_side() -> None:
@@ -55,6 +59,14 @@ def test_a_lane_has_16_bytes_of_one_channel_side_by_side() -> None:
     tiles = packing.tiles(matrix).view(2, 2, 8, 4, 8)  # [tile][chunk][channel][lane of four][column]
     assert torch.equal(tiles[1, 0, 3, 2], matrix[11, 16:24])
     assert torch.equal(tiles[0, 1, 5, :2].flatten(), matrix[5, 32:]) and not tiles[:, 1, :, 2:].any()
+
+
+def test_of_int8_a_lane_has_the_columns_that_it_has_of_bf16_in_both_halves_of_a_chunk() -> None:
+    matrix = (torch.arange(8 * 128).view(8, 128) % 64).to(torch.int8)
+    tiles = packing.tiles(matrix).view(1, 2, 8, 4, 2, 2, 4)  # [tile][chunk][channel][lane][half][word][byte]
+    for half in range(2):
+        of_bf16 = matrix[5, 64 + 32 * half + 8 * 3 :][:8].view(2, 4)  # lane 3's
+        assert torch.equal(tiles[0, 1, 5, 3, half], of_bf16[:, [0, 2, 1, 3]])
 
 
 @pytest.mark.parametrize(
@@ -96,15 +108,16 @@ def test_times_by_token_are_refused() -> None:
 def test_older_gpus_are_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (8, 6))
     assert denoise.unavailable(GPU) is None
-    assert "in FP8 needs compute capability 8.9 or newer, this GPU has 8.6" in str(denoise.unavailable(GPU, fp8=True))
+    assert "in FP8 needs compute capability 8.9 or newer, this GPU has 8.6" in str(denoise.unavailable(GPU, "fp8"))
 
 
 @pytest.mark.skipif(not has_nvrtc(), reason="no NVRTC here")
 @pytest.mark.parametrize("arch", ["sm_80", "sm_86", "sm_89", "sm_120"])
 def test_the_source_compiles_for_gpus_that_are_not_here(tmp_path: Path, arch: str) -> None:
-    for fp8 in {False, arch in ("sm_89", "sm_120")}:
+    numbers: tuple[WeightNumbers, ...] = ("bf16", "int8", "fp8") if arch in ("sm_89", "sm_120") else ("bf16", "int8")
+    for weights in numbers:
         sizes = denoise.kernel_sizes(
-            CONFIGS["golden"], blocks=84, cache_rows=976, suffix=10, fp8=fp8, choice=denoise.choices(10)
+            CONFIGS["golden"], blocks=84, cache_rows=976, suffix=10, weights=weights, choice=denoise.choices(10)
         )
         assert denoise.compiled(arch, sizes, folder=tmp_path)
 
@@ -156,6 +169,17 @@ def test_kernel_is_as_exact_as_ordinary_bf16(name: str, steps: int, suffix: int,
 
 
 @pytest.mark.gpu
+@SHAPES
+def test_with_int8_weights_it_is_as_exact_as_ordinary_bf16(name: str, steps: int, suffix: int, length: int) -> None:
+    p = problem(name, steps, suffix, length, steps * 1000 + suffix, GPU)
+    packed = PackedExpert.pack(p.config, p.layers, int8_inputs(p), format=INT8)
+    x_t, _ = run(p, packed)
+    ordinary = relative(ordinary_bf16(p), plain(p, torch.float64)[0][-1])  # of the weights before they were rounded
+    p.layers = standing_for(packed, p)
+    assert relative(x_t[-1], plain(p, torch.float64)[0][-1]) <= 1.1 * ordinary
+
+
+@pytest.mark.gpu
 @pytest.mark.parametrize("blocks", [1, 7, 40])
 def test_any_number_of_blocks_gives_the_same(blocks: int) -> None:
     p = problem("tiny", 2, 20, 100, 5, GPU)
@@ -167,15 +191,14 @@ def test_any_number_of_blocks_gives_the_same(blocks: int) -> None:
 @SHAPES
 def test_in_fp8_it_is_as_exact_as_its_emulation(name: str, steps: int, suffix: int, length: int) -> None:
     """Both against exact activations. Rounded numbers near an edge fall either way, so each problem has some luck."""
-    if denoise.unavailable(GPU, fp8=True):
+    if denoise.unavailable(GPU, "fp8"):
         pytest.skip("this GPU has no FP8")
     ours, emulated = [], []
     for seed in range(4 if name in ("shallow", "full") else 16):
         p = problem(name, steps, suffix, length, seed, GPU)
         packed = PackedExpert.pack(p.config, p.layers, input_scales(p))
         x_t, _ = run(p, packed)
-        stood_for = [dict(zip(KINDS, packed.matrices(i), strict=True)) for i in range(p.config.expert.depth)]
-        p.layers = [dataclasses.replace(layer, **new) for layer, new in zip(p.layers, stood_for, strict=True)]
+        p.layers = standing_for(packed, p)
         reference = plain(p, torch.float64)[0][-1]
         ours.append(relative(x_t[-1], reference))
         emulated.append(relative(plain(p, torch.float64, in_e4m3(packed.inputs))[0][-1], reference))

@@ -4,7 +4,6 @@ g++ stands for NVRTC, and tests/emulator/machine.h for the GPU: all blocks of th
 """
 
 import ctypes
-import dataclasses
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,24 @@ from typing import Any
 import pytest
 import torch
 from emulator import emulate
-from kernel_turns.problems import Problem, input_scales, ordinary_bf16, plain, problem, relative
+from kernel_turns.problems import (
+    Problem,
+    input_scales,
+    int8_inputs,
+    ordinary_bf16,
+    plain,
+    problem,
+    relative,
+    standing_for,
+)
 from torch import Tensor
 
 from turbopi.kernels.arguments import Parameter, Parameters
 from turbopi.kernels.portable.denoise import kernel as denoise
-from turbopi.kernels.portable.denoise.packing import KINDS, PackedExpert
+from turbopi.kernels.portable.denoise.packing import PackedExpert
 from turbopi.kernels.sm90.denoise.plain import in_e4m3
 from turbopi.model.denoise import euler_step
+from turbopi.quantization.formats import INT8
 
 pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
 CPU = torch.device("cpu")
@@ -75,7 +84,7 @@ def run(
         return Emulated(sizes, folder, seed, prepare=False), Emulated(sizes, folder, seed, prepare=True)
 
     monkeypatch.setattr(denoise, "load", load)
-    monkeypatch.setattr(denoise, "unavailable", lambda device, fp8: None)
+    monkeypatch.setattr(denoise, "unavailable", lambda device, weights: None)
     monkeypatch.setattr(denoise, "has_large_l2", lambda device: True)
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
     suffix, rows, steps = p.noise.shape[0], p.cache_k.shape[1], len(p.table)
@@ -135,6 +144,21 @@ def test_choices_of_a_launch_change_no_more_than_the_order_of_sums(
     assert relative(run(p, packed, monkeypatch, folder, blocks=3, choice=choice)[0], usual) < 3e-3
 
 
+@pytest.mark.parametrize(
+    ("name", "steps", "suffix", "length", "blocks"),
+    [("golden", 2, 1, 5, 1), ("golden", 2, 10, 37, 3), ("odd", 1, 17, 70, 2), ("uneven", 1, 10, 30, 3)],
+)
+def test_with_int8_weights_it_is_as_exact_as_ordinary_bf16(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, name: str, steps: int, suffix: int, length: int, blocks: int
+) -> None:
+    p = problem(name, steps, suffix, length, 1, CPU)
+    packed = PackedExpert.pack(p.config, p.layers, int8_inputs(p), format=INT8)
+    x_t, _ = run(p, packed, monkeypatch, folder, blocks=blocks)
+    ordinary = relative(ordinary_bf16(p), plain(p, torch.float64)[0][-1])  # of the weights before they were rounded
+    p.layers = standing_for(packed, p)
+    assert relative(x_t[-1], plain(p, torch.float64)[0][-1]) <= 1.1 * ordinary
+
+
 def test_in_fp8_it_is_as_exact_as_its_emulation(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     """Both against exact activations. Rounded numbers near an edge fall either way, so each problem has some luck."""
     ours, emulated = [], []
@@ -142,8 +166,7 @@ def test_in_fp8_it_is_as_exact_as_its_emulation(monkeypatch: pytest.MonkeyPatch,
         p = problem("golden", 1, 10, 37, seed, CPU)
         packed = PackedExpert.pack(p.config, p.layers, input_scales(p))
         x_t, _ = run(p, packed, monkeypatch, folder, blocks=3)
-        stood_for = [dict(zip(KINDS, packed.matrices(i), strict=True)) for i in range(p.config.expert.depth)]
-        p.layers = [dataclasses.replace(layer, **new) for layer, new in zip(p.layers, stood_for, strict=True)]
+        p.layers = standing_for(packed, p)
         reference = plain(p, torch.float64)[0][-1]
         ours.append(relative(x_t[-1], reference))
         emulated.append(relative(plain(p, torch.float64, in_e4m3(packed.inputs))[0][-1], reference))

@@ -1,11 +1,12 @@
 """The portable products equal their twins, their tiles fit every GPU, and TURBOPI_KERNELS chooses them.
 
 Without a GPU in float32 through Triton's interpreter, which takes E4M3 but can't round to it. On a GPU with FP8 each
-product is held against the float32 sums of its numbers.
+product is held against the float32 sums of its numbers. INT8 needs no such GPU.
 """
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from typing import Any
 
 import pytest
 import torch
@@ -18,22 +19,22 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 from turbopi.errors import ConfigError  # noqa: E402
 from turbopi.kernels import ops as kernels_ops  # noqa: E402
 from turbopi.kernels import plain  # noqa: E402
-from turbopi.kernels.portable import activations, norms  # noqa: E402
+from turbopi.kernels.portable import activations, attention, norms  # noqa: E402
 from turbopi.kernels.portable.gemm import tiles  # noqa: E402
 from turbopi.kernels.portable.gemm.kernel import gpu, product  # noqa: E402
 from turbopi.kernels.portable.gemm.tiles import Capability, Epilogue, Tile  # noqa: E402
-from turbopi.kernels.portable.ops import portable_ops  # noqa: E402
+from turbopi.kernels.portable.ops import attend, portable_ops  # noqa: E402
 from turbopi.kernels.portable.quantize import quantize  # noqa: E402
 from turbopi.kernels.tile_table import LIBRARY, TileKey, TileTable  # noqa: E402
-from turbopi.quantization.fp8 import E4M3, E4M3_MAX, Fp8Matrix, to_e4m3  # noqa: E402
+from turbopi.quantization.formats import FP8, INT8, Format  # noqa: E402
+from turbopi.quantization.fp8 import E4M3_MAX, ScaledMatrix, to_e4m3  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32
 HERE: Capability = torch.cuda.get_device_capability() if ON_GPU else (8, 9)
-pytestmark = [
-    *gpu_or_interpreter(),
-    pytest.mark.skipif(tiles.fp8_refusal(HERE) is not None, reason="needs compute capability 8.9"),
-]
+FORMATS_HERE = [FP8, INT8] if tiles.fp8_refusal(HERE) is None else [INT8]
+FP8_HERE = pytest.mark.skipif(FP8 not in FORMATS_HERE, reason="needs compute capability 8.9")
+pytestmark = gpu_or_interpreter()
 SMALL = (Tile(32, 64, 4, 6),)  # the interpreter computes whole tiles
 EPILOGUES: tuple[Epilogue, ...] = ("plain", "gelu", "geglu", "parts")
 seeds = iter(range(10**6))
@@ -47,12 +48,22 @@ def random(*shape: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(next(seeds))).to(DEVICE, DTYPE)
 
 
-def operands(m: int, n: int, k: int) -> tuple[Tensor, Fp8Matrix]:
-    matrix = quantize(random(n, k) / k**0.5, 0.01)
-    return to_e4m3(random(m, k), matrix.inverse), matrix
+def operands(m: int, n: int, k: int, format: Format = FORMATS_HERE[0]) -> tuple[Tensor, ScaledMatrix]:
+    matrix = quantize(random(n, k) / k**0.5, 4.0 / format.largest, format=format)
+    return format.rounded(random(m, k), matrix.inverse), matrix
 
 
-def exactly(x: Tensor, weight: Fp8Matrix, epilogue: str, bias: Tensor | None) -> Tensor:
+def stored(format: Format) -> torch.dtype:
+    """What a result that is rounded to it comes as: the interpreter can't round to E4M3."""
+    return format.dtype if ON_GPU or format is INT8 else torch.float32
+
+
+def rounding(exact: Tensor, inverse: float, format: Format) -> float:
+    """The relative error that rounding costs."""
+    return relative(format.rounded(exact, inverse).float() / inverse, exact) if stored(format) == format.dtype else 0.0
+
+
+def exactly(x: Tensor, weight: ScaledMatrix, epilogue: str, bias: Tensor | None) -> Tensor:
     sums = weight.product(x, bias)
     return plain.gelu(sums) if epilogue == "gelu" else plain.geglu(sums) if epilogue == "geglu" else sums
 
@@ -66,22 +77,36 @@ def every_tile(epilogue: Epilogue, k: int) -> list[Tile]:
     return fitting if ON_GPU else [tile for tile in fitting if replace(tile, splits=1) in SMALL]
 
 
+@pytest.mark.parametrize("format", FORMATS_HERE, ids=lambda format: format.name)
 @pytest.mark.parametrize("epilogue", EPILOGUES)
-@pytest.mark.parametrize("out_fp8", [False, True])
+@pytest.mark.parametrize("out_rounded", [False, True])
 @pytest.mark.parametrize(("m", "n", "k"), [(1, 16, 16), (33, 72, 272), (130, 136, 4304)])
-def test_products_in_every_tile(m: int, n: int, k: int, epilogue: Epilogue, out_fp8: bool) -> None:
+def test_products_in_every_tile(m: int, n: int, k: int, epilogue: Epilogue, out_rounded: bool, format: Format) -> None:
     if not ON_GPU:
         m, k = min(m, 33), min(k, 400)
-    x, matrix = operands(m, 2 * n if epilogue == "geglu" else n, k)
+    x, matrix = operands(m, 2 * n if epilogue == "geglu" else n, k, format)
     bias = None if epilogue == "geglu" else random(n)
-    exact, inverse = exactly(x, matrix, epilogue, bias), 30.0 if out_fp8 and epilogue != "parts" else None
+    exact, inverse = exactly(x, matrix, epilogue, bias), 30.0 if out_rounded and epilogue != "parts" else None
     for tile in every_tile(epilogue, k):
-        ours = product(x, matrix, epilogue, bias, inverse=inverse, tile=tile)
-        assert ours.dtype == ((E4M3 if ON_GPU else torch.float32) if inverse else DTYPE)
+        ours = product(x, matrix, epilogue, bias, inverse=inverse, tile=tile, numbers=format.dtype)
+        assert ours.dtype == (stored(format) if inverse else DTYPE)
         assert ours.shape == ((m, n) if tile.splits == 1 else (tile.splits, m, n))
         ours = (ours.float().sum(0) if tile.splits > 1 else ours.float()) / (inverse or 1)
-        rounding = relative(to_e4m3(exact, inverse).float() / inverse, exact) if inverse and ON_GPU else 0.0
-        assert relative(ours, exact) < (0.006 if ON_GPU else 1e-6) + rounding, tile
+        lost = rounding(exact, inverse, format) if inverse else 0.0
+        assert relative(ours, exact) < (0.006 if ON_GPU else 1e-6) + lost, tile
+
+
+@pytest.mark.parametrize("k", [16384] if ON_GPU else [272])
+def test_int8_products_of_the_largest_numbers_are_exact(k: int) -> None:
+    """All of one sign: the sum of 16384 has 29 bits, which float32 hasn't."""
+    x = torch.full((4, k), 127, dtype=torch.int8, device=DEVICE)
+    x[1], x[2, ::2], x[3, 0] = -127, -127, 126
+    one = torch.ones(16, device=DEVICE)
+    weight = ScaledMatrix(torch.full((16, k), 127, dtype=torch.int8, device=DEVICE), one, 1.0, torch.float32)
+    sums = (x.double() @ weight.data.double().T).float()
+    for tile in every_tile("plain", k):
+        assert torch.equal(product(x, weight, tile=tile), sums), tile
+    assert torch.equal(weight.product(x), sums)
 
 
 @on_gpu
@@ -92,8 +117,9 @@ def test_products_in_every_tile(m: int, n: int, k: int, epilogue: Epilogue, out_
         *((560, 2560, 2048, "plain"), (304, 2048, 16384, "parts"), (563, 16384, 2048, "geglu")),
     ],
 )
-def test_products_of_the_full_size(m: int, n: int, k: int, epilogue: Epilogue) -> None:
-    x, matrix = operands(m, 2 * n if epilogue == "geglu" else n, k)
+@pytest.mark.parametrize("format", FORMATS_HERE, ids=lambda format: format.name)
+def test_products_of_the_full_size(m: int, n: int, k: int, epilogue: Epilogue, format: Format) -> None:
+    x, matrix = operands(m, 2 * n if epilogue == "geglu" else n, k, format)
     bias = random(n) if k in (1152, 4304) else None
     exact = exactly(x, matrix, epilogue, bias)
     for tile in tiles.candidates(HERE, True, epilogue, k):
@@ -101,6 +127,7 @@ def test_products_of_the_full_size(m: int, n: int, k: int, epilogue: Epilogue) -
         assert relative(ours.sum(0) if tile.splits > 1 else ours, exact) < 0.006, tile
 
 
+@FP8_HERE
 @on_gpu
 @pytest.mark.parametrize("k", [1152, 2048, 4304, 16384])
 def test_long_sums_lose_little_to_the_tensor_cores(k: int) -> None:
@@ -113,6 +140,7 @@ def test_long_sums_lose_little_to_the_tensor_cores(k: int) -> None:
     assert relative(product(x, replace(matrix, dtype=torch.float32)), exact) < 0.01
 
 
+@FP8_HERE
 @on_gpu
 def test_nan_shows_and_too_much_saturates() -> None:
     x, matrix = operands(8, 32, 64)
@@ -139,10 +167,11 @@ def test_rows_beyond_the_result_are_left_alone() -> None:
     assert bool(whole[[0, 6]].isnan().all()) and bool(whole[1:6].isfinite().all())
 
 
-def test_operations_take_both_kinds_of_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("format", FORMATS_HERE, ids=lambda format: format.name)
+def test_operations_take_both_kinds_of_matrix(monkeypatch: pytest.MonkeyPatch, format: Format) -> None:
     monkeypatch.setattr("turbopi.kernels.portable.gemm.kernel.best_tile", lambda *_: SMALL[0])
     ops, bias = portable_ops(), random(24)
-    x, matrix = operands(5, 48, 32)
+    x, matrix = operands(5, 48, 32, format)
     half = matrix[:24]
     tolerance = 0.006 if ON_GPU else 1e-6
     for ours, twin in (
@@ -156,9 +185,9 @@ def test_operations_take_both_kinds_of_matrix(monkeypatch: pytest.MonkeyPatch) -
     wide, gate_up = random(5, 32), random(48, 32)
     assert relative(ops.linear_geglu(wide, gate_up), plain.linear_geglu(wide, gate_up)) < tolerance
     twin = plain.linear_geglu(wide, gate_up)
-    inverse = 400 / float(twin.abs().max())
-    rounded = ops.linear_geglu(wide, gate_up, inverse=inverse)
-    assert rounded.dtype == (E4M3 if ON_GPU else torch.float32) and relative(rounded.float() / inverse, twin) < 0.04
+    inverse = 0.9 * format.largest / float(twin.abs().max())
+    rounded = ops.linear_geglu(wide, gate_up, inverse=inverse, numbers=format.dtype)
+    assert rounded.dtype == stored(format) and relative(rounded.float() / inverse, twin) < 0.04
 
 
 def test_parts_are_what_the_norms_add_up() -> None:
@@ -170,11 +199,26 @@ def test_parts_are_what_the_norms_add_up() -> None:
     assert all(relative(a, b) < (0.01 if ON_GPU else 1e-6) for a, b in zip(ours, twin, strict=True))
 
 
-def test_geglu_behind_a_product_leaves_in_e4m3() -> None:
-    x = random(5, 96)
-    ours = activations.geglu(x, 30.0)
-    assert ours.dtype == (E4M3 if ON_GPU else torch.float32)
-    assert relative(ours.float() / 30, plain.geglu(x.float())) < (0.04 if ON_GPU else 1e-6)
+@pytest.mark.parametrize("format", FORMATS_HERE, ids=lambda format: format.name)
+def test_whatever_stands_before_a_product_leaves_in_its_numbers(format: Format) -> None:
+    """Exactly as the twin rounds it, but where a sum's last bit decides."""
+    x, qkv, ones = random(5, 96), random(8, 96), torch.ones(96, device=DEVICE, dtype=DTYPE)
+    keys, length = random(4, 16), torch.tensor([3], device=DEVICE)
+    to: dict[str, Any] = {"inverse": format.largest / 9, "numbers": format.dtype}
+    norm, layer_norm = (x, None, None, ones.float(), None, 1e-6), (x, x, ones, ones, 1e-6)
+    pictures, prefix = (qkv, 2, 2), (qkv.view(-1, 16), keys, keys, length, 4, 6)
+    for ours, twin in (
+        (activations.geglu(x, **to), plain.as_input(plain.geglu(x.float()), DTYPE, **to)),
+        (norms.residual_rms_norm(*norm, **to)[1], plain.residual_rms_norm(*norm, **to)[1]),
+        (norms.residual_layer_norm(*layer_norm, **to)[1], plain.residual_layer_norm(*layer_norm, **to)[1]),
+        (attention.vision_attention(*pictures, **to), plain.vision_attention(*pictures, **to)),
+        (attend(*prefix, **to), plain.attention(*prefix, **to)),
+    ):
+        assert ours.dtype == stored(format) and twin.dtype == format.dtype
+        if ours.dtype == torch.int8:
+            assert int((ours.int() - twin.int()).abs().max()) <= 1 and float((ours != twin).float().mean()) < 0.02
+        else:
+            assert relative(ours.float(), twin.float()) < 0.05
 
 
 # Which tile

@@ -15,7 +15,9 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 from turbopi.kernels.portable.quantize import quantize, round_rows
 from turbopi.kernels.portable.rounding import round_with_feedback
 from turbopi.quantization.directions import COUNT, ROWS, Rows, directions
+from turbopi.quantization.formats import FORMATS, Format
 from turbopi.quantization.fp8 import Directions, to_e4m3
+from turbopi.quantization.int8 import to_int8
 from turbopi.quantization.rounding import feedback, round_with_feedback_plain
 from turbopi.studies.formats import round_nvfp4
 
@@ -38,12 +40,16 @@ def error(rounded: Tensor, weight: Tensor, x: Tensor) -> float:
     return float((x @ (rounded - weight).T).norm() / (x @ weight.T).norm())
 
 
+EVERY_FORMAT = pytest.mark.parametrize("format", FORMATS.values(), ids=FORMATS)
+
+
+@EVERY_FORMAT
 @pytest.mark.parametrize(("out", "width", "count"), [(24, 64, 600), (17, 200, 40), (1, 40, 3)])
-def test_errors_cancel_where_activations_lie(out: int, width: int, count: int) -> None:
+def test_errors_cancel_where_activations_lie(out: int, width: int, count: int, format: Format) -> None:
     weight, seen, unseen = random(out, width) / 50, activations(count, width), activations(300, width, seed=3)
     known = directions(seen)
     assert known is not None and known.codes.shape == (width, min(COUNT, count, width))
-    nearest, spared = (quantize(weight, 1.0, d).dequantized() for d in (None, known))
+    nearest, spared = (quantize(weight, 1.0, d, format).dequantized() for d in (None, known))
     assert error(spared, weight, seen) < 0.3 * error(nearest, weight, seen)
     if count > COUNT:
         assert error(spared, weight, unseen) < 0.3 * error(nearest, weight, unseen)
@@ -78,12 +84,14 @@ def exact_sums(rows: int, columns: int, num: int) -> tuple[Tensor, ...]:
     )
 
 
+@EVERY_FORMAT
 @pytest.mark.parametrize(("rows", "columns", "num"), [(40, 32, 4), (16, 24, 3), (5, 1, 1)])
-def test_the_kernel_rounds_as_its_twin(rows: int, columns: int, num: int) -> None:
-    given = exact_sums(rows, columns, num)
-    ours, twin = round_with_feedback(*given), round_with_feedback_plain(*given)
+def test_the_kernel_rounds_as_its_twin(rows: int, columns: int, num: int, format: Format) -> None:
+    weight, inverse, order, errors, answers = exact_sums(rows, columns, num)
+    ours = round_with_feedback(weight, inverse, order, errors, answers, format.dtype)
+    twin = round_with_feedback_plain(weight, inverse, order, errors, answers, format)
     assert torch.equal(ours.float(), twin.float())
-    assert not torch.equal(twin.float(), to_e4m3(given[0], given[1][:, None]).float()) or columns == 1
+    assert not torch.equal(twin.float(), format.rounded(weight, inverse[:, None]).float()) or columns == 1
 
 
 def test_errors_of_nvfp4_cancel_too() -> None:
@@ -103,10 +111,20 @@ def test_without_feedback_the_kernel_rounds_every_number_to_nearest() -> None:
     assert torch.equal(ours.float(), to_e4m3(weight, 1.0).float())
 
 
-def test_nan_shows_in_its_row_alone() -> None:
+def test_without_feedback_the_kernel_rounds_every_whole_number_to_nearest() -> None:
+    x = torch.cat((torch.arange(-300, 300) / 2, torch.tensor([0.49, 126.51, -1e30, torch.inf, -torch.inf, torch.nan])))
+    weight, none = x[:, None].contiguous().to(DEVICE), torch.zeros(1, 1, device=DEVICE)
+    order, inverse = torch.zeros(1, dtype=torch.int64, device=DEVICE), torch.ones(len(x), device=DEVICE)
+    ours = round_with_feedback(weight, inverse, order, none, none, torch.int8)
+    assert ours.dtype == torch.int8 and torch.equal(ours, to_int8(weight, 1.0))
+    assert to_int8(torch.tensor([0.5, 1.5, -2.5, 127.4, 128.0, torch.nan]), 1.0).tolist() == [0, 2, -2, 127, 127, 0]
+
+
+@EVERY_FORMAT
+def test_nan_shows_in_its_row_alone(format: Format) -> None:
     weight, known = random(20, 64), directions(activations(100, 64))
     weight[3, 10] = torch.nan
-    matrix = quantize(weight, 1.0, known).dequantized()
+    matrix = quantize(weight, 1.0, known, format).dequantized()
     assert bool(matrix[3].isnan().any()) and bool(matrix[torch.arange(20) != 3].isfinite().all())
 
 

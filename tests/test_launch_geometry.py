@@ -25,7 +25,7 @@ from turbopi.kernels.sm90.gemm import bf16 as gemm
 from turbopi.kernels.sm90.gemm import fp8 as gemm_fp8
 from turbopi.kernels.sm90.gemm import tiles
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
-from turbopi.quantization.fp8 import E4M3, Fp8Matrix
+from turbopi.quantization.fp8 import E4M3, ScaledMatrix
 
 GPU = torch.device("cuda", 0)
 CPU = torch.device("cpu")
@@ -115,7 +115,7 @@ def launched(tile: Tile, m: int, n: int, k: int, epilogue: Epilogue, fp8: bool, 
     for module in (gemm, gemm_fp8):
         monkeypatch.setattr(module, "_kernel", lambda *args: kernel)
     if fp8:
-        weight = Fp8Matrix(on_meta(rows, k, dtype=E4M3), on_meta(rows, dtype=torch.float32), 1.0, torch.bfloat16)
+        weight = ScaledMatrix(on_meta(rows, k, dtype=E4M3), on_meta(rows, dtype=torch.float32), 1.0, torch.bfloat16)
         gemm_fp8.matmul_fp8(on_meta(m, k, dtype=E4M3), weight, tile, epilogue, bias)
     else:
         gemm.matmul(on_meta(m, k), on_meta(rows, k), tile, epilogue, bias)

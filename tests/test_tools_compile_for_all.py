@@ -45,6 +45,8 @@ def test_fp8_is_refused_below_8_9_with_the_reason(tmp_path: Path) -> None:
     refused = [row for row in result.rows if row.refused]
     assert len(refused) == 1 and "from compute capability 8.9 on" in str(refused[0].refused)
     assert not any("fp8" in row.variant for row in result.rows)
+    fit = [row for row in result.rows if row.registers and not row.problem]
+    assert len(fit) == len(result.rows) - 1 > 5, "INT8's, in their place"
 
 
 def test_every_triton_kernel_is_among_the_calls() -> None:

@@ -22,7 +22,7 @@ from turbopi.kernels.sm90.gemm.bf16 import Folded, Tile
 from turbopi.kernels.sm90.gemm.fp8 import FoldedFp8
 from turbopi.kernels.tile_checks import why_not
 from turbopi.kernels.tile_table import LIBRARY, Knobs
-from turbopi.quantization.fp8 import E4M3, Fp8Matrix, to_e4m3
+from turbopi.quantization.fp8 import E4M3, ScaledMatrix, to_e4m3
 from turbopi.tune import gpu, hopper, portable
 from turbopi.tune.gpu import GpuBench
 from turbopi.tune.race import Round, race
@@ -167,7 +167,7 @@ def fp8_twin(
 ) -> Any:
     """`fp8.matmul_fp8`, likewise."""
     matrix = weight.matrix if isinstance(weight, FoldedFp8) else weight
-    assert a.dtype == E4M3 and isinstance(matrix, Fp8Matrix)
+    assert a.dtype == E4M3 and isinstance(matrix, ScaledMatrix)
     n = matrix.shape[0] // 2 if epilogue == "geglu" else matrix.shape[0]
     residual = more.get("residual")
     bf16.layout(tile, epilogue, len(a), n, -(-a.shape[1] // fp8.DEPTH), residual, more.get("sums_out"))

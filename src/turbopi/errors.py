@@ -4,7 +4,7 @@
     ├── ConfigError            an option, preset or turbopi.json that can't be right       (also a ValueError)
     ├── CheckpointError        a checkpoint that can't be read, or doesn't fit its config  (also a ValueError)
     ├── TokenizerError         the SentencePiece model is missing or isn't one             (also a ValueError)
-    ├── CalibrationError       an FP8 calibration that isn't one, or was made for others  (also a ValueError)
+    ├── CalibrationError       a calibration that isn't one, or was made for others  (also a ValueError)
     ├── ObservationError       an observation the policy can't use                         (also a ValueError)
     ├── BackendError           a backend can't do what it was asked to
     │   ├── BackendUnavailable it can't run here at all; says why and what to do
@@ -40,7 +40,7 @@ class TokenizerError(TurboPiError, ValueError):
 
 
 class CalibrationError(TurboPiError, ValueError):
-    """An FP8 calibration that can't be read, or was made for other weights, shapes or another version."""
+    """A calibration that can't be read, or was made for other weights, shapes or another version."""
 
 
 class ObservationError(TurboPiError, ValueError):

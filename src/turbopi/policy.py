@@ -53,9 +53,10 @@ class UnifiedPolicy:
         config: what no checkpoint records (robot, statistics, horizon, …): a preset's name, a .json, a PolicyConfig, or
             "auto" for LeRobot's own config or the `turbopi.json` beside the weights.
         backend: a name from `turbopi backends`; "auto" takes the fastest one available and says which in `metadata`.
-        precision: "bf16" as openpi serves it, "f32", or with a calibration "fp8" or "fp8-mlp" (docs/quantization.md).
-        quantization: what `turbopi calibrate` wrote for this checkpoint, for the FP8 precisions alone. None: the
-            `turbopi_fp8.json` beside the weights.
+        precision: "bf16" as openpi serves it, "f32", or with a calibration "fp8", "fp8-mlp" or "int8"
+            (docs/quantization.md).
+        quantization: what `turbopi calibrate` wrote for this checkpoint, for these precisions alone. None: the
+            `turbopi_fp8.json` or `turbopi_int8.json` beside the weights.
         num_denoising_steps: Euler steps a call, unless `infer` is told otherwise. None: the config's, which has them
             from turbopi.json, else from LeRobot's `num_inference_steps`, else openpi's 10.
         device: "auto", "cpu", "cuda" or "cuda:N".
@@ -118,11 +119,11 @@ class UnifiedPolicy:
             self._loading = {"load_seconds": round(loaded.seconds, 3), "weight_bytes": loaded.bytes}
             return loaded.state
 
-        fp8 = for_policy(quantization, precision, checkpoint)
+        calibration = for_policy(quantization, precision, checkpoint)
         self._guard = Guard(self._device)
         with self._guard:
             self.backend = backends.create(
-                name, self.config.model, load, device=self._device, precision=precision, quantization=fp8
+                name, self.config.model, load, device=self._device, precision=precision, quantization=calibration
             )
         self.backend.strict = self._strict = strict
         self._joining = Joining(self.config, self._pipeline, lambda: self.backend)

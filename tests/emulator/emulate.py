@@ -28,7 +28,7 @@ INSTRUCTIONS = (
     *(("barrier.cluster.arrive", "cluster_sync"), ("bar.sync", "bar_sync"), ("mapa.", "mapa")),
     *(("st.async", "st_async"), ("rcp.approx", "rcp"), ("tanh.approx", "tanh")),
     *(("wgmma.commit_group", "wgmma_commit"), ("wgmma.wait_group", "wgmma_wait")),
-    *(("cvt.rn.f16x2.e4m3x2", "cvt_e4m3_halves"), ("cvt.rn.bf16x2", "cvt_bf16x2")),
+    *(("fma.rn.bf16x2", "fma_bf16x2"), ("cvt.rn.f16x2.e4m3x2", "cvt_e4m3_halves"), ("cvt.rn.bf16x2", "cvt_bf16x2")),
     *(("cvt.rn.satfinite.e4m3x2", "cvt_e4m3x2"), ("m8n8.x4.shared.b16", "ldmatrix")),
     *(("m16n8k16.row.col.f32.bf16", "mma_bf16"), ("m16n8k16.row.col.f32.f16", "mma_half")),
     *(("m16n8k32.row.col.f32.e4m3", "mma_e4m3"), ("red.release.gpu.global.add.u32", "add_released")),

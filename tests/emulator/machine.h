@@ -418,6 +418,13 @@ inline void ptx_wgmma_wait(int left) { machine::await(left); }
 inline void ptx_cvt_bf16x2(unsigned& both, float high, float low) {
     both = machine::to_bf16(high) << 16 | machine::to_bf16(low);
 }
+inline void ptx_fma_bf16x2(unsigned& both, unsigned a, unsigned b, unsigned c) {
+    auto one = [&](int from) {
+        auto of = [&](unsigned x) { return __uint_as_float((x >> from & 0xffff) << 16); };
+        return machine::to_bf16(fmaf(of(a), of(b), of(c)));
+    };
+    both = one(16) << 16 | one(0);
+}
 inline void ptx_cvt_e4m3x2(unsigned short& both, float high, float low) {
     both = machine::to_e4m3(high) << 8 | machine::to_e4m3(low);
 }

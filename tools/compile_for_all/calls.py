@@ -14,12 +14,13 @@ from turbopi.kernels.portable.attention_tiles import Attention, AttentionTile
 from turbopi.kernels.portable.attention_tiles import candidates as attention_candidates
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
-from turbopi.quantization.fp8 import E4M3, Fp8Matrix
+from turbopi.quantization.fp8 import E4M3, ScaledMatrix
 
 BF16, F32 = torch.bfloat16, torch.float32
 Calls = list[Callable[[], Any]]
+Input = dict[str, Any]  # what the operation in front of a matrix is told: see `quantization.fp8.input_of`
 ROWS, PREFIX, SUFFIX = 512, 560, 50
-# name, epilogue, rows, out, in, bias, E4M3 behind it
+# name, epilogue, rows, out, in, bias, E4M3 or int8 behind it
 PRODUCTS: tuple[tuple[str, tiles.Epilogue, int, int, int, bool, bool], ...] = (
     ("vision's qkv", "plain", ROWS, 3456, 1152, True, False),
     ("vision's out", "parts", ROWS, 1152, 1152, True, False),
@@ -40,42 +41,53 @@ def of(*shape: int, dtype: torch.dtype = BF16) -> Tensor:
 
 
 def all_calls(target: Target, chosen: bool = False) -> Calls:
-    """Every variant that the product can launch there at full size; E4M3 where the GPU has it. chosen: see below."""
-    fp8 = tiles.fp8_refusal(target.capability) is None
-    inverses: tuple[float | None, ...] = (None, 30.0) if fp8 else (None,)
+    """Every variant that the product can launch there at full size; E4M3 where the GPU has it, else int8. chosen: see
+    below.
+    """
+    numbers = E4M3 if tiles.fp8_refusal(target.capability) is None else torch.int8
+    inverses: tuple[Input, ...] = ({}, {"inverse": 30.0, "numbers": numbers})
     calls = [*_norms(inverses), *_attention(target, inverses), *_batch(target, inverses), *_rest(), *_backward()]
-    calls += [partial(lambda inverse: activations.geglu(of(PREFIX, 2 * 16384), inverse), one) for one in inverses]
-    if fp8:
-        calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152))]
-    return [*calls, *product_calls(target, fp8, chosen)]
+    calls += [partial(lambda input: activations.geglu(of(PREFIX, 2 * 16384), **input), one) for one in inverses]
+    calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152), numbers)]
+    return [*calls, *product_calls(target, numbers, chosen)]
 
 
-def product_calls(target: Target, fp8: bool, chosen: bool = False) -> Calls:
+def product_calls(target: Target, numbers: torch.dtype, chosen: bool = False) -> Calls:
     """The products in every tile of the table that this GPU takes; `chosen`: in the tile that it would choose alone.
+    numbers: E4M3 or int8, beside bfloat16.
 
     Splits of the inner axis are two, which stands for more.
     """
     calls: Calls = []
-    for in_fp8 in (True, False) if fp8 else (False,):
-        for _, epilogue, m, n, k, bias, out_fp8 in PRODUCTS:
-            if not in_fp8 and (epilogue != "geglu" or out_fp8):
+    for of_numbers in (numbers, BF16):
+        for _, epilogue, m, n, k, bias, behind in PRODUCTS:
+            if of_numbers == BF16 and (epilogue != "geglu" or behind):
                 continue  # the library's
-            for tile in tiles.candidates(target.capability, in_fp8, epilogue, k):
+            for tile in tiles.candidates(target.capability, of_numbers != BF16, epilogue, k):
                 if tile.splits <= 2:
-                    calls.append(partial(_product, in_fp8, epilogue, m, n, k, bias, out_fp8, None if chosen else tile))
+                    used = None if chosen else tile
+                    calls.append(partial(_product, of_numbers, epilogue, m, n, k, bias, behind, used))
     return calls
 
 
 def _product(
-    fp8: bool, epilogue: tiles.Epilogue, m: int, n: int, k: int, bias: bool, out_fp8: bool, tile: tiles.Tile | None
+    numbers: torch.dtype,
+    epilogue: tiles.Epilogue,
+    m: int,
+    n: int,
+    k: int,
+    bias: bool,
+    behind: bool,
+    tile: tiles.Tile | None,
 ) -> Tensor:
     rows = 2 * n if epilogue == "geglu" else n
-    weight = Fp8Matrix(of(rows, k, dtype=E4M3), of(rows, dtype=F32), 50.0, BF16) if fp8 else of(rows, k)
-    x = of(m, k, dtype=E4M3 if fp8 else BF16)
-    return product(x, weight, epilogue, of(n) if bias else None, inverse=30.0 if out_fp8 else None, tile=tile)
+    data = of(rows, k, dtype=numbers)
+    weight = data if numbers == BF16 else ScaledMatrix(data, of(rows, dtype=F32), 50.0, BF16)
+    inverse, added = 30.0 if behind else None, of(n) if bias else None
+    return product(of(m, k, dtype=numbers), weight, epilogue, added, inverse=inverse, tile=tile, numbers=numbers)
 
 
-def _norms(inverses: tuple[float | None, ...]) -> Calls:
+def _norms(inverses: tuple[Input, ...]) -> Calls:
     calls: Calls = []
     for inverse in inverses:
         for splits in (None, 0, 2, 3, 4):
@@ -87,36 +99,36 @@ def _norms(inverses: tuple[float | None, ...]) -> Calls:
                     calls.append(partial(_layer_norm, rows, width, None if splits is None else y, inverse))
     for by_row in (False, True):
         for given in (None, (SUFFIX, 1024)):
-            calls.append(partial(_rms, SUFFIX, 1024, given, given, by_row, None))
+            calls.append(partial(_rms, SUFFIX, 1024, given, given, by_row, {}))
     return calls
 
 
 def _rms(
-    rows: int, width: int, y: tuple[int, ...] | None, gate: Any, by_row: bool, inverse: float | None
+    rows: int, width: int, y: tuple[int, ...] | None, gate: Any, by_row: bool, input: Input
 ) -> tuple[Tensor, Tensor]:
     shape = (rows, width) if by_row else (width,)
     modulated = width == 1024
     factor, shift = of(*shape, dtype=F32), of(*shape, dtype=F32) if modulated else None
     gated = None if gate is None else of(*shape, dtype=F32)
     given = None if y is None else of(*y)
-    return norms.residual_rms_norm(of(rows, width), given, gated, factor, shift, 1e-6, inverse)
+    return norms.residual_rms_norm(of(rows, width), given, gated, factor, shift, 1e-6, **input)
 
 
-def _layer_norm(rows: int, width: int, y: tuple[int, ...] | None, inverse: float | None) -> tuple[Tensor, Tensor]:
+def _layer_norm(rows: int, width: int, y: tuple[int, ...] | None, input: Input) -> tuple[Tensor, Tensor]:
     given = None if y is None else of(*y)
-    return norms.residual_layer_norm(of(rows, width), given, of(width), of(width), 1e-6, inverse)
+    return norms.residual_layer_norm(of(rows, width), given, of(width), of(width), 1e-6, **input)
 
 
-def _attention(target: Target, inverses: tuple[float | None, ...]) -> Calls:
+def _attention(target: Target, inverses: tuple[Input, ...]) -> Calls:
     """In every tile that this GPU takes."""
 
-    def vision(tile: AttentionTile, inverse: float | None) -> Tensor:
-        return attention.vision_attention(of(ROWS, 3456), 2, 16, inverse, tile=tile)
+    def vision(tile: AttentionTile, input: Input) -> Tensor:
+        return attention.vision_attention(of(ROWS, 3456), 2, 16, tile=tile, **input)
 
-    def prefix(tile: AttentionTile, inverse: float | None) -> Tensor:
+    def prefix(tile: AttentionTile, input: Input) -> Tensor:
         k = of(PREFIX, 256)
         length = of(1, dtype=torch.int64)
-        return attention.prefix_attention(of(PREFIX * 8, 256), k, k, length, 8, inverse, tile=tile)
+        return attention.prefix_attention(of(PREFIX * 8, 256), k, k, length, 8, tile=tile, **input)
 
     def softmax(state_token: bool) -> Tensor:
         length = of(1, dtype=torch.int64)
@@ -130,33 +142,34 @@ def _attention(target: Target, inverses: tuple[float | None, ...]) -> Calls:
 
 
 def _in_tiles(
-    target: Target, kind: Attention, dim: int, inverses: tuple[float | None, ...]
-) -> list[tuple[AttentionTile, float | None]]:
+    target: Target, kind: Attention, dim: int, inverses: tuple[Input, ...]
+) -> list[tuple[AttentionTile, Input]]:
     return [(tile, one) for tile in attention_candidates(kind, target.capability, dim) for one in inverses]
 
 
-def _batch(target: Target, inverses: tuple[float | None, ...]) -> Calls:
+def _batch(target: Target, inverses: tuple[Input, ...]) -> Calls:
     """Of two and sixteen observations: keys of a suffix split over blocks, and in one. In every tile."""
 
-    def packed(tile: AttentionTile, inverse: float | None) -> Tensor:
+    def packed(tile: AttentionTile, input: Input) -> Tensor:
         k, rows = of(2 * PREFIX, 256), of(3, dtype=torch.int32)
         segments = Segments(rows, rows, of(143, 4, dtype=torch.int32))
-        return batch.packed_attention(of(2 * PREFIX * 8, 256), k, k, segments, 8, inverse, tile=tile)
+        return batch.packed_attention(of(2 * PREFIX * 8, 256), k, k, segments, 8, tile=tile, **input)
 
-    def suffix(count: int, state_token: bool, tile: AttentionTile, inverse: float | None) -> Tensor:
+    def suffix(count: int, state_token: bool, tile: AttentionTile, input: Input) -> Tensor:
         prefix, own, rows = of(count * PREFIX, 256), of(count * SUFFIX, 256), of(count + 1, dtype=torch.int32)
-        queries = of(count * SUFFIX * 8, 256)
+        queries, inverse = of(count * SUFFIX * 8, 256), input.get("inverse")
         return batch.suffix_attention(queries, prefix, prefix, own, own, rows, rows, 8, state_token, inverse, tile=tile)
 
     def embed() -> None:
         batch.embed_rows(of(2 * PREFIX, dtype=torch.int64), of(4 * 256, 2048), of(257152, 2048), of(2 * PREFIX, 2048))
 
-    suffixes = _in_tiles(target, "suffix_attention", 256, inverses)
+    beside = tuple(one for one in inverses if one.get("numbers") != torch.int8)  # of INT8's expert: bfloat16
+    suffixes = _in_tiles(target, "suffix_attention", 256, beside)
     return [
         embed,
         *(partial(packed, *one) for one in _in_tiles(target, "packed_attention", 256, inverses)),
         *(partial(suffix, count, False, *one) for count in (2, 16) for one in suffixes),
-        *(partial(suffix, count, True, *one) for count in (2, 16) for one in suffixes if one[1] is None),
+        *(partial(suffix, count, True, *one) for count in (2, 16) for one in suffixes if not one[1]),
     ]
 
 

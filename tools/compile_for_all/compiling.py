@@ -27,6 +27,7 @@ from turbopi.config import preset
 from turbopi.errors import BackendError
 from turbopi.kernels import portable
 from turbopi.kernels.portable.denoise import kernel as denoise
+from turbopi.kernels.portable.denoise.packing import WeightNumbers
 from turbopi.kernels.portable.gemm.tiles import fp8_refusal
 
 HOPPER = (9, 0)
@@ -88,18 +89,19 @@ def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], 
     if target.capability == HOPPER:
         yield from ((f"sm90: {name}", make) for name, make in machine_code.SHAPES.items())
     for suffix in (10, 50):
-        for fp8 in (False, True) if fp8_refusal(target.capability) is None else (False,):
-            name = f"denoise.kernel, H={suffix}, {'FP8' if fp8 else 'bf16'}"
-            yield name, partial(_denoising, target, suffix, fp8)
+        numbers: tuple[WeightNumbers, ...] = ("bf16", "fp8" if fp8_refusal(target.capability) is None else "int8")
+        for weights in numbers:
+            label = weights if weights == "bf16" else weights.upper()
+            yield f"denoise.kernel, H={suffix}, {label}", partial(_denoising, target, suffix, weights)
 
 
-def _denoising(target: Target, suffix: int, fp8: bool, folder: Path | None) -> bytes:
+def _denoising(target: Target, suffix: int, weights: WeightNumbers, folder: Path | None) -> bytes:
     sizes = denoise.kernel_sizes(
         preset("pi05_libero").model,
         blocks=MULTIPROCESSORS[target.capability],
         cache_rows=machine_code.CACHE_ROWS,
         suffix=suffix,
-        fp8=fp8,
+        weights=weights,
         choice=denoise.choices(suffix),
     )
     assert target.shared >= denoise.SHARED_BYTES, target

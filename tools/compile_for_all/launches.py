@@ -25,6 +25,7 @@ TYPES = {
     torch.float8_e4m3fn: "fp8e4nv",
     torch.float16: "fp16",
     torch.uint8: "u8",
+    torch.int8: "i8",
     torch.int32: "i32",
     torch.int64: "i64",
 }

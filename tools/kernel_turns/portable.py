@@ -20,9 +20,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kernel_turns.problems import GPU, Problem, input_scales, ordinary_bf16, plain, problem, relative
+from kernel_turns.problems import GPU, Problem, input_scales, int8_inputs, ordinary_bf16, plain, problem, relative
 from turbopi.kernels.portable.denoise.kernel import PHASES, Choices, PortableDenoiser, choices, unavailable
 from turbopi.kernels.portable.denoise.packing import PackedExpert
+from turbopi.quantization.formats import INT8
 
 STEPS, CACHE_ROWS, SEED = 10, 976, 1
 
@@ -97,6 +98,12 @@ def traced(kernel: PortableDenoiser, p: Problem, launches: int = 5) -> dict[str,
     return {phase: [round(value) for value in of] for phase, of in zip(PHASES, cycles.tolist(), strict=True)}
 
 
+def packed_in(p: Problem, precision: str) -> PackedExpert:
+    if precision == "int8":
+        return PackedExpert.pack(p.config, p.layers, int8_inputs(p), format=INT8)
+    return PackedExpert.pack(p.config, p.layers, input_scales(p) if precision == "fp8" else None)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m kernel_turns.portable",
@@ -104,7 +111,7 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--tokens", default="10,50")
-    parser.add_argument("--precisions", default="bf16,fp8")
+    parser.add_argument("--precisions", default="bf16,fp8", help="also int8")
     parser.add_argument("--length", type=int, default=560, help="valid prefix tokens")
     parser.add_argument("--replays", type=int, default=100)
     parser.add_argument("--shipped", action="store_true", help="only the shipped choice")
@@ -118,7 +125,7 @@ def main() -> None:
         p = problem("full", STEPS, tokens, arguments.length, SEED, GPU)
         reference, ordinary = plain(p, torch.float32)[0][-1], ordinary_bf16(p)
         for precision in arguments.precisions.split(","):
-            packed = PackedExpert.pack(p.config, p.layers, input_scales(p) if precision == "fp8" else None)
+            packed = packed_in(p, precision)
             size = packed.weights.numel() * packed.weights.element_size() * STEPS
             for choice in variants(tokens)[: 1 if arguments.shipped else None]:
                 make = partial(

@@ -11,6 +11,7 @@ from turbopi.config import GemmaConfig, ModelConfig, preset
 from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.interface import GemmaLayer, TokenInputs
+from turbopi.kernels.portable.denoise.packing import PackedExpert
 from turbopi.kernels.sm90.denoise.packing import KINDS
 from turbopi.kernels.sm90.denoise.plain import Operand, denoise_plain, guided
 from turbopi.model.denoise import euler_step
@@ -167,6 +168,19 @@ def input_scales(p: Problem) -> dict[str, float]:
 
     plain(p, torch.float32, watch)
     return {site: 2 * value / E4M3_MAX for site, value in largest.items()}
+
+
+def int8_inputs(p: Problem) -> dict[str, float]:
+    """In place of `input_scales` where weights alone are rounded."""
+    return {f"expert.{i}.{kind}": 1.0 for i in range(p.config.expert.depth) for kind in KINDS}
+
+
+def standing_for(packed: PackedExpert, p: Problem) -> list[GemmaLayer]:
+    """The problem's layers with the weights that the packed ones stand for, in float32."""
+    return [
+        dataclasses.replace(layer, **dict(zip(KINDS, packed.matrices(i), strict=True)))
+        for i, layer in enumerate(p.layers)
+    ]
 
 
 def ordinary_bf16(p: Problem) -> Tensor:

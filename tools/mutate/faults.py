@@ -208,8 +208,8 @@ FAULTS = (
     Fault(
         "an FP8 matrix whose input is multiplied by its scale",
         "turbopi.kernels",
-        "return Fp8Matrix(rounded, scale * input_scale, 1 / input_scale, weight.dtype)",
-        "return Fp8Matrix(rounded, scale * input_scale, input_scale, weight.dtype)",
+        "return ScaledMatrix(rounded, scale * input_scale, 1 / input_scale, weight.dtype)",
+        "return ScaledMatrix(rounded, scale * input_scale, input_scale, weight.dtype)",
         "activations saturate or vanish",
         ("tests/test_kernels_fp8.py::test_a_matrix_has_a_scale_for_each_channel",),
     ),

@@ -26,7 +26,7 @@ from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
 from turbopi.model.conditioning import Form
 from turbopi.quantization.calibration_file import Quantization
-from turbopi.quantization.plan import TIERS
+from turbopi.quantization.plan import TIERS, format_of
 
 __all__ = [
     "BACKENDS",
@@ -78,13 +78,19 @@ _SPECS = (
         "fused",
         "turbopi.backends.fused",
         "FusedBackend",
-        "cuda_graph with kernels of our own: NVIDIA GPUs from compute capability 8.0; in FP8 9.0",
+        "cuda_graph with kernels of our own: NVIDIA GPUs from compute capability 8.0; FP8 from 8.9 on, INT8 below",
     ),
     BackendSpec(
         "emulated_fp8",
         "turbopi.backends.emulated_fp8",
         "EmulatedFp8Backend",
         "the reference with a calibration's FP8 roundings, exact and slow, to judge FP8 by: any device",
+    ),
+    BackendSpec(
+        "emulated_int8",
+        "turbopi.backends.emulated_fp8",
+        "EmulatedInt8Backend",
+        "the reference with a calibration's INT8 roundings, exact and slow, to judge INT8 by: any device",
     ),
     BackendSpec(
         "onnx",
@@ -177,9 +183,11 @@ def check(name: str, device: torch.device, precision: Precision) -> None:
     reason, what = cls.unavailable(device), "run"
     if precision in TIERS:
         if reason is not None and device.type != "cuda":
+            format = format_of(precision)
+            which = "8.0 to 8.7" if format.name == "int8" else "8.9 or newer"
             reason = (
-                f"{precision} needs an NVIDIA GPU of compute capability 9.0; take precision 'bf16', or to judge FP8 "
-                "without such a GPU backend 'emulated_fp8'"
+                f"{precision} needs an NVIDIA GPU of compute capability {which}; take precision 'bf16', or to judge "
+                f"{format.label} without such a GPU backend 'emulated_{format.name}'"
             )
         elif issubclass(cls, RunsFp8) and (other_gpu := cls.unavailable_in(device, precision)) is not None:
             reason, what = other_gpu, f"run in {precision}"  # before what a package would mend
@@ -198,7 +206,7 @@ def create(
 ) -> Backend:
     """Build the backend called `name` around a checkpoint's tensors. Raises what `check` raises.
 
-    quantization   for the FP8 tiers alone: the calibration of this very checkpoint
+    quantization   for FP8 and INT8 alone: the calibration of this very checkpoint
     """
     check(name, device, precision)
     more = {} if quantization is None else {"quantization": quantization}

@@ -189,7 +189,7 @@ class Conditions(Protocol):
 
 @runtime_checkable
 class RunsFp8(Protocol):
-    """A backend that has FP8 tiers among its precisions."""
+    """A backend that has FP8 or INT8 among its precisions."""
 
     @classmethod
     def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:

@@ -1,10 +1,11 @@
-"""Backend `emulated_fp8`: the float32 reference in which all that a calibration has in E4M3 is rounded, on any device.
+"""Backends `emulated_fp8`, `emulated_int8`: the float32 reference in which all that a calibration has in eight bits is
+rounded, on any device.
 
-For judging FP8 where no GPU with FP8 is at hand, closed loop included. It is slower than the reference, so `auto` never
-takes it. Everything that isn't rounded to E4M3 is float32 here, bfloat16 in `fused`.
+For judging FP8 and INT8 where no GPU that has them is at hand, closed loop included. They are slower than the
+reference, so `auto` never takes them. Everything that isn't rounded is float32 here, bfloat16 in `fused`.
 """
 
-from functools import partial
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
@@ -13,11 +14,11 @@ from torch import Tensor, nn
 from turbopi.backends.base import LoadState, Precision
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
-from turbopi.engine.emulate import put_into_norm, round_activation, round_weight
+from turbopi.engine.emulate import Round, input_rounding, put_into_norm, round_weight
 from turbopi.model.conditioning import Form
 from turbopi.model.sites import linears, norm_of
 from turbopi.quantization.calibration_file import Quantization, check_given
-from turbopi.quantization.plan import TIERS
+from turbopi.quantization.plan import FP8_TIERS
 from turbopi.quantization.sites import sites
 
 
@@ -25,8 +26,8 @@ class EmulatedFp8Backend(PyTorchBackend):
     """Rounds weights once, with a scale for each output channel, and activations whenever a product reads them."""
 
     name: ClassVar[str] = "emulated_fp8"
-    precisions: ClassVar[tuple[Precision, ...]] = TIERS
-    forms: ClassVar[tuple[Form, ...]] = ("tokens",)  # E4M3's rounding has no derivative
+    precisions: ClassVar[tuple[Precision, ...]] = FP8_TIERS
+    forms: ClassVar[tuple[Form, ...]] = ("tokens",)  # rounding has no derivative
 
     def __init__(
         self,
@@ -46,13 +47,14 @@ class EmulatedFp8Backend(PyTorchBackend):
             scale = self._plan.scales.get(str(site))
             if scale is None:
                 continue
-            norm = norm_of(self.model, site)
+            format, norm = self._plan.format, norm_of(self.model, site)
+            rounding = input_rounding(site, scale, format)
             if norm is not None:
-                put_into_norm(norm, partial(round_activation, scale=scale))
+                put_into_norm(norm, rounding)
             for linear in linears(self.model, site):
-                linear.weight.data = round_weight(linear.weight.data, self._plan.directions.get(str(site)))
+                linear.weight.data = round_weight(linear.weight.data, self._plan.directions.get(str(site)), format)
                 if norm is None:
-                    linear.register_forward_pre_hook(partial(_round_input, scale=scale))
+                    linear.register_forward_pre_hook(_before(rounding))
 
     @classmethod
     def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
@@ -61,7 +63,7 @@ class EmulatedFp8Backend(PyTorchBackend):
     def describe(self) -> dict[str, Any]:
         return {
             "attention": "explicit float32",
-            "fp8": {
+            self._plan.format.name: {
                 "emulated": "in float32",
                 "sites in bf16": "run in float32 here",
                 **self._quantization.describe(self._plan),
@@ -69,5 +71,12 @@ class EmulatedFp8Backend(PyTorchBackend):
         }
 
 
-def _round_input(module: nn.Module, inputs: tuple[Tensor, ...], *, scale: float) -> tuple[Tensor, ...]:
-    return round_activation(inputs[0], scale), *inputs[1:]
+class EmulatedInt8Backend(EmulatedFp8Backend):
+    """The same in INT8, in which the expert's activations stay as they are."""
+
+    name: ClassVar[str] = "emulated_int8"
+    precisions: ClassVar[tuple[Precision, ...]] = ("int8",)
+
+
+def _before(rounding: Round) -> Callable[[nn.Module, tuple[Tensor, ...]], tuple[Tensor, ...]]:
+    return lambda module, inputs: (rounding(inputs[0]), *inputs[1:])

@@ -29,6 +29,7 @@ from turbopi.kernels.interface import Denoiser, Ops, PairDenoiser
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import NO_TILES
 from turbopi.quantization.calibration_file import Quantization, check_given
+from turbopi.quantization.formats import INT8
 from turbopi.quantization.fp8 import Directions, Matrix
 from turbopi.quantization.plan import TIERS
 from turbopi.quantization.sites import KINDS
@@ -49,7 +50,7 @@ class Watched(Protocol):
 
 
 class FusedBackend(CudaGraphBackend):
-    """As `cuda_graph`, in bfloat16 or, as a calibration says, partly in FP8; `describe()` says what runs where."""
+    """As `cuda_graph`, in bfloat16 or, as a calibration says, partly in FP8 or INT8: `describe()` says what runs."""
 
     name: ClassVar[str] = "fused"
     # measured on an H200 with two cameras in bfloat16: benchmarks/results/h200_2026-11-24_batches.json, of 2 see
@@ -59,7 +60,7 @@ class FusedBackend(CudaGraphBackend):
     _tiles = Tiles(NO_TILES, BY_MODEL)  # measured ones, as they were when this backend was made
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
-    _fp8_expert: list[Any] | None = None  # layers with `Fp8Matrix`, of batches
+    _fp8_expert: list[Any] | None = None  # layers with `ScaledMatrix`, of batches
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
 
     def __init__(
@@ -98,24 +99,33 @@ class FusedBackend(CudaGraphBackend):
     @classmethod
     def unavailable_in(cls, device: torch.device, precision: Precision) -> str | None:
         """Why this precision, besides the backend, can't run on a GPU that the backend runs on; or None."""
-        if precision not in TIERS:
+        if precision not in TIERS or importlib.util.find_spec("triton") is None:  # which `unavailable` tells
             return None
-        from turbopi.kernels.portable.gemm.tiles import fp8_refusal
+        from turbopi.kernels.ops import forced_portable
+        from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
 
-        reason = fp8_refusal(torch.cuda.get_device_capability(device))
-        return None if reason is None else f"{reason}; use 'bf16'"
+        capability = torch.cuda.get_device_capability(device)
+        if precision == "int8":
+            reason = int8_refusal(capability)
+            measured_here = capability == (9, 0) and forced_portable()
+            return None if reason is None or measured_here else f"{reason}; use 'fp8'"
+        reason = fp8_refusal(capability)
+        return None if reason is None else f"{reason}; use 'bf16', or 'int8'"
 
     def describe(self) -> dict[str, Any]:
         described = super().describe() | {"tiles": self._tiles.about}
         if self._plan is not None and self._quantization is not None:
-            described["fp8"] = self._quantization.describe(self._plan)
-            expert, plan = self._expert_precision(), described["fp8"]["plan"]
+            numbers = self._plan.format.name
+            described[numbers] = self._quantization.describe(self._plan)
+            expert, plan = self._expert_precision(), described[numbers]["plan"]
             for name, what in plan.items():
-                if name.startswith("expert.") and what == "fp8" and not expert.startswith("fp8"):
+                if name.startswith("expert.") and what == numbers and not expert.startswith(numbers):
                     plan[name] = expert  # its kernel takes one precision
             plan["expert"] = expert
             if self._fp8_expert is not None:
-                plan["expert of batches"] = "fp8"
+                plan["expert of batches"] = numbers
+            elif self._batches_denoise_in_bf16 and self._plan.expert != "bf16":
+                plan["expert of batches"] = "bf16, as operations denoise"
 
         by_kernel = sorted({str(loop) for loop, _ in list(self._denoisers)})
         by_operations: dict[str, list[str]] = {}
@@ -137,23 +147,16 @@ class FusedBackend(CudaGraphBackend):
         return described
 
     def _pack(self, load: LoadState) -> Weights:
-        scales = {} if self._plan is None else self._plan.scales
-
-        def make(place: str, matrix: Tensor) -> Matrix:
-            if place not in scales:
-                return matrix
-            return quantize(matrix, scales[place], self._directions.get(place))
-
         # what is rounded comes to the GPU a matrix at a time, which then never holds the checkpoint in bfloat16
         whole = self.device if self._plan is None else HOST
-        return pack(self.config, load(whole, "bf16"), make, device=self.device, expert_device=HOST)
+        return pack(self.config, load(whole, "bf16"), self._quantized, device=self.device, expert_device=HOST)
 
     @property
     def _directions(self) -> Mapping[str, Directions]:
         return {} if self._plan is None else self._plan.directions
 
     def _expert_inputs(self) -> Mapping[str, float] | None:
-        """The scales of the expert's activations where the denoising kernel is to run in FP8."""
+        """The scales of the expert's activations where the denoising kernel is to run in FP8 or with INT8 weights."""
         return None if self._plan is None or self._plan.expert == "bf16" else self._plan.scales
 
     def _expert_precision(self) -> str:
@@ -162,11 +165,12 @@ class FusedBackend(CudaGraphBackend):
             kept = {} if self._plan is None else self._plan.kept
             why = next((reason for site, reason in kept.items() if site.startswith("expert.")), "it isn't planned")
             return f"bf16, all of it, as its kernel takes one precision; {why}"
+        numbers = self._plan.expert
         if not self._refused:
-            return "fp8"
+            return numbers
         if not self._denoisers:
             return "bf16, as operations denoise"
-        return "fp8 in the denoising kernel; bf16 where operations denoise"
+        return f"{numbers} in the denoising kernel; bf16 where operations denoise"
 
     def _make_ops(self) -> Ops:
         from turbopi.kernels.ops import fused_ops, hopper_kernels  # Triton isn't imported for other backends
@@ -235,8 +239,8 @@ class FusedBackend(CudaGraphBackend):
         return kernel
 
     def _batch_weights(self) -> Weights:
-        inputs = self._expert_inputs()
-        if inputs is None:
+        """Operations denoise batches: where the denoising kernel runs in FP8, they do, else in bfloat16."""
+        if self._plan is None or self._plan.expert != "fp8":
             self._batches_denoise_in_bf16 = True
             self._keep_expert_on(self.device)
             return self._weights
@@ -252,7 +256,9 @@ class FusedBackend(CudaGraphBackend):
         return replace(self._weights, expert=self._fp8_expert)
 
     def _quantized(self, place: str, matrix: Tensor) -> Matrix:
-        return quantize(matrix, self._plan.scales[place], self._directions.get(place)) if self._plan else matrix
+        if self._plan is None or place not in self._plan.scales:
+            return matrix
+        return quantize(matrix, self._plan.scales[place], self._directions.get(place), self._plan.format)
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
@@ -288,8 +294,8 @@ class FusedBackend(CudaGraphBackend):
         from turbopi.kernels.portable.denoise.kernel import MAX_SUFFIX, PortableDenoiser, unavailable
         from turbopi.kernels.portable.denoise.packing import PackedExpert, refusal
 
-        in_fp8 = self._expert_inputs() is not None
-        table = self._covered(unavailable(self.device, in_fp8) or refusal(self.config), loop, MAX_SUFFIX, table)
+        weights = "bf16" if self._plan is None else self._plan.expert
+        table = self._covered(unavailable(self.device, weights) or refusal(self.config), loop, MAX_SUFFIX, table)
         if loop.form != "plain":
             raise BackendUnavailable("the portable denoising kernel has one time for all actions")
         return PortableDenoiser(
@@ -312,12 +318,14 @@ class FusedBackend(CudaGraphBackend):
     def _packed(self, kind: Any) -> Any:
         """The expert's matrices as a denoising kernel has them."""
         if self._packed_expert is None:
+            int8 = self._plan is not None and self._plan.expert == "int8"  # which the portable kernel alone has
             self._packed_expert = kind.pack(
                 self.config,
                 self._weights.expert,
                 inputs=self._expert_inputs(),
                 directions=self._directions,
                 device=self.device,
+                **({"format": INT8} if int8 else {}),
             )
         return self._packed_expert
 

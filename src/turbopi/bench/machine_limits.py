@@ -8,7 +8,13 @@ from msgspec import Struct
 
 from turbopi.kernels.grid_barrier import barrier_us
 
-_DTYPES = {"bf16": torch.bfloat16, "f32": torch.float32, "fp8": torch.float8_e4m3fn, "fp8-mlp": torch.float8_e4m3fn}
+_DTYPES = {
+    "bf16": torch.bfloat16,
+    "f32": torch.float32,
+    "fp8": torch.float8_e4m3fn,
+    "fp8-mlp": torch.float8_e4m3fn,
+    "int8": torch.int8,
+}
 
 
 class Floors(Struct, frozen=True):
@@ -71,6 +77,8 @@ def _matmul_rate(device: torch.device, dtype: torch.dtype, n: int) -> float:
     a, b = (torch.randn(n, n, device=device).to(dtype) for _ in range(2))
 
     def product() -> torch.Tensor:
+        if dtype == torch.int8:
+            return torch._int_mm(a, b.t())
         if dtype != torch.float8_e4m3fn:
             return a @ b if device.type == "cuda" else torch.nn.functional.linear(a, b)
         one = torch.ones((), device=device)

@@ -20,6 +20,7 @@ from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes, guida
 from turbopi.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
+from turbopi.quantization.plan import TIERS
 from turbopi.robots import Plain, Robot
 
 _WORDS = "pick up the red black white bowl mug plate and place put it on in left right drawer stove open a to of"
@@ -60,7 +61,7 @@ def bench_policy(
         num_denoising_steps=job.steps,
         device=device,
         tokenizer=tokenizer,
-        quantization=quantization if precision.startswith("fp8") else None,
+        quantization=quantization if precision in TIERS else None,
         robot=robot,
     )
 

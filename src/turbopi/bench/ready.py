@@ -20,6 +20,7 @@ from msgspec import Struct
 
 from turbopi.bench.document import Ready, ReadyTimes
 from turbopi.errors import BackendError
+from turbopi.quantization.plan import TIERS
 
 _TIMEOUT = 900  # seconds
 
@@ -112,7 +113,7 @@ def _main(start: Start) -> None:
         num_denoising_steps=start.steps,
         device=start.device,
         tokenizer=start.tokenizer,
-        quantization=start.quantization if start.precision.startswith("fp8") else None,
+        quantization=start.quantization if start.precision in TIERS else None,
         robot=import_robot(start.robot) if start.robot is not None and ":" in start.robot else start.robot,
     )
     load = time.perf_counter() - begin

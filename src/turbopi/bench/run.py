@@ -57,7 +57,7 @@ class BenchPlan:
     main_calls: int | None = None  # of `backends` on the main job; None: as all others
     seconds: float = 60.0  # one measurement ends after them, though not before 20 calls
     profile: bool = False
-    quantization: str | None = None  # what the FP8 precisions need
+    quantization: str | None = None  # what fp8, fp8-mlp or int8 needs
     robot: str | Robot | None = None  # whose own observations are measured; None: random ones of the jobs' shapes
 
     @property
@@ -83,7 +83,7 @@ class BenchPlan:
         if not self.backends or not self.precisions:
             raise ConfigError("there is nothing to measure: name a backend and a precision")
         if self.quantization is not None and not set(self.precisions) & set(TIERS):
-            raise ConfigError(f"a calibration was given, but none of the precisions is of FP8: {', '.join(TIERS)}")
+            raise ConfigError(f"a calibration was given, but none of the precisions takes one: {', '.join(TIERS)}")
         if max(self.batches) > 1 and set(self.joins) != {"none"}:
             raise ConfigError("chunks that join a running one are measured one at a time: --join without --batch")
         named = [*self.backends, *self.beside]

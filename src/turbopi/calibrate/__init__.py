@@ -1,4 +1,4 @@
-"""FP8 on real observations: which numbers a policy's products see, and what rounding them to E4M3 does to its actions.
+"""FP8 and INT8 on real observations: which numbers a policy's products see, and what rounding them does to its actions.
 
     turbopi calibrate CKPT --observations RECORDING --out FILE     run.py      docs/quantization.md
 

@@ -1,13 +1,12 @@
 """What rounding does to each site's own products, everything before them exact."""
 
 from collections.abc import Iterable, Mapping
-from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from turbopi.engine.emulate import Round, RoundedWeights, replaced, round_activation, through_norm
+from turbopi.engine.emulate import Round, RoundedWeights, input_rounding, replaced, through_norm
 from turbopi.model.layers import AdaRMSNorm
 from turbopi.model.reference import Pi0Model
 from turbopi.model.sites import linears, norm_of
@@ -28,18 +27,20 @@ def product_errors(
     changes: list[tuple[nn.Linear, Round, Round]] = []
     handles = []
     for site, scale in scales.items():
-        norm = norm_of(model, site)
+        norm, rounding = norm_of(model, site), input_rounding(site, scale, weights.format)
         if norm is not None:
 
-            def keep(norm: AdaRMSNorm, inputs: tuple[Tensor, Tensor], site: Site = site, scale: float = scale) -> None:
-                behind[site] = through_norm(norm, partial(round_activation, scale=scale), *inputs)[0]
+            def keep(
+                norm: AdaRMSNorm, inputs: tuple[Tensor, Tensor], site: Site = site, rounding: Round = rounding
+            ) -> None:
+                behind[site] = through_norm(norm, rounding, *inputs)[0]
 
             handles.append(norm.register_forward_pre_hook(keep))
         for linear in linears(model, site):
 
-            def watch(x: Tensor, site: Site = site, scale: float = scale, linear: nn.Linear = linear) -> Tensor:
+            def watch(x: Tensor, site: Site = site, rounding: Round = rounding, linear: nn.Linear = linear) -> Tensor:
                 exact = F.linear(x, linear.weight)
-                given = behind[site] if site in behind else round_activation(x, scale)
+                given = behind[site] if site in behind else rounding(x)
                 difference = F.linear(given, weights(site, linear.weight)) - exact
                 both = torch.stack((difference.square().sum(), exact.square().sum())).double()
                 name = str(site)

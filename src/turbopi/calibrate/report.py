@@ -1,11 +1,12 @@
 """What a calibration says of itself: the file's `report`, which goes with it into every policy's metadata."""
 
 from collections.abc import Mapping
-from typing import Annotated, Final
+from typing import Annotated
 
 from msgspec import Meta, Struct, field
 
 from turbopi.errors import CalibrationError
+from turbopi.quantization.formats import Numbers
 from turbopi.reading import as_document
 
 Count = Annotated[int, Meta(ge=0)]
@@ -37,7 +38,7 @@ class WorstCall(Struct, frozen=True):
 
 
 class HeldOut(Struct, frozen=True):
-    """On observations that chose nothing. The sites that are kept run in float32 here."""
+    """Of FP8, on observations that chose nothing. The sites that are kept run in float32 here."""
 
     fp8: ActionsError
     fp8_mlp: ActionsError = field(name="fp8-mlp")
@@ -50,21 +51,34 @@ class HeldOut(Struct, frozen=True):
 
     def errors(self) -> dict[str, ActionsError]:
         """All but the worst call's, by the name that the file has for each."""
-        return {name: getattr(self, own) for own, name in _NAMES_OF_ERRORS.items()}
+        return _errors(self)
 
 
-_NAMES_OF_ERRORS: Final = {
-    own: name
-    for own, name in zip(HeldOut.__struct_fields__, HeldOut.__struct_encode_fields__, strict=True)
-    if own != "worst"
-}
+class Int8HeldOut(Struct, frozen=True):
+    """The same of INT8."""
+
+    int8: ActionsError
+    vision: ActionsError = field(name="int8 in the vision alone")
+    prefix: ActionsError = field(name="int8 in the prefix alone")
+    expert: ActionsError = field(name="int8 in the expert alone")
+    bf16: ActionsError
+    int8_against_bf16: ActionsError = field(name="int8 against bf16")
+    worst: WorstCall
+
+    def errors(self) -> dict[str, ActionsError]:
+        return _errors(self)
+
+
+def _errors(held_out: Struct) -> dict[str, ActionsError]:
+    names = zip(held_out.__struct_fields__, held_out.__struct_encode_fields__, strict=True)
+    return {name: getattr(held_out, own) for own, name in names if own != "worst"}
 
 
 class CalibrationReport(Struct, frozen=True):
-    """As `turbopi calibrate` writes it.
+    """As `turbopi calibrate` writes it of FP8.
 
     methods         of each way to choose scales, on the calls that sites are chosen on
-    groups_alone    with one group of sites in FP8
+    groups_alone    with one group of sites rounded
     kept_in_bf16    by site the reason
     target          cosine of the actions' deltas
     target_reached  None where observations were random noise
@@ -87,6 +101,17 @@ class CalibrationReport(Struct, frozen=True):
     seconds: dict[str, float]
 
 
-def read_report(report: Mapping[str, object], source: object = "the calibration's report") -> CalibrationReport:
-    """Of `Quantization.report`. Raises CalibrationError for a report that today's `turbopi calibrate` doesn't write."""
-    return as_document(report, CalibrationReport, source, CalibrationError)
+class Int8CalibrationReport(CalibrationReport, frozen=True):
+    """The same of INT8."""
+
+    held_out: Int8HeldOut  # type: ignore[assignment]
+
+
+def read_report(
+    report: Mapping[str, object], numbers: Numbers = "fp8", source: object = "the calibration's report"
+) -> CalibrationReport:
+    """Of `Quantization.report`, whose `numbers` say of what. Raises CalibrationError for a report that today's
+    `turbopi calibrate` doesn't write.
+    """
+    kind = Int8CalibrationReport if numbers == "int8" else CalibrationReport
+    return as_document(report, kind, source, CalibrationError)

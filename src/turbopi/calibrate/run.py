@@ -1,7 +1,8 @@
 """A calibration from beginning to end: statistics, the best of several ways to choose scales, the sites that stay in
 bfloat16, and a report on observations that had no say in any of it.
 
-Everything is measured with the emulated reference (emulate.py) against the float32 one, so it needs no FP8 hardware.
+Everything is measured with the emulated reference (emulate.py) against the float32 one, so it needs no GPU that has the
+format.
 """
 
 import math
@@ -30,6 +31,7 @@ from turbopi.model.reference import Pi0Model, parameter_dtype
 from turbopi.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, SiteScale, shapes_of
 from turbopi.quantization.directions import Rows, directions
+from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites
 from turbopi.reading import plain_document
@@ -53,6 +55,7 @@ class Settings:
     target: float = TARGET
     batch: int = 8
     methods: Sequence[Method] = METHODS
+    format: Format = FP8
 
 
 @dataclass
@@ -115,7 +118,8 @@ def calibrate(checkpoint: Checkpoint, settings: Settings, progress: Progress | N
     }
     del model, policy
     collect_and_empty_cache()
-    return Quantization(fingerprint, shapes_of(config), result.sites, plain_document(read_report(report)))
+    name = settings.format.name
+    return Quantization(fingerprint, shapes_of(config), result.sites, plain_document(read_report(report, name)), name)
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,7 @@ def calibrate_model(
     progress: Progress | None = None,
 ) -> Measured:
     """The same for a reference model and calls that are given. Raises what `calibrate` raises."""
-    progress = progress or Progress()
+    progress, format = progress or Progress(), settings.format
     everywhere = sites(model.config)
     eligible = [site for site in everywhere if site.refusal is None]
 
@@ -148,7 +152,7 @@ def calibrate_model(
                 yield batch
                 progress.advance()
 
-        return collect(model, everywhere, ticking(), steps, rows)
+        return collect(model, everywhere, ticking(), steps, rows, format)
 
     rows: dict[str, Rows] = {}
     # weights rounded for what some calls have in common are better on those than on any others
@@ -164,10 +168,10 @@ def calibrate_model(
         if (found := directions(rows.pop(str(site)).rows)) is not None:
             common[site] = found
         progress.advance()
-    weights = RoundedWeights(common)
+    weights = RoundedWeights(common, format)
     selection = _Trials(model, chosen, steps, settings.batch, progress, weights)
     method, methods = _best_method(eligible, histograms, selection, settings.methods, progress)
-    scales = {site: histograms[str(site)].scale(method) for site in everywhere}
+    scales = _scales(everywhere, histograms, method, format)
 
     progress.begin("products of every site", 1)
     products = product_errors(model, {site: scales[site] for site in eligible}, selection.batches, steps, weights)
@@ -182,7 +186,7 @@ def calibrate_model(
     entries, warnings = {}, []
     for site in everywhere:
         name, scale = str(site), scales[site]
-        saturated = unseen[name].error(scale)[1]
+        saturated = unseen[name].error(scale)[1] if format.rounds_input(site.part) else 0.0
         if saturated > SATURATION_LIMIT:
             warnings.append(f"{saturated:.1%} of the held-out values of {name} saturate: more observations may help")
         entries[name] = SiteScale(
@@ -195,9 +199,11 @@ def calibrate_model(
         )
     final = _Trials(model, held_out, steps, settings.batch, progress, weights)
     on_held_out = _held_out(model, eligible, scales, kept, final, progress)
-    reached = on_held_out["fp8"]["delta_cosine"]
+    reached = on_held_out[format.name]["delta_cosine"]
     if len(kept) == len(everywhere):
-        warnings.append("no site is left in FP8, so no policy can be made of this: a lower target may leave some")
+        warnings.append(
+            f"no site is left in {format.label}, so no policy can be made of this: a lower target may leave some"
+        )
     if reached < settings.target:
         warnings.append(f"the held-out actions' cosine is {reached:.5f}, below the target {settings.target}")
     report = {
@@ -247,6 +253,10 @@ class _Trials:
                 raise CheckpointError("the float32 reference itself gives actions that aren't finite; damaged weights?")
 
     @property
+    def format(self) -> Format:
+        return self._weights.format
+
+    @property
     def batches(self) -> list[Batch]:
         return [batch for _, batch in self._made]
 
@@ -271,6 +281,13 @@ class _Trials:
         }
 
 
+def _scales(
+    places: Sequence[Site], histograms: Mapping[str, Histogram], method: Method, format: Format
+) -> dict[Site, float]:
+    """Of these sites' activations; 1 where the format leaves them as they are."""
+    return {site: histograms[str(site)].scale(method) if format.rounds_input(site.part) else 1.0 for site in places}
+
+
 def _best_method(
     eligible: Sequence[Site],
     histograms: Mapping[str, Histogram],
@@ -282,14 +299,15 @@ def _best_method(
     progress.begin("ways to choose scales", len(methods))
     measured: dict[str, Any] = {}
     for method in methods:
-        scales = {site: histograms[str(site)].scale(method) for site in eligible}
+        scales = _scales(eligible, histograms, method, trials.format)
         measured[method] = trials.error(trials.actions(scales))
         progress.advance()
     least = min(one["relative_rms"] for one in measured.values())
     good = [method for method in methods if measured[method]["relative_rms"] <= 1.05 * least]
 
     def room(method: Method) -> float:
-        return sum(histograms[str(site)].scale(method) / histograms[str(site)].scale("max") for site in eligible)
+        rounding = [histograms[str(site)] for site in eligible if trials.format.rounds_input(site.part)]
+        return sum(one.scale(method) / one.scale("max") for one in rounding)
 
     return max(good, key=room), measured
 
@@ -301,7 +319,7 @@ def _groups(
     trials: _Trials,
     progress: Progress,
 ) -> dict[str, Any]:
-    """The actions' error with one group of sites in FP8 alone."""
+    """The actions' error with one group of sites rounded alone."""
     names = [f"{part}.{kind}" for part in PARTS for kind in KINDS[part]]
     progress.begin("groups of sites", len(names))
     measured = {}
@@ -365,26 +383,25 @@ def _held_out(
 ) -> dict[str, Any]:
     """Errors of tiers, parts and plain bfloat16 on observations that chose nothing."""
     used = {site: scale for site, scale in scales.items() if site in set(eligible) and str(site) not in kept}
-    cases: dict[str, dict[Site, float]] = {
-        "fp8": used,
-        "fp8-mlp": {s: scale for s, scale in used.items() if s.kind in MLP_KINDS and s.part != "expert"},
-        **{f"fp8 in the {part} alone": {s: used[s] for s in used if s.part == part} for part in PARTS},
-    }
+    name = trials.format.name
+    cases: dict[str, dict[Site, float]] = {name: used}
+    if name == "fp8":
+        cases["fp8-mlp"] = {s: scale for s, scale in used.items() if s.kind in MLP_KINDS and s.part != "expert"}
+    cases |= {f"{name} in the {part} alone": {s: used[s] for s in used if s.part == part} for part in PARTS}
     progress.begin("held-out observations", len(cases) + 1)
     report: dict[str, Any] = {}
     actions = {}
-    for name, own in cases.items():
-        actions[name] = trials.actions(own)
-        report[name] = trials.error(actions[name])
+    for case, own in cases.items():
+        actions[case] = trials.actions(own)
+        report[case] = trials.error(actions[case])
         progress.advance()
     state = {name: tensor.to(parameter_dtype(name, "bf16")) for name, tensor in model.state_dict().items()}
     plain = trials.actions({}, Pi0Model.from_state(model.config, state))
     report["bf16"] = trials.error(plain)
-    report["fp8 against bf16"] = trials.error(actions["fp8"], plain)
+    report[f"{name} against bf16"] = trials.error(actions[name], plain)
     progress.advance()
     by_call = [
-        relative_rms(ours, exact)
-        for ours, exact in zip(torch.cat(actions["fp8"]), torch.cat(trials.exact), strict=True)
+        relative_rms(ours, exact) for ours, exact in zip(torch.cat(actions[name]), torch.cat(trials.exact), strict=True)
     ]
     worst = max(range(len(by_call)), key=by_call.__getitem__)
     call = trials.calls[worst]

@@ -1,7 +1,8 @@
 """What a site's activation looks like over many calls, and the scales that follow from it.
 
 Values are counted by their first 16 bits as float32, sign aside: 128 bins an octave, over the whole range. That is fine
-enough to say what any rounding to E4M3 (8 numbers an octave) would cost, without keeping a value.
+enough to say what any rounding to E4M3 (8 numbers an octave) or int8 (64 in the highest octave) would cost, without
+keeping a value.
 """
 
 from collections.abc import Iterable, Iterator
@@ -17,7 +18,7 @@ from turbopi.model.reference import Pi0Model
 from turbopi.model.sites import linears, norm_of
 from turbopi.observation import Observation
 from turbopi.quantization.directions import Rows
-from turbopi.quantization.fp8 import E4M3_MAX, to_e4m3
+from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.sites import Site
 
 BINS = 0x7F80  # the bins above hold infinities and NaN
@@ -29,9 +30,10 @@ METHODS: tuple[Method, ...] = get_args(Method)
 
 
 class Histogram:
-    """Counts of |x| on the host; `largest` is exact. counts float64[BINS]"""
+    """Counts of |x| on the host, and what they say of rounding to a format; `largest` is exact. counts float64[BINS]"""
 
-    def __init__(self, counts: Tensor, largest: float) -> None:
+    def __init__(self, counts: Tensor, largest: float, format: Format = FP8) -> None:
+        self._format = format
         used = counts.nonzero().squeeze(1)  # a few thousand: the octaves that occur
         self.largest = largest
         self._bins, self._counts, self._values = used, counts[used], _centres()[used]
@@ -42,15 +44,15 @@ class Histogram:
         counts = torch.zeros(BINS, dtype=torch.float64)
         counts[self._bins] += self._counts
         counts[other._bins] += other._counts
-        return Histogram(counts, max(self.largest, other.largest))
+        return Histogram(counts, max(self.largest, other.largest), self._format)
 
     def error(self, scale: float) -> tuple[float, float]:
-        """(relative rms error of rounding to E4M3 with a scale, part of the values that saturates)."""
+        """(relative rms error of rounding to the format with a scale, part of the values that saturates)."""
         values = self._values.double()
-        rounded = to_e4m3(self._values, 1 / scale).float().double() * scale
+        rounded = self._format.rounded(self._values, 1 / scale).float().double() * scale
         squares = float((self._counts * values**2).sum())
         wrong = float((self._counts * (rounded - values) ** 2).sum())
-        beyond = float(self._counts[values > E4M3_MAX * scale].sum() / max(float(self._counts.sum()), 1.0))
+        beyond = float(self._counts[values > self._format.largest * scale].sum() / max(float(self._counts.sum()), 1.0))
         return (wrong / squares) ** 0.5 if squares else 0.0, beyond
 
     def percentile(self, percent: float) -> float:
@@ -68,13 +70,14 @@ class Histogram:
     def _scale(self, method: Method) -> float:
         if self.largest == 0:
             return 1.0
+        most = self._format.largest
         if method == "max":
-            return self.largest / E4M3_MAX
+            return self.largest / most
         if method == "headroom":
-            return self.largest * HEADROOM / E4M3_MAX
+            return self.largest * HEADROOM / most
         if method == "percentile":
-            return max(self.percentile(PERCENTILE), self.largest / 1e6) / E4M3_MAX
-        tried = [self.largest / E4M3_MAX * 2 ** (-step / 8) for step in range(-8, 41)]
+            return max(self.percentile(PERCENTILE), self.largest / 1e6) / most
+        tried = [self.largest / most * 2 ** (-step / 8) for step in range(-8, 41)]
         return min(tried, key=lambda scale: self.error(scale)[0])
 
 
@@ -84,6 +87,7 @@ def collect(
     batches: Iterable[tuple[Observation, Tensor]],
     steps: int,
     rows: dict[str, Rows] | None = None,
+    format: Format = FP8,
 ) -> dict[str, Histogram]:
     """Run the reference on (observations, noise) and count what every site sees, over all denoising steps.
 
@@ -102,7 +106,7 @@ def collect(
         on_host = bins.cpu().double()
         if on_host[BINS:].any():
             raise ObservationError(f"{name} sees values that aren't finite; are these weights or pictures damaged?")
-        found[name] = Histogram(on_host[:BINS], float(largest[name]))
+        found[name] = Histogram(on_host[:BINS], float(largest[name]), format)
     return found
 
 

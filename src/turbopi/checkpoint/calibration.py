@@ -7,11 +7,13 @@ from pathlib import Path
 from turbopi.checkpoint.base import Checkpoint
 from turbopi.errors import ConfigError
 from turbopi.quantization.calibration_file import Quantization, check_given
-from turbopi.quantization.plan import TIERS
+from turbopi.quantization.formats import Numbers
+from turbopi.quantization.plan import TIERS, format_of
 
 logger = logging.getLogger(__name__)
 
-BESIDE = "turbopi_fp8.json"  # in a checkpoint's folder: found there unless another file is named
+# in a checkpoint's folder: found there unless another file is named
+BESIDE: dict[Numbers, str] = {"fp8": "turbopi_fp8.json", "int8": "turbopi_int8.json"}
 
 
 def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:
@@ -26,24 +28,27 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
     if checkpoint.path is None:  # so not yet
         quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
     for warning in quantization.warnings:
-        logger.warning("FP8: %s", warning)
+        logger.warning("%s: %s", quantization.format.label, warning)
     return quantization
 
 
 def calibration_of(given: "str | Path | Quantization | None", tier: str, checkpoint: Checkpoint) -> Quantization | None:
     """What `for_policy` takes, checked before any work: against the weights only if they are on disk.
 
-    Raises ConfigError too where it leaves no site at all in FP8: such a policy would be bfloat16 under FP8's name.
+    Raises ConfigError too where it leaves no site at all in eight bits: such a policy would be bfloat16 with
+    another name.
     """
     if tier not in TIERS:
         check_given(tier, given)
         return None
     if given is None:
-        beside = None if checkpoint.path is None else checkpoint.path / BESIDE
+        numbers = format_of(tier).name
+        beside = None if checkpoint.path is None else checkpoint.path / BESIDE[numbers]
         if beside is None or not beside.is_file():
             raise ConfigError(
-                f"precision {tier!r} needs a calibration: run `turbopi calibrate` on this checkpoint and give the file "
-                f"that it writes (--quantization FILE, or as {BESIDE} beside the weights)"
+                f"precision {tier!r} needs a calibration: run `turbopi calibrate --precision {numbers}` on this "
+                f"checkpoint and give the file that it writes (--quantization FILE, or as {BESIDE[numbers]} beside the "
+                "weights)"
             )
         given = beside
     quantization = given if isinstance(given, Quantization) else Quantization.load(given)

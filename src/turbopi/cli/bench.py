@@ -158,7 +158,7 @@ def bench(
     precisions: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME,NAME,…", help="bf16, f32, fp8, fp8-mlp; else bf16, or what the backends have instead."
+            metavar="NAME,NAME,…", help="bf16, f32, fp8, fp8-mlp, int8; else bf16, or what the backends have instead."
         ),
     ] = None,
     table: Annotated[
@@ -204,7 +204,7 @@ def bench(
     device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     tokenizer: Annotated[str | None, typer.Option(metavar="FILE", help="SentencePiece model.")] = None,
     quantization: Annotated[
-        str | None, typer.Option(metavar="FILE", help="What `turbopi calibrate` wrote, for fp8 and fp8-mlp.")
+        str | None, typer.Option(metavar="FILE", help="What `turbopi calibrate` wrote, for fp8, fp8-mlp or int8.")
     ] = None,
     predict: Annotated[
         str | None,

@@ -1,4 +1,4 @@
-"""`turbopi calibrate`: FP8 scales for one's own checkpoint, from one's own observations."""
+"""`turbopi calibrate`: FP8 or INT8 scales for one's own checkpoint, from one's own observations."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,12 +25,19 @@ if TYPE_CHECKING:
     examples=(
         "turbopi calibrate checkpoints/mine --observations recordings",
         "turbopi calibrate checkpoints/pi05_libero --config pi05_libero --out fp8.json",
+        "turbopi calibrate checkpoints/mine --precision int8 --observations recordings",
         "turbopi calibrate --random-weights pi05_tiny --out tiny_fp8.json --noises 2",
     ),
 )
 def calibrate(
     options: RobotOptions,
     checkpoint: CheckpointArgument = None,
+    precision: Annotated[
+        str,
+        typer.Option(
+            "--precision", metavar="fp8|int8", help="int8 is for GPUs without FP8: compute capability 8.0-8.7."
+        ),
+    ] = "fp8",
     observations: Annotated[
         str | None,
         typer.Option(
@@ -43,7 +50,11 @@ def calibrate(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", metavar="FILE", help="Where it goes.", show_default="turbopi_fp8.json beside the weights"
+            "--out",
+            "-o",
+            metavar="FILE",
+            help="Where it goes.",
+            show_default="turbopi_fp8.json or turbopi_int8.json beside the weights",
         ),
     ] = None,
     count: Annotated[
@@ -80,19 +91,24 @@ def calibrate(
     tokenizer: Annotated[str | None, typer.Option("--tokenizer", metavar="FILE", help="SentencePiece model.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Prepare a checkpoint for FP8: scales of every activation, and which products had better stay in bf16.
+    """Prepare a checkpoint for FP8 or INT8: scales of every activation, and which products had better stay in bf16.
 
     Runs the float32 policy on your observations over all denoising steps, tries several ways to choose scales, and
-    reports on observations held out from all of that what FP8 does to the actions. The file it writes holds for these
-    weights alone. Needs no FP8 hardware.
+    reports on observations held out from all of that what that does to the actions. The file it writes holds for these
+    weights and this precision alone. Needs no such hardware.
     """
     output = Output(as_json)
+    from turbopi.quantization.formats import FORMATS
+
+    format = next((one for one in FORMATS.values() if one.name == precision), None)
+    if format is None:
+        raise ConfigError(f"--precision {precision!r} isn't what calibration is for; choose {' or '.join(FORMATS)}")
     if out is None and (checkpoint is None or options.random_weights is not None):
         raise ConfigError("there is no checkpoint's folder to write beside: name a file with --out FILE")
     from turbopi.checkpoint.calibration import BESIDE
 
     opened = options.open(checkpoint)
-    out = out or Path(str(checkpoint)) / BESIDE
+    out = out or Path(str(checkpoint)) / BESIDE[format.name]
     check_writable(out)
     replaced = _replaced(out)
     options.tell_if_random(opened, output)
@@ -105,7 +121,7 @@ def calibrate(
         "tokenizer": tokenizer,
         "robot": options.make_robot(),
     }
-    settings = Settings(arguments, observations, count, noises, seed, target, batch)
+    settings = Settings(arguments, observations, count, noises, seed, target, batch, format=format)
     result = with_stages(lambda progress: run(opened, settings, progress), Progress, output)
     result.save(out)
     _show(result, output)
@@ -133,7 +149,7 @@ def _replaced(out: Path) -> str | None:
 def _show(result: "Quantization", output: Output) -> None:
     from turbopi.calibrate.report import read_report
 
-    report = read_report(result.report)
+    report = read_report(result.report, result.numbers)
     seen, worst = report.observations, report.held_out.worst
     output.line(
         f"{report.model}: {len(seen.calibration)} observations ({seen.source}), {len(seen.held_out)} more "
@@ -141,7 +157,9 @@ def _show(result: "Quantization", output: Output) -> None:
     )
     methods = ", ".join(f"{name} {significant(error.relative_rms)}" for name, error in report.methods.items())
     output.line(f"scales chosen by {report.method} (the actions' relative rms with each way: {methods})")
-    output.table(_table("one group of sites in FP8 alone, calibration observations", report.groups_alone))
+    output.table(
+        _table(f"one group of sites in {result.format.label} alone, calibration observations", report.groups_alone)
+    )
     title = "held-out observations, against float32; sites that are kept run in float32 here"
     output.table(_table(title, report.held_out.errors()))
     output.line(
@@ -150,7 +168,8 @@ def _show(result: "Quantization", output: Output) -> None:
     )
     if report.target_reached is not None:
         verdict = "met" if report.target_reached else "NOT met"
-        output.line(f"cosine of the deltas (actions less noise): the target for fp8, {report.target:g}, is {verdict}")
+        target = f"the target for {result.numbers}, {report.target:g}, is {verdict}"
+        output.line(f"cosine of the deltas (actions less noise): {target}")
     kept: dict[str, list[str]] = {}
     for name, site in result.sites.items():
         if site.kept is not None:

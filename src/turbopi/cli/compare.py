@@ -135,7 +135,7 @@ def _run_variants(
 
 
 def _options_of(variant: "Variant", options: EvalOptions) -> EvalOptions:
-    """The options that a way to run is run with; a calibration is for FP8 alone."""
+    """The options that a way to run is run with; a calibration is for FP8 and INT8 alone."""
     from turbopi.quantization.plan import TIERS
 
     own = replace(options, backend=variant.backend, precision=variant.precision, steps=variant.steps)
@@ -155,7 +155,7 @@ def _check_variants(variants: "list[Variant]", options: EvalOptions, checkpoint:
         checked_steps(variant.steps, ConfigError)
         backends.check(variant.backend, device, variant.precision)  # type: ignore[arg-type]  # parsed
     if not tiers and (options.quantization is not None or options.fp8_parts is not None):
-        raise ConfigError("--quantization and --fp8-parts are for ways to run in FP8, and none of these is")
+        raise ConfigError("--quantization and --fp8-parts are for ways to run in FP8 or INT8, and none of these is")
     for tier in tiers:
         calibration_of(options.policy_arguments()["quantization"], tier, checkpoint)
 

@@ -176,6 +176,7 @@ def needed_gb(device: Any, precision: Any) -> float | None:
     from turbopi.bench.measured import measured_calls
 
     chosen = backends.choose(device, precision)[0]
+    alike = "fp8" if precision == "int8" else precision  # a byte a weight, either way
     try:
         backends.check(chosen, device, precision)
     except TurboPiError:
@@ -183,7 +184,7 @@ def needed_gb(device: Any, precision: Any) -> float | None:
     measured = [
         call.device_bytes / 1e9
         for call in measured_calls()
-        if (call.backend, call.precision, call.job.batch) == (chosen, precision, 1) and call.device_bytes is not None
+        if (call.backend, call.precision, call.job.batch) == (chosen, alike, 1) and call.device_bytes is not None
     ]
     return max(measured, default=FULL_SIZE_GB["bf16"] + ACTIVATIONS_GB) + CONTEXT_GB
 

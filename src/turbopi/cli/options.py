@@ -167,7 +167,7 @@ class PolicyOptions(RobotOptions):
         _option(
             "--precision",
             panel=_RUNNING,
-            metavar="bf16|f32|fp8|fp8-mlp",
+            metavar="bf16|f32|fp8|fp8-mlp|int8",
             help="bf16 as openpi serves it, f32, or calibrated. Unless given, bf16, or what --backend has instead.",
         ),
     ] = None
@@ -177,7 +177,7 @@ class PolicyOptions(RobotOptions):
             "--quantization",
             panel=_RUNNING,
             metavar="FILE",
-            help="What `turbopi calibrate` wrote, for fp8 and fp8-mlp. Unless given: turbopi_fp8.json beside them.",
+            help="What `turbopi calibrate` wrote. Unless given: turbopi_fp8.json or turbopi_int8.json beside them.",
         ),
     ] = None
     fp8_parts: Annotated[
@@ -186,7 +186,7 @@ class PolicyOptions(RobotOptions):
             "--fp8-parts",
             panel=_RUNNING,
             metavar="PART,PART",
-            help="FP8 in these parts alone: vision, prefix, expert. Unless given, in all that the calibration allows.",
+            help="FP8 or INT8 in these parts alone: vision, prefix, expert. Unless given, all that calibration allows.",
         ),
     ] = None
     steps: Annotated[

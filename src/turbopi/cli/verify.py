@@ -16,7 +16,7 @@ from turbopi.reading import as_document, plain_document
 from turbopi.wording import cosine, significant
 
 if TYPE_CHECKING:
-    from turbopi.verify.document import Certificate, Dimension, Fp8Details, IntermediateDocument
+    from turbopi.verify.document import CalibrationDetails, Certificate, Dimension, IntermediateDocument
 
 
 @command(
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         "turbopi verify checkpoints/mine --observations recordings --count 32",
         "turbopi verify checkpoints/pi05_libero --precision f32 --bound 2e-6 --json",
         "turbopi verify checkpoints/mine --precision fp8 --observations recordings/new",
+        "turbopi verify checkpoints/mine --backend emulated_int8 --precision int8",
     ),
 )
 def verify(
@@ -113,7 +114,7 @@ def _write(document: "Certificate", folder: Path, output: Output) -> None:
 
 
 def _show(document: "Certificate", output: Output) -> None:
-    from turbopi.verify.document import Fp8Details
+    from turbopi.verify.document import CalibrationDetails
 
     observed = document.observations
     subject = f"{document.backend} {document.precision}"
@@ -123,8 +124,9 @@ def _show(document: "Certificate", output: Output) -> None:
     )
     output.line(f"weights {document.weights.fingerprint or 'not hashed'}")
     output.line(f"observations {observed.sha256}")
-    if document.fp8 is not None:
-        output.line(_calibration(as_document(document.fp8, Fp8Details, "the policy's FP8")))
+    if document.calibrated is not None:
+        told = as_document(document.calibrated, CalibrationDetails, "the policy's calibration")
+        output.line(_calibration(told, document.precision))
         seen = observed.calibrated_on
         output.line(f"{seen} of {observed.count} observations were calibrated on", "yellow" if seen else None)
     output.table(_intermediates(document))
@@ -160,12 +162,15 @@ def _show(document: "Certificate", output: Output) -> None:
         output.line(f"{'ok  ' if check.ok else 'FAIL'} {check.text}", None if check.ok else "red")
 
 
-def _calibration(fp8: "Fp8Details") -> str:
-    """Which products run in FP8, by what."""
-    groups = {name: state if isinstance(state, str) else "in part" for name, state in fp8.plan.items()}
-    others = sorted(name for name, state in groups.items() if not state.startswith("fp8"))
+def _calibration(told: "CalibrationDetails", precision: str) -> str:
+    """Which products run in eight bits, by what."""
+    numbers = precision.split("-")[0]
+    groups = {name: state if isinstance(state, str) else "in part" for name, state in told.plan.items()}
+    others = sorted(name for name, state in groups.items() if not state.startswith(numbers))
     kept = f"all but {', '.join(others)}" if others else "every site"
-    return f"FP8 in {kept}; calibration {fp8.calibration} ({fp8.identity[:16]}…), on {fp8.observations}"
+    return (
+        f"{numbers.upper()} in {kept}; calibration {told.calibration} ({told.identity[:16]}…), on {told.observations}"
+    )
 
 
 def _intermediates(document: "Certificate") -> Table:

@@ -1,6 +1,7 @@
 """The reference with its sites rounded: plain PyTorch, float32 between the roundings, exact in what is rounded.
 
-The oracle of the engine's FP8, and the instrument that says what FP8 does to a checkpoint's actions, on any device.
+The oracle of the engine's FP8 and INT8, and the instrument that says what they do to a checkpoint's actions, on any
+device.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -15,52 +16,59 @@ from turbopi.kernels.portable.quantize import quantize
 from turbopi.model.layers import AdaRMSNorm, inverse_rms
 from turbopi.model.reference import Pi0Model
 from turbopi.model.sites import linears, norm_of
-from turbopi.quantization.fp8 import Directions, Fp8Matrix, to_e4m3
+from turbopi.quantization.formats import FP8, Format
+from turbopi.quantization.fp8 import Directions, ScaledMatrix
 from turbopi.quantization.sites import Site
 
 Round = Callable[[Tensor], Tensor]
 
 
-def round_activation(x: Tensor, scale: float) -> Tensor:
-    """x as E4M3 with a scale holds it, in x's dtype."""
-    return (to_e4m3(x, 1 / scale).float() * scale).to(x.dtype)
+def round_activation(x: Tensor, scale: float, format: Format = FP8) -> Tensor:
+    """x as numbers of the format with a scale hold it, in x's dtype."""
+    return format.held(x, scale)
 
 
-def round_weight(weight: Tensor, directions: Directions | None = None) -> Tensor:
-    """A matrix [out, in] as E4M3 with a scale an output channel holds it, in its dtype."""
-    return quantize(weight, 1.0, directions).dequantized().to(weight.dtype)
+def round_weight(weight: Tensor, directions: Directions | None = None, format: Format = FP8) -> Tensor:
+    """A matrix [out, in] as such numbers with a scale an output channel hold it, in its dtype."""
+    return quantize(weight, 1.0, directions, format).dequantized().to(weight.dtype)
 
 
 class RoundedWeights:
-    """A model's matrices in E4M3, each rounded when it is first asked for and then held, a byte a weight.
+    """A model's matrices in eight bits, each rounded when it is first asked for and then held, a byte a weight.
 
     directions  of the sites that have them
     """
 
-    def __init__(self, directions: Mapping[Site, Directions] | None = None) -> None:
+    def __init__(self, directions: Mapping[Site, Directions] | None = None, format: Format = FP8) -> None:
+        self.format = format
         self._directions = directions or {}
-        self._held: dict[int, tuple[Tensor, Fp8Matrix]] = {}  # with the weight, so that no other comes to lie there
+        self._held: dict[int, tuple[Tensor, ScaledMatrix]] = {}  # with the weight, so that no other comes to lie there
 
     def __call__(self, site: Site, weight: Tensor) -> Tensor:
         if id(weight) not in self._held:
-            self._held[id(weight)] = weight, quantize(weight, 1.0, self._directions.get(site))
+            self._held[id(weight)] = weight, quantize(weight, 1.0, self._directions.get(site), self.format)
         return self._held[id(weight)][1].dequantized().to(weight.dtype)
 
 
 @contextmanager
 def rounded(model: Pi0Model, scales: Mapping[Site, float], weights: RoundedWeights | None = None) -> Iterator[None]:
-    """For a while, products of these sites are of E4M3 numbers."""
+    """For a while, products of these sites are of rounded numbers, of the weights' format."""
     rounding = weights or RoundedWeights()
     changes: list[tuple[nn.Linear, Round, Round]] = []
     norms: list[tuple[AdaRMSNorm, Round]] = []
     for site, scale in scales.items():
-        inputs: Round = partial(round_activation, scale=scale)
+        inputs = input_rounding(site, scale, rounding.format)
         if (norm := norm_of(model, site)) is not None:
             norms.append((norm, inputs))
             inputs = _as_it_is
         changes += [(linear, inputs, partial(rounding, site)) for linear in linears(model, site)]
     with replaced(changes), replaced_in_norms(norms):
         yield
+
+
+def input_rounding(site: Site, scale: float, format: Format) -> Round:
+    """What becomes of a site's activation."""
+    return partial(round_activation, scale=scale, format=format) if format.rounds_input(site.part) else _as_it_is
 
 
 def _as_it_is(x: Tensor) -> Tensor:

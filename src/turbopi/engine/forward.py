@@ -6,7 +6,7 @@ or the state changes. The mathematics is `turbopi.model.reference`'s; only its o
 
   - matrices that share an input are one product; adaRMS comes from a table of all steps;
   - a residual is added together with the norm behind it;
-  - where the next matrix is an `Fp8Matrix`, an operation's result is rounded to E4M3 for it;
+  - where the next matrix is a `ScaledMatrix`, an operation's result is rounded to E4M3 for it;
   - logits leave their product in float32 and keys beyond `length` get -inf before the softmax.
 
 Rows of several observations may stand one behind the other: only attention knows whose they are (engine/batch.py).

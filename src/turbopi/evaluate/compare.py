@@ -15,6 +15,8 @@ from turbopi.evaluate.statistics import Paired, PairedDocument, Percentiles, Rat
 from turbopi.evaluate.visited import ActionDifference
 from turbopi.files import write_whole
 from turbopi.quantization.calibration_file import RANDOM_NOISE
+from turbopi.quantization.formats import told_by
+from turbopi.quantization.plan import format_of
 from turbopi.reading import plain_document
 from turbopi.wording import significant
 
@@ -77,10 +79,10 @@ class Compared:
 
     @property
     def precision(self) -> str:
-        """What the policy ran in, where it told; FP8 that was calibrated on noise says so."""
+        """What the policy ran in, where it told; a calibration on noise says so."""
         policy = self.results.policy
         precision = str(policy.identity.get("precision") or "-")
-        noisy = _at(policy.about, "backend_details", "fp8", "observations") == RANDOM_NOISE
+        noisy = (told_by(policy.about.get("backend_details")) or {}).get("observations") == RANDOM_NOISE
         calibration = _calibration(self.results)
         told = [precision, *([] if calibration is None else [calibration[:8]]), *(["random noise"] if noisy else [])]
         return ", ".join(told)
@@ -154,7 +156,9 @@ def check_same_protocol(runs: Sequence[Results]) -> None:
 
 
 def check_same_calibration(runs: Sequence[Results]) -> None:
-    """Two FP8 runs that differ in backend or steps should differ in nothing else without anybody's noticing."""
+    """Two runs in FP8, or in INT8, that differ in backend or steps should differ in nothing else without anybody's
+    noticing.
+    """
     first: dict[str, Results] = {}
     for run in runs:
         calibration = _calibration(run)
@@ -162,10 +166,11 @@ def check_same_calibration(runs: Sequence[Results]) -> None:
             continue
         # a server doesn't tell its weights: what it tells besides stands for them
         told = run.policy.identity.get("weights") or _at(run.policy.identity, "server", "config")
-        other = first.setdefault(str(told), run)
+        numbers = format_of(str(run.policy.identity.get("precision"))).label
+        other = first.setdefault(f"{numbers} of {told}", run)
         if _calibration(other) != calibration:
             raise ConfigError(
-                f"{other.folder} and {run.folder} are FP8 of one model by different calibrations "
+                f"{other.folder} and {run.folder} are {numbers} of one model by different calibrations "
                 f"({str(_calibration(other))[:8]} and {calibration[:8]}): run one of them again with the other's "
                 "--quantization, or give --across-calibrations if that is what you compare"
             )

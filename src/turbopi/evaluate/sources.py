@@ -10,6 +10,7 @@ import numpy as np
 
 from turbopi.errors import ActionError, ConfigError, TurboPiError
 from turbopi.execution.messages import PREFIX, message
+from turbopi.quantization.formats import told_by
 from turbopi.reading import is_finite, shown
 from turbopi.wire import MAX_BYTES, WireError, pack, unpack
 
@@ -123,10 +124,9 @@ class LocalPolicy:
 
 
 def calibration_of(metadata: Mapping[str, object]) -> str | None:
-    """Which calibration a policy runs with (`Quantization.identity`), where its metadata tells; None: not in FP8."""
-    details = metadata.get("backend_details")
-    fp8 = details.get("fp8") if isinstance(details, Mapping) else None
-    return fp8.get("identity") if isinstance(fp8, Mapping) else None
+    """Which calibration a policy runs with (`Quantization.identity`), where its metadata tells; None: it has none."""
+    identity = (told_by(metadata.get("backend_details")) or {}).get("identity")
+    return identity if isinstance(identity, str) else None
 
 
 def offered(metadata: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -35,9 +35,11 @@ def dependent_launch(x: Tensor) -> dict[str, Any]:
     return {"PDL": False}
 
 
-def result_dtype(x: Tensor, inverse: float | None) -> torch.dtype:
-    """x's, or E4M3 where a result is scaled for it. Triton's interpreter can't round to E4M3: it keeps float32."""
-    return x.dtype if inverse is None else E4M3 if x.is_cuda else torch.float32
+def result_dtype(x: Tensor, inverse: float | None, numbers: torch.dtype = E4M3) -> torch.dtype:
+    """x's, or `numbers` where a result is scaled for them; Triton's interpreter can't round to E4M3: then float32."""
+    if inverse is None:
+        return x.dtype
+    return numbers if x.is_cuda or numbers != E4M3 else torch.float32
 
 
 @lru_cache

@@ -32,8 +32,8 @@ def hopper_kernels(device: torch.device) -> bool:
 
 
 def fused_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
-    """Activations are bfloat16; with an `Fp8Matrix` (from compute capability 8.9) E4M3 between it and the operation
-    before it. `tiles` were measured on this GPU. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor
+    """Activations are bfloat16; between a `ScaledMatrix` and the operation before it E4M3 (from compute capability 8.9)
+    or int8. `tiles` were measured on this GPU. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor
     "portable".
     """
     if not hopper_kernels(device):

@@ -3,8 +3,8 @@
 `PLAIN` defines what an operation computes; kernels of our own must equal it. Reductions and nonlinear functions are
 float32 inside; results have the activations' dtype.
 
-Where the product behind an operation is an `Fp8Matrix`, the operation gets that input's `inverse` scale, and its result
-is E4M3, rounded once from float32.
+Where the product behind an operation is a `ScaledMatrix`, the operation gets that input's `inverse` scale and its
+`numbers`, E4M3 or int8, and its result is of these, rounded once from float32.
 
 Shapes: D, W widths, F hidden width of an MLP, K head_dim, n query heads over one key/value head.
 """
@@ -18,7 +18,8 @@ from torch import Tensor
 from turbopi.kernels.interface import PILLOW_BITS, Ops, Taps
 from turbopi.model.layers import apply_rope, rms_normalize
 from turbopi.model.vision import normalize_images
-from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
+from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
+from turbopi.quantization.int8 import to_int8
 
 
 def resize_picture(picture: Tensor, out: Tensor, rows: Taps, columns: Taps, top: int, left: int, low: float) -> None:
@@ -84,6 +85,7 @@ def residual_rms_norm(
     shift: Tensor | None,
     eps: float,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
 ) -> tuple[Tensor, Tensor]:
     """(x + y * gate, its RMSNorm * scale + shift). x, y [tokens, D].
 
@@ -94,43 +96,54 @@ def residual_rms_norm(
         x = x + (y if gate is None else y * gate.to(x.dtype))
     normed = rms_normalize(x, eps) * scale
     normed = normed if shift is None else normed + shift
-    return x, normed.to(x.dtype) if inverse is None else to_e4m3(normed, inverse)
+    return x, as_input(normed, x.dtype, inverse, numbers)
 
 
 def residual_layer_norm(
-    x: Tensor, y: Tensor | None, weight: Tensor, bias: Tensor, eps: float, inverse: float | None = None
+    x: Tensor,
+    y: Tensor | None,
+    weight: Tensor,
+    bias: Tensor,
+    eps: float,
+    inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
 ) -> tuple[Tensor, Tensor]:
     """(x + y, its LayerNorm). x, y [tokens, W]."""
     if y is not None:
         x = x + y
     if inverse is not None:
-        return x, to_e4m3(F.layer_norm(x.float(), (x.shape[-1],), weight.float(), bias.float(), eps), inverse)
+        normed = F.layer_norm(x.float(), (x.shape[-1],), weight.float(), bias.float(), eps)
+        return x, as_input(normed, x.dtype, inverse, numbers)
     return x, F.layer_norm(x, (x.shape[-1],), weight, bias, eps)
 
 
 def linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None) -> Tensor:
     """x @ weightᵀ + bias, into `out` if it is given."""
-    result = weight.product(x, bias).to(weight.dtype) if isinstance(weight, Fp8Matrix) else F.linear(x, weight, bias)
+    result = weight.product(x, bias).to(weight.dtype) if isinstance(weight, ScaledMatrix) else F.linear(x, weight, bias)
     return result if out is None else out.copy_(result)
 
 
-def linear_gelu(x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None) -> Tensor:
-    """gelu(x @ weightᵀ + bias). An Fp8Matrix's product isn't rounded before."""
-    if not isinstance(weight, Fp8Matrix):
-        return as_input(gelu(F.linear(x, weight, bias)), x.dtype, inverse)
-    return as_input(gelu(weight.product(x, bias)), weight.dtype, inverse)
+def linear_gelu(
+    x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None, numbers: torch.dtype = E4M3
+) -> Tensor:
+    """gelu(x @ weightᵀ + bias). A ScaledMatrix's product isn't rounded before."""
+    if not isinstance(weight, ScaledMatrix):
+        return as_input(gelu(F.linear(x, weight, bias)), x.dtype, inverse, numbers)
+    return as_input(gelu(weight.product(x, bias)), weight.dtype, inverse, numbers)
 
 
-def linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None) -> Tensor:
+def linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None, numbers: torch.dtype = E4M3) -> Tensor:
     """[tokens, D] times [2F, D], gate rows before up rows -> gelu(gate) * up [tokens, F]."""
-    if not isinstance(gate_up, Fp8Matrix):
-        return as_input(geglu(F.linear(x, gate_up)), x.dtype, inverse)
-    return as_input(geglu(gate_up.product(x)), gate_up.dtype, inverse)
+    if not isinstance(gate_up, ScaledMatrix):
+        return as_input(geglu(F.linear(x, gate_up)), x.dtype, inverse, numbers)
+    return as_input(geglu(gate_up.product(x)), gate_up.dtype, inverse, numbers)
 
 
-def as_input(x: Tensor, dtype: torch.dtype, inverse: float | None) -> Tensor:
-    """x for the product behind it: E4M3 if it asks for that."""
-    return x.to(dtype) if inverse is None else to_e4m3(x, inverse)
+def as_input(x: Tensor, dtype: torch.dtype, inverse: float | None, numbers: torch.dtype = E4M3) -> Tensor:
+    """x for the product behind it: E4M3 or int8 if it asks for that."""
+    if inverse is None:
+        return x.to(dtype)
+    return to_int8(x, inverse) if numbers == torch.int8 else to_e4m3(x, inverse)
 
 
 def gelu(x: Tensor) -> Tensor:
@@ -167,12 +180,14 @@ def rope_split(qkv: Tensor, cos: Tensor, sin: Tensor, k_out: Tensor, v_out: Tens
     return apply_rope(parts[:, :-2], cos[:, None], sin[:, None]).reshape(-1, head_dim)
 
 
-def vision_attention(qkv: Tensor, images: int, heads: int, inverse: float | None = None) -> Tensor:
+def vision_attention(
+    qkv: Tensor, images: int, heads: int, inverse: float | None = None, numbers: torch.dtype = E4M3
+) -> Tensor:
     """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W]."""
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     q, k, v = qkv.view(images, -1, 3, heads, width // heads).permute(2, 0, 3, 1, 4)
     attended = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(rows, width)
-    return as_input(attended, qkv.dtype, inverse)
+    return as_input(attended, qkv.dtype, inverse, numbers)
 
 
 def masked_softmax(
@@ -198,6 +213,7 @@ def attention(
     *,
     softmax: Callable[..., Tensor] = masked_softmax,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
 ) -> Tensor:
     """softmax(q kᵀ / √K) v over keys [0, length) and [slots, …): q [tokens * n, K] -> [tokens, n * K].
 
@@ -207,7 +223,7 @@ def attention(
     """
     logits = matmul_f32(q, k.t())
     probabilities = softmax(logits, length, slots, heads, state_token, q.shape[1] ** -0.5, v.dtype)
-    return as_input((probabilities @ v).view(-1, heads * q.shape[1]), q.dtype, inverse)
+    return as_input((probabilities @ v).view(-1, heads * q.shape[1]), q.dtype, inverse, numbers)
 
 
 def matmul_f32(a: Tensor, b: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from turbopi.kernels.interface import BatchOps, Segments
 from turbopi.kernels.plain import as_input, matmul_f32
+from turbopi.quantization.fp8 import E4M3
 
 
 def embed_rows(source: Tensor, pictures: Tensor, table: Tensor, out: Tensor) -> None:
@@ -22,7 +23,13 @@ def embed_rows(source: Tensor, pictures: Tensor, table: Tensor, out: Tensor) -> 
 
 
 def packed_attention(
-    q: Tensor, k: Tensor, v: Tensor, segments: Segments, heads: int, inverse: float | None = None
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    segments: Segments,
+    heads: int,
+    inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
 ) -> Tensor:
     """Each row of q [R * n, K] over the keys of its own segment: k, v [R, K], finite -> [R, n * K]."""
     rows, dim = k.shape
@@ -30,7 +37,7 @@ def packed_attention(
     visible = whose[:, None] == whose
     queries = q.view(rows, heads, dim).transpose(0, 1)
     attended = F.scaled_dot_product_attention(queries, k.expand(heads, -1, -1), v.expand(heads, -1, -1), visible)
-    return as_input(attended.transpose(0, 1).reshape(rows, heads * dim), q.dtype, inverse)
+    return as_input(attended.transpose(0, 1).reshape(rows, heads * dim), q.dtype, inverse, numbers)
 
 
 def suffix_attention(

@@ -1,4 +1,4 @@
-"""What calibration leaves behind: one JSON file that says which products run in FP8, with which scales, and why.
+"""What calibration leaves behind: one JSON file that says which products run in FP8 or INT8, with which scales, why.
 
 It holds for one set of weights (by the hash of all of them), one model and one version of this format; everything else
 is refused. What was measured to get there is kept in it and goes with it into every policy's metadata.
@@ -17,12 +17,15 @@ import torch
 from turbopi.config import ModelConfig
 from turbopi.errors import CalibrationError, ConfigError
 from turbopi.files import write_whole
+from turbopi.quantization.formats import FORMATS, Format, Numbers
 from turbopi.quantization.fp8 import E4M3, Directions
-from turbopi.quantization.plan import TIERS, PrecisionPlan, reason_for_bf16
+from turbopi.quantization.plan import TIERS, PrecisionPlan, format_of, reason_for_bf16
 from turbopi.quantization.sites import PARTS, Part, sites
 from turbopi.reading import is_finite, is_integer, one_line, read_json, shown
 
-FORMAT, VERSION = "turbopi-quantization", 3  # 1 has no directions; 2 has no scales for the expert's activations
+# version 1 has no directions; 2 has no scales for the expert's activations; 4 says `numbers`. FP8's files are written
+# as version 3, which older Turbo-Pis read, too.
+FORMAT, VERSION, FP8_VERSION = "turbopi-quantization", 4, 3
 RANDOM_NOISE = "random-noise"  # instead of observations: has to be asked for by this name
 
 
@@ -30,7 +33,8 @@ RANDOM_NOISE = "random-noise"  # instead of observations: has to be asked for by
 class SiteScale:
     """A site's share of the file.
 
-    scale       of its activation: x ≈ e4m3 * scale; None for the expert's in files of versions 1 and 2
+    scale       of its activation: x ≈ e4m3 or int8 * scale; 1 where it isn't rounded; None for the expert's in files of
+                versions 1 and 2
     largest     |x| seen in calibration
     saturated   part of the held-out values beyond the largest number
     error       relative rms of its products on the calls that sites are chosen on, rounded against not
@@ -88,14 +92,19 @@ class SiteScale:
 
 @dataclass(frozen=True)
 class Quantization:
-    """A calibrated checkpoint's FP8: read with `load`, checked with `check`, narrowed with `only`."""
+    """A calibrated checkpoint's FP8 or INT8: read with `load`, checked with `check`, narrowed with `only`."""
 
     fingerprint: str
     shapes: Mapping[str, Any]
     sites: Mapping[str, SiteScale]
     report: Mapping[str, Any]  # observations, method, held-out errors, warnings
+    numbers: Numbers = "fp8"
     parts: tuple[Part, ...] = PARTS
     source: str = field(default="", compare=False)  # where it was read from
+
+    @property
+    def format(self) -> Format:
+        return FORMATS[self.numbers]
 
     @property
     def on_random_noise(self) -> bool:
@@ -117,15 +126,17 @@ class Quantization:
         """SHA-256 of all that decides a policy's numbers: weights, scales, directions, what stays in bf16, parts."""
         sites = {name: (site.scale, site.kept is None, *site.digest) for name, site in self.sites.items()}
         decisive = {"weights": self.fingerprint, "sites": sites, "parts": list(self.parts)}
+        if self.numbers != "fp8":  # whose identities stay what they were
+            decisive["numbers"] = self.numbers
         return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
 
     def only(self, parts: Sequence[str]) -> "Quantization":
-        """The same with FP8 in these parts of the model alone. Raises ConfigError for a part that doesn't exist."""
+        """The same for these parts of the model alone. Raises ConfigError for a part that doesn't exist."""
         for part in parts:
             if part not in PARTS:
-                raise ConfigError(f"unknown part {part!r} for FP8; choose of {', '.join(PARTS)}")
+                raise ConfigError(f"unknown part {part!r} for {self.format.label}; choose of {', '.join(PARTS)}")
         if not parts:
-            raise ConfigError("FP8 in no part at all; use precision 'bf16'")
+            raise ConfigError(f"{self.format.label} in no part at all; use precision 'bf16'")
         return replace(self, parts=tuple(part for part in PARTS if part in parts))
 
     def check_shapes(self, config: ModelConfig) -> None:
@@ -162,9 +173,15 @@ class Quantization:
             )
 
     def plan(self, config: ModelConfig, tier: str) -> PrecisionPlan:
-        """What runs in FP8 in a tier, and why the rest doesn't."""
+        """What is rounded in a tier, and why the rest isn't. Raises ConfigError for a tier of other numbers."""
         if tier not in TIERS:
-            raise ConfigError(f"{tier!r} is no FP8 tier; choose one of {', '.join(TIERS)}")
+            raise ConfigError(f"{tier!r} is no calibrated precision; choose one of {', '.join(TIERS)}")
+        if format_of(tier).name != self.numbers:
+            wanted = format_of(tier).name
+            raise ConfigError(
+                f"{self.source or 'this calibration'} is for {self.numbers}, the precision is {tier!r}; make one with "
+                f"`turbopi calibrate --precision {wanted}`"
+            )
         chosen: dict[str, float] = {}
         kept: dict[str, str] = {}
         common: dict[str, Directions] = {}
@@ -202,7 +219,7 @@ class Quantization:
         found = {name: site if directions else replace(site, directions=None) for name, site in self.sites.items()}
         return {
             "format": FORMAT,
-            "version": VERSION,
+            **({"version": FP8_VERSION} if self.numbers == "fp8" else {"version": VERSION, "numbers": self.numbers}),
             "weights_sha256": self.fingerprint,
             "shapes": dict(self.shapes),
             "sites": {name: site.as_json() for name, site in found.items()},
@@ -227,6 +244,8 @@ class Quantization:
                     f"{path} has version {shown(content['version'])} of {FORMAT}, this Turbo-Pi reads versions 1 to "
                     f"{VERSION}. Run `turbopi calibrate` again"
                 )
+            numbers = content.get("numbers", "fp8")
+            _expect(isinstance(numbers, str) and numbers in FORMATS, "numbers", f"one of {', '.join(FORMATS)}", numbers)
             for name in ("sites", "shapes", "report"):
                 _expect(isinstance(content[name], dict), name, "an object", content[name])
             report = content["report"]
@@ -239,7 +258,7 @@ class Quantization:
             listed = isinstance(warnings, list) and all(isinstance(one, str) for one in warnings)
             _expect(listed, "warnings", "a list of texts", warnings)
             found = {name: SiteScale.from_json(values) for name, values in content["sites"].items()}
-            return cls(content["weights_sha256"], content["shapes"], found, report, source=str(path))
+            return cls(content["weights_sha256"], content["shapes"], found, report, numbers, source=str(path))
         except CalibrationError:
             raise
         except _UNSOUND as error:
@@ -280,9 +299,9 @@ def shapes_of(config: ModelConfig) -> dict[str, Any]:
 def check_given(precision: str, quantization: "str | Path | Quantization | None") -> None:
     """Raise ConfigError unless a calibration is given exactly where the precision needs one."""
     if precision not in TIERS and quantization is not None:
-        raise ConfigError(f"precision {precision!r} takes no FP8 calibration; with one take {' or '.join(TIERS)}")
+        raise ConfigError(f"precision {precision!r} takes no calibration; with one take {' or '.join(TIERS)}")
     if precision in TIERS and quantization is None:
         raise ConfigError(
-            f"precision {precision!r} needs FP8 calibration; make one with `turbopi calibrate` and give it as "
-            "`quantization`"
+            f"precision {precision!r} needs a calibration; make one with `turbopi calibrate --precision "
+            f"{format_of(precision).name}` and give it as `quantization`"
         )

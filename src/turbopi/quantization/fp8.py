@@ -1,4 +1,4 @@
-"""Numbers of eight bits: E4M3, four bits of exponent and three of mantissa, and matrices made of them.
+"""Numbers of eight bits: E4M3, four bits of exponent and three of mantissa, and matrices of such numbers.
 
 A matrix has one scale an output channel, an activation one scale a site, fixed by calibration: x ≈ e4m3 * scale. Sums
 are float32; the product of both scales is applied to them once, before bias and nonlinearity.
@@ -7,7 +7,7 @@ Rounding is to nearest even. What lies beyond ±448, infinities too, becomes ±4
 Weights whose activations' `Directions` are known are rounded with error feedback, see rounding.py.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -44,31 +44,39 @@ class Directions:
         return Directions(self.codes.to(device), self.scale.to(device), self.rest)
 
 
-def channel_scales(weight: Tensor) -> Tensor:
-    """float32[out]: with it the largest value of each output channel becomes 448."""
-    largest = weight.abs().amax(dim=1).float()
-    return torch.where(largest > 0, largest / E4M3_MAX, torch.ones_like(largest))
+def channel_scales(weight: Tensor, largest: float = E4M3_MAX) -> Tensor:
+    """float32[out]: with it the largest value of each output channel becomes `largest`. NaN where a channel has NaN."""
+    values = weight.abs().amax(dim=1).float()
+    return torch.where(values == 0, torch.ones_like(values), values / largest)
 
 
 @dataclass(frozen=True)
-class Fp8Matrix:
-    """A weight [out, in] in E4M3 whose input comes in E4M3, too. Takes a matrix's place in `engine.weights`."""
+class ScaledMatrix:
+    """A weight [out, in] in numbers of eight bits, E4M3 or int8, whose input comes in the same. Takes a matrix's place
+    in `engine.weights`.
+    """
 
-    data: Tensor  # e4m3[out, in]
+    data: Tensor  # e4m3 or int8[out, in]
     scale: Tensor  # float32[out]: the channel's scale times the input's
     inverse: float  # 1 / scale of the input
-    dtype: torch.dtype  # of results that aren't E4M3
+    dtype: torch.dtype  # of results that aren't rounded for the next matrix
 
     @property
     def shape(self) -> torch.Size:
         return self.data.shape
 
-    def __getitem__(self, rows: slice) -> "Fp8Matrix":
-        return Fp8Matrix(self.data[rows], self.scale[rows], self.inverse, self.dtype)
+    @property
+    def numbers(self) -> torch.dtype:
+        """torch.float8_e4m3fn or torch.int8"""
+        return self.data.dtype
+
+    def __getitem__(self, rows: slice) -> "ScaledMatrix":
+        return replace(self, data=self.data[rows], scale=self.scale[rows])
 
     def product(self, x: Tensor, bias: Tensor | None = None) -> Tensor:
-        """float32[tokens, out]: x e4m3[tokens, in] times this, as it is meant; slow."""
-        sums = (x.float() @ self.data.float().T) * self.scale
+        """float32[tokens, out]: x [tokens, in] of the same numbers times this, as it is meant; slow."""
+        exact = torch.float64 if self.numbers == torch.int8 else torch.float32  # int32 is exact, too
+        sums = (x.to(exact) @ self.data.to(exact).T).float() * self.scale
         return sums if bias is None else sums + bias.float()
 
     def dequantized(self) -> Tensor:
@@ -76,9 +84,14 @@ class Fp8Matrix:
         return self.data.float() * (self.scale * self.inverse)[:, None]
 
 
-Matrix = Tensor | Fp8Matrix
+Matrix = Tensor | ScaledMatrix
 
 
 def input_of(matrix: Matrix) -> dict[str, Any]:
-    """What the operation in front of a matrix must know: nothing, or that its result is to be E4M3, and its scale."""
-    return {"inverse": matrix.inverse} if isinstance(matrix, Fp8Matrix) else {}
+    """What the operation in front of a matrix must know: nothing, or that its result is to be of eight bits, with which
+    scale, and of which numbers, if not E4M3.
+    """
+    if not isinstance(matrix, ScaledMatrix):
+        return {}
+    numbers = {} if matrix.numbers == E4M3 else {"numbers": matrix.numbers}
+    return {"inverse": matrix.inverse, **numbers}

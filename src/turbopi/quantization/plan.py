@@ -4,17 +4,28 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+from turbopi.quantization.formats import FORMATS, Format
 from turbopi.quantization.fp8 import Directions
 from turbopi.quantization.sites import MLP_KINDS, Site
 
-Precision = Literal["bf16", "f32", "fp8", "fp8-mlp"]  # that a policy runs in; the FP8 tiers need a calibration
+# that a policy runs in; the tiers need a calibration
+Precision = Literal["bf16", "f32", "fp8", "fp8-mlp", "int8"]
 Fp8Tier = Literal["fp8", "fp8-mlp"]
-TIERS: tuple[Fp8Tier, ...] = get_args(Fp8Tier)
+FP8_TIERS: tuple[Fp8Tier, ...] = get_args(Fp8Tier)
+Tier = Literal["fp8", "fp8-mlp", "int8"]
+TIERS: tuple[Tier, ...] = get_args(Tier)
+
+
+def format_of(tier: str) -> Format:
+    """What a tier's numbers are."""
+    return FORMATS["int8" if tier == "int8" else "fp8"]
 
 
 @dataclass(frozen=True)
 class PrecisionPlan:
-    """A tier's choice: site -> scale of its activation, site -> why it stays in bfloat16, site -> directions."""
+    """A tier's choice: site -> scale of its activation (1 where that isn't rounded), site -> why it stays in bfloat16,
+    site -> directions.
+    """
 
     tier: str
     scales: Mapping[str, float]
@@ -22,16 +33,20 @@ class PrecisionPlan:
     directions: Mapping[str, Directions]
 
     @property
-    def expert(self) -> Literal["fp8", "bf16"]:
-        """The denoising kernel takes all of the expert's matrices in one precision: FP8 only if none is to be kept."""
-        return "bf16" if any(name.startswith("expert.") for name in self.kept) else "fp8"
+    def format(self) -> Format:
+        return format_of(self.tier)
+
+    @property
+    def expert(self) -> Literal["fp8", "int8", "bf16"]:
+        """The denoising kernel takes all of the expert's matrices in one precision: bf16 if any is to be kept so."""
+        return "bf16" if any(name.startswith("expert.") for name in self.kept) else self.format.name
 
     def describe(self) -> dict[str, Any]:
         """Which sites run in what, by group, and why the others don't."""
         by_group: dict[str, dict[str, list[str]]] = {}
         for name in [*self.scales, *self.kept]:
             part, layer, kind = name.split(".")
-            state = "fp8" if name in self.scales else f"bf16: {self.kept[name]}"
+            state = self.format.name if name in self.scales else f"bf16: {self.kept[name]}"
             by_group.setdefault(f"{part}.{kind}", {}).setdefault(state, []).append(layer)
         return {
             group: next(iter(states))
@@ -44,7 +59,7 @@ class PrecisionPlan:
 def reason_for_bf16(site: Site, scale: float | None, kept: str | None, tier: str, parts: Sequence[str]) -> str | None:
     """Why a site stays in bfloat16; None: it doesn't. `scale` and `kept`: what its calibration says."""
     if site.part not in parts:
-        return f"FP8 is switched off in the {site.part}"
+        return f"{format_of(tier).label} is switched off in the {site.part}"
     if tier == "fp8-mlp" and (site.kind not in MLP_KINDS or site.part == "expert"):
         return "fp8-mlp takes the feed-forward products of vision and prefix alone"
     if scale is None:

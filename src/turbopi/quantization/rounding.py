@@ -1,7 +1,7 @@
-"""Weights to E4M3 so that their errors cancel where activations lie.
+"""Weights to numbers of eight bits so that their errors cancel where activations lie.
 
-Rounded to nearest, a product's weights are off by 2.6 % each, at random. But activations share a few directions: 16
-hold most of a site's second moment. So the weights of a row are rounded one after the other, and
+Rounded to nearest, a product's weights are off by 2.6 % each in E4M3, at random. But activations share a few
+directions: 16 hold most of a site's second moment. So the weights of a row are rounded one after the other, and
 what the earlier ones' errors add up to along those directions is made up for by the later ones. This is GPTQ (Frantar
 et al., 2022, arXiv:2210.17323) with a Hessian of low rank, in which an error takes R numbers a row instead of a matrix.
 
@@ -13,7 +13,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from turbopi.quantization.fp8 import Directions, to_e4m3
+from turbopi.quantization.formats import FP8, Format
+from turbopi.quantization.fp8 import Directions
 
 
 def feedback(directions: Directions) -> tuple[Tensor, Tensor, Tensor]:
@@ -34,14 +35,14 @@ def feedback(directions: Directions) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def round_with_feedback_plain(
-    weight: Tensor, inverse: Tensor, order: Tensor, errors: Tensor, answers: Tensor
+    weight: Tensor, inverse: Tensor, order: Tensor, errors: Tensor, answers: Tensor, format: Format = FP8
 ) -> Tensor:
     """A column at a time: what `kernels.portable.rounding.round_with_feedback` does."""
     scale = 1 / inverse
     rounded = columns_with_feedback(
-        weight, order, errors, answers, lambda wanted, _: to_e4m3(wanted, inverse).float() * scale
+        weight, order, errors, answers, lambda wanted, _: format.rounded(wanted, inverse).float() * scale
     )
-    return to_e4m3(rounded, inverse[:, None])
+    return format.rounded(rounded, inverse[:, None])
 
 
 def columns_with_feedback(

@@ -22,7 +22,7 @@ from turbopi.calibrate.run import Settings, calibrate
 from turbopi.checkpoint import Checkpoint
 from turbopi.files import write_whole
 from turbopi.quantization.calibration_file import Quantization
-from turbopi.quantization.plan import TIERS
+from turbopi.quantization.plan import FP8_TIERS
 from turbopi.reading import plain_document
 from turbopi.recordings import RecordedCall, save_call
 from turbopi.studies.weights import WEIGHTS, Weights, studied_checkpoint
@@ -172,7 +172,7 @@ def condensed(certificate: Certificate) -> CondensedCertificate:
         gpu_bytes=certificate.gpu_bytes,
         weights=certificate.weights.fingerprint,
         observations=CondensedObservations(seen.count, seen.noises, seen.seed, seen.sha256),
-        fp8=certificate.fp8,
+        fp8=certificate.calibrated,
         random_weights=certificate.weights.random,
     )
     return msgspec.convert(_rounded(plain_document(whole)), CondensedCertificate)
@@ -238,7 +238,7 @@ def main() -> None:
     parser.add_argument("--preset", default="pi05_libero")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--weights", choices=WEIGHTS, action="append", help="one kind; may be given again")
-    parser.add_argument("--tier", choices=TIERS, action="append", help="one tier; may be given again")
+    parser.add_argument("--tier", choices=FP8_TIERS, action="append", help="one tier; may be given again")
     parser.add_argument("--calibration", type=int, default=16, help="observations to calibrate on")
     parser.add_argument("--verification", type=int, default=4, help="others to verify on")
     parser.add_argument("--noises", type=int, default=2, help="for each of these")
@@ -247,7 +247,7 @@ def main() -> None:
     passed = run(
         options.out,
         options.weights or WEIGHTS[1:],
-        options.tier or TIERS,
+        options.tier or FP8_TIERS,
         preset=options.preset,
         device=options.device,
         calibration=options.calibration,

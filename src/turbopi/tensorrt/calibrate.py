@@ -118,8 +118,10 @@ def from_quantization(model: Pi0Model, quantization: Quantization) -> Calibratio
     """The prefix MLPs' share of what `turbopi calibrate` measured; layers that it keeps in bfloat16 stay there.
 
     Weights are rounded with one scale a matrix here, from their largest magnitude. Raises ConfigError for scales from
-    random noise.
+    random noise, and for INT8.
     """
+    if quantization.numbers != "fp8":
+        raise ConfigError(f"{quantization.source} is for {quantization.numbers}; engines take scales for fp8")
     if quantization.on_random_noise:
         raise ConfigError(
             f"{quantization.source} was calibrated on random noise; engines take scales from observations"

@@ -29,7 +29,7 @@ from turbopi.kernels.sm90.gemm.products import (
     to_knobs,
 )
 from turbopi.kernels.tile_table import NO_TILES, Knobs
-from turbopi.quantization.fp8 import E4M3, Fp8Matrix, Matrix, to_e4m3
+from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
 from turbopi.tune.gpu import INVERSE, GpuBench, cold_copies, poisoned, relative
 from turbopi.tune.portable import EPS, activated, clone
 from turbopi.tune.shapes import Operation as Wanted
@@ -89,7 +89,7 @@ class Product(GpuBench):
         if one.normed:
             self._norm_in_front(first)
         else:
-            self.x = to_e4m3(self.raw, first.inverse) if isinstance(first, Fp8Matrix) else self.raw
+            self.x = to_e4m3(self.raw, first.inverse) if isinstance(first, ScaledMatrix) else self.raw
             self.exact, twin = self._products(self.x.float() if not self.fp8 else self.x, self.x, first)
             self.twin_error = relative(self.whole(twin), self.exact)
 
@@ -100,7 +100,7 @@ class Product(GpuBench):
         scale, shift = self.random(one.inner), self.random(one.inner)
         self.front = scale, shift
         normed = F.layer_norm(self.raw.float(), (one.inner,), scale.float(), shift.float(), EPS)
-        if isinstance(first, Fp8Matrix):
+        if isinstance(first, ScaledMatrix):
             self._copied(first, scale, shift)
             wide = normed @ first.dequantized().T + assert_bias.float()
             twin = first.product(to_e4m3(normed, first.inverse), assert_bias)
@@ -114,7 +114,7 @@ class Product(GpuBench):
         twin = plain.as_input(activated(one.operation, twin), torch.bfloat16, self.inverse)
         self.twin_error = relative(self.whole(twin), self.exact)
 
-    def _copied(self, first: Fp8Matrix, scale: Tensor, shift: Tensor) -> None:
+    def _copied(self, first: ScaledMatrix, scale: Tensor, shift: Tensor) -> None:
         """The copy of the stream in the units of another one's rows, as `bf16.Copy` says."""
         before = self.random(*self.raw.shape).float()
         mean = before.mean(1, keepdim=True)
@@ -125,13 +125,15 @@ class Product(GpuBench):
         sums = sums_of(units)
         sums.parts[0, :, 1] += units.shape[1] * EPS * factor[:, 0].square()
         self.sums = sums
-        self.folded_fp8 = [FoldedFp8.fold(one, scale, shift) for one in self.weights if isinstance(one, Fp8Matrix)]
+        self.folded_fp8 = [FoldedFp8.fold(one, scale, shift) for one in self.weights if isinstance(one, ScaledMatrix)]
 
     def _products(self, wide: Tensor, x: Tensor, weight: Matrix) -> tuple[Tensor, Tensor]:
         """(the exact result float32, the plain twin's)"""
         one = self.operation
         bias = None if self.bias is None else self.bias.float()
-        sums = weight.product(x, self.bias) if isinstance(weight, Fp8Matrix) else F.linear(wide, weight.float(), bias)
+        sums = (
+            weight.product(x, self.bias) if isinstance(weight, ScaledMatrix) else F.linear(wide, weight.float(), bias)
+        )
         exact = activated(one.operation, sums)
         if one.operation == "residual":
             assert self.stream is not None
@@ -168,7 +170,7 @@ class Product(GpuBench):
             return as_input(
                 matmul(self.raw, given, cut, epilogue, out=out, sums=self.sums, eps=EPS, ahead=ahead), self.inverse
             )
-        if isinstance(weight, Fp8Matrix):
+        if isinstance(weight, ScaledMatrix):
             return matmul_fp8(self.x, weight, cut, epilogue, self.bias, out, self.inverse, ahead=ahead)
         return as_input(matmul(self.x, weight, cut, epilogue, self.bias, out, ahead=ahead), self.inverse)
 
@@ -176,7 +178,7 @@ class Product(GpuBench):
         one, weight, stream = self.operation, self.weights[copy], self.stream
         assert stream is not None
         sums = Sums.allocate(tile, one.rows, one.columns, self.device)
-        if not isinstance(weight, Fp8Matrix):
+        if not isinstance(weight, ScaledMatrix):
             return matmul(
                 self.x,
                 weight,
@@ -245,7 +247,7 @@ class Product(GpuBench):
         if self.operation.normed and not self.fp8:
             return self.folded[at].data
         weight = self.weights[at]
-        return weight.data if isinstance(weight, Fp8Matrix) else weight
+        return weight.data if isinstance(weight, ScaledMatrix) else weight
 
 
 def sums_of(x: Tensor) -> Sums:

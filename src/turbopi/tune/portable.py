@@ -17,7 +17,7 @@ from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import LIBRARY, Knobs
-from turbopi.quantization.fp8 import E4M3, Fp8Matrix, Matrix, to_e4m3
+from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
 from turbopi.tune.gpu import INVERSE, GpuBench, cold_copies, poisoned, relative
 from turbopi.tune.shapes import Operation
 
@@ -69,14 +69,14 @@ class Product(GpuBench):
         self.bias = self.random(one.columns) if one.bias else None
         x = self.random(one.rows, one.inner)
         first: Matrix = quantize(weight, INPUT_SCALE) if fp8 else weight
-        self.x = to_e4m3(x, first.inverse) if isinstance(first, Fp8Matrix) else x
+        self.x = to_e4m3(x, first.inverse) if isinstance(first, ScaledMatrix) else x
         self.copies = cold_copies(weight.numel() * (1 if fp8 else 2), device)
         self.weights = [first, *(clone(first) for _ in range(self.copies - 1))]
         self.stream = self.random(one.rows, one.columns) if one.norm_behind else None
         self.scale = torch.ones(one.columns, device=device)
         self.norm = self.random(one.columns), self.random(one.columns)
         self.inverse = INVERSE if one.out_fp8 else None
-        sums = first.product(self.x, self.bias) if isinstance(first, Fp8Matrix) else x.float() @ weight.float().T
+        sums = first.product(self.x, self.bias) if isinstance(first, ScaledMatrix) else x.float() @ weight.float().T
         self.exact = activated(one.operation, sums)
         self.twin_error = relative(self.whole(self._twin(first)), self.exact)
 
@@ -117,7 +117,7 @@ def activated(operation: str, sums: Tensor) -> Tensor:
 
 
 def clone(matrix: Matrix) -> Matrix:
-    return replace(matrix, data=matrix.data.clone()) if isinstance(matrix, Fp8Matrix) else matrix.clone()
+    return replace(matrix, data=matrix.data.clone()) if isinstance(matrix, ScaledMatrix) else matrix.clone()
 
 
 class Attention(GpuBench):

@@ -19,15 +19,18 @@ since every way of adding up differs, and bugs are as much further off.
 from turbopi.backends import Precision
 
 # times the control (control.py), for actions in the model's units
-BOUND_FACTORS: dict[Precision, float] = {"bf16": 5.0, "f32": 30.0, "fp8": 5.0, "fp8-mlp": 5.0}
+BOUND_FACTORS: dict[Precision, float] = {"bf16": 5.0, "f32": 30.0, "fp8": 5.0, "fp8-mlp": 5.0, "int8": 5.0}
 TRAINED_FACTORS: dict[Precision, float] = BOUND_FACTORS | {"bf16": 10.0}
 
 # of `turbopi verify`
 F32_BOUND = 1e-5  # relative rms of the actions
 BF16_FACTOR = 1.25  # times the bf16 control's
+# of FP8 and of INT8
 FP8_BOUND = 0.0707  # relative rms of the actions: a cosine of 0.9975
 FP8_COSINE = 0.9975  # of what denoising did (actions less noise): what calibration aims at
-FP8_STEP = 2.0**5  # E4M3's rounding is so much coarser than bfloat16's, and so may intermediates be
+# E4M3's rounding is so much coarser than bfloat16's, and so may intermediates be. int8's is a dozen times as coarse
+# for a normal variable; with outliers, which its scale has to hold, more
+FP8_STEP = 2.0**5
 SUSPECT_FACTOR = 3.0  # times the control's, on an intermediate
 JUMP = 10.0  # times the layer or step before
 FLOAT32_ROUNDING = 1e-6  # relative rms: where the control stays in float32 it may have no error at all

@@ -8,9 +8,9 @@ bfloat16 is held to openpi's own error: the relative rms against float32 may be 
 and JAX on the same tensor, or float32's own rounding where openpi stays in float32 (cond). Tensors for which the folder
 has no bfloat16 numbers of openpi are shown without a bound.
 
-FP8 is calibrated on the golden cases themselves, for the target that is asked of it here: a cosine of 0.9995 of the
-actions, which is a relative rms of 3.2 %. Other tensors are shown without a bound. The sites that stay in bfloat16 for
-that are calibration's choice.
+FP8 and INT8 are calibrated on the golden cases themselves, for the target that is asked of them here: a cosine of
+0.9995 of the actions, which is a relative rms of 3.2 %. Other tensors are shown without a bound. The sites that stay in
+bfloat16 for that are calibration's choice.
 """
 
 from collections.abc import Iterator
@@ -23,12 +23,14 @@ import torch
 from turbopi import backends
 from turbopi.backends import Precision
 from turbopi.calibrate.run import Settings, calibrate_model
+from turbopi.calibrate.statistics import Method
 from turbopi.config import Kind
 from turbopi.examples import Example, NoisyExample
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import ModelInputs
 from turbopi.quantization.calibration_file import Quantization, shapes_of
-from turbopi.quantization.plan import TIERS
+from turbopi.quantization.formats import FP8, Format, Numbers
+from turbopi.quantization.plan import TIERS, format_of
 from turbopi.verify.golden import Arrays, Case, GoldenFolder, Run
 
 # max absolute error against torch_fp32. Masks, positions and times must be equal.
@@ -62,6 +64,7 @@ FLOAT32_ROUNDING = 1e-6  # relative rms
 FP8_COSINE = 0.9995  # of the actions
 FP8_BOUND = (1 - FP8_COSINE**2) ** 0.5  # relative rms: what that cosine allows
 FP8_TARGET = 0.9997  # asked of calibration, which aims at it with emulated float32 between the roundings
+GOLDEN_METHODS: dict[Numbers, tuple[Method, ...]] = {"fp8": ("headroom",), "int8": ("mse",)}  # how scales are chosen
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,9 @@ def check_folder(
                     lambda to, mode, checkpoint=checkpoint: checkpoint.load(to, mode).state,  # type: ignore[misc]
                     device=device,
                     precision=precision,
-                    quantization=golden_calibration(folder, case.kind, device) if precision in TIERS else None,
+                    quantization=golden_calibration(folder, case.kind, device, format=format_of(precision))
+                    if precision in TIERS
+                    else None,
                 )
             yield check_case(case, loaded[case.kind, precision])
 
@@ -114,7 +119,7 @@ def golden_calls(case: Case) -> list[NoisyExample]:
 
 
 def golden_calibration(
-    folder: GoldenFolder, kind: Kind, device: torch.device, target: float = FP8_TARGET
+    folder: GoldenFolder, kind: Kind, device: torch.device, target: float = FP8_TARGET, format: Format = FP8
 ) -> Quantization:
     """A calibration on the golden cases of a kind that have the first's horizon; what it reports is on them, too."""
     checkpoint = folder.checkpoint(kind)
@@ -122,9 +127,10 @@ def golden_calibration(
     calls = [call for case in folder.cases() if case.kind == kind for call in golden_calls(case)]
     calls = [call for call in calls if call.noise.shape == calls[0].noise.shape]
     twice = sorted(calls * 2, key=lambda call: call.example.source)  # one gives directions, the other chooses sites
-    measured = calibrate_model(model, twice, calls, 3, Settings({}, target=target, batch=1, methods=("headroom",)))
+    settings = Settings({}, target=target, batch=1, methods=GOLDEN_METHODS[format.name], format=format)
+    measured = calibrate_model(model, twice, calls, 3, settings)
     report = {**measured.report, "observations": {"source": "the golden cases themselves"}}
-    return Quantization(checkpoint.fingerprint(), shapes_of(model.config), measured.sites, report)
+    return Quantization(checkpoint.fingerprint(), shapes_of(model.config), measured.sites, report, format.name)
 
 
 def check_case(case: Case, backend: backends.Backend) -> list[Comparison]:

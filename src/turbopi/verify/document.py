@@ -10,6 +10,7 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from turbopi.provenance import Provenance
+from turbopi.quantization.formats import told_by
 
 Number = float | None
 Count = Annotated[int, Meta(ge=0)]
@@ -181,8 +182,8 @@ class WeightsDocument(Struct, frozen=True):
     fingerprint: str | None  # None: not hashed
 
 
-class Fp8Details(Struct, frozen=True):
-    """What an FP8 policy tells of its calibration."""
+class CalibrationDetails(Struct, frozen=True):
+    """What a policy in FP8 or INT8 tells of its calibration."""
 
     plan: Mapping[str, object]  # group of sites -> what it runs in; an object: its sites differ
     calibration: str
@@ -210,8 +211,6 @@ class Certificate(Judged, frozen=True, kw_only=True):
     provenance: Provenance
 
     @property
-    def fp8(self) -> Mapping[str, object] | None:
-        """What the backend tells of FP8, as it tells it (`Fp8Details`); None in another precision."""
-        details = self.policy.get("backend_details")
-        told = details.get("fp8") if isinstance(details, Mapping) else None
-        return told if isinstance(told, Mapping) else None
+    def calibrated(self) -> Mapping[str, object] | None:
+        """What the backend tells of its calibration, as it tells it (`CalibrationDetails`); None: it has none."""
+        return told_by(self.policy.get("backend_details"))

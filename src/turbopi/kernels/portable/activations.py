@@ -1,10 +1,13 @@
 """GeGLU behind a product that hasn't it in its epilogue. Twin: `kernels.plain.geglu`."""
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
+from turbopi.kernels.portable.rounding import as_stored
+from turbopi.quantization.fp8 import E4M3
 
 
 @triton.jit
@@ -25,17 +28,17 @@ def _geglu_kernel(gate_up, out, hidden, inverse, SCALED: tl.constexpr, BLOCK: tl
     result = gate * up
     if SCALED:
         result *= inverse
-    tl.store(out + row * hidden + cols, result.to(out.dtype.element_ty), mask)
+    tl.store(out + row * hidden + cols, as_stored(result, out), mask)
 
 
-def geglu(gate_up: Tensor, inverse: float | None = None) -> Tensor:
+def geglu(gate_up: Tensor, inverse: float | None = None, numbers: torch.dtype = E4M3) -> Tensor:
     """[tokens, 2F], gate columns before up columns -> [tokens, F]; the product isn't rounded in between.
 
-    With `inverse` the result leaves as E4M3: see `quantization.fp8`.
+    With `inverse` the result leaves as `numbers`, E4M3 or int8: see `quantization.fp8`.
     """
     assert gate_up.is_contiguous(), "gate_up is read as it lies in memory"
     rows, hidden = gate_up.shape[0], gate_up.shape[1] // 2
-    out = gate_up.new_empty(rows, hidden, dtype=result_dtype(gate_up, inverse))
+    out = gate_up.new_empty(rows, hidden, dtype=result_dtype(gate_up, inverse, numbers))
     block = min(2048, triton.next_power_of_2(hidden))
     _geglu_kernel[(triton.cdiv(hidden, block), rows)](
         gate_up, out, hidden, inverse or 1.0,

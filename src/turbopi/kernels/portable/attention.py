@@ -11,8 +11,10 @@ from torch import Tensor
 
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 from turbopi.kernels.portable.attention_tiles import AttentionTile, chosen_tile
+from turbopi.kernels.portable.rounding import as_stored
 from turbopi.kernels.portable.shared_memory import capability_of
 from turbopi.kernels.tile_table import NO_TILES, TileTable
+from turbopi.quantization.fp8 import E4M3
 
 LOG2_E = 1.4426950408889634
 
@@ -61,11 +63,10 @@ def _vision_kernel(
     if SCALED:
         total /= inverse
     to = out + (image * tokens + m)[:, None] * width + head * DIM
-    dtype = out.dtype.element_ty
-    tl.store(to + a[None, :], (acc_a / total[:, None]).to(dtype), (m < tokens)[:, None])
+    tl.store(to + a[None, :], as_stored(acc_a / total[:, None], out), (m < tokens)[:, None])
     if BLOCK_B > 0:
         stored = (m < tokens)[:, None] & (b < DIM)[None, :]
-        tl.store(to + b[None, :], (acc_b / total[:, None]).to(dtype), stored)
+        tl.store(to + b[None, :], as_stored(acc_b / total[:, None], out), stored)
 
 
 def vision_attention(
@@ -73,14 +74,15 @@ def vision_attention(
     images: int,
     heads: int,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
     *,
     tile: AttentionTile | None = None,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
 
-    With `inverse` the result leaves as E4M3: see `quantization.fp8`. Without a `tile`, that of `tiles`, else the usual
-    one.
+    With `inverse` the result leaves as `numbers`, E4M3 or int8: see `quantization.fp8`. Without a `tile`, that of
+    `tiles`, else the usual one.
     """
     assert qkv.is_contiguous(), "qkv is read as it lies in memory"
     rows, width = qkv.shape[0], qkv.shape[1] // 3
@@ -88,7 +90,7 @@ def vision_attention(
     block_a = 1 << (dim.bit_length() - 1)
     assert block_a >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
     block_b = 0 if block_a == dim else max(16, triton.next_power_of_2(dim - block_a))
-    out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse))
+    out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse, numbers))
     tile = tile or chosen_tile(tiles, "vision_attention", capability_of(qkv), rows, heads, dim)
     # launched early, several blocks would crowd onto each of the few SMs that the product before leaves idle
     _vision_kernel[(triton.cdiv(tokens, tile.rows), images * heads)](
@@ -131,7 +133,7 @@ def _prefix_kernel(
         acc = tl.dot(p.to(values.dtype), values, acc * shrink[:, None], input_precision="ieee")
     if SCALED:
         total /= inverse
-    tl.store(out + m[:, None] * DIM + d[None, :], (acc / total[:, None]).to(out.dtype.element_ty), inside)
+    tl.store(out + m[:, None] * DIM + d[None, :], as_stored(acc / total[:, None], out), inside)
 
 
 def prefix_attention(
@@ -141,19 +143,20 @@ def prefix_attention(
     length: Tensor,
     heads: int,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
     *,
     tile: AttentionTile | None = None,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """Rows q [tokens * n, K] over the first `length` (int64[1], on the device, at least 1) keys -> [tokens, n * K].
 
-    k, v [keys, K]; what lies beyond `length` is never read. With `inverse` the result leaves as E4M3. The tile is
+    k, v [keys, K]; what lies beyond `length` is never read. With `inverse` the result leaves as `numbers`. The tile is
     chosen as in `vision_attention`.
     """
     assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
-    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse, numbers))
     tile = tile or chosen_tile(tiles, "prefix_attention", capability_of(q), rows // heads, heads, dim)
     _prefix_kernel[(triton.cdiv(rows, tile.rows),)](
         q, k, v, length, out, rows, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim, BLOCK_D=triton.next_power_of_2(dim),

@@ -15,8 +15,10 @@ from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents
 from turbopi.kernels.interface import BatchOps, Segments
 from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.portable.attention_tiles import PACKED_ROWS, AttentionTile, chosen_tile
+from turbopi.kernels.portable.rounding import as_stored
 from turbopi.kernels.portable.shared_memory import capability_of
 from turbopi.kernels.tile_table import NO_TILES, TileTable
+from turbopi.quantization.fp8 import E4M3
 
 BLOCKS_AT_ONCE = 264  # of suffix attention, two a multiprocessor of Hopper: keys are split over blocks up to so many
 
@@ -85,7 +87,7 @@ def _packed_kernel(
             acc, top, total = _keys(queries, k, v, at, loaded, valid[None, :], acc, top, total, scale)
         if SCALED:
             total /= inverse
-        tl.store(out + m[:, None] * DIM + d[None, :], (acc / total[:, None]).to(out.dtype.element_ty), inside)
+        tl.store(out + m[:, None] * DIM + d[None, :], as_stored(acc / total[:, None], out), inside)
 
 
 def packed_attention(
@@ -95,15 +97,16 @@ def packed_attention(
     segments: Segments,
     heads: int,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
     *,
     tile: AttentionTile | None = None,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
-    """See `kernels.plain_batch.packed_attention`. With `inverse` the result leaves as E4M3."""
+    """See `kernels.plain_batch.packed_attention`. With `inverse` the result leaves as `numbers`, E4M3 or int8."""
     assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
     rows, dim = q.shape
     assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
-    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
+    out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse, numbers))
     tile = tile or chosen_tile(tiles, "packed_attention", capability_of(q), rows // heads, heads, dim)
     assert tile.rows == PACKED_ROWS, f"{tile}: `segments.tiles` have {PACKED_ROWS} rows"
     _packed_kernel[(len(segments.tiles),)](

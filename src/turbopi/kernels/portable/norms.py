@@ -2,7 +2,7 @@
 
 Twins: `residual_rms_norm` and `residual_layer_norm` of `kernels.plain`. `y` may also be [splits, tokens, D], float32
 or as x: the partial sums of a product split over its inner axis, added up here in float32. With `inverse` the norm
-leaves as E4M3, rounded once from float32: see `quantization.fp8`.
+leaves as `numbers`, E4M3 or int8, rounded once from float32: see `quantization.fp8`.
 """
 
 import torch
@@ -11,6 +11,8 @@ import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
+from turbopi.kernels.portable.rounding import as_stored
+from turbopi.quantization.fp8 import E4M3
 
 
 @triton.jit
@@ -61,7 +63,7 @@ def _rms_norm_kernel(
         result += tl.load(shift + cols, mask, 0.0)
     if SCALED:
         result *= inverse
-    tl.store(normed + row * width + cols, result.to(normed.dtype.element_ty), mask)
+    tl.store(normed + row * width + cols, as_stored(result, normed), mask)
 
 
 @triton.jit
@@ -84,7 +86,7 @@ def _layer_norm_kernel(
     result = centred * tl.rsqrt(tl.sum(centred * centred, 0) / width + eps) * factor + offset
     if SCALED:
         result *= inverse
-    tl.store(normed + row * width + cols, result.to(normed.dtype.element_ty), mask)
+    tl.store(normed + row * width + cols, as_stored(result, normed), mask)
 
 
 def residual_rms_norm(
@@ -95,11 +97,15 @@ def residual_rms_norm(
     shift: Tensor | None,
     eps: float,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
 ) -> tuple[Tensor, Tensor]:
     """(x + y * gate, its RMSNorm * scale + shift). x [tokens, D] contiguous; the others [D], or all [tokens, D]."""
     rows, width = _checked(x, y)
     assert all(one is None or (one.dim() == scale.dim() and one.is_contiguous()) for one in (gate, scale, shift))
-    out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x, dtype=result_dtype(x, inverse))
+    out, normed = (
+        (x if y is None else torch.empty_like(x)),
+        torch.empty_like(x, dtype=result_dtype(x, inverse, numbers)),
+    )
     block = triton.next_power_of_2(width)
     warps = _warps(2 * block)  # twice LayerNorm's, for parts to add up
     _rms_norm_kernel[(rows,)](
@@ -112,11 +118,20 @@ def residual_rms_norm(
 
 
 def residual_layer_norm(
-    x: Tensor, y: Tensor | None, weight: Tensor, bias: Tensor, eps: float, inverse: float | None = None
+    x: Tensor,
+    y: Tensor | None,
+    weight: Tensor,
+    bias: Tensor,
+    eps: float,
+    inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
 ) -> tuple[Tensor, Tensor]:
     """(x + y, its LayerNorm). x [tokens, W] contiguous."""
     rows, width = _checked(x, y)
-    out, normed = (x if y is None else torch.empty_like(x)), torch.empty_like(x, dtype=result_dtype(x, inverse))
+    out, normed = (
+        (x if y is None else torch.empty_like(x)),
+        torch.empty_like(x, dtype=result_dtype(x, inverse, numbers)),
+    )
     block = triton.next_power_of_2(width)
     _layer_norm_kernel[(rows,)](
         x, _or(y, x), weight, bias, out, normed, rows, width, eps, inverse or 1.0,

@@ -1,4 +1,5 @@
-"""The engine's operations for any NVIDIA GPU: Triton's kernels between cuBLAS's products; FP8 products are Triton's."""
+"""The engine's operations for any NVIDIA GPU: Triton's kernels between cuBLAS's products; FP8 and INT8
+products are Triton's."""
 
 from functools import partial
 from typing import Any
@@ -11,6 +12,7 @@ from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.portable import attention, backward, batch, embedding, norms, products, resize, rope
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, TileTable
+from turbopi.quantization.fp8 import E4M3
 
 
 def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
@@ -32,7 +34,7 @@ def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
         batch=batch.batch_ops(tiles),
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
-            "FP8 products": "Triton, with bias, GELU, GeGLU and rounding in the epilogue",
+            "FP8 products": "Triton, with bias, GELU, GeGLU and rounding in the epilogue, and so INT8's",
             "vision products": "cuBLAS",
             "GeGLU of the prefix": geglu_origin(tiles),
             "product behind the prefix's GeGLU": "cuBLAS",
@@ -80,9 +82,10 @@ def attend(
     heads: int,
     *state_token: Any,
     inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     if k.shape[0] == slots:  # no suffix behind the prefix
-        return attention.prefix_attention(q, k, v, length, heads, inverse, tiles=tiles)
+        return attention.prefix_attention(q, k, v, length, heads, inverse, numbers, tiles=tiles)
     assert inverse is None, "the suffix's activations stay as they are"
     return plain.attention(q, k, v, length, slots, heads, *state_token, softmax=attention.masked_softmax)

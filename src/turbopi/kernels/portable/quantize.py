@@ -1,31 +1,34 @@
-"""Weights to E4M3, by a kernel where there is a GPU with Triton. The plain way: `quantization.rounding`."""
+"""Weights to eight bits, by a kernel where there is a GPU with Triton. The plain way: `quantization.rounding`."""
 
 import importlib.util
 
 from torch import Tensor
 
-from turbopi.quantization.fp8 import Directions, Fp8Matrix, channel_scales, to_e4m3
+from turbopi.quantization.formats import FP8, Format
+from turbopi.quantization.fp8 import Directions, ScaledMatrix, channel_scales
 from turbopi.quantization.rounding import feedback, round_with_feedback_plain
 
 
-def quantize(weight: Tensor, input_scale: float, directions: Directions | None = None) -> Fp8Matrix:
+def quantize(
+    weight: Tensor, input_scale: float, directions: Directions | None = None, format: Format = FP8
+) -> ScaledMatrix:
     """weight [out, in] in its channels' own scales, rounded for its input's directions."""
-    scale = channel_scales(weight)
-    rounded = round_rows(weight, 1 / scale, directions)
-    return Fp8Matrix(rounded, scale * input_scale, 1 / input_scale, weight.dtype)
+    scale = channel_scales(weight, format.largest)
+    rounded = round_rows(weight, 1 / scale, directions, format)
+    return ScaledMatrix(rounded, scale * input_scale, 1 / input_scale, weight.dtype)
 
 
-def round_rows(weight: Tensor, inverse: Tensor, directions: Directions | None = None) -> Tensor:
-    """e4m3[out, in]: weight * inverse, rounded to nearest, or for the directions of what it is multiplied by.
+def round_rows(weight: Tensor, inverse: Tensor, directions: Directions | None = None, format: Format = FP8) -> Tensor:
+    """e4m3 or int8[out, in]: weight * inverse, rounded to nearest, or for the directions of what it is multiplied by.
 
     inverse float32[out], 1 / scale. On a GPU with Triton by a kernel, which may round other weights up or down than a
     CPU: a sum's last bit decides what all later weights of its row make up for.
     """
     if directions is None:
-        return to_e4m3(weight, inverse[:, None])
+        return format.rounded(weight, inverse[:, None])
     feeding = feedback(directions.to(weight.device))
     if weight.is_cuda and importlib.util.find_spec("triton") is not None:
         from turbopi.kernels.portable.rounding import round_with_feedback  # Triton isn't imported elsewhere
 
-        return round_with_feedback(weight, inverse, *feeding)
-    return round_with_feedback_plain(weight, inverse, *feeding)
+        return round_with_feedback(weight, inverse, *feeding, format.dtype)
+    return round_with_feedback_plain(weight, inverse, *feeding, format)

@@ -1,4 +1,7 @@
-"""Weights to E4M3 with error feedback. Twin: `quantization.rounding.columns_with_feedback`."""
+"""Numbers to eight bits: what kernels store, and weights with error feedback.
+
+Twin of the second: `quantization.rounding.columns_with_feedback`.
+"""
 
 import torch
 import triton
@@ -6,6 +9,7 @@ import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.dependent_launch import result_dtype
+from turbopi.quantization.fp8 import E4M3
 
 ROWS = 16  # of a program, one warp: a row's columns depend on each other, so rows are all there is to share
 
@@ -19,6 +23,21 @@ def _to_e4m3(x):
     normal = ((bits + 0x7FFFF + ((bits >> 20) & 1)) & -0x100000).to(tl.float32, bitcast=True)  # to nearest even
     small = (x + 24576.0) - 24576.0  # in steps of 2^-9
     return tl.where(damaged, float("nan"), tl.where(tl.abs(x) < 0.015625, small, normal))
+
+
+@triton.jit
+def _to_int8(x):
+    """float32 as int8 holds it: to nearest even, saturated, 0 for NaN."""
+    x = tl.clamp(tl.where(x == x, x, 0.0), -127.0, 127.0)
+    return (x + 12582912.0) - 12582912.0  # 1.5 * 2^23: no fraction has room beside it
+
+
+@triton.jit
+def as_stored(x, out):
+    """float32 x as what `out` points to: of int8 as `quantization.int8` rounds, else as Triton does."""
+    if out.dtype.element_ty == tl.int8:
+        x = _to_int8(x)
+    return x.to(out.dtype.element_ty)
 
 
 @triton.jit
@@ -39,14 +58,21 @@ def _feedback_kernel(
         error = tl.load(errors + column * NUM + direction, direction < NUM, 0.0)
         answer = tl.load(answers + column * NUM + direction, direction < NUM, 0.0)
         wanted = exact - tl.sum(left * answer[None, :], 1)
-        rounded = _to_e4m3(wanted * by)
+        rounded = _to_int8(wanted * by) if out.dtype.element_ty == tl.int8 else _to_e4m3(wanted * by)
         left += (rounded * scale - exact)[:, None] * error[None, :]
         tl.store(out + row * columns + at, rounded.to(out.dtype.element_ty), valid)
         at, exact = following, next_exact
 
 
-def round_with_feedback(weight: Tensor, inverse: Tensor, order: Tensor, errors: Tensor, answers: Tensor) -> Tensor:
-    """Weight [out, in] -> e4m3[out, in] of weight * inverse. `order`, `errors`, `answers`: of
+def round_with_feedback(
+    weight: Tensor,
+    inverse: Tensor,
+    order: Tensor,
+    errors: Tensor,
+    answers: Tensor,
+    numbers: torch.dtype = E4M3,
+) -> Tensor:
+    """Weight [out, in] -> e4m3 or int8[out, in] of weight * inverse. `order`, `errors`, `answers`: of
     `quantization.rounding.feedback`.
     """
     weight = weight.contiguous()
@@ -55,7 +81,7 @@ def round_with_feedback(weight: Tensor, inverse: Tensor, order: Tensor, errors: 
     assert order.shape == (columns,) and errors.shape == answers.shape == (columns, num)
     assert errors.is_contiguous() and answers.is_contiguous() and inverse.is_contiguous()
     assert inverse.shape == (rows,)
-    out = torch.empty(rows, columns, dtype=result_dtype(weight, 1.0), device=weight.device)
+    out = torch.empty(rows, columns, dtype=result_dtype(weight, 1.0, numbers), device=weight.device)
     _feedback_kernel[(triton.cdiv(rows, ROWS),)](
         weight, inverse, order, errors, answers, out, rows, columns,
         NUM=num, R=triton.next_power_of_2(num), ROWS=ROWS, num_warps=1,

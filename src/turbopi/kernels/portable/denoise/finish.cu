@@ -19,7 +19,7 @@ __device__ __forceinline__ void make_inverse_rms(const Args& args, float* smem) 
   }
 }
 
-// Sums of the stream behind a norm: times 1 / rms (of E4M3, and the channel's scale), plus the shift's product.
+// Sums of the stream behind a norm: times 1 / rms (of eight bits, and the channel's scale), plus the shift's product.
 struct Normed {
   const float *shifted, *scales;  // of the product's first channel
   const float* inverse_rms;       // shared memory
@@ -29,7 +29,7 @@ struct Normed {
   __device__ __forceinline__ Factors of(Item i) const {
     Factors f{make_float2(0, 0), make_float2(1, 1)};
     if (i.valid) f.shift = two(shifted + i.tile * 8 + i.pair * 2);
-    if (FP8 && i.valid) f.scale = two(scales + i.tile * 8 + i.pair * 2);
+    if (SCALED && i.valid) f.scale = two(scales + i.tile * 8 + i.pair * 2);
     return f;
   }
   __device__ __forceinline__ float2 apply(Item i, Factors f, float2 sum) const {

@@ -82,7 +82,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denois
       const byte* const next = layer + 1 < L ? weights + LAYER_BYTES : args.weights;
       const float* const norms = table + layer * 6 * D;  // scale, shift, gate before attention; before the feed-forward
       const float* const shifted = args.shifted + ((long long)step * L + layer) * (QKV_ROWS + 2 * F);
-      const float* const scales = args.row_scales + (FP8 ? layer * (QKV_ROWS + 2 * F) : 0);
+      const float* const scales = args.row_scales + (SCALED ? layer * (QKV_ROWS + 2 * F) : 0);
       {
         Product<QkvShape> product(weights + QKV_AT);
         product.ask();
@@ -111,7 +111,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denois
         product.ask();
         ahead<QkvShape>(next + QKV_AT);
         cache_ahead(args, layer + 1 < L ? layer + 1 : 0, length);
-        FinishGateUp finish{{shifted + QKV_ROWS, scales + (FP8 ? QKV_ROWS : 0), smem + S_RMS}, args.hidden};
+        FinishGateUp finish{{shifted + QKV_ROWS, scales + (SCALED ? QKV_ROWS : 0), smem + S_RMS}, args.hidden};
         product.run(grid, smem, args.stream, finish, inverse_rms);
       }
       grid.arrive();

@@ -18,7 +18,7 @@ from turbopi.kernels.arguments import Parameter, Struct
 from turbopi.kernels.interface import State, TokenInputs
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
 from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
-from turbopi.kernels.portable.denoise.packing import CHUNK_BYTES, PackedExpert, Tables
+from turbopi.kernels.portable.denoise.packing import CHUNK_BYTES, PackedExpert, Tables, WeightNumbers
 
 PARTS = ("primitives", "product", "finish", "attention", "kernel")  # behind sizes.cu and the arguments
 MAX_SUFFIX = 64
@@ -48,14 +48,14 @@ def choices(suffix: int) -> Choices:
     return FEW if suffix <= 16 else MANY
 
 
-def unavailable(device: torch.device, fp8: bool = False) -> str | None:
+def unavailable(device: torch.device, weights: WeightNumbers = "bf16") -> str | None:
     """Why the kernel can't run on this device, or None if it can."""
     if device.type != "cuda":
         return "the portable denoising kernel needs an NVIDIA GPU"
     major, minor = torch.cuda.get_device_capability(device)
-    needed = (8, 9) if fp8 else (8, 0)
+    needed = (8, 9) if weights == "fp8" else (8, 0)
     if (major, minor) < needed:
-        what = " in FP8" if fp8 else ""
+        what = "" if weights == "bf16" else f" in {weights.upper()}"
         return (
             f"the portable denoising kernel{what} needs compute capability {needed[0]}.{needed[1]} or newer, "
             f"this GPU has {major}.{minor}"
@@ -69,7 +69,7 @@ ARGS = Struct(
         Parameter("const unsigned char*", "weights", "[L] qkv, out, gate|up, down: [tile][chunk][8][64 bytes]"),
         Parameter("const float*", "table", "[N][2L+1][3][D]: scale, shift, gate"),
         Parameter("const float*", "shifted", "[N][L][channels of qkv, gate|up]: W shift"),
-        Parameter("const float*", "row_scales", "[L][channels of qkv, gate|up]: FP8"),
+        Parameter("const float*", "row_scales", "[L][channels of qkv, gate|up]: FP8, INT8"),
         Parameter("const float*", "attended_times", "[L]: FP8"),
         Parameter("const float*", "out_w", "[A][D]"),
         Parameter("const float*", "out_shift", "[N][A]: action_out_proj of the final norm's shift, and its bias"),
@@ -84,7 +84,7 @@ ARGS = Struct(
         Parameter("float*", "v_t", "[N][T][A]"),
         Parameter("float*", "x", "[T][D] the residual stream"),
         Parameter("float*", "squares", "[T][D/8] of x, added up by tiles"),
-        Parameter("unsigned char*", "stream", "[chunk][T][64 bytes] x times a norm's scale; zeros beyond D"),
+        Parameter("unsigned char*", "stream", "[chunk][T][columns of a chunk] x times a norm's scale; zeros beyond D"),
         Parameter("unsigned char*", "attended", "the same of attention's outputs"),
         Parameter("unsigned char*", "hidden", "the same of the feed-forward's hidden units"),
         Parameter("unsigned char*", "queries", "bf16 [T * n][K]"),
@@ -105,7 +105,7 @@ ARGS = Struct(
 
 
 def kernel_sizes(
-    config: ModelConfig, *, blocks: int, cache_rows: int, suffix: int, fp8: bool, choice: Choices
+    config: ModelConfig, *, blocks: int, cache_rows: int, suffix: int, weights: WeightNumbers, choice: Choices
 ) -> dict[str, int]:
     """The kernel's compile-time constants."""
     g, keys = config.expert, cache_rows + suffix
@@ -129,7 +129,8 @@ def kernel_sizes(
         "TP_AHEAD": int(choice.ahead),
         "TP_SPLITS": splits,
         "TP_SPLIT_KEYS": -(-split_keys // 16) * 16,
-        "TP_FP8": int(fp8),
+        "TP_FP8": int(weights == "fp8"),
+        "TP_INT8": int(weights == "int8"),
         "TP_SHARED_BYTES": SHARED_BYTES,
         "TP_TRACE": 0,
     }
@@ -175,7 +176,7 @@ class PortableDenoiser:
     ) -> None:
         if by_token or num_steps is not None:
             raise BackendUnavailable("the portable denoising kernel has no times by token")
-        reason = unavailable(device, packed.fp8)
+        reason = unavailable(device, packed.numbers)
         if reason is not None:
             raise BackendUnavailable(reason)
         if not 1 <= suffix <= MAX_SUFFIX:
@@ -185,7 +186,12 @@ class PortableDenoiser:
         if not has_large_l2(device):
             self._choice = replace(self._choice, ahead=False)
         self._sizes = kernel_sizes(
-            config, blocks=self._blocks, cache_rows=cache_rows, suffix=suffix, fp8=packed.fp8, choice=self._choice
+            config,
+            blocks=self._blocks,
+            cache_rows=cache_rows,
+            suffix=suffix,
+            weights=packed.numbers,
+            choice=self._choice,
         )
         self._sizes["TP_TRACE"] = int(traced)
         self._kernel, self._prepare = load(device, self._sizes)
@@ -260,7 +266,8 @@ def tensors(packed: PackedExpert, small: State, table: Tensor, sizes: dict[str, 
 
     def activation(columns: int) -> Tensor:
         chunk = CHUNK_BYTES // packed.weights.element_size()
-        return scratch(-(-columns // chunk), suffix, CHUNK_BYTES, dtype=torch.uint8)
+        size = chunk * (1 if packed.numbers == "fp8" else 2)
+        return scratch(-(-columns // chunk), suffix, size, dtype=torch.uint8)
 
     shares = -(-suffix * g.num_heads // 16) * sizes["TP_SPLITS"]
     return {

@@ -5,6 +5,7 @@ Shapes: N steps, L layers, D width, F feed-forward width, n query heads of K col
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -14,10 +15,12 @@ from turbopi.errors import BackendError
 from turbopi.kernels.interface import GemmaLayer
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.quantization import sites
+from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import E4M3, Directions
 
 TILE = 8  # output channels
 CHUNK_BYTES = 64  # of a channel: the part of the reduction of which a lane has 16 bytes
+WeightNumbers = Literal["bf16", "fp8", "int8"]
 KINDS = sites.KINDS["expert"]  # a layer's matrices, in the order in which they are read
 
 
@@ -54,6 +57,14 @@ def gate_up_rows(g: GemmaConfig) -> Tensor:
     return torch.arange(2 * g.mlp_dim).view(2, g.mlp_dim).T.flatten()
 
 
+def int8_columns() -> Tensor:
+    """int64[64]: which column of a chunk each place has. A lane has 16 bytes: of both halves of the chunk those columns
+    that it has of bfloat16, four by four in the order 0, 2, 1, 3.
+    """
+    places = torch.arange(CHUNK_BYTES).view(2, 4, 2, 2, 2)  # half, lane, word, pair, which of the pair
+    return places.permute(1, 0, 2, 4, 3).flatten()
+
+
 def tiles(matrix: Tensor) -> Tensor:
     """[rows, columns] -> flat [tile][chunk][8 rows][columns of a chunk], zeros beyond the columns."""
     rows, columns = matrix.shape
@@ -61,7 +72,10 @@ def tiles(matrix: Tensor) -> Tensor:
     chunks = -(-columns // chunk)
     padded = matrix.new_zeros(rows, chunks * chunk)
     padded[:, :columns] = matrix
-    return padded.view(rows // TILE, TILE, chunks, chunk).transpose(1, 2).flatten()
+    of_chunks = padded.view(rows // TILE, TILE, chunks, chunk)
+    if matrix.dtype == torch.int8:
+        of_chunks = of_chunks[..., int8_columns().to(matrix.device)]
+    return of_chunks.transpose(1, 2).flatten()
 
 
 @dataclass(frozen=True)
@@ -69,9 +83,11 @@ class PackedExpert:
     """The expert's matrices in the kernel's order. One serves kernels of any number of steps, tokens and blocks."""
 
     config: ModelConfig
-    weights: Tensor  # bfloat16 or e4m3[L, elements]: of a layer qkv, out, gate|up, down
-    scales: Tensor  # float32[L, rows of qkv, out, gate|up, down] of E4M3 weights, in the matrices' order; else [L, 0]
-    inputs: Tensor  # float32[L, 4] of the activations that meet E4M3 weights; [L, 0] of others
+    weights: Tensor  # bfloat16, e4m3 or int8[L, elements]: of a layer qkv, out, gate|up, down
+    scales: (
+        Tensor  # float32[L, rows of qkv, out, gate|up, down] of weights of eight bits, in the matrices' order; [L, 0]
+    )
+    inputs: Tensor  # float32[L, 4] of the activations that meet E4M3 weights, 1 of int8's; [L, 0] of others
 
     @classmethod
     def pack(
@@ -80,10 +96,12 @@ class PackedExpert:
         layers: list[GemmaLayer],
         inputs: Mapping[str, float] | None = None,
         directions: Mapping[str, Directions] | None = None,
+        format: Format = FP8,
         device: torch.device | None = None,
     ) -> "PackedExpert":
-        """`inputs`: the activations' scales by site, and weights become E4M3 with a scale for each output channel,
-        rounded for `directions` by site. The layers come to the `device`, if one is named, one at a time.
+        """`inputs`: the activations' scales by site (1 for INT8, which leaves them in bfloat16), and weights become
+        numbers of the format with a scale for each output channel, rounded for `directions` by site. The layers come
+        to the `device`, if one is named, one at a time.
 
         Raises BackendError for sizes that the kernel doesn't cover.
         """
@@ -97,8 +115,8 @@ class PackedExpert:
             parts = [matrix.to(device) for matrix in (layer.qkv, layer.out, layer.gate_up, layer.down)]
             places = [f"expert.{i}.{kind}" for kind in KINDS]
             if inputs is not None:
-                made = [quantize(m, 1.0, (directions or {}).get(s)) for m, s in zip(parts, places, strict=True)]
-                parts = [matrix.data.view(torch.uint8) for matrix in made]
+                made = [quantize(m, 1.0, (directions or {}).get(s), format) for m, s in zip(parts, places, strict=True)]
+                parts = [m.data if m.numbers == torch.int8 else m.data.view(torch.uint8) for m in made]
                 scales.append(torch.cat([matrix.scale for matrix in made]))
                 of_inputs.append([inputs[place] for place in places])
             else:
@@ -109,33 +127,41 @@ class PackedExpert:
         none = torch.empty(len(layers), 0, device=weights.device)
         return cls(
             config,
-            weights if inputs is None else weights.view(E4M3),
+            weights if inputs is None else weights.view(format.dtype),
             torch.stack(scales) if scales else none,
             torch.tensor(of_inputs, dtype=torch.float32, device=weights.device) if of_inputs else none,
         )
 
     @property
-    def fp8(self) -> bool:
-        return self.weights.dtype == E4M3
+    def numbers(self) -> WeightNumbers:
+        return {torch.bfloat16: "bf16", E4M3: "fp8", torch.int8: "int8"}[self.weights.dtype]  # type: ignore[return-value]
+
+    @property
+    def scaled(self) -> bool:
+        """Whether weights have eight bits, and each output channel a scale."""
+        return self.numbers != "bf16"
 
     def row_scales(self, layer: int) -> tuple[Tensor, ...]:
-        """float32 of the output channels of a layer's qkv, out, gate|up and down; E4M3 weights alone have them."""
+        """float32 of the output channels of a layer's qkv, out, gate|up and down, where `scaled`."""
         return torch.split(self.scales[layer], [rows for rows, _ in matrix_shapes(self.config.expert)])
 
     def matrices(self, layer: int) -> tuple[Tensor, ...]:
-        """A layer's qkv, out, gate|up and down as they were before packing; of E4M3 weights what they stand for, in
+        """A layer's qkv, out, gate|up and down as they were before packing; where `scaled` what they stand for, in
         float32.
         """
         g, found, at = self.config.expert, [], 0
         chunk = CHUNK_BYTES // self.weights.element_size()
-        flat = self.weights[layer].float() if self.fp8 else self.weights[layer]
+        flat = self.weights[layer].float() if self.scaled else self.weights[layer]
         for k, ((rows, columns), order) in enumerate(zip(matrix_shapes(g), _orders(g), strict=True)):
             size = rows * -(-columns // chunk) * chunk
             part = flat[at : at + size].view(rows // TILE, -1, TILE, chunk)
+            if self.numbers == "int8":
+                stored, part = part, torch.empty_like(part)
+                part[..., int8_columns().to(part.device)] = stored
             ordered = part.transpose(1, 2).reshape(rows, -1)[:, :columns]
             matrix = torch.empty_like(ordered)
             matrix[torch.arange(rows) if order is None else order] = ordered
-            found.append(matrix * self.row_scales(layer)[k][:, None] if self.fp8 else matrix)
+            found.append(matrix * self.row_scales(layer)[k][:, None] if self.scaled else matrix)
             at += size
         return tuple(found)
 
@@ -146,7 +172,7 @@ def _orders(g: GemmaConfig) -> tuple[Tensor | None, ...]:
 
 @dataclass(frozen=True)
 class Tables:
-    """What the kernel needs beside the weights. Scales of E4M3 numbers are in it, so that the kernel applies few."""
+    """What the kernel needs beside the weights. Scales of eight bits are in it, so that the kernel applies few."""
 
     modulation: Tensor  # float32[N, 2L + 1, 3, D]
     shifted: Tensor  # float32[N, L, channels of qkv, gate|up]: what the norms' shifts add to the products behind them
@@ -158,11 +184,11 @@ class Tables:
         """table float32[N, 2L + 1, 3, D], see `engine.weights.modulation`"""
         g = packed.config.expert
         qkv_order, gate_up_order = qkv_rows(g).to(table.device), gate_up_rows(g).to(table.device)
-        modulation, shifted, rows = table.clone() if packed.fp8 else table, [], []
+        modulation, shifted, rows = table.clone() if packed.scaled else table, [], []
         for i in range(g.depth):
             qkv, _, gate_up, _ = packed.matrices(i)
             products = [table[:, 2 * i + j, 1].double() @ m.double().T for j, m in enumerate((qkv, gate_up))]
-            if packed.fp8:
+            if packed.scaled:
                 of_qkv, of_out, of_gate_up, of_down = packed.row_scales(i)
                 stream, attended, stream_2, hidden = packed.inputs[i]
                 modulation[:, 2 * i, 0] /= stream
@@ -175,5 +201,5 @@ class Tables:
                 rows.append(torch.cat(((of_qkv * stream)[qkv_order], (of_gate_up * stream_2 * after)[gate_up_order])))
             shifted.append(torch.cat((products[0][:, qkv_order], products[1][:, gate_up_order]), dim=1).float())
         row_scales = torch.stack(rows) if rows else packed.inputs
-        times = 1 / packed.inputs[:, 1] if packed.fp8 else packed.inputs[:, 0:0]
+        times = 1 / packed.inputs[:, 1] if packed.scaled else packed.inputs[:, 0:0]
         return cls(modulation, torch.stack(shifted, dim=1).contiguous(), row_scales.contiguous(), times.contiguous())

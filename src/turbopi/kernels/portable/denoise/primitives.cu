@@ -90,6 +90,20 @@ __device__ __forceinline__ void mma_operands(float (&c)[4], u32 a0, u32 a1, u32 
   mma(c, a0, a1, a2, a3, b0, b1);
 }
 #endif
+// Bytes 0 and 2 of four int8 as two bfloat16, exactly: 128 and the low seven bits, less 128, or 256 of negative ones.
+__device__ __forceinline__ u32 two_of_int8(u32 four) {
+  const u32 sum = (four & 0x007f007f) | 0x43004300, less = (four & 0x00800080) | 0x43004300;
+  u32 v;
+  asm("fma.rn.bf16x2 %0, %1, %2, %3;" : "=r"(v) : "r"(less), "r"(0xbf80bf80u), "r"(sum));  // sum - less
+  return v;
+}
+// The weights that meet a piece of the activations: a lane's 16 bytes, of int8 half of them. Four int8 lie in the order 0,
+// 2, 1, 3.
+__device__ __forceinline__ uint4 piece_of_weights(uint4 w, int piece) {
+  if (!INT8) return w;
+  const u32 first = piece ? w.z : w.x, second = piece ? w.w : w.y;
+  return make_uint4(two_of_int8(first), two_of_int8(first >> 8), two_of_int8(second), two_of_int8(second >> 8));
+}
 // A chunk of 16 rows (8 in `low`, 8 in `high`) times 8: any order of columns that all three have.
 __device__ __forceinline__ void mma_chunk(float (&c)[4], uint4 low, uint4 high, uint4 b) {
   mma_operands(c, low.x, high.x, low.y, high.y, b.x, b.y);

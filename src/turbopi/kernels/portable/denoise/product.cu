@@ -46,14 +46,18 @@ struct Product {
 #pragma unroll
     for (int n = 0; n < S::IN_FLIGHT; ++n) w[n] = load(0, n);
   }
-  __device__ __forceinline__ void load_chunk(uint4 (&a)[GROUPS], const byte* activation, int chunk) const {
+  __device__ __forceinline__ void load_chunk(uint4 (&a)[GROUPS][PIECES], const byte* activation, int chunk) const {
     const int lane = thread % 32, at = first_chunk() + chunk;
     const bool there = S::CHUNKS % S::WK == 0 || at < S::CHUNKS;
 #pragma unroll
     for (int group = 0; group < GROUPS; ++group) {
       const int token = group * 8 + lane / 4;
-      a[group] = make_uint4(0, 0, 0, 0);
-      if (there && token < T) a[group] = load_shared_by_grid(activation + (at * T + token) * 64 + lane % 4 * 16);
+#pragma unroll
+      for (int piece = 0; piece < PIECES; ++piece) {
+        a[group][piece] = make_uint4(0, 0, 0, 0);
+        if (there && token < T)
+          a[group][piece] = load_shared_by_grid(activation + ((at * T + token) * PIECES + piece) * 64 + lane % 4 * 16);
+      }
     }
   }
   __device__ __forceinline__ Item item(int pass, int index) const {
@@ -70,7 +74,7 @@ struct Product {
     Item mine = item(0, thread);
     auto factors = finish.factors(mine);
     grid.wait();
-    uint4 a[S::A_IN_FLIGHT][GROUPS];
+    uint4 a[S::A_IN_FLIGHT][GROUPS][PIECES];
     for (int pass = 0; pass < S::PASSES; ++pass) {
       if (pass == 0 || S::A_IN_FLIGHT < S::WARP_CHUNKS) {
 #pragma unroll
@@ -80,15 +84,19 @@ struct Product {
       float c[S::WARP_TILES][M_TILES][4] = {};
 #pragma unroll
       for (int chunk = 0; chunk < S::WARP_CHUNKS; ++chunk) {
-        uint4(&here)[GROUPS] = a[chunk % S::A_IN_FLIGHT];
+        uint4(&here)[GROUPS][PIECES] = a[chunk % S::A_IN_FLIGHT];
 #pragma unroll
         for (int tile = 0; tile < S::WARP_TILES; ++tile) {
           const int n = chunk * S::WARP_TILES + tile, next = n + S::IN_FLIGHT;
-          const uint4 b = w[n % S::IN_FLIGHT];
 #pragma unroll
-          for (int m = 0; m < M_TILES; ++m) {
-            const uint4 none = make_uint4(0, 0, 0, 0);
-            mma_chunk(c[tile][m], here[2 * m], 2 * m + 1 < GROUPS ? here[2 * m + 1 < GROUPS ? 2 * m + 1 : 0] : none, b);
+          for (int piece = 0; piece < PIECES; ++piece) {
+            const uint4 b = piece_of_weights(w[n % S::IN_FLIGHT], piece);
+#pragma unroll
+            for (int m = 0; m < M_TILES; ++m) {
+              const uint4 none = make_uint4(0, 0, 0, 0);
+              const uint4 high = 2 * m + 1 < GROUPS ? here[2 * m + 1 < GROUPS ? 2 * m + 1 : 0][piece] : none;
+              mma_chunk(c[tile][m], here[2 * m][piece], high, b);
+            }
           }
           if (next < S::LOADS)
             w[n % S::IN_FLIGHT] = load(pass, next);

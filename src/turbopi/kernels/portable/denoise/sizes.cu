@@ -15,8 +15,8 @@
 // x is float32. The stream is x times the next norm's scale, rounded to OPERAND; 1 / rms is multiplied in behind the
 // product, and the norm's shift comes as a table that is already multiplied with the weights, `shifted`.
 //
-// Products: a *tile* is 8 output channels, a *chunk* is the part of the reduction of which a lane has 16 bytes (32
-// columns of bfloat16, 64 of E4M3). Activations are operand A of mma.sync (16 tokens), weights operand B (8 channels). The
+// Products: a *tile* is 8 output channels, a *chunk* is the part of the reduction of which a lane has 16 bytes of weights
+// (32 columns of bfloat16, 64 of E4M3 or int8). Activations are operand A of mma.sync (16 tokens), weights operand B (8 channels). The
 // order of columns within a chunk is free as long as both operands have the same, so a lane takes 16 bytes that lie side
 // by side: [tile][chunk][8 channels][32 columns] of weights, [chunk][token][32 columns] of activations, both coalesced.
 // A block has whole tiles; its warps share out the chunks, and above that (WN) the tiles; their sums meet in shared memory.
@@ -30,9 +30,11 @@ using u64 = unsigned long long;
 constexpr int D = TP_WIDTH, F = TP_MLP_DIM, L = TP_DEPTH, HEADS = TP_HEADS, HD = TP_HEAD_DIM;
 constexpr int T = TP_TOKENS, A = TP_ACTION_DIM;
 constexpr int BLOCKS = TP_BLOCKS, WARPS = TP_WARPS, THREADS = WARPS * 32;
-constexpr bool FP8 = TP_FP8;
-constexpr int OPERAND_BYTES = FP8 ? 1 : 2;
-constexpr int CHUNK = 64 / OPERAND_BYTES;  // columns
+constexpr bool FP8 = TP_FP8, INT8 = TP_INT8;  // INT8: weights alone, which become bfloat16 in registers, exactly
+constexpr bool SCALED = FP8 || INT8;          // each output channel has a scale
+constexpr int WEIGHT_BYTES = SCALED ? 1 : 2, OPERAND_BYTES = FP8 ? 1 : 2;  // an operand: an activation that meets weights
+constexpr int CHUNK = 64 / WEIGHT_BYTES;                 // columns
+constexpr int PIECES = OPERAND_BYTES / WEIGHT_BYTES;     // of 64 bytes: a token's activations in a chunk
 constexpr int CHUNK_BYTES = 512;           // of a tile
 constexpr int GROUPS = (T + 7) / 8;        // of 8 tokens
 constexpr int M_TILES = (T + 15) / 16;
@@ -66,7 +68,7 @@ struct Shape {
   static constexpr int WARP_CHUNKS = (CHUNKS + WK - 1) / WK;
   static constexpr int LOADS = WARP_CHUNKS * WARP_TILES;  // of a lane, in a pass
   static constexpr int IN_FLIGHT = divisor(LOADS, TP_WEIGHTS_IN_FLIGHT);
-  static constexpr int A_WANTED = TP_ACTIVATIONS_IN_FLIGHT / GROUPS < 1 ? 1 : TP_ACTIVATIONS_IN_FLIGHT / GROUPS;
+  static constexpr int A_ROOM = TP_ACTIVATIONS_IN_FLIGHT / (GROUPS * PIECES), A_WANTED = A_ROOM < 1 ? 1 : A_ROOM;
   static constexpr int A_IN_FLIGHT = A_WANTED < WARP_CHUNKS ? A_WANTED : WARP_CHUNKS;  // chunks
   static constexpr int SUM_WORDS = WK * PASS_TILES * GROUPS * 8 * 8;
   static constexpr long long BYTES = (long long)TILES * CHUNKS * CHUNK_BYTES;

@@ -1,7 +1,8 @@
-"""x @ weightᵀ with its epilogue: one tile of the result a program. E4M3 or bfloat16 in, float32 sums.
+"""x @ weightᵀ with its epilogue: one tile of the result a program. E4M3 or bfloat16 in, float32 sums;
+int8 in, int32 sums.
 
-Twins: the products of `kernels.plain` with an `Fp8Matrix`, and `linear_geglu` of bfloat16. Triton makes wgmma, mma.sync
-or tcgen05 of the same source, as the GPU has it.
+Twins: the products of `kernels.plain` with a `ScaledMatrix`, and `linear_geglu` of bfloat16. Triton makes wgmma,
+mma.sync or tcgen05 of the same source, as the GPU has it.
 """
 
 from functools import lru_cache
@@ -20,8 +21,9 @@ from turbopi.kernels.dependent_launch import (
 )
 from turbopi.kernels.portable.activations import gelu_tanh
 from turbopi.kernels.portable.gemm.tiles import STEP_BYTES, Epilogue, Tile, best_tile, promotes, tuned_tile
-from turbopi.kernels.tile_table import NO_TILES, TileTable
-from turbopi.quantization.fp8 import ALIGNMENT, E4M3, Fp8Matrix, Matrix
+from turbopi.kernels.portable.rounding import as_stored
+from turbopi.kernels.tile_table import NO_TILES, Numbers, TileTable
+from turbopi.quantization.fp8 import ALIGNMENT, E4M3, Matrix, ScaledMatrix
 
 GROUP = 8  # rows of tiles that are computed together, so that they read the same weights from the L2 cache
 ANYWHERE = (9, 0)  # the GPU that the interpreter's tiles are chosen for
@@ -32,7 +34,7 @@ def _sum(a, b, acc, PROMOTE: tl.constexpr, DEPTH: tl.constexpr):
     """acc + a bᵀ; with PROMOTE the tensor cores begin at 0 and the sum is float32."""
     if PROMOTE:
         return acc + tl.dot(a, b.T, max_num_imprecise_acc=DEPTH)
-    return tl.dot(a, b.T, acc, input_precision="ieee")
+    return tl.dot(a, b.T, acc, input_precision="ieee", out_dtype=acc.dtype)
 
 
 @triton.jit
@@ -53,8 +55,9 @@ def _product_kernel(
     # rows past the end are computed from others, and not stored
     a_at = x + ((m % rows)[:, None] * inner + d[None, :])
     b_at = weight + ((n % columns)[:, None] * inner + d[None, :])
-    acc = tl.zeros((BLOCK_M, BLOCK_N), tl.float32)
-    up = tl.zeros((BLOCK_M, BLOCK_N), tl.float32)
+    SUMS: tl.constexpr = tl.int32 if x.dtype.element_ty == tl.int8 else tl.float32
+    acc = tl.zeros((BLOCK_M, BLOCK_N), SUMS)
+    up = tl.zeros((BLOCK_M, BLOCK_N), SUMS)
     up_at = b_at + columns * inner
     steps = tl.cdiv(inner, DEPTH)
     begin, end = 0, steps
@@ -74,6 +77,7 @@ def _product_kernel(
             up = _sum(a, c, up, PROMOTE, DEPTH)
     launch_dependents(PDL)
     there = n < columns
+    acc, up = acc.to(tl.float32), up.to(tl.float32)
     if HAS_SCALE:
         acc *= tl.load(scale + n, there, 0.0)[None, :]
         if GEGLU:
@@ -88,7 +92,7 @@ def _product_kernel(
     if SCALED:
         acc *= inverse
     to = out + ((split * rows + m)[:, None] * columns + n[None, :])
-    tl.store(to, acc.to(out.dtype.element_ty), (m < rows)[:, None] & there[None, :])
+    tl.store(to, as_stored(acc, out), (m < rows)[:, None] & there[None, :])
 
 
 def product(
@@ -99,37 +103,40 @@ def product(
     out: Tensor | None = None,
     inverse: float | None = None,
     tile: Tile | None = None,
+    numbers: torch.dtype = E4M3,
+    *,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
-    """x [M, K] @ weightᵀ + bias, then the epilogue -> [M, N] in the weight's dtype, or with `inverse` E4M3.
+    """x [M, K] @ weightᵀ + bias, then the epilogue -> [M, N] in the weight's dtype, or with `inverse` in `numbers`.
 
-    x is E4M3 with an `Fp8Matrix`, else as the weight. weight [N, K], of "geglu" [2N, K], gate rows before up rows; bias
-    [N]. "parts" -> [splits, M, N], whose sum is the result; of one split [M, N]. All contiguous, K a multiple of 16.
-    Without a `tile`, that of `tiles`, else the cost model's.
+    x is of the numbers of a `ScaledMatrix`, else as the weight. weight [N, K], of "geglu" [2N, K], gate rows before up
+    rows; bias [N]. "parts" -> [splits, M, N], whose sum is the result; of one split [M, N]. All contiguous, K a
+    multiple of 16. Without a `tile`, that of `tiles`, else the cost model's.
     """
-    data = weight.data if isinstance(weight, Fp8Matrix) else weight
+    data = weight.data if isinstance(weight, ScaledMatrix) else weight
     m, k = x.shape
     n = data.shape[0] // 2 if epilogue == "geglu" else data.shape[0]
     assert data.shape[1] == k and k % ALIGNMENT == 0, f"{tuple(x.shape)} @ {tuple(data.shape)}"
     assert x.dtype == data.dtype and x.is_contiguous() and data.is_contiguous(), "rows are read as they lie in memory"
     assert bias is None or (epilogue != "geglu" and bias.shape == (n,))
-    fp8, on = isinstance(weight, Fp8Matrix), gpu(x.device)
-    tile = tile or tuned_tile(tiles, "fp8" if fp8 else "bf16", epilogue, m, n, k)
-    tile = tile or best_tile(on[0], fp8, epilogue, m, n, k, on[1])
+    scaled, on = isinstance(weight, ScaledMatrix), gpu(x.device)
+    multiplied: Numbers = "bf16" if not scaled else "int8" if data.dtype == torch.int8 else "fp8"
+    tile = tile or tuned_tile(tiles, multiplied, epilogue, m, n, k)
+    tile = tile or best_tile(on[0], scaled, epilogue, m, n, k, on[1])
     assert tile.splits == 1 or epilogue == "parts"
     assert max(x.numel(), data.numel(), tile.splits * m * n) < 1 << 31, "places are counted in 32 bits"
-    depth = STEP_BYTES if fp8 else STEP_BYTES // 2
+    depth = STEP_BYTES if scaled else STEP_BYTES // 2
     block_n = tile.columns // 2 if epilogue == "geglu" else tile.columns
     if out is None:
-        dtype = weight.dtype if inverse is None else result_dtype(x, inverse)
+        dtype = weight.dtype if inverse is None else result_dtype(x, inverse, numbers)
         out = torch.empty((m, n) if tile.splits == 1 else (tile.splits, m, n), dtype=dtype, device=x.device)
     assert out.is_contiguous() and out.shape[-2:] == (m, n), "the result is written as it lies in memory"
     grid = (triton.cdiv(m, tile.rows) * triton.cdiv(n, block_n), tile.splits)
     _product_kernel[grid](
-        x, data, weight.scale if isinstance(weight, Fp8Matrix) else x, x if bias is None else bias, out, m, n, k,
+        x, data, weight.scale if isinstance(weight, ScaledMatrix) else x, x if bias is None else bias, out, m, n, k,
         1.0 if inverse is None else inverse,
-        GELU=epilogue == "gelu", GEGLU=epilogue == "geglu", HAS_BIAS=bias is not None, HAS_SCALE=fp8,
-        SCALED=inverse is not None, PROMOTE=fp8 and x.dtype == E4M3 and promotes(on[0], k), WHOLE=k % depth == 0,
+        GELU=epilogue == "gelu", GEGLU=epilogue == "geglu", HAS_BIAS=bias is not None, HAS_SCALE=scaled,
+        SCALED=inverse is not None, PROMOTE=x.dtype == E4M3 and promotes(on[0], k), WHOLE=k % depth == 0,
         SPLIT=tile.splits > 1, GROUP=GROUP, BLOCK_M=tile.rows, BLOCK_N=block_n, DEPTH=depth,
         num_warps=tile.warps, num_stages=tile.stages, **dependent_launch(x),
     )  # fmt: skip

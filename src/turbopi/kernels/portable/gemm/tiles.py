@@ -13,7 +13,7 @@ from turbopi.kernels.tile_table import LIBRARY, Numbers, TileTable
 Epilogue = Literal["plain", "gelu", "geglu", "parts"]
 Capability = tuple[int, int]
 
-STEP_BYTES = 128  # of a row along the inner axis in one step: 128 E4M3 or 64 bfloat16
+STEP_BYTES = 128  # of a row along the inner axis in one step: 128 E4M3 or int8, or 64 bfloat16
 SPLITS = (1, 2, 3, 4)
 UNPROMOTED = 2176  # longest sum of E4M3 products that stays in the tensor cores, as in sm90/gemm/fp8.py
 
@@ -66,17 +66,24 @@ def fp8_refusal(capability: Capability) -> str | None:
     return f"tensor cores multiply E4M3 from compute capability 8.9 on; this GPU has {capability[0]}.{capability[1]}"
 
 
+def int8_refusal(capability: Capability) -> str | None:
+    """Why INT8 isn't for this GPU; None if it is."""
+    if capability < (8, 9):
+        return None
+    return f"INT8 is for GPUs without FP8, up to compute capability 8.7; this GPU has {capability[0]}.{capability[1]}"
+
+
 def promotes(capability: Capability, inner: int) -> bool:
     """Whether sums over `inner` E4M3 products are added up in float32 after each step.
 
     Tensor cores of 8.9 and 9.0 keep some 14 bits of a running sum. Those of 10.x and 11.0 keep float32. 12.x is taken
     for an 8.9 until somebody measures it.
     """
-    return inner > UNPROMOTED and capability[0] not in (10, 11)
+    return inner > UNPROMOTED and capability >= (8, 9) and capability[0] not in (10, 11)
 
 
 def candidates(capability: Capability, fp8: bool, epilogue: Epilogue, inner: int) -> list[Tile]:
-    """All tiles that this GPU takes."""
+    """All tiles that this GPU takes. fp8: of numbers of eight bits, INT8 too where the GPU has no FP8."""
     promoted = fp8 and promotes(capability, inner)
     fitting = [tile for tile in TILES if tile.takes(capability, epilogue, promoted)]
     if epilogue != "parts":

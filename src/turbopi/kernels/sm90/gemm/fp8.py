@@ -1,7 +1,7 @@
 """Matrix products of E4M3 numbers, for compute capability 9.0: kernel.cu compiled for them.
 
-Twins: `kernels.plain`' products with an `Fp8Matrix`. The results are bfloat16, E4M3 for a product that reads them next
-(`inverse`), or parts of the sums ("partial", "parts") for the norms of `norms.py` to add up.
+Twins: `kernels.plain`' products with a `ScaledMatrix` of E4M3. The results are bfloat16, E4M3 for a product that reads
+them next (`inverse`), or parts of the sums ("partial", "parts") for the norms of `norms.py` to add up.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ from turbopi.kernels.sm90.gemm.bf16 import (
 )
 from turbopi.kernels.sm90.gemm.tiles import TILES_FP8
 from turbopi.kernels.sm90.instructions import DependentKernel
-from turbopi.quantization.fp8 import ALIGNMENT, E4M3, Fp8Matrix
+from turbopi.quantization.fp8 import ALIGNMENT, E4M3, ScaledMatrix
 
 DEPTH = 128  # of a step along the inner axis
 PROMOTE = 4  # steps after which the tensor cores' sums, of some 14 bits, are added up in float32
@@ -50,13 +50,13 @@ NO_EPS = 1e-12  # the sums of a copy have it; what is left keeps a variance that
 class FoldedFp8:
     """An E4M3 matrix behind a LayerNorm whose input comes as a `Copy`, HEADROOM times smaller than calibrated."""
 
-    matrix: Fp8Matrix
+    matrix: ScaledMatrix
     scale: Tensor  # float32[N]: the matrix's, for such a copy
     of_scale: Tensor  # float32[N]: the matrix times the norm's scale
     of_shift: Tensor  # float32[N]: the matrix times its shift
 
     @classmethod
-    def fold(cls, matrix: Fp8Matrix, scale: Tensor, shift: Tensor) -> "FoldedFp8":
+    def fold(cls, matrix: ScaledMatrix, scale: Tensor, shift: Tensor) -> "FoldedFp8":
         wide = matrix.dequantized()
         return cls(matrix, matrix.scale * HEADROOM, wide @ scale.float(), wide @ shift.float())
 
@@ -68,7 +68,7 @@ def promotion(tile: Tile, k: int) -> int:
 
 def matmul_fp8(
     a: Tensor,
-    weight: Fp8Matrix | FoldedFp8,
+    weight: ScaledMatrix | FoldedFp8,
     tile: Tile,
     epilogue: Epilogue,
     bias: Tensor | None = None,

@@ -23,7 +23,7 @@ from turbopi.kernels.sm90.gemm.tiles import (
     VISION_TILES,
 )
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, Knobs, TileTable
-from turbopi.quantization.fp8 import Fp8Matrix, Matrix, to_e4m3
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix, to_e4m3
 
 GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
 
@@ -75,7 +75,7 @@ def bf16_tile(tiles: TileTable, operation: Operation, x: Tensor, weight: Tensor)
 def tuned_linear(
     x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None, *, tiles: TileTable = NO_TILES
 ) -> Tensor:
-    if isinstance(weight, Fp8Matrix):
+    if isinstance(weight, ScaledMatrix):
         return _fp8(x, weight, "plain" if bias is None else "bias", bias, out, tiles=tiles)
     tile = bf16_tile(tiles, "plain" if bias is None else "bias", x, weight)
     if tile is None:
@@ -92,7 +92,7 @@ def tuned_residual_linear(
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """The product, or parts of it that the norms add up."""
-    if isinstance(weight, Fp8Matrix):
+    if isinstance(weight, ScaledMatrix):
         return _fp8(x, weight, "parts" if bias is None else "partial", bias, ahead=ahead, tiles=tiles)
     if bias is None:
         cut = chosen(tiles, "parts", x.shape[0], *weight.shape)
@@ -121,7 +121,7 @@ def tuned_linear_gelu(
     *,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
-    if isinstance(weight, Fp8Matrix):
+    if isinstance(weight, ScaledMatrix):
         return _fp8(x, weight, "gelu", bias, inverse=inverse, ahead=ahead, tiles=tiles)
     tile = bf16_tile(tiles, "gelu", x, weight)
     result = linear_gelu(x, weight, bias) if tile is None else matmul(x, weight, tile, "gelu", bias, ahead=ahead)
@@ -131,7 +131,7 @@ def tuned_linear_gelu(
 def tuned_linear_geglu(
     x: Tensor, gate_up: Matrix, inverse: float | None = None, *, tiles: TileTable = NO_TILES
 ) -> Tensor:
-    if isinstance(gate_up, Fp8Matrix):
+    if isinstance(gate_up, ScaledMatrix):
         return _fp8(x, gate_up, "geglu", inverse=inverse, tiles=tiles)
     tile = chosen_geglu(tiles, x.shape[0], gate_up.shape[0] // 2, x.shape[1], num_sms(x.device))
     return as_input(linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu"), inverse)
@@ -144,7 +144,7 @@ def as_input(x: Tensor, inverse: float | None) -> Tensor:
 
 def _fp8(
     x: Tensor,
-    weight: Fp8Matrix,
+    weight: ScaledMatrix,
     epilogue: Epilogue,
     bias: Tensor | None = None,
     out: Tensor | None = None,

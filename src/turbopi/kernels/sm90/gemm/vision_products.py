@@ -18,7 +18,7 @@ from turbopi.kernels.sm90.gemm.products import (
     tuned_residual_linear,
 )
 from turbopi.kernels.tile_table import NO_TILES, TileTable
-from turbopi.quantization.fp8 import E4M3, Fp8Matrix, Matrix
+from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class VisionProducts:
     def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
         sms, tile = num_sms(x.device), None
         if bias is not None and sms >= GATHERING_SMS:
-            if isinstance(weight, Fp8Matrix):
+            if isinstance(weight, ScaledMatrix):
                 tile = chosen_fp8(self._tiles, "residual", x.shape[0], weight.shape[0], weight.shape[1], sms)
             else:
                 tile = bf16_tile(self._tiles, "residual", x, weight)
@@ -98,7 +98,7 @@ class VisionProducts:
             copy = Copy(
                 torch.empty_like(x, dtype=E4M3), before.sums, *self._for_copies(weight, bias, inverse), eps, plain
             )
-        if isinstance(y.weight, Fp8Matrix):
+        if isinstance(y.weight, ScaledMatrix):
             x = matmul_fp8(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, copy=copy, ahead=ahead)
         else:
             x = matmul(y.x, y.weight, y.tile, "bias", y.bias, residual=x, sums_out=sums, copy=copy, ahead=ahead)
@@ -135,7 +135,7 @@ class VisionProducts:
         self, x: Normed, weight: Matrix, bias: Tensor | None, epilogue: Epilogue, out: Tensor | None = None
     ) -> Tensor | None:
         if (
-            isinstance(weight, Fp8Matrix)
+            isinstance(weight, ScaledMatrix)
             or bias is None
             or (tile := bf16_tile(self._tiles, epilogue, x.x, weight)) is None
             or tile.splits > 1
@@ -167,7 +167,7 @@ class VisionProducts:
         out: Tensor | None = None,
         inverse: float | None = None,
     ) -> Tensor:
-        assert isinstance(weight, Fp8Matrix), "only such a matrix's input is asked for in E4M3"
+        assert isinstance(weight, ScaledMatrix), "only such a matrix's input is asked for in E4M3"
         key = weight.data.data_ptr()
         if key not in self._folded_fp8:
             self._folded_fp8[key] = FoldedFp8.fold(weight, x.scale, x.shift)
@@ -179,7 +179,7 @@ class VisionProducts:
 
     def _next(self, matrix: Matrix) -> Tensor | None:
         """What may be fetched into L2 during a product: the matrix that came behind this one last time."""
-        data = matrix.data if isinstance(matrix, Fp8Matrix) else matrix
+        data = matrix.data if isinstance(matrix, ScaledMatrix) else matrix
         if self._last is not None:
             self._behind[self._last.data_ptr()] = data
         self._last = data

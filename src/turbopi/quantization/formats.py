@@ -1,0 +1,55 @@
+"""The formats that a model's numbers may be rounded to, by the name that precisions have of them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, to_e4m3
+from turbopi.quantization.int8 import INT8_MAX, to_int8
+
+Numbers = Literal["fp8", "int8"]
+
+
+@dataclass(frozen=True)
+class Format:
+    """Numbers of eight bits.
+
+    rounded        (x, 1 / scale) -> x in these numbers, to nearest, saturated
+    expert_inputs  whether the expert's activations are rounded, too, or its weights alone: denoising is bound by
+                   reading weights, so activations of bfloat16 cost nothing there
+    """
+
+    name: Numbers
+    dtype: torch.dtype
+    largest: float
+    rounded: Callable[[Tensor, float | Tensor], Tensor]
+    expert_inputs: bool
+
+    @property
+    def label(self) -> str:
+        """As it is written in sentences."""
+        return self.name.upper()
+
+    def held(self, x: Tensor, scale: float) -> Tensor:
+        """x as these numbers hold it with a scale, in x's dtype."""
+        return (self.rounded(x, 1 / scale).float() * scale).to(x.dtype)
+
+    def rounds_input(self, part: str) -> bool:
+        """Whether activations of a part of the model are rounded, beside its weights."""
+        return self.expert_inputs or part != "expert"
+
+
+FP8 = Format("fp8", E4M3, E4M3_MAX, to_e4m3, expert_inputs=True)
+INT8 = Format("int8", torch.int8, INT8_MAX, to_int8, expert_inputs=False)
+FORMATS: Mapping[Numbers, Format] = {"fp8": FP8, "int8": INT8}
+
+
+def told_by(details: object) -> Mapping[str, object] | None:
+    """What a backend's `describe` tells of its calibration (`Quantization.describe`), under the name of the format;
+    None: it has none.
+    """
+    found = [details.get(name) for name in FORMATS] if isinstance(details, Mapping) else []
+    return next((one for one in found if isinstance(one, Mapping)), None)

@@ -1,0 +1,122 @@
+"""INT8 of the `fused` backend on a real GPU: what the emulated reference says, on openpi's golden cases."""
+
+from functools import lru_cache
+from typing import Any
+
+import pytest
+import torch
+from conftest import golden_cases, golden_folder, golden_model
+from torch import Tensor
+
+from turbopi import backends
+from turbopi.backends.fused import FusedBackend
+from turbopi.config import Kind
+from turbopi.engine.emulate import RoundedWeights, delta_cosine, relative_rms, rounded
+from turbopi.kernels.portable.denoise.packing import refusal
+from turbopi.model.reference import Pi0Model
+from turbopi.observation import Observation
+from turbopi.quantization.calibration_file import Quantization
+from turbopi.quantization.formats import INT8
+from turbopi.quantization.sites import sites
+from turbopi.verify.check_golden import FP8_COSINE, FP8_TARGET, golden_calibration
+from turbopi.verify.golden import Case
+
+HERE = torch.cuda.get_device_capability() if torch.cuda.is_available() else None
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(
+        HERE is None or not ((8, 0) <= HERE < (8, 9) or HERE == (9, 0)),
+        reason="needs an NVIDIA GPU of compute capability 8.0 to 8.7, or 9.0",
+    ),
+]
+CASES = ["a_three_cams", "b_third_masked", "e_horizon50", "p0_pi0_state"]
+STEPS = 10
+
+
+@lru_cache
+def on_gpu(kind: Kind) -> Pi0Model:
+    state = {name: tensor.to("cuda") for name, tensor in golden_model(kind).state_dict().items()}
+    return Pi0Model.from_state(golden_model(kind).config, state)
+
+
+@lru_cache
+def quantization(kind: Kind, target: float) -> Quantization:
+    return golden_calibration(golden_folder(), kind, torch.device("cuda", 0), target, INT8)
+
+
+@lru_cache
+def backend(kind: Kind, target: float = 0.0) -> backends.Backend:
+    checkpoint = golden_folder().checkpoint(kind)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("TURBOPI_KERNELS", "portable")
+        return backends.create(
+            "fused",
+            checkpoint.config.model,
+            lambda to, mode: checkpoint.load(to, mode).state,
+            device=torch.device("cuda", 0),
+            precision="int8",
+            quantization=quantization(kind, target),
+        )
+
+
+def emulated(case: Case, target: float, expert: bool = True) -> tuple[Tensor, Tensor]:
+    """(float32, float32 with the plan's sites rounded, the expert's among them), on the host."""
+    model, chosen = on_gpu(case.kind), quantization(case.kind, target)
+    plan = chosen.plan(model.config, "int8")
+    in_kernel = expert and refusal(model.config) is None and plan.expert == "int8"
+    used = {
+        site: plan.scales[str(site)]
+        for site in sites(model.config)
+        if str(site) in plan.scales and (in_kernel or site.part != "expert")
+    }
+    weights = RoundedWeights({site: plan.directions[str(site)] for site in used}, INT8)
+    observation, noise = case.observation.to("cuda"), case.noise.to("cuda")
+    exact = model.sample(observation, noise, STEPS)
+    with rounded(model, used, weights):
+        return exact.cpu(), model.sample(observation, noise, STEPS).cpu()
+
+
+def is_as_far_off(ours: Tensor, exact: Tensor, expected: Tensor) -> bool:
+    """Whether actions are as far from float32 as the emulation, and near to it; bfloat16 has a share of some 0.01."""
+    error = relative_rms(expected, exact)
+    return relative_rms(ours, exact) < 1.3 * error + 0.01 and relative_rms(ours, expected) < 0.75 * error + 0.02
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_engine_is_as_far_from_float32_as_its_emulation(case: str) -> None:
+    one = golden_cases()[case]
+    exact, expected = emulated(one, 0.0)
+    ours = backend(one.kind).sample(one.observation, one.noise, STEPS).actions
+    print(f"{case}: {relative_rms(ours, exact):.4f} of float32, emulated {relative_rms(expected, exact):.4f}")
+    assert is_as_far_off(ours, exact, expected)
+
+
+def test_a_batch_is_as_far_from_float32_as_its_emulation_with_a_bf16_expert() -> None:
+    one = golden_cases()["b_third_masked"]
+    exact, expected = emulated(one, 0.0, expert=False)
+    four = Observation(
+        **{name: value.repeat(4, *[1] * (value.dim() - 1)) for name, value in vars(one.observation).items()}
+    )
+    runner: Any = backend("pi05")
+    ours = runner.sample(four, one.noise.repeat(4, 1, 1), STEPS).actions
+    assert all(is_as_far_off(row[None], exact, expected) for row in ours)
+    assert runner.describe()["int8"]["plan"]["expert of batches"] == "bf16, as operations denoise"
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_sites_kept_in_bf16_reach_the_target(case: str) -> None:
+    one = golden_cases()[case]
+    exact, _ = emulated(one, FP8_TARGET)
+    ours = backend(one.kind, FP8_TARGET).sample(one.observation, one.noise, STEPS).actions
+    cosine = delta_cosine(ours, exact, torch.zeros_like(exact))
+    print(f"{case}: cosine {cosine:.6f}, plan {backend(one.kind, FP8_TARGET).describe()['int8']['plan']}")
+    assert cosine >= FP8_COSINE
+
+
+def test_repeated_calls_are_bit_identical_and_the_denoising_kernel_runs() -> None:
+    one = golden_cases()["b_third_masked"]
+    runner: Any = backend("pi05")
+    assert isinstance(runner, FusedBackend)
+    first, again = (runner.sample(one.observation, one.noise, STEPS).actions.clone() for _ in range(2))
+    assert torch.equal(first, again)
+    assert runner.describe()["int8"]["plan"]["expert"] == "int8"
