@@ -160,6 +160,10 @@ class FusedBackend(CudaGraphBackend):
         self._on_hopper = hopper_kernels(self.device)
         return fused_ops(self.device)
 
+    @property
+    def _times_by_token(self) -> bool:
+        return self._on_hopper
+
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, loop or GPU."""
         cameras = min(max(shape.cameras, 3), MAX_CAMERAS)
