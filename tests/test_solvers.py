@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,7 @@ def test_every_solver_is_as_its_formula_says(solver: Solver) -> None:
 
 def _written_out(velocity: Velocity, x: Tensor, solver: Solver, times: tuple[float, ...]) -> Tensor:
     before: tuple[float, Tensor, Tensor] | None = None  # t, v and D of the interval before
-    for t, s in zip(times[:-1], times[1:], strict=True):
+    for t, s in pairwise(times):
         v = velocity(x, t)
         data = x - t * v
         if solver == "midpoint":
@@ -161,9 +162,7 @@ def test_the_reference_does_what_its_own_velocity_says(kind: Kind, solver: Solve
 
     asked = Integration(solver, UNEVEN)
     trace: Trace = {}
-    found = model.denoise(
-        cache, noise, asked.evaluations, conditioning=Conditioning(integration=asked), trace=trace
-    )
+    found = model.denoise(cache, noise, asked.evaluations, conditioning=Conditioning(integration=asked), trace=trace)
     torch.testing.assert_close(found, integrated(velocity, noise, asked), rtol=1e-5, atol=1e-5)
     assert trace["v_t"].shape[0] == asked.evaluations and torch.equal(trace["actions"], found)
     euler = model.denoise(cache, noise, 3, conditioning=Conditioning(integration=Integration("euler", UNEVEN)))
@@ -197,9 +196,9 @@ def test_eulers_steps_on_a_grid_hold_actions_and_other_solvers_refuse_to() -> No
     ):
         with pytest.raises(ObservationError, match=f"{what} and solver 'ab2' were both asked for.*take .*'euler'"):
             model.denoise(cache, noise, 3, conditioning=one)
-    with pytest.raises(ObservationError, match="token times and a time grid .* were both given"):
+    with pytest.raises(ObservationError, match=r"token times and a time grid .* were both given"):
         model.denoise(cache, noise, 3, conditioning=Conditioning(TokenTimes.of(grid), integration=asked))
-    with pytest.raises(ObservationError, match="a loop of 5 steps was asked for.*takes 3"):
+    with pytest.raises(ObservationError, match=r"a loop of 5 steps was asked for.*takes 3"):
         model.denoise(cache, noise, 5, conditioning=Conditioning(integration=asked))
 
 
@@ -258,7 +257,7 @@ def test_kernels_of_a_solvers_loop_are_forgotten_with_it_unless_another_loop_has
     backend, case = fused(), golden_cases()["b_third_masked"]
     monkeypatch.setattr(type(backend), "_times_by_token", False)
     for solver in ("ab2", "exponential"):
-        asked = Conditioning(integration=Integration(solver, UNEVEN))  # type: ignore[arg-type]
+        asked = Conditioning(integration=Integration(solver, UNEVEN))
         backend.sample(case.observation, case.noise, 3, conditioning=asked)
     assert len(kernels.made) == 3, "both evaluate at the same times"
     loops = list(backend._recent)

@@ -39,7 +39,9 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
 
 ImageResize = Literal["openpi", "lerobot", "lerobot_0.4"]  # how, see preprocess/images.py
 Schedule = Literal["exponential", "linear", "ones", "zeros"]  # of guidance's weights: model/conditioning.py
-Solver = Literal["euler", "midpoint", "heun", "ab2", "exponential"]  # of the flow from noise to actions: model/solvers.py
+Solver = Literal[
+    "euler", "midpoint", "heun", "ab2", "exponential"
+]  # of the flow from noise to actions: model/solvers.py
 GridName = Literal["uniform", "shifted_to_noise", "shifted_to_actions"]
 TimeGrid = GridName | Sequence[float]  # or times, strictly falling from 1 to 0
 
@@ -236,6 +238,16 @@ _PRESETS = (
     ),
 )
 PRESETS: dict[str, PolicyConfig] = {preset.name: preset for preset in _PRESETS}
+
+
+def typed_grid(text: str | None) -> Any:
+    """A `TimeGrid`, or None, as it is typed: a name, which isn't checked, or times with commas between them."""
+    if text is None or "," not in text:
+        return text
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"time_grid={text!r} isn't times with commas between them, such as 1,0.6,0.3,0") from None
 
 
 def preset(name: str) -> PolicyConfig:

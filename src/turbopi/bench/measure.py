@@ -14,7 +14,7 @@ from turbopi.backends import Precision
 from turbopi.bench.document import PolicyError, Times
 from turbopi.bench.work import MODEL_SIZE, Job
 from turbopi.checkpoint import Checkpoint
-from turbopi.config import CAMERAS, Normalization
+from turbopi.config import CAMERAS, Normalization, Solver, TimeGrid
 from turbopi.errors import ConfigError
 from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
 from turbopi.policy import UnifiedPolicy
@@ -40,6 +40,8 @@ def bench_policy(
     tokenizer: object = None,
     quantization: str | None = None,
     robot: str | Robot | None = None,
+    solver: Solver | None = None,
+    time_grid: TimeGrid | None = None,
 ) -> UnifiedPolicy:
     """The checkpoint's policy for a job: its model with the `plain` robot, so that cameras and prompt can be chosen.
 
@@ -58,6 +60,8 @@ def bench_policy(
         backend=backend,
         precision=precision,
         num_denoising_steps=job.steps,
+        solver=solver,
+        time_grid=time_grid,
         device=device,
         tokenizer=tokenizer,
         quantization=quantization if precision.startswith("fp8") else None,

@@ -22,13 +22,18 @@ MOST_TIMES = 1024  # of a loop: 2.9 MB each, on the device
 
 
 def conditioned_loop(
-    conditioning: Conditioning | None, num_steps: int, horizon: int, config: ModelConfig, *, times_by_token: bool = False
+    conditioning: Conditioning | None,
+    num_steps: int,
+    horizon: int,
+    config: ModelConfig,
+    *,
+    times_by_token: bool = False,
 ) -> Loop:
     """The loop that a call needs. Raises ObservationError for a conditioning that doesn't fit it.
 
     One with the config's own grid of times serves all calls that have no others, and 0, whatever they hold.
 
-    times_by_token  whether one launch of the runner's denoiser takes times by token: so it does Euler's steps on any grid
+    times_by_token  whether one launch of the denoiser takes times by token: then Euler's steps on any grid are one, too
     """
     if conditioning is None:
         return Loop(num_steps, horizon)

@@ -16,8 +16,8 @@ class Loop(NamedTuple):
     steps: int
     horizon: int
     form: Form = "plain"
-    # Of a conditioned loop: all that an action's t may be, so many rows has its table. Of a solver's: each evaluation's.
-    # Of a plain one: where steps begin, if not as openpi's do (solving.py)
+    # Of a conditioned loop: all that an action's t may be, so many rows has its table. Of a solver's loop: that of each
+    # evaluation. Of a plain one: where steps begin, if not where openpi's do (solving.py)
     times: tuple[float, ...] = ()
     integration: Integration | None = None  # of a solver's loop
 

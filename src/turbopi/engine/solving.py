@@ -74,7 +74,8 @@ def solving(
 
     table  float32[N, …]: the modulation at each evaluation's time, as the loop has them; None: there is none
     """
-    loop, launches = shape.loop, []
+    loop = shape.loop
+    launches: list[tuple[Denoiser, tuple[TokenInputs, ...]]] = []
     assert loop.integration is not None
     if by_token:
         kernel = make(replace(shape, loop=_by_token(loop)), table)

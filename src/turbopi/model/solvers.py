@@ -89,8 +89,7 @@ class Integration:
     evaluations: int = 0
 
     def __post_init__(self) -> None:
-        if self.solver not in SOLVERS:
-            raise ObservationError(f"the solver is {shown(self.solver)}; it should be one of {', '.join(SOLVERS)}")
+        checked_solver(self.solver)
         times, count = checked_times(self.times), len(self.times) - 1
         object.__setattr__(self, "times", times)
         if not self.evaluations:
@@ -135,6 +134,13 @@ class Integration:
         return f"{self.solver}, t = {', '.join(f'{t:.3g}' for t in self.times)}"
 
 
+def checked_solver(solver: Solver) -> Solver:
+    """A solver's name. Raises ObservationError."""
+    if solver not in SOLVERS:
+        raise ObservationError(f"the solver is {shown(solver)}; it should be one of {', '.join(SOLVERS)}")
+    return solver
+
+
 def checked_times(times: Sequence[float]) -> tuple[float, ...]:
     """Times of a grid as float32 numbers. Raises ObservationError, see `Integration`."""
     most = LIMITS["num_denoising_steps"]
@@ -149,6 +155,20 @@ def checked_times(times: Sequence[float]) -> tuple[float, ...]:
             f"the time grid is {shown(told)}; its times should fall strictly, from 1 (noise) to 0 (actions)"
         )
     return rounded
+
+
+def checked_grid(grid: TimeGrid) -> GridName | tuple[float, ...]:
+    """A grid as a policy takes it: a name, or times from 1 to 0. Raises ObservationError."""
+    if isinstance(grid, str):
+        if grid not in GRIDS:
+            raise ObservationError(
+                f"the time grid is {shown(grid)}; it should be one of {', '.join(GRIDS)}, or times from 1 to 0"
+            )
+        return grid
+    times = checked_times(grid)
+    if times[0] != 1:
+        raise ObservationError(f"the time grid begins at {times[0]:g}; it should begin at 1, which is noise")
+    return times
 
 
 @lru_cache
@@ -186,17 +206,3 @@ def _in_float64(asked: Integration) -> Iterator[tuple[float, Row]]:
 
 def _log_term(s: float, t: float) -> float:
     return s * math.log(t / s) if s > 0 else 0.0
-
-
-def named_or_checked(grid: TimeGrid) -> GridName | tuple[float, ...]:
-    """A grid as a policy takes it: a name, or times from 1 to 0. Raises ObservationError."""
-    if isinstance(grid, str):
-        if grid not in GRIDS:
-            raise ObservationError(
-                f"the time grid is {shown(grid)}; it should be one of {', '.join(GRIDS)}, or times that fall from 1 to 0"
-            )
-        return grid
-    times = checked_times(grid)
-    if times[0] != 1:
-        raise ObservationError(f"the time grid begins at {times[0]:g}; it should begin at 1, which is noise")
-    return times
