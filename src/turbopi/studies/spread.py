@@ -27,7 +27,7 @@ class Spread(Struct, frozen=True):
     sideways: list[list[float]]
 
 
-def spread(policy: ToyPolicy, episodes: Sequence[int], samples: int) -> Spread:
+def spread(policy: ToyPolicy, episodes: Sequence[int], samples: int, steps: int = STEPS) -> Spread:
     world = policy.toy.start(seeds_of(episodes))
     seen = policy.observe(world)
     cache = policy.model.prefix(seen)
@@ -36,7 +36,7 @@ def spread(policy: ToyPolicy, episodes: Sequence[int], samples: int) -> Spread:
     found = []
     for sample in range(samples):
         noise = policy.noise(episodes, 1_000_000 + sample)
-        chunks = policy.model.denoise(cache, noise, STEPS)
+        chunks = policy.model.denoise(cache, noise, steps)
         moved = chunks[:, :REPLAN, :2].double().numpy().sum(1)
         found.append((moved * left).sum(1))
     sideways = np.stack(found, axis=1)  # [N, M]
