@@ -22,6 +22,7 @@ from turbopi.shipped import CHASE_POLICY
 from turbopi.sim.chase import SPEED as CHASE_SPEED
 from turbopi.studies import (
     STUDIES,
+    distillation,
     formats,
     fp4_products,
     fp8_and_fp4,
@@ -84,6 +85,31 @@ def test_a_study_runs_in_its_small_form_and_its_controls_hold(name: str, tmp_pat
     assert result.exit_code == 0, result.output
     found = read_document(tmp_path / name / report.JSON, Report)
     assert found.small and found.sound and len(found.controls) >= 2 and "small form" in report.markdown(found)
+
+
+def test_students_are_judged_beside_their_teacher(tmp_path: Path) -> None:
+    given = ("study", "distillation", "--small", "--episodes", "4", "--device", "cpu", "--out", tmp_path)
+    result = turbopi(*given, "--policy", f"chase.consistency={CHASE_POLICY}", "--policy", f"chase.mean={CHASE_POLICY}")
+    assert result.exit_code == 0, result.output
+    found = read_document(tmp_path / "distillation" / report.JSON, Report)
+    (table,) = found.tables
+    cells = [(row[0], row[1]) for row in table.rows]
+    assert cells == [("teacher", 10), ("teacher", 1)] + [("consistency", n) for n in (1, 2, 10)] + [("mean", 1)]
+    solved = {cell: row[2] for cell, row in zip(cells, table.rows, strict=True)}
+    assert solved["consistency", 10] == solved["teacher", 10] and solved["mean", 1] == solved["teacher", 1]
+    assert table.rows[3][-1] != 0 and table.rows[0][-1] == table.rows[4][-1] == 0
+    assert "chase.shuffled: `python -m small_policy distill --recipe shuffled`" in found.not_run[0]
+    for name in ("chase.magic", "other.mean"):
+        said = refusal(turbopi(*given, "--policy", f"{name}={CHASE_POLICY}"))
+        assert f"--policy {name} is no student" in said
+
+
+def test_a_student_with_another_prefix_fails_the_control() -> None:
+    policy = open_policy("chase")
+    assert distillation.same_prefix([policy, open_policy("again")])
+    other = open_policy("other")
+    other.model.vlm.layers[0].self_attn.k_proj.weight.mul_(1.01)
+    assert not distillation.same_prefix([policy, other])
 
 
 def test_a_failed_control_voids_the_verdict_and_the_exit_code_says_so(
