@@ -182,6 +182,8 @@ def test_turbopi_json_has_a_solver_and_its_grid(tmp_path: Path, tiny: Any) -> No
     policy = made(opened)
     assert policy.metadata["solver"] == "ab2" and policy.metadata["num_denoising_steps"] == 3
     assert made(opened, solver="euler", time_grid="uniform", num_denoising_steps=4).loop_arguments == {}
+    file.write_text(json.dumps({"solver": "midpoint", "solver_grid": [1, 0.5, 0], "num_denoising_steps": 3}))
+    assert made(random_checkpoint("pi05_tiny", 0, str(file))).metadata["num_denoising_steps"] == 3
     folder = tmp_path / "converted"
     convert(opened, folder, precision="f32")
     assert open_checkpoint(folder).config.solver == "ab2"

@@ -1,7 +1,7 @@
 """What a call of a policy is asked for, checked: noise and seeds, steps and solver, numbers of cameras and actions."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -65,13 +65,18 @@ class Denoising:
         cls, config: PolicyConfig, steps: int | None, solver: Solver | None, time_grid: TimeGrid | None
     ) -> "Denoising":
         """A policy's: its config's, unless it says otherwise. Raises ConfigError."""
-        own = cls(config.num_denoising_steps).changed(None, config.solver, config.solver_grid, ConfigError)
+        number = checked_steps(config.num_denoising_steps, ConfigError)
+        own = cls(number).changed(None, config.solver, config.solver_grid, ConfigError)
+        if own.steps != number and intervals(own.solver, number) == intervals(own.solver, own.steps):
+            own = replace(own, steps=number)  # fits the grid's times, too
         return own.changed(steps, solver, time_grid, ConfigError)
 
     def changed(
         self, steps: int | None, solver: Solver | None, time_grid: TimeGrid | None, error: Error
     ) -> "Denoising":
         """The same but for what isn't None. Times bring their number of steps, unless it is given, too."""
+        if steps is None and solver is None and time_grid is None:
+            return self
         try:
             chosen = self.solver if solver is None else checked_solver(solver)
             grid = self.time_grid if time_grid is None else checked_grid(time_grid)
@@ -79,7 +84,7 @@ class Denoising:
             raise error(str(wrong)) from None
         count = self.steps if steps is None else checked_steps(steps, error)
         if isinstance(grid, tuple):
-            if steps is None and not (solver is None and time_grid is None):
+            if steps is None:
                 count = evaluations_of(chosen, len(grid) - 1)
             if intervals(chosen, count) != len(grid) - 1:
                 fits = evaluations_of(chosen, len(grid) - 1)
