@@ -13,8 +13,8 @@ very noise. Only the action expert and its projections learn: keys and values of
                  noise, of the same observation. What is left to learn is the mean of all ways
     mean         control: regression on the mean of the teacher's actions for the observation
 
-Some four minutes on a CPU core. What comes out is an ordinary checkpoint; its turbopi.json says one denoising step. It wasn't trained with held actions,
-so it doesn't say that it was.
+Some four minutes on a CPU core. What comes out is an ordinary checkpoint; its turbopi.json says one denoising step. It
+wasn't trained with held actions, so it doesn't say that it was.
 """
 
 import dataclasses
