@@ -166,4 +166,4 @@ def test_too_many_times_are_refused() -> None:
 
 
 def test_backends_say_which_forms_they_have() -> None:
-    assert set(backends.forms(on_cpu())) == {"tokens", "jacobian"}
+    assert set(backends.forms(on_cpu())) == {"solver", "tokens", "jacobian"}

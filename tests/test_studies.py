@@ -13,12 +13,16 @@ from msgspec.structs import replace
 from torch import Tensor
 
 from turbopi import UnifiedPolicy
+from turbopi.arguments import Denoising
+from turbopi.errors import ConfigError
 from turbopi.evaluate.statistics import Paired, Rate
+from turbopi.model.conditioning import Conditioning
 from turbopi.reading import read_document
 from turbopi.shipped import CHASE_POLICY
 from turbopi.sim.chase import SPEED as CHASE_SPEED
 from turbopi.studies import (
     STUDIES,
+    distillation,
     formats,
     fp4_products,
     fp8_and_fp4,
@@ -29,7 +33,6 @@ from turbopi.studies import (
     report,
     solvers,
     steps,
-    steps_libero,
 )
 from turbopi.studies.report import Control, Grid, Report
 from turbopi.studies.rollouts import CHASE, Call, met, open_policy, play, sampled
@@ -84,6 +87,31 @@ def test_a_study_runs_in_its_small_form_and_its_controls_hold(name: str, tmp_pat
     assert found.small and found.sound and len(found.controls) >= 2 and "small form" in report.markdown(found)
 
 
+def test_students_are_judged_beside_their_teacher(tmp_path: Path) -> None:
+    given = ("study", "distillation", "--small", "--episodes", "4", "--device", "cpu", "--out", tmp_path)
+    result = turbopi(*given, "--policy", f"chase.consistency={CHASE_POLICY}", "--policy", f"chase.mean={CHASE_POLICY}")
+    assert result.exit_code == 0, result.output
+    found = read_document(tmp_path / "distillation" / report.JSON, Report)
+    (table,) = found.tables
+    cells = [(row[0], row[1]) for row in table.rows]
+    assert cells == [("teacher", 10), ("teacher", 1)] + [("consistency", n) for n in (1, 2, 10)] + [("mean", 1)]
+    solved = {cell: row[2] for cell, row in zip(cells, table.rows, strict=True)}
+    assert solved["consistency", 10] == solved["teacher", 10] and solved["mean", 1] == solved["teacher", 1]
+    assert table.rows[3][-1] != 0 and table.rows[0][-1] == table.rows[4][-1] == 0
+    assert "chase.shuffled: `python -m small_policy distill --recipe shuffled`" in found.not_run[0]
+    for name in ("chase.magic", "other.mean"):
+        said = refusal(turbopi(*given, "--policy", f"{name}={CHASE_POLICY}"))
+        assert f"--policy {name} is no student" in said
+
+
+def test_a_student_with_another_prefix_fails_the_control() -> None:
+    policy = open_policy("chase")
+    assert distillation.same_prefix([policy, open_policy("again")])
+    other = open_policy("other")
+    other.model.vlm.layers[0].self_attn.k_proj.weight.mul_(1.01)
+    assert not distillation.same_prefix([policy, other])
+
+
 def test_a_failed_control_voids_the_verdict_and_the_exit_code_says_so(
     small_steps: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,70 +147,29 @@ def test_plots_show_intervals(drawn: list[Figure], tmp_path: Path) -> None:
 # --- solvers ----------------------------------------------------------------------------------------------------------
 
 
-def bent(x: Tensor, t: float) -> Tensor:
-    """dx/dt = cos(3 t) x, with the solution x(0) = x(1) exp(−sin(3) / 3)."""
-    return math.cos(3 * t) * x
+def test_no_cell_asks_for_a_velocity_at_the_end_where_none_was_trained() -> None:
+    cells = [way for way in solvers.ways(small=False) if way.grid != "learned"]
+    for way in cells:
+        asked = solvers.integration(way.solver, solvers.grid_times(way, {}), way.evaluations)
+        assert min(asked.evaluated) >= 0.03 and len(asked.evaluated) == way.evaluations, way
+    assert len({*cells}) == len(cells)
 
 
-@pytest.mark.parametrize("solver", solvers.SOLVERS)
-def test_solvers_converge_with_the_second_order_and_euler_with_the_first(solver: str) -> None:
-    start = torch.ones(1, 1, 1, dtype=torch.float64)
-    exact = math.exp(-math.sin(3) / 3)
-    errors = []
-    for evaluations in (4096, 16384):
-        times = solvers.uniform(solvers.intervals(solver, evaluations))
-        errors.append(abs(float(solvers.integrate(bent, start, solver, times, evaluations)) - exact))
-    assert math.log(errors[0] / errors[1], 4) == pytest.approx(1 if solver == "euler" else 2, abs=0.3)
+def test_a_way_is_what_the_policys_options_of_the_same_names_are() -> None:
+    policy, episodes = open_policy("chase"), range(3)
+    product = UnifiedPolicy(CHASE_POLICY, backend="pytorch", precision="f32", device="cpu")
+    for way, grid in (
+        (solvers.Way("exponential", "uniform", 3), "uniform"),
+        (solvers.Way("ab2", "shifted to actions", 3), "shifted_to_actions"),
+    ):
+        asked = Denoising(3).changed(3, way.solver, grid, ConfigError).integration  # type: ignore[arg-type]
 
+        def by_option(call: Call, asked: Any = asked) -> Tensor:
+            conditioning = Conditioning(integration=asked)
+            return product.backend.sample(call.observation, call.noise, 3, conditioning=conditioning).actions  # type: ignore[call-arg]
 
-def test_the_exponential_solver_is_exact_after_its_first_interval_for_actions_linear_in_t() -> None:
-    # D(t) = a + b t: the flow is (x − D) / t, and x(t) = c t + a − b t log t
-    a, b, c = 2.0, 3.0, 5.0
-
-    def velocity(x: Tensor, t: float) -> Tensor:
-        return (x - (a + b * t)) / t
-
-    second = solvers.intervals("exponential", 2)
-    x = torch.full((1, 1, 1), c + a, dtype=torch.float64)
-    found = solvers.integrate(velocity, x, "exponential", solvers.uniform(second), 2)
-    euler = solvers.integrate(velocity, x, "euler", solvers.uniform(second), 2)
-    assert abs(float(found) - a) < 1e-12 < abs(float(euler) - a)
-
-
-@pytest.mark.parametrize("solver", solvers.SOLVERS)
-@pytest.mark.parametrize("evaluations", solvers.EVALUATIONS)
-def test_a_solver_evaluates_as_often_as_it_is_told_and_one_evaluation_is_eulers(solver: str, evaluations: int) -> None:
-    asked: list[float] = []
-
-    def velocity(x: Tensor, t: float) -> Tensor:
-        asked.append(t)
-        return bent(x, t)
-
-    x = torch.ones(1, 1, 1)
-    found = solvers.integrate(velocity, x, solver, solvers.uniform(solvers.intervals(solver, evaluations)), evaluations)
-    assert len(asked) == evaluations and all(0 <= t <= 1 for t in asked)
-    if evaluations == 1:
-        assert float(found) == float(x - bent(x, 1.0))
-
-
-def test_no_solver_asks_for_a_velocity_at_the_end_where_none_was_trained() -> None:
-    for way in solvers.ways(small=False):
-        asked: list[float] = []
-
-        def velocity(x: Tensor, t: float, asked: list[float] = asked) -> Tensor:
-            asked.append(t)
-            return bent(x, t)
-
-        count = solvers.intervals(way.solver, way.evaluations)
-        solvers.integrate(velocity, torch.ones(1, 1, 1), way.solver, solvers.uniform(count), way.evaluations)
-        assert min(asked) >= 0.05 and len(asked) == way.evaluations, way
-
-
-def test_grids_fall_from_one_and_shift_where_they_say() -> None:
-    for shift in solvers.SHIFTS.values():
-        times = solvers.shifted(10, shift)
-        assert times[0] == 1 and times == sorted(times, reverse=True) and times[-1] > 0
-    assert solvers.shifted(4, 3.0)[2] == pytest.approx(0.75) and solvers.shifted(4, 1 / 3)[2] == pytest.approx(0.25)
+        one, other = (play(policy, episodes, actor).paths for actor in (steps.actor(policy, way, {}), by_option))
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-5)
 
 
 def test_a_learned_grid_is_never_worse_and_stays_a_grid() -> None:
@@ -191,8 +178,8 @@ def test_a_learned_grid_is_never_worse_and_stays_a_grid() -> None:
     def error(times: solvers.Times) -> float:
         return sum((a - b) ** 2 for a, b in zip(times, wanted, strict=True))
 
-    found = solvers.learn_times(error, solvers.uniform(3))
-    assert error(found) < error(solvers.uniform(3)) / 2
+    found = solvers.learn_times(error, solvers.begins("uniform", 3))
+    assert error(found) < error(solvers.begins("uniform", 3)) / 2
     assert found[0] == 1 and found == sorted(found, reverse=True) and found[-1] > 0
 
 
@@ -252,13 +239,8 @@ def test_the_post_is_between_the_tip_and_a_target_that_never_moves() -> None:
 def test_the_controls_of_steps_fail_where_the_loop_isnt_the_models(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = open_policy("chase")
     assert steps.loop_is_the_models(policy) < 1e-5
-    true = solvers.velocity_of
-
-    def slow(*given: Any) -> solvers.Velocity:
-        velocity = true(*given)
-        return lambda x, t: 0.99 * velocity(x, t)
-
-    monkeypatch.setattr(solvers, "velocity_of", slow)
+    true = solvers.solve
+    monkeypatch.setattr(solvers, "solve", lambda model, cache, noise, *way: 0.99 * true(model, cache, noise, *way))
     assert steps.loop_is_the_models(policy) > 1e-3
 
 
@@ -419,17 +401,6 @@ def test_overlap_finds_actions_that_change_beside_others() -> None:
 
 
 # --- in a simulator ---------------------------------------------------------------------------------------------------
-
-
-def test_a_backend_with_a_solver_is_the_policys_own_where_that_is_ten_euler_steps() -> None:
-    policies = [UnifiedPolicy(CHASE_POLICY, backend="pytorch", precision="f32", device="cpu") for _ in range(3)]
-    observation = policies[0].example_observation(0)
-    plain = policies[0].infer(observation, seed=0, num_steps=10)["actions"]
-    found = []
-    for policy, way in zip(policies[1:], (solvers.BASELINE, solvers.Way("exponential", "uniform", 2)), strict=True):
-        policy.backend = steps_libero.SolvedBackend(policy.backend, way)  # type: ignore[assignment]
-        found.append(policy.infer(observation, seed=0)["actions"])
-    assert np.allclose(found[0], plain, atol=1e-5) and not np.allclose(found[1], plain, atol=1e-3)
 
 
 def test_steps_in_a_simulator_are_paired_kept_and_continued(tmp_path: Path) -> None:

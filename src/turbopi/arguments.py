@@ -1,12 +1,24 @@
-"""What a call of a policy is asked for, checked: noise and seeds, numbers of steps, cameras and actions."""
+"""What a call of a policy is asked for, checked: noise and seeds, steps and solver, numbers of cameras and actions."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from turbopi.config import LIMITS
+from turbopi.config import LIMITS, GridName, PolicyConfig, Solver, TimeGrid
 from turbopi.engine.recent_loops import MOST_LOOPS, MOST_STEPS, Loop, fit
 from turbopi.errors import ConfigError, ObservationError
+from turbopi.model.conditioning import Conditioning
+from turbopi.model.solvers import (
+    Integration,
+    checked_grid,
+    checked_solver,
+    evaluations_of,
+    grid_times,
+    intervals,
+)
 
 MAX_STEPS = LIMITS["num_denoising_steps"]  # far beyond any use; a larger number is a mistake, not a wish
 MAX_HORIZON = LIMITS["action_horizon"]
@@ -38,6 +50,81 @@ def _checked(what: str, number: int, most: int, error: Error) -> int:
     if not whole or not 1 <= number <= most:
         raise error(f"{what} is {number!r}; it should be a whole number from 1 to {most}")
     return int(number)
+
+
+@dataclass(frozen=True)
+class Denoising:
+    """How noise becomes actions: evaluations of the action expert, solver, time grid. A policy's own, or a call's."""
+
+    steps: int
+    solver: Solver = "euler"
+    time_grid: GridName | tuple[float, ...] = "uniform"
+
+    @classmethod
+    def of(
+        cls, config: PolicyConfig, steps: int | None, solver: Solver | None, time_grid: TimeGrid | None
+    ) -> "Denoising":
+        """A policy's: its config's, unless it says otherwise. Raises ConfigError."""
+        number = checked_steps(config.num_denoising_steps, ConfigError)
+        own = cls(number).changed(None, config.solver, config.solver_grid, ConfigError)
+        if own.steps != number and intervals(own.solver, number) == intervals(own.solver, own.steps):
+            own = replace(own, steps=number)  # fits the grid's times, too
+        return own.changed(steps, solver, time_grid, ConfigError)
+
+    def changed(
+        self, steps: int | None, solver: Solver | None, time_grid: TimeGrid | None, error: Error
+    ) -> "Denoising":
+        """The same but for what isn't None. Times bring their number of steps, unless it is given, too."""
+        if steps is None and solver is None and time_grid is None:
+            return self
+        try:
+            chosen = self.solver if solver is None else checked_solver(solver)
+            grid = self.time_grid if time_grid is None else checked_grid(time_grid)
+        except ObservationError as wrong:
+            raise error(str(wrong)) from None
+        count = self.steps if steps is None else checked_steps(steps, error)
+        if isinstance(grid, tuple):
+            if steps is None:
+                count = evaluations_of(chosen, len(grid) - 1)
+            if intervals(chosen, count) != len(grid) - 1:
+                fits = evaluations_of(chosen, len(grid) - 1)
+                raise error(
+                    f"{count} steps of solver {chosen!r} are {intervals(chosen, count)} intervals, but the time grid "
+                    f"has {len(grid) - 1}: give {fits} steps, leave them out, or take time grid 'uniform'"
+                )
+        return Denoising(count, chosen, grid)
+
+    def of_call(
+        self,
+        steps: int | None,
+        solver: Solver | None = None,
+        time_grid: TimeGrid | None = None,
+        conditioning: Conditioning | None = None,
+    ) -> "Denoising":
+        """A call's. A conditioning with times or a solver of its own brings its steps. Raises ObservationError."""
+        if steps is None and conditioning is not None:
+            if conditioning.integration is not None:
+                steps = conditioning.integration.evaluations
+            elif conditioning.tokens is not None:
+                steps = len(conditioning.tokens.times)
+        return self.changed(steps, solver, time_grid, ObservationError)
+
+    @cached_property
+    def integration(self) -> Integration | None:
+        """What backends are asked for. None: openpi's loop, as one evaluation with every solver and named grid is."""
+        if isinstance(self.time_grid, tuple):
+            return Integration(self.solver, self.time_grid, self.steps)
+        if self.steps == 1 or (self.solver, self.time_grid) == ("euler", "uniform"):
+            return None
+        times = grid_times(self.time_grid, intervals(self.solver, self.steps))
+        integration = Integration(self.solver, times, self.steps)
+        return None if self.time_grid == "uniform" and integration.is_euler else integration
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """Plain values."""
+        grid = self.time_grid if isinstance(self.time_grid, str) else list(self.time_grid)
+        return {"num_denoising_steps": self.steps, "solver": self.solver, "time_grid": grid}
 
 
 def several(what: str, given: Numbers, default: Sequence[int], check: Callable[[int, Error], int]) -> list[int]:

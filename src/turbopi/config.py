@@ -8,7 +8,7 @@ Every size has a limit, LIMITS: a number beyond it is damage or a slip, and beli
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -39,6 +39,11 @@ LIMITS = {  # the largest value of each whole number; the smallest is 1. Pi0.5 a
 
 ImageResize = Literal["openpi", "lerobot", "lerobot_0.4"]  # how, see preprocess/images.py
 Schedule = Literal["exponential", "linear", "ones", "zeros"]  # of guidance's weights: model/conditioning.py
+Solver = Literal[
+    "euler", "midpoint", "heun", "ab2", "exponential"
+]  # of the flow from noise to actions: model/solvers.py
+GridName = Literal["uniform", "shifted_to_noise", "shifted_to_actions"]
+TimeGrid = GridName | Sequence[float]  # or times, strictly falling from 1 to 0
 
 
 @dataclass(frozen=True)
@@ -166,7 +171,9 @@ class PolicyConfig:
     image_resize: ImageResize = "openpi"  # how pictures become 224 x 224: "openpi", "lerobot" or "lerobot_0.4"
     prompt_state_dim: int | None = None  # zeros fill the state up to it in the prompt, as in LeRobot 0.4; None: nothing
     prompt_as_is: bool = False  # without a state, blanks, underscores and newlines stay in the prompt: LeRobot's Pi0
-    num_denoising_steps: int = 10  # unless whoever runs the policy says otherwise
+    num_denoising_steps: int = 10  # unless whoever runs the policy says otherwise; so are the next two
+    solver: Solver = "euler"
+    solver_grid: TimeGrid = "uniform"  # where its intervals end. `model.time_grid` is how uniform times are rounded
     real_time: RealTime = RealTime()
 
     def with_model(self, **changes: Any) -> "PolicyConfig":
@@ -231,6 +238,16 @@ _PRESETS = (
     ),
 )
 PRESETS: dict[str, PolicyConfig] = {preset.name: preset for preset in _PRESETS}
+
+
+def typed_grid(text: str | None) -> Any:
+    """A `TimeGrid`, or None, as it is typed: a name, which isn't checked, or times with commas between them."""
+    if text is None or "," not in text:
+        return text
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"time_grid={text!r} isn't times with commas between them, such as 1,0.6,0.3,0") from None
 
 
 def preset(name: str) -> PolicyConfig:

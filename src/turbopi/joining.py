@@ -1,6 +1,7 @@
 """What a policy's calls may join, checked and turned into what the denoising loop is asked for (docs/real_time.md)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,7 +9,8 @@ from turbopi import backends
 from turbopi.backends import Backend
 from turbopi.config import ModelConfig, PolicyConfig
 from turbopi.errors import ConfigError, ObservationError
-from turbopi.model.conditioning import Conditioning, Form, Guidance
+from turbopi.model.conditioning import Conditioning, Form, Guidance, TokenTimes, guidance_strength
+from turbopi.model.solvers import Integration
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.running_chunk import FORMS, JoinMode, RunningChunk
 
@@ -16,24 +18,53 @@ Loop = tuple[int, int]  # denoising steps, action horizon
 
 
 class Joining:
-    """Of one policy; `backend` tells the one that it holds."""
+    """Of one policy; `backend` tells the one that it holds, `integration` how it denoises unless a call says otherwise.
 
-    def __init__(self, config: PolicyConfig, pipeline: Pipeline, backend: Callable[[], Backend]) -> None:
+    Raises ConfigError for an integration that the backend doesn't have.
+    """
+
+    def __init__(
+        self,
+        config: PolicyConfig,
+        pipeline: Pipeline,
+        backend: Callable[[], Backend],
+        integration: Integration | None = None,
+    ) -> None:
         self._config, self._model, self._pipeline, self._backend = config, config.model, pipeline, backend
+        self._integration = integration
+        if integration is not None:
+            try:
+                self._check_form("solver")
+            except ObservationError as error:
+                raise ConfigError(str(error)) from None
 
     @property
     def modes(self) -> tuple[JoinMode, ...]:
         """What `RunningChunk`s may ask of this policy."""
+        if self._integration is not None and not self._integration.is_euler:
+            return ()  # see `Conditioning`
         able = backends.forms(self._backend())
         trained = self._config.real_time.trained_max_delay > 0
         return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
 
     def checked(
-        self, conditioning: Conditioning | None, previous: RunningChunk | None, steps: int, horizon: int
+        self,
+        conditioning: Conditioning | None,
+        previous: RunningChunk | None,
+        steps: int,
+        horizon: int,
+        integration: Integration | None = None,
     ) -> tuple[Conditioning | None, RunningChunk | None]:
-        """What a call is to join; of the two at most one. Raises ObservationError."""
+        """What a call is to join, and how it is integrated; of the two at most one. Raises ObservationError."""
         if conditioning is not None and previous is not None:
             raise ObservationError("conditioning and previous were both given; give one of them")
+        if previous is None:
+            conditioning = integrated(conditioning, integration)
+        elif integration is not None and not integration.is_euler:
+            raise ObservationError(
+                f"a running chunk and solver {integration.solver!r} were both given: chunks join by Euler's steps, so "
+                "take solver 'euler', whose time grid may be any, or leave out previous"
+            )
         if conditioning is not None:
             conditioning.check(steps, horizon, self._model.action_dim)
             self._check_form(conditioning.form)
@@ -50,11 +81,18 @@ class Joining:
         state: np.ndarray,
         steps: int,
         horizon: int,
+        integration: Integration | None = None,
     ) -> dict[str, Conditioning]:
         """The backend's, once the new state is known, of what is `checked`; {} for an ordinary call."""
         if chunk is not None:
             left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
             conditioning = chunk.conditioning(left_over, steps, horizon, self._model.time_grid)
+            if integration is not None:
+                conditioning = replace(conditioning, integration=integration)
+                if (pull := conditioning.guidance) is not None and chunk.max_guidance_weight is not None:
+                    times = TokenTimes.integrated(integration, horizon).times
+                    strength = guidance_strength(times, chunk.max_guidance_weight)
+                    conditioning = replace(conditioning, guidance=replace(pull, strength=strength))
         return {} if conditioning is None or conditioning.form == "plain" else {"conditioning": conditioning}
 
     def to_warm(
@@ -63,21 +101,28 @@ class Joining:
         modes: JoinMode | Sequence[JoinMode],
         others: Sequence[Conditioning],
         num_steps: int,
+        integrations: Callable[[int], Integration | None],
     ) -> list[tuple[int, int, Conditioning | None]]:
-        """Steps, horizon and an example of every conditioned loop that a warm-up is to cover. Raises ConfigError.
+        """Steps, horizon and an example of every loop that a warm-up is to cover, or None. Raises ConfigError.
 
-        num_steps  of those of `others` that don't say
+        num_steps     of those of `others` that don't say
+        integrations  of so many steps
         """
-        asked: list[tuple[int, int, Conditioning | None]] = []
+        asked: list[tuple[int, int, Conditioning | None]] = [
+            (*loop, integrated(None, integrations(loop[0]))) for loop in loops
+        ]
         for mode in [modes] if isinstance(modes, str) else modes:
             if mode not in self.modes:
                 raise ConfigError(
                     f"warm-up was asked for real-time mode {mode!r}; this policy has {', '.join(self.modes) or 'none'}"
                 )
-            asked += [(*loop, _example(FORMS[mode], *loop, self._model)) for loop in loops]
+            for loop in loops:
+                asked.append((*loop, integrated(_example(FORMS[mode], *loop, self._model), integrations(loop[0]))))
         for one in others:
             steps, horizon = one.size(num_steps, self._model.action_horizon)
             try:
+                if one.tokens is None and one.integration is None:
+                    one = integrated(one, integrations(steps)) or one
                 one.check(steps, horizon, self._model.action_dim)
                 self._check_form(one.form)
             except ObservationError as error:
@@ -89,10 +134,29 @@ class Joining:
         backend = self._backend()
         if form != "plain" and form not in backends.forms(backend):
             what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
+            if form == "solver":
+                raise ObservationError(
+                    f"backend {backend.name!r} takes Euler's steps on the uniform grid alone; take solver 'euler' and "
+                    "time grid 'uniform', or backend 'fused', 'cuda_graph' or 'pytorch'"
+                )
             raise ObservationError(
                 f"backend {backend.name!r} has no {what}; take backend 'fused', 'cuda_graph' or 'pytorch', or "
                 "leave out conditioning and previous"
             )
+
+
+def integrated(conditioning: Conditioning | None, integration: Integration | None) -> Conditioning | None:
+    """A conditioning, or none, with how it is integrated. Raises ObservationError for two that say so."""
+    if integration is None:
+        return conditioning
+    if conditioning is None:
+        return Conditioning(integration=integration)
+    if conditioning.tokens is not None or conditioning.integration is not None:
+        raise ObservationError(
+            f"the conditioning has times of its own, and this call's solver and time grid say {integration}: leave out "
+            "one of them, or give solver 'euler' and time grid 'uniform' for this call"
+        )
+    return replace(conditioning, integration=integration)
 
 
 def _example(form: Form, num_steps: int, horizon: int, model: ModelConfig) -> Conditioning:

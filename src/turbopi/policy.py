@@ -14,6 +14,7 @@ import torch
 
 from turbopi import backends
 from turbopi.arguments import (
+    Denoising,
     Numbers,
     checked_batch,
     checked_cameras,
@@ -27,7 +28,7 @@ from turbopi.backends import Precision
 from turbopi.backends.lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.checkpoint.calibration import for_policy
-from turbopi.config import PolicyConfig
+from turbopi.config import PolicyConfig, Solver, TimeGrid
 from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.joining import Joining
 from turbopi.model.conditioning import Conditioning
@@ -57,8 +58,11 @@ class UnifiedPolicy:
             (docs/quantization.md).
         quantization: what `turbopi calibrate` wrote for this checkpoint, for these precisions alone. None: the
             `turbopi_fp8.json` or `turbopi_int8.json` beside the weights.
-        num_denoising_steps: Euler steps a call, unless `infer` is told otherwise. None: the config's, which has them
-            from turbopi.json, else from LeRobot's `num_inference_steps`, else openpi's 10.
+        num_denoising_steps: evaluations of the action expert in a call, unless `infer` is told otherwise. None: the
+            config's, which has them from turbopi.json, else from LeRobot's `num_inference_steps`, else openpi's 10.
+        solver: "euler", as openpi, "midpoint", "heun", "ab2" or "exponential": docs/performance.md. None: the config's.
+        time_grid: "uniform", as openpi, "shifted_to_noise", "shifted_to_actions", or times that fall strictly from 1
+            (noise) to 0, which bring their number of steps. None: the config's.
         device: "auto", "cpu", "cuda" or "cuda:N".
         tokenizer: a SentencePiece model's path, or an object with `encode(text, add_bos) -> list[int]`. None: found in
             the checkpoint folder or in openpi's cache.
@@ -82,6 +86,8 @@ class UnifiedPolicy:
         precision: Precision = "bf16",
         quantization: str | Path | Quantization | None = None,
         num_denoising_steps: int | None = None,
+        solver: Solver | None = None,
+        time_grid: TimeGrid | None = None,
         device: str | torch.device = "auto",
         tokenizer: Any = None,
         default_prompt: str | None = None,
@@ -101,8 +107,7 @@ class UnifiedPolicy:
         if checkpoint.format == "random" and tokenizer is None:
             tokenizer = TINY_TOKENIZER  # any will do: no weight knows a word
         self.config = checkpoint.config
-        steps = self.config.num_denoising_steps if num_denoising_steps is None else num_denoising_steps
-        self._num_steps = checked_steps(steps, ConfigError)
+        self._denoising = Denoising.of(self.config, num_denoising_steps, solver, time_grid)
         prompt_tokenizer = load_tokenizer(
             tokenizer,
             checkpoint_dir=checkpoint.path,
@@ -126,7 +131,7 @@ class UnifiedPolicy:
                 name, self.config.model, load, device=self._device, precision=precision, quantization=calibration
             )
         self.backend.strict = self._strict = strict
-        self._joining = Joining(self.config, self._pipeline, lambda: self.backend)
+        self._joining = Joining(self.config, self._pipeline, lambda: self.backend, self._denoising.integration)
         self._generator = np.random.default_rng()
         self._lock = threading.Lock()
         self._backend_reason = why
@@ -139,6 +144,8 @@ class UnifiedPolicy:
         noise: np.ndarray | None = None,
         seed: int | None = None,
         num_steps: int | None = None,
+        solver: Solver | None = None,
+        time_grid: TimeGrid | None = None,
         horizon: int | None = None,
         conditioning: Conditioning | None = None,
         previous: RunningChunk | None = None,
@@ -151,14 +158,14 @@ class UnifiedPolicy:
             noise: float32[H, action_dim] or [1, H, action_dim], x at t = 1. Given noise, or a seed, makes the result
                 deterministic.
             seed: draws the noise from `numpy.random.default_rng(seed)`; neither: fresh noise every call.
-            num_steps: denoising steps for this call alone.
+            num_steps, solver, time_grid: for this call alone, as the policy's `num_denoising_steps` and so on.
             horizon: actions of the chunk, H, for this call alone. None: the config's, which the weights were trained
                 for and openpi has no other than. All actions of a chunk attend to each other, so a shorter chunk isn't
                 the beginning of a longer one. Backends with engines for one horizon refuse another.
             previous: the chunk that the robot is carrying out, which this one is to join (docs/real_time.md). What can
                 be asked for is in `metadata["real_time"]`.
             conditioning: instead of `previous`, what exactly the denoising loop is to do (model/conditioning.py). One
-                with token times brings its number of steps.
+                with times or a solver of its own brings its number of steps.
             model_actions: also return what a later call's `previous` needs, see below.
 
         Returns {"actions": float64[H, d], "policy_timing": {...}}, in milliseconds:
@@ -180,7 +187,8 @@ class UnifiedPolicy:
         infinite; DeviceLost once the GPU has failed for good (`lost`).
         """
         noises = None if noise is None else [noise]
-        return self._infer([obs], noises, seed, num_steps, horizon, conditioning, previous, model_actions)[0]
+        asked = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
+        return self._infer([obs], noises, seed, asked, horizon, conditioning, previous, model_actions)[0]
 
     def infer_batch(
         self,
@@ -189,6 +197,8 @@ class UnifiedPolicy:
         noise: Sequence[np.ndarray] | np.ndarray | None = None,
         seed: int | Sequence[int] | None = None,
         num_steps: int | None = None,
+        solver: Solver | None = None,
+        time_grid: TimeGrid | None = None,
         horizon: int | None = None,
     ) -> list[dict[str, Any]]:
         """Several observations in one run of the model: `infer` for each, with the times of the whole batch.
@@ -198,16 +208,18 @@ class UnifiedPolicy:
 
         `runs_batches` says whether the backend runs observations together: in calls of 1, 2, 4, 8 or 16, into which it
         splits other numbers (`backend.batch_costs`). Observations may differ in cameras and prompts. Actions then
-        differ from what `infer` returns by as much as sums in another order do: docs/performance.md.
+        differ from what `infer` returns by as much as sums in another order do: docs/performance.md. With another
+        solver or time grid than openpi's they run one by one there.
         """
-        return self._infer(observations, noise, seed, num_steps, horizon)
+        asked = self._denoising.of_call(num_steps, solver, time_grid)
+        return self._infer(observations, noise, seed, asked, horizon)
 
     def _infer(
         self,
         observations: Sequence[Mapping[str, Any]],
         noise: Sequence[np.ndarray] | np.ndarray | None,
         seed: int | Sequence[int] | None,
-        num_steps: int | None,
+        denoising: Denoising,
         horizon: int | None,
         conditioning: Conditioning | None = None,
         previous: RunningChunk | None = None,
@@ -218,10 +230,8 @@ class UnifiedPolicy:
         self._guard.refuse_if_lost()
         if not observations:
             raise ObservationError("infer_batch was given no observation")
-        if num_steps is None and conditioning is not None and conditioning.tokens is not None:
-            num_steps = len(conditioning.tokens.times)
-        steps, actions = self._loop(num_steps, horizon)
-        conditioning, chunk = self._joining.checked(conditioning, previous, steps, actions)
+        steps, integration, actions = denoising.steps, denoising.integration, self._horizon(horizon)
+        conditioning, chunk = self._joining.checked(conditioning, previous, steps, actions, integration)
         if len(observations) == 1 and isinstance(self.backend, backends.Begins):
             seen = self._pipeline.see(observations[0], resize=False)
             asked = time.perf_counter()
@@ -230,7 +240,7 @@ class UnifiedPolicy:
                 begun = self.backend.begin(seen.pictures, self._pipeline.config.image_resize)
                 self._pipeline.read(seen)  # while the device is at the pictures
                 x_1 = self._noise(1, actions, noise, seed)[0]
-                asked_for = self._joining.argument(conditioning, chunk, seen.state, steps, actions)
+                asked_for = self._joining.argument(conditioning, chunk, seen.state, steps, actions, integration)
                 sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps, **asked_for)
                 infer_end = time.perf_counter()
             states = [seen.state]
@@ -252,7 +262,7 @@ class UnifiedPolicy:
             inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
             states = [state for _, state in prepared]
             noises = torch.from_numpy(self._noise(len(observations), actions, noise, seed))
-            asked_for = self._joining.argument(conditioning, chunk, states[0], steps, actions)
+            asked_for = self._joining.argument(conditioning, chunk, states[0], steps, actions, integration)
             asked = time.perf_counter()
             with self._lock, self._guard:
                 infer_start = time.perf_counter()
@@ -264,7 +274,7 @@ class UnifiedPolicy:
             results[0]["model_actions"] = sample.actions[0].numpy().copy()
             if (anchor := self._pipeline.anchor(states[0])) is not None:
                 results[0]["anchor"] = anchor
-        timing = _timing(sample, start, asked, infer_start, infer_end, time.perf_counter())
+        timing = sample.timing(start, asked, infer_start, infer_end, time.perf_counter())
         return [result | {"policy_timing": dict(timing)} for result in results]
 
     def submit(
@@ -293,7 +303,7 @@ class UnifiedPolicy:
             return done
         start = time.perf_counter()
         self._guard.refuse_if_lost()
-        steps, actions = self._loop(num_steps, horizon)
+        actions, steps = self._horizon(horizon), self._denoising.of_call(num_steps).steps
         inputs, state = self._pipeline.before(obs)
         x_1 = torch.from_numpy(self._noise(1, actions, None if noise is None else [noise], seed))
         asked = time.perf_counter()
@@ -311,7 +321,7 @@ class UnifiedPolicy:
                 infer_end = time.perf_counter()
                 result = self._results(sample, [state])[0]
                 infer_start = asked + sample.queue_ms / 1e3
-                timing = _timing(sample, start, asked, infer_start, infer_end, time.perf_counter())
+                timing = sample.timing(start, asked, infer_start, infer_end, time.perf_counter())
                 answer.set_result(result | {"policy_timing": timing})
             except BaseException as error:
                 answer.set_exception(error)
@@ -358,11 +368,11 @@ class UnifiedPolicy:
         counts = several("cameras", cameras, sent, lambda n, error: n if n == own else checked_cameras(n, error))
         sizes = several("batches", 1 if batches is None else batches, [], checked_batch)
         loops = warm_loops(
-            several("steps", steps, [self._num_steps], checked_steps),
+            several("steps", steps, [self._denoising.steps], checked_steps),
             several("horizons", horizons, [self.config.model.action_horizon], self._checked_horizon),
         )
-        asked: list[tuple[int, int, Conditioning | None]] = [(*loop, None) for loop in loops]
-        asked += self._joining.to_warm(loops, real_time, conditioning, self._num_steps)
+        of_steps = {n: self._denoising.changed(n, None, None, ConfigError).integration for n, _ in loops}
+        asked = self._joining.to_warm(loops, real_time, conditioning, self._denoising.steps, of_steps.get)
         plan = [(count, *one) for count in counts for one in asked]
         with self._lock, self._guard:
             for i, (count, num_steps, horizon, one) in enumerate(plan):
@@ -407,7 +417,16 @@ class UnifiedPolicy:
     @property
     def runs_batches(self) -> bool:
         """Whether `infer_batch` runs observations together, and `warmup` prepares `batches` of them."""
-        return isinstance(self.backend, backends.RunsBatches)
+        return isinstance(self.backend, backends.RunsBatches) and self._denoising.integration is None
+
+    @property
+    def loop_arguments(self) -> dict[str, Any]:
+        """What the backend's own methods are told of this policy's solver and time grid: nothing, if they are openpi's.
+
+        For whoever calls `backend` itself, with `metadata["num_denoising_steps"]`.
+        """
+        asked = self._denoising.integration
+        return {} if asked is None else {"conditioning": Conditioning(integration=asked)}
 
     @property
     def pipelined(self) -> bool:
@@ -427,7 +446,7 @@ class UnifiedPolicy:
             "config": self.config.name,
             "model": model.kind,
             "action_horizon": model.action_horizon,
-            "num_denoising_steps": self._num_steps,
+            **self._denoising.metadata,
             "backend": self.backend.name,
             "backend_reason": self._backend_reason,
             "backend_details": self.backend.describe(),
@@ -456,12 +475,10 @@ class UnifiedPolicy:
                 raise ActionError(f"observation {row} of {len(states)} (from 0): {error}") from None
         return results
 
-    def _loop(self, num_steps: int | None, horizon: int | None) -> tuple[int, int]:
-        """A call's number of steps and horizon. Raises ObservationError."""
-        return (
-            self._num_steps if num_steps is None else checked_steps(num_steps, ObservationError),
-            self.config.model.action_horizon if horizon is None else self._checked_horizon(horizon, ObservationError),
-        )
+    def _horizon(self, horizon: int | None) -> int:
+        """A call's. Raises ObservationError."""
+        own = self.config.model.action_horizon
+        return own if horizon is None else self._checked_horizon(horizon, ObservationError)
 
     def _checked_horizon(self, horizon: int, error: type[ConfigError] | type[ObservationError]) -> int:
         own = self.config.model.action_horizon
@@ -472,26 +489,6 @@ class UnifiedPolicy:
             )
         return int(horizon)
 
-    def _noise(
-        self,
-        batch: int,
-        horizon: int,
-        noise: Sequence[np.ndarray] | np.ndarray | None,
-        seed: int | Sequence[int] | None,
-    ) -> np.ndarray:
+    def _noise(self, batch: int, horizon: int, noise: Any, seed: int | Sequence[int] | None) -> np.ndarray:
         """float32[B, H, action_dim], given or drawn."""
         return noise_for((batch, horizon, self.config.model.action_dim), noise, seed, self._generator)
-
-
-def _timing(
-    sample: backends.Sample, start: float, asked: float, infer_start: float, infer_end: float, end: float
-) -> dict[str, float]:
-    """`policy_timing` of a call's times in seconds: see `infer`."""
-    return {
-        "infer_ms": (infer_end - infer_start) * 1e3,
-        "preprocess_ms": (asked - start) * 1e3,
-        "queue_ms": (infer_start - asked) * 1e3,
-        **{f"{stage}_ms": milliseconds for stage, milliseconds in sample.stage_ms.items()},
-        "postprocess_ms": (end - infer_end) * 1e3,
-        "total_ms": (end - start) * 1e3,
-    }

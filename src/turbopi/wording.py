@@ -1,6 +1,7 @@
 """How numbers are written for people, in one way everywhere."""
 
 import math
+from collections.abc import Mapping
 
 
 def significant(value: float | None) -> str:
@@ -16,3 +17,14 @@ def significant(value: float | None) -> str:
 def cosine(value: float | None) -> str:
     """With six decimals, as those near 1 are of interest. None is "not finite"."""
     return "not finite" if value is None else f"{value:.6f}"
+
+
+def denoising(about: Mapping[str, object]) -> str:
+    """ "10 steps" of a policy's metadata, and its solver and time grid where they aren't openpi's."""
+    said = f"{about.get('num_denoising_steps')} steps"
+    solver, grid = about.get("solver", "euler"), about.get("time_grid", "uniform")
+    if solver != "euler":
+        said += f" of {solver}"
+    if isinstance(grid, list | tuple):
+        return f"{said}, times {', '.join(f'{t:.3g}' for t in grid)}"
+    return said if grid == "uniform" else f"{said}, grid {str(grid).replace('_', ' ')}"

@@ -8,6 +8,7 @@
     python -m small_policy card --help                               the model card, from results and curves
     python -m small_policy chase --out work/chase                    the policy of the dynamic task, see chase.py
     python -m small_policy post --out work/two_ways --ways 2         a policy of two modes for studies, see post.py
+    python -m small_policy distill --start work/two_ways/checkpoint --out work/student   one step, see distill.py
     python -m small_policy throughput                                samples a second, before a GPU is rented for long
 
 `train` needs a GPU with 60 GB (fewer with a smaller --capacity) and 2 GB of memory for each worker. It leaves
@@ -72,6 +73,7 @@ def main() -> None:
     card.add_argument("--out", type=Path, required=True)
     _add_chase(commands.add_parser("chase", help="the policy of the dynamic task: demonstrations, training, export"))
     _add_post(commands.add_parser("post", help="one of two policies that differ in their demonstrations, see post.py"))
+    _add_distill(commands.add_parser("distill", help="a student that takes one denoising step, see distill.py"))
     speed = commands.add_parser("throughput", help="time training steps on random data")
     playing = commands.add_parser("play", help="play episodes and keep them without pictures, for train --tapes")
     playing.add_argument("--out", type=Path, required=True, help="a folder; several runs may share it")
@@ -83,7 +85,7 @@ def main() -> None:
     _add_settings(speed, required=False)
     arguments = parser.parse_args()
     run = {"measure": _measure, "stats": _stats, "train": _train, "throughput": _throughput, "card": _card}
-    run |= {"chase": _chase, "play": _play, "post": _post}
+    run |= {"chase": _chase, "play": _play, "post": _post, "distill": _distill}
     run[arguments.command](arguments)
 
 
@@ -128,6 +130,22 @@ def _add_post(parser: argparse.ArgumentParser) -> None:
 
 def _post(arguments: argparse.Namespace) -> None:
     from small_policy.post import Settings, train
+
+    train(Settings(**{item.name: getattr(arguments, item.name) for item in fields(Settings)}))
+
+
+def _add_distill(parser: argparse.ArgumentParser) -> None:
+    from small_policy.distill import Settings
+
+    for item in fields(Settings):
+        needed = item.name in ("start", "out")
+        kind = Path if needed else str if item.name == "recipe" else item.type
+        default = None if needed else item.default
+        parser.add_argument("--" + item.name.replace("_", "-"), type=kind, default=default, required=needed)
+
+
+def _distill(arguments: argparse.Namespace) -> None:
+    from small_policy.distill import Settings, train
 
     train(Settings(**{item.name: getattr(arguments, item.name) for item in fields(Settings)}))
 

@@ -146,6 +146,23 @@ def velocity(
         return model.action_out_proj(modulated(model.expert.norm, y.float(), cond)[0]), x
 
 
+def suffix_velocity(model: Pi0Model, k: Tensor, v: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
+    """The predicted velocity float32[B, H, action_dim] of Pi0.5, for a prefix whose keys and values are there.
+
+    k, v   float32[layers, B, heads, S, K], all of them valid
+    x_t    float32[B, H, action_dim]
+    t      float32[B] in (0, 1]
+    """
+    cond, config = _condition(model, t, None), model.config
+    positions = torch.arange(x_t.shape[1], device=x_t.device)[None] + k.shape[3]
+    rope = rope_tables(positions, config.vlm.head_dim, config.rope_base)
+    mask = torch.ones(1, 1, 1, k.shape[3] + x_t.shape[1], dtype=torch.bool, device=x_t.device)
+    y = model.embed_suffix(x_t, x_t, cond.own[:, None])
+    for layer, keys, values in zip(model.expert.layers, k, v, strict=True):
+        y = _suffix_layer(layer, y, cond, keys, values, rope, mask)
+    return model.action_out_proj(modulated(model.expert.norm, y, cond)[0])
+
+
 def _condition(model: Pi0Model, t: Tensor, held: Tensor | None) -> Condition:
     own = model.time_condition(time_embedding(t, model.config.expert.width))
     if held is None:

@@ -35,7 +35,7 @@ class CudaGraphBackend(BatchRunner):
         self.config, self.device, self.precision = config, device, precision
         weights, ops = self._pack(load), self._make_ops()
         super().__init__(config, weights, ops, device, joint=ops is without_compiler.OPS)
-        self._loops: dict[int, without_compiler.Denoiser] = {}  # by number of steps
+        self._loops: dict[tuple[int, tuple[float, ...]], without_compiler.Denoiser] = {}  # by `Loop.table`
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
@@ -61,11 +61,12 @@ class CudaGraphBackend(BatchRunner):
         """None: the engine's operations one by one."""
         if self._ops is not without_compiler.OPS or table is None or shape.loop.form != "plain":
             return None
-        if shape.num_steps not in self._loops:
-            self._loops[shape.num_steps] = without_compiler.Denoiser.prepare(self.config, self._weights, table)
-        return dataclasses.replace(self._loops[shape.num_steps], slots=shape.prefix_slots(self.config))
+        key = shape.loop.table
+        if key not in self._loops:
+            self._loops[key] = without_compiler.Denoiser.prepare(self.config, self._weights, table)
+        return dataclasses.replace(self._loops[key], slots=shape.prefix_slots(self.config))
 
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
-        if loop.steps not in {other.steps for other in self._recent if other.form == "plain"}:
-            self._loops.pop(loop.steps, None)
+        if loop.table not in {other.table for other in self._recent if other.form == "plain"}:
+            self._loops.pop(loop.table, None)

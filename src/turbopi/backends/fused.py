@@ -178,6 +178,10 @@ class FusedBackend(CudaGraphBackend):
         self._on_hopper, self._tiles = hopper_kernels(self.device), tiles_of(self.device)
         return fused_ops(self.device, self._tiles.table)
 
+    @property
+    def _times_by_token(self) -> bool:
+        return self._on_hopper
+
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, loop or GPU."""
         cameras = min(max(shape.cameras, 3), MAX_CAMERAS)

@@ -21,7 +21,7 @@ class PyTorchBackend:
     name: ClassVar[str] = "pytorch"
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", "f32")
     any_horizon: ClassVar[bool] = True
-    forms: ClassVar[tuple[Form, ...]] = ("tokens", "jacobian")
+    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
     model_class: ClassVar[type[Pi0Model]] = Pi0Model
     strict = False  # nothing here depends on shapes
 

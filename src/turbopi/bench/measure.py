@@ -14,7 +14,7 @@ from turbopi.backends import Precision
 from turbopi.bench.document import PolicyError, Times
 from turbopi.bench.work import MODEL_SIZE, Job
 from turbopi.checkpoint import Checkpoint
-from turbopi.config import CAMERAS, Normalization
+from turbopi.config import CAMERAS, Normalization, Solver, TimeGrid
 from turbopi.errors import ConfigError
 from turbopi.model.conditioning import Conditioning, Guidance, TokenTimes, guidance_strength, guidance_weights
 from turbopi.policy import UnifiedPolicy
@@ -41,6 +41,8 @@ def bench_policy(
     tokenizer: object = None,
     quantization: str | None = None,
     robot: str | Robot | None = None,
+    solver: Solver | None = None,
+    time_grid: TimeGrid | None = None,
 ) -> UnifiedPolicy:
     """The checkpoint's policy for a job: its model with the `plain` robot, so that cameras and prompt can be chosen.
 
@@ -59,6 +61,8 @@ def bench_policy(
         backend=backend,
         precision=precision,
         num_denoising_steps=job.steps,
+        solver=solver,
+        time_grid=time_grid,
         device=device,
         tokenizer=tokenizer,
         quantization=quantization if precision in TIERS else None,

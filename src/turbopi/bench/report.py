@@ -36,7 +36,9 @@ def report(document: BenchDocument) -> str:
         f"# {document.model} on {about.device_name}",
         "",
         f"{about.date}, commit {about.commit}, torch {about.torch}, Python {about.python}; weights: "
-        f"{document.weights}. Milliseconds; every call has new pictures, prompt, state and noise.",
+        f"{document.weights}. Milliseconds; every call has new pictures, prompt, state and noise."
+        + (f" Solver {document.solver}." if document.solver else "")
+        + (f" Time grid {document.time_grid}." if document.time_grid else ""),
         "",
         *(f"- {floors_line(precision, floor)}" for precision, floor in document.floors.items()),
         "",

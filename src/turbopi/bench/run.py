@@ -27,6 +27,7 @@ from turbopi.bench.profile import stage_kernels, start_profiler
 from turbopi.bench.summary import linear_models, warnings_on
 from turbopi.bench.work import MODEL_SIZE, Job, Join, Work, floor_ms, stage_work
 from turbopi.checkpoint import Checkpoint
+from turbopi.config import Solver, TimeGrid
 from turbopi.engine.graph import collect_and_empty_cache
 from turbopi.errors import ConfigError, TurboPiError
 from turbopi.policy import UnifiedPolicy
@@ -59,6 +60,8 @@ class BenchPlan:
     profile: bool = False
     quantization: str | None = None  # what fp8, fp8-mlp or int8 needs
     robot: str | Robot | None = None  # whose own observations are measured; None: random ones of the jobs' shapes
+    solver: Solver | None = None  # None: the checkpoint's; so is the next
+    time_grid: TimeGrid | None = None
 
     @property
     def main(self) -> Job:
@@ -86,6 +89,8 @@ class BenchPlan:
             raise ConfigError(f"a calibration was given, but none of the precisions takes one: {', '.join(TIERS)}")
         if max(self.batches) > 1 and set(self.joins) != {"none"}:
             raise ConfigError("chunks that join a running one are measured one at a time: --join without --batch")
+        if set(self.joins) != {"none"} and (self.solver, self.time_grid) != (None, None):
+            raise ConfigError("chunks join by openpi's steps: --join without --solver and --time-grid")
         named = [*self.backends, *self.beside]
         for precision in self.precisions:
             if precision in PRECISIONS and not any(precision in backends.precisions(name) for name in named):
@@ -159,6 +164,8 @@ def run(
             random_weights=checkpoint.format == "random",
             observations_seed=0,
             main_job=plan.main,
+            solver=plan.solver,
+            time_grid=None if plan.time_grid is None else str(plan.time_grid),
             floors=floors,
             results=measured,
             failed=failed,
@@ -315,6 +322,8 @@ def _policy(
         tokenizer=plan.tokenizer,
         quantization=plan.quantization,
         robot=plan.robot,
+        solver=plan.solver,
+        time_grid=plan.time_grid,
     )
 
 

@@ -144,6 +144,8 @@ class Checkpoint:
             "robot": self.config.robot,
             "action_horizon": self.config.model.action_horizon,
             "num_denoising_steps": self.config.num_denoising_steps,
+            "solver": self.config.solver,
+            "time_grid": self.config.solver_grid,
             "max_prompt_tokens": self.config.model.max_prompt_tokens,
             "discrete_state_input": self.config.discrete_state_input,
             "normalization": {

@@ -202,6 +202,10 @@ def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], P
     }
     if config.real_time != RealTime():
         values["real_time"] = asdict(config.real_time)
+    if config.solver != "euler":
+        values["solver"] = config.solver
+    if config.solver_grid != "uniform":
+        values["solver_grid"] = config.solver_grid if isinstance(config.solver_grid, str) else [*config.solver_grid]
     for name in ("default_prompt", "prompt_state_dim"):  # null says nothing where the preset has none either
         if values[name] is None and getattr(PRESETS[preset], name) is None:
             del values[name]

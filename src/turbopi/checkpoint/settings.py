@@ -21,6 +21,7 @@ itself.
     lerobot_semantics     of LeRobot's checkpoints alone: "0.4", "0.6" (0.5, too), or "auto" for the one that wrote it
     time_grid             "accumulated" (openpi) or "multiplied" (LeRobot)
     num_denoising_steps   1 to 1000, unless whoever runs it says otherwise; else LeRobot's num_inference_steps, or 10
+    solver, solver_grid   of a call, unless whoever runs it says otherwise: as UnifiedPolicy's `solver` and `time_grid`
     real_time             object of trained_max_delay (delays that training simulated, control steps),
                           execution_horizon, schedule, max_guidance_weight: see turbopi.config.RealTime
     vision_heads          attention heads of a vision tower of a non-standard width
@@ -43,8 +44,9 @@ from pathlib import Path
 from typing import Any, get_args
 
 from turbopi.checkpoint.openpi_lora import LoraScale
-from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, PolicyConfig, RealTime
+from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, PolicyConfig, RealTime, TimeGrid
 from turbopi.errors import ConfigError
+from turbopi.model.solvers import GRIDS, SOLVERS, checked_grid
 from turbopi.reading import is_finite, is_integer, read_json, shown
 
 FILE_NAME = "turbopi.json"
@@ -131,6 +133,8 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
         "prompt_state_dim",
         "prompt_as_is",
         "num_denoising_steps",
+        "solver",
+        "solver_grid",
         "real_time",
     )
     if values.get("robot", config.robot) != config.robot:  # the options were the other robot's
@@ -276,6 +280,12 @@ def _real_time(value: object) -> RealTime:
     return RealTime(**options)  # type: ignore[arg-type]  # which checks; its ConfigError is a ValueError
 
 
+def _solver_grid(value: object) -> TimeGrid:
+    if not isinstance(value, str | list):
+        raise ValueError
+    return checked_grid(value)  # type: ignore[arg-type]  # its ObservationError is a ValueError
+
+
 _ALPHAS = (1e-6, 1e6)  # in use are 8 to 128
 
 
@@ -309,6 +319,8 @@ _SCHEMA: dict[str, tuple[str, Callable[[object], object]]] = {
     "lerobot_semantics": ("'0.4', '0.6' or 'auto'", _choice("0.4", "0.6", "auto")),
     "time_grid": ("'accumulated' or 'multiplied'", _choice("accumulated", "multiplied")),
     "num_denoising_steps": _count(LIMITS["num_denoising_steps"]),
+    "solver": (f"one of {', '.join(SOLVERS)}", _choice(*SOLVERS)),
+    "solver_grid": (f"one of {', '.join(GRIDS)}, or times that fall strictly from 1 to 0", _solver_grid),
     "real_time": (
         "an object with trained_max_delay, execution_horizon (whole numbers of control steps), schedule (exponential, "
         "linear, ones or zeros) or max_guidance_weight (a number from 0)",

@@ -17,7 +17,7 @@ from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import JsonFlag, Output, command, new_console
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions, own_precision
 from turbopi.cli.predict import show_predictions
-from turbopi.config import CAMERAS, LIMITS, ModelConfig
+from turbopi.config import CAMERAS, LIMITS, ModelConfig, typed_grid
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
 from turbopi.reading import plain_document, shown
@@ -168,6 +168,13 @@ def bench(
     prompt_tokens: Annotated[str | None, typer.Option(metavar="N,N,…", help="Valid prompt tokens; else 48.")] = None,
     horizons: Annotated[str | None, typer.Option(metavar="N,N,…", help="Actions in a chunk; else 10.")] = None,
     steps: Annotated[str | None, typer.Option(metavar="N,N,…", help="Denoising steps; else 10.")] = None,
+    solver: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="As of `turbopi serve`; --steps counts its evaluations. Not with --join."),
+    ] = None,
+    time_grid: Annotated[
+        str | None, typer.Option("--time-grid", metavar="NAME|T,T,…", help="As of `turbopi serve`. Not with --join.")
+    ] = None,
     batch: Annotated[str | None, typer.Option(metavar="N,N,…", help="Observations of one call; else 1.")] = None,
     image_size: Annotated[
         str | None, typer.Option(metavar="WxH,WxH,…", help="Of the cameras' pictures; else 224x224, the model's.")
@@ -231,6 +238,7 @@ def bench(
     if predict is not None:
         given = {"--backends": backends != "auto", "--beside": beside, "--precisions": precisions, "--join": join}
         given |= {"--image-size": image_size, "--main-calls": main_calls, "--ready": ready, "--profile": profile}
+        given |= {"--solver": solver, "--time-grid": time_grid}
         given |= {"--quantization": quantization, "--robot": options.robot, "--report": report}
         numbers = {option: _axis(option, text, table) for option, text in axes.items()}
         ignored = [option for option, value in given.items() if value]
@@ -241,6 +249,7 @@ def bench(
     # before Triton is imported and looks for its cache: what the measured starts compile serves this process, too
     with empty_caches() if ready else nullcontext():
         from turbopi import backends as registry
+        from turbopi.arguments import Denoising
         from turbopi.bench.run import BenchPlan, run
 
         opened = options.open(checkpoint)
@@ -255,6 +264,9 @@ def bench(
         names = _backends(_names(backends), tiers, resolved)
         robot = options.make_robot()
         axes["--image-size"] = image_size
+        own = Denoising(1).changed(None, solver, typed_grid(time_grid), ConfigError)  # type: ignore[arg-type]
+        if axes["--steps"] is None and isinstance(own.time_grid, tuple):
+            axes["--steps"] = str(own.steps)  # a grid's own
         if robot is not None:
             axes = _robots_own(axes, table, opened, robot, tokenizer)
         plan = BenchPlan(
@@ -276,8 +288,12 @@ def bench(
             seconds=seconds,
             profile=profile,
             quantization=quantization,
+            solver=None if solver is None else own.solver,
+            time_grid=None if time_grid is None else own.time_grid,
         )
         plan.check(resolved)
+        if ready and (plan.solver, plan.time_grid) != (None, None):
+            raise ConfigError("--ready starts programs with openpi's steps: give it without --solver and --time-grid")
         if report is not None:
             check_folder(report)
             check_replaces(report / RESULTS, "floors", "a benchmark's results")

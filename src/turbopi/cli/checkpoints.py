@@ -16,6 +16,7 @@ from turbopi.cli.options import CheckpointArgument, RobotOptions
 from turbopi.cli.typed import as_typed
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
+from turbopi.wording import denoising
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
@@ -133,7 +134,7 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
             ("configuration", f"{info['name']}, from {info['config_source']}"),
             ("robot", info["robot"]),
             *((f"  its {key}", value) for key, value in info.get("observation", {}).items()),
-            ("action horizon", f"{info['action_horizon']}, {info['num_denoising_steps']} denoising steps"),
+            ("action horizon", f"{info['action_horizon']}, denoising in {denoising(info)}"),
             ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
             ("statistics", _statistics_source(info)),
             ("  of the state", _statistics(info["norm_stats"]["state"], normalization["state"])),

@@ -11,8 +11,9 @@ from turbopi.cli.files import let_import_from_here
 from turbopi.cli.framework import Output
 from turbopi.cli.process import interrupts_end_at_once
 from turbopi.cli.typed import as_typed
-from turbopi.config import PRESETS
+from turbopi.config import PRESETS, typed_grid
 from turbopi.errors import ConfigError
+from turbopi.wording import denoising
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
@@ -44,6 +45,28 @@ ScaleMethod = Annotated[
 
 def _option(*names: str, panel: str, metavar: str, help: str) -> Any:
     return typer.Option(*names, metavar=metavar, help=help, rich_help_panel=panel)
+
+
+SolverOption = Annotated[
+    str | None,
+    _option(
+        "--solver",
+        panel=_RUNNING,
+        metavar="NAME",
+        help="Of the flow from noise to actions: euler, midpoint, heun, ab2 or exponential. --steps counts its "
+        "evaluations. Unless given: what the checkpoint says, else euler.",
+    ),
+]
+TimeGridOption = Annotated[
+    str | None,
+    _option(
+        "--time-grid",
+        panel=_RUNNING,
+        metavar="NAME|T,T,…",
+        help="uniform, shifted_to_noise, shifted_to_actions, or times that fall strictly from 1 to 0. Unless given: "
+        "what the checkpoint says, else uniform.",
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -198,6 +221,8 @@ class PolicyOptions(RobotOptions):
             help="Denoising steps of an inference. Unless given: what the checkpoint says, else 10.",
         ),
     ] = None
+    solver: SolverOption = None
+    time_grid: TimeGridOption = None
     device: Annotated[
         str,
         _option("--device", panel=_RUNNING, metavar="DEVICE", help="cpu, cuda, cuda:N, or auto: the GPU if any."),
@@ -224,6 +249,8 @@ class PolicyOptions(RobotOptions):
             "precision": self.precision_of(self.backend),
             "quantization": self._quantization(),
             "num_denoising_steps": self.steps,
+            "solver": self.solver,
+            "time_grid": typed_grid(self.time_grid),
             "device": self.device,
             "tokenizer": self.tokenizer,
             "default_prompt": self.default_prompt,
@@ -257,7 +284,7 @@ class PolicyOptions(RobotOptions):
             about["backend_reason"] = "auto: the folder holds ONNX graphs"
         output.line(
             f"{about['config']} for {about['robot']}, {about['precision']} on {about['device']} "
-            f"({about['device_name']}), {about['num_denoising_steps']} steps; "
+            f"({about['device_name']}), {denoising(about)}; "
             f"weights: {about['weight_bytes'] / 1e6:,.0f} MB in {about['load_seconds']:.1f} s"
         )
         if self.precision is None and about["precision"] != "bf16":

@@ -10,6 +10,8 @@ OPTIONS = {
     "precision": "--precision",
     "quantization": "--quantization",
     "num_denoising_steps": "--steps",
+    "solver": "--solver",
+    "time_grid": "--time-grid",
     "device": "--device",
     "tokenizer": "--tokenizer",
     "default_prompt": "--default-prompt",

@@ -13,7 +13,7 @@ from turbopi.cli.options import MOST_NOISES, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
 from turbopi.files import write_whole
 from turbopi.reading import as_document, plain_document
-from turbopi.wording import cosine, significant
+from turbopi.wording import cosine, denoising, significant
 
 if TYPE_CHECKING:
     from turbopi.verify.document import CalibrationDetails, Certificate, Dimension, IntermediateDocument
@@ -119,7 +119,7 @@ def _show(document: "Certificate", output: Output) -> None:
     observed = document.observations
     subject = f"{document.backend} {document.precision}"
     output.line(
-        f"{document.model}, {subject} on {document.policy['device_name']}, {document.steps} steps; "
+        f"{document.model}, {subject} on {document.policy['device_name']}, {denoising(document.policy)}; "
         f"{observed.count} observations x {observed.noises} noises"
     )
     output.line(f"weights {document.weights.fingerprint or 'not hashed'}")

@@ -196,7 +196,8 @@ class StaticCall:
         plain = shape.loop.form == "plain"
         times = time_grid(shape.num_steps, config.time_grid) if plain else np.array(shape.loop.times, np.float32)
         self.time_embs = time_embedding(times, config.expert.width).to(device)  # Pi0's
-        self.asked = None if plain else Conditioned.allocate(config, shape.loop, device)
+        by_token = shape.loop.form in ("tokens", "jacobian")
+        self.asked = Conditioned.allocate(config, shape.loop, device) if by_token else None
         self.host = Inputs.allocate(config, shape, torch.device("cpu"), pinned=on_gpu)
         self._arrays = self.host.arrays()
         self.inputs = Inputs.allocate(config, shape, device, pinned=False)
@@ -273,6 +274,10 @@ class StaticCall:
         self.x_t[0] = self.inputs.noise
         for step in range(self.shape.num_steps):
             x_t = self.x_t[step]
+            if self.shape.loop.integration is not None:
+                self.v_t[step] = self._velocity(step, rope)
+                self.x_t[step + 1] = self.shape.loop.integration.next_x(step, self.x_t, self.v_t)
+                continue
             if self.asked is None:
                 v_t = self._velocity(step, rope)
                 self.x_t[step + 1] = euler_step(x_t, v_t, self.shape.num_steps)

@@ -21,10 +21,19 @@ from turbopi.model.conditioning import Conditioning, TokenTimes
 MOST_TIMES = 1024  # of a loop: 2.9 MB each, on the device
 
 
-def conditioned_loop(conditioning: Conditioning | None, num_steps: int, horizon: int, config: ModelConfig) -> Loop:
+def conditioned_loop(
+    conditioning: Conditioning | None,
+    num_steps: int,
+    horizon: int,
+    config: ModelConfig,
+    *,
+    times_by_token: bool = False,
+) -> Loop:
     """The loop that a call needs. Raises ObservationError for a conditioning that doesn't fit it.
 
     One with the config's own grid of times serves all calls that have no others, and 0, whatever they hold.
+
+    times_by_token  whether one launch of the denoiser takes times by token: then Euler's steps on any grid are one, too
     """
     if conditioning is None:
         return Loop(num_steps, horizon)
@@ -32,10 +41,15 @@ def conditioned_loop(conditioning: Conditioning | None, num_steps: int, horizon:
     form = conditioning.form
     if form == "plain":
         return Loop(num_steps, horizon)
-    own = _own_times(num_steps, config.time_grid)
-    if conditioning.tokens is None:
+    integration = conditioning.integration
+    if form == "solver" and integration is not None:
+        if not (integration.is_euler and times_by_token):
+            return Loop(num_steps, horizon, form, integration.evaluated, integration)
+        form = "tokens"
+    own, tokens = _own_times(num_steps, config.time_grid), conditioning.own_tokens(horizon)
+    if tokens is None:
         return Loop(num_steps, horizon, form, own)
-    wanted = {*conditioning.tokens.distinct().tolist(), 0.0}
+    wanted = {*tokens.distinct().tolist(), 0.0}
     times = own if wanted <= {*own} else tuple(sorted(wanted, reverse=True))
     if len(times) > MOST_TIMES:
         raise ObservationError(
@@ -87,9 +101,10 @@ class Conditioned:
     def write(self, conditioning: Conditioning) -> None:
         """Into the host's buffer."""
         arrays, loop, table = self.arrays, self.loop, np.array(self.loop.times, np.float32)
-        asked = conditioning.tokens or _plain(loop.steps, loop.horizon, self.config.time_grid)
+        own = conditioning.own_tokens(loop.horizon)
+        asked = own or _plain(loop.steps, loop.horizon, self.config.time_grid)
         arrays["steps"][:], arrays["times"][:] = asked.steps, asked.times
-        if conditioning.tokens is None:
+        if own is None:
             arrays["rows"][:] = np.searchsorted(-table, -asked.times[:, :1])  # all actions have a step's time
         else:
             arrays["rows"][:] = asked.rows(table)

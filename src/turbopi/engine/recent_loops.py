@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from turbopi.model.conditioning import Form
+from turbopi.model.solvers import Integration
 
 logger = logging.getLogger(__name__)
 
@@ -15,11 +16,18 @@ class Loop(NamedTuple):
     steps: int
     horizon: int
     form: Form = "plain"
-    times: tuple[float, ...] = ()  # of a conditioned loop: all that an action's t may be, so many rows has its table
+    # Of a conditioned loop: all that an action's t may be, so many rows has its table. Of a solver's loop: that of each
+    # evaluation. Of a plain one: where steps begin, if not where openpi's do (solving.py)
+    times: tuple[float, ...] = ()
+    integration: Integration | None = None  # of a solver's loop
 
     def __str__(self) -> str:
         said = f"H={self.horizon}, {self.steps} steps"
-        return said if self.form == "plain" else f"{said}, {FORMS[self.form]}, {len(self.times)} times"
+        if self.integration is not None:
+            return f"{said}, {self.integration}"
+        if self.form == "plain":
+            return f"{said}, t = {', '.join(f'{t:.3g}' for t in self.times)}" if self.times else said
+        return f"{said}, {FORMS[self.form]}, {len(self.times)} times"
 
     @property
     def rows(self) -> int:

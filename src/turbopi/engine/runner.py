@@ -3,9 +3,10 @@
 A call is two graphs. The first, vision, is for a number of valid cameras; it can start before the prompt is known. The
 second, prefix and all denoising steps, is for a bucket, which rounds the prompt's length up to a multiple of 16, too;
 inside it nothing is captured anew when pictures, prompt, state or noise change. That of a conditioned call is for its
-form and the times that its actions may have, whatever is held or pulls. A bucket that warm-up didn't capture is
-captured when first needed, with a log line, or refused if the runner is `strict`. Graphs of the denoising loops used
-last are kept, see recent_loops.py. Observations run one after the other here; batch_runner.py has them run together.
+form and the times that its actions may have, whatever is held or pulls; that of a solver for its grid. A bucket that
+warm-up didn't capture is captured when first needed, with a log line, or refused if the runner is `strict`. Graphs of
+the denoising loops used last are kept, see recent_loops.py. Observations run one after the other here; batch_runner.py
+has them run together.
 """
 
 import logging
@@ -25,6 +26,7 @@ from turbopi.engine.conditioned import conditioned_loop
 from turbopi.engine.graph import Graph, Mark, building
 from turbopi.engine.not_warm import not_warm
 from turbopi.engine.recent_loops import Loop, RecentLoops
+from turbopi.engine.solving import evaluation_loops, solving
 from turbopi.engine.weights import Weights, modulation, modulation_at
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import Denoiser, Ops
@@ -85,7 +87,7 @@ class GraphRunner:
     """
 
     name: ClassVar[str]
-    forms: ClassVar[tuple[Form, ...]] = ("tokens", "jacobian")
+    forms: ClassVar[tuple[Form, ...]] = ("solver", "tokens", "jacobian")
     strict = False
 
     def __init__(
@@ -95,7 +97,7 @@ class GraphRunner:
         self._weights, self._ops = weights, ops
         rows = MAX_CAMERAS * config.vision.num_tokens + bucket(config.max_prompt_tokens) + config.action_horizon + 64
         self._cache = Cache.allocate(config, rows, device, weights.embed_tokens.dtype, joint)
-        self._recent = RecentLoops(self._forget)
+        self._recent = RecentLoops(self._forget_all)
         self._tables: dict[tuple[int, tuple[float, ...]], Tensor | None] = {}  # by `Loop.table`
         self._calls: dict[CallShape, StaticCall] = {}
         self._pictures: dict[tuple[int, bool], Pictures] = {}  # by cameras, and whether they are float
@@ -123,7 +125,7 @@ class GraphRunner:
         self._warming = True
         try:
             self._check_cameras(cameras)
-            loop = conditioned_loop(conditioning, num_steps, actions, self.config)
+            loop = self._loop(conditioning, num_steps, actions)
             for slots in range(BUCKET, bucket(self.config.max_prompt_tokens) + 1, BUCKET):
                 self._graph(CallShape(cameras, slots, loop, floats), "answer")
             if self._ops.resize_pictures is not None:
@@ -153,7 +155,7 @@ class GraphRunner:
         length, per_image = cache.k.shape[3], self.config.vision.num_tokens
         cameras = min(length // per_image, MAX_CAMERAS)
         asked = of_rows(conditioning, 1)[0]
-        loop = conditioned_loop(asked, num_steps, noise.shape[1], self.config)
+        loop = self._loop(asked, num_steps, noise.shape[1])
         shape = CallShape(cameras, bucket(length - cameras * per_image), loop)
         graph, call = self._graph(shape, "denoise"), self._calls[shape]
         call.cache_k[:, :length], call.cache_v[:, :length] = cache.k[:, 0, 0], cache.v[:, 0, 0]
@@ -199,8 +201,9 @@ class GraphRunner:
 
     def describe(self) -> dict[str, Any]:
         captured = sorted(
-            {(s.cameras, s.prompt_slots, s.loop) for s in list(self._calls)}
-        )  # a call of another thread may add some
+            {(s.cameras, s.prompt_slots, s.loop) for s in list(self._calls)},  # a call of another thread may add some
+            key=lambda one: (*one[:2], *one[2][:2], str(one[2])),
+        )
         return {
             "captured": [f"{cameras} cameras + {tokens} tokens, {loop}" for cameras, tokens, loop in captured],
             "graphs": {"kept": len(self._graphs), **self._recent.describe()},
@@ -219,9 +222,24 @@ class GraphRunner:
                 f"{cameras} and {tokens}"
             )
 
+    @property
+    def _times_by_token(self) -> bool:
+        """Whether one launch of what `_make_denoiser` makes takes times by token."""
+        return False
+
+    def _loop(self, conditioning: Conditioning | None, num_steps: int, horizon: int) -> Loop:
+        by_token = self._times_by_token
+        return conditioned_loop(conditioning, num_steps, horizon, self.config, times_by_token=by_token)
+
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """All denoising steps at once; None: the engine's operations one by one."""
         return None
+
+    def _denoiser_of(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
+        """`_make_denoiser`'s, or of a solver's loop one that launches it for each evaluation."""
+        if shape.loop.integration is None:
+            return self._make_denoiser(shape, table)
+        return solving(self._make_denoiser, shape, table, self.config, self.device, by_token=self._times_by_token)
 
     def _run(
         self, part: str, row: HostRow, noise: np.ndarray, num_steps: int, conditioning: Conditioning | None = None
@@ -244,7 +262,7 @@ class GraphRunner:
             raise BackendError(f"{self.name} has finished this observation, or begun another one since")
         cameras = begun.cameras
         self._check_tokens(cameras, len(tokens))
-        loop = conditioned_loop(conditioning, num_steps, len(noise), self.config)
+        loop = self._loop(conditioning, num_steps, len(noise))
         shape = CallShape(cameras, bucket(len(tokens)), loop, begun.float_images)
         with self._explaining():
             graph, call = self._graph(shape, part), self._calls[shape]
@@ -292,7 +310,7 @@ class GraphRunner:
             return self._capture(of.run, None)
         call = self._call(of)
         if part != "prefix" and call.denoiser is None:
-            call.denoiser = self._make_denoiser(of, call.table)
+            call.denoiser = self._denoiser_of(of, call.table)
         run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
         return self._capture(run, None if part == "denoise" else self._graph(call.pictures, "vision"))
 
@@ -317,6 +335,14 @@ class GraphRunner:
                 horizons=shape.horizon,
                 steps=shape.num_steps,
             )
+
+    def _forget_all(self, loop: Loop) -> None:
+        """Let go of a loop, and of its evaluations' that no other loop has."""
+        self._forget(loop)
+        kept = {one for other in self._recent for one in evaluation_loops(other)}
+        for one in evaluation_loops(loop):
+            if one not in kept:
+                self._forget(one)
 
     def _forget(self, loop: Loop) -> None:
         """Let go of all that is a denoising loop's alone. Vision's graphs are every loop's."""

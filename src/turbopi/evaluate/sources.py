@@ -13,6 +13,7 @@ from turbopi.execution.messages import PREFIX, message
 from turbopi.quantization.formats import told_by
 from turbopi.reading import is_finite, shown
 from turbopi.wire import MAX_BYTES, WireError, pack, unpack
+from turbopi.wording import denoising
 
 CONNECT_S = 10.0
 ANSWER_S = 600.0  # a server's first call may compile
@@ -92,7 +93,9 @@ class LocalPolicy:
         self.real_time = offered(about)
         self.identity: dict[str, object] = {"weights": weights, "calibration": calibration_of(about)}
         self.identity |= {name: about.get(name) for name in names}
-        default = f"{about.get('backend')} {about.get('precision')} {about.get('num_denoising_steps')} steps"
+        openpis = {"solver": "euler", "time_grid": "uniform"}  # not told, as runs of before that were an option don't
+        self.identity |= {name: about[name] for name, usual in openpis.items() if about.get(name, usual) != usual}
+        default = f"{about.get('backend')} {about.get('precision')} {denoising(about)}"
         self.label = label or default
 
     def infer(

@@ -1,4 +1,4 @@
-"""What a denoising loop may be asked for beyond "noise to actions": times by token, held actions, guidance.
+"""What a denoising loop may be asked for beyond "noise to actions": times by token, a solver, held actions, guidance.
 
 Real-time execution needs nothing else of the model (docs/real_time.md). N steps, H actions, A action_dim; t = 1 is
 noise and t = 0 the action. One call of the loop, for every action i and step s:
@@ -8,6 +8,7 @@ noise and t = 0 the action. One call of the loop, for every action i and step s:
     x ← x + steps[s, i] · v
 
 A held action has its given value in x from the start, time 0 and a step of 0: so it stays, and the others attend to it.
+With a solver other than Euler's the last line is another one, and the same for all actions: model/solvers.py.
 """
 
 import math
@@ -20,10 +21,12 @@ import numpy as np
 from turbopi.config import Schedule as Schedule
 from turbopi.errors import ObservationError
 from turbopi.model.denoise import time_grid
+from turbopi.model.solvers import Integration
 
 GuidanceMode = Literal["jacobian", "identity"]
-# What a backend must be able to do: times, steps and values by token, identity guidance among them; the true Jacobian.
-Form = Literal["plain", "tokens", "jacobian"]
+# What a backend must be able to do: a solver or a time grid of its own; times, steps and values by token, identity
+# guidance among them; the true Jacobian.
+Form = Literal["plain", "solver", "tokens", "jacobian"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,12 @@ class TokenTimes:
         """openpi's: one time for all actions. `kind` as in `time_grid`."""
         times = np.repeat(time_grid(num_steps, kind)[:, None], horizon, axis=1)
         return cls(times, np.full(times.shape, np.float32(-1.0 / num_steps)))
+
+    @classmethod
+    def integrated(cls, integration: Integration, horizon: int) -> "TokenTimes":
+        """A solver's times, the same ones for all actions; the steps are right for Euler's alone."""
+        times, steps = np.array([[t, row.v] for t, row in integration.by_evaluation], np.float32).T
+        return cls(*(np.repeat(column[:, None], horizon, axis=1) for column in (times, steps)))
 
     @classmethod
     def of(cls, t: np.ndarray) -> "TokenTimes":
@@ -94,13 +103,17 @@ class Conditioning:
     """All of it, for one observation. What is None is as openpi has it, to the last bit.
 
     The `noise` that comes with it is x at `tokens.times[0]`, noise or not: a warm start passes the chunk it starts
-    from, mixed with noise. Held actions' values replace its rows.
+    from, mixed with noise. Held actions' values replace its rows. With an `integration` it is x at its first time.
+
+    Held actions and guidance go with Euler's steps, on any grid. Other solvers take neither: what they go on with is
+    made of several velocities, and an action that is held or pulled has none of them.
     """
 
     tokens: TokenTimes | None = None
     held: np.ndarray | None = None  # bool[H]; needs values
     values: np.ndarray | None = None  # float32[H, A]; rows that aren't held are ignored
     guidance: Guidance | None = None
+    integration: Integration | None = None  # in place of `tokens`: a solver, and one grid of times for all actions
 
     @property
     def form(self) -> Form:
@@ -108,7 +121,9 @@ class Conditioning:
         if self.guidance is not None and self.guidance.mode == "jacobian":
             return "jacobian"
         holds = self.held is not None and bool(np.any(self.held))
-        return "tokens" if holds or self.tokens is not None or self.guidance is not None else "plain"
+        if holds or self.tokens is not None or self.guidance is not None:
+            return "tokens"
+        return "plain" if self.integration is None else "solver"
 
     def size(self, num_steps: int, horizon: int) -> tuple[int, int]:
         """Steps and actions of the loop that it is for; what it doesn't fix is as given."""
@@ -116,11 +131,16 @@ class Conditioning:
         grid = grid if self.tokens is None else self.tokens.times
         if grid is not None:
             return int(grid.shape[0]), int(grid.shape[1])
-        return num_steps, horizon if self.held is None else len(self.held)
+        steps = num_steps if self.integration is None else self.integration.evaluations
+        return steps, horizon if self.held is None else len(self.held)
+
+    def own_tokens(self, horizon: int) -> TokenTimes | None:
+        """Times and steps that it brings; None: openpi's."""
+        return self.tokens if self.integration is None else TokenTimes.integrated(self.integration, horizon)
 
     def token_times(self, num_steps: int, horizon: int, kind: str = "accumulated") -> TokenTimes:
         """The loop's times and steps, held actions among them. `kind` as in `time_grid`, if it has none of its own."""
-        tokens = self.tokens or TokenTimes.plain(num_steps, horizon, kind)
+        tokens = self.own_tokens(horizon) or TokenTimes.plain(num_steps, horizon, kind)
         return tokens if self.held is None else tokens.holding(self.held)
 
     def started(self, noise: np.ndarray) -> np.ndarray:
@@ -132,6 +152,8 @@ class Conditioning:
     def check(self, num_steps: int, horizon: int, action_dim: int) -> None:
         """Raises ObservationError if any of it doesn't fit a loop of so many steps and actions."""
         grid, chunk = (num_steps, horizon), (horizon, action_dim)
+        if self.integration is not None:
+            self._check_integration(self.integration, num_steps)
         if self.tokens is not None:
             _check("token times", self.tokens.times, grid)
             _check("token steps", self.tokens.steps, grid)
@@ -151,6 +173,24 @@ class Conditioning:
             _check("the guidance's target", self.guidance.target, chunk)
             _check("the guidance's weights", self.guidance.weights, (horizon,))
             _check("the guidance's strength", self.guidance.strength, grid)
+
+    def _check_integration(self, integration: Integration, num_steps: int) -> None:
+        if self.tokens is not None:
+            raise ObservationError(
+                f"token times and a time grid ({integration}) were both given: both say when actions are where; leave "
+                "out one of them"
+            )
+        if integration.evaluations != num_steps:
+            raise ObservationError(
+                f"a loop of {num_steps} steps was asked for, but {integration} takes {integration.evaluations} "
+                "evaluations: say so, or take another time grid"
+            )
+        what = "guidance" if self.guidance is not None else "held actions" if self.form == "tokens" else None
+        if what is not None and not integration.is_euler:
+            raise ObservationError(
+                f"{what} and solver {integration.solver!r} were both asked for: {what} take Euler's steps, so take "
+                f"solver 'euler', whose time grid may be any, or leave out {what}"
+            )
 
 
 Conditionings = Conditioning | Sequence[Conditioning | None] | None  # for all rows of a batch, or one each

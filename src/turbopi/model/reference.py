@@ -134,6 +134,7 @@ class Pi0Model(nn.Module):
     ) -> Tensor:
         """Integrate from noise float32[B, H, action_dim] to actions of the same shape in `num_steps` Euler steps.
 
+        num_steps     of a conditioning with another solver: evaluations of the action expert
         conditioning  of all rows, or a list with one, or None, for each: then rows are computed one by one. None, and
                       whatever asks for nothing beside openpi's loop, gives its results to the last bit
 
@@ -156,6 +157,7 @@ class Pi0Model(nn.Module):
         def on_device(array: np.ndarray) -> Tensor:
             return torch.from_numpy(array).to(noise.device)
 
+        solver = None if asked.integration is None or asked.integration.is_euler else asked.integration
         x_t, steps = noise, []
         if asked.held is not None and asked.values is not None:
             x_t = torch.where(on_device(asked.held)[:, None], on_device(asked.values), noise)
@@ -181,9 +183,12 @@ class Pi0Model(nn.Module):
                     guidance.mode == "jacobian",
                 )
                 suffix_out, v_t = guided_velocity(velocity, x_t, pull)
-            if trace is not None:
+            if trace is not None or solver is not None:
                 steps.append((x_t, suffix_out, v_t))
-            x_t = x_t + dt[i] * v_t
+            if solver is None:
+                x_t = x_t + dt[i] * v_t
+            else:
+                x_t = solver.next_x(i, [x for x, _, _ in steps], [v for _, _, v in steps])
 
         if trace is not None:
             batch = noise.shape[0]

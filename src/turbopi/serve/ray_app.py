@@ -26,6 +26,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.frames import CloseCode
 
+from turbopi.config import typed_grid
 from turbopi.errors import ConfigError
 from turbopi.running_chunk import JoinMode
 from turbopi.serve.calls import Policy
@@ -56,6 +57,8 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     precision: str = "bf16"
     quantization: str | None = None
     steps: int | None = None
+    solver: str | None = None
+    time_grid: str | None = None
     device: str = "auto"
     tokenizer: str | None = None
     default_prompt: str | None = None
@@ -94,6 +97,8 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
             precision=self.precision,  # type: ignore[arg-type]  # checked there
             quantization=self.quantization,
             num_denoising_steps=self.steps,
+            solver=self.solver,  # type: ignore[arg-type]  # checked there
+            time_grid=typed_grid(self.time_grid),
             device=self.device,
             tokenizer=self.tokenizer,
             default_prompt=self.default_prompt,

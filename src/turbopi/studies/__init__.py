@@ -4,7 +4,7 @@ Each study gives a `Report` (report.py): question, method, controls, tables, plo
 questions, by the name that `turbopi study` takes, are in STUDIES; the reports that stand are in docs/research.md.
 
 study.py                what a study is and is given
-solvers.py, spread.py   integrators and time grids; how broad a policy's actions are
+solvers.py, spread.py   cells of solvers and time grids; how broad a policy's actions are
 rollouts.py, post.py    closed loop on toy tasks; the task with two ways
 problems.py             batches with exact solutions
 formats.py, weights.py  emulated number formats; kinds of weights
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 STUDIES: dict[str, str] = {  # name -> what it asks, in a few words; modules are imported when they are asked for
     "steps": "how few denoising steps are enough, and with which solver",
+    "distillation": "one denoising step by distillation",
     "kv_reuse": "keys and values of old pictures, reused while new ones look alike",
     "fp8_and_fp4": "numbers of eight and four bits",
     "pipelining": "the next observation encoded beside this one's denoising",

@@ -11,25 +11,15 @@ from torch import Tensor
 from turbopi import shipped
 from turbopi.calibrate.observations import Batch
 from turbopi.checkpoint import Checkpoint
+from turbopi.config import Solver
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import Pi0Model
+from turbopi.model.solvers import GRIDS, intervals
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
-from turbopi.studies.solvers import (
-    SHIFTS,
-    Learned,
-    Way,
-    grid_times,
-    integrate,
-    intervals,
-    learn_times,
-    shifted,
-    uniform,
-    velocity_of,
-    ways,
-)
+from turbopi.studies.solvers import Learned, Way, begins, grid_times, learn_times, solve, ways
 from turbopi.studies.study import Setup
 
 EXACT = 100  # intervals of the midpoint method: the solution that errors are measured against
@@ -64,26 +54,26 @@ class Problem:
         cls, model: Pi0Model, observation: Observation, noise: Tensor, dims: int, exact_intervals: int = EXACT
     ) -> "Problem":
         cache, count = model.prefix(observation), exact_intervals
-        exact = integrate(velocity_of(model, cache), noise, "midpoint", uniform(count), 2 * count)
+        exact = solve(model, cache, noise, "midpoint", begins("uniform", count), 2 * count)
         return cls(model, cache, noise, dims, exact, count)
 
     @property
     def halved(self) -> float:
         """The error of half as many steps of the exact solution's solver."""
         count = self.exact_intervals // 2
-        return self.error("midpoint", uniform(count), 2 * count)
+        return self.error("midpoint", begins("uniform", count), 2 * count)
 
-    def solve(self, solver: str, times: Sequence[float], evaluations: int) -> Tensor:
-        return integrate(velocity_of(self.model, self.cache), self.noise, solver, times, evaluations)
+    def solve(self, solver: Solver, times: Sequence[float], evaluations: int) -> Tensor:
+        return solve(self.model, self.cache, self.noise, solver, times, evaluations)
 
-    def error(self, solver: str, times: Sequence[float], evaluations: int) -> float:
+    def error(self, solver: Solver, times: Sequence[float], evaluations: int) -> float:
         exact, found = (x[..., : self.dims].double() for x in (self.exact, self.solve(solver, times, evaluations)))
         return float((found - exact).norm() / exact.norm())
 
 
 def learned_grids(problem: Problem, small: bool) -> dict[tuple[str, int], list[float]]:
     """For each solver and number of evaluations the best grid found, from the best one of those that aren't learned."""
-    grids = {}
+    grids: dict[tuple[str, int], list[float]] = {}
     for way in ways(small):
         if way.grid != "learned":
             continue
@@ -92,7 +82,7 @@ def learned_grids(problem: Problem, small: bool) -> dict[tuple[str, int], list[f
             return problem.error(way.solver, times, way.evaluations)
 
         count = intervals(way.solver, way.evaluations)
-        starts = [uniform(count), *(shifted(count, shift) for shift in SHIFTS.values())]
+        starts = [begins(name, count) for name in GRIDS]
         grids[way.solver, way.evaluations] = learn_times(error, min(starts, key=error), rounds=1 if small else 2)
     return grids
 

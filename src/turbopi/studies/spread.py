@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import Struct
 
-from turbopi.studies import solvers
 from turbopi.studies.rollouts import REPLAN, ToyPolicy, seeds_of
 
 UNIFORM = 5 / 9  # Sarle's coefficient of a uniform distribution; a normal one has 1/3, two equal points have 1
@@ -28,17 +27,16 @@ class Spread(Struct, frozen=True):
     sideways: list[list[float]]
 
 
-def spread(policy: ToyPolicy, episodes: Sequence[int], samples: int) -> Spread:
+def spread(policy: ToyPolicy, episodes: Sequence[int], samples: int, steps: int = STEPS) -> Spread:
     world = policy.toy.start(seeds_of(episodes))
     seen = policy.observe(world)
     cache = policy.model.prefix(seen)
-    velocity = solvers.velocity_of(policy.model, cache)
     line = world.target - world.tip
     left = np.stack((-line[:, 1], line[:, 0]), axis=1) / np.linalg.norm(line, axis=1, keepdims=True)
     found = []
     for sample in range(samples):
         noise = policy.noise(episodes, 1_000_000 + sample)
-        chunks = solvers.integrate(velocity, noise, "euler", solvers.uniform(STEPS), STEPS)
+        chunks = policy.model.denoise(cache, noise, steps)
         moved = chunks[:, :REPLAN, :2].double().numpy().sum(1)
         found.append((moved * left).sum(1))
     sideways = np.stack(found, axis=1)  # [N, M]

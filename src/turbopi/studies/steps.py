@@ -60,11 +60,11 @@ def actor(policy: ToyPolicy, way: Way, learned: Learned, warm: float = WARM) -> 
     times = grid_times(way, learned)
 
     def answer(call: Call) -> Tensor:
-        velocity = solvers.velocity_of(policy.model, policy.model.prefix(call.observation))
+        model, cache = policy.model, policy.model.prefix(call.observation)
         if not way.warm or call.previous is None:
-            return solvers.integrate(velocity, call.noise, way.solver, times, way.evaluations)
+            return solvers.solve(model, cache, call.noise, way.solver, times, way.evaluations)
         begun = warm * call.noise + (1 - warm) * call.previous
-        return solvers.integrate(velocity, begun, way.solver, [warm * t for t in times], way.evaluations)
+        return solvers.solve(model, cache, begun, way.solver, [warm * t for t in times], way.evaluations)
 
     return answer
 
@@ -100,10 +100,10 @@ def warm_from_noise_is_plain(policy: ToyPolicy) -> bool:
 
 
 def loop_is_the_models(policy: ToyPolicy) -> float:
-    """How far this file's Euler steps are from `Pi0Model.denoise`'s: largest difference of an action."""
+    """How far Euler's steps on the uniform grid are from openpi's loop: largest difference of an action."""
     world = policy.toy.start(seeds_of(range(4)))
     cache, noise = policy.model.prefix(policy.observe(world)), policy.noise(range(4), 0)
-    ours = solvers.integrate(solvers.velocity_of(policy.model, cache), noise, "euler", solvers.uniform(10), 10)
+    ours = solvers.solve(policy.model, cache, noise, "euler", solvers.begins("uniform", 10), 10)
     return float((ours - policy.model.denoise(cache, noise, 10)).abs().max())
 
 

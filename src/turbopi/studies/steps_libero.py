@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from msgspec import Struct
-from torch import Tensor
 
 from turbopi import shipped
-from turbopi.backends.pytorch import reference_model
 from turbopi.checkpoint import open_checkpoint
 from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan, choose_tasks, make_jobs
@@ -22,15 +20,11 @@ from turbopi.evaluate.results import Results
 from turbopi.evaluate.run import default_workers, evaluate, prepare
 from turbopi.evaluate.sources import LocalPolicy
 from turbopi.evaluate.statistics import Paired, PairedDocument, Rate, RateDocument
-from turbopi.model.reference import Pi0Model
-from turbopi.model.sample import Sample
-from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
 from turbopi.reading import plain_document
 from turbopi.sim import SimSettings, create
-from turbopi.studies import solvers
 from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
-from turbopi.studies.solvers import BASELINE, Way
+from turbopi.studies.solvers import BASELINE, Way, grid_times
 from turbopi.studies.study import Setup, Study
 
 WAYS = (
@@ -46,24 +40,6 @@ class SimulatorCell(Struct, frozen=True):
     evaluations: int
     rate: RateDocument
     against_baseline: PairedDocument
-
-
-class SolvedBackend:
-    """A `pytorch` backend in float32 whose samples are integrated in another way; else as it is."""
-
-    def __init__(self, inner: Any, way: Way) -> None:
-        self._inner, self._way = inner, way
-        self._model: Pi0Model = reference_model(inner)
-
-    def sample(self, observation: Observation, noise: Tensor, num_steps: int) -> Sample:
-        """`num_steps` isn't looked at: the way has its own number of evaluations."""
-        way, device = self._way, self._model.device
-        velocity = solvers.velocity_of(self._model, self._model.prefix(observation.to(device)))
-        times = solvers.grid_times(way, {})
-        return Sample(solvers.integrate(velocity, noise.to(device), way.solver, times, way.evaluations).cpu())
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._inner, name)
 
 
 def run(setup: Setup) -> Report:
@@ -136,12 +112,11 @@ def _solved(
 ) -> dict[tuple[int, int], bool]:
     """By task and initial state; crashes of the simulator are tried once more, then refused."""
     checkpoint = setup.checkpoint or open_checkpoint(shipped.SMALL_POLICY)
-    policy = UnifiedPolicy(
-        checkpoint, backend="pytorch", precision="f32", device=setup.device, num_denoising_steps=BASELINE.evaluations
-    )
+    options: dict[str, Any] = {"num_denoising_steps": way.evaluations}
+    if not plain:  # the baseline's, too, by its times: so the control compares two ways to ask for the same
+        options |= {"solver": way.solver, "time_grid": (*grid_times(way, {}), 0.0)}
+    policy = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device=setup.device, **options)
     name = "plain" if plain else str(way).replace(", ", "_")
-    if not plain:
-        policy.backend = SolvedBackend(policy.backend, way)  # type: ignore[assignment]
     source = LocalPolicy(policy, label=name)
     source.identity["way"] = name
     simulator = create(setup.simulator)

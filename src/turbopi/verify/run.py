@@ -197,7 +197,7 @@ class _Reference:
 def _run(policy: UnifiedPolicy, call: NoisyExample, steps: int) -> Tensors:
     """One call's intermediates on the host, with the actions that `sample` gives."""
     observation = call.observation
-    trace = policy.backend.intermediates(observation, call.noise, steps)
+    trace = policy.backend.intermediates(observation, call.noise, steps, **policy.loop_arguments)
     missing = [name for name in _DEMANDED if name not in trace]
     if missing:
         raise BackendError(f"backend {policy.backend.name!r} doesn't expose {', '.join(missing)}; it can't be verified")
@@ -210,7 +210,7 @@ def _sample(policy: UnifiedPolicy, call: NoisyExample, steps: int) -> tuple[np.n
     """Actions float32[1, H, action_dim], a copy, and the milliseconds they took from host to host."""
     observation = call.observation
     start = time.perf_counter()
-    actions = policy.backend.sample(observation, call.noise, steps).actions
+    actions = policy.backend.sample(observation, call.noise, steps, **policy.loop_arguments).actions
     milliseconds = (time.perf_counter() - start) * 1e3
     return actions.float().cpu().numpy().copy(), milliseconds
 

@@ -1,0 +1,104 @@
+"""A solver's denoising loop by the kernels that do a whole Euler loop: one launch for each evaluation.
+
+A launch of one step begins at x_k, and what counts of it is the velocity that it leaves; `Integration.next_x`, a few
+small operations between the launches, makes x_{k+1} of these. All of it is captured in one graph. Where a kernel takes
+times by token, one kernel does all evaluations, and each takes its row of the table; else each time has a kernel of its
+own, which shares the matrices with the others.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from turbopi.config import ModelConfig
+from turbopi.engine.call import CallShape
+from turbopi.engine.recent_loops import Loop
+from turbopi.kernels.interface import Denoiser, TokenInputs
+from turbopi.model.solvers import Integration
+
+MakeDenoiser = Callable[[CallShape, Tensor | None], Denoiser | None]
+
+
+@dataclass(frozen=True)
+class Solving:
+    """A `Denoiser` of a solver's loop; `launches` has one-step kernels, with what they are told of tokens."""
+
+    integration: Integration
+    launches: Sequence[tuple[Denoiser, tuple[TokenInputs, ...]]]
+    unused: Tensor  # float32[2, H, A]: a launch's own x
+
+    def launch(
+        self,
+        noise: Tensor,
+        cache_k: Tensor,
+        cache_v: Tensor,
+        length: Tensor,
+        x_t: Tensor,
+        v_t: Tensor,
+        tokens: TokenInputs | None = None,
+    ) -> None:
+        assert tokens is None, "a solver's loop has one time for all actions"
+        x_t[0] = noise
+        for k, (kernel, told) in enumerate(self.launches):
+            kernel.launch(x_t[k], cache_k, cache_v, length, self.unused, v_t[k : k + 1], *told)
+            x_t[k + 1] = self.integration.next_x(k, x_t, v_t)
+
+
+def evaluation_loops(loop: Loop) -> set[Loop]:
+    """The loops of one step that kernels of a solver's loop may be made for, as `solving` names them."""
+    if loop.integration is None:
+        return set()
+    return {_by_token(loop), *(_at(loop, t) for t in loop.times)}
+
+
+def _by_token(loop: Loop) -> Loop:
+    return Loop(1, loop.horizon, "tokens", loop.times)
+
+
+def _at(loop: Loop, t: float) -> Loop:
+    return Loop(1, loop.horizon, times=(t,))
+
+
+def solving(
+    make: MakeDenoiser,
+    shape: CallShape,
+    table: Tensor | None,
+    config: ModelConfig,
+    device: torch.device,
+    *,
+    by_token: bool,
+) -> Denoiser | None:
+    """The denoiser of a solver's loop; None where `make` makes none: then operations do it.
+
+    table  float32[N, …]: the modulation at each evaluation's time, as the loop has them; None: there is none
+    """
+    loop = shape.loop
+    launches: list[tuple[Denoiser, tuple[TokenInputs, ...]]] = []
+    assert loop.integration is not None
+    if by_token:
+        kernel = make(replace(shape, loop=_by_token(loop)), table)
+        if kernel is None:
+            return None
+        launches = [(kernel, (_told(loop, k, config, device),)) for k in range(loop.steps)]
+    else:
+        for k, t in enumerate(loop.times):
+            kernel = make(replace(shape, loop=_at(loop, t)), None if table is None else table[k : k + 1])
+            if kernel is None:
+                return None
+            launches.append((kernel, ()))
+    return Solving(loop.integration, launches, torch.empty(2, loop.horizon, config.action_dim, device=device))
+
+
+def _told(loop: Loop, k: int, config: ModelConfig, device: torch.device) -> TokenInputs:
+    """All actions at the time of evaluation k, which is row k of the table; nothing is moved, held or pulled."""
+    grid = (1, loop.horizon)
+    nothing = torch.zeros(grid, device=device)
+    return TokenInputs(
+        rows=torch.full(grid, k, dtype=torch.int32, device=device),
+        steps=nothing,
+        times=torch.full(grid, loop.times[k], device=device),
+        target=torch.zeros(loop.horizon, config.action_dim, device=device),
+        gain=nothing,
+    )

@@ -1,0 +1,71 @@
+"""Solvers of the denoising loop on a real GPU, against the reference. Run by scripts/gpu_check."""
+
+from typing import Any
+
+import pytest
+import torch
+from conftest import golden_model
+from test_engine import made_up
+from test_gpu import GRAPHS, PORTABLE, backend, rms
+
+from turbopi.config import Kind
+from turbopi.model.conditioning import Conditioning
+from turbopi.model.reference import FloatPrecision
+from turbopi.model.solvers import SOLVERS, Integration
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU"),
+    pytest.mark.filterwarnings("default"),  # Inductor warns of what it does
+]
+UNEVEN = (1.0, 0.7, 0.2, 0.0)
+MODES = [("cuda_graph", "f32"), ("cuda_graph", "bf16"), ("fused", "bf16"), (PORTABLE, "bf16")]
+
+
+@pytest.mark.parametrize(("name", "precision"), MODES)
+@pytest.mark.parametrize("kind", ["pi05", "pi0"])
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_solvers_loop_is_the_references(name: str, precision: FloatPrecision, kind: Kind, solver: Any) -> None:
+    """With the bound of Euler's steps: twice what bfloat16 does to the reference. Plain calls keep their bits."""
+    runner: Any = backend(name, kind, precision)
+    observation, noise = made_up(kind, 2, 19)
+    plain = runner.sample(observation, noise, 3).actions
+    for times in (UNEVEN, tuple(0.6 * t for t in UNEVEN)):
+        integration = Integration(solver, times)
+        asked, steps = Conditioning(integration=integration), integration.evaluations
+        exact = golden_model(kind).sample(observation, noise, steps, conditioning=asked)
+        found = runner.sample(observation, noise, steps, conditioning=asked).actions
+        if precision == "f32":
+            torch.testing.assert_close(found, exact, atol=5e-5, rtol=5e-5)
+        else:
+            reference = golden_model(kind, "bf16").sample(observation, noise, steps, conditioning=asked)
+            assert 0 < rms(found - exact) <= 2 * rms(reference - exact)
+        for _ in range(3):
+            assert torch.equal(runner.sample(observation, noise, steps, conditioning=asked).actions, found)
+    assert torch.equal(runner.sample(observation, noise, 3).actions, plain)
+
+
+@pytest.mark.parametrize("name", ["fused", PORTABLE])
+def test_the_denoising_kernel_does_every_evaluation(name: str) -> None:
+    runner: Any = backend(name, "pi05", "bf16")
+    observation, noise = made_up("pi05", 1, 7)
+    asked = Conditioning(integration=Integration("exponential", UNEVEN))
+    runner.sample(observation, noise, 3, conditioning=asked)
+    told = runner.describe()["denoising"]
+    loops = {how: [loop for loop in these if loop.startswith("H=7, 1 steps, ")] for how, these in told.items()}
+    assert [how for how, these in loops.items() if these] in (["one CUDA kernel"], ["one portable CUDA kernel"])
+
+
+@pytest.mark.parametrize("name", [*GRAPHS, PORTABLE])
+def test_intermediates_of_a_solvers_loop_are_the_references(name: str) -> None:
+    runner: Any = backend(name, "pi05", "bf16")
+    observation, noise = made_up("pi05", 2, 19)
+    asked = Conditioning(integration=Integration("ab2", UNEVEN))
+    exact: dict[str, torch.Tensor] = {}
+    rounded: dict[str, torch.Tensor] = {}
+    golden_model("pi05").sample(observation, noise, 3, conditioning=asked, trace=exact)
+    golden_model("pi05", "bf16").sample(observation, noise, 3, conditioning=asked, trace=rounded)
+    found = runner.intermediates(observation, noise, 3, conditioning=asked)
+    for tensor in ("v_t", "x_t"):
+        ours, theirs = (rms(one[tensor].cpu() - exact[tensor]) for one in (found, rounded))
+        assert 0 < ours <= 2 * theirs, tensor
