@@ -58,9 +58,10 @@ def test_packed_attention_leaves_in_int8(lengths: list[int], spare: int, batch: 
     q, k, v = random((rows + spare) * HEADS, DIM), random(rows + spare, DIM, seed=1), random(rows + spare, DIM, seed=2)
     to: dict[str, Any] = {"inverse": 40.0, "numbers": torch.int8}
     ours = portable_batch.packed_attention(q, k, v, segments, HEADS, **to)[:rows]
-    twin = plain_batch.packed_attention(q, k, v, segments, HEADS, **to)[:rows]
-    assert ours.dtype == twin.dtype == torch.int8 and int(twin.abs().max()) > 30
-    assert int((ours.int() - twin.int()).abs().max()) <= 1 and float((ours != twin).float().mean()) < 0.02
+    twin = plain_batch.packed_attention(q, k, v, segments, HEADS)[:rows].float()
+    assert ours.dtype == torch.int8 and int(ours.abs().max()) > 30
+    rounding, before = 0.5, 40 * TOLERANCE * (1 + twin.abs())  # as `check_packed` allows before it is rounded
+    assert bool(((ours.float() - 40 * twin).abs() <= rounding + before).all())
 
 
 @on_hopper

@@ -34,10 +34,12 @@ def raced(one: Operation) -> Raced:
     return race(bench_maker(DEVICE)(one), candidates[:FEW])
 
 
-def check(one: Operation) -> None:
+def check(one: Operation) -> int:
+    """How many tiles were timed."""
     found = raced(one)
     assert not [why for why in found.refused.values() if why.startswith("its ")], "no result of ours is wrong"
-    assert 0 < found.best.microseconds <= found.usual.microseconds < 1e4 and found.timed > 1
+    assert 0 < found.best.microseconds <= found.usual.microseconds < 1e4
+    return found.timed
 
 
 @pytest.mark.parametrize("kind", ["vision_attention", "prefix_attention", "packed_attention", "suffix_attention"])
@@ -66,7 +68,7 @@ def test_portable_products(operation: str, numbers: Numbers, norm: Literal["rms"
         pytest.skip("has no FP8")
     out_fp8, bias = numbers == "fp8" and operation in ("gelu", "geglu"), norm == "layer" or operation == "gelu"
     usual = Operation(operation, "portable", operation, numbers, 500, 1024, 1152, 1, bias=bias, out_fp8=out_fp8)
-    check(replace(usual, norm_behind=norm))
+    assert check(replace(usual, norm_behind=norm)) > 1
 
 
 @on_hopper
@@ -75,9 +77,8 @@ def test_portable_products(operation: str, numbers: Numbers, norm: Literal["rms"
 def test_hoppers_products(precision: Precision, batch: int) -> None:
     found = operations(preset("pi05_libero").model, Call(1, 48, batch), precision, "hopper", horizon=10)
     sms = torch.cuda.get_device_properties(DEVICE).multi_processor_count
-    for one in found:
-        if one.kernels == "hopper":
-            check(hopper.resolved(one, sms))
+    timed = [check(hopper.resolved(one, sms)) for one in found if one.kernels == "hopper"]
+    assert max(timed) > 1  # of some the first candidates don't fit, and the usual tile stays
 
 
 def test_an_idle_gpu_is_steady() -> None:
