@@ -169,7 +169,7 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
     state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
     backend._weights = pack(backend.config, state, backend._quantized)
     assert {layer.qkv.numbers for layer in backend._weights.vlm} == {torch.int8}  # type: ignore[union-attr]
-    backend._calls, backend._ops, backend._denoisers, backend._refused = {}, PLAIN, {}, {}
+    backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers, backend._refused = {}, PLAIN, {}, {}, {}
     backend._packed_expert = None
     backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
     backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
@@ -178,6 +178,7 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
     backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
     assert backend._batch_weights() is backend._weights and moved == [backend.device]
     assert backend.describe()["int8"]["plan"]["expert of batches"] == "bf16, as operations denoise"
+    backend.device = CPU  # where the kernel's weights are to lie
     packed = backend._packed(PackedExpert)
     assert packed.numbers == "int8" and bool((packed.inputs == 1).all())
 
@@ -187,7 +188,7 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     everything = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}
     calibration = dataclasses.replace(calibration, sites=everything)
     backend._quantization, backend._plan = calibration, calibration.plan(golden_model("pi05").config, "fp8")
-    backend._calls, backend._ops, backend._denoisers = {}, PLAIN, {}
+    backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers = {}, PLAIN, {}, {}
     backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
     backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
     backend._refused = {

@@ -38,6 +38,7 @@ BASES: dict[str, tuple[str, ...]] = {
     "eval": ("reacher", *_QUICK, *_FEW, "--out", "{here}/eval"),
     "compare": ("pytorch:bf16", *_QUICK, *_FEW, "--simulator", "reacher", "--out", "{here}/compare"),
     "bench": (*_TINY, "--steps", "1", "--calls", "1", "--main-calls", "1", "--seconds", "0", "--backends", "pytorch"),
+    "tune": ("--seconds", "0", "--out", "{here}/tiles.json"),
     "plan": ("--robots", "3", "--hz", "20", "--horizon", "10", "--gpu", "h200"),
     "export": ("onnx", *_TINY, "{here}/onnx"),
     "build": _TINY,

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from turbopi.config import ModelConfig
+from turbopi.engine.runner import BUCKET, bucket
 from turbopi.kernels.tile_table import Kernels, Numbers, TileKey, whole_64
 
-BUCKET = 16  # prompt tokens, as engine/runner.py rounds them up
 Precision = Literal["bf16", "fp8"]
 
 
@@ -85,10 +85,6 @@ def every_prompt(config: ModelConfig) -> list[int]:
     longest = bucket(config.max_prompt_tokens)
     usual = min(48, longest)
     return [usual, *(tokens for tokens in range(BUCKET, longest + 1, BUCKET) if tokens != usual)]
-
-
-def bucket(tokens: int) -> int:
-    return max(BUCKET, -(-tokens // BUCKET) * BUCKET)
 
 
 def operations(
