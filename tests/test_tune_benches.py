@@ -23,7 +23,7 @@ from turbopi.kernels.sm90.gemm.fp8 import FoldedFp8
 from turbopi.kernels.tile_checks import why_not
 from turbopi.kernels.tile_table import LIBRARY, Knobs
 from turbopi.quantization.fp8 import E4M3, ScaledMatrix, to_e4m3
-from turbopi.tune import gpu, hopper, portable
+from turbopi.tune import gpu, hopper, portable, product_bench
 from turbopi.tune.gpu import GpuBench
 from turbopi.tune.race import Round, race
 from turbopi.tune.shapes import Call, Operation, operations
@@ -36,8 +36,7 @@ pytestmark = [pytest.mark.filterwarnings(f"ignore::{one}") for one in ("RuntimeW
 
 @pytest.fixture(autouse=True)
 def on_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (portable, hopper):
-        monkeypatch.setattr(module, "cold_copies", lambda size, device: 2)
+    monkeypatch.setattr(product_bench, "cold_copies", lambda size, device: 2)
     monkeypatch.setattr(gpu, "poison", lambda size, device: None)
 
 

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from turbopi.errors import ConfigError
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
 from turbopi.reading import plain_document
 from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
 from turbopi.studies.rollouts import POST, Played, ToyPolicy, open_policy, play, sampled, seeds_of
-from turbopi.studies.spread import UNIFORM, Spread, spread
+from turbopi.studies.spread import UNIFORM, Spread, spread, spread_plot, spread_table
 from turbopi.studies.study import Setup, Study, Tell
 
 RECIPES = {  # and what a student of it learned
@@ -71,8 +71,11 @@ def run(setup: Setup) -> Report:
         STUDY,
         method=METHOD,
         controls=_controls(every),
-        tables=[*(_table(name, cells) for name in teachers), *([_spread_table(spreads)] if spreads else [])],
-        plots=[_plot(cells), *([_spread_plot(spreads)] if spreads else [])],
+        tables=[
+            *(_table(name, cells) for name in teachers),
+            *([spread_table("Which ways are left", "weights", spreads)] if spreads else []),
+        ],
+        plots=[_plot(cells), *([spread_plot("ways", spreads)] if spreads else [])],
         verdict=verdict(cells),
         would_change=WOULD_CHANGE,
         not_run=_not_run(teachers, students),
@@ -116,8 +119,7 @@ def _judge(
         for weights, policy in models.items():
             for steps in (STEPS, 1) if weights == TEACHER else (1,):
                 one = spread(policy, episodes, 16 if small else 64, steps)
-                label = f"{name}, {weights}, {_told(steps)}"
-                spreads.append(Spread(label, one.observations, one.samples, one.bimodality, one.minority, one.sideways))
+                spreads.append(structs.replace(one, policy=f"{name}, {weights}, {_told(steps)}"))
     pairs_matter = None
     if {"consistency", "shuffled"} <= models.keys():
         pairs_matter = found["shuffled", 1].against(found["consistency", 1]).document
@@ -248,14 +250,6 @@ def _table(policy: str, cells: Sequence[DistilledCell]) -> Grid:
     return Grid(f"Closed loop: {policy}", [*columns, "error"], rows, note)
 
 
-def _spread_table(spreads: Sequence[Spread]) -> Grid:
-    rows: list[list[Cell]] = [
-        [one.policy, one.observations, one.samples, one.bimodality, one.minority] for one in spreads
-    ]
-    columns = ["weights", "observations", "chunks each", "Sarle's coefficient", "share of the rarer side"]
-    return Grid("Which ways are left", columns, rows)
-
-
 def _plot(cells: Sequence[DistilledCell]) -> Plot:
     panels = []
     for policy in dict.fromkeys(cell.policy for cell in cells):
@@ -272,16 +266,6 @@ def _plot(cells: Sequence[DistilledCell]) -> Plot:
             Panel(f"{policy}: success", "Euler steps", "%, Wilson's 95 %", series, True, ticks=[1.0, 2.0, 10.0])
         )
     return Plot("distillation", panels)
-
-
-def _spread_plot(spreads: Sequence[Spread]) -> Plot:
-    edges = np.linspace(-5, 5, 41)
-    series = []
-    for one in spreads:
-        density, _ = np.histogram(np.ravel(one.sideways), edges, density=True)
-        series.append(Series(one.policy, ((edges[1:] + edges[:-1]) / 2).tolist(), density.tolist()))
-    title = "Where five actions lead at an episode's start"
-    return Plot("ways", [Panel(title, "to the left of the straight way", "density", series)])
 
 
 STUDY = Study(

@@ -5,18 +5,22 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import Struct
 
+from turbopi.studies.report import Cell, Grid, Panel, Plot, Series
 from turbopi.studies.rollouts import REPLAN, ToyPolicy, seeds_of
 
 UNIFORM = 5 / 9  # Sarle's coefficient of a uniform distribution; a normal one has 1/3, two equal points have 1
 STEPS = 10
+SIDES = np.linspace(-5, 5, 41)
 
 
 class Spread(Struct, frozen=True):
     """Of many chunks for each observation at the beginning of an episode.
 
-    sideways     float[N][M]: how far the first actions lead to the left of the straight way to the target
-    bimodality   mean over observations of Sarle's coefficient of `sideways`
+    Sideways is how far a chunk's first actions lead to the left of the straight way to the target.
+
+    bimodality   mean over observations of Sarle's coefficient of sideways
     minority     mean over observations of the share of chunks that go to the rarer side
+    density      of sideways, over all chunks, between SIDES
     """
 
     policy: str
@@ -24,7 +28,7 @@ class Spread(Struct, frozen=True):
     samples: int
     bimodality: float
     minority: float
-    sideways: list[list[float]]
+    density: list[float]
 
 
 def spread(policy: ToyPolicy, episodes: Sequence[int], samples: int, steps: int = STEPS) -> Spread:
@@ -47,8 +51,24 @@ def spread(policy: ToyPolicy, episodes: Sequence[int], samples: int, steps: int 
         samples,
         float(np.mean([bimodality(row) for row in sideways])),
         float(np.minimum(share, 1 - share).mean()),
-        sideways.round(4).tolist(),
+        np.histogram(sideways, SIDES, density=True)[0].tolist(),
     )
+
+
+def spread_table(title: str, whose: str, spreads: Sequence[Spread]) -> Grid:
+    """whose: what their names are, the head of the first column."""
+    rows: list[list[Cell]] = [
+        [one.policy, one.observations, one.samples, one.bimodality, one.minority] for one in spreads
+    ]
+    columns = [whose, "observations", "chunks each", "Sarle's coefficient", "share of the rarer side"]
+    return Grid(title, columns, rows)
+
+
+def spread_plot(name: str, spreads: Sequence[Spread]) -> Plot:
+    middles = ((SIDES[1:] + SIDES[:-1]) / 2).tolist()
+    title = "Where five actions lead at an episode's start"
+    series = [Series(one.policy, middles, one.density) for one in spreads]
+    return Plot(name, [Panel(title, "to the left of the straight way", "density", series)])
 
 
 def bimodality(values: np.ndarray) -> float:

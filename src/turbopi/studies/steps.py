@@ -25,7 +25,7 @@ from turbopi.studies.problems import EXACT, ErrorCell, Problem, errors, learned_
 from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
 from turbopi.studies.rollouts import POST, Call, Played, ToyPolicy, met, open_policy, play, seeds_of
 from turbopi.studies.solvers import BASELINE, Learned, Way, grid_times, ways
-from turbopi.studies.spread import UNIFORM, Spread, spread
+from turbopi.studies.spread import UNIFORM, Spread, spread, spread_plot, spread_table
 from turbopi.studies.study import Setup, Study, Tell
 
 WARM = 0.6  # where a warm start begins: that much noise, and the rest is the chunk of before
@@ -155,11 +155,11 @@ def run(setup: Setup) -> Report:
         method=METHOD,
         controls=_controls(open_policy("chase"), spreads, {one.name: one.halved for one in every}, setup.small),
         tables=[
-            *([_spread_table(spreads)] if spreads else []),
+            *([spread_table("How broad the policies of the post are", "policy", spreads)] if spreads else []),
             *(_success_table(name, cells) for name in setup.toy_policies),
             _error_table(found),
         ],
-        plots=[_plot(cells, found)] + ([_spread_plot(spreads)] if spreads else []),
+        plots=[_plot(cells, found)] + ([spread_plot("spread", spreads)] if spreads else []),
         verdict=verdict(cells),
         would_change=WOULD_CHANGE,
         not_run=_not_run(setup),
@@ -258,12 +258,6 @@ def _not_run(setup: Setup) -> list[str]:
 # --- tables and plots -------------------------------------------------------------------------------------------------
 
 
-def _spread_table(spreads: Sequence[Spread]) -> Grid:
-    rows: list[list[Cell]] = [[s.policy, s.observations, s.samples, s.bimodality, s.minority] for s in spreads]
-    columns = ["policy", "observations", "chunks each", "Sarle's coefficient", "share of the rarer side"]
-    return Grid("How broad the policies of the post are", columns, rows)
-
-
 def _success_table(policy: str, cells: Sequence[SuccessCell]) -> Grid:
     columns = [
         "solver",
@@ -342,16 +336,6 @@ def _panel(policy: str, cells: Sequence[SuccessCell]) -> Panel:
     return Panel(
         f"{policy}: success", "evaluations of the action expert", "%, Wilson's 95 %", series, True, ticks=ticks
     )
-
-
-def _spread_plot(spreads: Sequence[Spread]) -> Plot:
-    edges = np.linspace(-5, 5, 41)
-    series = []
-    for one in spreads:
-        density, _ = np.histogram(np.ravel(one.sideways), edges, density=True)
-        series.append(Series(one.policy, ((edges[1:] + edges[:-1]) / 2).tolist(), density.tolist()))
-    title = "Where five actions lead at an episode's start"
-    return Plot("spread", [Panel(title, "to the left of the straight way", "density", series)])
 
 
 STUDY = Study("steps", "How few denoising steps are enough, and with which solver?", CLAIMED, run)

@@ -13,7 +13,6 @@ from torch import Tensor
 from turbopi.kernels import plain
 from turbopi.kernels.portable import norms
 from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
-from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.sm90.gemm import candidates as hopper_candidates
 from turbopi.kernels.sm90.gemm.bf16 import SPLIT, Copy, Folded, Sums, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, matmul_fp8
@@ -30,12 +29,13 @@ from turbopi.kernels.sm90.gemm.products import (
 )
 from turbopi.kernels.tile_table import NO_TILES, Knobs
 from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
-from turbopi.tune.gpu import INVERSE, GpuBench, cold_copies, poisoned, relative
-from turbopi.tune.portable import EPS, activated, clone
+from turbopi.tune.gpu import poisoned, relative
+from turbopi.tune.product_bench import EPS, ProductBench, activated
 from turbopi.tune.shapes import Operation as Wanted
 
 STREAM_PARTS = 16  # of the sums of the stream's rows: as many as the product before has tiles along its columns
 COPY_SCALE = 20.0
+INPUT_SCALE = 0.02
 
 
 def resolved(one: Wanted, sms: int) -> Wanted:
@@ -66,25 +66,15 @@ def candidates(one: Wanted, sms: int) -> list[Knobs]:
     return [to_knobs(cut) for cut in found]
 
 
-class Product(GpuBench):
+class Product(ProductBench):
     """One of them, in bfloat16 or E4M3."""
 
     def __init__(self, operation: Wanted, device: torch.device) -> None:
-        super().__init__(operation, device)
-        one, self.fp8 = operation, operation.numbers == "fp8"
-        rows = one.columns * (2 if one.operation == "geglu" else 1)
-        weight = self.random(rows, one.inner) / one.inner**0.5
-        self.bias = self.random(one.columns) if one.bias else None
-        self.copies = cold_copies(weight.numel() * (1 if self.fp8 else 2), device)
-        self.inverse = INVERSE if one.out_fp8 else None
-        self.stream = self.random(one.rows, one.columns) if one.norm_behind else None
-        self.scale = torch.ones(one.columns, device=device)
-        self.norm = self.random(one.columns), self.random(one.columns)
+        super().__init__(operation, device, INPUT_SCALE)
+        one, first = operation, self.weights[0]
         if self.stream is not None:
             self.stream_sums = sums_of(self.stream)
             self.for_copy = self.norm[0].float() * COPY_SCALE, self.norm[1].float() * COPY_SCALE
-        first: Matrix = quantize(weight, 0.02) if self.fp8 else weight
-        self.weights = [first, *(clone(first) for _ in range(self.copies - 1))]
         self.raw = self.random(one.rows, one.inner)  # what a norm stands before
         if one.normed:
             self._norm_in_front(first)
@@ -138,14 +128,10 @@ class Product(GpuBench):
         if one.operation == "residual":
             assert self.stream is not None
             exact = exact + self.stream.float()
-        return exact, plain.as_input(exact, torch.bfloat16, self.inverse) if self.fp8 else self._twin(x, weight)
+        return exact, plain.as_input(exact, torch.bfloat16, self.inverse) if self.fp8 else self.twin(x, weight)
 
-    def _twin(self, x: Tensor, weight: Matrix) -> Tensor:
-        if self.operation.operation == "geglu":
-            return plain.linear_geglu(x, weight, self.inverse)
-        if self.operation.operation == "gelu" and self.bias is not None:
-            return plain.linear_gelu(x, weight, self.bias, self.inverse)
-        result = plain.linear(x, weight, self.bias)
+    def twin(self, x: Tensor, weight: Matrix) -> Tensor:
+        result = super().twin(x, weight)
         return result + self.stream if self.operation.operation == "residual" and self.stream is not None else result
 
     def run(self, knobs: Knobs, copy: int, out: Tensor | None = None) -> Tensor:
@@ -178,38 +164,13 @@ class Product(GpuBench):
         one, weight, stream = self.operation, self.weights[copy], self.stream
         assert stream is not None
         sums = Sums.allocate(tile, one.rows, one.columns, self.device)
+        ahead, x, bias = self._ahead(copy), self.x, self.bias
         if not isinstance(weight, ScaledMatrix):
-            return matmul(
-                self.x,
-                weight,
-                tile,
-                "bias",
-                self.bias,
-                out,
-                residual=stream,
-                sums_out=sums,
-                ahead=self._ahead(copy),
-            )
-        copied = Copy(
-            torch.empty(one.rows, one.columns, dtype=E4M3, device=self.device),
-            self.stream_sums,
-            self.for_copy[0],
-            self.for_copy[1],
-            EPS,
-            Sums.allocate(tile, one.rows, one.columns, self.device),
-        )
-        return matmul_fp8(
-            self.x,
-            weight,
-            tile,
-            "bias",
-            self.bias,
-            out,
-            residual=stream,
-            sums_out=sums,
-            copy=copied,
-            ahead=self._ahead(copy),
-        )
+            return matmul(x, weight, tile, "bias", bias, out, residual=stream, sums_out=sums, ahead=ahead)
+        plain_sums = Sums.allocate(tile, one.rows, one.columns, self.device)
+        room = torch.empty(one.rows, one.columns, dtype=E4M3, device=self.device)
+        left = Copy(room, self.stream_sums, *self.for_copy, EPS, plain_sums)
+        return matmul_fp8(x, weight, tile, "bias", bias, out, residual=stream, sums_out=sums, copy=left, ahead=ahead)
 
     def _by_library(self, parts: int | None, copy: int) -> Tensor:
         one, weight, bias = self.operation, self.weights[copy], self.bias
@@ -223,14 +184,6 @@ class Product(GpuBench):
             assert bias is not None
             return linear_gelu(x, weight, bias, self.inverse)
         return linear(x, weight, bias)
-
-    def behind(self, result: Tensor) -> object:
-        one, inverse = self.operation, INVERSE if self.fp8 else None
-        if self.stream is None or one.operation == "residual":
-            return result
-        if one.norm_behind == "layer":
-            return norms.residual_layer_norm(self.stream, result, *self.norm, EPS, inverse)
-        return norms.residual_rms_norm(self.stream, result, None, self.scale, None, EPS, inverse)
 
     def out_for(self, knobs: Knobs) -> Tensor | None:
         one, cut = self.operation, from_knobs(knobs)

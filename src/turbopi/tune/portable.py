@@ -1,6 +1,7 @@
 """The portable operations with their inputs, as the tuner measures them: products and attention in Triton."""
 
-from dataclasses import asdict, replace
+from abc import abstractmethod
+from dataclasses import asdict
 
 import numpy as np
 import torch
@@ -10,19 +11,18 @@ from torch import Tensor
 from turbopi.engine.packing import pack_rows
 from turbopi.kernels import plain, plain_batch
 from turbopi.kernels.interface import Segments
-from turbopi.kernels.portable import activations, attention, batch, norms
+from turbopi.kernels.portable import activations, attention, batch
 from turbopi.kernels.portable.attention_tiles import AttentionTile, usual_tile
 from turbopi.kernels.portable.attention_tiles import candidates as attention_candidates
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
-from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import LIBRARY, Knobs
-from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
-from turbopi.tune.gpu import INVERSE, GpuBench, cold_copies, poisoned, relative
+from turbopi.quantization.fp8 import E4M3, ScaledMatrix, to_e4m3
+from turbopi.tune.gpu import INVERSE, GpuBench, poisoned, relative
+from turbopi.tune.product_bench import ProductBench, activated
 from turbopi.tune.shapes import Operation
 
 INPUT_SCALE = 0.01
-EPS = 1e-6
 
 
 def usual(one: Operation, capability: tuple[int, int], sms: int) -> Knobs:
@@ -58,34 +58,16 @@ def bench(one: Operation, device: torch.device) -> GpuBench:
     return kinds.get(one.operation, Product)(one, device)
 
 
-class Product(GpuBench):
-    """x @ weightᵀ with its epilogue, and the norm that adds parts up."""
+class Product(ProductBench):
+    """In Triton, or by the library."""
 
     def __init__(self, operation: Operation, device: torch.device) -> None:
-        super().__init__(operation, device)
-        one, fp8 = operation, operation.numbers == "fp8"
-        rows = one.columns * (2 if one.operation == "geglu" else 1)
-        weight = self.random(rows, one.inner) / one.inner**0.5
-        self.bias = self.random(one.columns) if one.bias else None
-        x = self.random(one.rows, one.inner)
-        first: Matrix = quantize(weight, INPUT_SCALE) if fp8 else weight
+        super().__init__(operation, device, INPUT_SCALE)
+        x, first = self.random(operation.rows, operation.inner), self.weights[0]
         self.x = to_e4m3(x, first.inverse) if isinstance(first, ScaledMatrix) else x
-        self.copies = cold_copies(weight.numel() * (1 if fp8 else 2), device)
-        self.weights = [first, *(clone(first) for _ in range(self.copies - 1))]
-        self.stream = self.random(one.rows, one.columns) if one.norm_behind else None
-        self.scale = torch.ones(one.columns, device=device)
-        self.norm = self.random(one.columns), self.random(one.columns)
-        self.inverse = INVERSE if one.out_fp8 else None
-        sums = first.product(self.x, self.bias) if isinstance(first, ScaledMatrix) else x.float() @ weight.float().T
-        self.exact = activated(one.operation, sums)
-        self.twin_error = relative(self.whole(self._twin(first)), self.exact)
-
-    def _twin(self, weight: Matrix) -> Tensor:
-        if self.operation.operation == "geglu":
-            return plain.linear_geglu(self.x, weight, self.inverse)
-        if self.operation.operation == "gelu" and self.bias is not None:
-            return plain.linear_gelu(self.x, weight, self.bias, self.inverse)
-        return plain.linear(self.x, weight, self.bias)
+        sums = first.product(self.x, self.bias) if isinstance(first, ScaledMatrix) else x.float() @ first.float().T
+        self.exact = activated(operation.operation, sums)
+        self.twin_error = relative(self.whole(self.twin(self.x, first)), self.exact)
 
     def run(self, knobs: Knobs, copy: int, out: Tensor | None = None) -> Tensor:
         weight = self.weights[copy]
@@ -95,29 +77,12 @@ class Product(GpuBench):
         epilogue: tiles.Epilogue = self.operation.operation  # type: ignore[assignment]
         return product(self.x, weight, epilogue, self.bias, out, self.inverse, tiles.Tile(**knobs))
 
-    def behind(self, result: Tensor) -> object:
-        stream, inverse = self.stream, INVERSE if self.operation.numbers == "fp8" else None
-        if stream is None:
-            return result
-        if self.operation.norm_behind == "layer":
-            return norms.residual_layer_norm(stream, result, *self.norm, EPS, inverse)
-        return norms.residual_rms_norm(stream, result, None, self.scale, None, EPS, inverse)
-
     def out_for(self, knobs: Knobs) -> Tensor | None:
         if LIBRARY in knobs:
             return None
         shape = (self.operation.rows, self.operation.columns)
         split = () if knobs["splits"] == 1 else (knobs["splits"],)
         return poisoned((*split, *shape), E4M3 if self.operation.out_fp8 else self.weights[0].dtype, self.device)
-
-
-def activated(operation: str, sums: Tensor) -> Tensor:
-    """float32[rows, columns] of a product's sums."""
-    return plain.gelu(sums) if operation == "gelu" else plain.geglu(sums) if operation == "geglu" else sums
-
-
-def clone(matrix: Matrix) -> Matrix:
-    return replace(matrix, data=matrix.data.clone()) if isinstance(matrix, ScaledMatrix) else matrix.clone()
 
 
 class Attention(GpuBench):
@@ -135,11 +100,13 @@ class Attention(GpuBench):
         twin = self._plain(torch.bfloat16)
         self.twin_error = relative(self.whole(plain.as_input(twin, torch.bfloat16, self.inverse)), self.exact)
 
+    @abstractmethod
     def _allocate(self, one: Operation) -> None:
-        raise NotImplementedError
+        """Make the inputs."""
 
+    @abstractmethod
     def _plain(self, dtype: torch.dtype) -> Tensor:
-        raise NotImplementedError
+        """The twin's result, computed in these numbers."""
 
 
 class VisionAttention(Attention):
