@@ -43,7 +43,8 @@ def shared_out(tapes: Sequence[Tape], scenes: Sequence[int]) -> list[list[Tape]]
 class Fleet(threading.Thread):
     """Runs until `stop`. `log` receives one JSON line for each episode.
 
-    tapes   whose frames the workers of their scenes draw before they play
+    tapes      whose frames the workers of their scenes draw before they play
+    draw_gpus  numbers of the GPUs that draw, shared out among the workers; none: EGL's first
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class Fleet(threading.Thread):
         log: Path,
         output: Path,
         tapes: Sequence[Tape] = (),
+        draw_gpus: Sequence[int] = (),
     ) -> None:
         super().__init__(daemon=True)
         self.memory, self.actor, self.scale, self.log = memory, actor, scale, log
@@ -71,7 +73,8 @@ class Fleet(threading.Thread):
         shares = shared_out(tapes, [scene_of(worker) for worker in range(workers)])
         for worker in range(workers):
             ours, theirs = context.Pipe()
-            arguments = (theirs, scene_of(worker), seed * 1000 + worker, str(output), shares[worker])
+            gpu = draw_gpus[worker % len(draw_gpus)] if draw_gpus else None
+            arguments = (theirs, scene_of(worker), seed * 1000 + worker, str(output), shares[worker], gpu)
             process = context.Process(target=_main, args=arguments, daemon=True)
             process.start()
             theirs.close()
@@ -165,9 +168,11 @@ class Fleet(threading.Thread):
         log.flush()
 
 
-def _main(pipe: Any, scene: int, seed: int, output: str, tapes: list[Tape]) -> None:
+def _main(pipe: Any, scene: int, seed: int, output: str, tapes: list[Tape], gpu: int | None) -> None:
     with open(output, "ab") as file:  # simulators print
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     os.environ["OMP_NUM_THREADS"] = "1"
+    if gpu is not None:
+        os.environ["MUJOCO_EGL_DEVICE_ID"] = str(gpu)  # robosuite reads it
     run_worker(pipe, scene, seed, tapes)

@@ -81,6 +81,7 @@ class Settings:
     delayed: float = 0.5  # share of DAgger episodes in which the learner's chunks come late; with max_delay
     max_delay: int = 0  # control steps of delay that are simulated, for real-time execution; 0: none
     device: str = "cuda"
+    draw_gpus: str = ""  # numbers of the GPUs that draw pictures, as 1,2: beside the one that learns, if there are any
 
 
 @dataclass
@@ -284,6 +285,7 @@ def train(settings: Settings) -> None:
         out / "episodes.jsonl",
         out / "workers.log",
         tapes,
+        [int(gpu) for gpu in settings.draw_gpus.split(",") if gpu],
     )
     actor.capture()  # while simulators start
     fleet.start()
