@@ -295,6 +295,26 @@ def delays(document: Any) -> list[str]:
     return _table(HEADS, [row(cell) for cell in document.cells])
 
 
+def _read_judged(file: Path) -> Any:
+    from small_policy.judged import load_judged
+
+    return load_judged(file)
+
+
+def small_policy(document: Any) -> list[str]:
+    """The small policy's runs without delay."""
+    from small_policy.judged import table
+
+    return table(document)
+
+
+def small_policy_delays(document: Any) -> list[str]:
+    """The small policy under delay, by way to run."""
+    from small_policy.judged import delayed_table
+
+    return delayed_table(document)
+
+
 def _read_marks(file: Path) -> list[MarkedVariant]:
     """What `python -m kernel_turns time --marks --json` wrote."""
     marks = read_turns(file).marks
@@ -311,6 +331,8 @@ TABLES = {
     **{lines.__name__: Table(read_benchmark, lines) for lines in _OF_BENCHMARKS},
     "attacks": Table(_read_attacks, attacks),
     "delays": Table(_read_delays, delays),
+    "small_policy": Table(_read_judged, small_policy),
+    "small_policy_delays": Table(_read_judged, small_policy_delays),
     "layer_in_cycles": Table(_read_marks, layer_in_cycles),
     **{lines.__name__: Table(_read_nothing, lines) for lines in (sizing, gpus, gpu_refusals, gpu_predictions)},
     "study": Table(read_report, study),

@@ -5,7 +5,8 @@
     python -m small_policy stats --out work/norm_stats.json          statistics of demonstrations, without pictures
     python -m small_policy train --out work/run --stats work/norm_stats.json --seconds 420 --workers 32
     python -m small_policy play --help                               episodes from machines without a GPU, for `train`
-    python -m small_policy card --help                               the model card, from results and curves
+    python -m small_policy judged --help                             what evaluations came to, in one file
+    python -m small_policy card --help                               the model card, from that file and the curves
     python -m small_policy chase --out work/chase                    the policy of the dynamic task, see chase.py
     python -m small_policy post --out work/two_ways --ways 2         a policy of two modes for studies, see post.py
     python -m small_policy distill --start work/two_ways/checkpoint --out work/student   one step, see distill.py
@@ -67,8 +68,13 @@ def main() -> None:
     stats.add_argument("--episodes", type=int, default=6, help="of each task")
     stats.add_argument("--raw", type=Path, help="also keep states and actions, as .npz; several runs' can be merged")
     stats.add_argument("--merge", type=Path, nargs="*", help="play nothing; take these .npz")
+    judged = commands.add_parser("judged", help="what evaluations of one policy came to, paired with the first")
+    judged.add_argument(
+        "runs", nargs="+", metavar="NAME=FOLDER", help="folders of `turbopi eval`, such as float32=work/f32"
+    )
+    judged.add_argument("--out", type=Path, required=True)
     card = commands.add_parser("card", help="write the model card from results and curves")
-    card.add_argument("--results", type=Path, required=True, help="summary of evaluations, as in benchmarks/results")
+    card.add_argument("--results", type=Path, required=True, help="what `judged` wrote")
     card.add_argument("--curves", type=Path, required=True, help="the training's curves.csv")
     card.add_argument("--out", type=Path, required=True)
     _add_chase(commands.add_parser("chase", help="the policy of the dynamic task: demonstrations, training, export"))
@@ -85,6 +91,7 @@ def main() -> None:
     _add_settings(speed, required=False)
     arguments = parser.parse_args()
     run = {"measure": _measure, "stats": _stats, "train": _train, "throughput": _throughput, "card": _card}
+    run["judged"] = _judged
     run |= {"chase": _chase, "play": _play, "post": _post, "distill": _distill}
     run[arguments.command](arguments)
 
@@ -154,6 +161,13 @@ def _settings(arguments: argparse.Namespace) -> Any:
     from small_policy.train import Settings
 
     return Settings(**{item.name: getattr(arguments, item.name) for item in fields(Settings)})
+
+
+def _judged(arguments: argparse.Namespace) -> None:
+    from small_policy.judged import write_judged
+
+    runs = [run.partition("=") for run in arguments.runs]
+    write_judged({name: Path(folder) for name, _, folder in runs}, arguments.out)
 
 
 def _card(arguments: argparse.Namespace) -> None:
