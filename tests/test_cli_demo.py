@@ -58,7 +58,7 @@ def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_exp
         assert heading in out
     for frame in shipped.load_frames()[:2]:
         assert frame.prompt.split()[-1] in out
-    assert "frame 0: the next 10 actions, 7 numbers each" in out
+    assert "frame 0: the next 16 actions, 7 numbers each" in out
     assert "The bound is 10 times the control" in out
     assert "OK: pytorch bf16 is within" in out
     assert "\x1b" not in out
@@ -74,7 +74,7 @@ def test_without_a_checkpoint_the_demo_runs_the_small_policy_and_is_near_the_exp
     assert check["rms_of_all"] == pytest.approx(np.sqrt(np.mean(np.square(check["rms"]))))
     assert 0 < check["rms_of_all"] <= check["bound"]
     with np.load(tmp_path / "report" / "actions.npz") as actions:
-        assert actions["actions"].shape == actions["oracle_actions"].shape == (2, 10, 7)
+        assert actions["actions"].shape == actions["oracle_actions"].shape == (2, 16, 7)
         assert actions["actions"].dtype == np.float64
         np.testing.assert_allclose(actions["actions"][1], report["frames"][1]["actions"])
         assert not np.array_equal(actions["actions"], actions["oracle_actions"])

@@ -40,7 +40,7 @@ def test_it_is_small_and_describes_itself() -> None:
     checkpoint = open_checkpoint(SMALL_POLICY)
     assert checkpoint.config.robot == "libero"
     assert not checkpoint.config.discrete_state_input
-    assert checkpoint.config.model.action_horizon == 10
+    assert checkpoint.config.model.action_horizon == 16
     assert checkpoint.info()["parameters"]["total"] < 6_000_000
     assert sum(file.stat().st_size for file in SMALL_POLICY.rglob("*") if file.is_file()) < 12 * 2**20
     assert (SMALL_POLICY / "MODEL_CARD.md").is_file()
