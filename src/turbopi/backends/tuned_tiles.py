@@ -165,7 +165,7 @@ def find_tiles(machine: Machine, *, cache: Path | None = None, shipped: Path | N
         if ships and document.gpu != machine.gpu:
             continue
         found, why = usable(document, machine, ships=ships)
-        if why is not None:
+        if why is not None and not ships:  # of what ships, nothing is for the user to mend
             unused.append(f"{file}: {why}; measure again with {COMMAND}")
         if found:
             table |= {one.key: one.tile for one in found}
