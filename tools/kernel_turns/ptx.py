@@ -1,0 +1,155 @@
+"""Run the portable denoising kernel as PTX for older GPUs on this one, and compare it with its own machine code.
+
+    export PYTHONPATH=src:tools
+    python -m kernel_turns.ptx --out benchmarks/results/h200_2026-11-26_ptx.json
+
+The driver compiles PTX for the GPU that loads it, so instructions are those of the older GPU, and speed isn't. Some
+cases take as many blocks as another GPU has multiprocessors, as products and attention are cut by that number. Both are
+judged against float64. Exit code 1 if a case has a problem.
+"""
+
+import argparse
+import json
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import torch
+from msgspec import Struct
+
+from kernel_turns.portable import packed_in
+from kernel_turns.problems import GPU, plain, portable_outputs, problem, relative, standing_for
+from turbopi.errors import ConfigError
+from turbopi.kernels.portable.denoise.kernel import unavailable
+from turbopi.kernels.portable.denoise.packing import WeightNumbers
+from turbopi.provenance import Provenance, provenance
+from turbopi.reading import plain_document, read_document
+
+KERNEL, SEED = "denoise.kernel", 11
+APART = 2  # times the error of the native build
+
+
+@dataclass(frozen=True)
+class Case:
+    """One problem of `problems.problem`. blocks: those of another GPU; None: one for each multiprocessor here."""
+
+    target: str  # "compute_80"
+    numbers: WeightNumbers
+    name: str
+    steps: int
+    suffix: int
+    length: int
+    blocks: int | None = None
+
+    def __str__(self) -> str:
+        blocks = "" if self.blocks is None else f", {self.blocks} blocks"
+        return f"{self.name}, {self.numbers}, H={self.suffix}, {self.steps} steps, {self.length} rows{blocks}"
+
+    @property
+    def capability(self) -> tuple[int, int]:
+        number = int(self.target.removeprefix("compute_"))
+        return number // 10, number % 10
+
+
+_KINDS: tuple[tuple[str, WeightNumbers], ...] = (("compute_80", "bf16"), ("compute_80", "int8"), ("compute_89", "fp8"))
+_SIZES = (("golden", 3, 10, 37), ("odd", 3, 17, 101), ("full", 10, 10, 560), ("full", 3, 50, 560))
+_OTHER_GPUS: tuple[tuple[str, WeightNumbers, int], ...] = (  # A100, RTX 3090, Orin twice, RTX 4090, Thor
+    *(("compute_80", "bf16", 108), ("compute_80", "bf16", 82), ("compute_80", "bf16", 16)),
+    *(("compute_80", "int8", 16), ("compute_89", "fp8", 128), ("compute_89", "fp8", 20)),
+)
+CASES = (
+    *(Case(*kind, *size) for kind in _KINDS for size in _SIZES),
+    *(
+        Case(target, numbers, "shallow", 2, suffix, 571, blocks)
+        for target, numbers, blocks in _OTHER_GPUS
+        for suffix in (10, 50)
+    ),
+)
+
+
+class RanAsPtx(Struct, frozen=True, omit_defaults=True):
+    """A case. Numbers are relative rms of the actions: `difference` to the native build, errors to float64."""
+
+    kernel: str
+    variant: str
+    target: str  # what the PTX was compiled for: "compute_80"
+    same: bool  # to the last bit as the native build
+    difference: float
+    error: float
+    error_of_native: float
+    problem: str | None = None
+
+
+class PtxDocument(Struct, frozen=True):
+    """What `python -m kernel_turns.ptx --out` writes."""
+
+    provenance: Provenance
+    rows: list[RanAsPtx]
+
+
+def read_ptx(file: Path) -> PtxDocument:
+    """Raises ConfigError for another file."""
+    return read_document(file, PtxDocument, ConfigError)
+
+
+def compared(case: Case) -> RanAsPtx:
+    """The case as PTX and as machine code, on this GPU."""
+    p = problem(case.name, case.steps, case.suffix, case.length, SEED, GPU)
+    packed = packed_in(p, case.numbers)
+    ptx, _ = portable_outputs(p, packed, blocks=case.blocks, arch=case.target)
+    native, _ = portable_outputs(p, packed, blocks=case.blocks)
+    if packed.scaled:
+        p.layers = standing_for(packed, p)
+    exact = plain(p, torch.float64)[0][-1]
+    row = RanAsPtx(
+        kernel=KERNEL,
+        variant=str(case),
+        target=case.target,
+        same=torch.equal(ptx, native),
+        difference=relative(ptx[-1], native[-1]),
+        error=relative(ptx[-1], exact),
+        error_of_native=relative(native[-1], exact),
+    )
+    return judged(row)
+
+
+def judged(row: RanAsPtx) -> RanAsPtx:
+    """With its problem, if it has one.
+
+    The two compilers may fuse another product with a sum, or not. Then single activations round to their other
+    neighbour, and results are two samples of the same rounding error: at most twice that apart.
+    """
+    most = APART * row.error_of_native
+    if row.same or row.difference <= most:  # not a number is neither
+        return row
+    why = f"differs from the native build by {row.difference:.5f}, more than {APART} times its error"
+    return RanAsPtx(**{name: getattr(row, name) for name in row.__struct_fields__} | {"problem": why})
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m kernel_turns.ptx", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--jobs", type=int, default=8, help="processes at a time, as most of it is compiling")
+    parser.add_argument("--out", type=Path, required=True, help="write JSON here")
+    arguments = parser.parse_args()
+    if (reason := unavailable(GPU)) is not None:
+        parser.error(reason)
+    here = torch.cuda.get_device_capability(GPU)
+    cases = [case for case in CASES if case.capability <= here]
+    with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
+        rows = list(pool.map(compared, cases))
+    for row in rows:
+        found = "same bits" if row.same else f"{row.difference:.5f} apart"
+        print(f"{row.target} {row.variant}: {found}; errors {row.error:.5f}, native {row.error_of_native:.5f}")
+        if row.problem is not None:
+            print(f"    {row.problem}")
+    document = PtxDocument(provenance(GPU), rows)
+    arguments.out.write_text(json.dumps(plain_document(document), indent=1) + "\n")
+    return 1 if any(row.problem for row in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
