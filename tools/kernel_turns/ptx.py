@@ -60,7 +60,11 @@ _OTHER_GPUS: tuple[tuple[str, WeightNumbers, int], ...] = (  # A100, RTX 3090, O
     *(("compute_80", "int8", 16), ("compute_89", "fp8", 128), ("compute_89", "fp8", 20)),
 )
 CASES = (
-    *(Case(*kind, *size) for kind in _KINDS for size in _SIZES),
+    *(
+        Case(target, numbers, name, steps, suffix, length)
+        for target, numbers in _KINDS
+        for name, steps, suffix, length in _SIZES
+    ),
     *(
         Case(target, numbers, "shallow", 2, suffix, 571, blocks)
         for target, numbers, blocks in _OTHER_GPUS
