@@ -81,7 +81,9 @@ def compiled_launch(target: Target, launch: Launch) -> Compiled:
     except PTXASError as e:
         if f"'{target.arch}' is not defined" in str(e):
             ptxas = versions()["ptxas from 10.0 on" if target.number >= 100 else "ptxas"]
-            return row(refused=f"Triton's ptxas {ptxas} doesn't know it; pip install 'nvidia-cuda-nvcc>=13,<14'")
+            return row(
+                refused=f"Triton's ptxas {ptxas} doesn't know it; pip install --no-deps 'nvidia-cuda-nvcc>=13,<14'"
+            )
         return row(problem=next((line for line in str(e).splitlines() if "fatal" in line or "error" in line), str(e)))
     except (triton.CompilationError, RuntimeError, ValueError) as e:
         return row(problem=str(e).strip().splitlines()[-1])

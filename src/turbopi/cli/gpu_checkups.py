@@ -217,7 +217,7 @@ def judge_compilers(index: int, capability: tuple[int, int]) -> Iterator[Row]:
 def newer_ptxas(capability: tuple[int, int]) -> str:
     """CUDA 13's ptxas, of NVIDIA's wheel, for Triton."""
     variable = PTXAS_BLACKWELL_VARIABLE if capability >= (10, 0) else PTXAS_VARIABLE
-    return f"pip install 'nvidia-cuda-nvcc>=13,<14' && export {variable}='{cuda_13_ptxas()}'"
+    return f"pip install --no-deps 'nvidia-cuda-nvcc>=13,<14' && export {variable}='{cuda_13_ptxas()}'"
 
 
 def ptxas_version(arch: int) -> str | None:
