@@ -6,21 +6,39 @@ from pathlib import Path
 import pytest
 import torch
 from kernel_turns.problems import CONFIGS, GPU, has_nvrtc
-from kernel_turns.ptx import CASES, Case, RanAsPtx, compared, judged, read_ptx
+from kernel_turns.ptx import CASES, Case, RanAsPtx, capability_of, compared, judged, read_ptx
 
 from turbopi.errors import ConfigError
+from turbopi.kernels import grid_barrier as barrier
+from turbopi.kernels import nvrtc
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise.packing import WeightNumbers
 
 NUMBERS: dict[str, list[WeightNumbers]] = {"compute_80": ["bf16", "int8"], "compute_89": ["fp8"]}
 
 
+def skip_if_older(target: str) -> None:
+    if torch.cuda.get_device_capability(GPU) < capability_of(target):
+        pytest.skip(f"this GPU is older than {target}")
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.target} {case}")
 def test_ptx_for_an_older_gpu_computes_what_the_native_build_does(case: Case) -> None:
-    if torch.cuda.get_device_capability(GPU) < case.capability:
-        pytest.skip(f"this GPU is older than {case.target}")
+    skip_if_older(case.target)
     assert compared(case).problem is None
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("target", ["compute_80", "compute_89"])
+def test_the_grids_barrier_as_ptx_counts_every_block(target: str) -> None:
+    blocks, rounds = torch.cuda.get_device_properties(GPU).multi_processor_count, 5
+    skip_if_older(target)
+    counter = torch.zeros(1, dtype=torch.int32, device=GPU)  # before the kernel, which is loaded into its context
+    kernel = nvrtc.Kernel(nvrtc.compile_ptx(barrier.SOURCE, target, {}), "turbopi_barriers", 0)
+    kernel.launch_cooperative(blocks, barrier.THREADS, barrier._Args(counter.data_ptr(), rounds))
+    torch.cuda.synchronize()
+    assert int(counter) == rounds * blocks
 
 
 def test_every_number_format_is_run_small_and_at_full_size() -> None:
@@ -69,3 +87,7 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "some.json").write_text('{"rows": []}')
     with pytest.raises(ConfigError, match="provenance"):
         read_ptx(tmp_path / "some.json")
+
+
+def test_a_targets_capability_is_read_from_its_name() -> None:
+    assert (capability_of("compute_89"), capability_of("compute_120")) == ((8, 9), (12, 0))

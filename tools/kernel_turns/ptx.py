@@ -47,10 +47,11 @@ class Case:
         blocks = "" if self.blocks is None else f", {self.blocks} blocks"
         return f"{self.name}, {self.numbers}, H={self.suffix}, {self.steps} steps, {self.length} rows{blocks}"
 
-    @property
-    def capability(self) -> tuple[int, int]:
-        number = int(self.target.removeprefix("compute_"))
-        return number // 10, number % 10
+
+def capability_of(target: str) -> tuple[int, int]:
+    """(8, 0) of "compute_80"."""
+    number = int(target.removeprefix("compute_"))
+    return number // 10, number % 10
 
 
 _KINDS: tuple[tuple[str, WeightNumbers], ...] = (("compute_80", "bf16"), ("compute_80", "int8"), ("compute_89", "fp8"))
@@ -142,7 +143,7 @@ def main() -> int:
     if (reason := unavailable(GPU)) is not None:
         parser.error(reason)
     here = torch.cuda.get_device_capability(GPU)
-    cases = [case for case in CASES if case.capability <= here]
+    cases = [case for case in CASES if capability_of(case.target) <= here]
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
         rows = list(pool.map(compared, cases))
     for row in rows:
