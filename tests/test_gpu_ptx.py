@@ -1,12 +1,15 @@
 """The portable denoising kernel as PTX for older GPUs, which the driver of a newer one compiles."""
 
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 from kernel_turns.problems import CONFIGS, GPU, has_nvrtc
-from kernel_turns.ptx import CASES, Case, RanAsPtx, capability_of, compared, judged, read_ptx
+from kernel_turns.ptx import CASES, TRITON, Case, RanAsPtx, capability_of, compared, judged, read_ptx, triton_rows
 
 from turbopi.errors import ConfigError
 from turbopi.kernels import grid_barrier as barrier
@@ -14,6 +17,7 @@ from turbopi.kernels import nvrtc
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise.packing import WeightNumbers
 
+ROOT = Path(__file__).parents[1]
 NUMBERS: dict[str, list[WeightNumbers]] = {"compute_80": ["bf16", "int8"], "compute_89": ["fp8"]}
 
 
@@ -27,6 +31,14 @@ def skip_if_older(target: str) -> None:
 def test_ptx_for_an_older_gpu_computes_what_the_native_build_does(case: Case) -> None:
     skip_if_older(case.target)
     assert compared(case).problem is None
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("capability", TRITON)
+def test_tritons_kernels_for_an_older_gpu_are_right_in_every_tile(capability: tuple[int, int]) -> None:
+    skip_if_older(f"compute_{capability[0]}{capability[1]}")
+    rows = triton_rows(capability)
+    assert len(rows) > 50 and [(row.kernel, row.variant, row.problem) for row in rows if row.problem] == []
 
 
 @pytest.mark.gpu
@@ -68,8 +80,55 @@ def test_ptx_is_for_its_target_and_kept_apart_from_machine_code(tmp_path: Path, 
     assert denoise.compiled(target, sizes, folder=tmp_path) == ptx
 
 
+FAKED = """
+import torch, triton
+from types import SimpleNamespace
+from triton.backends.compiler import GPUTarget
+from compile_for_all.targets import Target
+from kernel_turns.triton_ptx import compiled_as
+from turbopi.kernels.dependent_launch import capability
+from turbopi.kernels.portable.gemm.kernel import product
+from turbopi.kernels.portable.gemm.tiles import Tile
+from turbopi.kernels.portable.quantize import quantize
+from turbopi.quantization.formats import INT8
+
+class Driver:
+    loaded = []
+    utils = SimpleNamespace(
+        load_binary=lambda name, code, *rest: Driver.loaded.append(code) or (1, 2, 32, 0, 1024),
+        get_device_properties=lambda device: {"max_shared_mem": 232448},
+    )
+    launcher_cls = staticmethod(lambda *made: lambda *args, **more: None)
+    get_current_device = get_current_stream = lambda self, *device: 0
+    get_current_target = lambda self: GPUTarget("cuda", 90, 32)
+
+def run():
+    weight = quantize(torch.ones(64, 128, dtype=torch.bfloat16), 0.03, format=INT8)
+    product(torch.zeros(64, 128, dtype=torch.int8), weight, tile=Tile(32, 64, 4, 6))
+    return Driver.loaded[-1]
+
+triton.runtime.driver.set_active(Driver())
+assert run()[:4] == b"\\x7fELF"
+for older in ((8, 0), (8, 6)):
+    with compiled_as(Target(older)):
+        code = run()
+        assert capability(torch.device("cuda", 0)) == older
+    assert b".target sm_%d%d" % older in code and code.endswith(bytes(1)), code[:300]
+    assert run()[:4] == b"\\x7fELF", "it is itself again"
+print(len(Driver.loaded))
+"""
+
+
+def test_triton_compiles_ptx_for_the_older_gpu_and_then_for_its_own_again() -> None:
+    pytest.importorskip("triton", reason="Triton isn't installed")
+    environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    environment["PYTHONPATH"] = f"{ROOT / 'src'}{os.pathsep}{ROOT / 'tools'}"
+    done = subprocess.run([sys.executable, "-c", FAKED], capture_output=True, text=True, env=environment, cwd=ROOT)
+    assert done.stdout.split() == ["5"], done.stderr
+
+
 def row(same: bool, difference: float) -> RanAsPtx:
-    return RanAsPtx("denoise.kernel", "one", "compute_80", same, difference, 0.004, 0.003)
+    return RanAsPtx("denoise.kernel", "one", "compute_80", "native build", difference, 0.006, same, 0.004)
 
 
 @pytest.mark.parametrize(

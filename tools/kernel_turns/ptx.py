@@ -1,26 +1,30 @@
-"""Run the portable denoising kernel as PTX for older GPUs on this one, and compare it with its own machine code.
+"""Run the portable kernels as PTX for older GPUs on this one: are results right?
 
     export PYTHONPATH=src:tools
     python -m kernel_turns.ptx --out benchmarks/results/h200_2026-11-26_ptx.json
 
-The driver compiles PTX for the GPU that loads it, so instructions are those of the older GPU, and speed isn't. Some
-cases take as many blocks as another GPU has multiprocessors, as products and attention are cut by that number. Both are
-judged against float64. Exit code 1 if a case has a problem.
+The driver compiles PTX for the GPU that loads it, so instructions are those of the older GPU, and speed isn't. The
+denoising kernel is compared with its native build; some cases take as many blocks as another GPU has multiprocessors,
+as products and attention are cut by that number. Triton's products and attention, in every tile that the older GPU may
+take, are compared with float32 (triton_ptx.py). Exit code 1 if one has a problem.
 """
 
 import argparse
 import json
+import math
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Literal
 
 import torch
 from msgspec import Struct
 
 from kernel_turns.portable import packed_in
 from kernel_turns.problems import GPU, plain, portable_outputs, problem, relative, standing_for
+from turbopi.backends.tuned_tiles import knobs_text
 from turbopi.errors import ConfigError
 from turbopi.kernels.portable.denoise.kernel import unavailable
 from turbopi.kernels.portable.denoise.packing import WeightNumbers
@@ -28,6 +32,7 @@ from turbopi.provenance import Provenance, provenance
 from turbopi.reading import plain_document, read_document
 
 KERNEL, SEED = "denoise.kernel", 11
+TRITON = ((8, 0), (8, 6), (8, 9))  # what Triton's kernels are compiled for
 APART = 2  # times the error of the native build
 
 
@@ -75,15 +80,16 @@ CASES = (
 
 
 class RanAsPtx(Struct, frozen=True, omit_defaults=True):
-    """A case. Numbers are relative rms of the actions: `difference` to the native build, errors to float64."""
+    """One case. Numbers are relative rms."""
 
     kernel: str
     variant: str
     target: str  # what the PTX was compiled for: "compute_80"
-    same: bool  # to the last bit as the native build
-    difference: float
-    error: float
-    error_of_native: float
+    against: Literal["native build", "float32"]
+    difference: float | None  # to that; None: it didn't run
+    most: float  # what it may be
+    same: bool = False  # to the last bit
+    error: float | None = None  # of actions, to float64
     problem: str | None = None
 
 
@@ -112,10 +118,11 @@ def compared(case: Case) -> RanAsPtx:
         kernel=KERNEL,
         variant=str(case),
         target=case.target,
-        same=torch.equal(ptx, native),
+        against="native build",
         difference=relative(ptx[-1], native[-1]),
+        most=APART * relative(native[-1], exact),
+        same=torch.equal(ptx, native),
         error=relative(ptx[-1], exact),
-        error_of_native=relative(native[-1], exact),
     )
     return judged(row)
 
@@ -126,11 +133,31 @@ def judged(row: RanAsPtx) -> RanAsPtx:
     The two compilers may fuse another product with a sum, or not. Then single activations round to their other
     neighbour, and results are two samples of the same rounding error: at most twice that apart.
     """
-    most = APART * row.error_of_native
-    if row.same or row.difference <= most:  # not a number is neither
+    if row.same or (row.difference is not None and row.difference <= row.most):  # not a number is neither
         return row
     why = f"differs from the native build by {row.difference:.5f}, more than {APART} times its error"
     return RanAsPtx(**{name: getattr(row, name) for name in row.__struct_fields__} | {"problem": why})
+
+
+def triton_rows(capability: tuple[int, int]) -> list[RanAsPtx]:
+    """Triton's kernels for a GPU of this compute capability."""
+    from compile_for_all.targets import Target
+
+    from kernel_turns.triton_ptx import results
+
+    target = Target(capability)
+    return [
+        RanAsPtx(
+            kernel=f"Triton: {one.operation}",
+            variant=f"{one.name}, {one.numbers}{', out in eight bits' * one.out_fp8}, {knobs_text(knobs)}",
+            target=f"compute_{target.number}",
+            against="float32",
+            difference=error if error is not None and math.isfinite(error) else None,
+            most=most,
+            problem=why,
+        )
+        for one, knobs, error, most, why in results(target)
+    ]
 
 
 def main() -> int:
@@ -144,13 +171,19 @@ def main() -> int:
         parser.error(reason)
     here = torch.cuda.get_device_capability(GPU)
     cases = [case for case in CASES if capability_of(case.target) <= here]
+    older = [capability for capability in TRITON if capability <= here]
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
+        of_triton = [pool.submit(triton_rows, capability) for capability in older]
         rows = list(pool.map(compared, cases))
+        rows += [row for job in of_triton for row in job.result()]
     for row in rows:
-        found = "same bits" if row.same else f"{row.difference:.5f} apart"
-        print(f"{row.target} {row.variant}: {found}; errors {row.error:.5f}, native {row.error_of_native:.5f}")
+        if row.kernel == KERNEL:
+            found = "same bits" if row.same else f"{row.difference:.5f} apart"
+            print(f"{row.target} {row.variant}: {found}, at most {row.most:.5f}; error {row.error:.5f}")
+    for row in rows:
         if row.problem is not None:
-            print(f"    {row.problem}")
+            print(f"{row.target} {row.kernel} {row.variant}: {row.problem}")
+    print(f"{len(rows)} cases, {sum(row.problem is not None for row in rows)} with a problem")
     document = PtxDocument(provenance(GPU), rows)
     arguments.out.write_text(json.dumps(plain_document(document), indent=1) + "\n")
     return 1 if any(row.problem for row in rows) else 0
