@@ -71,22 +71,21 @@ class Checkpoint:
         """One of "openpi_torch", "openpi_jax", "lerobot", "onnx", "random"."""
         return self.source.format
 
-    def load(self, to: torch.device | str | Room, precision: FloatPrecision, *, progress: bool = False) -> Loaded:
-        """Read all weights straight into their final dtype and place, a piece at a time.
+    def load(self, device: torch.device | str | Room, precision: FloatPrecision, *, progress: bool = False) -> Loaded:
+        """Read all weights straight into their final dtype and device, or where a room has them, a piece at a time.
 
         Host memory besides the result stays small: safetensors are mapped, Orbax arrays decoded one chunk at a time.
         Raises CheckpointError if a value is NaN or infinite, as it is stored or in that precision, and as `check_hash`;
         its kind GraphsOnly for an ONNX export.
         """
         self.check_hash()
-        room = OneDevice(torch.device(to)) if isinstance(to, (str, torch.device)) else to
-        device = room.device
+        room = OneDevice(torch.device(device)) if isinstance(device, (str, torch.device)) else device
         began = time.perf_counter()
         shapes = self.source.shapes
         state: dict[str, Tensor] = {}
         sums: dict[torch.device, list[Tensor]] = {}  # of the pieces: one is finite only if all of its values are
         with progress_bar(progress, f"loading {self.format}", self.stored_bytes) as advance:
-            for piece in self.source.pieces(device):
+            for piece in self.source.pieces(room.device):
                 if piece.name not in state:
                     dtype = parameter_dtype(piece.name, precision)
                     state[piece.name] = room(piece.name, shapes[piece.name], dtype)
@@ -97,8 +96,8 @@ class Checkpoint:
         if not all(all(torch.stack(some).isfinite().tolist()) for some in sums.values()):  # one may have overflowed
             for name, tensor in state.items():
                 check_finite(tensor, self.source.native_name(name), self.path)
-        if device.type == "cuda":
-            torch.cuda.current_stream(device).synchronize()  # not the device: others may be capturing
+        if room.device.type == "cuda":
+            torch.cuda.current_stream(room.device).synchronize()  # not the device: others may be capturing
         total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
         return Loaded(state, time.perf_counter() - began, total)
 
