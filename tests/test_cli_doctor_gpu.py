@@ -111,6 +111,7 @@ def test_what_runs_is_what_the_backends_say(capability: tuple[int, int], fake: F
             assert row == Row("OK", row.name, f"doesn't run: {refused}")
         else:
             assert row.level == "OK" and row.found.startswith(f"{chosen}: ")
+            assert ("never run on compute capability" in row.found) == (capability != (9, 0))
             took = measured_gb(chosen, precision)
             assert took is None or f"takes {took + gpu_checkups.CONTEXT_GB:.1f} GB" in row.found
 
@@ -258,7 +259,7 @@ def test_a_ptxas_that_does_not_know_the_gpu_is_told(
     assert (row is None) == good
     if row is not None:
         variable = "TRITON_PTXAS_BLACKWELL_PATH" if capability >= (10, 0) else "TRITON_PTXAS_PATH"
-        assert row.fix.startswith("pip install 'nvidia-cuda-nvcc>=13,<14' && export " + variable)
+        assert row.fix.startswith("pip install --no-deps 'nvidia-cuda-nvcc>=13,<14' && export " + variable)
         assert row.fix.endswith("nvidia/cu13/bin/ptxas'")
 
 

@@ -80,12 +80,25 @@ def test_compiled_kernels_are_counted_by_target(tmp_path: Path) -> None:
         {"kernel": "a", "variant": "1", "target": "sm_120a"},
     ]
     (tmp_path / tables.COMPILED).write_text(json.dumps({"rows": rows}))
-    (tmp_path / tables.AS_PTX).write_text(json.dumps({"rows": rows[3:]}))
     found = tables.gpus(tmp_path)
     assert cells(found, "GeForce RTX 4090")["kernels compiled"] == "1 of 2"
     assert cells(found, "GeForce RTX 5090")["kernels compiled"] == "1"
-    assert cells(found, "GeForce RTX 5090")["run as PTX on Hopper"] == "1"
     assert cells(found, "A100 80 GB SXM")["kernels compiled"] == "no"
+
+
+def test_cases_run_as_ptx_count_for_their_gpu_and_newer_ones(tmp_path: Path) -> None:
+    (tmp_path / tables.TESTED).write_bytes((ROOT / "benchmarks/results/gpu_check.json").read_bytes())
+    head = "run as PTX on Hopper"
+    assert {cells(tables.gpus(tmp_path), gpu.name)[head] for gpu in published_gpus().values()} == {"not run yet"}
+    rows = [{"target": "compute_80"}, {"target": "compute_80"}, {"target": "compute_89"}]
+    (tmp_path / "h200_2026-11-26_ptx.json").write_text(json.dumps({"rows": rows}))
+    (tmp_path / "h100_2026-11-25_ptx.json").write_text(json.dumps({"rows": rows * 2}))  # an older one
+    found = tables.gpus(tmp_path)
+    for name, count in (("A100 80 GB SXM", "2"), ("Jetson AGX Orin 64 GB", "2"), ("GeForce RTX 4090", "3")):
+        assert cells(found, name)[head] == count
+    rows[2]["problem"] = "differs"
+    (tmp_path / "h100_2026-11-27_ptx.json").write_text(json.dumps({"rows": rows}))
+    assert cells(tables.gpus(tmp_path), "Jetson AGX Thor (T5000)")[head] == "2 of 3"
 
 
 def test_predictions_are_of_the_backend_that_runs_there() -> None:

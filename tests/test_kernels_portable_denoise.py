@@ -9,17 +9,16 @@ from kernel_turns.problems import (
     CONFIGS,
     FULL,
     GPU,
-    Problem,
     has_nvrtc,
     input_scales,
     int8_inputs,
     ordinary_bf16,
     plain,
+    portable_outputs,
     problem,
     relative,
     standing_for,
 )
-from torch import Tensor
 
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.portable.denoise import kernel as denoise
@@ -125,20 +124,6 @@ def test_the_source_compiles_for_gpus_that_are_not_here(tmp_path: Path, arch: st
 # ---- on a GPU
 
 
-def run(p: Problem, packed: PackedExpert, blocks: int | None = None) -> tuple[Tensor, Tensor]:
-    """Both outputs, poisoned before."""
-    steps, chunk, rows = p.table.shape[0], p.noise.shape, p.cache_k.shape[1]
-    x_t = torch.full((steps + 1, *chunk), torch.nan, device=GPU)
-    v_t = torch.full((steps, *chunk), torch.nan, device=GPU)
-    kernel = denoise.PortableDenoiser(
-        *(p.config, packed, p.small, p.table), cache_rows=rows, suffix=chunk[0], device=GPU, blocks=blocks
-    )
-    for _ in range(2):  # scratch memory of the first launch changes nothing
-        kernel.launch(p.noise, p.cache_k, p.cache_v, torch.tensor([p.length], device=GPU), x_t, v_t)
-    torch.cuda.synchronize()
-    return x_t, v_t
-
-
 SHAPES = pytest.mark.parametrize(
     ("name", "steps", "suffix", "length"),
     [
@@ -161,7 +146,7 @@ SHAPES = pytest.mark.parametrize(
 @SHAPES
 def test_kernel_is_as_exact_as_ordinary_bf16(name: str, steps: int, suffix: int, length: int) -> None:
     p = problem(name, steps, suffix, length, steps * 1000 + suffix, GPU)
-    x_t, v_t = run(p, PackedExpert.pack(p.config, p.layers))
+    x_t, v_t = portable_outputs(p, PackedExpert.pack(p.config, p.layers))
     reference, _ = plain(p, torch.float64)
     assert torch.equal(x_t[0], p.noise)
     torch.testing.assert_close(x_t[1:], euler_step(x_t[:-1], v_t, steps), rtol=0, atol=0)
@@ -173,7 +158,7 @@ def test_kernel_is_as_exact_as_ordinary_bf16(name: str, steps: int, suffix: int,
 def test_with_int8_weights_it_is_as_exact_as_ordinary_bf16(name: str, steps: int, suffix: int, length: int) -> None:
     p = problem(name, steps, suffix, length, steps * 1000 + suffix, GPU)
     packed = PackedExpert.pack(p.config, p.layers, int8_inputs(p), format=INT8)
-    x_t, _ = run(p, packed)
+    x_t, _ = portable_outputs(p, packed)
     ordinary = relative(ordinary_bf16(p), plain(p, torch.float64)[0][-1])  # of the weights before they were rounded
     p.layers = standing_for(packed, p)
     assert relative(x_t[-1], plain(p, torch.float64)[0][-1]) <= 1.1 * ordinary
@@ -184,7 +169,7 @@ def test_with_int8_weights_it_is_as_exact_as_ordinary_bf16(name: str, steps: int
 def test_any_number_of_blocks_gives_the_same(blocks: int) -> None:
     p = problem("tiny", 2, 20, 100, 5, GPU)
     packed = PackedExpert.pack(p.config, p.layers)
-    assert relative(run(p, packed, blocks=blocks)[0], run(p, packed)[0]) < 5e-3
+    assert relative(portable_outputs(p, packed, blocks=blocks)[0], portable_outputs(p, packed)[0]) < 5e-3
 
 
 @pytest.mark.gpu
@@ -197,7 +182,7 @@ def test_in_fp8_it_is_as_exact_as_its_emulation(name: str, steps: int, suffix: i
     for seed in range(4 if name in ("shallow", "full") else 16):
         p = problem(name, steps, suffix, length, seed, GPU)
         packed = PackedExpert.pack(p.config, p.layers, input_scales(p))
-        x_t, _ = run(p, packed)
+        x_t, _ = portable_outputs(p, packed)
         p.layers = standing_for(packed, p)
         reference = plain(p, torch.float64)[0][-1]
         ours.append(relative(x_t[-1], reference))

@@ -80,7 +80,7 @@ def run(
     seed: int = 0,
     choice: denoise.Choices | None = None,
 ) -> tuple[Tensor, Tensor]:
-    def load(device: torch.device, sizes: dict[str, int]) -> tuple[Any, Any]:
+    def load(device: torch.device, sizes: dict[str, int], arch: str | None) -> tuple[Any, Any]:
         return Emulated(sizes, folder, seed, prepare=False), Emulated(sizes, folder, seed, prepare=True)
 
     monkeypatch.setattr(denoise, "load", load)
@@ -110,6 +110,7 @@ def run(
         ("odd", 1, 17, 70, 2),
         ("uneven", 1, 10, 30, 3),
         ("golden", 1, 50, 300, 2),
+        ("uneven", 1, 50, 30, 1),  # gate and up in four passes
     ],
 )
 def test_the_loop_is_as_exact_as_ordinary_bf16(

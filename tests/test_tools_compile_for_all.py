@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
+from compile_for_all.allowed import ALLOWED, allowed
 from compile_for_all.document import CompiledForAll, read_compiled
 from compile_for_all.targets import TARGETS, over_limit
 
@@ -69,3 +70,23 @@ def test_what_is_over_a_limit_is_named() -> None:
 
 def test_all_targets_are_there() -> None:
     assert {target.arch for target in TARGETS} == ALL
+
+
+def test_the_checked_in_result_has_every_target_and_no_problem() -> None:
+    result = read_compiled(ROOT / "benchmarks/results/compiled_for_all.json")
+    assert {row.target for row in result.rows} == ALL
+    assert [row for row in result.rows if row.problem] == []
+    assert {row.kernel for row in result.rows if row.refused} == {"gemm.kernel.product, FP8"}
+
+
+@pytest.mark.parametrize(("kernel", "number"), [(kernel, number) for kernel in ALLOWED for number in ALLOWED[kernel]])
+def test_what_may_spill_is_what_does(kernel: str, number: int) -> None:
+    """A bound that nothing needs any more is taken down."""
+    rows = read_compiled(ROOT / "benchmarks/results/compiled_for_all.json").rows
+    (arch,) = (target.arch for target in TARGETS if target.number == number)
+    most = max(row.spilled for row in rows if row.kernel.startswith(kernel) and row.target == arch)
+    assert most == ALLOWED[kernel][number] == allowed(f"{kernel}, H=10", number)
+
+
+def test_what_is_not_named_may_not_spill() -> None:
+    assert allowed("attention.vision", 90) == allowed("batch.suffix", 80) == 0

@@ -102,7 +102,8 @@ def product_files() -> list[Path]:
 
 def fingerprint() -> dict[str, str]:
     """{file, relative to the repository: hash of its code} for the product's files and the GPU tests."""
-    files = [*product_files(), *gpu_test_files(), ROOT / "tests/conftest.py", ROOT / "tools/kernel_turns/problems.py"]
+    judging = [ROOT / "tools/kernel_turns" / name for name in ("problems.py", "portable.py", "ptx.py", "triton_ptx.py")]
+    files = [*product_files(), *gpu_test_files(), ROOT / "tests/conftest.py", *judging]
     code = {str(path.relative_to(ROOT)): code_of(path) for path in files}
     return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in code.items()}
 

@@ -27,6 +27,7 @@ from turbopi.arguments import (
 from turbopi.backends import Precision
 from turbopi.backends.lost import Guard
 from turbopi.checkpoint import Checkpoint, open_checkpoint
+from turbopi.checkpoint.base import Room
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import PolicyConfig, Solver, TimeGrid
 from turbopi.errors import ActionError, ConfigError, ObservationError
@@ -119,7 +120,7 @@ class UnifiedPolicy:
             logger.warning("%s", note)
         self._loading: dict[str, Any] = {}
 
-        def load(to: torch.device, in_precision: FloatPrecision) -> dict[str, torch.Tensor]:
+        def load(to: torch.device | Room, in_precision: FloatPrecision) -> dict[str, torch.Tensor]:
             loaded = checkpoint.load(to, in_precision, progress=progress)
             self._loading = {"load_seconds": round(loaded.seconds, 3), "weight_bytes": loaded.bytes}
             return loaded.state

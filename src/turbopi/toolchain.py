@@ -4,6 +4,7 @@ import shutil
 import sysconfig
 from pathlib import Path
 
+PTXAS_VARIABLE, PTXAS_BLACKWELL_VARIABLE = "TRITON_PTXAS_PATH", "TRITON_PTXAS_BLACKWELL_PATH"  # below 10.0, from it on
 _INSTALL = "on Debian and Ubuntu: apt-get install g++ python3-dev"
 
 
@@ -24,3 +25,8 @@ def missing_for_cpp() -> str | None:
 def _missing_headers() -> str | None:
     header = Path(sysconfig.get_paths()["include"]) / "Python.h"
     return None if header.is_file() else f"no {header}, Python's headers ({_INSTALL})"
+
+
+def cuda_13_ptxas() -> Path:
+    """Where the wheel nvidia-cuda-nvcc puts CUDA 13's ptxas, whether it is installed or not."""
+    return Path(sysconfig.get_paths()["purelib"]) / "nvidia" / "cu13" / "bin" / "ptxas"

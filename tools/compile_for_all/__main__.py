@@ -5,8 +5,9 @@
 
 Triton's kernels in each variant that the full model launches there, products and attention in each tile that
 `turbopi tune` may choose; CUDA C++ kernels by NVRTC: those below kernels/portable for each target, Hopper's for 90a.
-Exit code 1 if one doesn't compile, spills or takes more than a block may have. That it compiles doesn't say that it was
-run.
+Triton's own ptxas doesn't know 11.0: pip install --no-deps 'nvidia-cuda-nvcc>=13,<14' brings one that is taken for it.
+Exit code 1 if one doesn't compile, spills more than allowed.py says or takes more than a block may have. That it
+compiles doesn't say that it was run.
 """
 
 import argparse

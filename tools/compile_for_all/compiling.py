@@ -4,12 +4,14 @@ import contextlib
 import importlib
 import importlib.metadata
 import io
+import os
 import pkgutil
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import machine_code
 import triton
@@ -18,6 +20,7 @@ from triton.compiler import ASTSource
 from triton.runtime.errors import PTXASError
 from triton.runtime.jit import JITFunction
 
+from compile_for_all.allowed import allowed
 from compile_for_all.calls import all_calls
 from compile_for_all.cubin import used
 from compile_for_all.document import Compiled
@@ -29,12 +32,28 @@ from turbopi.kernels import portable
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise.packing import WeightNumbers
 from turbopi.kernels.portable.gemm.tiles import fp8_refusal
+from turbopi.toolchain import PTXAS_BLACKWELL_VARIABLE, cuda_13_ptxas
 
-HOPPER = (9, 0)
+HOPPER, THOR = (9, 0), (11, 0)
 
 
 def compile_target(target: Target, only: str = "", chosen: bool = False) -> list[Compiled]:
     """A row for each kernel and variant; `only`: of kernels with this in their name."""
+    with patch.dict(os.environ, ptxas_of(target)):
+        return _compile_target(target, only, chosen)
+
+
+def ptxas_of(target: Target) -> dict[str, str]:
+    """What names the ptxas for a target that Triton's own doesn't know, as `turbopi doctor` says; nothing for others,
+    or where one is named already, or that one isn't installed.
+    """
+    newer = cuda_13_ptxas()
+    if target.capability != THOR or PTXAS_BLACKWELL_VARIABLE in os.environ or not newer.is_file():
+        return {}
+    return {PTXAS_BLACKWELL_VARIABLE: str(newer)}
+
+
+def _compile_target(target: Target, only: str, chosen: bool) -> list[Compiled]:
     found = [one for one in launches(target, all_calls(target, chosen)) if only in one.name]
     rows = [compiled_launch(target, launch) for launch in found]
     for name, make in cuda_kernels(target):
@@ -63,17 +82,23 @@ def compiled_launch(target: Target, launch: Launch) -> Compiled:
         if f"'{target.arch}' is not defined" in str(e):
             ptxas = versions()["ptxas from 10.0 on" if target.number >= 100 else "ptxas"]
             return row(
-                refused=f"Triton's ptxas {ptxas} doesn't know it; set TRITON_PTXAS_BLACKWELL_PATH to a newer one"
+                refused=f"Triton's ptxas {ptxas} doesn't know it; pip install --no-deps 'nvidia-cuda-nvcc>=13,<14'"
             )
         return row(problem=next((line for line in str(e).splitlines() if "fatal" in line or "error" in line), str(e)))
     except (triton.CompilationError, RuntimeError, ValueError) as e:
         return row(problem=str(e).strip().splitlines()[-1])
     registers, spilled, _ = used(code.asm["cubin"])
     shared = int(code.metadata.shared)
-    problem = over_limit(target, registers, shared, launch.threads)
-    if problem is None and spilled:
-        problem = f"a thread spills {spilled} bytes"
+    problem = over_limit(target, registers, shared, launch.threads) or over_allowed(launch.name, target, spilled)
     return row(registers=registers, spilled=spilled, shared=shared, problem=problem)
+
+
+def over_allowed(kernel: str, target: Target, spilled: int) -> str | None:
+    """What a kernel spills too much, in words."""
+    may = allowed(kernel, target.number)
+    if spilled <= may:
+        return None
+    return f"a thread spills {spilled} bytes" + (f", {may} are allowed" if may else "")
 
 
 def compiled_cuda(target: Target, name: str, make: Callable[[Path | None], bytes]) -> Compiled:
@@ -81,7 +106,7 @@ def compiled_cuda(target: Target, name: str, make: Callable[[Path | None], bytes
         registers, spilled, shared = used(make(None))
     except BackendError as e:
         return Compiled(name, "", target.arch, problem=str(e).splitlines()[0])
-    return Compiled(name, "", target.arch, registers, spilled, shared)
+    return Compiled(name, "", target.arch, registers, spilled, shared, over_allowed(name, target, spilled))
 
 
 def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], bytes]]]:
@@ -105,7 +130,7 @@ def _denoising(target: Target, suffix: int, weights: WeightNumbers, folder: Path
         choice=denoise.choices(suffix),
     )
     assert target.shared >= denoise.SHARED_BYTES, target
-    return denoise.compiled(target.arch, sizes, folder=folder)
+    return denoise.compiled(denoise.native_arch(target.capability), sizes, folder=folder)
 
 
 def portable_modules() -> list[Any]:
@@ -127,9 +152,12 @@ def triton_kernels() -> set[str]:
 def versions() -> dict[str, str]:
     """The compilers'."""
     nvidia = triton.knobs.nvidia
+    with patch.dict(os.environ, ptxas_of(Target(THOR))):
+        of_thor = nvidia.ptxas_blackwell.version
     return {
         "triton": importlib.metadata.version("triton"),
         "ptxas": nvidia.ptxas.version,
         "ptxas from 10.0 on": nvidia.ptxas_blackwell.version,
+        "ptxas of 11.0": of_thor,
         "nvrtc": machine_code.compiler() or "none",
     }

@@ -27,7 +27,7 @@ from turbopi.errors import TurboPiError
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 TESTED = "gpu_check.json"
-COMPILED, AS_PTX = "compiled_for_all.json", "ptx_on_hopper.json"
+COMPILED, AS_PTX = "compiled_for_all.json", "h?00_*_ptx.json"  # the second of an H100 or H200; its newest counts
 DEVICE = torch.device("cuda", 0)
 TIERS: tuple[Precision, ...] = tuple(one for one in backends.PRECISIONS if one != "f32" and not one.endswith("-mlp"))
 
@@ -85,12 +85,30 @@ def rows_of(file: Path) -> list[dict[str, object]]:
     return [row for row in rows if isinstance(row, dict) and "target" in row]
 
 
-def done(gpu: GpuSpec, rows: list[dict[str, object]]) -> str:
+def ran_as_ptx(gpu: GpuSpec, results: Path) -> str:
+    """How many cases of kernels as PTX for this GPU, or an older one, a newer GPU computed right."""
+    files = sorted(results.glob(AS_PTX), key=lambda file: file.name.split("_")[1:])
+    number = gpu.capability[0] * 10 + gpu.capability[1]
+    rows = [row for row in rows_of(files[-1]) if target_number(row) <= number] if files else []
+    return counted(rows) or "not run yet"
+
+
+def compiled_for(gpu: GpuSpec, results: Path) -> str:
     """How many kernels are fit for a GPU, of those that are meant for it."""
-    digits = "".join(map(str, gpu.capability))
-    mine = [row for row in rows if re.sub(r"\D", "", str(row["target"])) == digits and not row.get("refused")]
-    fit = sum(not row.get("problem") for row in mine)
-    return "no" if not mine else f"{fit}" if fit == len(mine) else f"{fit} of {len(mine)}"
+    number = gpu.capability[0] * 10 + gpu.capability[1]
+    mine = [row for row in rows_of(results / COMPILED) if target_number(row) == number and not row.get("refused")]
+    return counted(mine) or "no"
+
+
+def target_number(row: dict[str, object]) -> int:
+    """80 of "sm_80" and "compute_80", 120 of "sm_120a"."""
+    return int(re.sub(r"\D", "", str(row["target"])))
+
+
+def counted(rows: list[dict[str, object]]) -> str:
+    """How many rows have no problem, and of how many if some have one; nothing for none."""
+    fit = sum(not row.get("problem") for row in rows)
+    return "" if not rows else f"{fit}" if fit == len(rows) else f"{fit} of {len(rows)}"
 
 
 def was_run(gpu: GpuSpec, results: Path) -> str:
@@ -107,13 +125,12 @@ def was_run(gpu: GpuSpec, results: Path) -> str:
 
 def gpus(results: Path = RESULTS) -> list[str]:
     """Each GPU: what `auto` takes by precision, and what was run, run as PTX, compiled."""
-    compiled, as_ptx = rows_of(results / COMPILED), rows_of(results / AS_PTX)
     heads = ["GPU", "compute capability", *TIERS, "run", "run as PTX on Hopper", "kernels compiled"]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for gpu in published_gpus().values():
         taken = runs(gpu)
         cells = [gpu.name, gpu.compute_capability, *(taken[precision] for precision in TIERS)]
-        cells += [was_run(gpu, results), done(gpu, as_ptx), done(gpu, compiled)]
+        cells += [was_run(gpu, results), ran_as_ptx(gpu, results), compiled_for(gpu, results)]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 

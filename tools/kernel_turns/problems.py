@@ -11,6 +11,7 @@ from turbopi.config import GemmaConfig, ModelConfig, preset
 from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.interface import GemmaLayer, TokenInputs
+from turbopi.kernels.portable.denoise.kernel import PortableDenoiser
 from turbopi.kernels.portable.denoise.packing import PackedExpert
 from turbopi.kernels.sm90.denoise.packing import KINDS
 from turbopi.kernels.sm90.denoise.plain import Operand, denoise_plain, guided
@@ -181,6 +182,27 @@ def standing_for(packed: PackedExpert, p: Problem) -> list[GemmaLayer]:
         dataclasses.replace(layer, **dict(zip(KINDS, packed.matrices(i), strict=True)))
         for i, layer in enumerate(p.layers)
     ]
+
+
+def portable_outputs(
+    p: Problem, packed: PackedExpert, *, blocks: int | None = None, arch: str | None = None
+) -> tuple[Tensor, Tensor]:
+    """x_t and v_t of the portable kernel, poisoned before. blocks, arch: see `PortableDenoiser`."""
+    steps, chunk, rows = p.table.shape[0], p.noise.shape, p.cache_k.shape[1]
+    x_t = torch.full((steps + 1, *chunk), torch.nan, device=GPU)
+    v_t = torch.full((steps, *chunk), torch.nan, device=GPU)
+    kernel = PortableDenoiser(
+        *(p.config, packed, p.small, p.table),
+        cache_rows=rows,
+        suffix=chunk[0],
+        device=GPU,
+        blocks=blocks,
+        arch=arch,
+    )
+    for _ in range(2):  # scratch memory of the first launch changes nothing
+        kernel.launch(p.noise, p.cache_k, p.cache_v, torch.tensor([p.length], device=GPU), x_t, v_t)
+    torch.cuda.synchronize()
+    return x_t, v_t
 
 
 def ordinary_bf16(p: Problem) -> Tensor:

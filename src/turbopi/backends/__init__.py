@@ -150,7 +150,8 @@ def availability(name: str, device: torch.device) -> str | None:
 def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, str]:
     """The backend that "auto" stands for on a device in a precision, and why."""
     if precision in TIERS:
-        return "fused", f"auto: the fast one of those that run in {precision}"
+        untried = _untried("fused", device) if device.type == "cuda" else None
+        return "fused", f"auto: the fast one of those that run in {precision}" + (f"; it {untried}" if untried else "")
     if device.type == "cpu":
         return "pytorch", "auto: on a CPU the eager reference starts at once and compiling gains little"
     reasons: list[str] = []
@@ -167,10 +168,16 @@ def choose(device: torch.device, precision: Precision = "bf16") -> tuple[str, st
 
 def _unproven(name: str, device: torch.device) -> str | None:
     """Why "auto" doesn't take a backend that could run on the device."""
+    untried = _untried(name, device)
+    return None if untried is None else f"it {untried}; try it with backend={name!r}"
+
+
+def _untried(name: str, device: torch.device) -> str | None:
+    """What a backend wasn't run on, in words; None if it was."""
     major, minor = torch.cuda.get_device_capability(device)
     if major in _RUN_ON.get(name, (major,)):
         return None
-    return f"it was never run on compute capability {major}.{minor}; try it with backend={name!r}"
+    return f"was never run on compute capability {major}.{minor}"
 
 
 def check(name: str, device: torch.device, precision: Precision) -> None:

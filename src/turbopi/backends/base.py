@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbopi.checkpoint.base import Room
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.model.conditioning import Conditioning, Conditionings, Form
 from turbopi.model.kv_cache import KVCache
@@ -16,8 +17,8 @@ from turbopi.model.sample import Sample
 from turbopi.observation import Observation
 from turbopi.quantization.plan import Precision
 
-# Loads the checkpoint's tensors, by canonical name, to a device in a precision.
-LoadState = Callable[[torch.device, FloatPrecision], dict[str, Tensor]]
+# Loads the checkpoint's tensors, by canonical name, to a device or a room (`Checkpoint.load`) in a precision.
+LoadState = Callable[[torch.device | Room, FloatPrecision], dict[str, Tensor]]
 
 
 class Begun(Protocol):

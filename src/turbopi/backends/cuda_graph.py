@@ -4,6 +4,7 @@ What is captured, kept and refused: engine/runner.py; of batches: engine/batches
 """
 
 import dataclasses
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -17,6 +18,7 @@ from turbopi.engine.batch_runner import BatchRunner
 from turbopi.engine.call import CallShape
 from turbopi.engine.compiled import compiled
 from turbopi.engine.recent_loops import Loop
+from turbopi.engine.room import PackingRoom, is_conditioning
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import Denoiser, Ops
@@ -47,7 +49,8 @@ class CudaGraphBackend(BatchRunner):
         return None
 
     def _pack(self, load: LoadState) -> Weights:
-        return pack(self.config, load(self.device, "f32" if self.precision == "f32" else "bf16"))
+        room = PackingRoom(self.config, self.device, partial(is_conditioning, self.config))
+        return pack(self.config, load(room, "f32" if self.precision == "f32" else "bf16"))
 
     def _make_ops(self) -> Ops:
         if PyTorchCompileBackend.unavailable(self.device) is not None:

@@ -22,6 +22,7 @@ from turbopi.backends.tuned_tiles import BY_MODEL, Tiles, tiles_of
 from turbopi.config import ModelConfig
 from turbopi.engine.call import CallShape
 from turbopi.engine.recent_loops import Loop
+from turbopi.engine.room import HOST, PackingRoom, is_conditioning
 from turbopi.engine.runner import MAX_CAMERAS, bucket
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
@@ -36,8 +37,6 @@ from turbopi.quantization.sites import KINDS
 from turbopi.toolchain import missing_for_c
 
 logger = logging.getLogger(__name__)
-
-HOST = torch.device("cpu")
 
 
 @runtime_checkable
@@ -147,9 +146,14 @@ class FusedBackend(CudaGraphBackend):
         return described
 
     def _pack(self, load: LoadState) -> Weights:
-        # what is rounded comes to the GPU a matrix at a time, which then never holds the checkpoint in bfloat16
-        whole = self.device if self._plan is None else HOST
-        return pack(self.config, load(whole, "bf16"), self._quantized, device=self.device, expert_device=HOST)
+        def on_host(name: str) -> bool:
+            """What is rounded comes to the GPU a matrix at a time, which then never holds the checkpoint in bfloat16;
+            so does the expert, in its kernel's order.
+            """
+            return self._plan is not None or name.startswith("expert.layers.") or is_conditioning(self.config, name)
+
+        room = PackingRoom(self.config, self.device, on_host)
+        return pack(self.config, load(room, "bf16"), self._quantized, device=self.device, expert_device=HOST)
 
     @property
     def _directions(self) -> Mapping[str, Directions]:

@@ -17,12 +17,31 @@ from torch import Tensor
 
 from turbopi.checkpoint import known_hashes
 from turbopi.checkpoint.norm_stats import NormStats
-from turbopi.checkpoint.source import Piece, WeightSource, check_finite
+from turbopi.checkpoint.source import Piece, Shape, WeightSource, check_finite
 from turbopi.config import PolicyConfig
 from turbopi.errors import CheckpointError
 from turbopi.model.reference import FloatPrecision, parameter_dtype
 
 PARTS = ("vision", "projector", "vlm", "expert")  # the rest: action, state and time projections
+
+
+class Room(Protocol):
+    """Where weights are read to. device: where random ones are made."""
+
+    device: torch.device
+
+    def __call__(self, name: str, shape: Shape, dtype: torch.dtype) -> Tensor:
+        """An uninitialised tensor for a parameter."""
+
+
+@dataclass(frozen=True)
+class OneDevice:
+    """All of them on one device."""
+
+    device: torch.device
+
+    def __call__(self, name: str, shape: Shape, dtype: torch.dtype) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=self.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,32 +71,33 @@ class Checkpoint:
         """One of "openpi_torch", "openpi_jax", "lerobot", "onnx", "random"."""
         return self.source.format
 
-    def load(self, device: torch.device | str, precision: FloatPrecision, *, progress: bool = False) -> Loaded:
-        """Read all weights straight into their final dtype and device, a piece at a time.
+    def load(self, device: torch.device | str | Room, precision: FloatPrecision, *, progress: bool = False) -> Loaded:
+        """Read all weights straight into their final dtype and device, or where a room has them, a piece at a time.
 
         Host memory besides the result stays small: safetensors are mapped, Orbax arrays decoded one chunk at a time.
         Raises CheckpointError if a value is NaN or infinite, as it is stored or in that precision, and as `check_hash`;
         its kind GraphsOnly for an ONNX export.
         """
         self.check_hash()
-        device = torch.device(device)
+        room = OneDevice(torch.device(device)) if isinstance(device, (str, torch.device)) else device
         began = time.perf_counter()
         shapes = self.source.shapes
         state: dict[str, Tensor] = {}
-        sums: list[Tensor] = []  # of the pieces: one is finite only if all of its values are
+        sums: dict[torch.device, list[Tensor]] = {}  # of the pieces: one is finite only if all of its values are
         with progress_bar(progress, f"loading {self.format}", self.stored_bytes) as advance:
-            for piece in self.source.pieces(device):
+            for piece in self.source.pieces(room.device):
                 if piece.name not in state:
                     dtype = parameter_dtype(piece.name, precision)
-                    state[piece.name] = torch.empty(shapes[piece.name], dtype=dtype, device=device)
-                sums.append(put(state[piece.name], piece).sum())
+                    state[piece.name] = room(piece.name, shapes[piece.name], dtype)
+                place = put(state[piece.name], piece)
+                sums.setdefault(place.device, []).append(place.sum())
                 advance.update(piece.values.numel() * piece.values.element_size())
         assert state.keys() == shapes.keys(), state.keys() ^ shapes.keys()
-        if not all(torch.stack(sums).isfinite().tolist()):  # a sum may also have overflowed
+        if not all(all(torch.stack(some).isfinite().tolist()) for some in sums.values()):  # one may have overflowed
             for name, tensor in state.items():
                 check_finite(tensor, self.source.native_name(name), self.path)
-        if device.type == "cuda":
-            torch.cuda.current_stream(device).synchronize()  # not the device: others may be capturing
+        if room.device.type == "cuda":
+            torch.cuda.current_stream(room.device).synchronize()  # not the device: others may be capturing
         total = sum(tensor.numel() * tensor.element_size() for tensor in state.values())
         return Loaded(state, time.perf_counter() - began, total)
 

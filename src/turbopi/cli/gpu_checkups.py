@@ -8,7 +8,6 @@ import importlib.util
 import re
 import shutil
 import subprocess
-import sysconfig
 from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
@@ -19,6 +18,7 @@ from packaging.version import Version
 from turbopi.cli.checkup import FULL_SIZE_GB, Row, has_gpu, imported_torch
 from turbopi.cli.typed import as_typed
 from turbopi.errors import TurboPiError
+from turbopi.toolchain import PTXAS_BLACKWELL_VARIABLE, PTXAS_VARIABLE, cuda_13_ptxas
 
 MIN_CAPABILITY = (8, 0)  # the first with bfloat16 tensor cores
 MIN_DRIVER = {11: 450, 12: 525, 13: 580}  # by CUDA's major version: NVIDIA's CUDA compatibility guide
@@ -216,9 +216,8 @@ def judge_compilers(index: int, capability: tuple[int, int]) -> Iterator[Row]:
 
 def newer_ptxas(capability: tuple[int, int]) -> str:
     """CUDA 13's ptxas, of NVIDIA's wheel, for Triton."""
-    variable = "TRITON_PTXAS_BLACKWELL_PATH" if capability >= (10, 0) else "TRITON_PTXAS_PATH"
-    path = Path(sysconfig.get_paths()["purelib"]) / "nvidia" / "cu13" / "bin" / "ptxas"
-    return f"pip install 'nvidia-cuda-nvcc>=13,<14' && export {variable}='{path}'"
+    variable = PTXAS_BLACKWELL_VARIABLE if capability >= (10, 0) else PTXAS_VARIABLE
+    return f"pip install --no-deps 'nvidia-cuda-nvcc>=13,<14' && export {variable}='{cuda_13_ptxas()}'"
 
 
 def ptxas_version(arch: int) -> str | None:

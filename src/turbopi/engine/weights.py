@@ -1,7 +1,8 @@
 """A checkpoint's tensors as the engine wants them: matrices that share an input are packed into one, layer by layer.
 
 Packing takes tensors out of the state as it goes, so that the device never holds more than one layer twice; and if the
-state is the host's, no more than one layer as the checkpoint has it.
+state is the host's, no more than one layer as the checkpoint has it. Of a state that was read to a `PackingRoom`
+nothing is held twice.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import empty_cache
+from turbopi.engine.room import GATE_UP, QKV, is_conditioning, join
 from turbopi.kernels.interface import Affine, AffineMatrix, AnyMatrix, GemmaLayer, State, VisionLayer
 from turbopi.model.denoise import time_embedding, time_grid
 from turbopi.quantization.fp8 import Matrix
@@ -56,7 +58,7 @@ class _Tensors:
         return self(f"{name}.weight"), self(f"{name}.bias")
 
     def joined(self, names: Sequence[str]) -> Tensor:
-        return torch.cat([self(name) for name in names])
+        return join([self._state.pop(name) for name in names], self._device)
 
     def scale(self, name: str) -> Tensor | None:
         """1 + a norm's weight, float32; None for adaRMS, which has none."""
@@ -78,11 +80,8 @@ def pack(
     expert_device  the same for the action expert's layers
     """
     take = _Tensors(state, device)
-    conditioning = {
-        name: state.pop(name).cpu()
-        for name in sorted(state)
-        if ".dense." in name or (config.kind == "pi05" and name.startswith("time_mlp_"))
-    }
+    conditioning = {name: state.pop(name).cpu() for name in sorted(state) if is_conditioning(config, name)}
+    empty_cache()  # of what loading needed besides
     patch_weight, patch_bias = take.affine("vision.patch_embedding")
     state.pop("vlm.norm.weight")  # would change no key and no value
     weights = Weights(
@@ -105,7 +104,7 @@ def pack(
 def _vision_layers(config: ModelConfig, take: _Tensors, make: MakeMatrix) -> Iterator[VisionLayer]:
     for i in range(config.vision.depth):
         prefix = f"vision.layers.{i}"
-        projections = [f"{prefix}.self_attn.{p}_proj" for p in "qkv"]
+        projections = [f"{prefix}.self_attn.{p}" for p in QKV]
 
         def matrix(kind: str, name: str, i: int = i, prefix: str = prefix) -> AffineMatrix:
             weight, bias = take.affine(f"{prefix}.{name}")
@@ -136,8 +135,8 @@ def _gemma_layers(
         if stack == "vlm" and i + 1 == config.vlm.depth:  # nothing but its keys and values is ever used: 0.2 GB
             for name in ("self_attn.o_proj", "mlp.gate_proj", "mlp.up_proj", "mlp.down_proj"):
                 state[f"{prefix}.{name}.weight"] = state[f"{prefix}.{name}.weight"][:0].clone()
-        qkv = take.joined([f"{prefix}.self_attn.{p}_proj.weight" for p in "qkv"])
-        gate_up = take.joined([f"{prefix}.mlp.{p}_proj.weight" for p in ("gate", "up")])
+        qkv = take.joined([f"{prefix}.self_attn.{p}.weight" for p in QKV])
+        gate_up = take.joined([f"{prefix}.mlp.{p}.weight" for p in GATE_UP])
         yield GemmaLayer(
             qkv=make(f"{place}.qkv", qkv),
             out=make(f"{place}.out", take(f"{prefix}.self_attn.o_proj.weight")),
@@ -146,8 +145,7 @@ def _gemma_layers(
             norm1=take.scale(f"{prefix}.input_layernorm"),
             norm2=take.scale(f"{prefix}.post_attention_layernorm"),
         )
-        # gate and up leave two holes that the packed matrix, twice their size, can't fill: 2.4 GB at full size
-        empty_cache()
+        empty_cache()  # of what making them left
 
 
 def modulation(config: ModelConfig, conditioning: State, num_steps: int) -> Tensor | None:

@@ -35,41 +35,52 @@ def compile_cubin(
 
     Raises BackendError with the compiler's log.
     """
+    return _cached("CUBIN", source, arch, defines, folder, ["-lineinfo"] if lines else [])
+
+
+def compile_ptx(source: str, arch: str, defines: dict[str, int], *, folder: Path | None = None) -> bytes:
+    """The same as PTX for `arch` ("compute_80"): any GPU of that compute capability or a newer one runs it, as the
+    driver compiles it when it is loaded.
+    """
+    return _cached("PTX", source, arch, defines, folder, [])
+
+
+def _cached(kind: str, source: str, arch: str, defines: dict[str, int], folder: Path | None, more: list[str]) -> bytes:
     nvrtc = bindings("nvrtc")
     major, minor = checked("nvrtcVersion", nvrtc.nvrtcVersion())
-    options = [f"-arch={arch}", "-std=c++17", *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
-    options += ["-lineinfo"] if lines else []
+    options = [f"-arch={arch}", "-std=c++17", *(f"-D{name}={value}" for name, value in sorted(defines.items())), *more]
     key = hashlib.sha256("\0".join((source, *options, f"{major}.{minor}")).encode()).hexdigest()[:32]
-    path = (folder or cache_folder()) / f"{key}.cubin"
+    path = (folder or cache_folder()) / f"{key}.{kind.lower()}"
     if path.is_file():
         return path.read_bytes()
-    code = _compile(nvrtc, source, options)
+    code = _compile(nvrtc, kind, source, options)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, code)
     logger.info("compiled a kernel for %s: %s", arch, path)
     return code
 
 
-def _compile(nvrtc: Any, source: str, options: list[str]) -> bytes:
+def _compile(nvrtc: Any, kind: str, source: str, options: list[str]) -> bytes:
     program = checked("nvrtcCreateProgram", nvrtc.nvrtcCreateProgram(source.encode(), b"kernel.cu", 0, [], []))
     (status,) = nvrtc.nvrtcCompileProgram(program, len(options), [option.encode() for option in options])
     if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
         log = b" " * checked("nvrtcGetProgramLogSize", nvrtc.nvrtcGetProgramLogSize(program))
         nvrtc.nvrtcGetProgramLog(program, log)
         raise BackendError(f"a kernel doesn't compile with {' '.join(options)}:\n{log.decode().rstrip(chr(0))}")
-    code = b" " * checked("nvrtcGetCUBINSize", nvrtc.nvrtcGetCUBINSize(program))
-    checked("nvrtcGetCUBIN", nvrtc.nvrtcGetCUBIN(program, code))
+    size, get = f"nvrtcGet{kind}Size", f"nvrtcGet{kind}"
+    code = b" " * checked(size, getattr(nvrtc, size)(program))
+    checked(get, getattr(nvrtc, get)(program, code))
     nvrtc.nvrtcDestroyProgram(program)
     return code
 
 
 class Kernel:
-    """One function of a cubin, loaded on the current CUDA device."""
+    """One function of a cubin or of PTX, loaded on the current CUDA device."""
 
-    def __init__(self, cubin: bytes, name: str, shared_bytes: int) -> None:
+    def __init__(self, code: bytes, name: str, shared_bytes: int) -> None:
         self._driver = bindings("driver")
         d = self._driver
-        self._module = checked("cuModuleLoadData", d.cuModuleLoadData(cubin))
+        self._module = checked("cuModuleLoadData", d.cuModuleLoadData(code))
         self._function = checked("cuModuleGetFunction", d.cuModuleGetFunction(self._module, name.encode()))
         self._shared = shared_bytes
         attribute = d.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES

@@ -88,16 +88,19 @@ def race(bench: Bench, candidates: Sequence[Knobs], *, advance: Callable[[], Non
 def checked(bench: Bench, knobs: Knobs) -> tuple[Round | None, str | None]:
     """The timer of a candidate whose result is right, or why it can't be taken."""
     try:
-        error = bench.error(knobs)
-        if not math.isfinite(error):
-            return None, "its result isn't finite, or it left out rows or columns"
-        if error > bench.bound:
-            return None, f"its error is {error:.2g}; at most {bench.bound:.2g} is right"
-        return bench.timer(knobs), None
+        why = wrong(bench.error(knobs), bench.bound)
+        return (bench.timer(knobs), None) if why is None else (None, why)
     except DeviceLost:
         raise
     except Exception as failure:  # a tile that doesn't run is a result
         return None, first_line(failure)
+
+
+def wrong(error: float, bound: float) -> str | None:
+    """What is wrong with a result, by its error; None if it is right."""
+    if not math.isfinite(error):
+        return "its result isn't finite, or it left out rows or columns"
+    return f"its error is {error:.2g}; at most {bound:.2g} is right" if error > bound else None
 
 
 def in_turns(timers: Mapping[int, Round], rounds: int) -> dict[int, list[float]]:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from turbopi.kernels.portable.gemm.tiles import by_mma_sync
 from turbopi.kernels.portable.shared_memory import BLOCK_SHARED, LEAST_SHARED
 from turbopi.kernels.tile_table import TileTable
 
@@ -24,14 +23,17 @@ class AttentionTile:
         """Whether queries, keys and values of so many columns fit shared memory, and the sums registers."""
         shared = (self.rows + 2 * self.stages * self.keys) * columns * 2
         sums = self.rows * (columns + self.keys) // (32 * self.warps)
-        most = MOST_BY_MMA_SYNC if by_mma_sync(capability) else MOST_SUMS
-        return shared <= BLOCK_SHARED.get(capability, LEAST_SHARED) and sums <= most
+        return shared <= BLOCK_SHARED.get(capability, LEAST_SHARED) and sums <= (MOST if roomy(capability) else FEWER)
 
 
-MOST_SUMS, MOST_BY_MMA_SYNC = 160, 100  # a thread: with more it spills
-ROOMY = 227 * 1024  # bytes of shared memory that the first of two usual tiles is for
+def roomy(capability: Capability) -> bool:
+    """Whether registers and shared memory are enough for the larger of two usual tiles. On 11.0 it spills."""
+    return capability in ((9, 0), (10, 0), (10, 3))
+
+
+MOST, FEWER = 160, 100  # sums a thread: with more it spills
 PACKED_ROWS = 64  # as `Segments.tiles` says
-USUAL: dict[Attention, tuple[AttentionTile, AttentionTile]] = {  # the second for less shared memory
+USUAL: dict[Attention, tuple[AttentionTile, AttentionTile]] = {  # the second where there is less room
     "vision_attention": (AttentionTile(64, 64, 4, 3), AttentionTile(64, 64, 4, 3)),
     "prefix_attention": (AttentionTile(64, 64, 4, 2), AttentionTile(64, 32, 8, 2)),
     "packed_attention": (AttentionTile(PACKED_ROWS, 64, 8, 2), AttentionTile(PACKED_ROWS, 32, 8, 2)),
@@ -53,8 +55,8 @@ OTHERS: dict[Attention, tuple[AttentionTile, ...]] = {
 
 def usual_tile(attention: Attention, capability: Capability) -> AttentionTile:
     """What is taken where nobody measured."""
-    roomy, narrow = USUAL[attention]
-    return roomy if BLOCK_SHARED.get(capability, LEAST_SHARED) >= ROOMY else narrow
+    large, small = USUAL[attention]
+    return large if roomy(capability) else small
 
 
 def candidates(attention: Attention, capability: Capability, dim: int) -> list[AttentionTile]:

@@ -16,7 +16,7 @@ from turbopi.config import ModelConfig
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct
 from turbopi.kernels.interface import State, TokenInputs
-from turbopi.kernels.nvrtc import Kernel, compile_cubin
+from turbopi.kernels.nvrtc import Kernel, compile_cubin, compile_ptx
 from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
 from turbopi.kernels.portable.denoise.packing import CHUNK_BYTES, PackedExpert, Tables, WeightNumbers
 
@@ -143,8 +143,14 @@ def source() -> str:
 
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
-    """The kernel's machine code. Raises BackendError with the compiler's log."""
-    return compile_cubin(source(), arch, sizes, folder=folder)
+    """The kernel's machine code ("sm_80") or PTX ("compute_80"). Raises BackendError with the compiler's log."""
+    compile_for = compile_ptx if arch.startswith("compute_") else compile_cubin
+    return compile_for(source(), arch, sizes, folder=folder)
+
+
+def native_arch(capability: tuple[int, int]) -> str:
+    """What the kernel is compiled for on a GPU of this compute capability."""
+    return f"sm_{capability[0]}{capability[1]}"
 
 
 class PortableDenoiser:
@@ -155,6 +161,7 @@ class PortableDenoiser:
     BackendError for a suffix that it doesn't cover, BackendUnavailable for a GPU or a loop with times by token.
 
     choice, blocks  how it is launched; default: as `choices` has it, one block for each multiprocessor
+    arch    what it is compiled for: the GPU at hand, or PTX for an older one ("compute_80")
     traced  slower, and `trace` then says where cycles went
     """
 
@@ -172,6 +179,7 @@ class PortableDenoiser:
         by_token: bool = False,
         choice: Choices | None = None,
         blocks: int | None = None,
+        arch: str | None = None,
         traced: bool = False,
     ) -> None:
         if by_token or num_steps is not None:
@@ -194,7 +202,7 @@ class PortableDenoiser:
             choice=self._choice,
         )
         self._sizes["TP_TRACE"] = int(traced)
-        self._kernel, self._prepare = load(device, self._sizes)
+        self._kernel, self._prepare = load(device, self._sizes, arch)
         self._steps = len(table)
         self._tensors = tensors(packed, small, table.to(device).float().contiguous(), self._sizes)
 
@@ -247,13 +255,12 @@ def has_large_l2(device: torch.device) -> bool:
     return int(torch.cuda.get_device_properties(device).L2_cache_size) >= LARGE_L2
 
 
-def load(device: torch.device, sizes: dict[str, int]) -> tuple[Kernel, Kernel]:
+def load(device: torch.device, sizes: dict[str, int], arch: str | None = None) -> tuple[Kernel, Kernel]:
     """The loop, and what runs in front of it."""
-    major, minor = torch.cuda.get_device_capability(device)
-    cubin = compiled(f"sm_{major}{minor}", sizes)
+    code = compiled(arch or native_arch(torch.cuda.get_device_capability(device)), sizes)
     with torch.cuda.device(device):
-        loop = Kernel(cubin, "turbopi_portable_denoise", SHARED_BYTES)
-        return loop, Kernel(cubin, "turbopi_portable_denoise_prepare", 0)
+        loop = Kernel(code, "turbopi_portable_denoise", SHARED_BYTES)
+        return loop, Kernel(code, "turbopi_portable_denoise_prepare", 0)
 
 
 def tensors(packed: PackedExpert, small: State, table: Tensor, sizes: dict[str, int]) -> dict[str, Tensor]:

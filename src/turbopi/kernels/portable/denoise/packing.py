@@ -108,8 +108,9 @@ class PackedExpert:
         reason = refusal(config)
         if reason is not None:
             raise BackendError(f"the portable denoising kernel can't run this model: {reason}")
-        packed, scales, of_inputs = [], [], []
+        scales, of_inputs = [], []
         device = device or layers[0].qkv.device
+        weights = torch.empty(0, device=device)
         orders = [None if order is None else order.to(device) for order in _orders(config.expert)]
         for i, layer in enumerate(layers):
             parts = [matrix.to(device) for matrix in (layer.qkv, layer.out, layer.gate_up, layer.down)]
@@ -122,8 +123,9 @@ class PackedExpert:
             else:
                 parts = [part.to(torch.bfloat16) for part in parts]
             ordered = [m if order is None else m[order] for m, order in zip(parts, orders, strict=True)]
-            packed.append(torch.cat([tiles(m) for m in ordered]))
-        weights = torch.stack(packed)
+            flat = torch.cat([tiles(m) for m in ordered])
+            weights = flat.new_empty(len(layers), len(flat)) if i == 0 else weights
+            weights[i] = flat
         none = torch.empty(len(layers), 0, device=weights.device)
         return cls(
             config,

@@ -76,6 +76,7 @@ struct Product {
     grid.wait();
     uint4 a[S::A_IN_FLIGHT][GROUPS][PIECES];
     for (int pass = 0; pass < S::PASSES; ++pass) {
+      if (S::PASSES > 1) thread = of_phase(thread), first = of_phase(first), end = of_phase(end);
       if (pass == 0 || S::A_IN_FLIGHT < S::WARP_CHUNKS) {
 #pragma unroll
         for (int chunk = 0; chunk < S::A_IN_FLIGHT; ++chunk) load_chunk(a[chunk], activation, chunk);
