@@ -1,7 +1,7 @@
 """What `python -m small_policy judged` makes of evaluations' folders."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from small_policy.card import write_card
@@ -21,7 +21,7 @@ def run(folder: Path, solved: str, *, weights: str = "w", **protocol: Any) -> Pa
     results = Results(folder, {"suite": "libero_spatial", **protocol}, policy, tasks, {"torch": "2"}, {})
     results.planned = {(0, 30 + place) for place in range(len(solved))}
     for place, one in enumerate(solved):
-        status = "success" if one == "1" else "failure"
+        status: Literal["success", "failure"] = "success" if one == "1" else "failure"
         results.add(Episode(0, 30 + place, status, 90 + place, seed=1, seconds=1.0, motion=MOTION))
     results.save()
     return folder
@@ -55,8 +55,8 @@ def test_the_document_is_read_back_and_makes_the_card(tmp_path: Path) -> None:
     assert table(document)[2] == "| `pytorch`, float32 | 3 of 4 | 75.0 % [30.1, 95.4] |  |"
     assert delayed_table(document)[2].startswith("| `async` | 2 | 3 of 4 | 75.0 % [30.1, 95.4] | +0.0 [")
     curves = tmp_path / "curves.csv"
-    heads = ("seconds", "step", "frames", "dagger_frames", "demonstration", "demonstration solved", "dagger")
-    heads += ("recent_trials", "recent_trials_solved")
+    heads = ["seconds", "step", "frames", "dagger_frames", "demonstration", "demonstration solved", "dagger"]
+    heads += ["recent_trials", "recent_trials_solved"]
     curves.write_text(",".join(heads) + "\n" + ",".join("7" for _ in heads) + "\n")
     write_card(tmp_path / "judged.json", curves, tmp_path / "card.md")
     assert "| 0 | pick up the black bowl" in (tmp_path / "card.md").read_text()
