@@ -32,7 +32,6 @@ from turbopi.kernels.plain_batch import PLAIN_BATCH, visible_to_suffix
 from turbopi.model.conditioning import Conditioning
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 
-
 PLAIN_ROW = Conditioning()  # of an observation that asks for nothing, or an empty place
 
 
@@ -264,9 +263,7 @@ class BatchLoop:
         pi0 = buffers.config.kind == "pi0"
         return k, v, ~visible_to_suffix(starts, lengths, end - count, count, pi0)[:, None]
 
-    def _expert(
-        self, weights: Weights, step: int, rope: forward.Rope, k: Tensor, v: Tensor, hidden: Tensor
-    ) -> Expert:
+    def _expert(self, weights: Weights, step: int, rope: forward.Rope, k: Tensor, v: Tensor, hidden: Tensor) -> Expert:
         buffers, table = self._buffers, self._modulation(step)
         back = buffers.ops.backward or PLAIN_BACKWARD
         return Expert(buffers.config, weights, buffers.ops, back, table, self._seen, k, v, rope, hidden)

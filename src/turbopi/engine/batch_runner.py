@@ -198,7 +198,8 @@ class BatchRunner(GraphRunner):
             return split(count, costs)
         warm = {1, *self._batches.warm_sizes(form)}
         if count > max(warm) > 1 and max(warm) < max(costs):
-            raise not_warm(self.name, f"{count} observations at once", self._batches.describe(), batches=count)
+            needs, conditioned = f"{count} observations at once", form != "plain"
+            raise not_warm(self.name, needs, self._batches.describe(), conditioned=conditioned, batches=count)
         return split(count, {size: cost for size, cost in costs.items() if size in warm})
 
     def _batch_denoises_by(self, loop: Loop, batch: int, rows: int) -> Weights | PairDenoiser:
@@ -243,9 +244,10 @@ class BatchRunner(GraphRunner):
         super()._forget(loop)
         self._batches.forget(loop)
 
-    def _refuse_batch_if_cold(self, needs: str, batch: int) -> None:
+    def _refuse_batch_if_cold(self, needs: str, batch: int, loop: Loop | None) -> None:
         if self.strict and not self._warming:
-            raise not_warm(self.name, needs, self._batches.describe(), batches=batch)
+            what, conditioned = needs if loop is None else f"{needs}, {loop}", loop is not None and loop.form != "plain"
+            raise not_warm(self.name, what, self._batches.describe(), conditioned=conditioned, batches=batch)
 
 
 def _groups(forms: Sequence[Form]) -> Iterator[tuple[Form, list[int]]]:

@@ -37,7 +37,8 @@ class Batches:
     table       a loop's modulation
     denoises_by  what denoises so many observations, of at most so many rows, when that is first captured; of a
                  conditioned loop it is operations
-    refuse      is told what a call needs that isn't captured, and raises if that isn't allowed now
+    refuse      is told what a call needs that isn't captured, for how many, with which loop if that is what is
+                lacking; and raises if that isn't allowed now
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class Batches:
         capture: Capture,
         table: Callable[[Loop], Tensor | None],
         denoises_by: Callable[[Loop, int, int], Weights | PairDenoiser],
-        refuse: Callable[[str, int], None],
+        refuse: Callable[[str, int, Loop | None], None],
     ) -> None:
         self._config, self._weights, self._ops, self._device = config, weights, ops, device
         self._bucket, self._capture, self._table = bucket, capture, table
@@ -189,8 +190,8 @@ class Batches:
 
     def _graph(self, size: BatchSize, key: tuple[Any, ...], capture: Callable[[], Graph]) -> Graph:
         if key not in self._graphs:
-            what = f", {key[-1]}" if key[0] == "denoise" else ""
-            self._refuse(f"{size.batch} observations with {size.pictures} pictures{what}", size.batch)
+            loop = key[-1] if key[0] == "denoise" else None
+            self._refuse(f"{size.batch} observations with {size.pictures} pictures", size.batch, loop)
             self._graphs[key] = capture()
             logger.info("captured %s of %s", key[0], size)
         return self._graphs[key]

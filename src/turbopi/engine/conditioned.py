@@ -63,9 +63,7 @@ def batch_form(conditioning: Conditioning | None) -> Form:
     return "tokens" if form == "solver" and integration is not None and integration.is_euler else form
 
 
-def batch_loop(
-    conditionings: Sequence[Conditioning | None], num_steps: int, horizon: int, config: ModelConfig
-) -> Loop:
+def batch_loop(conditionings: Sequence[Conditioning | None], num_steps: int, horizon: int, config: ModelConfig) -> Loop:
     """The loop of observations that run together, none of the form "solver", all checked.
 
     Its times are all that any of them has, and openpi's, so that plain observations are always among those it is for.
@@ -116,9 +114,7 @@ class Conditioned:
     weights: Tensor  # float32[H, 1], of guidance
 
     @classmethod
-    def allocate(
-        cls, config: ModelConfig, loop: Loop, device: torch.device, batch: int | None = None
-    ) -> "Conditioned":
+    def allocate(cls, config: ModelConfig, loop: Loop, device: torch.device, batch: int | None = None) -> "Conditioned":
         """`batch`: of so many observations; None: of one, without their axis."""
         actions = (loop.horizon,) if batch is None else (batch, loop.horizon)
         grid, chunk = (loop.steps, *actions), (*actions, config.action_dim)

@@ -126,6 +126,11 @@ class Conditioning:
             return "tokens"
         return "plain" if self.integration is None else "solver"
 
+    @property
+    def brings_steps(self) -> bool:
+        """Whether it says itself how many steps its loop has."""
+        return self.tokens is not None or self.integration is not None
+
     def size(self, num_steps: int, horizon: int) -> tuple[int, int]:
         """Steps and actions of the loop that it is for; what it doesn't fix is as given."""
         grid = None if self.guidance is None else self.guidance.strength
