@@ -333,13 +333,8 @@ def test_a_batch_joins_a_chunk_in_each_row_as_infer_does(which: str, request: py
     plain = policy.infer_batch(seen, seed=4)
     assert all("model_actions" not in one for one in plain)
     if isinstance(policy.backend, OnCpu):
-        told = policy.backend.describe()["batches"]
-        assert [one.split(",")[0][:14] for one in told] == [
-            "4 observations",
-            "4 observations",
-            "8 observations",
-        ] or told
-    assert not np.allclose(plain[0]["actions"], together[0]["actions"], atol=1e-3)
+        batches = policy.backend.describe()["batches"]
+        assert any(one.startswith("4 observations") and "by token" in one for one in batches), "all but the one guided"
 
 
 def test_a_batch_takes_conditionings_beside_running_chunks(engine: UnifiedPolicy) -> None:
