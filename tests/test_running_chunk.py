@@ -355,8 +355,13 @@ def test_a_batch_takes_conditionings_beside_running_chunks(engine: UnifiedPolicy
 def test_relative_actions_of_a_batch_are_moved_to_each_rows_own_state(engine: UnifiedPolicy) -> None:
     moved: list[np.ndarray] = []
     pipeline = engine.pipeline
+
+    def noted(left_over: np.ndarray, _: Any, state: np.ndarray) -> np.ndarray:
+        moved.append(state)
+        return left_over
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "reanchored", lambda left, anchor, state: moved.append(state) or left)
+        patch.setattr(pipeline, "reanchored", noted)
         seen = [engine.example_observation(seed) for seed in range(3)]
         engine.infer_batch(seen, seed=0, previous=[CHUNKS[0], None, CHUNKS[3]])
     states = [pipeline.before(one)[1] for one in seen]
