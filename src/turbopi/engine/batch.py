@@ -255,9 +255,9 @@ class BatchLoop:
         """
         buffers, count, end = self._buffers, len(self._keys), self._whole_rows
         starts, lengths = buffers.segments
-        written = torch.arange(buffers.rows, device=buffers.device)[:, None] < starts[-1]
+        unwritten = torch.arange(buffers.rows, device=buffers.device)[:, None] >= starts[-1]
         k, v = (
-            F.pad(torch.where(written, one, 0), (0, 0, 0, end - buffers.rows))
+            F.pad(one.masked_fill(unwritten, 0), (0, 0, 0, end - buffers.rows))
             for one in (buffers.cache.k, buffers.cache.v)
         )
         pi0 = buffers.config.kind == "pi0"
