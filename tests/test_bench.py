@@ -489,16 +489,20 @@ def test_a_batch_is_one_call_with_observations_of_its_own(
     policy: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[list[str]] = []
+    forms: list[list[str]] = []
     together = policy.infer_batch
 
     def noted(observations: list[dict[str, Any]], **more: Any) -> list[dict[str, Any]]:
         asked.append([one["prompt"] for one in observations])
+        forms.append([one.form for one in more["conditioning"] or []])
         return together(observations, **more)
 
     monkeypatch.setattr(policy, "infer_batch", noted)
     latency = measure_calls(policy, Job(cameras=1, prompt_tokens=3, steps=1, batch=3), 2)
     assert latency["total"].calls == 2 and len(asked) == 5
-    assert all(len(prompts) == len(set(prompts)) == 3 for prompts in asked)
+    assert all(len(prompts) == len(set(prompts)) == 3 for prompts in asked) and not any(forms)
+    measure_calls(policy, Job(cameras=1, prompt_tokens=3, steps=1, batch=2, join="held"), 1)
+    assert forms[-1] == ["tokens", "tokens"], "each joins a chunk"
 
 
 def test_a_batch_reads_the_weights_once() -> None:
@@ -510,10 +514,10 @@ def test_a_batch_reads_the_weights_once() -> None:
     assert "batch" not in to_builtins(Job()) and to_builtins(Job(batch=4))["batch"] == 4
 
 
-def test_batches_are_planned_and_refused_for_chunks_that_join() -> None:
+def test_batches_are_planned() -> None:
     plan = BenchPlan(["pytorch"], ["f32"], batches=[2, 1, 4])
     assert [job.batch for job in plan.jobs()] == [2, 1, 4] and plan.main == Job()
     assert [plan.judges(job) for job in plan.jobs()] == [False, True, False]
-    joined = BenchPlan(["pytorch"], ["f32"], batches=[2], joins=["held"])
-    with pytest.raises(ConfigError, match="--join without --batch"):
-        joined.check(CPU)
+    joined = BenchPlan(["pytorch"], ["f32"], batches=[2, 4], joins=["none", "held"])
+    assert [(job.batch, job.join) for job in joined.jobs()] == [(2, "none"), (4, "none"), (2, "held"), (4, "held")]
+    joined.check(CPU)

@@ -185,7 +185,6 @@ def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
         (["--control-hz", "0"], "control_hz must be more than 0"),
         (["--deadline-ms", "0"], "deadline_ms must be more than 0 and at most 60000"),
         (["--max-batch", "4", "--no-warmup"], "--max-batch 4 needs the warm-up, which measures batches"),
-        (["--max-batch", "4", "--execution", "rtc", "--control-hz", "50"], "each request joins a chunk and runs alone"),
     ],
 )
 def test_bad_options_are_refused_before_weights_are_loaded(options: list[str], message: str) -> None:

@@ -137,6 +137,7 @@ def test_batches_denoise_by_operations_in_the_kernels_precision() -> None:
     assert backend._batch_weights() is backend._weights
     backend._put_expert_away()
     assert moved == [CPU], "it is asked for, and then not let go"
+    assert backend._batch_denoises_by(Loop(2, 5, "tokens", (1.0, 0.5, 0.0)), 4, 64) is backend._weights
 
     backend = FusedBackend.__new__(FusedBackend)
     moved = []
@@ -155,6 +156,20 @@ def test_batches_denoise_by_operations_in_the_kernels_precision() -> None:
             assert isinstance(made, ScaledMatrix) and made.inverse == 1 / scale
             assert float((made.dequantized() - was).norm() / was.norm()) < 0.05
     assert backend._batch_weights().expert is expert
+
+
+def test_batches_guided_by_the_jacobian_keep_the_experts_first_copy_beside_fp8() -> None:
+    backend = FusedBackend.__new__(FusedBackend)
+    moved: list[torch.device] = []
+    backend.config, backend.device = golden_model("pi05").config, CPU
+    state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
+    backend._weights, backend._refused = pack(backend.config, state), {}
+    backend._plan = cast(Any, SimpleNamespace(expert="fp8", scales={}))
+    backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
+    assert backend._batch_denoises_by(Loop(2, 5, "jacobian", (1.0, 0.5, 0.0)), 4, 64) is backend._weights
+    assert moved == [CPU] and not backend._batches_denoise_in_bf16
+    backend._put_expert_away()
+    assert moved == [CPU], "it is asked for, and then not let go"
 
 
 def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> None:

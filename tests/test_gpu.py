@@ -258,6 +258,52 @@ def test_conditioned_calls_are_the_references(name: str, precision: FloatPrecisi
     assert torch.equal(runner.sample(observation, noise, 10).actions, plain)
 
 
+@pytest.mark.parametrize("name", [*GRAPHS, PORTABLE])
+@pytest.mark.parametrize("count", [4, 8])
+@pytest.mark.parametrize("which", ["by token", "jacobian"])
+def test_a_batch_of_conditioned_observations_equals_its_rows(name: str, count: int, which: str) -> None:
+    """Rows of other cameras and prompts, some plain beside those with times, held actions and identity guidance."""
+    golden = [golden_cases()[case].observation for case in ("a_three_cams", "b_third_masked")]
+    rows = [golden[i % 2] for i in range(count)]
+    batch = Observation(**{field: torch.cat([getattr(row, field) for row in rows]) for field in vars(golden[0])})
+    noise = torch.randn(count, 10, 32, generator=torch.Generator().manual_seed(1))
+    forms = [None, *BY_TOKEN] if which == "by token" else ["jacobian", "jacobian_and_held"]
+    asked = [
+        None if form is None else conditioned(form, 5, 10, 32, seed)
+        for seed, form in zip(range(count), forms * count, strict=False)
+    ]
+    runner: Any = backend(name, "pi05", "bf16")
+    plain = runner.sample(batch, noise, 5).actions
+    together = runner.sample(batch, noise, 5, conditioning=asked).actions
+    assert torch.equal(runner.sample(batch, noise, 5, conditioning=asked).actions, together)
+    assert torch.equal(runner.sample(batch, noise, 5).actions, plain)
+    for row, one in enumerate(asked):
+        given = (rows[row], noise[row : row + 1], 5)
+        exact = golden_model("pi05").sample(*given, conditioning=one)[0]
+        error = rms(golden_model("pi05", "bf16").sample(*given, conditioning=one)[0] - exact)
+        assert rms(together[row] - exact) <= 2 * error, (row, forms[row % len(forms)])
+        alone = runner.sample(*given, conditioning=one).actions[0]
+        assert rms(together[row] - alone) <= 3 * error, "each is as far from float32 as the reference, or twice that"
+        if one is not None and one.held is not None and one.values is not None:
+            np.testing.assert_array_equal(together[row].numpy()[one.held], one.values[one.held])
+    loop = "by token" if which == "by token" else "guided by the Jacobian"
+    assert any("observations" in told and loop in told for told in runner.describe()["batches"])
+
+
+@pytest.mark.parametrize("kind", ["pi05", "pi0"])
+@pytest.mark.parametrize("which", ["held_and_identity", "staircase", "jacobian"])
+def test_a_conditioned_batch_in_float32_is_the_references(kind: Kind, which: str) -> None:
+    runner: Any = backend("cuda_graph", kind, "f32")
+    one, noise = made_up(kind, 2, 19)
+    other, _ = made_up(kind, 1, 7, seed=1)
+    both = Observation(**{field: torch.cat((getattr(one, field), getattr(other, field))) for field in vars(one)})
+    asked = [conditioned(which, 5, 7, 32, seed) for seed in range(2)]
+    exact = golden_model(kind).sample(both, noise.repeat(2, 1, 1), 5, conditioning=asked)
+    found = runner.sample(both, noise.repeat(2, 1, 1), 5, conditioning=asked).actions
+    torch.testing.assert_close(found, exact, atol=5e-5, rtol=5e-5)
+    assert any(told.startswith("2 observations") for told in runner.describe()["batches"])
+
+
 @pytest.mark.parametrize("name", GRAPHS)
 @pytest.mark.parametrize("forms", [("held", "identity"), ("jacobian", "jacobian_and_held")])
 def test_what_is_held_and_what_pulls_changes_without_a_new_capture(name: str, forms: tuple[str, str]) -> None:

@@ -123,6 +123,43 @@ def test_conditioned_calls_are_as_far_from_float32_as_their_emulation(case: str,
     assert relative_rms(ours, expected) < 0.75 * relative_rms(expected, exact) + 0.02
 
 
+@pytest.mark.parametrize("kernels", ["auto", "portable"])
+@pytest.mark.parametrize("which", ["held", "identity", "staircase"])
+def test_a_conditioned_batch_is_as_far_from_float32_as_its_emulation(which: str, kernels: str) -> None:
+    """Beside a plain row, which is as far as without them."""
+    one = golden_cases()["b_third_masked"]
+    asked = conditioned(which, STEPS, *one.noise.shape[1:])
+    four = Observation(
+        **{name: value.repeat(4, *[1] * (value.dim() - 1)) for name, value in vars(one.observation).items()}
+    )
+    runner: Any = backend("pi05", "fp8", kernels=kernels)
+    told = [asked, None, asked, asked]
+    ours = runner.sample(four, one.noise.repeat(4, 1, 1), STEPS, conditioning=told).actions
+    assert any("4 observations" in batch and "by token" in batch for batch in runner.describe()["batches"])
+    for row, how in zip(ours, told, strict=True):
+        exact, expected = emulated(one, "fp8", 0.0, how)
+        free = torch.ones(len(row), dtype=torch.bool)
+        if how is not None and how.held is not None:
+            free = ~torch.from_numpy(how.held)
+        found, exact, expected = row[None, free], exact[:, free], expected[:, free]
+        assert relative_rms(found, exact) < 1.3 * relative_rms(expected, exact) + 0.01
+        assert relative_rms(found, expected) < 0.75 * relative_rms(expected, exact) + 0.02
+
+
+def test_beside_fp8_batches_guided_by_the_jacobian_go_through_the_bf16_expert_and_say_so() -> None:
+    one = golden_cases()["b_third_masked"]
+    asked = conditioned("jacobian", STEPS, *one.noise.shape[1:])
+    two = Observation(
+        **{name: value.repeat(2, *[1] * (value.dim() - 1)) for name, value in vars(one.observation).items()}
+    )
+    runner: Any = backend("pi05", "fp8")
+    ours = runner.sample(two, one.noise.repeat(2, 1, 1), STEPS, conditioning=asked).actions
+    exact, expected = emulated(one, "fp8", 0.0, asked, expert=False)
+    for row in ours:
+        assert relative_rms(row[None], exact) < 1.3 * relative_rms(expected, exact) + 0.01
+    assert "expert of batches guided by the Jacobian" in runner.describe()["fp8"]["plan"]
+
+
 def test_beside_fp8_the_true_jacobian_goes_through_the_bf16_expert_and_says_so() -> None:
     one = golden_cases()["b_third_masked"]
     asked = conditioned("jacobian", STEPS, *one.noise.shape[1:])

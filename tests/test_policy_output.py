@@ -94,7 +94,8 @@ def test_waiting_for_ones_turn_is_in_no_other_time(
     whole: UnifiedPolicy, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, clock = answering(whole, kind, monkeypatch)
-    monkeypatch.setattr("turbopi.policy.time", SimpleNamespace(perf_counter=clock))
+    for module in ("policy", "model_call"):
+        monkeypatch.setattr(f"turbopi.{module}.time", SimpleNamespace(perf_counter=clock))
     pipeline = whole.pipeline
     first = "see" if kind == "begin" else "before"
     monkeypatch.setattr(pipeline, first, clock.passes(0.5, getattr(pipeline, first)))
@@ -105,7 +106,7 @@ def test_waiting_for_ones_turn_is_in_no_other_time(
 
         def __exit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr(whole, "_lock", Lock())
+    monkeypatch.setattr(whole._call, "lock", Lock())
     timing = CALLS[kind](whole, whole.example_observation())["policy_timing"]
     stages = {f"{stage}_ms": milliseconds for stage, milliseconds in STAGES.items()}
     expected = {"preprocess_ms": 500.0, "queue_ms": 2000.0, "infer_ms": 1000.0, "postprocess_ms": 250.0}

@@ -10,6 +10,7 @@ import pytest
 import torch
 from checkpoint_helpers import lerobot_copy
 from conftest import golden_model
+from test_begin import OnCpu
 from test_policy import golden_policy
 
 from turbopi import UnifiedPolicy, open_checkpoint
@@ -287,3 +288,136 @@ def test_guidance_of_an_unused_dimension_is_the_left_overs_own(policy: UnifiedPo
     assert isinstance(asked.guidance, Guidance)
     np.testing.assert_array_equal(asked.guidance.target[: H - 2, 7:], first[2:, 7:])
     assert torch.from_numpy(asked.guidance.target[H - 2 :]).abs().max() == 0
+
+
+# -- batches -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def engine() -> UnifiedPolicy:
+    """A policy whose backend runs observations together: the engine without its graphs."""
+    checkpoint = random_checkpoint("pi05_tiny")
+    checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, real_time=TRAINED))
+    made = UnifiedPolicy(checkpoint, num_denoising_steps=2, precision="f32", device="cpu", backend="pytorch")
+    made.backend = OnCpu(
+        made.config.model,
+        lambda device, precision: checkpoint.load(device, precision).state,
+        device=torch.device("cpu"),
+        precision="f32",
+    )
+    return made
+
+
+CHUNKS = [
+    RunningChunk(rows(8), 2, 4, "rtc_identity"),
+    None,
+    RunningChunk(rows(6, 1), 3, mode="rtc_trained"),
+    RunningChunk(rows(7, 2), 1, 5, "rtc"),
+    RunningChunk(rows(7, 3), 0, mode="rtc_trained"),
+]
+
+
+@pytest.mark.parametrize("which", ["policy", "engine"])
+def test_a_batch_joins_a_chunk_in_each_row_as_infer_does(which: str, request: pytest.FixtureRequest) -> None:
+    policy: UnifiedPolicy = request.getfixturevalue(which)
+    seen = [policy.example_observation(seed) for seed in range(5)]
+    told = [True, False, True, False, True]
+    together = policy.infer_batch(seen, seed=[4, 5, 6, 7, 8], previous=CHUNKS, model_actions=told)
+    for i, (one, obs, chunk) in enumerate(zip(together, seen, CHUNKS, strict=True)):
+        alone = policy.infer(obs, seed=4 + i, previous=chunk, model_actions=True)
+        np.testing.assert_allclose(one["actions"], alone["actions"], atol=1e-4)
+        assert ("model_actions" in one) == told[i]
+        if told[i]:
+            np.testing.assert_allclose(one["model_actions"], alone["model_actions"], atol=1e-4)
+    np.testing.assert_array_equal(together[2]["model_actions"][:3], CHUNKS[2].left_over[:3])  # type: ignore[union-attr]
+    plain = policy.infer_batch(seen, seed=4)
+    assert all("model_actions" not in one for one in plain)
+    if isinstance(policy.backend, OnCpu):
+        batches = policy.backend.describe()["batches"]
+        assert any(one.startswith("4 observations") and "by token" in one for one in batches), "all but the one guided"
+
+
+def test_a_batch_takes_conditionings_beside_running_chunks(engine: UnifiedPolicy) -> None:
+    """Times of its own bring the number of steps, for all rows."""
+    seen = [engine.example_observation(seed) for seed in range(3)]
+    warm = Conditioning(tokens=TokenTimes.of(np.linspace(0.5, 0, 4)[:, None].repeat(H, 1)))
+    told: list[Conditioning | None] = [None, warm, None]
+    together = engine.infer_batch(seen, seed=1, conditioning=told, previous=[CHUNKS[0], None, None])
+    alone = [
+        engine.infer(seen[0], seed=1, previous=CHUNKS[0], num_steps=3),
+        engine.infer(seen[1], seed=2, conditioning=warm),
+        engine.infer(seen[2], seed=3, num_steps=3),
+    ]
+    for one, expected in zip(together, alone, strict=True):
+        np.testing.assert_allclose(one["actions"], expected["actions"], atol=1e-4)
+
+
+def test_relative_actions_of_a_batch_are_moved_to_each_rows_own_state(engine: UnifiedPolicy) -> None:
+    moved: list[np.ndarray] = []
+    pipeline = engine.pipeline
+
+    def noted(left_over: np.ndarray, _: Any, state: np.ndarray) -> np.ndarray:
+        moved.append(state)
+        return left_over
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "reanchored", noted)
+        seen = [engine.example_observation(seed) for seed in range(3)]
+        engine.infer_batch(seen, seed=0, previous=[CHUNKS[0], None, CHUNKS[3]])
+    states = [pipeline.before(one)[1] for one in seen]
+    np.testing.assert_array_equal(moved, [states[0], states[2]])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"previous": [CHUNKS[0]]},
+            "previous has 1 entries for 2 observations; it should have one for each: a Run",
+        ),
+        (
+            {"previous": CHUNKS[0]},
+            "previous is of type RunningChunk; for a batch it should be a list of a Run",
+        ),
+        ({"previous": [None, {}]}, r"observation 1 of 2 \(from 0\): its previous is of type dict; it should be a Runn"),
+        ({"conditioning": [None] * 3}, "conditioning has 3 entries for 2 observations"),
+        (
+            {"previous": [None, RunningChunk(rows(3), 5)]},
+            r"observation 1 of 2 \(from 0\): the delay is 5 control",
+        ),
+        (
+            {"conditioning": [Conditioning(held=np.ones(3, bool)), None]},
+            r"observation 0 of 2 \(from 0\): held is bool of shape \[3\]; it should be bool of shape \[10\]",
+        ),
+        (
+            {"previous": [None, CHUNKS[0]], "conditioning": [None, Conditioning()]},
+            r"observation 1 of 2 \(from 0\): conditioning and previous were both given",
+        ),
+        (
+            {"previous": [CHUNKS[0], None], "solver": "ab2"},
+            r"observation 0 of 2 \(from 0\): a running chunk and solver 'ab2' were both given",
+        ),
+        ({"model_actions": [True]}, r"model_actions is \[True\]; it should be true or false, or a list of 2 of these"),
+        ({"model_actions": "yes"}, "model_actions is 'yes'"),
+    ],
+)
+def test_what_a_row_cannot_join_is_refused_with_its_number(
+    engine: UnifiedPolicy, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ObservationError, match=message):
+        engine.infer_batch([engine.example_observation()] * 2, seed=0, **arguments)
+
+
+def test_warm_up_captures_batches_of_each_mode(engine: UnifiedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(engine.backend, "warmup", lambda *_, **__: None)
+    monkeypatch.setattr(engine.backend, "warmup_batches", lambda _, *rest: asked.append(rest))
+    engine.warmup(cameras=2, batches=[1, 4], real_time=["rtc", "rtc_trained"])
+    forms = [None if one is None else one.form for *_, one in asked]
+    assert forms == [None, "jacobian", "tokens"] and {rest[:2] for rest in asked} == {(2, H)}
+    assert all(rest[2] == [1, 4] for rest in asked)
+    assert engine.batch_modes == ("rtc", "rtc_identity", "rtc_trained")
+
+
+def test_a_backend_that_runs_observations_one_by_one_has_no_modes_for_batches(policy: UnifiedPolicy) -> None:
+    assert policy.batch_modes == () and not policy.runs_batches

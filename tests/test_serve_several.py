@@ -469,9 +469,9 @@ def test_a_size_that_fails_at_warm_up_is_left_out_or_refused_if_it_was_asked_for
 
 
 def test_batches_that_do_not_pay_are_said(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    def measure_size(calls: PolicyCalls, size: int) -> bool:
+    def measure_size(calls: PolicyCalls, size: int, times: BatchTimes, arguments: dict[str, Any]) -> bool:
         for _ in range(3):
-            calls.times.measured(size, 0.01 * size)
+            times.measured(size, 0.01 * size)
         return True
 
     monkeypatch.setattr(PolicyCalls, "_measure_size", measure_size)
@@ -489,7 +489,11 @@ def test_batches_that_do_not_pay_are_said(caplog: pytest.LogCaptureFixture, monk
         (FakePolicy, {"max_batch": 65}, "max_batch must be from 1 to 64, not 65"),
         (FakePolicy, {"deadline_ms": 0}, "deadline_ms must be more than 0 and at most 60000, not 0"),
         (FakePolicy, {"deadline_ms": float("nan")}, "deadline_ms must be more than 0"),
-        (Joins, {"max_batch": 2, "execution": "rtc", "control_hz": 50}, "each request joins a chunk and runs alone"),
+        (
+            Joins,
+            {"max_batch": 2, "execution": "rtc", "control_hz": 50},
+            "runs requests that join a chunk one by one, a",
+        ),
     ],
 )
 def test_options_that_cannot_be_right_are_refused(policy: Any, options: dict[str, Any], text: str) -> None:

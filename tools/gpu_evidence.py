@@ -31,6 +31,7 @@ PRODUCT = (
         "src/turbopi/observation.py",
         "src/turbopi/policy.py",
         "src/turbopi/joining.py",
+        "src/turbopi/model_call.py",
         "src/turbopi/running_chunk.py",
     ),
     "src/turbopi/verify/check_golden.py",

@@ -1,20 +1,53 @@
 """What a policy's calls may join, checked and turned into what the denoising loop is asked for (docs/real_time.md)."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 from turbopi import backends
 from turbopi.backends import Backend
 from turbopi.config import ModelConfig, PolicyConfig
+from turbopi.engine.conditioned import batch_form
 from turbopi.errors import ConfigError, ObservationError
-from turbopi.model.conditioning import Conditioning, Form, Guidance, TokenTimes, guidance_strength
+from turbopi.model.conditioning import (
+    Conditioning,
+    Form,
+    Guidance,
+    TokenTimes,
+    guidance_strength,
+    row_named,
+)
 from turbopi.model.solvers import Integration
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.running_chunk import FORMS, JoinMode, RunningChunk
 
 Loop = tuple[int, int]  # denoising steps, action horizon
+Row = tuple[Conditioning | None, RunningChunk | None]  # of one observation, checked: at most one of the two
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Joins:
+    """What the observations of a call are to join, checked, and how the call denoises."""
+
+    rows: Sequence[Row]
+    steps: int
+    horizon: int
+    integration: Integration | None = None
+
+    @property
+    def forms(self) -> list[Form]:
+        """What each observation's denoising loop must be able to do, as far as a batch is concerned."""
+        return [self._form(*row) for row in self.rows]
+
+    def _form(self, conditioning: Conditioning | None, chunk: RunningChunk | None) -> Form:
+        if chunk is None:
+            return batch_form(conditioning)
+        if chunk.mode == "rtc_trained" and chunk.delay == 0:  # nothing is held
+            return batch_form(integrated(None, self.integration))
+        return FORMS[chunk.mode]
 
 
 class Joining:
@@ -49,13 +82,31 @@ class Joining:
 
     def checked(
         self,
+        conditionings: Sequence[Conditioning | None],
+        previous: Sequence[RunningChunk | None],
+        steps: int,
+        horizon: int,
+        integration: Integration | None = None,
+    ) -> Joins:
+        """What each observation of a call is to join, and how it is integrated.
+
+        Raises ObservationError; of several observations it names the row.
+        """
+        plain, rows = self._checked(None, None, steps, horizon, integration), []
+        for i, (conditioning, chunk) in enumerate(zip(conditionings, previous, strict=True)):
+            with row_named(i, len(conditionings)):
+                joins = conditioning is not None or chunk is not None
+                rows.append(self._checked(conditioning, chunk, steps, horizon, integration) if joins else plain)
+        return Joins(rows, steps, horizon, integration)
+
+    def _checked(
+        self,
         conditioning: Conditioning | None,
         previous: RunningChunk | None,
         steps: int,
         horizon: int,
         integration: Integration | None = None,
-    ) -> tuple[Conditioning | None, RunningChunk | None]:
-        """What a call is to join, and how it is integrated; of the two at most one. Raises ObservationError."""
+    ) -> Row:
         if conditioning is not None and previous is not None:
             raise ObservationError("conditioning and previous were both given; give one of them")
         if previous is None:
@@ -74,26 +125,31 @@ class Joining:
             self._check_form(FORMS[previous.mode])
         return conditioning, previous
 
-    def argument(
-        self,
-        conditioning: Conditioning | None,
-        chunk: RunningChunk | None,
-        state: np.ndarray,
-        steps: int,
-        horizon: int,
-        integration: Integration | None = None,
-    ) -> dict[str, Conditioning]:
-        """The backend's, once the new state is known, of what is `checked`; {} for an ordinary call."""
-        if chunk is not None:
-            left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
-            conditioning = chunk.conditioning(left_over, steps, horizon, self._model.time_grid)
-            if integration is not None:
-                conditioning = replace(conditioning, integration=integration)
-                if (pull := conditioning.guidance) is not None and chunk.max_guidance_weight is not None:
-                    times = TokenTimes.integrated(integration, horizon).times
-                    strength = guidance_strength(times, chunk.max_guidance_weight)
-                    conditioning = replace(conditioning, guidance=replace(pull, strength=strength))
-        return {} if conditioning is None or conditioning.form == "plain" else {"conditioning": conditioning}
+    def arguments(self, joins: Joins, states: Sequence[np.ndarray]) -> dict[str, Any]:
+        """What the backend is given beside the noise, once the new states are known. Raises ObservationError.
+
+        {} for an ordinary call, else "conditioning": one for all observations, or a list with one for each.
+        """
+        rows: list[Conditioning | None] = []
+        for i, ((conditioning, chunk), state) in enumerate(zip(joins.rows, states, strict=True)):
+            with row_named(i, len(states)):
+                one = conditioning if chunk is None else self._of_chunk(chunk, state, joins)
+            rows.append(None if one is None or one.form == "plain" else one)
+        if all(one is rows[0] for one in rows):
+            return {} if rows[0] is None else {"conditioning": rows[0]}
+        return {"conditioning": rows}
+
+    def _of_chunk(self, chunk: RunningChunk, state: np.ndarray, joins: Joins) -> Conditioning:
+        steps, horizon, integration = joins.steps, joins.horizon, joins.integration
+        left_over = self._pipeline.reanchored(chunk.left_over, chunk.anchor, state)
+        conditioning = chunk.conditioning(left_over, steps, horizon, self._model.time_grid)
+        if integration is not None:
+            conditioning = replace(conditioning, integration=integration)
+            if (pull := conditioning.guidance) is not None and chunk.max_guidance_weight is not None:
+                times = TokenTimes.integrated(integration, horizon).times
+                strength = guidance_strength(times, chunk.max_guidance_weight)
+                conditioning = replace(conditioning, guidance=replace(pull, strength=strength))
+        return conditioning
 
     def to_warm(
         self,
@@ -157,6 +213,37 @@ def integrated(conditioning: Conditioning | None, integration: Integration | Non
             "one of them, or give solver 'euler' and time grid 'uniform' for this call"
         )
     return replace(conditioning, integration=integration)
+
+
+def of_each(what: str, given: Sequence[T | None] | None, rows: int, kind: type[T]) -> list[T | None]:
+    """An argument of a batch: one for each observation, or None. Raises ObservationError for anything else."""
+    if given is None:
+        return [None] * rows
+    if not isinstance(given, Sequence) or isinstance(given, str | Mapping):
+        raise ObservationError(
+            f"{what} is of type {type(given).__name__}; for a batch it should be a list of a {kind.__name__}, or None, "
+            "for each observation"
+        )
+    if len(given) != rows:
+        raise ObservationError(
+            f"{what} has {len(given)} entries for {rows} observations; it should have one for each: a "
+            f"{kind.__name__}, or None"
+        )
+    for row, one in enumerate(given):
+        if one is not None and not isinstance(one, kind):
+            with row_named(row, rows):
+                raise ObservationError(
+                    f"its {what} is of type {type(one).__name__}; it should be a {kind.__name__}, or None"
+                )
+    return list(given)
+
+
+def flags(what: str, given: bool | Sequence[bool], rows: int) -> list[bool]:
+    """An argument of a batch: for all of its observations, or for each. Raises ObservationError."""
+    each: Any = [given] * rows if isinstance(given, bool) else given
+    if not isinstance(each, Sequence) or len(each) != rows or not all(isinstance(one, bool) for one in each):
+        raise ObservationError(f"{what} is {given!r:.100}; it should be true or false, or a list of {rows} of these")
+    return list(each)
 
 
 def _example(form: Form, num_steps: int, horizon: int, model: ModelConfig) -> Conditioning:

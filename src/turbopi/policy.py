@@ -2,7 +2,6 @@
 
 import dataclasses
 import logging
-import threading
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
@@ -31,9 +30,10 @@ from turbopi.checkpoint.base import Room
 from turbopi.checkpoint.calibration import for_policy
 from turbopi.config import PolicyConfig, Solver, TimeGrid
 from turbopi.errors import ActionError, ConfigError, ObservationError
-from turbopi.joining import Joining
+from turbopi.joining import Joining, flags, of_each
 from turbopi.model.conditioning import Conditioning
 from turbopi.model.reference import FloatPrecision
+from turbopi.model_call import ModelCall
 from turbopi.observation import ModelInputs, Observation, with_cameras
 from turbopi.preprocess.pipeline import Pipeline
 from turbopi.preprocess.tokenizer import TINY_TOKENIZER, load_tokenizer
@@ -133,8 +133,8 @@ class UnifiedPolicy:
             )
         self.backend.strict = self._strict = strict
         self._joining = Joining(self.config, self._pipeline, lambda: self.backend, self._denoising.integration)
+        self._call = ModelCall(self._pipeline, self._joining, lambda: self.backend, self._guard)
         self._generator = np.random.default_rng()
-        self._lock = threading.Lock()
         self._backend_reason = why
         self._checkpoint = checkpoint
 
@@ -189,7 +189,7 @@ class UnifiedPolicy:
         """
         noises = None if noise is None else [noise]
         asked = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
-        return self._infer([obs], noises, seed, asked, horizon, conditioning, previous, model_actions)[0]
+        return self._infer([obs], noises, seed, asked, horizon, [conditioning], [previous], [model_actions])[0]
 
     def infer_batch(
         self,
@@ -201,19 +201,29 @@ class UnifiedPolicy:
         solver: Solver | None = None,
         time_grid: TimeGrid | None = None,
         horizon: int | None = None,
+        conditioning: Sequence[Conditioning | None] | None = None,
+        previous: Sequence[RunningChunk | None] | None = None,
+        model_actions: bool | Sequence[bool] = False,
     ) -> list[dict[str, Any]]:
         """Several observations in one run of the model: `infer` for each, with the times of the whole batch.
 
         `noise` is [B, H, action_dim]; `seed` one number for the batch's first row, the next row taking the next
-        number, or one for each row.
+        number, or one for each row. `conditioning` and `previous` are lists with one for each row, or None for a row
+        that joins nothing; `model_actions` is for all rows, or a list with one for each. What is wrong with a row is
+        said with its number.
 
         `runs_batches` says whether the backend runs observations together: in calls of 1, 2, 4, 8 or 16, into which it
-        splits other numbers (`backend.batch_costs`). Observations may differ in cameras and prompts. Actions then
-        differ from what `infer` returns by as much as sums in another order do: docs/performance.md. With another
-        solver or time grid than openpi's they run one by one there.
+        splits other numbers (`backend.batch_costs`). Observations may differ in cameras, prompts and what they join:
+        rows with times, held actions or identity guidance run together with plain ones, rows guided by the true
+        Jacobian with each other. Actions then differ from what `infer` returns by as much as sums in another order do:
+        docs/performance.md. With another solver than Euler's they run one by one there.
         """
-        asked = self._denoising.of_call(num_steps, solver, time_grid)
-        return self._infer(observations, noise, seed, asked, horizon)
+        rows = len(observations)
+        own = of_each("conditioning", conditioning, rows, Conditioning)
+        bringing = next((one for one in own if one is not None and one.brings_steps), None)
+        asked = self._denoising.of_call(num_steps, solver, time_grid, bringing)
+        joined, told = of_each("previous", previous, rows, RunningChunk), flags("model_actions", model_actions, rows)
+        return self._infer(observations, noise, seed, asked, horizon, own, joined, told)
 
     def _infer(
         self,
@@ -222,60 +232,25 @@ class UnifiedPolicy:
         seed: int | Sequence[int] | None,
         denoising: Denoising,
         horizon: int | None,
-        conditioning: Conditioning | None = None,
-        previous: RunningChunk | None = None,
-        model_actions: bool = False,
+        conditionings: Sequence[Conditioning | None],
+        previous: Sequence[RunningChunk | None],
+        model_actions: Sequence[bool],
     ) -> list[dict[str, Any]]:
-        """`infer_batch`; the last three are for one observation."""
+        """`infer_batch`; the last three have one for each observation."""
         start = time.perf_counter()
         self._guard.refuse_if_lost()
         if not observations:
             raise ObservationError("infer_batch was given no observation")
-        steps, integration, actions = denoising.steps, denoising.integration, self._horizon(horizon)
-        conditioning, chunk = self._joining.checked(conditioning, previous, steps, actions, integration)
-        if len(observations) == 1 and isinstance(self.backend, backends.Begins):
-            seen = self._pipeline.see(observations[0], resize=False)
-            asked = time.perf_counter()
-            with self._lock, self._guard:
-                infer_start = time.perf_counter()
-                begun = self.backend.begin(seen.pictures, self._pipeline.config.image_resize)
-                self._pipeline.read(seen)  # while the device is at the pictures
-                x_1 = self._noise(1, actions, noise, seed)[0]
-                asked_for = self._joining.argument(conditioning, chunk, seen.state, steps, actions, integration)
-                sample = begun.finish(seen.tokens[seen.token_mask], seen.model_state, x_1, steps, **asked_for)
-                infer_end = time.perf_counter()
-            states = [seen.state]
-        elif isinstance(self.backend, backends.RunsBatches) and conditioning is None and chunk is None:
-            each = [self._pipeline.see(obs, resize=False) for obs in observations]
-            asked = time.perf_counter()
-            with self._lock, self._guard:
-                infer_start = time.perf_counter()
-                batch = self.backend.begin_batch([seen.pictures for seen in each], self._pipeline.config.image_resize)
-                for seen in each:
-                    self._pipeline.read(seen)  # while the device is at the first ones' pictures
-                x_1 = self._noise(len(each), actions, noise, seed)
-                tokens = [seen.tokens[seen.token_mask] for seen in each]
-                sample = batch.finish(tokens, np.stack([seen.model_state for seen in each]), x_1, steps)
-                infer_end = time.perf_counter()
-            states = [seen.state for seen in each]
-        else:
-            prepared = [self._pipeline.before(obs) for obs in observations]
-            inputs = Observation.stack([model_inputs for model_inputs, _ in prepared])
-            states = [state for _, state in prepared]
-            noises = torch.from_numpy(self._noise(len(observations), actions, noise, seed))
-            asked_for = self._joining.argument(conditioning, chunk, states[0], steps, actions, integration)
-            asked = time.perf_counter()
-            with self._lock, self._guard:
-                infer_start = time.perf_counter()
-                sample = self.backend.sample(inputs, noises, steps, **asked_for)
-                infer_end = time.perf_counter()
-
-        results = self._results(sample, states)
-        if model_actions:
-            results[0]["model_actions"] = sample.actions[0].numpy().copy()
-            if (anchor := self._pipeline.anchor(states[0])) is not None:
-                results[0]["anchor"] = anchor
-        timing = sample.timing(start, asked, infer_start, infer_end, time.perf_counter())
+        rows, steps, actions = len(observations), denoising.steps, self._horizon(horizon)
+        joins = self._joining.checked(conditionings, previous, steps, actions, denoising.integration)
+        ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed))
+        results = self._results(ran.sample, ran.states)
+        for row, result in enumerate(results):
+            if model_actions[row]:
+                result["model_actions"] = ran.sample.actions[row].numpy().copy()
+                if (anchor := self._pipeline.anchor(ran.states[row])) is not None:
+                    result["anchor"] = anchor
+        timing = ran.sample.timing(start, ran.asked, ran.infer_start, ran.infer_end, time.perf_counter())
         return [result | {"policy_timing": dict(timing)} for result in results]
 
     def submit(
@@ -350,7 +325,8 @@ class UnifiedPolicy:
             horizons    action horizons, see `infer`. None: the config's
             steps       numbers of denoising steps. None: the policy's
             batches     sizes of the batches that `infer_batch` will be given, whose observations have any of these
-                        numbers of cameras on average. None: none, only single observations
+                        numbers of cameras on average, and join what `real_time` and `conditioning` say, or nothing.
+                        None: none, only single observations
             real_time   modes of `RunningChunk` that calls will have, besides calls without one
             conditioning
                         examples of other conditionings that they will have, each for its own steps and horizon alone:
@@ -375,7 +351,7 @@ class UnifiedPolicy:
         of_steps = {n: self._denoising.changed(n, None, None, ConfigError).integration for n, _ in loops}
         asked = self._joining.to_warm(loops, real_time, conditioning, self._denoising.steps, of_steps.get)
         plan = [(count, *one) for count in counts for one in asked]
-        with self._lock, self._guard:
+        with self._call.lock, self._guard:
             for i, (count, num_steps, horizon, one) in enumerate(plan):
                 seen = inputs if count == own else with_cameras(inputs, count)
                 self.backend.warmup(
@@ -386,8 +362,8 @@ class UnifiedPolicy:
                     last=i + 1 == len(plan),
                     **({} if one is None else {"conditioning": one}),
                 )
-                if one is None and sizes and isinstance(self.backend, backends.RunsBatches):
-                    self.backend.warmup_batches(Observation.stack([seen]), num_steps, horizon, sizes)
+                if sizes and isinstance(self.backend, backends.RunsBatches):
+                    self.backend.warmup_batches(Observation.stack([seen]), num_steps, horizon, sizes, one)
         if own in counts:
             self._whole_call(example, *loops[0])
         return time.perf_counter() - start
@@ -418,7 +394,13 @@ class UnifiedPolicy:
     @property
     def runs_batches(self) -> bool:
         """Whether `infer_batch` runs observations together, and `warmup` prepares `batches` of them."""
-        return isinstance(self.backend, backends.RunsBatches) and self._denoising.integration is None
+        integration = self._denoising.integration
+        return isinstance(self.backend, backends.RunsBatches) and (integration is None or integration.is_euler)
+
+    @property
+    def batch_modes(self) -> tuple[JoinMode, ...]:
+        """Modes of `RunningChunk`s with which `infer_batch` runs observations together."""
+        return self._joining.modes if self.runs_batches else ()
 
     @property
     def loop_arguments(self) -> dict[str, Any]:

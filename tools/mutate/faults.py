@@ -13,6 +13,7 @@ CHOICE = "tests/test_fused_choice.py"
 ARGUMENTS = "tests/test_kernels_arguments.py"
 GEOMETRY = "tests/test_launch_geometry.py"
 BY_TOKEN = "tests/test_kernels_denoise_by_token.py"
+CONDITIONED_BATCH = "tests/test_engine_batch_conditioned.py"
 ENGINE = "tests/test_engine.py::test_equals_the_reference_for_odd_prompts_and_cameras"
 PARITY = "tests/test_model_parity.py::test_float32_equals_openpi_within_float32_rounding"
 
@@ -112,7 +113,8 @@ FAULTS = (
     Fault(
         "the expert put away from under a graph of operations",
         "turbopi.backends",
-        "if not self._refused and not self._batches_denoise_in_bf16:\n            self._keep_expert_on(",
+        "if not (self._refused or self._batches_denoise_in_bf16 or self._batches_guide_in_bf16):\n"
+        "            self._keep_expert_on(",
         "if True:\n            self._keep_expert_on(",
         "replays read freed memory",
         (CHOICE,),
@@ -308,6 +310,22 @@ FAULTS = (
         "await_products<2>();  // the round before is done",
         "weights are overwritten while they are multiplied: wrong now and then",
         (PRODUCTS,),
+    ),
+    Fault(
+        "every observation of a batch told what the first one asks for",
+        "turbopi.engine",
+        "array[row] if name in BY_ACTION else array[:, row] for",
+        "array[0] if name in BY_ACTION else array[:, 0] for",
+        "a robot carries out another one's actions",
+        (CONDITIONED_BATCH,),
+    ),
+    Fault(
+        "guided observations of a batch see each other's prefixes on the way",
+        "turbopi.engine",
+        "logits.view(len(tokens), g.num_heads, -1).masked_fill_(self.hidden, -torch.inf)",
+        "pass",
+        "one robot's pictures move another one's arm",
+        (CONDITIONED_BATCH,),
     ),
     Fault(
         "a graph's replay isn't waited for",

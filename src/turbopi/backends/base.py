@@ -117,12 +117,20 @@ class Begins(Protocol):
 class BegunBatch(Protocol):
     """Several observations whose pictures a backend works on already: what `RunsBatches.begin_batch` returns."""
 
-    def finish(self, tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+    def finish(
+        self,
+        tokens: Sequence[np.ndarray],
+        state: np.ndarray,
+        noise: np.ndarray,
+        num_steps: int,
+        conditioning: Conditionings = None,
+    ) -> Sample:
         """Actions of all of them, with the time of each stage of the whole batch.
 
         tokens  of each int64[valid prompt tokens]
         state   float32[B, action_dim]
         noise   float32[B, H, action_dim]
+        conditioning  of a backend that is `Conditions`, too: for all of them or each, of the forms that were told
         """
 
 
@@ -130,20 +138,38 @@ class BegunBatch(Protocol):
 class RunsBatches(Protocol):
     """A backend whose batches are sooner than their observations one by one.
 
-    batch_costs  how many observations it runs together, and how long that takes, in calls of one; other batches are
-        split into these
+    batch_costs  how many plain observations it runs together, and how long that takes, in calls of one; other batches
+        are split into these
     """
 
     @property
     def batch_costs(self) -> Mapping[int, float]: ...
 
-    def begin_batch(self, pictures: Sequence[Sequence[np.ndarray]], resize: ImageResize | None = None) -> BegunBatch:
-        """`Begins.begin` of several observations: each one's valid pictures, perhaps none."""
+    def begin_batch(
+        self,
+        pictures: Sequence[Sequence[np.ndarray]],
+        resize: ImageResize | None = None,
+        forms: Sequence[Form] | None = None,
+    ) -> BegunBatch:
+        """`Begins.begin` of several observations: each one's valid pictures, perhaps none.
+
+        forms  of each observation's conditioning (`engine.conditioned.batch_form`), by which they are put together;
+               None: all are plain
+        """
 
     def warmup_batches(
-        self, observation: Observation, num_steps: int, horizon: int | None, batches: Sequence[int]
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None,
+        batches: Sequence[int],
+        conditioning: Conditioning | None = None,
     ) -> None:
-        """Capture whatever batches of these sizes need if each observation has so many cameras as this one."""
+        """Capture whatever batches of these sizes need if each observation has so many cameras as this one.
+
+        conditioning  an example, for batches with observations of its form and times beside plain ones; None: for plain
+                      ones alone
+        """
 
 
 @runtime_checkable

@@ -59,6 +59,7 @@ class FusedBackend(CudaGraphBackend):
     _tiles = Tiles(NO_TILES, BY_MODEL)  # measured ones, as they were when this backend was made
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
+    _batches_guide_in_bf16 = False  # the same, of those guided by the true Jacobian
     _fp8_expert: list[Any] | None = None  # layers with `ScaledMatrix`, of batches
     precisions: ClassVar[tuple[Precision, ...]] = ("bf16", *TIERS)
 
@@ -125,6 +126,8 @@ class FusedBackend(CudaGraphBackend):
                 plan["expert of batches"] = numbers
             elif self._batches_denoise_in_bf16 and self._plan.expert != "bf16":
                 plan["expert of batches"] = "bf16, as operations denoise"
+            if self._batches_guide_in_bf16 and self._plan.expert != "bf16":
+                plan["expert of batches guided by the Jacobian"] = "bf16, as its way back is"
 
         by_kernel = sorted({str(loop) for loop, _ in list(self._denoisers)})
         by_operations: dict[str, list[str]] = {}
@@ -217,7 +220,16 @@ class FusedBackend(CudaGraphBackend):
         return FEW < 2 * horizon <= MAX_SUFFIX and refusal(self.config) is None
 
     def _batch_denoises_by(self, loop: Loop, batch: int, rows: int) -> Weights | PairDenoiser:
-        """Hopper's kernel for two observations; of more, operations in its precision, which are as fast."""
+        """Hopper's kernel for two plain observations; else operations in its precision, which are as fast.
+
+        The way back of the true Jacobian goes through the bfloat16 expert, as in a single call.
+        """
+        if loop.form == "jacobian":
+            self._batches_guide_in_bf16 = True
+            self._keep_expert_on(self.device)
+            return self._weights
+        if loop.form != "plain":
+            return self._batch_weights()
         if batch != 2 or not self._denoises_pairs(loop.horizon):
             return self._batch_weights()
         key = (loop, rows)
@@ -346,7 +358,7 @@ class FusedBackend(CudaGraphBackend):
 
     def _put_expert_away(self) -> None:
         """A kernel has its own copy of the expert's matrices; the first one, 0.6 GB, waits on the host."""
-        if not self._refused and not self._batches_denoise_in_bf16:
+        if not (self._refused or self._batches_denoise_in_bf16 or self._batches_guide_in_bf16):
             self._keep_expert_on(HOST)
 
     def _keep_expert_on(self, device: torch.device) -> None:

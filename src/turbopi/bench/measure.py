@@ -177,11 +177,12 @@ def call(
     policy: UnifiedPolicy, job: Job, observations: Observations, asked: Conditioning | None = None
 ) -> dict[str, float]:
     """The times of one call with new observations: of a batch all of it. `asked` is `conditioning(policy, job)`."""
-    if job.batch > 1:
-        batch = [next(observations) for _ in range(job.batch)]
-        return dict(policy.infer_batch(batch, num_steps=job.steps)[0]["policy_timing"])
     if asked is None:
         asked = conditioning(policy, job)
+    if job.batch > 1:
+        batch = [next(observations) for _ in range(job.batch)]
+        joins = None if asked is None else [asked] * job.batch
+        return dict(policy.infer_batch(batch, num_steps=job.steps, conditioning=joins)[0]["policy_timing"])
     return dict(policy.infer(next(observations), num_steps=job.steps, conditioning=asked)["policy_timing"])
 
 

@@ -87,8 +87,6 @@ class BenchPlan:
             raise ConfigError("there is nothing to measure: name a backend and a precision")
         if self.quantization is not None and not set(self.precisions) & set(TIERS):
             raise ConfigError(f"a calibration was given, but none of the precisions takes one: {', '.join(TIERS)}")
-        if max(self.batches) > 1 and set(self.joins) != {"none"}:
-            raise ConfigError("chunks that join a running one are measured one at a time: --join without --batch")
         if set(self.joins) != {"none"} and (self.solver, self.time_grid) != (None, None):
             raise ConfigError("chunks join by openpi's steps: --join without --solver and --time-grid")
         named = [*self.backends, *self.beside]

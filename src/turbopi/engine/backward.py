@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.engine.forward import Rope
+from turbopi.engine.conditioned import Conditioned
+from turbopi.engine.forward import Rope, project
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import BackwardOps, Ops, State
 from turbopi.kernels.plain import matmul_f32
@@ -45,6 +46,7 @@ class Expert:
     cache_k: Tensor  # [layer, R, K]
     cache_v: Tensor
     rope: Rope
+    hidden: Tensor | None = None  # bool[T, 1, R]: which rows a token doesn't see, of several observations' together
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, list[KeptLayer], Tensor]:
         """Suffix tokens [T, D] -> (the final norm's result float32[T, D], what each layer keeps, the last stream)."""
@@ -59,8 +61,11 @@ class Expert:
             start, gate = x, next_gate
             k, v = self.cache_k[i], self.cache_v[i]
             q = ops.rope_split(ops.linear(normed, layer.qkv), *self.rope, k[slots:], v[slots:])
-            heads = (g.num_heads, pi0, g.head_dim**-0.5, v.dtype)
-            probabilities = self.back.softmax(matmul_f32(q, k.t()), self.length, slots, *heads)
+            heads = (g.num_heads, pi0 and self.hidden is None, g.head_dim**-0.5, v.dtype)
+            logits = matmul_f32(q, k.t())
+            if self.hidden is not None:
+                logits.view(len(tokens), g.num_heads, -1).masked_fill_(self.hidden, -torch.inf)
+            probabilities = self.back.softmax(logits, self.length, slots, *heads)
             attended = (probabilities @ v).view(len(tokens), -1)
             scale, shift, next_gate = self._modulation(2 * i + 1, layer.norm2)
             y = ops.residual_linear(attended, layer.out)
@@ -110,8 +115,31 @@ class Expert:
         return scale, shift, gate
 
 
+def jacobian_velocity(
+    expert: Expert, asked: Conditioned, step: int, x_t: Tensor, tokens: Tensor, time: Tensor
+) -> Tensor:
+    """v_t float32[..., H, A] of x_t, pulled through the expert as `model.conditioning` says.
+
+    tokens  the suffix [T, D] of x_t; of several observations theirs one behind the other
+    time    as `suffix_vjp`'s
+    """
+    small, horizon = expert.weights.small, x_t.shape[-2]
+
+    def of_actions(rows: Tensor) -> Tensor:  # Pi0's state token has no velocity
+        return rows.view(*x_t.shape[:-2], -1, rows.shape[-1])[..., -horizon:, :]
+
+    out, kept, last = expert.forward(tokens)
+    v_t = project(small, "action_out_proj", of_actions(out))
+    error = asked.error(step, x_t, v_t) * asked.weights
+    d_out = torch.zeros_like(out)
+    of_actions(d_out).copy_((asked.tokens.times[step, ..., None] * error) @ small["action_out_proj.weight"])
+    d_tokens = of_actions(expert.vjp(kept, last, d_out))
+    through = suffix_vjp(expert.config, small, x_t, time, d_tokens)
+    return v_t - asked.tokens.gain[step, ..., None] * (error - through)
+
+
 def suffix_vjp(config: ModelConfig, small: State, x_t: Tensor, time: Tensor, d_tokens: Tensor) -> Tensor:
-    """Back from the actions' tokens float32[H, D] to x_t float32[H, A]. `time` float32[D] or [H, D] is Pi0's."""
+    """Back from the actions' tokens float32[..., H, D] to x_t [..., H, A]. `time` float32[D] or [..., H, D]: Pi0's."""
     d = d_tokens.float()
     if config.kind == "pi0":
         actions = F.linear(x_t, small["action_in_proj.weight"], small["action_in_proj.bias"])
@@ -120,5 +148,5 @@ def suffix_vjp(config: ModelConfig, small: State, x_t: Tensor, time: Tensor, d_t
         sigmoid = inner.sigmoid()
         slope = sigmoid * (1 + inner * (1 - sigmoid))
         d = (d @ small["action_time_mlp_out.weight"] * slope) @ small["action_time_mlp_in.weight"]
-        d = d[:, : actions.shape[1]]
+        d = d[..., : actions.shape[-1]]
     return d @ small["action_in_proj.weight"]

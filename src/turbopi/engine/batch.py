@@ -14,18 +14,25 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine import forward
+from turbopi.engine.backward import Expert, jacobian_velocity
 from turbopi.engine.call import Cache, Pictures
+from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.flat import allocate
 from turbopi.engine.packing import most_tiles, pack_rows
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.weights import Weights
+from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.interface import Ops, PairDenoiser, Segments
-from turbopi.kernels.plain_batch import PLAIN_BATCH
+from turbopi.kernels.plain_batch import PLAIN_BATCH, visible_to_suffix
+from turbopi.model.conditioning import Conditioning
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
+
+PLAIN_ROW = Conditioning()  # of an observation that asks for nothing, or an empty place
 
 
 @dataclass(frozen=True)
@@ -112,7 +119,11 @@ class PackedPrefix:
 
 
 class BatchLoop:
-    """All denoising steps of a batch, from the keys and values that `PackedPrefix` left."""
+    """All denoising steps of a batch, from the keys and values that `PackedPrefix` left.
+
+    In a conditioned loop each action has its own time, step and pull, and an observation that asks for nothing has
+    openpi's. A plain loop has none of that.
+    """
 
     def __init__(
         self,
@@ -120,16 +131,19 @@ class BatchLoop:
         loop: Loop,
         by: Weights
         | PairDenoiser,  # operations with these, perhaps others than those of `buffers`; or, of two, a kernel
-        table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation
+        table: Tensor | None,  # float32[N, 2 * layers + 1, 3, D], Pi0.5's modulation; a conditioned loop's: [U, …]
     ) -> None:
-        assert loop.form == "plain", loop
+        assert loop.form != "solver" and (loop.form == "plain" or isinstance(by, Weights)), loop
+        self._loop = loop
         self._buffers, self._by, self._table = buffers, by, table
         config, device, batch = buffers.config, buffers.device, buffers.size.batch
         on_gpu = device.type == "cuda"
         self._steps, self._horizon = loop.steps, loop.horizon
         self._tokens = loop.horizon + (config.kind == "pi0")
-        times = time_grid(loop.steps, config.time_grid)
+        plain = loop.form == "plain"
+        times = time_grid(loop.steps, config.time_grid) if plain else np.array(loop.times, np.float32)
         self._time_embs = time_embedding(times, config.expert.width).to(device)  # Pi0's
+        self._asked = None if plain else Conditioned.allocate(config, loop, device, batch)
         chunk = (batch, loop.horizon, config.action_dim)
         fields = {"noise": (chunk, torch.float32), "state": ((batch, config.action_dim), torch.float32)}
         self._host, host = allocate(fields, torch.device("cpu"), pinned=on_gpu)
@@ -142,17 +156,33 @@ class BatchLoop:
         self.v_t = torch.empty(loop.steps, *chunk, device=device)
         size, dtype = (batch * self._tokens, config.vlm.head_dim), buffers.weights.embed_tokens.dtype
         self._keys, self._values = (torch.empty(size, device=device, dtype=dtype) for _ in range(2))
+        self._whole_rows = -(-(buffers.rows + len(self._keys)) // 16) * 16  # of `_whole_cache`; as `cache_rows`
+        self._seen = torch.tensor([self._whole_rows - len(self._keys)], device=device)  # all: `hidden` says what isn't
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
 
-    def write(self, noise: np.ndarray, state: np.ndarray) -> None:
-        """noise float32[b, H, A] and state float32[b, A] of b <= B observations; the others are zeros."""
+    def write(
+        self, noise: np.ndarray, state: np.ndarray, conditionings: Sequence[Conditioning | None] | None = None
+    ) -> None:
+        """noise float32[b, H, A] and state float32[b, A] of b <= B observations; the others are zeros.
+
+        conditionings  of each, of a conditioned loop alone, which is for all of them
+        """
         for name, given in (("noise", noise), ("state", state)):
             array = self._arrays[name]
             array[: len(given)] = given
             array[len(given) :] = 0
+        if self._asked is None:
+            return
+        for row in range(self._buffers.size.batch):
+            one = conditionings[row] if conditionings is not None and row < len(conditionings) else None
+            self._asked.write(one or PLAIN_ROW, row)
+            if one is not None:
+                self._arrays["noise"][row] = one.started(noise[row])
 
     def run(self, *_: Any) -> None:
         self._flat.copy_(self._host, non_blocking=True)
+        if self._asked is not None:
+            self._asked.upload()
         buffers = self._buffers
         if isinstance(self._by, Weights):
             self._run_operations(self._by)
@@ -166,9 +196,19 @@ class BatchLoop:
         positions = (lengths[:, None] + self._offsets).flatten()
         rope = (self._rope[0][positions], self._rope[1][positions])
         self.x_t[0] = self._noise
+        whole = self._whole_cache() if self._loop.form == "jacobian" else None
         for step in range(self._steps):
-            v_t = self._velocity(weights, step, rope)
-            self.x_t[step + 1] = euler_step(self.x_t[step], v_t, self._steps)
+            x_t, asked = self.x_t[step], self._asked
+            if asked is None:
+                v_t = self._velocity(weights, step, rope)
+                self.x_t[step + 1] = euler_step(x_t, v_t, self._steps)
+            else:
+                if whole is None:
+                    v_t = asked.pulled(step, x_t, self._velocity(weights, step, rope))
+                else:
+                    expert = self._expert(weights, step, rope, *whole)
+                    v_t = jacobian_velocity(expert, asked, step, x_t, self._suffix(weights, step), self._time(step))
+                self.x_t[step + 1] = asked.next_x(step, x_t, v_t)
             self.v_t[step] = v_t
 
     def _velocity(self, weights: Weights, step: int, rope: forward.Rope) -> Tensor:
@@ -186,9 +226,44 @@ class BatchLoop:
                 q, *prefix, *suffix, *buffers.segments, heads, config.kind == "pi0", **input
             )
 
-        tokens = forward.suffix_tokens(config, weights.small, self.x_t[step], self._time_embs[step], self._state)
-        tokens = tokens.flatten(0, 1).to(weights.embed_tokens.dtype)
-        table = None if self._table is None else self._table[step]
+        tokens, table = self._suffix(weights, step), self._modulation(step)
         out = forward.expert_layers(config, weights, ops, tokens, table, rope, places, attend)
         out = out.view(-1, self._tokens, out.shape[-1])[:, -self._horizon :]
         return forward.project(weights.small, "action_out_proj", out)
+
+    def _suffix(self, weights: Weights, step: int) -> Tensor:
+        """Tokens [B * T, D]"""
+        config = self._buffers.config
+        tokens = forward.suffix_tokens(config, weights.small, self.x_t[step], self._time(step), self._state)
+        return tokens.flatten(0, 1).to(weights.embed_tokens.dtype)
+
+    def _time(self, step: int) -> Tensor:
+        """The time embedding float32[D], or [B, H, D] by token."""
+        return self._time_embs[step if self._asked is None else self._asked.tokens.rows[step]]
+
+    def _modulation(self, step: int) -> Tensor | None:
+        """float32[2 * layers + 1, 3, D], or [2 * layers + 1, 3, B * H, D] by token."""
+        if self._table is None:
+            return None
+        return self._table[step] if self._asked is None else self._asked.modulation(self._table, step)
+
+    def _whole_cache(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Keys and values of all prefixes with room for the suffixes' behind them, and what `Expert` is told is hidden.
+
+        One product over the rows of all observations, most of them hidden: the way back has no attention of its own.
+        Rows that nothing was written to are 0, as 0 * NaN is NaN.
+        """
+        buffers, count, end = self._buffers, len(self._keys), self._whole_rows
+        starts, lengths = buffers.segments
+        unwritten = torch.arange(buffers.rows, device=buffers.device)[:, None] >= starts[-1]
+        k, v = (
+            F.pad(one.masked_fill(unwritten, 0), (0, 0, 0, end - buffers.rows))
+            for one in (buffers.cache.k, buffers.cache.v)
+        )
+        pi0 = buffers.config.kind == "pi0"
+        return k, v, ~visible_to_suffix(starts, lengths, end - count, count, pi0)[:, None]
+
+    def _expert(self, weights: Weights, step: int, rope: forward.Rope, k: Tensor, v: Tensor, hidden: Tensor) -> Expert:
+        buffers, table = self._buffers, self._modulation(step)
+        back = buffers.ops.backward or PLAIN_BACKWARD
+        return Expert(buffers.config, weights, buffers.ops, back, table, self._seen, k, v, rope, hidden)

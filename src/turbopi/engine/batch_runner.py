@@ -2,11 +2,14 @@
 
 A batch of any number is split into calls of 1, 2, 4, 8 or 16 observations, in the way that is the soonest by the
 backend's `batch_costs`; they run one after the other. One observation alone is the runner's own call, to the last bit.
-What is captured: batches.py.
+
+Observations may have conditionings. Those with times, held actions or identity guidance by token run together with
+plain ones, in a loop that takes each action's own time; those with guidance by the true Jacobian together with each
+other, in one with a way back; those with a solver's sums alone. A call whose observations are all plain has the plain
+loop. What is captured: batches.py.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from itertools import accumulate
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,6 +18,7 @@ from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine.batches import Batches
+from turbopi.engine.conditioned import batch_form, batch_loop
 from turbopi.engine.graph import building
 from turbopi.engine.not_warm import not_warm
 from turbopi.engine.packing import split
@@ -22,12 +26,14 @@ from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import BUCKET, GraphRunner, HostRow, floats, padded_trace
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser
-from turbopi.model.conditioning import Conditionings, of_rows
+from turbopi.model.conditioning import Conditioning, Conditionings, Form, check_rows, of_rows
 from turbopi.model.reference import Trace
 from turbopi.model.sample import Sample
 from turbopi.observation import Observation
 
-Finish = Callable[[Sequence[np.ndarray], np.ndarray, np.ndarray, int], Sample]
+Asked = Sequence[Conditioning | None]  # of each observation
+Finish = Callable[[Sequence[np.ndarray], np.ndarray, np.ndarray, int, Asked], Sample]
+Call = tuple[int, list[int]]  # for how many observations it is, and which ones are in it
 
 
 class BegunBatch:
@@ -36,26 +42,35 @@ class BegunBatch:
     def __init__(
         self,
         begin: Callable[[int, Sequence[Sequence[np.ndarray]]], Finish],
-        calls: Sequence[int],  # buckets
+        calls: Sequence[Call],
         pictures: Sequence[Sequence[np.ndarray]],
     ) -> None:
-        self._begin, self._pictures = begin, pictures
-        ends = [min(end, len(pictures)) for end in accumulate(calls)]
-        self._calls = [(bucket, slice(start, end)) for bucket, start, end in zip(calls, [0, *ends], ends, strict=False)]
+        self._begin, self._calls, self._pictures = begin, calls, pictures
         self._first = self._begun(0)
 
-    def finish(self, tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
+    def finish(
+        self,
+        tokens: Sequence[np.ndarray],
+        state: np.ndarray,
+        noise: np.ndarray,
+        num_steps: int,
+        conditioning: Conditionings = None,
+    ) -> Sample:
         """See `turbopi.backends.base.RunsBatches`."""
-        samples = []
+        asked, samples = of_rows(conditioning, len(tokens)), []
+        check_rows(asked, num_steps, *noise.shape[1:])
+        actions = torch.empty(noise.shape)
         for number, (_, rows) in enumerate(self._calls):
             finish = self._begun(number) if number else self._first
-            samples.append(finish(tokens[rows], state[rows], noise[rows], num_steps))
+            these = [tokens[row] for row in rows], state[rows], noise[rows]
+            samples.append(finish(*these, num_steps, [asked[row] for row in rows]))
+            actions[rows] = samples[-1].actions
         stages = {name: sum(one.stage_ms[name] for one in samples) for name in samples[0].stage_ms}
-        return Sample(torch.cat([one.actions for one in samples]), stages)
+        return Sample(actions, stages)
 
     def _begun(self, number: int) -> Finish:
         bucket, rows = self._calls[number]
-        return self._begin(bucket, self._pictures[rows])
+        return self._begin(bucket, [self._pictures[row] for row in rows])
 
 
 class BatchRunner(GraphRunner):
@@ -63,6 +78,8 @@ class BatchRunner(GraphRunner):
 
     # estimated from single calls: without the denoising kernel, whose time a batch of two doubles, sharing pays sooner
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.6, 4: 2.9, 8: 5.5, 16: 10.7}
+    # of guided ones: most of a single call's way back waits for launches. Larger ones would keep gigabytes for it
+    JACOBIAN_COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.3, 4: 1.8, 8: 3}
 
     def __init__(
         self, config: ModelConfig, weights: Weights, ops: Ops, device: torch.device, *, joint: bool = False
@@ -83,15 +100,23 @@ class BatchRunner(GraphRunner):
         return self.COSTS
 
     def warmup_batches(
-        self, observation: Observation, num_steps: int, horizon: int | None, batches: Sequence[int]
+        self,
+        observation: Observation,
+        num_steps: int,
+        horizon: int | None,
+        batches: Sequence[int],
+        conditioning: Conditioning | None = None,
     ) -> None:
         """See `turbopi.backends.base.RunsBatches`."""
         cameras, float_images = int(observation.image_mask[0].sum()), observation.images.dtype == torch.float32
-        loop = Loop(num_steps, self.config.action_horizon if horizon is None else horizon)
+        form, actions = batch_form(conditioning), self.config.action_horizon if horizon is None else horizon
+        if form == "solver":  # they run alone
+            return
+        loop = batch_loop([conditioning], num_steps, actions, self.config)
         self._check_cameras(cameras)
         self._warming = True
         try:
-            for batch in sorted({bucket for count in batches for bucket in split(count, self.batch_costs)} - {1}):
+            for batch in sorted({bucket for count in batches for bucket in split(count, self._costs_of(form))} - {1}):
                 with building(self.device):
                     self._recent.use(loop)
                     size = self._batches.size(batch, [cameras] * batch, float_images)
@@ -99,7 +124,12 @@ class BatchRunner(GraphRunner):
         finally:
             self._warming = False
 
-    def begin_batch(self, pictures: Sequence[Sequence[np.ndarray]], resize: ImageResize | None = None) -> BegunBatch:
+    def begin_batch(
+        self,
+        pictures: Sequence[Sequence[np.ndarray]],
+        resize: ImageResize | None = None,
+        forms: Sequence[Form] | None = None,
+    ) -> BegunBatch:
         """See `turbopi.backends.base.RunsBatches`."""
         for one in pictures:
             self._check_cameras(len(one))
@@ -112,27 +142,29 @@ class BatchRunner(GraphRunner):
                 else self._begin_call(bucket, these, resize, float_images)
             )
 
-        return BegunBatch(begin, self._calls_of(len(pictures)), pictures)
+        return BegunBatch(begin, self._calls_of(forms or ["plain"] * len(pictures)), pictures)
 
     def sample(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
-        """Rows with a conditioning run one after the other."""
-        if observation.batch_size == 1 or not _plain(conditioning, observation.batch_size):
+        if observation.batch_size == 1:
             return super().sample(observation, noise, num_steps, conditioning=conditioning)
+        asked = of_rows(conditioning, observation.batch_size)
         rows = [HostRow.of(observation, row) for row in range(observation.batch_size)]
-        begun = self.begin_batch([row.images for row in rows])
+        begun = self.begin_batch([row.images for row in rows], forms=[batch_form(one) for one in asked])
         state = np.stack([row.state for row in rows])
-        return begun.finish([row.tokens for row in rows], state, noise.cpu().numpy(), num_steps)
+        return begun.finish([row.tokens for row in rows], state, noise.cpu().numpy(), num_steps, asked)
 
     def intermediates(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Trace:
-        """Of a batched call where the observations are one; else, and with a conditioning, one by one."""
+        """Of a batched call where the observations are one; else one by one."""
         count = observation.batch_size
-        if count == 1 or self._calls_of(count) != [count] or not _plain(conditioning, count):
+        asked = of_rows(conditioning, count)
+        if count == 1 or self._calls_of([batch_form(one) for one in asked]) != [(count, list(range(count)))]:
             return super().intermediates(observation, noise, num_steps, conditioning=conditioning)
-        self.sample(observation, noise, num_steps)
+        self.sample(observation, noise, num_steps, conditioning=asked)
+        loop = batch_loop(asked, num_steps, noise.shape[1], self.config)
         size = self._batches.size(
             count, observation.image_mask.sum(1).tolist(), observation.images.dtype == torch.float32
         )
@@ -140,33 +172,49 @@ class BatchRunner(GraphRunner):
         for row in range(count):
             cameras = observation.image_mask[row].repeat_interleave(per_image)
             valid = torch.cat((cameras, observation.token_mask[row])).cpu()
-            left = self._batches.trace(size, Loop(num_steps, noise.shape[1]), row)
+            left = self._batches.trace(size, loop, row)
             traces.append(padded_trace(*left, valid))
         return {name: torch.cat([one[name] for one in traces], dim=int(name != "actions")) for name in traces[0]}
 
     def describe(self) -> dict[str, Any]:
         return super().describe() | {"batches": self._batches.describe()}
 
-    def _calls_of(self, count: int) -> list[int]:
-        """Observations of each call that a batch is split into; strict: of those that are captured."""
+    def _costs_of(self, form: Form) -> Mapping[int, float]:
+        """As `batch_costs`, in single calls of this form, which may run together."""
+        return {"plain": self.batch_costs, "jacobian": self.JACOBIAN_COSTS}.get(form, self.COSTS)
+
+    def _calls_of(self, forms: Sequence[Form]) -> list[Call]:
+        """The calls that a batch of observations of these forms is split into; strict: of those that are captured."""
+        calls: list[Call] = []
+        for form, rows in _groups(forms):
+            for bucket in [1] * len(rows) if form == "solver" else self._split(len(rows), form):
+                calls.append((bucket, rows[:bucket]))
+                rows = rows[bucket:]
+        return calls
+
+    def _split(self, count: int, form: Form) -> list[int]:
+        costs = self._costs_of(form)
         if not self.strict:
-            return split(count, self.batch_costs)
-        warm = {1, *self._batches.warm_sizes()}
-        if count > max(warm) > 1:
-            raise not_warm(self.name, f"{count} observations at once", self._batches.describe(), batches=count)
-        return split(count, {size: cost for size, cost in self.batch_costs.items() if size in warm})
+            return split(count, costs)
+        warm = {1, *self._batches.warm_sizes(form)}
+        if count > max(warm) > 1 and max(warm) < max(costs):
+            needs, conditioned = f"{count} observations at once", form != "plain"
+            raise not_warm(self.name, needs, self._batches.describe(), conditioned=conditioned, batches=count)
+        return split(count, {size: cost for size, cost in costs.items() if size in warm})
 
     def _batch_denoises_by(self, loop: Loop, batch: int, rows: int) -> Weights | PairDenoiser:
         """What a batch with up to so many prefix rows is denoised by: operations with weights, or a kernel for two
-        observations. Its graph goes on pointing to it.
+        observations of a plain loop. Its graph goes on pointing to it.
         """
         return self._weights
 
     def _begin_one(self, pictures: Sequence[np.ndarray], resize: ImageResize | None) -> Finish:
         begun = self.begin(pictures, resize)
 
-        def finish(tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
-            return begun.finish(tokens[0], state[0], noise[0], num_steps)
+        def finish(
+            tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int, asked: Asked
+        ) -> Sample:
+            return begun.finish(tokens[0], state[0], noise[0], num_steps, asked[0])
 
         return finish
 
@@ -177,13 +225,15 @@ class BatchRunner(GraphRunner):
         cameras = [len(one) for one in pictures]
         size = self._batches.size(bucket, cameras, float_images)
 
-        def finish(tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int) -> Sample:
-            loop = Loop(num_steps, noise.shape[1])
+        def finish(
+            tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int, asked: Asked
+        ) -> Sample:
+            loop = batch_loop(asked, num_steps, noise.shape[1], self.config)
             for count, prompt in zip(cameras, tokens, strict=True):
                 self._check_tokens(count, len(prompt))
             self._recent.use(loop)
             with self._explaining():
-                return self._batches.finish(size, loop, cameras, tokens, state, noise)
+                return self._batches.finish(size, loop, cameras, tokens, state, noise, asked)
 
         self._begun = None  # its pictures' buffers stay, but nobody gets what becomes of them
         with self._explaining():
@@ -194,10 +244,17 @@ class BatchRunner(GraphRunner):
         super()._forget(loop)
         self._batches.forget(loop)
 
-    def _refuse_batch_if_cold(self, needs: str, batch: int) -> None:
+    def _refuse_batch_if_cold(self, needs: str, batch: int, loop: Loop | None) -> None:
         if self.strict and not self._warming:
-            raise not_warm(self.name, needs, self._batches.describe(), batches=batch)
+            what, conditioned = needs if loop is None else f"{needs}, {loop}", loop is not None and loop.form != "plain"
+            raise not_warm(self.name, what, self._batches.describe(), conditioned=conditioned, batches=batch)
 
 
-def _plain(conditioning: Conditionings, rows: int) -> bool:
-    return all(asked is None for asked in of_rows(conditioning, rows))
+def _groups(forms: Sequence[Form]) -> Iterator[tuple[Form, list[int]]]:
+    """Which observations may share calls, and the form of their loop."""
+    by_token = [row for row, form in enumerate(forms) if form in ("plain", "tokens")]
+    if by_token:
+        yield "tokens" if "tokens" in forms else "plain", by_token
+    for form in ("jacobian", "solver"):
+        if rows := [row for row, one in enumerate(forms) if one == form]:
+            yield form, rows

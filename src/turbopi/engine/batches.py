@@ -21,6 +21,7 @@ from turbopi.engine.graph import Graph, Mark
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser
+from turbopi.model.conditioning import Conditioning, Form
 from turbopi.model.sample import Sample
 
 logger = logging.getLogger(__name__)
@@ -34,8 +35,10 @@ class Batches:
 
     capture     makes a graph of a function, see `GraphRunner`
     table       a loop's modulation
-    denoises_by  what denoises so many observations, of at most so many rows, when that is first captured
-    refuse      is told what a call needs that isn't captured, and raises if that isn't allowed now
+    denoises_by  what denoises so many observations, of at most so many rows, when that is first captured; of a
+                 conditioned loop it is operations
+    refuse      is told what a call needs that isn't captured, for how many, with which loop if that is what is
+                lacking; and raises if that isn't allowed now
     """
 
     def __init__(
@@ -49,7 +52,7 @@ class Batches:
         capture: Capture,
         table: Callable[[Loop], Tensor | None],
         denoises_by: Callable[[Loop, int, int], Weights | PairDenoiser],
-        refuse: Callable[[str, int], None],
+        refuse: Callable[[str, int, Loop | None], None],
     ) -> None:
         self._config, self._weights, self._ops, self._device = config, weights, ops, device
         self._bucket, self._capture, self._table = bucket, capture, table
@@ -99,13 +102,14 @@ class Batches:
         tokens: Sequence[np.ndarray],
         state: np.ndarray,
         noise: np.ndarray,
+        conditionings: Sequence[Conditioning | None] | None = None,
     ) -> Sample:
         """What comes behind `launch_vision`: actions float32[b, H, A] of the observations that are there."""
         slots = self.slots(size.batch, [len(prompt) for prompt in tokens])
         encode, denoise = self._prefix_graph(size, slots), self._loop_graph(size, loop)
         self._prefixes[size, slots].write(cameras, tokens)
         run = self._loops[size, loop]
-        run.write(noise, state)
+        run.write(noise, state, conditionings)
         encode.launch()
         self._mark(2)
         denoise.launch()
@@ -135,9 +139,9 @@ class Batches:
             for size, loop in sorted(self._loops, key=str)
         ]
 
-    def warm_sizes(self) -> set[int]:
-        """Observations of the calls that are captured."""
-        return {size.batch for size, _ in self._loops}
+    def warm_sizes(self, form: Form) -> set[int]:
+        """Observations of the calls that are captured with a loop of this form."""
+        return {size.batch for size, loop in self._loops if loop.form == form}
 
     def _mark(self, place: int) -> None:
         if self._marks:
@@ -186,7 +190,8 @@ class Batches:
 
     def _graph(self, size: BatchSize, key: tuple[Any, ...], capture: Callable[[], Graph]) -> Graph:
         if key not in self._graphs:
-            self._refuse(f"{size.batch} observations with {size.pictures} pictures", size.batch)
+            loop = key[-1] if key[0] == "denoise" else None
+            self._refuse(f"{size.batch} observations with {size.pictures} pictures", size.batch, loop)
             self._graphs[key] = capture()
             logger.info("captured %s of %s", key[0], size)
         return self._graphs[key]

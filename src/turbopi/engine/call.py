@@ -15,7 +15,7 @@ from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine import forward
-from turbopi.engine.backward import Expert, suffix_vjp
+from turbopi.engine.backward import Expert, jacobian_velocity
 from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.flat import allocate
 from turbopi.engine.graph import Mark
@@ -303,21 +303,13 @@ class StaticCall:
 
     def _guided_velocity(self, asked: Conditioned, step: int, rope: forward.Rope) -> Tensor:
         """v_t float32[H, A], pulled as `model.conditioning` says."""
-        x_t, gain, horizon = self.x_t[step], asked.tokens.gain[step, :, None], self.shape.horizon
+        x_t = self.x_t[step]
         if self.shape.loop.form == "tokens":
-            v_t = self._velocity(step, rope)
-            return v_t - gain * asked.error(step, x_t, v_t)
+            return asked.pulled(step, x_t, self._velocity(step, rope))
         back, cache = self.ops.backward or PLAIN_BACKWARD, (self.cache_k, self.cache_v)
         table, length = self._modulation(step), self.inputs.length
         expert = Expert(self.config, self.weights, self.ops, back, table, length, *cache, rope)
-        out, kept, last = expert.forward(self._suffix_tokens(step))
-        v_t = forward.project(self.weights.small, "action_out_proj", out[-horizon:])
-        error = asked.error(step, x_t, v_t) * asked.weights
-        d_out = torch.zeros_like(out)  # Pi0's state token has no velocity
-        d_out[-horizon:] = (asked.tokens.times[step, :, None] * error) @ self.weights.small["action_out_proj.weight"]
-        d_tokens = expert.vjp(kept, last, d_out)[-horizon:]
-        through = suffix_vjp(self.config, self.weights.small, x_t, self._time(step), d_tokens)
-        return v_t - gain * (error - through)
+        return jacobian_velocity(expert, asked, step, x_t, self._suffix_tokens(step), self._time(step))
 
     def _time(self, step: int) -> Tensor:
         """The time embedding float32[D], or [H, D] by token."""

@@ -4,6 +4,7 @@ Which times may occur is fixed when the loop is captured (`Loop.times`): the mod
 action has which of them in which step, what is held and what pulls differ from call to call.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,9 +17,10 @@ from turbopi.engine.flat import allocate
 from turbopi.engine.recent_loops import Loop
 from turbopi.errors import ObservationError
 from turbopi.kernels.interface import TokenInputs
-from turbopi.model.conditioning import Conditioning, TokenTimes
+from turbopi.model.conditioning import Conditioning, Form, TokenTimes
 
 MOST_TIMES = 1024  # of a loop: 2.9 MB each, on the device
+BY_ACTION = ("target", "weights")  # have no axis of steps
 
 
 def conditioned_loop(
@@ -50,12 +52,39 @@ def conditioned_loop(
     if tokens is None:
         return Loop(num_steps, horizon, form, own)
     wanted = {*tokens.distinct().tolist(), 0.0}
-    times = own if wanted <= {*own} else tuple(sorted(wanted, reverse=True))
-    if len(times) > MOST_TIMES:
+    return Loop(num_steps, horizon, form, own if wanted <= {*own} else _checked_times(wanted))
+
+
+def batch_form(conditioning: Conditioning | None) -> Form:
+    """What an observation with this conditioning needs of a batched loop. "solver": it runs alone."""
+    if conditioning is None:
+        return "plain"
+    form, integration = conditioning.form, conditioning.integration
+    return "tokens" if form == "solver" and integration is not None and integration.is_euler else form
+
+
+def batch_loop(conditionings: Sequence[Conditioning | None], num_steps: int, horizon: int, config: ModelConfig) -> Loop:
+    """The loop of observations that run together, none of the form "solver", all checked.
+
+    Its times are all that any of them has, and openpi's, so that plain observations are always among those it is for.
+    """
+    forms = {batch_form(one) for one in conditionings}
+    assert "solver" not in forms, "a solver's loop has other sums"
+    if forms == {"plain"}:
+        return Loop(num_steps, horizon)
+    own = _own_times(num_steps, config.time_grid)
+    tokens = [None if one is None else one.own_tokens(horizon) for one in conditionings]
+    wanted = {*own}.union(*(one.distinct().tolist() for one in tokens if one is not None))
+    form: Form = "jacobian" if "jacobian" in forms else "tokens"
+    return Loop(num_steps, horizon, form, own if len(wanted) == len(own) else _checked_times(wanted))
+
+
+def _checked_times(wanted: set[float]) -> tuple[float, ...]:
+    if len(wanted) > MOST_TIMES:
         raise ObservationError(
-            f"the token times have {len(times)} different values; at most {MOST_TIMES} fit: let actions share times"
+            f"the token times have {len(wanted)} different values; at most {MOST_TIMES} fit: let actions share times"
         )
-    return Loop(num_steps, horizon, form, times)
+    return tuple(sorted(wanted, reverse=True))
 
 
 @lru_cache
@@ -71,7 +100,10 @@ def _plain(num_steps: int, horizon: int, time_grid: str) -> TokenTimes:
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A conditioned loop's inputs, on the host and on the device. N steps, H actions, A action_dim."""
+    """A conditioned loop's inputs, on the host and on the device. N steps, H actions, A action_dim.
+
+    Of a batch every array has the axis of its observations before that of the actions: [N, B, H], [B, H, A].
+    """
 
     loop: Loop
     config: ModelConfig
@@ -82,15 +114,17 @@ class Conditioned:
     weights: Tensor  # float32[H, 1], of guidance
 
     @classmethod
-    def allocate(cls, config: ModelConfig, loop: Loop, device: torch.device) -> "Conditioned":
-        grid, chunk = (loop.steps, loop.horizon), (loop.horizon, config.action_dim)
+    def allocate(cls, config: ModelConfig, loop: Loop, device: torch.device, batch: int | None = None) -> "Conditioned":
+        """`batch`: of so many observations; None: of one, without their axis."""
+        actions = (loop.horizon,) if batch is None else (batch, loop.horizon)
+        grid, chunk = (loop.steps, *actions), (*actions, config.action_dim)
         fields = {
             "rows": (grid, torch.int32),
             "steps": (grid, torch.float32),
             "times": (grid, torch.float32),
             "target": (chunk, torch.float32),
             "gain": (grid, torch.float32),
-            "weights": ((loop.horizon, 1), torch.float32),
+            "weights": ((*actions, 1), torch.float32),
         }
         host, views = allocate(fields, torch.device("cpu"), pinned=device.type == "cuda")
         flat, on_device = allocate(fields, device, pinned=False)
@@ -98,9 +132,11 @@ class Conditioned:
         arrays = {name: view.numpy() for name, view in views.items()}
         return cls(loop, config, host, flat, arrays, TokenInputs(**on_device), weights)
 
-    def write(self, conditioning: Conditioning) -> None:
-        """Into the host's buffer."""
+    def write(self, conditioning: Conditioning, row: int | None = None) -> None:
+        """Into the host's buffer; of a batch into a row of it."""
         arrays, loop, table = self.arrays, self.loop, np.array(self.loop.times, np.float32)
+        if row is not None:
+            arrays = {name: array[row] if name in BY_ACTION else array[:, row] for name, array in arrays.items()}
         own = conditioning.own_tokens(loop.horizon)
         asked = own or _plain(loop.steps, loop.horizon, self.config.time_grid)
         arrays["steps"][:], arrays["times"][:] = asked.steps, asked.times
@@ -125,12 +161,16 @@ class Conditioned:
         self.device.copy_(self.host, non_blocking=True)
 
     def modulation(self, table: Tensor, step: int) -> Tensor:
-        """Of every action's own time: of a table float32[U, norms, 3, D] float32[norms, 3, H, D]."""
-        return table.permute(1, 2, 0, 3).index_select(2, self.tokens.rows[step])
+        """Of every action's own time: of a table float32[U, norms, 3, D] float32[norms, 3, H or B * H, D]."""
+        return table.permute(1, 2, 0, 3).index_select(2, self.tokens.rows[step].flatten())
 
     def error(self, step: int, x_t: Tensor, v_t: Tensor) -> Tensor:
         """target − x̂, x̂ = x − t v: float32[H, A]."""
-        return self.tokens.target - (x_t - self.tokens.times[step, :, None] * v_t)
+        return self.tokens.target - (x_t - self.tokens.times[step, ..., None] * v_t)
+
+    def pulled(self, step: int, x_t: Tensor, v_t: Tensor) -> Tensor:
+        """v_t with identity guidance; without guidance as it is."""
+        return v_t - self.tokens.gain[step, ..., None] * self.error(step, x_t, v_t)
 
     def next_x(self, step: int, x_t: Tensor, v_t: Tensor) -> Tensor:
-        return x_t + self.tokens.steps[step, :, None] * v_t
+        return x_t + self.tokens.steps[step, ..., None] * v_t

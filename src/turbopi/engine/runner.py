@@ -331,6 +331,7 @@ class GraphRunner:
                 self.name,
                 f"{shape.cameras} cameras, {shape.loop}",
                 (f"{s.cameras} cameras, {s.loop}" for s in warm),
+                conditioned=shape.loop.form != "plain",
                 cameras=shape.cameras,
                 horizons=shape.horizon,
                 steps=shape.num_steps,

@@ -57,8 +57,19 @@ def suffix_attention(
     prefix_k, prefix_v [rows, K]; those of observation b begin at starts[b], int32[B + 1], and are lengths[b] many. k, v
     [B * T, K]. With `state_token` the first token of an observation sees no other one of them (Pi0).
     """
-    batch, (count, dim) = len(starts) - 1, k.shape
-    row, token, device = torch.arange(len(prefix_k), device=q.device), count // batch, q.device
+    count, dim = k.shape
+    visible = visible_to_suffix(starts, lengths, len(prefix_k), count, state_token).repeat_interleave(heads, 0)
+    # what nobody has written yet counts with 0, but 0 * NaN is NaN
+    keys, values = torch.cat((prefix_k, k)), torch.cat((prefix_v, v)).nan_to_num(0.0)
+    logits = (matmul_f32(q, keys.t()) * dim**-0.5).masked_fill(~visible, -torch.inf)
+    attended = (logits.softmax(-1).to(v.dtype) @ values).view(count, heads * dim)
+    return as_input(attended, q.dtype, inverse)
+
+
+def visible_to_suffix(starts: Tensor, lengths: Tensor, rows: int, count: int, state_token: bool) -> Tensor:
+    """bool[B * T, rows + B * T]: which prefix rows, and which tokens behind them, each of `count` tokens attends to."""
+    batch, device = len(starts) - 1, starts.device
+    row, token = torch.arange(rows, device=device), count // batch
     own = torch.arange(count, device=device) // token
     starts, lengths = starts[own, None], lengths[own, None]
     to_prefix = (row >= starts) & (row < starts + lengths)
@@ -66,12 +77,7 @@ def suffix_attention(
     if state_token:
         place = torch.arange(count, device=device) % token
         to_suffix = to_suffix & ((place[:, None] > 0) | (place == 0))
-    visible = torch.cat((to_prefix, to_suffix), 1).repeat_interleave(heads, 0)
-    # what nobody has written yet counts with 0, but 0 * NaN is NaN
-    keys, values = torch.cat((prefix_k, k)), torch.cat((prefix_v, v)).nan_to_num(0.0)
-    logits = (matmul_f32(q, keys.t()) * dim**-0.5).masked_fill(~visible, -torch.inf)
-    attended = (logits.softmax(-1).to(v.dtype) @ values).view(count, heads * dim)
-    return as_input(attended, q.dtype, inverse)
+    return torch.cat((to_prefix, to_suffix), 1)
 
 
 def _whose(starts: Tensor, rows: int) -> Tensor:

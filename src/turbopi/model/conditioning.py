@@ -12,7 +12,8 @@ With a solver other than Euler's the last line is another one, and the same for 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -125,6 +126,11 @@ class Conditioning:
             return "tokens"
         return "plain" if self.integration is None else "solver"
 
+    @property
+    def brings_steps(self) -> bool:
+        """Whether it says itself how many steps its loop has."""
+        return self.tokens is not None or self.integration is not None
+
     def size(self, num_steps: int, horizon: int) -> tuple[int, int]:
         """Steps and actions of the loop that it is for; what it doesn't fix is as given."""
         grid = None if self.guidance is None else self.guidance.strength
@@ -203,6 +209,25 @@ def of_rows(conditionings: Conditionings, rows: int) -> Sequence[Conditioning | 
     if len(conditionings) != rows:
         raise ObservationError(f"{len(conditionings)} conditionings were given for {rows} observations")
     return conditionings
+
+
+def check_rows(conditionings: Sequence[Conditioning | None], num_steps: int, horizon: int, action_dim: int) -> None:
+    """`Conditioning.check` of each row of a batch; what is wrong is said with its number."""
+    for row, one in enumerate(conditionings):
+        if one is not None:
+            with row_named(row, len(conditionings)):
+                one.check(num_steps, horizon, action_dim)
+
+
+@contextmanager
+def row_named(row: int, rows: int) -> Iterator[None]:
+    """Around what looks at one observation: its number of several goes before what is wrong with it."""
+    try:
+        yield
+    except ObservationError as error:
+        if rows == 1:
+            raise
+        raise ObservationError(f"observation {row} of {rows} (from 0): {error}") from None
 
 
 def _check(what: str, array: np.ndarray, shape: tuple[int, ...], rows: np.ndarray | None = None) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from turbopi.errors import ActionError, ConfigError, DeviceLost, ObservationError
+from turbopi.running_chunk import RunningChunk
 from turbopi.serve.batch_times import BatchTimes
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
@@ -32,7 +33,9 @@ class Policy(Protocol):
     next request is handed over while the one before it is still computed.
 
     With `infer_batch(list of obs)`, which returns a list of what `infer` returns, and `example_observation()` to
-    measure it on, observations of several clients run together where that is sooner.
+    measure it on, observations of several clients run together where that is sooner. With `batch_modes`, too, so do
+    those that join a chunk in one of these modes: `infer_batch` then takes `previous` and `model_actions`, lists with
+    one for each observation.
     """
 
     @property
@@ -101,11 +104,13 @@ class PolicyCalls:
         self._pipelined = bool(getattr(policy, "pipelined", False))
         self._metrics = metrics
         self._on_lost = on_lost
-        self._asked_for = options.max_batch
+        self._asked_for, self._execution = options.max_batch, options.execution
         self._numbers = itertools.count()  # of runs
         self.times = BatchTimes(_largest(policy, self._pipelined, options))
+        self.joining = BatchTimes(self.times.largest if options.execution is not None else 1)
         turns = BatchTimes() if self._pipelined else None
-        self.worker = worker = Worker(Schedule(options.queue_limit, self.times, turns), self._run)
+        schedule = Schedule(options.queue_limit, self.times, turns, self.joining)
+        self.worker = worker = Worker(schedule, self._run)
         self.waits, self.stop, self.drain, self.close = worker.schedule.waits, worker.stop, worker.drain, worker.close
 
     @property
@@ -142,54 +147,69 @@ class PolicyCalls:
             await self.worker.call(self._measure)
 
     def _measure(self) -> None:
-        """Fill the table T(B), as far as the time for it allows."""
+        """Fill the tables T(B), as far as the time for it allows."""
+        self._fill(self.times, {}, "batches")
+        if self.joining.largest > 1:
+            self._fill(self.joining, self._example_of_joining(), "batches that join chunks")
+
+    def _example_of_joining(self) -> dict[str, Any]:
+        """Arguments of an `infer` that joins a chunk in the server's mode."""
+        result = self._policy.infer(self._policy.example_observation(), model_actions=True)  # type: ignore[attr-defined, call-arg]
+        left_over = result["model_actions"]
+        assert self._execution is not None
+        chunk = RunningChunk(left_over, min(1, len(left_over) - 1), mode=self._execution, anchor=result.get("anchor"))
+        return {"previous": chunk, "model_actions": True}
+
+    def _fill(self, times: BatchTimes, arguments: Mapping[str, Any], what: str) -> None:
+        """Fill a table with runs of the example, with these arguments of `infer`. `what` they are, in messages."""
         asked_for = self._asked_for
         for size in self._sizes:
             try:
-                enough = self._measure_size(size)
+                enough = self._measure_size(size, times, arguments)
             except DeviceLost:
                 raise
             except Exception as error:  # out of memory, a size that isn't warm, …
                 if asked_for is not None:
                     raise ConfigError(
-                        f"batches of {size} fail: {type(error).__name__}: {error}. Choose a smaller --max-batch"
+                        f"{what} of {size} fail: {type(error).__name__}: {error}. Choose a smaller --max-batch"
                     ) from error
-                logger.warning("no batches of %d and more: %s: %s", size, type(error).__name__, error)
+                logger.warning("no %s of %d and more: %s: %s", what, size, type(error).__name__, error)
                 enough = False
             if not enough:
-                self.times.failed(size)
+                times.failed(size)
                 break
-        measured = self.times.measured_largest
-        table = ", ".join(f"{size}: {self.times.seconds(size, 0.0) or 0:.4f}" for size in self.times.sizes)
-        logger.info("seconds in the policy by size of a batch: %s", table)
-        if asked_for is not None and self.times.best(measured, 0.0) == 1 < measured:
+        measured = times.measured_largest
+        table = ", ".join(f"{size}: {times.seconds(size, 0.0) or 0:.4f}" for size in times.sizes)
+        logger.info("seconds in the policy by size, of %s: %s", what, table)
+        if asked_for is not None and times.best(measured, 0.0) == 1 < measured:
             logger.warning(
-                "--max-batch is %d, but batches of this policy take as long as their observations one by one, so "
+                "--max-batch is %d, but %s of this policy take as long as their observations one by one, so "
                 "none are formed (seconds by size: %s)",
                 asked_for,
+                what,
                 table,
             )
 
-    def _measure_size(self, size: int) -> bool:
+    def _measure_size(self, size: int, times: BatchTimes, arguments: Mapping[str, Any]) -> bool:
         """Measure one size; False if that would take too long, unless the options ask for batches."""
         example = self._policy.example_observation()  # type: ignore[attr-defined]
 
         def run() -> float:
             started = time.perf_counter()
             if size == 1:
-                self._policy.infer(example)
+                self._policy.infer(example, **arguments)
             else:
-                self._policy.infer_batch([example] * size)  # type: ignore[attr-defined]
+                self._infer_batch([example] * size, [arguments] * size)
             return time.perf_counter() - started
 
         at_will = self._asked_for is not None
-        if not at_will and (self.times.seconds(1, 0.0) or 0.0) * size * MEASURED > SIZE_SECONDS:
+        if not at_will and (times.seconds(1, 0.0) or 0.0) * size * MEASURED > SIZE_SECONDS:
             return False
         first = run()
         if not at_will and size == 1 and first * MEASURED > SIZE_SECONDS:
             return False
         for _ in range(MEASURED):
-            self.times.measured(size, run())
+            times.measured(size, run())
         return True
 
     # --- requests -----------------------------------------------------------------------------------------------------
@@ -203,11 +223,20 @@ class PolicyCalls:
         """
         request.call = _Call([observation], arguments)
         request.joins = bool(arguments.keys() - {"seed"})
-        request.alone = request.alone or bool(arguments)
+        request.alone = request.alone or (bool(arguments) and not self._may_share(arguments))
         answer = self.worker.ask(request)
         if self._pipelined and not arguments:
             answer.add_done_callback(self._learn)
         return answer
+
+    def _may_share(self, arguments: Mapping[str, Any]) -> bool:
+        """Whether a request with arguments may run together with others: if warm-up has measured such batches.
+
+        With a seed it runs alone, so that it has the same answer whoever asks meanwhile.
+        """
+        chunk = arguments.get("previous")
+        measured = self.joining.measured_largest > 1 and (chunk is None or chunk.mode == self._execution)
+        return measured and arguments.keys() <= {"previous", "model_actions"}
 
     async def ask_rows(
         self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
@@ -247,7 +276,7 @@ class PolicyCalls:
             return self._run_one(calls[0])
         observations = [observation for call in calls for observation in call.observations]
         self._metrics.batch_size.observe(len(observations))
-        outcomes = self._together(observations)
+        outcomes = self._together(observations, [call.arguments for call in calls for _ in call.observations])
         if not outcomes:  # one spoils it: the others don't pay for it, nor does who asks meanwhile
             return Ran([None] * len(turn))
         answers, at = [], 0
@@ -259,7 +288,7 @@ class PolicyCalls:
     def _run_one(self, call: _Call) -> Ran:
         if len(call.observations) > 1:
             self._metrics.batch_size.observe(len(call.observations))
-            if outcomes := self._together(call.observations):
+            if outcomes := self._together(call.observations, [{}] * len(call.observations)):
                 return Ran([outcomes], _told(outcomes))
             return Ran([[self._infer(observation, {}) for observation in call.observations]])
         self._metrics.batch_size.observe(1)
@@ -274,13 +303,26 @@ class PolicyCalls:
     def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Outcome:
         return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments))
 
-    def _together(self, observations: Sequence[dict[str, Any]]) -> list[Outcome]:
+    def _infer_batch(
+        self, observations: Sequence[dict[str, Any]], arguments: Sequence[Mapping[str, Any]]
+    ) -> list[dict[str, Any]]:
+        """`arguments` of `infer`, for each observation; what isn't asked for by any isn't said."""
+        joins: dict[str, list[Any]] = {}
+        if any(arguments):
+            joins["previous"] = [one.get("previous") for one in arguments]
+            joins["model_actions"] = [bool(one.get("model_actions")) for one in arguments]
+        results = self._policy.infer_batch(list(observations), **joins)  # type: ignore[attr-defined]
+        if not isinstance(results, list) or len(results) != len(observations):
+            raise TypeError(f"infer_batch must return a list of {len(observations)} results")
+        return results
+
+    def _together(
+        self, observations: Sequence[dict[str, Any]], arguments: Sequence[Mapping[str, Any]]
+    ) -> list[Outcome]:
         """An outcome of each; none if one of them spoiled the batch, so that each shall run for itself."""
         rows, started = len(observations), time.perf_counter()
         try:
-            results = self._policy.infer_batch(list(observations))  # type: ignore[attr-defined]
-            if not isinstance(results, list) or len(results) != rows:
-                raise TypeError(f"infer_batch must return a list of {rows} results")
+            results = self._infer_batch(observations, arguments)
             seconds = time.perf_counter() - started
             run = next(self._numbers)
             return [Outcome(seconds, result=_checked(result), together=rows, run=run) for result in results]
@@ -293,10 +335,11 @@ class PolicyCalls:
             logger.exception("a batch of %d failed: its observations run one by one", rows)
         finally:
             self._metrics.inference_seconds.observe(time.perf_counter() - started)
-        outcomes = [self._infer(observation, {}) for observation in observations]
+        outcomes = [self._infer(*one) for one in zip(observations, arguments, strict=True)]
         if all(outcome.wrong != "policy" for outcome in outcomes):  # it was the batch's fault, not one observation's
-            logger.warning("batches of %d and more aren't formed any more", rows)
-            self.times.failed(rows)
+            joins = " that join chunks" if any(arguments) else ""
+            logger.warning("batches of %d and more%s aren't formed any more", rows, joins)
+            (self.joining if joins else self.times).failed(rows)
         return outcomes
 
     def _submit(self, observation: dict[str, object]) -> "Future[list[Outcome]]":
@@ -340,10 +383,15 @@ class PolicyCalls:
 
 def _largest(policy: Policy, pipelined: bool, options: ServerOptions) -> int:
     """Observations of a batch, at most, as far as measuring allows. Raises ConfigError."""
-    asked_for = options.max_batch
-    if options.execution is not None:  # all requests join a chunk, and run alone
-        return 1
+    asked_for, execution = options.max_batch, options.execution
     lacking = [name for name in ("infer_batch", "example_observation") if not hasattr(policy, name)]
+    if execution is not None and execution not in getattr(policy, "batch_modes", ()):
+        if asked_for is not None and asked_for > 1:
+            raise ConfigError(
+                f"max_batch is {asked_for}, but this policy runs requests that join a chunk one by one, and with "
+                f"execution {execution!r} all do: leave one of them out"
+            )
+        return 1
     if not pipelined and not lacking:
         return AUTO_LARGEST if asked_for is None else asked_for
     if asked_for is not None and asked_for > 1:

@@ -66,11 +66,6 @@ class ServerOptions:
             raise ConfigError(f"queue_limit must be 0 or more, not {self.queue_limit}")
         if self.max_batch is not None and not 1 <= self.max_batch <= MAX_BATCH:
             raise ConfigError(f"max_batch must be from 1 to {MAX_BATCH}, not {self.max_batch}")
-        if self.execution is not None and self.max_batch is not None and self.max_batch > 1:
-            raise ConfigError(
-                f"max_batch is {self.max_batch}, but with execution {self.execution!r} each request joins a chunk and "
-                "runs alone: leave one of them out"
-            )
         if not 0 < self.deadline_ms <= MAX_DEADLINE_MS:
             raise ConfigError(
                 f"deadline_ms must be more than 0 and at most {MAX_DEADLINE_MS:g}, not {self.deadline_ms:g}"

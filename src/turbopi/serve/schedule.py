@@ -46,7 +46,7 @@ class Request:
     rows      observations in it; they run together
     later     observations of the same message that come after these, for whose last one the deadline is
     alone     never in a batch with others
-    joins     it joins a chunk, or is else not as others are: it runs alone, and such runs have times of their own
+    joins     it joins a chunk, or is else not as others are: runs with such a request have times of their own
     call      what to run; not looked at here
     """
 
@@ -117,13 +117,20 @@ class Schedule:
     queue_limit  requests that may wait while a turn runs
     times        T(B); one that forms no batches by default
     turns        how long a turn keeps the next one from beginning, where that isn't T(B): a pipelined policy
+    joining      T(B) of runs in which a chunk is joined; by default they form no batches
     """
 
-    def __init__(self, queue_limit: int, times: BatchTimes | None = None, turns: BatchTimes | None = None) -> None:
+    def __init__(
+        self,
+        queue_limit: int,
+        times: BatchTimes | None = None,
+        turns: BatchTimes | None = None,
+        joining: BatchTimes | None = None,
+    ) -> None:
         self.queue_limit = queue_limit
         self.times = BatchTimes() if times is None else times
         self._turns = self.times if turns is None else turns
-        self._joining = BatchTimes()  # of runs that join a chunk
+        self._joining = BatchTimes() if joining is None else joining
         self._waiting: list[Request] = []
         self._running: tuple[Request, ...] = ()
         self._until = 0.0  # when the running turn is expected to end
@@ -187,7 +194,7 @@ class Schedule:
         """The running turn has ended: the next one may begin. `seconds` that it took; None if they tell nothing."""
         if seconds is not None:
             rows = sum(request.rows for request in self._running)
-            (self._joining if any(request.joins for request in self._running) else self._turns).ran(rows, seconds, now)
+            self._turn_times(self._running).ran(rows, seconds, now)
         self._running, self._free_since = (), now
 
     @property
@@ -222,14 +229,15 @@ class Schedule:
         if not request.firm:
             return None
         before = [one for one in self._waiting if _order(one) < _order(request)]
-        together = sum(one.rows for one in before if not one.alone)
-        wait = self._until_free(now) + sum(self._turn_seconds(one, now) for one in before if one.alone)
+        others = [one for one in before if not one.alone]
+        together = sum(one.rows for one in others)
+        wait = self._until_free(now) + sum(self._turn_seconds((one,), now) for one in before if one.alone)
         run = self._seconds(request, now)
         if self._turns is self.times and not request.alone:  # it may run together with those before it
             rows = together + request.rows + request.later
-            wait += max(0.0, self.times.total(rows, now) - run)
+            wait += max(0.0, self._times((*others, request)).total(rows, now) - run)
         else:
-            wait += self._turns.total(together, now)
+            wait += self._turn_seconds(others, now)
         return self._late(request, now, wait, run) if now + wait + run > request.deadline else None
 
     def _hopeless(self, now: float) -> list[Refused]:
@@ -250,11 +258,20 @@ class Schedule:
 
     def _seconds(self, request: Request, now: float) -> float:
         """From the beginning of its turn to the actions of all rows of its message, if they run on their own."""
-        return (self._joining if request.joins else self.times).total(request.rows + request.later, now)
+        return self._times((request,)).total(request.rows + request.later, now)
 
-    def _turn_seconds(self, request: Request, now: float) -> float:
-        """For how long its turn keeps others from theirs."""
-        return (self._joining if request.joins else self._turns).total(request.rows, now)
+    def _turn_seconds(self, requests: Iterable[Request], now: float) -> float:
+        """For how long turns of these, which may run together, keep others from theirs."""
+        requests = tuple(requests)
+        return self._turn_times(requests).total(sum(request.rows for request in requests), now)
+
+    def _times(self, requests: Iterable[Request]) -> BatchTimes:
+        """T(B) of runs of these."""
+        return self._joining if any(request.joins for request in requests) else self.times
+
+    def _turn_times(self, requests: Iterable[Request]) -> BatchTimes:
+        """The same, of how long they keep the next turn from beginning."""
+        return self._joining if any(request.joins for request in requests) else self._turns
 
     def _late(self, request: Request, now: float, wait: float, run: float) -> Refused:
         since, deadline = now - request.arrived, request.deadline - request.arrived
@@ -291,8 +308,7 @@ class Schedule:
         for request in self._waiting:
             request.overtaken += request.number < last
         self._running, self._exhausted_last = turn, exhausted
-        rows = sum(request.rows for request in turn)
-        self._until = now + (self._turns.total(rows, now) if rows > 1 else self._turn_seconds(turn[0], now))
+        self._until = now + self._turn_seconds(turn, now)
         refused += tuple(self._hopeless(now))  # those for whom this turn takes too long
         return Decision(turn, refused, self._next_hopeless(now))
 
@@ -312,11 +328,19 @@ class Schedule:
         return [head, *sorted(others, key=_order)]
 
     def _fitting(self, group: list[Request], now: float) -> tuple[Request, ...]:
-        """The first of a group, as many as pay and as keep the deadlines."""
+        """The first of a group, as many as pay and as keep the deadlines.
+
+        If some join a chunk and others don't, these may pay more without the others.
+        """
+        alike = [request for request in group if request.joins == group[0].joins]
+        turns = [self._first_that_pay(some, now) for some in ([group] if len(alike) == len(group) else [group, alike])]
+        return max(turns, key=lambda turn: sum(request.rows for request in turn))
+
+    def _first_that_pay(self, group: list[Request], now: float) -> tuple[Request, ...]:
         if len(group) == 1:
             return tuple(group)
         rows = sum(request.rows for request in group)
-        best = self.times.best(rows, now, self._longest(group, now))
+        best = self._times(group).best(rows, now, self._longest(group, now))
         turn, taken = [group[0]], group[0].rows
         for request in group[1:]:
             if taken + request.rows > best:
@@ -331,7 +355,7 @@ class Schedule:
         A robot whose deadline is shorter than two runs has no guarantee, and none is tried for it.
         """
         group = tuple(group)
-        alone = self.times.seconds(1, now) or 0.0
+        alone = self._times(group).seconds(1, now) or 0.0
         slacks = [one.deadline - now for one in group if one.firm]
         sources = {request.source for request in group}
         tight = (within - alone for source, within in self._tight.values(now).items() if source not in sources)
@@ -348,17 +372,18 @@ class Schedule:
         Company is waited for if it saves more time than it usually takes to come: as long as the saving, not longer
         than a few usual gaps after the last arrival, and only while all deadlines of the group leave room for T(B).
         """
+        times = self._times(group)
         expected = len(self._active.values(now).keys() - {request.source for request in group})
-        most = min(self._places - len(group), expected, self.times.measured_largest - rows)
+        most = min(self._places - len(group), expected, times.measured_largest - rows)
         if most < 1 or len(self._gaps) < GAPS // 4:
             return -math.inf
-        gap, alone, together = median(self._gaps), self.times.total(1, now), self.times.total(rows, now)
+        gap, alone, together = median(self._gaps), times.total(1, now), times.total(rows, now)
         opened = max(self._free_since, min(request.arrived for request in group))
         deadline = min(request.deadline for request in group)
         until = -math.inf
         for more in range(1, most + 1):
-            saving = together + more * alone - self.times.total(rows + more, now)
-            safe = self.times.seconds(rows + more, now, SAFE)
+            saving = together + more * alone - times.total(rows + more, now)
+            safe = times.seconds(rows + more, now, SAFE)
             if saving > more * gap and safe is not None:
                 until = max(until, min(opened + saving, deadline - safe - LATE_TIMER))
         return min(until, self._last_arrival + PATIENCE * gap)
