@@ -307,10 +307,11 @@ class StaticCall:
         if self.shape.loop.form == "tokens":
             v_t = self._velocity(step, rope)
             return v_t - gain * asked.error(step, x_t, v_t)
-        back, cache = self.ops.backward or PLAIN_BACKWARD, (self.cache_k, self.cache_v)
+        tokens, cache = self._suffix_tokens(step), (self.cache_k, self.cache_v)
+        back = PLAIN_BACKWARD if self.ops.backward is None else self.ops.backward(self.config.expert, len(tokens))
         table, length = self._modulation(step), self.inputs.length
         expert = Expert(self.config, self.weights, self.ops, back, table, length, *cache, rope)
-        out, kept, last = expert.forward(self._suffix_tokens(step))
+        out, kept, last = expert.forward(tokens)
         v_t = forward.project(self.weights.small, "action_out_proj", out[-horizon:])
         error = asked.error(step, x_t, v_t) * asked.weights
         d_out = torch.zeros_like(out)  # Pi0's state token has no velocity

@@ -1,7 +1,8 @@
 """Programmatic dependent launch: a kernel's blocks start while the kernel before it ends, and wait for its results.
 
 Every kernel here that is launched so waits before it touches anything another kernel writes; so work that a kernel
-may overlap with is only ever its own constants' loading. Needs compute capability 9.0.
+may overlap with is only ever its own constants' loading: into registers, or by `prefetch` into the L2 cache. Needs
+compute capability 9.0.
 """
 
 from functools import lru_cache
@@ -26,6 +27,15 @@ def wait_for_producer(PDL: tl.constexpr):
 def launch_dependents(PDL: tl.constexpr):
     if PDL:
         gdc_launch_dependents()
+
+
+@triton.jit
+def prefetch(at, PDL: tl.constexpr):
+    """Have the lines of 128 bytes at these addresses brought into the L2 cache. Nothing waits for them."""
+    if PDL:
+        tl.inline_asm_elementwise(
+            "prefetch.global.L2 [$1]; mov.u32 $0, 0;", "=r,l", [at.to(tl.int64)], tl.int32, is_pure=False, pack=1
+        )
 
 
 def dependent_launch(x: Tensor) -> dict[str, Any]:
