@@ -80,7 +80,7 @@ OWN_KEYS = 16  # of a program that gathers their gradient
 
 
 def attention_cut(capability: Capability, tokens: int, keys: int) -> AttentionCut:
-    """Few splits, as the product behind adds them up; of more tokens fewer. Each is a multiple of the keys at a time."""
+    """Few splits, as the product behind adds them up. Each is a multiple of the keys at a time."""
     at_once = 64 if BLOCK_SHARED.get(capability, LEAST_SHARED) > 128 * 1024 else 32
     least, most = (128, SPLITS) if tokens <= 16 else (256, 3)
     split = max(least, -(-keys // most))
