@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
@@ -314,8 +315,9 @@ class StaticCall:
         out, kept, last = expert.forward(tokens)
         v_t = forward.project(self.weights.small, "action_out_proj", out[-horizon:])
         error = asked.error(step, x_t, v_t) * asked.weights
-        d_out = torch.zeros_like(out)  # Pi0's state token has no velocity
-        d_out[-horizon:] = (asked.tokens.times[step, :, None] * error) @ self.weights.small["action_out_proj.weight"]
+        d_out = (asked.tokens.times[step, :, None] * error) @ self.weights.small["action_out_proj.weight"]
+        if len(out) > horizon:
+            d_out = F.pad(d_out, (0, 0, len(out) - horizon, 0))  # Pi0's state token has no velocity
         d_tokens = expert.vjp(kept, last, d_out)[-horizon:]
         through = suffix_vjp(self.config, self.weights.small, x_t, self._time(step), d_tokens)
         return v_t - gain * (error - through)

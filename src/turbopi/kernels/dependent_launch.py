@@ -38,6 +38,12 @@ def prefetch(at, PDL: tl.constexpr):
         )
 
 
+@triton.jit
+def prefetch_row(at, width, PER_LINE: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr):
+    """The lines of a row of `width` numbers, at most BLOCK, of which PER_LINE are 128 bytes."""
+    prefetch(at + tl.minimum(tl.arange(0, max(1, BLOCK // PER_LINE)) * PER_LINE, width - 1), PDL)
+
+
 def dependent_launch(x: Tensor) -> dict[str, Any]:
     """Launch options: dependent launch where the GPU has it."""
     if x.is_cuda and capability(x.device)[0] >= 9:
