@@ -171,7 +171,8 @@ def attention_vjp(
     """See the twin. d_attended [T, n * K] -> parts that `qkv_vjp` adds up: of the queries float32[splits, T * n, K],
     of the suffix's keys and values float32[groups, T, 2, K].
 
-    All but d_attended is read before the kernel in front has ended: that must not be `out`, which completes `kept`.
+    All but d_attended is read before the kernel in front has ended. So that must wait before it lets this one start, as
+    `out_vjp` does, and not be `out`, which completes `kept`.
     """
     q = kept.q
     assert d_attended.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"

@@ -27,6 +27,30 @@ def _prefetch(weight, row, length, stride, ROWS: tl.constexpr, LINES: tl.constex
 
 
 @triton.jit
+def _two_products(
+    x, weight, row, apart, tokens, inner,
+    BLOCK_M: tl.constexpr, PAIRS: tl.constexpr, DEPTH: tl.constexpr, LINES: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """x [tokens, inner] times PAIRS of the matrix's rows from `row` on, and times as many that are `apart` behind.
+
+    As one product of rows in turn: in 16 columns, two would each keep half of the warps busy.
+    """
+    _prefetch(weight, row, inner, inner, PAIRS, LINES, PDL)
+    _prefetch(weight, row + apart, inner, inner, PAIRS, LINES, PDL)
+    m, n, d = tl.arange(0, BLOCK_M), tl.arange(0, 2 * PAIRS), tl.arange(0, DEPTH)
+    weight_at = weight + ((row + n // 2 + n % 2 * apart)[:, None] * inner + d[None, :])
+    x_at = x + (m[:, None] * inner + d[None, :])
+    there = (m < tokens)[:, None]
+    acc = tl.zeros((BLOCK_M, 2 * PAIRS), tl.float32)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    for at in range(0, inner, DEPTH):
+        a = tl.load(x_at + at, there, 0.0)
+        acc = tl.dot(a, tl.load(weight_at + at).T, acc, input_precision="ieee")
+    return tl.split(tl.reshape(acc, (BLOCK_M, PAIRS, 2)))
+
+
+@triton.jit
 def _qkv_kernel(
     x, weight, cos, sin, q, k, v, tokens, inner, heads,
     HALF: tl.constexpr, PAIRS: tl.constexpr, BLOCK_M: tl.constexpr, DEPTH: tl.constexpr, LINES: tl.constexpr,
@@ -34,23 +58,10 @@ def _qkv_kernel(
 ):  # fmt: skip
     """PAIRS of columns of one head, each of one column of either half."""
     head, part = tl.program_id(0) // (HALF // PAIRS), tl.program_id(0) % (HALF // PAIRS)
-    m, d = tl.arange(0, BLOCK_M), tl.arange(0, DEPTH)
-    pair = part * PAIRS + tl.arange(0, PAIRS)
     row = head * 2 * HALF + part * PAIRS
-    _prefetch(weight, row, inner, inner, PAIRS, LINES, PDL)
-    _prefetch(weight, row + HALF, inner, inner, PAIRS, LINES, PDL)
-    first_at = weight + ((head * 2 * HALF + pair)[:, None] * inner + d[None, :])
-    second_at = first_at + HALF * inner
-    x_at = x + (m[:, None] * inner + d[None, :])
+    first, second = _two_products(x, weight, row, HALF, tokens, inner, BLOCK_M, PAIRS, DEPTH, LINES, PDL)
+    m, pair = tl.arange(0, BLOCK_M), part * PAIRS + tl.arange(0, PAIRS)
     there = (m < tokens)[:, None]
-    first = tl.zeros((BLOCK_M, PAIRS), tl.float32)
-    second = tl.zeros((BLOCK_M, PAIRS), tl.float32)
-    wait_for_producer(PDL)
-    launch_dependents(PDL)
-    for at in range(0, inner, DEPTH):
-        a = tl.load(x_at + at, there, 0.0)
-        first = tl.dot(a, tl.load(first_at + at).T, first, input_precision="ieee")
-        second = tl.dot(a, tl.load(second_at + at).T, second, input_precision="ieee")
     turned = m[:, None] * HALF + pair[None, :]
     c = tl.load(cos + turned, there & (head <= heads), 1.0)  # values aren't turned
     s = tl.load(sin + turned, there & (head <= heads), 0.0)
@@ -84,23 +95,10 @@ def _gate_up_kernel(
     x, weight, product, out, tokens, inner, hidden,
     COLUMNS: tl.constexpr, BLOCK_M: tl.constexpr, DEPTH: tl.constexpr, LINES: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
-    m, d = tl.arange(0, BLOCK_M), tl.arange(0, DEPTH)
     row = tl.program_id(0) * COLUMNS
-    n = row + tl.arange(0, COLUMNS)
-    _prefetch(weight, row, inner, inner, COLUMNS, LINES, PDL)
-    _prefetch(weight, row + hidden, inner, inner, COLUMNS, LINES, PDL)
-    gate_at = weight + (n[:, None] * inner + d[None, :])
-    up_at = gate_at + hidden * inner
-    x_at = x + (m[:, None] * inner + d[None, :])
+    gate, up = _two_products(x, weight, row, hidden, tokens, inner, BLOCK_M, COLUMNS, DEPTH, LINES, PDL)
+    m, n = tl.arange(0, BLOCK_M), row + tl.arange(0, COLUMNS)
     there = (m < tokens)[:, None]
-    gate = tl.zeros((BLOCK_M, COLUMNS), tl.float32)
-    up = tl.zeros((BLOCK_M, COLUMNS), tl.float32)
-    wait_for_producer(PDL)
-    launch_dependents(PDL)
-    for at in range(0, inner, DEPTH):
-        a = tl.load(x_at + at, there, 0.0)
-        gate = tl.dot(a, tl.load(gate_at + at).T, gate, input_precision="ieee")
-        up = tl.dot(a, tl.load(up_at + at).T, up, input_precision="ieee")
     dtype = out.dtype.element_ty
     to = product + (m[:, None] * 2 * hidden + n[None, :])
     tl.store(to, gate.to(dtype), there)

@@ -51,8 +51,13 @@ def split_of(inner: int) -> int:
 def streaming(
     capability: Capability, tokens: int, columns: int, inner: int, most_columns: int, matrices: int = 1
 ) -> Tile:
-    """`matrices` are read at once, each in `columns` columns; two blocks shall fit a multiprocessor."""
+    """`matrices` are read at once, each in at most `most_columns` columns; two blocks shall fit a multiprocessor.
+
+    Up to 16 tokens a product has 32 columns at most, 8 a warp: what bounds it is a warp's chain of instructions, which
+    more programs hide.
+    """
     rows = token_rows(tokens)
+    most_columns = min(most_columns, 32 // matrices) if rows == LEAST_ROWS else most_columns
     taken, depth = power_dividing(columns, most_columns), power_dividing(inner, 128)
     stage = (rows + matrices * taken) * depth * 2
     room = BLOCK_SHARED.get(capability, LEAST_SHARED) // 2
