@@ -16,6 +16,7 @@ from turbopi.engine.backward import Expert, suffix_vjp
 from turbopi.engine.compiled import compiled
 from turbopi.engine.forward import expert_output, rope_of_all_positions
 from turbopi.engine.weights import pack
+from turbopi.kernels.backward import PLAIN as PIECES
 from turbopi.kernels.backward import PLAIN_BACKWARD, rope_vjp
 from turbopi.kernels.interface import BackwardOps, Ops
 from turbopi.kernels.plain import PLAIN
@@ -147,6 +148,22 @@ def test_equals_autograd_of_the_reference(
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("times", ["one time", "by token"])
+@pytest.mark.skipif(torch.cuda.is_available(), reason="Triton interprets where there is no GPU")
+@pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::DeprecationWarning")  # the interpreter is NumPy
+def test_kernels_for_few_tokens_equal_autograd(kind: Kind, times: Times) -> None:
+    pytest.importorskip("triton", reason="Triton isn't installed")
+    from turbopi.kernels.portable.norms import residual_rms_norm
+    from turbopi.kernels.portable.vjp.ops import FEW_TOKENS
+
+    problem = Problem.of(kind, times)
+    given = (problem.chunk(0), problem.chunk(1))
+    v, gradient = problem.engine(dataclasses.replace(PLAIN, residual_rms_norm=residual_rms_norm), FEW_TOKENS)(*given)
+    exact_v, exact = problem.reference(*given)
+    assert relative(v, exact_v) < 1e-5 and relative(gradient, exact) < 1e-5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("times", ["one time", "by token"])
 def test_bfloat16_is_as_close_to_float32_as_autograd_is(kind: Kind, times: Times) -> None:
     """Both with the same rounded weights and prefix."""
     dtypes = {name: one.dtype for name, one in golden_model(kind, "bf16").state_dict().items()}
@@ -187,7 +204,7 @@ def test_the_suffixs_own_keys_and_values_carry_gradient(kind: Kind, broken: Call
 
     given = (problem.chunk(0), problem.chunk(1))
     whole = problem.engine()(*given)[1]
-    cut = problem.engine(back=dataclasses.replace(PLAIN_BACKWARD, rope_vjp=broken))(*given)[1]
+    cut = problem.engine(back=dataclasses.replace(PIECES, rope_vjp=broken).ops(""))(*given)[1]
     assert relative(cut, whole) > 1e-4, "ten times what the comparison with autograd lets pass"
 
 
@@ -198,8 +215,9 @@ def test_the_suffixs_own_keys_and_values_carry_gradient(kind: Kind, broken: Call
 )
 @pytest.mark.parametrize("times", ["one time", "by token"])
 def test_compiled_operations_equal_autograd_and_compile_nothing_for_another_horizon(times: Times) -> None:
-    back = compiled().backward
-    assert back is not None
+    made = compiled().backward
+    assert made is not None
+    back = made(Problem.of("pi05", times).model.config.expert, 10)
     for horizon, stance in ((10, "default"), (13, "fail_on_recompile")):
         problem = Problem.of("pi05", times, horizon)
         given = (problem.chunk(0), problem.chunk(1))

@@ -14,6 +14,7 @@ from turbopi.kernels.portable.attention_tiles import Attention, AttentionTile
 from turbopi.kernels.portable.attention_tiles import candidates as attention_candidates
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
+from turbopi.kernels.portable.vjp.ops import FEW_TOKENS
 from turbopi.quantization.fp8 import E4M3, ScaledMatrix
 
 BF16, F32 = torch.bfloat16, torch.float32
@@ -46,7 +47,14 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
     """
     numbers = E4M3 if tiles.fp8_refusal(target.capability) is None else torch.int8
     inverses: tuple[Input, ...] = ({}, {"inverse": 30.0, "numbers": numbers})
-    calls = [*_norms(inverses), *_attention(target, inverses), *_batch(target, inverses), *_rest(), *_backward()]
+    calls = [
+        *_norms(inverses),
+        *_attention(target, inverses),
+        *_batch(target, inverses),
+        *_rest(),
+        *_backward(),
+        *_way_back(),
+    ]
     calls += [partial(lambda input: activations.geglu(of(PREFIX, 2 * 16384), **input), one) for one in inverses]
     calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152), numbers)]
     return [*calls, *product_calls(target, numbers, chosen)]
@@ -193,20 +201,44 @@ def _rest() -> Calls:
 
 
 def _backward() -> Calls:
-    def rms(by_row: bool, full: bool) -> Any:
+    def rms(by_row: bool, full: bool, parts: int) -> Any:
         factor = of(SUFFIX, 1024, dtype=F32) if by_row else of(1024, dtype=F32)
         d_x, gate = (of(SUFFIX, 1024, dtype=F32), factor) if full else (None, None)
-        return backward.rms_norm_vjp(of(SUFFIX, 1024), of(SUFFIX, 1024), factor, 1e-6, d_x, gate)
+        d_normed = of(parts, SUFFIX, 1024, dtype=F32) if parts else of(SUFFIX, 1024)
+        return backward.rms_norm_vjp(d_normed, of(SUFFIX, 1024), factor, 1e-6, d_x, gate)
 
     def rope_vjp() -> Tensor:
         cos, head = of(SUFFIX, 128, dtype=F32), of(SUFFIX, 256)
         return backward.rope_vjp(of(SUFFIX * 8, 256), head, head, cos, cos)
 
     return [
-        *(partial(rms, by_row, full) for by_row in (False, True) for full in (False, True)),
+        *(partial(rms, by_row, full, 0) for by_row in (False, True) for full in (False, True)),
+        *(partial(rms, True, True, parts) for parts in (8, 10)),
         lambda: backward.geglu_vjp(of(SUFFIX, 4096), of(SUFFIX, 8192)),
         lambda: backward.softmax_vjp(of(SUFFIX * 8, 1026), of(SUFFIX * 8, 1026, dtype=F32), 0.06),
         rope_vjp,
+    ]
+
+
+def _way_back() -> Calls:
+    """The expert on few tokens: a tile for each power of two of them, with prefixes of one and of four cameras."""
+
+    def layer(tokens: int, slots: int, state_token: bool) -> None:
+        ops, x, cos = FEW_TOKENS, of(tokens, 1024), of(tokens, 128, dtype=F32)
+        k, own, heads = of(slots + tokens, 256), of(tokens, 256), (of(1, dtype=torch.int64), slots, 8, state_token)
+        qkv, out, gate_up, down = of(2560, 1024), of(1024, 2048), of(8192, 1024), of(1024, 4096)
+        q = ops.qkv(x, qkv, cos, cos, own, own)
+        attended, kept = ops.attention(q, k, k, *heads)
+        ops.out(attended, out)
+        product, hidden = ops.gate_up(x, gate_up)
+        ops.down(hidden, down)
+        ops.gate_up_vjp(ops.down_vjp(x, down, product), gate_up)
+        ops.qkv_vjp(ops.attention_vjp(kept, ops.out_vjp(x, out), k, k, *heads), cos, cos, qkv)
+
+    return [
+        partial(layer, tokens, slots, tokens == 51)
+        for tokens in (10, 32, 50, 51)
+        for slots in (256 + 64, PREFIX + 8, 4 * 256 + 208)
     ]
 
 

@@ -1,7 +1,7 @@
 """The vector-Jacobian product through the action expert, the prefix's keys and values fixed: exact, as operations.
 
-Forward as `forward.expert_output`, but that what the way back needs is kept; then back, layer by layer. Per layer five
-tensors are kept, for one evaluation. The suffix's own keys and values depend on its tokens, so gradients go through the
+Forward as `forward.expert_output`, but that what the way back needs is kept; then back, layer by layer. What a layer
+keeps is kept for one evaluation. The suffix's own keys and values depend on its tokens, so gradients go through the
 cache's last rows, too.
 
 Shapes: T suffix tokens, D width, K head_dim, n query heads, R cache rows.
@@ -19,7 +19,6 @@ from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.forward import Rope, project
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import BackwardOps, Ops, State
-from turbopi.kernels.plain import matmul_f32
 
 
 @dataclass(frozen=True)
@@ -27,8 +26,7 @@ class KeptLayer:
     """What one layer's way back needs."""
 
     x: Tensor  # [T, D]  the residual stream as attention's norm reads it
-    q: Tensor  # [T * n, K], turned
-    probabilities: Tensor  # [T * n, R]
+    attention: Any  # as `BackwardOps.attention` keeps it
     middle: Tensor  # [T, D]  the residual stream as the MLP's norm reads it
     gate_up: Tensor  # [T, 2F]
 
@@ -50,8 +48,9 @@ class Expert:
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, list[KeptLayer], Tensor]:
         """Suffix tokens [T, D] -> (the final norm's result float32[T, D], what each layer keeps, the last stream)."""
-        config, ops, g = self.config, self.ops, self.config.expert
-        slots, pi0, kept = self._slots(tokens), config.kind == "pi0", []
+        config, ops, back, g, kept = self.config, self.ops, self.back, self.config.expert, []
+        slots, heads = self._slots(tokens), self._heads(tokens)
+        hidden_keys = {} if self.hidden is None else {"hidden": self.hidden}
         x: Tensor = tokens
         y: Any = None
         gate: Tensor | None = None
@@ -60,19 +59,14 @@ class Expert:
             x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
             start, gate = x, next_gate
             k, v = self.cache_k[i], self.cache_v[i]
-            q = ops.rope_split(ops.linear(normed, layer.qkv), *self.rope, k[slots:], v[slots:])
-            heads = (g.num_heads, pi0 and self.hidden is None, g.head_dim**-0.5, v.dtype)
-            logits = matmul_f32(q, k.t())
-            if self.hidden is not None:
-                logits.view(len(tokens), g.num_heads, -1).masked_fill_(self.hidden, -torch.inf)
-            probabilities = self.back.softmax(logits, self.length, slots, *heads)
-            attended = (probabilities @ v).view(len(tokens), -1)
+            q = back.qkv(normed, layer.qkv, *self.rope, k[slots:], v[slots:])
+            attended, for_vjp = back.attention(q, k, v, *heads, **hidden_keys)
             scale, shift, next_gate = self._modulation(2 * i + 1, layer.norm2)
-            y = ops.residual_linear(attended, layer.out)
+            y = back.out(attended, layer.out)
             x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
-            gate_up = ops.linear(normed, layer.gate_up)
-            y, gate = ops.residual_linear(self.back.geglu(gate_up), layer.down), next_gate
-            kept.append(KeptLayer(start, q, probabilities, x, gate_up))
+            gate_up, hidden = back.gate_up(normed, layer.gate_up)
+            y, gate = back.down(hidden, layer.down), next_gate
+            kept.append(KeptLayer(start, for_vjp, x, gate_up))
         scale, shift, _ = self._modulation(2 * g.depth, self.weights.expert_norm)
         x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
         return normed.float(), kept, x
@@ -80,7 +74,7 @@ class Expert:
     def vjp(self, kept: list[KeptLayer], last: Tensor, d_out: Tensor) -> Tensor:
         """What comes back to the tokens, float32[T, D], of d_out float32[T, D] at the final norm's result."""
         back, eps, g, layers = self.back, self.config.rms_norm_eps, self.config.expert, self.weights.expert
-        slots = self._slots(last)
+        heads = self._heads(last)
 
         def norm(d: Tensor, x: Tensor, index: int, plain: Tensor | None, d_x: Tensor | None) -> tuple[Tensor, Any]:
             """Back through norm number `index` and the addition before it: to the stream, and to what was added."""
@@ -93,19 +87,21 @@ class Expert:
 
         d_x, d_y = norm(d_out.to(last.dtype), last, 2 * g.depth, self.weights.expert_norm, None)
         for i in reversed(range(g.depth)):
-            layer, had, k, v = layers[i], kept[i], self.cache_k[i], self.cache_v[i]
-            d_normed = back.geglu_vjp(d_y @ layer.down, had.gate_up) @ layer.gate_up
+            layer, had = layers[i], kept[i]
+            d_normed = back.gate_up_vjp(back.down_vjp(d_y, layer.down, had.gate_up), layer.gate_up)
             d_x, d_y = norm(d_normed, had.middle, 2 * i + 1, layer.norm2, d_x)
-            d_attended = (d_y @ layer.out).view(-1, g.head_dim)  # [T * n, K]
-            d_logits = back.softmax_vjp(had.probabilities, matmul_f32(d_attended, v.t()), g.head_dim**-0.5)
-            d_k = d_logits[:, slots:].t() @ had.q
-            d_v = had.probabilities[:, slots:].t() @ d_attended
-            d_qkv = back.rope_vjp(d_logits @ k, d_k, d_v, *self.rope)
-            d_x, d_y = norm(d_qkv @ layer.qkv, had.x, 2 * i, layer.norm1, d_x)
+            d_attended = back.out_vjp(d_y, layer.out)
+            gradients = back.attention_vjp(had.attention, d_attended, self.cache_k[i], self.cache_v[i], *heads)
+            d_x, d_y = norm(back.qkv_vjp(gradients, *self.rope, layer.qkv), had.x, 2 * i, layer.norm1, d_x)
         return d_x
 
     def _slots(self, tokens: Tensor) -> int:
         return self.cache_k.shape[1] - len(tokens)
+
+    def _heads(self, tokens: Tensor) -> tuple[Tensor, int, int, bool]:
+        """What attention is told of what its queries see: length, slots, heads, whether there is a state token."""
+        state_token = self.config.kind == "pi0" and self.hidden is None  # else `hidden` says what it doesn't see
+        return self.length, self._slots(tokens), self.config.expert.num_heads, state_token
 
     def _modulation(self, index: int, plain: Tensor | None) -> tuple[Any, Any, Any]:
         """Scale, shift and gate of norm number `index`; the shift and the gate may be None."""
@@ -125,14 +121,18 @@ def jacobian_velocity(
     """
     small, horizon = expert.weights.small, x_t.shape[-2]
 
-    def of_actions(rows: Tensor) -> Tensor:  # Pi0's state token has no velocity
+    def of_actions(rows: Tensor) -> Tensor:
         return rows.view(*x_t.shape[:-2], -1, rows.shape[-1])[..., -horizon:, :]
 
     out, kept, last = expert.forward(tokens)
     v_t = project(small, "action_out_proj", of_actions(out))
     error = asked.error(step, x_t, v_t) * asked.weights
-    d_out = torch.zeros_like(out)
-    of_actions(d_out).copy_((asked.tokens.times[step, ..., None] * error) @ small["action_out_proj.weight"])
+    d_out = (asked.tokens.times[step, ..., None] * error) @ small["action_out_proj.weight"]
+    if d_out.numel() == out.numel():
+        d_out = d_out.view(out.shape)
+    else:  # Pi0's state token has no velocity
+        of_actions(every := torch.zeros_like(out)).copy_(d_out)
+        d_out = every
     d_tokens = of_actions(expert.vjp(kept, last, d_out))
     through = suffix_vjp(expert.config, small, x_t, time, d_tokens)
     return v_t - asked.tokens.gain[step, ..., None] * (error - through)

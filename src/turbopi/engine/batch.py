@@ -265,5 +265,6 @@ class BatchLoop:
 
     def _expert(self, weights: Weights, step: int, rope: forward.Rope, k: Tensor, v: Tensor, hidden: Tensor) -> Expert:
         buffers, table = self._buffers, self._modulation(step)
-        back = buffers.ops.backward or PLAIN_BACKWARD
+        choose, tokens = buffers.ops.backward, buffers.size.batch * self._tokens
+        back = PLAIN_BACKWARD if choose is None else choose(buffers.config.expert, tokens, True)
         return Expert(buffers.config, weights, buffers.ops, back, table, self._seen, k, v, rope, hidden)

@@ -306,10 +306,11 @@ class StaticCall:
         x_t = self.x_t[step]
         if self.shape.loop.form == "tokens":
             return asked.pulled(step, x_t, self._velocity(step, rope))
-        back, cache = self.ops.backward or PLAIN_BACKWARD, (self.cache_k, self.cache_v)
+        tokens, cache = self._suffix_tokens(step), (self.cache_k, self.cache_v)
+        back = PLAIN_BACKWARD if self.ops.backward is None else self.ops.backward(self.config.expert, len(tokens))
         table, length = self._modulation(step), self.inputs.length
         expert = Expert(self.config, self.weights, self.ops, back, table, length, *cache, rope)
-        return jacobian_velocity(expert, asked, step, x_t, self._suffix_tokens(step), self._time(step))
+        return jacobian_velocity(expert, asked, step, x_t, tokens, self._time(step))
 
     def _time(self, step: int) -> Tensor:
         """The time embedding float32[D], or [H, D] by token."""

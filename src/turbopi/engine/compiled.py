@@ -11,7 +11,7 @@ from torch import Tensor
 
 from turbopi.engine import without_compiler
 from turbopi.kernels import backward
-from turbopi.kernels.interface import BackwardOps, BatchOps, Ops
+from turbopi.kernels.interface import BatchOps, Ops
 from turbopi.kernels.plain import (
     PLAIN,
     attention,
@@ -65,11 +65,21 @@ def compiled() -> Ops:
     """
     if torch._dynamo.config.disable or os.environ.get("TORCHDYNAMO_DISABLE") == "1":
         return without_compiler.OPS
-    softmax = _compiled(masked_softmax)
+    softmax, rope = _compiled(masked_softmax), _compiled(rope_split)
     compiled_gelu, compiled_geglu = _compiled(gelu_by_sigmoid), _compiled(geglu_by_sigmoid)
 
     def compiled_attention(*args: Any) -> Tensor:
         return attention(*args, softmax=softmax)
+
+    way_back = backward.BetweenProducts(
+        softmax=softmax,
+        geglu=_compiled(backward.geglu),
+        rope_split=rope,
+        rms_norm_vjp=_compiled(backward.rms_norm_vjp),
+        geglu_vjp=_compiled(backward.geglu_vjp),
+        softmax_vjp=_compiled(backward.softmax_vjp),
+        rope_vjp=_compiled(backward.rope_vjp),
+    ).ops("Inductor, between cuBLAS's products")
 
     return Ops(
         resize_pictures=_resize_pictures if torch.cuda.is_available() else None,
@@ -81,19 +91,11 @@ def compiled() -> Ops:
         residual_linear=linear,
         linear_gelu=lambda x, weight, bias: compiled_gelu(F.linear(x, weight, bias)),
         linear_geglu=lambda x, gate_up: compiled_geglu(F.linear(x, gate_up)),
-        rope_split=_compiled(rope_split),
+        rope_split=rope,
         vision_attention=vision_attention,
         attention=compiled_attention,
         batch=_batch() if torch.cuda.is_available() else None,
-        backward=BackwardOps(
-            softmax=softmax,
-            geglu=_compiled(backward.geglu),
-            rms_norm_vjp=_compiled(backward.rms_norm_vjp),
-            geglu_vjp=_compiled(backward.geglu_vjp),
-            softmax_vjp=_compiled(backward.softmax_vjp),
-            rope_vjp=_compiled(backward.rope_vjp),
-            origin="Inductor, between cuBLAS's products",
-        ),
+        backward=lambda expert, tokens, masked=False: way_back,
         origin={**PLAIN.origin, "all else": "Inductor"},
     )
 

@@ -1,16 +1,20 @@
 """What a vector-Jacobian product through the action expert is made of, in plain PyTorch: the twins of `BackwardOps`.
 
-The products between them are the library's. Gradients that enter a product have the activations' dtype; the residual
-stream's gradient is float32. Inside, everything is float32.
+`BetweenProducts` makes them of the library's products and what stands between these. Gradients that enter a product
+have the activations' dtype; the residual stream's gradient is float32. Inside, everything is float32.
 
-Shapes: T tokens, D width, F hidden width of an MLP, K head_dim, n query heads over one key/value head.
+Shapes: T tokens, D width, F hidden width of an MLP, K head_dim, n query heads over one key/value head, R cache rows.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.kernels.interface import BackwardOps
-from turbopi.kernels.plain import geglu, masked_softmax
+from turbopi.kernels.plain import geglu, masked_softmax, matmul_f32, rope_split
 from turbopi.model.layers import apply_rope, inverse_rms
 
 _TANH = 0.7978845608028654  # sqrt(2 / pi), of GELU
@@ -23,8 +27,10 @@ def rms_norm_vjp(
     """Back through `residual_rms_norm`: (d_x + the norm's part, float32; that times gate, in x's dtype).
 
     d_normed, x [T, D]; d_x float32[T, D], what reaches x by other ways; scale, gate float32[T, D] or [D]; the gate is
-    that of the addition before the norm, rounded as there. None: left out.
+    that of the addition before the norm, rounded as there. None: left out. d_normed may be parts float32[parts, T, D].
     """
+    if d_normed.dim() == 3:
+        d_normed = d_normed.sum(0)
     g, wide, r = d_normed.float() * scale, x.float(), inverse_rms(x, eps)
     through = r * (g - wide * (r * r * (wide * g).mean(-1, keepdim=True)))
     total = through if d_x is None else d_x + through
@@ -55,6 +61,89 @@ def rope_vjp(d_q: Tensor, d_k: Tensor, d_v: Tensor, cos: Tensor, sin: Tensor) ->
     return torch.cat((q, apply_rope(d_k, cos, -sin)[:, None], d_v[:, None]), dim=1).view(tokens, -1)
 
 
-PLAIN_BACKWARD = BackwardOps(
-    masked_softmax, geglu, rms_norm_vjp, geglu_vjp, softmax_vjp, rope_vjp, "PyTorch, between cuBLAS's products"
-)
+@dataclass(frozen=True)
+class BetweenProducts:
+    """The operations around cuBLAS's products, by their twins' names. `softmax` is `plain.masked_softmax`'s."""
+
+    softmax: Callable[..., Tensor]
+    geglu: Callable[[Tensor], Tensor]
+    rope_split: Callable[..., Tensor]
+    rms_norm_vjp: Callable[..., tuple[Tensor, Tensor | None]]
+    geglu_vjp: Callable[[Tensor, Tensor], Tensor]
+    softmax_vjp: Callable[[Tensor, Tensor, float], Tensor]
+    rope_vjp: Callable[..., Tensor]
+
+    def ops(self, origin: str) -> BackwardOps:
+        return BackwardOps(
+            qkv=self.qkv,
+            attention=self.attention,
+            out=F.linear,
+            gate_up=self.gate_up,
+            down=F.linear,
+            down_vjp=self.down_vjp,
+            gate_up_vjp=torch.matmul,
+            rms_norm_vjp=self.rms_norm_vjp,
+            out_vjp=torch.matmul,
+            attention_vjp=self.attention_vjp,
+            qkv_vjp=self.qkv_vjp,
+            origin=origin,
+        )
+
+    def qkv(self, x: Tensor, weight: Tensor, cos: Tensor, sin: Tensor, k_out: Tensor, v_out: Tensor) -> Tensor:
+        """x [T, D] times weight [(n + 2) * K, D], split: turned queries [T * n, K], the others [T, K] written."""
+        return self.rope_split(F.linear(x, weight), cos, sin, k_out, v_out)
+
+    def attention(
+        self,
+        q: Tensor,
+        k: Tensor,
+        v: Tensor,
+        length: Tensor,
+        slots: int,
+        heads: int,
+        state_token: bool,
+        hidden: Tensor | None = None,
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """`plain.attention` [T, n * K], and what is kept: queries and probabilities [T * n, R].
+
+        hidden  bool[T, 1, R]: keys that a token doesn't see besides; these operations alone take it
+        """
+        scale, logits = q.shape[1] ** -0.5, matmul_f32(q, k.t())
+        if hidden is not None:
+            logits.view(-1, heads, len(k)).masked_fill_(hidden, -torch.inf)
+        probabilities = self.softmax(logits, length, slots, heads, state_token, scale, v.dtype)
+        return (probabilities @ v).view(-1, heads * q.shape[1]), (q, probabilities)
+
+    def gate_up(self, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """x [T, D] times weight [2F, D], which is kept: [T, 2F]; and its GeGLU [T, F]."""
+        product = F.linear(x, weight)
+        return product, self.geglu(product)
+
+    def down_vjp(self, d_y: Tensor, weight: Tensor, product: Tensor) -> Tensor:
+        """d_y [T, D] back through weight [D, F] and GeGLU, to its product [T, 2F]."""
+        return self.geglu_vjp(d_y @ weight, product)
+
+    def attention_vjp(
+        self,
+        kept: tuple[Tensor, Tensor],
+        d_attended: Tensor,
+        k: Tensor,
+        v: Tensor,
+        length: Tensor,
+        slots: int,
+        heads: int,
+        state_token: bool,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """d_attended [T, n * K] back to the queries [T * n, K] and the suffix's keys and values [T, K]."""
+        q, probabilities = kept
+        d_rows = d_attended.view(q.shape)
+        d_logits = self.softmax_vjp(probabilities, matmul_f32(d_rows, v.t()), q.shape[1] ** -0.5)
+        return d_logits @ k, d_logits[:, slots:].t() @ q, probabilities[:, slots:].t() @ d_rows
+
+    def qkv_vjp(self, gradients: tuple[Tensor, Tensor, Tensor], cos: Tensor, sin: Tensor, weight: Tensor) -> Tensor:
+        """`attention_vjp`'s gradients back through RoPE and weight [(n + 2) * K, D]: [T, D]."""
+        return self.rope_vjp(*gradients, cos, sin) @ weight
+
+
+PLAIN = BetweenProducts(masked_softmax, geglu, rope_split, rms_norm_vjp, geglu_vjp, softmax_vjp, rope_vjp)
+PLAIN_BACKWARD = PLAIN.ops("PyTorch, between cuBLAS's products")

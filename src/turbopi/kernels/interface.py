@@ -85,24 +85,34 @@ class Ops:
     attention: Callable[..., Tensor]
     prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
     resize_pictures: Callable[[Tensor, Tensor], None] | None = None  # as `SOURCE` says; None: the host resizes them
-    backward: "BackwardOps | None" = None  # None: `kernels.backward.PLAIN_BACKWARD`
+    # by the expert's sizes, the number of its tokens, and whether keys are hidden from some of them (`Expert.hidden`);
+    # None: `kernels.backward.PLAIN_BACKWARD`
+    backward: "Callable[..., BackwardOps] | None" = None
     batch: "BatchOps | None" = None  # None: `kernels.plain_batch.PLAIN_BATCH`
     origin: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class BackwardOps:
-    """What guidance by the true Jacobian takes beside `Ops`, between products: see `kernels.backward` for the twins.
+    """The action expert with a way back, for guidance by the true Jacobian: see `kernels.backward` for the twins.
 
-    The first two are forward, apart from their products, since what lies between is needed on the way back.
+    The first five are forward, with `Ops.residual_rms_norm` between them, and keep what the way back needs. What
+    `attention` gives only `out` reads, what `attention_vjp` gives only `qkv_vjp` reads: what they hand over is a matter
+    between them. Where a product is read by a norm or its way back alone, it may be float32 parts [parts, T, D] that
+    are to be added up.
     """
 
-    softmax: Callable[..., Tensor]
-    geglu: Callable[[Tensor], Tensor]
+    qkv: Callable[..., Tensor]
+    attention: Callable[..., tuple[Any, Any]]
+    out: Callable[[Any, Tensor], Tensor]
+    gate_up: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    down: Callable[[Tensor, Tensor], Tensor]
+    down_vjp: Callable[[Tensor, Tensor, Tensor], Tensor]
+    gate_up_vjp: Callable[[Tensor, Tensor], Tensor]
     rms_norm_vjp: Callable[..., tuple[Tensor, Tensor | None]]
-    geglu_vjp: Callable[[Tensor, Tensor], Tensor]
-    softmax_vjp: Callable[[Tensor, Tensor, float], Tensor]
-    rope_vjp: Callable[..., Tensor]
+    out_vjp: Callable[[Tensor, Tensor], Tensor]
+    attention_vjp: Callable[..., Any]
+    qkv_vjp: Callable[[Any, Tensor, Tensor, Tensor], Tensor]
     origin: str
 
 

@@ -5,15 +5,18 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.interface import BackwardOps
+from turbopi.kernels.backward import BetweenProducts
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, prefetch_row, wait_for_producer
 from turbopi.kernels.portable.activations import geglu
 from turbopi.kernels.portable.attention import masked_softmax
+from turbopi.kernels.portable.rope import rope_split
 
 
 @triton.jit
 def _rms_norm_kernel(
-    d_normed, x, scale, d_x, gate, out, gated, width, eps,
-    HAS_D_X: tl.constexpr, HAS_GATE: tl.constexpr, BY_ROW: tl.constexpr, BLOCK: tl.constexpr,
+    d_normed, x, scale, d_x, gate, out, gated, rows, width, eps,
+    PARTS: tl.constexpr, HAS_D_X: tl.constexpr, HAS_GATE: tl.constexpr, BY_ROW: tl.constexpr, BLOCK: tl.constexpr,
+    PDL: tl.constexpr,
 ):  # fmt: skip
     row = tl.program_id(0)
     cols = tl.arange(0, BLOCK)
@@ -23,8 +26,18 @@ def _rms_norm_kernel(
         if HAS_GATE:
             gate += row * width
     at = row * width + cols
+    # from the forward pass: long out of the L2 cache
+    prefetch_row(x + row * width, width, 64, BLOCK, PDL)
+    prefetch_row(scale, width, 32, BLOCK, PDL)
+    if HAS_GATE:
+        prefetch_row(gate, width, 32, BLOCK, PDL)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
     wide = tl.load(x + at, mask, 0.0).to(tl.float32)
-    g = tl.load(d_normed + at, mask, 0.0).to(tl.float32) * tl.load(scale + cols, mask, 0.0)
+    g = tl.load(d_normed + at, mask, 0.0).to(tl.float32)
+    for part in tl.static_range(1, PARTS):
+        g += tl.load(d_normed + part * rows * width + at, mask, 0.0)
+    g *= tl.load(scale + cols, mask, 0.0)
     r = tl.rsqrt(tl.sum(wide * wide, 0) / width + eps)
     total = r * (g - wide * (r * r * (tl.sum(wide * g, 0) / width)))
     if HAS_D_X:
@@ -49,9 +62,9 @@ def rms_norm_vjp(
     block = triton.next_power_of_2(width)
     _rms_norm_kernel[(rows,)](
         d_normed, x, scale, out if d_x is None else d_x, scale if gate is None else gate, out,
-        out if gated is None else gated, width, eps,
-        HAS_D_X=d_x is not None, HAS_GATE=gate is not None, BY_ROW=scale.dim() == 2, BLOCK=block,
-        num_warps=max(1, min(8, block // 256)),
+        out if gated is None else gated, rows, width, eps,
+        PARTS=1 if d_normed.dim() == 2 else len(d_normed), HAS_D_X=d_x is not None, HAS_GATE=gate is not None,
+        BY_ROW=scale.dim() == 2, BLOCK=block, num_warps=max(1, min(8, block // 256)), **dependent_launch(x),
     )  # fmt: skip
     return out, gated
 
@@ -139,6 +152,4 @@ def rope_vjp(d_q: Tensor, d_k: Tensor, d_v: Tensor, cos: Tensor, sin: Tensor) ->
     return out
 
 
-BACKWARD = BackwardOps(
-    masked_softmax, geglu, rms_norm_vjp, geglu_vjp, softmax_vjp, rope_vjp, "Triton, between cuBLAS's products"
-)
+PIECES = BetweenProducts(masked_softmax, geglu, rope_split, rms_norm_vjp, geglu_vjp, softmax_vjp, rope_vjp)

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
-from turbopi.kernels.portable import attention, backward, batch, embedding, norms, products, resize, rope
+from turbopi.kernels.portable import attention, batch, embedding, norms, products, resize, rope
+from turbopi.kernels.portable.vjp import ops as vjp
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, TileTable
 from turbopi.quantization.fp8 import E4M3
 
@@ -30,7 +31,7 @@ def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
         vision_attention=partial(attention.vision_attention, tiles=tiles),
         attention=partial(attend, tiles=tiles),
         resize_pictures=resize.resize_pictures,
-        backward=backward.BACKWARD,
+        backward=vjp.way_back,
         batch=batch.batch_ops(tiles),
         origin={
             "matrix products": "cuBLAS, with bias and GELU in its epilogue",
@@ -40,6 +41,7 @@ def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
             "product behind the prefix's GeGLU": "cuBLAS",
             "vision and prefix attention": "Triton",
             "suffix attention": "cuBLAS and Triton's softmax",
+            "the expert with a way back": vjp.ORIGIN,
             "LayerNorm": "Triton",
             "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding, pictures' sizes": "Triton",
         },
