@@ -10,13 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.dependent_launch import (
-    dependent_launch,
-    launch_dependents,
-    prefetch_row,
-    result_dtype,
-    wait_for_producer,
-)
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 from turbopi.kernels.portable.rounding import as_stored
 from turbopi.quantization.fp8 import E4M3
 
@@ -55,11 +49,6 @@ def _rms_norm_kernel(
         if HAS_GATE:
             gate += row * width
     if BY_ROW:  # gathered by the kernel before, perhaps; one for all rows is a constant
-        prefetch_row(scale, width, 32, BLOCK, PDL)
-        if HAS_SHIFT:
-            prefetch_row(shift, width, 32, BLOCK, PDL)
-        if HAS_GATE:
-            prefetch_row(gate, width, 32, BLOCK, PDL)
         wait_for_producer(PDL)
     factor = tl.load(scale + cols, mask, 0.0)
     if not BY_ROW:
