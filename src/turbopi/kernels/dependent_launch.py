@@ -1,9 +1,8 @@
 """Programmatic dependent launch: a kernel's blocks start while the kernel before it ends, and wait for its results.
 
 Every kernel here that is launched so waits before it touches anything another kernel writes; so work that a kernel
-may overlap with is only ever its own constants' loading: into registers, or by `prefetch` into the L2 cache. One
-exception: attention's way back (portable/vjp/attention.py) also reads what was complete when the kernel in front
-began, which lets it start after a wait of its own. Needs compute capability 9.0.
+may overlap with is only ever its own constants' loading: into registers, or by `prefetch` into the L2 cache. Needs
+compute capability 9.0.
 """
 
 from functools import lru_cache
@@ -37,12 +36,6 @@ def prefetch(at, PDL: tl.constexpr):
         tl.inline_asm_elementwise(
             "prefetch.global.L2 [$1]; mov.u32 $0, 0;", "=r,l", [at.to(tl.int64)], tl.int32, is_pure=False, pack=1
         )
-
-
-@triton.jit
-def prefetch_row(at, width, PER_LINE: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr):
-    """The lines of a row of `width` numbers, at most BLOCK, of which PER_LINE are 128 bytes."""
-    prefetch(at + tl.minimum(tl.arange(0, max(1, BLOCK // PER_LINE)) * PER_LINE, width - 1), PDL)
 
 
 def dependent_launch(x: Tensor) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.backward import BetweenProducts
-from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, prefetch_row, wait_for_producer
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
 from turbopi.kernels.portable.activations import geglu
 from turbopi.kernels.portable.attention import masked_softmax
 from turbopi.kernels.portable.rope import rope_split
@@ -26,11 +26,6 @@ def _rms_norm_kernel(
         if HAS_GATE:
             gate += row * width
     at = row * width + cols
-    # from the forward pass: long out of the L2 cache
-    prefetch_row(x + row * width, width, 64, BLOCK, PDL)
-    prefetch_row(scale, width, 32, BLOCK, PDL)
-    if HAS_GATE:
-        prefetch_row(gate, width, 32, BLOCK, PDL)
     wait_for_producer(PDL)
     launch_dependents(PDL)
     wide = tl.load(x + at, mask, 0.0).to(tl.float32)
