@@ -19,12 +19,15 @@ class Returns:
     """When sources that were answered are expected to ask again."""
 
     def __init__(self) -> None:
-        self._answered: dict[Hashable, float] = {}  # those that haven't asked again
+        self._answered: OrderedDict[Hashable, float] = OrderedDict()  # those that haven't asked again
         self._seconds: OrderedDict[Hashable, deque[float]] = OrderedDict()  # the one that asked last at the end
 
     def answered(self, source: Hashable, now: float) -> None:
         """A turn with a source's request has ended."""
         self._answered[source] = now
+        self._answered.move_to_end(source)
+        if len(self._answered) > MOST:
+            self._answered.popitem(last=False)
 
     def asked(self, source: Hashable, now: float) -> None:
         """A source's request has come."""
@@ -34,22 +37,19 @@ class Returns:
         self._seconds.setdefault(source, deque(maxlen=KEPT)).append(now - since)
         self._seconds.move_to_end(source)
         if len(self._seconds) > MOST:
-            self._answered.pop(self._seconds.popitem(last=False)[0], None)
+            self._seconds.popitem(last=False)
 
     def expected(self, now: float, within: float, but: Container[Hashable]) -> list[tuple[float, float]]:
-        """(when it is expected, when it isn't any more) of each source that should ask within seconds, in order.
+        """(when it is expected, when it isn't any more) of each source that was answered within seconds, in order.
 
         but  sources that are left out
         """
+        while self._answered and next(iter(self._answered.values())) < now - within:
+            self._answered.popitem(last=False)  # who asks so late doesn't come for company
         found = []
-        for source, since in tuple(self._answered.items()):
+        for source, since in self._answered.items():
             usual = self._usual(source)
-            if usual is None or usual > within or source in but:
-                if now - since > within:
-                    del self._answered[source]  # whoever asks so late asks again, not for company
-                continue
-            last = since + usual * LATER + LATER_SECONDS
-            if last > now:
+            if usual is not None and source not in but and (last := since + usual * LATER + LATER_SECONDS) > now:
                 found.append((since + usual, last))
         return sorted(found)
 
