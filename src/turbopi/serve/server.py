@@ -16,6 +16,7 @@ may send it. See docs/serving.md for the limits, and for what differs from openp
 import asyncio
 import contextlib
 import logging
+import sys
 import time
 import traceback
 from collections.abc import Callable
@@ -56,6 +57,9 @@ _REFUSALS = {
     "replica": "the replica is lost: {}",
 }
 LOST_NOTICE = 5.0  # seconds from the device's loss to the end, in which /healthz says 503: load balancers look seldom
+# Seconds after which a thread that computes lets another one go on that waits to. Python's 5 ms are long for answers
+# that wait while the policy's thread reads a batch, and for that thread while the event loop reads what comes.
+SWITCH_SECONDS = 0.0005
 LARGE = 4 * 2**20  # bytes of a message that is decoded beside the event loop
 MAX_TEXT = 4000  # characters of an error message; one that quotes its input shouldn't send it all back
 
@@ -234,7 +238,12 @@ class PolicyServer:
                 finally:
                     stopped.cancel()
 
-        asyncio.run(main())
+        usual = sys.getswitchinterval()
+        sys.setswitchinterval(min(usual, SWITCH_SECONDS))
+        try:
+            asyncio.run(main())
+        finally:
+            sys.setswitchinterval(usual)
         if self.lost is not None:
             raise DeviceLost(self.lost)
 
