@@ -586,24 +586,32 @@ def test_nobody_waits_for_company_in_vain(why: str) -> None:
 
 
 def closed_loop(
-    schedule: Schedule, seconds: float, returns: Sequence[float], begins: Sequence[float], leave: float = math.inf
+    schedule: Schedule,
+    seconds: float,
+    returns: Sequence[float],
+    begins: Sequence[float],
+    leave: float = math.inf,
+    joins: bool = False,
 ) -> list[int]:
     """Rows of each turn, of clients that ask again so long after their answers; from `leave` on, client 0 doesn't."""
+    times = schedule._joining if joins else schedule.times
     coming = sorted((at, source) for source, at in enumerate(begins))
     now, ends, wake, turn, rows = 0.0, math.inf, math.inf, list[Request](), list[int]()
     while now < seconds:
         now = min(coming[0][0] if coming else math.inf, ends, wake)
         if now == ends:
-            schedule.freed(now, schedule.times.total(len(turn), now))
-            sources = [source for source in range(len(returns)) if any(one.source == source for one in turn)]
+            schedule.freed(now, times.total(len(turn), now))
+            sources = [source for source in range(len(returns)) if any(ran.source == source for ran in turn)]
             coming += [(now + returns[source], source) for source in sources]
             coming, ends = sorted(one for one in coming if one[1] != 0 or one[0] < leave), math.inf
         while coming and coming[0][0] <= now:
-            assert not schedule.add(request(now, source=coming.pop(0)[1]), now)
+            one = request(now, source=coming.pop(0)[1])
+            one.joins = joins
+            assert not schedule.add(one, now)
         decision = schedule.decide(now)
         wake = math.inf if decision.wake is None else decision.wake
         if decision.turn:
-            turn, ends = list(decision.turn), now + schedule.times.total(len(decision.turn), now)
+            turn, ends = list(decision.turn), now + times.total(len(decision.turn), now)
             rows.append(len(turn))
     return rows
 
