@@ -11,7 +11,7 @@ import torch
 from test_begin import OnCpu
 from test_running_chunk import TRAINED
 from test_serve_real_time import H
-from test_serve_schedule import PAYING, SERIAL, begin, request, table
+from test_serve_schedule import PAYING, SERIAL, begin, closed_loop, request, table
 from test_serve_server import client, eventually, metric, served
 from test_serve_several import HoldingJoins, answer
 from websockets.asyncio.client import ClientConnection
@@ -295,6 +295,21 @@ def test_times_of_what_ran_go_into_the_table_of_its_kind() -> None:
         begin(schedule, 0.5)
         schedule.freed(0.5, 0.5)
     assert schedule._joining.seconds(4, 0.5) == 0.5 and schedule.times.seconds(4, 0.5) == PAYING[4]
+
+
+@pytest.mark.parametrize("late", [0, 1, 4])
+def test_sessions_that_ask_again_at_once_are_waited_for_by_the_times_of_those_that_join(late: int) -> None:
+    returns = [0.002 + 0.0004 * number for number in range(8)]
+    begins = [0.02 if number < late else 0.0001 * number for number in range(8)]
+    schedule = Schedule(16, table(SERIAL), joining=table(PAYING))
+    rows = closed_loop(schedule, 2.0, returns, begins, joins=True)
+    assert rows[12:] == [8] * (len(rows) - 12), rows
+
+
+def test_sessions_are_not_waited_for_where_joining_together_does_not_pay() -> None:
+    """Though plain ones would be: the policy is never idle."""
+    rows = closed_loop(Schedule(16, table(PAYING), joining=table(SERIAL)), 2.0, [0.001] * 2, [0.0] * 2, joins=True)
+    assert set(rows) == {1} and len(rows) >= 2.0 / SERIAL[1] - 1, len(rows)
 
 
 # --- a real policy ----------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbopi.serve.batch_times import FRESH_SECONDS, GAIN, KEPT, BatchTimes
+from turbopi.serve.returns import MOST, Returns
 from turbopi.serve.schedule import LATE_TIMER, OVERTAKEN, Priority, Refused, Request, Schedule
 
 T1 = 0.01
@@ -581,6 +582,92 @@ def test_nobody_waits_for_company_in_vain(why: str) -> None:
     assert begin(schedule, now) == [one]
 
 
+# --- clients that ask again at once -----------------------------------------------------------------------------------
+
+
+def closed_loop(
+    schedule: Schedule,
+    seconds: float,
+    returns: Sequence[float],
+    begins: Sequence[float],
+    leave: float = math.inf,
+    joins: bool = False,
+) -> list[int]:
+    """Rows of each turn, of clients that ask again so long after their answers; from `leave` on, client 0 doesn't."""
+    times = schedule._joining if joins else schedule.times
+    coming = sorted((at, source) for source, at in enumerate(begins))
+    now, ends, wake, turn, rows = 0.0, math.inf, math.inf, list[Request](), list[int]()
+    while now < seconds:
+        now = min(coming[0][0] if coming else math.inf, ends, wake)
+        if now == ends:
+            schedule.freed(now, times.total(len(turn), now))
+            sources = [source for source in range(len(returns)) if any(ran.source == source for ran in turn)]
+            coming += [(now + returns[source], source) for source in sources]
+            coming, ends = sorted(one for one in coming if one[1] != 0 or one[0] < leave), math.inf
+        while coming and coming[0][0] <= now:
+            one = request(now, source=coming.pop(0)[1])
+            one.joins = joins
+            assert not schedule.add(one, now)
+        decision = schedule.decide(now)
+        wake = math.inf if decision.wake is None else decision.wake
+        if decision.turn:
+            turn, ends = list(decision.turn), now + times.total(len(decision.turn), now)
+            rows.append(len(turn))
+    return rows
+
+
+H100_BF16 = {1: 0.0079, 2: 0.0134, 4: 0.025, 8: 0.041}
+
+
+@pytest.mark.parametrize("seconds", [PAYING, H100_BF16], ids=["paying", "h100"])
+@pytest.mark.parametrize("late", [0, 1, 4])
+def test_clients_that_ask_again_at_once_come_into_one_batch(seconds: dict[int, float], late: int) -> None:
+    """Whoever asked in the middle of the others' turn would stay out of step: alone, then seven, then alone."""
+    returns = [0.002 + 0.0004 * number for number in range(8)]
+    begins = [0.02 if number < late else 0.0001 * number for number in range(8)]
+    rows = closed_loop(Schedule(16, table(seconds)), 2.0, returns, begins)
+    assert rows[12:] == [8] * (len(rows) - 12), rows
+
+
+def test_clients_that_take_longer_than_they_save_are_not_waited_for() -> None:
+    returns = [0.002] * 4 + [0.02] * 4  # they would save 14 ms
+    rows = closed_loop(Schedule(16, table({1: 0.01, 4: 0.02, 8: 0.04})), 2.0, returns, [0.0] * 4 + [0.01] * 4)
+    assert set(rows[12:]) == {4}, rows
+
+
+def test_a_client_that_left_is_waited_for_once() -> None:
+    schedule = Schedule(16, table(PAYING))
+    rows = closed_loop(schedule, 2.0, [0.002] * 8, [0.0] * 8, leave=1.0)
+    assert set(rows[-20:]) == {7}
+    schedule.freed(2.1, None)
+    others = [request(2.101, source=number) for number in range(1, 8)]
+    for one in others:
+        schedule.add(one, 2.101)
+    assert begin(schedule, 2.101) == others, "not for the one that left"
+
+
+def test_returns_are_forgotten_with_their_clients() -> None:
+    returns = Returns()
+    for source in range(3000):
+        for now in (0.0, 1.0):
+            returns.answered(source, now)
+            returns.asked(source, now + 0.001)
+        returns.answered(source, 2.0)
+    assert len(returns.expected(2.0, 1.0, ())) <= MOST
+    assert returns.expected(3.5, 1.0, ()) == [] and not returns._answered
+
+
+def test_one_slow_return_of_five_changes_nothing_and_two_do() -> None:
+    returns = Returns()
+    for now, seconds in enumerate((0.002, 0.002, 0.003, 0.002, 0.5, 0.5)):
+        returns.answered("robot", now)
+        returns.asked("robot", now + seconds)
+        returns.answered("robot", now + 0.6)
+        usual = [when - now - 0.6 for when, _ in returns.expected(now + 0.6, 1.0, ())]
+        assert usual == ([] if now == 0 else pytest.approx([{3: 0.003, 4: 0.003, 5: 0.5}.get(now, seconds)])), now
+        returns._answered.clear()
+
+
 # --- the table --------------------------------------------------------------------------------------------------------
 
 
@@ -642,3 +729,30 @@ def test_a_size_that_failed_is_not_formed_any_more() -> None:
 def test_a_gain_of_a_few_percent_is_none() -> None:
     assert table({1: 0.01, 2: 0.02 * GAIN}).best(2, 0.0) == 1
     assert table({1: 0.01, 2: 0.0199 * GAIN}).best(2, 0.0) == 2
+
+
+@given(st.lists(st.tuples(st.sampled_from(["ran", "measured", "failed", "ask"]), st.integers(1, 9), st.floats(0, 90))))
+def test_what_was_looked_up_before_changes_no_answer(events: list[tuple[str, int, float]]) -> None:
+    """Answers are kept until something is added or grows old."""
+    times, now, log = table(PAYING), 0.0, list[tuple[str, int, float]]()
+    for what, rows, value in events:
+        now += value if what == "ask" else 0.0
+        log.append((what, rows, now))
+        fresh = table(PAYING)
+        for told, size, at in log:
+            if told == "ran":
+                fresh.ran(size, 0.011 * size, at)
+            elif told == "measured":
+                fresh.measured(size, 0.009 * size)
+            elif told == "failed":
+                fresh.failed(size)
+        if what == "ran":
+            times.ran(rows, 0.011 * rows, now)
+        elif what == "measured":
+            times.measured(rows, 0.009 * rows)
+        elif what == "failed":
+            times.failed(rows)
+        for size in (1, 3, 8):
+            assert times.seconds(size, now) == fresh.seconds(size, now)
+            assert times.best(size, now) == fresh.best(size, now)
+            assert times.total(size, now) == fresh.total(size, now)

@@ -26,6 +26,7 @@ from turbopi.errors import ConfigError, DeviceLost
 from turbopi.recordings import iter_recording
 from turbopi.serve import PolicyServer, running
 from turbopi.serve.limits import Limits
+from turbopi.serve.server import SWITCH_SECONDS
 from turbopi.wire import pack, unpack
 
 
@@ -434,6 +435,19 @@ def test_serving_for_ever_ends_with_the_reason_when_the_device_is_lost(monkeypat
         PolicyServer(FakePolicy(), port=0).serve_forever(on_ready=crash)
     threads[0].join(30)
     assert not threads[0].is_alive()
+
+
+def test_threads_give_way_sooner_while_a_server_runs_and_as_before_after_it() -> None:
+    usual, met = sys.getswitchinterval(), list[float]()
+
+    def look(_: PolicyServer) -> None:
+        met.append(sys.getswitchinterval())
+        raise RuntimeError("seen")
+
+    with pytest.raises(RuntimeError, match="seen"):
+        PolicyServer(FakePolicy(), port=0).serve_forever(on_ready=look)
+    assert met == [pytest.approx(SWITCH_SECONDS)] and usual > SWITCH_SECONDS
+    assert sys.getswitchinterval() == usual
 
 
 # --- health, pings, metrics -------------------------------------------------------------------------------------------

@@ -465,3 +465,69 @@ def test_a_damaged_request_never_crashes_the_decoder(changes: list[tuple[int, in
 @settings(deadline=None, max_examples=500)
 def test_odd_structures_never_crash_the_decoder(value: Any) -> None:
     decodes_or_refuses(msgpack.packb(value))
+
+
+# --- messages that look alike -----------------------------------------------------------------------------------------
+
+
+def outcome_of(read: Any, data: bytes) -> tuple[str, Any]:
+    try:
+        return "value", read(data)
+    except WireError as error:
+        return "refused", str(error)
+
+
+def request_of(prompt: str, number: int, **more: Any) -> bytes:
+    pictures = np.random.default_rng(number).integers(0, 256, (2, 90, 90, 3), np.uint8)
+    state = {"joints": np.linspace(number, 1, 7), "gripper": np.float32(number), "closed": np.array([True, False])}
+    return pack({"images": dict(zip("ab", pictures, strict=True)), "state": state, "prompt": prompt, **more})
+
+
+def test_messages_that_differ_in_numbers_alone_are_read_without_a_walk(monkeypatch: pytest.MonkeyPatch) -> None:
+    unpacker = wire.Unpacker()
+    for number in (1, 1):
+        unpacker.unpack(request_of("stack", number))
+    expected = unpack(again := request_of("stack", 1))
+    monkeypatch.setattr(wire, "unpack", lambda *_, **__: pytest.fail("walked"))
+    first, second = unpacker.unpack(again), unpacker.unpack(again)
+    assert_same(first, expected)
+    first["state"]["joints"] = first["more"] = None
+    assert_same(second, expected)
+    assert not second["images"]["a"].flags.writeable and second["state"]["joints"].flags.aligned
+
+
+def test_a_message_that_looks_different_is_read_as_ever() -> None:
+    unpacker = wire.Unpacker()
+    for data in (
+        *(request_of("stack", 1) for _ in range(3)),
+        request_of("stick", 1),  # as long
+        request_of("stack", 2),  # the gripper is a scalar
+        request_of("unstack", 2),
+        request_of("unstack", 2, steps=[1, 2]),
+        *(request_of("unstack", 2, steps=[1, [2, 3]]) for _ in range(3)),
+        *(pack([1, 2]) for _ in range(3)),
+    ):
+        assert_same(unpacker.unpack(data), unpack(data))
+    (own,) = {id(unpacker.unpack(request_of("a", 1, steps=[1]))["steps"]) for _ in range(1)}
+    assert own != id(unpacker.unpack(request_of("a", 1, steps=[1]))["steps"]), "lists can be changed"
+
+
+def test_large_bytes_that_are_no_array_are_not_kept() -> None:
+    unpacker, data = wire.Unpacker(), pack({"jpeg": bytes(wire.LARGE), "state": np.zeros(3)})
+    for _ in range(3):
+        assert_same(unpacker.unpack(data), unpack(data))
+    assert unpacker._like is None
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 2**20), st.integers(0, 255)), max_size=3))
+def test_a_damaged_message_is_read_or_refused_as_if_it_came_first(changes: list[tuple[int, int]]) -> None:
+    small = pack({"image": np.arange(48, dtype=np.uint8).reshape(4, 4, 3), "s": {"x": np.ones(2), "n": 3}, "p": "data"})
+    unpacker, damaged = wire.Unpacker(), bytearray(small)
+    for _ in range(2):
+        unpacker.unpack(small)
+    for place, value in changes:
+        damaged[place % len(damaged)] = value
+    (how, found), (expected_how, expected) = (outcome_of(read, bytes(damaged)) for read in (unpacker.unpack, unpack))
+    assert how == expected_how
+    assert_same(found, expected)

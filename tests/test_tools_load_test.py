@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from load_test import stand_in
 from load_test.__main__ import main, show
 from load_test.connections import connect, kind_of
 from load_test.document import COLUMNS, Load, LoadDocument, Spread, read_load, summary
@@ -363,6 +364,24 @@ def test_openpis_client_is_driven_in_its_own_environment() -> None:
 def test_a_process_of_clients_that_fails_says_why() -> None:
     with running(Counting(), max_clients=2) as server, pytest.raises(ConfigError, match=r"clients ended: .*503"):
         run(Wanted(url=server.url, clients=3, **QUICK), [])  # type: ignore[arg-type]
+
+
+# --- a server without a GPU -------------------------------------------------------------------------------------------
+
+
+def test_the_stand_in_takes_a_gpus_time_for_one_and_for_several(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(stand_in.BACKENDS, "sleeping", stand_in.BACKENDS["pytorch"])  # all is as before after the test
+    monkeypatch.setattr(stand_in.SleepingBackend, "gpu", "none")
+    monkeypatch.setattr("torch.set_num_threads", lambda count: None)
+    served: list[Any] = []
+    stand_in.main(["--gpu", "h100_fp8"], run=lambda policy, port: served.append(policy))
+    (policy,) = served
+    observations = [policy.example_observation(seed) for seed in range(3)]
+    results = policy.infer_batch(observations)
+    assert [one["actions"].shape for one in results] == [policy.infer(observations[0])["actions"].shape] * 3
+    least = sum(sum(policy.backend.stages[calls]) for calls in (2, 1))
+    assert results[0]["policy_timing"]["infer_ms"] >= 0.99 * least
+    assert not all(np.array_equal(one["actions"], results[0]["actions"]) for one in results), "each has its own noise"
 
 
 # --- the table --------------------------------------------------------------------------------------------------------

@@ -118,6 +118,26 @@ def unpack(data: bytes, *, max_bytes: int = MAX_BYTES) -> Any:
     return _restore(value, ())
 
 
+class Unpacker:
+    """`unpack` for the messages of one sender.
+
+    Those that differ from an earlier one in their arrays' numbers alone, as a robot's observations do, are compared
+    with it instead of being walked: 5 us instead of 80.
+    """
+
+    def __init__(self) -> None:
+        self._size = -1
+        self._like: _Alike | None = None
+
+    def unpack(self, data: bytes, *, max_bytes: int = MAX_BYTES) -> Any:
+        """What `unpack` returns or raises."""
+        if self._like is not None and (value := self._like.filled(data)) is not None:
+            return value
+        value, again = unpack(data, max_bytes=max_bytes), len(data) == self._size
+        self._size, self._like = len(data), _Alike.of(data, value) if again else None  # not of what comes only once
+        return value
+
+
 _NUMBER, _BYTES, _ARRAY, _MAP, _EXT, _INVALID = range(6)
 _RUN = 256  # numbers looked at together
 
@@ -348,3 +368,95 @@ class _Short(reprlib.Repr):
 
 
 _shown = _Short().repr
+
+
+# --- messages that look alike -----------------------------------------------------------------------------------------
+
+_Hole = tuple[int, int, np.dtype, tuple[int, ...]]  # an array's numbers: first byte and end, dtype, shape
+
+
+class _Alike:
+    """A message, and where the numbers of its arrays are. All else is compared byte by byte."""
+
+    def __init__(self, data: bytes, value: dict[str, Any], holes: list[_Hole]) -> None:
+        self._size, self._value, self._holes = len(data), value, holes
+        begins, ends = [0, *(hole[1] for hole in holes)], [*(hole[0] for hole in holes), len(data)]
+        self._same = [(begin, end, data[begin:end]) for begin, end in zip(begins, ends, strict=True)]
+
+    @classmethod
+    def of(cls, data: bytes, value: Any) -> "_Alike | None":
+        """None: it holds lists, of which each message needs its own, or too much to keep besides the arrays."""
+        holes: list[_Hole] = []
+        if not isinstance(value, dict):
+            return None
+        try:
+            skeleton, end = _skeleton(data, 0, value, holes)
+        except _NotAlike:
+            return None
+        assert end == len(data)
+        return cls(data, skeleton, holes) if len(data) - sum(end - begin for begin, end, *_ in holes) < LARGE else None
+
+    def filled(self, data: bytes) -> dict[str, Any] | None:
+        """The value of `data`; None if it doesn't look like this message."""
+        if len(data) != self._size or any(data[begin:end] != same for begin, end, same in self._same):
+            return None
+        whole = memoryview(data)
+        arrays = [
+            np.ndarray(shape, dtype, whole[begin:end] if dtype.itemsize == 1 else data[begin:end])
+            for begin, end, dtype, shape in self._holes
+        ]
+        return _filled(self._value, arrays)
+
+
+class _NotAlike(Exception):
+    pass
+
+
+class _Place(int):
+    """Stands for an array: its place among the holes."""
+
+
+def _skeleton(data: bytes, at: int, value: Any, holes: list[_Hole]) -> tuple[Any, int]:
+    """`value`, which begins at `data[at]`, with a `_Place` for each array of numbers; and where it ends."""
+    if isinstance(value, list):
+        raise _NotAlike
+    if isinstance(value, dict):
+        made, at = {}, _content(data, at)[0]
+        for key, item in value.items():
+            made[key], at = _skeleton(data, _end(data, at), item, holes)
+        return made, at
+    end = _end(data, at)
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
+        return value, end  # it can't be changed
+    at = _content(data, at)[0]
+    while at < end:
+        key, key_end = _content(data, at)
+        begin, at = _content(data, key_end)[0], _end(data, key_end)
+        if data[key:key_end] == b"data":
+            holes.append((begin, at, value.dtype, value.shape))
+    return _Place(len(holes) - 1), end
+
+
+def _content(data: bytes, at: int) -> tuple[int, int]:
+    """Of the value at `data[at]`: where its content begins, and where that ends if it is no container."""
+    _, length_bytes, length = _HEADS[data[at]]
+    begin = at + 1 + length_bytes
+    return begin, begin + (int.from_bytes(data[at + 1 : begin], "big") if length_bytes else length)
+
+
+def _end(data: bytes, at: int) -> int:
+    """Where the value at `data[at]` ends."""
+    left = 1
+    while left:
+        kind, (begin, end) = _HEADS[data[at]][0], _content(data, at)
+        left += (end - begin) * (kind == _MAP) * 2 + (end - begin) * (kind == _ARRAY) - 1
+        at = begin if kind in (_MAP, _ARRAY) else end
+    return at
+
+
+def _filled(skeleton: dict[str, Any], arrays: list[np.ndarray]) -> dict[str, Any]:
+    made = {}
+    for key, item in skeleton.items():
+        kind = type(item)
+        made[key] = arrays[item] if kind is _Place else _filled(item, arrays) if kind is dict else item
+    return made

@@ -5,6 +5,7 @@
     python -m load_test ws://127.0.0.1:8000 --clients 8 --out eight.json
     python -m load_test ws://gpu:8000 --clients 12 --rate 60               each robot five times a second
     python -m load_test ws://gpu:8000 --clients 12 --poisson 60            at random
+    python -m load_test ws://127.0.0.1:8000 --clients 8 --client bare --processes 1    clients that need few cores
     python -m load_test ws://127.0.0.1:8000 --client openpi --python .venv-openpi-client/bin/python
     python -m load_test ws://127.0.0.1:8000 --robot droid --pictures 640x480
     python -m load_test --show eight.json                                  the table of a result
@@ -51,7 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--warmup", type=float, default=Wanted.warmup, metavar="S", help="before that")
     parser.add_argument("--drain", type=float, default=Wanted.drain_s, metavar="S", help="to send what is late, after")
     parser.add_argument("--processes", type=int, metavar="P", help="of the clients; default: one each")
-    parser.add_argument("--client", choices=("turbopi", "openpi"), default="turbopi", help="whose client")
+    parser.add_argument(
+        "--client",
+        choices=("turbopi", "openpi", "bare"),
+        default="turbopi",
+        help="whose client; bare: sends prepared bytes",
+    )
     parser.add_argument("--python", metavar="FILE", help="the clients' interpreter, such as one with openpi-client")
     parser.add_argument("--robot", help="whose observations: a name or a .json; default: as the server's metadata says")
     parser.add_argument("--observation", type=Path, metavar="FILE", help="or one that was recorded")

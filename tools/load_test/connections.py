@@ -1,13 +1,15 @@
-"""The two clients: Turbo-Pi's own, and openpi's. Only the one that is asked for is imported."""
+"""The clients: Turbo-Pi's own, openpi's, and one that does next to nothing. Only what is asked for is imported."""
 
 import contextlib
+import os
+import socket
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from load_test.schedule import Refused
 
-Kind = Literal["turbopi", "openpi"]
+Kind = Literal["turbopi", "openpi", "bare"]
 # How a server's text frames begin, docs/serving.md. Another text is a traceback.
 TEXTS = (
     "bad request",
@@ -88,14 +90,95 @@ class OpenpiConnection:
             self._policy._ws.close()
 
 
-def connect(kind: Kind, url: str, api_key: str | None, answer_s: float) -> TurbopiConnection | OpenpiConnection:
-    """A new connection. Raises what the client raises: ServerLost or ConfigError, or openpi-client's."""
-    return TurbopiConnection(url, api_key, answer_s) if kind == "turbopi" else OpenpiConnection(url, api_key)
+class BareConnection:
+    """A socket that sends what was packed and masked before, so that clients don't take the cores from the server.
+
+    What it leaves out a robot does on its own computer: packing, masking, unpacking the actions.
+    """
+
+    def __init__(self, url: str, api_key: str | None, answer_s: float) -> None:
+        host, _, port = url.removeprefix("ws://").rstrip("/").rpartition(":")
+        self._socket = socket.create_connection((host.strip("[]"), int(port)), timeout=answer_s)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._received, self._frames = bytearray(), dict[int, bytes]()
+        key = "" if api_key is None else f"Authorization: Api-Key {api_key}\r\n"
+        upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        nonce = "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+        self._socket.sendall(f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\n{upgrade}{nonce}{key}\r\n".encode())
+        while b"\r\n\r\n" not in self._received:
+            self._more()
+        head, _, self._received = self._received.partition(b"\r\n\r\n")
+        if not head.startswith(b"HTTP/1.1 101 "):
+            raise ConnectionError(head.decode("latin-1"))
+        self._frame()  # the metadata
+
+    def infer(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
+        from turbopi.wire import unpack
+
+        if id(observation) not in self._frames:
+            self._frames[id(observation)] = _masked_frame(observation)
+        try:
+            self._socket.sendall(self._frames[id(observation)])
+            opcode, payload = self._frame()
+        except OSError as error:
+            raise Refused(SILENT if isinstance(error, TimeoutError) else LOST) from error
+        if opcode == 1:
+            raise Refused(kind_of(payload.decode()))
+        return dict(unpack(payload))
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _frame(self) -> tuple[int, bytes]:
+        """The next frame of a message: what is to be answered, pings, only comes after 20 idle seconds."""
+        while True:
+            while len(self._received) < 10:
+                if len(self._received) >= 2 and self._received[1] < 126:
+                    break
+                self._more()
+            opcode, short = self._received[0] & 0x0F, self._received[1]
+            extended = {126: 2, 127: 8}.get(short, 0)
+            start = 2 + extended
+            end = start + (int.from_bytes(self._received[2:start], "big") if extended else short)
+            while len(self._received) < end:
+                self._more()
+            payload = bytes(self._received[start:end])
+            del self._received[:end]
+            if opcode == 8:
+                raise ConnectionError("the server closed")
+            if opcode in (1, 2):
+                return opcode, payload
+
+    def _more(self) -> None:
+        data = self._socket.recv(65536)
+        if not data:
+            raise ConnectionError("the server closed")
+        self._received += data
+
+
+def _masked_frame(observation: Mapping[str, Any]) -> bytes:
+    """A binary message with an observation, as a client sends it (RFC 6455, 5.2)."""
+    from websockets.frames import apply_mask
+
+    from turbopi.wire import pack
+
+    payload, mask = pack(dict(observation)), os.urandom(4)
+    return b"\x82\xff" + len(payload).to_bytes(8, "big") + mask + apply_mask(payload, mask)
+
+
+Connection = TurbopiConnection | OpenpiConnection | BareConnection
+
+
+def connect(kind: Kind, url: str, api_key: str | None, answer_s: float) -> Connection:
+    """A new connection. Raises what the client raises: ServerLost or ConfigError, openpi-client's, or OSError."""
+    if kind == "openpi":
+        return OpenpiConnection(url, api_key)
+    return (TurbopiConnection if kind == "turbopi" else BareConnection)(url, api_key, answer_s)
 
 
 def read_observation(kind: Kind, file: Path) -> dict[str, Any]:
     """An observation as `turbopi.wire.pack` wrote it, by what the client has to read it: openpi's needs no Turbo-Pi."""
-    if kind == "turbopi":
+    if kind != "openpi":
         from turbopi.wire import unpack
 
         return dict(unpack(file.read_bytes()))

@@ -42,7 +42,7 @@ class Spread(Struct, frozen=True):
 class Load(Struct, frozen=True, kw_only=True):
     """What was asked for.
 
-    client      "turbopi": turbopi.client.RealTimeClient; "openpi": openpi-client
+    client      "turbopi": turbopi.client.RealTimeClient; "openpi": openpi-client; "bare": sends prepared bytes
     rate        requests a second of all clients together; None in a closed loop
     seconds     that were measured, after `warmup_seconds` that weren't
     robot       whose observations were sent, or the file of one
@@ -51,7 +51,7 @@ class Load(Struct, frozen=True, kw_only=True):
     """
 
     url: str
-    client: Literal["turbopi", "openpi"]
+    client: Literal["turbopi", "openpi", "bare"]
     arrivals: Arrivals
     clients: Annotated[int, Meta(ge=1)]
     processes: Annotated[int, Meta(ge=1)]

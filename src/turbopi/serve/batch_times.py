@@ -50,22 +50,26 @@ class BatchTimes:
         self.largest = largest
         self._warm: dict[int, _Times] = {}
         self._recent: dict[int, _Times] = {}
-        self._found: dict[tuple[int, float], float | None] = {}  # answers of `seconds` at `_found_at`
-        self._found_at = math.nan
+        # What was found, which holds from and until these moments, as long as nothing is added: whoever forms batches
+        # asks again and again, while clients wait.
+        self._seconds: dict[tuple[int, float], float | None] = {}
+        self._totals: dict[int, float] = {}
+        self._found_from, self._found_until = math.inf, -math.inf
 
     def measured(self, rows: int, seconds: float) -> None:
         """A run at warm-up."""
         self._warm.setdefault(rows, _Times()).add(seconds, 0.0)
-        self._found_at = math.nan
+        self._forget()
 
     def ran(self, rows: int, seconds: float, now: float) -> None:
         """A run for requests, which ended at `now`."""
         self._recent.setdefault(rows, _Times()).add(seconds, now)
-        self._found_at = math.nan
+        self._forget()
 
     def failed(self, rows: int) -> None:
         """A batch of that size failed, and not by an observation's fault: neither it nor a larger one is formed."""
         self.largest = min(self.largest, max(1, rows - 1))
+        self._forget()
 
     @property
     def measured_largest(self) -> int:
@@ -79,12 +83,23 @@ class BatchTimes:
 
     def seconds(self, rows: int, now: float, part: float = TYPICAL) -> float | None:
         """T(rows), the `part`-quantile of its last times; None if neither that size nor a larger one was measured."""
-        if now != self._found_at:
-            self._found, self._found_at = {}, now
-        if (rows, part) not in self._found:
+        self._look(now)
+        if (rows, part) not in self._seconds:
             times = self._times(rows, now)
-            self._found[rows, part] = None if times is None else times.quantile(part)
-        return self._found[rows, part]
+            self._seconds[rows, part] = None if times is None else times.quantile(part)
+        return self._seconds[rows, part]
+
+    def _forget(self) -> None:
+        self._found_from, self._found_until = math.inf, -math.inf
+
+    def _look(self, now: float) -> None:
+        """Forget what was found if it doesn't hold now."""
+        if not self._found_from <= now <= self._found_until:
+            self._seconds, self._totals = {}, {}
+            self._found_from = now
+            self._found_until = min(
+                (times.last + FRESH_SECONDS for times in self._recent.values() if times.tell(now)), default=math.inf
+            )
 
     def _times(self, rows: int, now: float) -> _Times | None:
         good = {size: times for size, times in self._recent.items() if times.tell(now)}
@@ -115,10 +130,13 @@ class BatchTimes:
         """Seconds for `rows` observations in as many runs as they need; 0 as long as nothing was measured."""
         if rows == 1:  # nearly always
             return self.seconds(1, now) or 0.0
-        seconds = 0.0
-        while rows > 0:
-            best = self.best(rows, now)
-            runs = rows // best
-            seconds += runs * (self.seconds(best, now) or 0.0)
-            rows -= runs * best
-        return seconds
+        self._look(now)
+        if rows not in self._totals:
+            seconds, left = 0.0, rows
+            while left > 0:
+                best = self.best(left, now)
+                runs = left // best
+                seconds += runs * (self.seconds(best, now) or 0.0)
+                left -= runs * best
+            self._totals[rows] = seconds
+        return self._totals[rows]

@@ -2,7 +2,7 @@
 
 The websockets library reads all that comes, as fast as it comes. This connection stands between the socket and the
 library: it looks at the frames' headers alone, hands over what may be handled now, holds the rest (at most one read of
-the socket, 256 KiB) and stops reading. TCP then stops the client. Pictures' messages don't go through the library at
+the socket, 512 KiB) and stops reading. TCP then stops the client. Pictures' messages don't go through the library at
 all: straight.py.
 """
 
@@ -21,10 +21,11 @@ from websockets.server import ServerProtocol
 from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.limits import Credit, Limits, MemoryBudget, WorkPool
 from turbopi.serve.metrics import Metrics
-from turbopi.serve.straight import SpareBuffer, StraightFrame, goes_straight
+from turbopi.serve.straight import SpareBuffer, StraightFrame, apply_mask, goes_straight
+from turbopi.wire import Unpacker
 
 AHEAD = 2  # messages of one client: one that is computed, one that waits
-READ_BYTES = 256 * 1024  # at most, in one read of a socket
+READ_BYTES = 512 * 1024  # at most, in one read of a socket: two pictures of 224 x 224 are 300 KB
 BYTES_OF_ONE_WORK = 65536
 BREATH_SECONDS = 0.002  # 128 MB a second and more: who sent too much shall come to read why it is closed
 WORK_OF_A_SECOND = 4000.0  # that a message keeps the event loop busy: all who are slowed get a fifth of its time
@@ -98,6 +99,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         limits = shared.limits
         super().__init__(protocol, owner, close_timeout=limits.close_seconds, max_queue=None)  # type: ignore[arg-type]
         self.bad_in_a_row = 0
+        self.unpacker = Unpacker()  # of its messages
         self._owner, self._shared, self._limits = owner, shared, limits
         self._credit = Credit(limits, shared.pool, shared.clock)
         self._head: bytes | None = b""  # the last bytes of the HTTP request as long as that goes on
@@ -266,7 +268,12 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
                 if begins and head.straight and head.length <= self._limits.message_bytes:
                     self._hand_over(data[begun:at])
                     begun = at + head.size
-                    self._straight = StraightFrame(self._shared.spare, head.length, bytes(data[begun - 4 : begun]))
+                    mask, end = bytes(data[begun - 4 : begun]), begun + head.length
+                    if end <= len(data):  # it is here as a whole
+                        self._came(head.length, apply_mask(data[begun:end], mask))
+                        at = begun = end
+                        continue
+                    self._straight = StraightFrame(self._shared.spare, head.length, mask)
                 at += head.size
             part = min(self._left, len(data) - at)
             if self._straight is not None:
@@ -278,8 +285,8 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._hand_over(data[begun:at])
         return waits
 
-    def _came(self, size: int) -> None:
-        """So many bytes of the current frame's payload have come."""
+    def _came(self, size: int, message: bytes | None = None) -> None:
+        """So many bytes of the current frame's payload have come. `message`: all of it, past the library."""
         self._left -= size
         if self._message is None:
             return
@@ -291,8 +298,8 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
             self._message = None
         if self._straight is not None:
             message, self._straight = self._straight.message(), None
-            if self.protocol.state is State.OPEN:  # not after a wrong frame or a close
-                self.process_event(Frame(Opcode.BINARY, message))
+        if message is not None and self.protocol.state is State.OPEN:  # not after a wrong frame or a close
+            self.process_event(Frame(Opcode.BINARY, message))
 
     def _hand_over(self, data: bytes | memoryview) -> None:
         """Give the library what it is to see. It copies that."""

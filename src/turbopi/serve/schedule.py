@@ -21,6 +21,7 @@ from statistics import median
 from typing import Any, Literal
 
 from turbopi.serve.batch_times import SAFE, BatchTimes
+from turbopi.serve.returns import Returns
 
 Priority = Literal["robot", "simulator"]
 PRIORITIES: tuple[Priority, ...] = ("robot", "simulator")
@@ -141,6 +142,7 @@ class Schedule:
         self._tight = _Recent(TIGHT_SECONDS)
         self._last_arrival = -math.inf
         self._gaps: deque[float] = deque(maxlen=GAPS)
+        self._returns = Returns()
 
     @property
     def waiting(self) -> int:
@@ -195,6 +197,9 @@ class Schedule:
         if seconds is not None:
             rows = sum(request.rows for request in self._running)
             self._turn_times(self._running).ran(rows, seconds, now)
+        for request in self._running:
+            if not request.later:
+                self._returns.answered(request.source, now)
         self._running, self._free_since = (), now
 
     @property
@@ -217,6 +222,8 @@ class Schedule:
         """Give it its number, and learn how soon others follow."""
         self._number += 1
         request.number, request.queued = self._number, now
+        if not request.continued:
+            self._returns.asked(request.source, now)
         if not (request.alone or request.continued):
             if now - self._last_arrival <= ACTIVE_SECONDS:
                 self._gaps.append(now - self._last_arrival)
@@ -369,23 +376,39 @@ class Schedule:
     def _window(self, group: list[Request], rows: int, now: float) -> float:
         """Until when to wait for company; it is over if that isn't later than now.
 
-        Company is waited for if it saves more time than it usually takes to come: as long as the saving, not longer
-        than a few usual gaps after the last arrival, and only while all deadlines of the group leave room for T(B).
+        Company is waited for if it saves more time than it takes to come: clients that were answered and usually ask
+        again so soon, or else anybody at the usual pace, as long as the saving and not longer than a few usual gaps
+        after the last arrival. Only while all deadlines of the group leave room for T(B).
         """
         times = self._times(group)
-        expected = len(self._active.values(now).keys() - {request.source for request in group})
-        most = min(self._places - len(group), expected, times.measured_largest - rows)
-        if most < 1 or len(self._gaps) < GAPS // 4:
+        sources = {request.source for request in group}
+        places = min(self._places - len(group), times.measured_largest - rows)
+        if places < 1:
             return -math.inf
-        gap, alone, together = median(self._gaps), times.total(1, now), times.total(rows, now)
         opened = max(self._free_since, min(request.arrived for request in group))
         deadline = min(request.deadline for request in group)
-        until = -math.inf
-        for more in range(1, most + 1):
-            saving = together + more * alone - times.total(rows + more, now)
+        together = times.total(rows, now)
+
+        def saving(more: int) -> float:
+            return together + times.total(more, now) - times.total(rows + more, now)
+
+        def latest(more: int) -> float:
             safe = times.seconds(rows + more, now, SAFE)
-            if saving > more * gap and safe is not None:
-                until = max(until, min(opened + saving, deadline - safe - LATE_TIMER))
+            return -math.inf if safe is None else deadline - safe - LATE_TIMER
+
+        expected = self._returns.expected(now, ACTIVE_SECONDS, sources)[:places]
+        for more in range(len(expected), 0, -1):
+            when, last = expected[more - 1]
+            if when - now < saving(more) and (until := min(last, latest(more))) > now:
+                return until
+        most = min(places, len(self._active.values(now).keys() - sources))
+        if most < 1 or len(self._gaps) < GAPS // 4:
+            return -math.inf
+        gap = median(self._gaps)
+        until = max(
+            (min(opened + saving(more), latest(more)) for more in range(1, most + 1) if saving(more) > more * gap),
+            default=-math.inf,
+        )
         return min(until, self._last_arrival + PATIENCE * gap)
 
 

@@ -1,10 +1,13 @@
 """One thread that runs the policy, for the turns that schedule.py decides about."""
 
 import asyncio
+import contextlib
+import queue
+import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
@@ -46,9 +49,14 @@ class Worker:
     ) -> None:
         self.schedule = schedule
         self._run, self._clock = run, clock
-        self._executor = ThreadPoolExecutor(1, thread_name_prefix="turbopi-inference")
+        # A queue and not an executor, whose Future costs a turn twice as much as the queue does.
+        self._work: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._perform, name="turbopi-inference", daemon=True)
+        self._closed = False
+        self._turns = 0  # on the thread or on their way
         self._answers: dict[Request, asyncio.Future[list[Outcome]]] = {}
-        self._going: set[Future[Any]] = set()  # turns and work that they began
+        self._going: set[Future[Any]] = set()  # work that turns began
+        self._idle: asyncio.Future[None] | None = None  # `drain` waits for it
         self._timer: asyncio.TimerHandle | None = None
         self._stopping = False
 
@@ -60,11 +68,20 @@ class Worker:
     @property
     def running(self) -> bool:
         """A turn is on the thread, or what one began goes on."""
-        return bool(self._going)
+        return bool(self._turns or self._going)
 
     async def call(self, function: Callable[[], R]) -> R:
         """`function()` on the thread: before there are requests. Raises what it raises."""
-        return await asyncio.get_running_loop().run_in_executor(self._executor, function)
+        answer: Future[R] = Future()
+
+        def perform() -> None:
+            try:
+                answer.set_result(function())
+            except BaseException as error:
+                answer.set_exception(error)
+
+        self._put(perform)
+        return await asyncio.wrap_future(answer)
 
     def ask(self, request: Request) -> "asyncio.Future[list[Outcome]]":
         """An outcome of each row of the request, once it has them: what is wrong if it gets no turn.
@@ -91,15 +108,17 @@ class Worker:
 
     async def drain(self) -> None:
         """Wait for the running turn to end, if there is one, and for all that turns began. Call `stop` first."""
-        while self._going:
-            await asyncio.wait([asyncio.wrap_future(future) for future in tuple(self._going)])
-            await asyncio.sleep(0)  # for what `_ended` begins
+        while self.running:
+            self._idle = asyncio.get_running_loop().create_future()
+            await self._idle
 
     def close(self) -> None:
         """Let the thread end. It isn't waited for."""
         self._stopping = True
         self._set_timer(None)
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        if not self._closed:
+            self._closed = True
+            self._work.put(None)
 
     # --- turns --------------------------------------------------------------------------------------------------------
 
@@ -110,17 +129,11 @@ class Worker:
             self._answer(refused.request, [Outcome(0.0, wrong=refused.kind, text=refused.text)])
         self._set_timer(decision.wake)
         if decision.turn:
-            assert self._run is not None
-            self._follow(self._executor.submit(self._run, decision.turn), partial(self._ended, decision.turn))
+            self._turns += 1
+            self._put(partial(self._take, decision.turn, asyncio.get_running_loop()))
 
-    def _ended(self, turn: tuple[Request, ...], future: "Future[Ran]") -> None:
-        if future.cancelled():
-            return
-        if (error := future.exception()) is not None:  # a fault of this server: nobody shall wait for ever
-            text = "".join(traceback.format_exception(error))
-            ran = Ran([[Outcome(0.0, wrong="policy", text=text)] * request.rows for request in turn])
-        else:
-            ran = future.result()
+    def _ended(self, turn: tuple[Request, ...], ran: Ran) -> None:
+        self._turns -= 1
         self.schedule.freed(self._clock(), ran.seconds)
         for request, answer in zip(turn, ran.answers, strict=True):
             if answer is None and request in self._answers:
@@ -128,31 +141,36 @@ class Worker:
         self._next()  # first: the policy shouldn't wait for what follows
         for request, answer in zip(turn, ran.answers, strict=True):
             if isinstance(answer, Future):
-                self._follow(answer, partial(self._finished, request))
+                self._follow(answer, request)
             elif answer is not None:
                 self._answer(request, answer)
+        self._look_if_idle()
 
-    def _finished(self, request: Request, future: "Future[list[Outcome]]") -> None:
-        self._answer(request, future.result())
-
-    def _follow(self, future: Future[R], then: Callable[[Future[R]], None]) -> None:
-        """Call `then` in the event loop when `future` is done.
+    def _follow(self, future: "Future[list[Outcome]]", request: Request) -> None:
+        """Answer the request in the event loop when `future` is done.
 
         A Future keeps its callbacks: none may refer to it, or what they hold (observations) would wait for the garbage
         collector.
         """
         loop = asyncio.get_running_loop()
 
-        def tell(done: Future[R]) -> None:
+        def tell(done: "Future[list[Outcome]]") -> None:
             if not loop.is_closed():
-                loop.call_soon_threadsafe(self._followed, done, then)
+                loop.call_soon_threadsafe(self._finished, request, done)
 
         self._going.add(future)
         future.add_done_callback(tell)
 
-    def _followed(self, future: Future[R], then: Callable[[Future[R]], None]) -> None:
+    def _finished(self, request: Request, future: "Future[list[Outcome]]") -> None:
         self._going.discard(future)
-        then(future)
+        self._answer(request, future.result())
+        self._look_if_idle()
+
+    def _look_if_idle(self) -> None:
+        if self._idle is not None and not self.running:
+            if not self._idle.done():
+                self._idle.set_result(None)
+            self._idle = None
 
     def _answer(self, request: Request, outcomes: list[Outcome]) -> None:
         answer = self._answers.pop(request, None)
@@ -170,3 +188,28 @@ class Worker:
             self._timer = None
         if when is not None:
             self._timer = asyncio.get_running_loop().call_later(max(0.0, when - self._clock()), self._next)
+
+    # --- the thread ---------------------------------------------------------------------------------------------------
+
+    def _put(self, work: Callable[[], None]) -> None:
+        if self._closed:
+            raise RuntimeError("this worker is closed")
+        if self._thread.ident is None:
+            self._thread.start()
+        self._work.put(work)
+
+    def _perform(self) -> None:
+        while (work := self._work.get()) is not None:
+            work()
+            del work  # a thread that waits holds nothing
+
+    def _take(self, turn: tuple[Request, ...], loop: asyncio.AbstractEventLoop) -> None:
+        """On the thread: a turn."""
+        assert self._run is not None
+        try:
+            ran = self._run(turn)
+        except BaseException as error:  # a fault of this server: nobody shall wait for ever
+            text = "".join(traceback.format_exception(error))
+            ran = Ran([[Outcome(0.0, wrong="policy", text=text)] * request.rows for request in turn])
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits
+            loop.call_soon_threadsafe(self._ended, turn, ran)

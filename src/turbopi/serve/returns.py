@@ -1,0 +1,61 @@
+"""How soon clients ask again once they were answered. From times alone; no clock of its own.
+
+Clients that ask again as soon as they have their actions, such as simulators and robots that stand still meanwhile,
+come back together after a batch, a few milliseconds later. schedule.py waits for them where that pays.
+"""
+
+from collections import OrderedDict, deque
+from collections.abc import Container, Hashable
+
+KEPT = 5  # returns of a source, the last ones
+FEW = 2  # that tell something
+TYPICAL = 3 / 4  # of the kept ones in order: that one is expected
+LATER = 2.0  # times the expected return, and
+LATER_SECONDS = 0.0005  # more, after which a source isn't expected any more this time
+MOST = 1024  # sources that are remembered
+
+
+class Returns:
+    """When sources that were answered are expected to ask again."""
+
+    def __init__(self) -> None:
+        self._answered: OrderedDict[Hashable, float] = OrderedDict()  # those that haven't asked again
+        self._seconds: OrderedDict[Hashable, deque[float]] = OrderedDict()  # the one that asked last at the end
+
+    def answered(self, source: Hashable, now: float) -> None:
+        """A turn with a source's request has ended."""
+        self._answered[source] = now
+        self._answered.move_to_end(source)
+        if len(self._answered) > MOST:
+            self._answered.popitem(last=False)
+
+    def asked(self, source: Hashable, now: float) -> None:
+        """A source's request has come."""
+        since = self._answered.pop(source, None)
+        if since is None:
+            return
+        self._seconds.setdefault(source, deque(maxlen=KEPT)).append(now - since)
+        self._seconds.move_to_end(source)
+        if len(self._seconds) > MOST:
+            self._seconds.popitem(last=False)
+
+    def expected(self, now: float, within: float, but: Container[Hashable]) -> list[tuple[float, float]]:
+        """(when it is expected, when it isn't any more) of each source that was answered within seconds, in order.
+
+        but  sources that are left out
+        """
+        while self._answered and next(iter(self._answered.values())) < now - within:
+            self._answered.popitem(last=False)  # who asks so late doesn't come for company
+        found = []
+        for source, since in self._answered.items():
+            usual = self._usual(source)
+            if usual is not None and source not in but and (last := since + usual * LATER + LATER_SECONDS) > now:
+                found.append((since + usual, last))
+        return sorted(found)
+
+    def _usual(self, source: Hashable) -> float | None:
+        """Seconds from an answer to the next request; None if that isn't known."""
+        seconds = self._seconds.get(source)
+        if seconds is None or len(seconds) < FEW:
+            return None
+        return sorted(seconds)[min(len(seconds) - 1, int(TYPICAL * len(seconds)))]

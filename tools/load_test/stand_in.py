@@ -1,0 +1,174 @@
+"""A server for load tests without a GPU: the whole served path, with a backend that sleeps instead of computing.
+
+    PYTHONPATH=src:tools python -m load_test.stand_in --gpu h100_bf16 --port 8001
+
+Everything on the host is what `turbopi serve --random-weights pi05_libero` does: reading, resizing, tokenising, copies
+into the engine's input buffers, un-normalising. In place of the GPU there is a queue of stages with their measured
+durations; waiting for it releases the GIL, as waiting for a CUDA event does. Actions are the noise.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from turbopi import UnifiedPolicy, serve
+from turbopi.backends import BACKENDS, BackendSpec, LoadState, Precision, Sample
+from turbopi.checkpoint import random_checkpoint
+from turbopi.config import ImageResize, ModelConfig
+from turbopi.engine.batch_runner import Asked, BegunBatch, Call, Finish
+from turbopi.engine.packing import pack_rows, split
+from turbopi.model.conditioning import Form
+
+# Milliseconds of vision, prefix and denoising of a call for so many observations of two pictures, and what `fused`
+# splits other numbers by. benchmarks/results/h100_2026-11-24_batches.json, device times; of two observations the
+# denoising is that of h200_2026-11-24_pairs.json, scaled as two single calls' are.
+GPUS: dict[str, tuple[dict[int, tuple[float, float, float]], dict[int, float]]] = {
+    "h100_bf16": (
+        {1: (1.29, 3.45, 3.0), 2: (2.6, 6.92, 3.95), 4: (4.46, 12.99, 7.03), 8: (8.64, 23.85, 7.91)},
+        {1: 1, 2: 1.75, 4: 3.2, 8: 5.4},
+    ),
+    "h100_fp8": (
+        {1: (1.06, 2.08, 2.01), 2: (2.11, 4.16, 2.89), 4: (3.52, 8.29, 5.79), 8: (6.52, 14.34, 6.51)},
+        {1: 1, 2: 1.75, 4: 3.2, 8: 5.4},
+    ),
+    "none": ({1: (0.0, 0.0, 0.0)}, {1: 1}),
+}
+
+
+class Device:
+    """A GPU's stream: stages run one after the other, each for its time."""
+
+    def __init__(self) -> None:
+        self._free = 0.0
+
+    def launch(self, milliseconds: float) -> None:
+        self._free = max(self._free, time.perf_counter()) + milliseconds / 1e3
+
+    def wait(self) -> None:
+        """Until all that was launched has run."""
+        if (left := self._free - time.perf_counter()) > 0:
+            time.sleep(left)
+
+
+@dataclass
+class _Begun:
+    backend: "SleepingBackend"
+    cameras: int
+
+    def finish(
+        self, tokens: np.ndarray, state: np.ndarray, noise: np.ndarray, num_steps: int, conditioning: None = None
+    ) -> Sample:
+        return self.backend.finish(1, [self.cameras], [tokens], state[None], noise[None])
+
+
+class SleepingBackend:
+    """Begins and RunsBatches, in the time that `gpu` says."""
+
+    name: ClassVar[str] = "sleeping"
+    precisions: ClassVar[tuple[Precision, ...]] = ("bf16",)
+    any_horizon: ClassVar[bool] = True
+    gpu: ClassVar[str] = "none"
+    strict = False
+
+    def __init__(self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: Precision) -> None:
+        self.config, self.device, self.precision = config, device, precision
+        self.stages, self.costs = GPUS[self.gpu]
+        self._device = Device()
+        side = config.vision.image_size
+        self._pictures = np.zeros((4 * max(self.stages), side, side, 3), np.uint8)
+        self._inputs = np.zeros((max(self.stages), config.action_horizon, config.action_dim), np.float32)
+
+    @classmethod
+    def unavailable(cls, device: torch.device) -> str | None:
+        return None
+
+    @property
+    def batch_costs(self) -> Mapping[int, float]:
+        return self.costs
+
+    def warmup(self, *_: Any, **__: Any) -> None: ...
+
+    def warmup_batches(self, *_: Any, **__: Any) -> None: ...
+
+    def describe(self) -> dict[str, Any]:
+        return {"gpu": self.gpu}
+
+    def begin(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> _Begun:
+        self._see(1, [pictures])
+        return _Begun(self, len(pictures))
+
+    def begin_batch(
+        self,
+        pictures: Sequence[Sequence[np.ndarray]],
+        resize: ImageResize | None = None,
+        forms: Sequence[Form] | None = None,
+    ) -> BegunBatch:
+        calls: list[Call] = []
+        rows = list(range(len(pictures)))
+        for bucket in split(len(pictures), self.costs):
+            calls.append((bucket, rows[:bucket]))
+            rows = rows[bucket:]
+        return BegunBatch(self._begin_call, calls, pictures)
+
+    def _begin_call(self, bucket: int, pictures: Sequence[Sequence[np.ndarray]]) -> Finish:
+        self._see(bucket, pictures)
+        cameras = [len(one) for one in pictures]
+
+        def finish(
+            tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int, asked: Asked
+        ) -> Sample:
+            return self.finish(bucket, cameras, tokens, state, noise)
+
+        return finish
+
+    def _see(self, bucket: int, pictures: Sequence[Sequence[np.ndarray]]) -> None:
+        for place, picture in zip(self._pictures, (picture for one in pictures for picture in one), strict=False):
+            place[:] = picture
+        self._device.launch(self.stages[bucket][0])
+
+    def finish(
+        self,
+        bucket: int,
+        cameras: Sequence[int],
+        tokens: Sequence[np.ndarray],
+        state: np.ndarray,
+        noise: np.ndarray,
+    ) -> Sample:
+        config = self.config
+        if bucket > 1:
+            rows = sum(cameras) * config.vision.num_tokens + bucket * config.max_prompt_tokens
+            per_picture, heads = config.vision.num_tokens, config.vlm.num_heads
+            pack_rows(cameras, tokens, batch=bucket, rows=rows, per_picture=per_picture, heads=heads)
+        self._inputs[: len(noise)] = noise
+        for milliseconds in self.stages[bucket][1:]:
+            self._device.launch(milliseconds)
+        self._device.wait()
+        stages = dict(zip(("vision", "prefix", "denoise"), self.stages[bucket], strict=True))
+        return Sample(torch.from_numpy(noise.copy()), stages)
+
+
+def make_policy(gpu: str) -> UnifiedPolicy:
+    """The full-size policy of LIBERO's robot on a GPU that isn't there."""
+    SleepingBackend.gpu = gpu
+    BACKENDS["sleeping"] = BackendSpec("sleeping", __name__, "SleepingBackend", "sleeps")
+    return UnifiedPolicy(random_checkpoint("pi05_libero"), backend="sleeping", device="cpu")
+
+
+def main(arguments: Sequence[str] | None = None, run: Callable[..., None] = serve.run) -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m load_test.stand_in", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--gpu", choices=sorted(GPUS), default="h100_bf16", help="whose times")
+    parser.add_argument("--port", type=int, default=8001)
+    given = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    run(make_policy(given.gpu), port=given.port)
+
+
+if __name__ == "__main__":
+    main()
