@@ -170,8 +170,8 @@ FAULTS = (
     Fault(
         "gate and up swapped in the packed matrix",
         "turbopi.engine",
-        'for p in ("gate", "up")])',
-        'for p in ("up", "gate")])',
+        '("gate_proj", "up_proj")',
+        '("up_proj", "gate_proj")',
         "every feed-forward is wrong",
         (ENGINE,),
     ),
@@ -321,8 +321,8 @@ FAULTS = (
     ),
     Fault(
         "guided observations of a batch see each other's prefixes on the way",
-        "turbopi.engine",
-        "logits.view(len(tokens), g.num_heads, -1).masked_fill_(self.hidden, -torch.inf)",
+        "turbopi.kernels",
+        "logits.view(-1, heads, len(k)).masked_fill_(hidden, -torch.inf)",
         "pass",
         "one robot's pictures move another one's arm",
         (CONDITIONED_BATCH,),
