@@ -47,9 +47,7 @@ def plan(
         int | None,
         typer.Option(metavar="S", min=1, help="Control steps between two requests of a robot; else half a chunk."),
     ] = None,
-    max_batch: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="No larger batches; 1 where chunks join a running one.")
-    ] = None,
+    max_batch: Annotated[int | None, typer.Option(metavar="N", min=1, help="No larger batches.")] = None,
     overhead_ms: Annotated[
         float,
         typer.Option(metavar="MS", min=0, max=60_000, help="Of a request beyond the policy: network and server."),

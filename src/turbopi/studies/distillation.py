@@ -233,7 +233,7 @@ def _not_run(teachers: Mapping[str, Path], students: Mapping[str, Mapping[str, P
         for recipe in RECIPES
         if recipe not in students[teacher]
     ]
-    return [*lines, "LIBERO: its small policy has one way of doing it, and one plain step solves as much as ten."]
+    return [*lines, "LIBERO: its small policy imitates one expert, so there are no two ways to keep."]
 
 
 # --- tables and plots -------------------------------------------------------------------------------------------------
