@@ -8,9 +8,9 @@ too, and lands at 0.7 to 3.2 times the control (66 chunks of `pytorch` and `pyto
 seeds, openpi's golden Pi0.5 and Pi0; 1, 3 and 10 steps). The bound is 5 times the control. On pi05_tiny one wrong
 prompt token lands at 8 times, swapped cameras at 16, and attended padding, a lost camera mask or BGR beyond 75.
 
-Trained weights make more of rounded activations, beside rounded weights: the small policy of 0.1.0 landed at 1.2 to 5.5 times its
-control (18 chunks), so for them the bound is 10 times. Of its chunks, one wrong word moves the worst to 73 times,
-swapped cameras or BGR every one beyond 130.
+Trained weights make more of rounded activations, beside rounded weights: the small policy of 0.1.0 landed at 1.2 to 5.5
+times its control (18 chunks), so for them the bound is 10 times. Of its chunks, one wrong word moves the worst to 73
+times, swapped cameras or BGR every one beyond 130.
 
 Float32 rounds 2^16 times finer, and so is its control. Compiled float32 lands at 5 to 10 times that; the bound is 30,
 since every way of adding up differs, and bugs are as much further off.
