@@ -1,4 +1,4 @@
-"""What is captured in a CUDA graph never asks the device for a number, nor brings one from the host's pageable memory."""
+"""What is captured in a CUDA graph asks the device for no number, and makes no tensor of Python's numbers there."""
 
 from collections.abc import Callable
 from functools import wraps
