@@ -10,8 +10,9 @@ from torch import Tensor
 
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import PRESETS
-from turbopi.engine.room import PackingRoom, is_conditioning, join, joined_with
+from turbopi.engine.room import GATE_UP, PackingRoom, is_conditioning, join, joined_with
 from turbopi.engine.weights import Weights, pack
+from turbopi.model.reference import parameter_shapes
 
 CPU, META = torch.device("cpu"), torch.device("meta")
 CONFIG = PRESETS["pi05_tiny"].with_model(vocab_size=64)
@@ -60,6 +61,15 @@ def test_tensors_lie_where_the_room_has_them() -> None:
         assert room(name, (2, 3), torch.float32).device == device
     pi0 = replace(CONFIG.model, kind="pi0")
     assert not is_conditioning(pi0, "time_mlp_in.weight"), "which of Pi0 is a part of every step"
+
+
+def test_a_room_keeps_nothing_of_what_it_gave_away() -> None:
+    """What packing rounds or drops shall be freed layer by layer, not when all is packed."""
+    room, shapes = PackingRoom(CONFIG.model, CPU, nothing), parameter_shapes(CONFIG.model)
+    names = [f"vlm.layers.1.mlp.{part}.weight" for part in GATE_UP]
+    stores = [[room(name, shapes[name], torch.bfloat16).untyped_storage() for name in names] for _ in range(2)]
+    (gate, up), (other_gate, other_up) = ([one.data_ptr() for one in some] for some in stores)
+    assert gate == up != other_gate == other_up
 
 
 def test_a_damaged_number_is_found_wherever_it_lies(monkeypatch: pytest.MonkeyPatch) -> None:

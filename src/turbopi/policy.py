@@ -210,7 +210,8 @@ class UnifiedPolicy:
         `noise` is [B, H, action_dim]; `seed` one number for the batch's first row, the next row taking the next
         number, or one for each row. `conditioning` and `previous` are lists with one for each row, or None for a row
         that joins nothing; `model_actions` is for all rows, or a list with one for each. What is wrong with a row is
-        said with its number.
+        said with its number. All rows take the same number of denoising steps: `num_steps`, else what a row's
+        conditioning brings, else the policy's.
 
         `runs_batches` says whether the backend runs observations together: in calls of 1, 2, 4, 8 or 16, into which it
         splits other numbers (`backend.batch_costs`). Observations may differ in cameras, prompts and what they join:

@@ -76,13 +76,18 @@ def batch_loop(conditionings: Sequence[Conditioning | None], num_steps: int, hor
     tokens = [None if one is None else one.own_tokens(horizon) for one in conditionings]
     wanted = {*own}.union(*(one.distinct().tolist() for one in tokens if one is not None))
     form: Form = "jacobian" if "jacobian" in forms else "tokens"
-    return Loop(num_steps, horizon, form, own if len(wanted) == len(own) else _checked_times(wanted))
+    times = own if len(wanted) == len(own) else _checked_times(wanted, len(conditionings))
+    return Loop(num_steps, horizon, form, times)
 
 
-def _checked_times(wanted: set[float]) -> tuple[float, ...]:
+def _checked_times(wanted: set[float], rows: int = 1) -> tuple[float, ...]:
     if len(wanted) > MOST_TIMES:
+        what, besides = "", ""
+        if rows > 1:
+            what, besides = f"of {rows} observations together ", ", or ask for fewer observations at once"
         raise ObservationError(
-            f"the token times have {len(wanted)} different values; at most {MOST_TIMES} fit: let actions share times"
+            f"the token times {what}have {len(wanted)} different values; at most {MOST_TIMES} fit: let actions share "
+            f"times{besides}"
         )
     return tuple(sorted(wanted, reverse=True))
 

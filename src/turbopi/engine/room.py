@@ -34,17 +34,24 @@ class PackingRoom:
     def __init__(self, config: ModelConfig, device: torch.device, on_host: Callable[[str], bool]) -> None:
         self.device = device
         self._on_host, self._shapes = on_host, parameter_shapes(config)
-        self._joined: dict[tuple[str, ...], Tensor] = {}  # by the names of their parts
+        self._parts: dict[tuple[str, ...], dict[str, Tensor]] = {}  # of what is joined, those not yet given away
 
     def __call__(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """An uninitialised tensor for a parameter by its canonical name."""
+        """An uninitialised tensor for a parameter by its canonical name.
+
+        The room keeps nothing of a joined matrix once all its parts are given away, so packing can free it.
+        """
         device, names = HOST if self._on_host(name) else self.device, joined_with(name)
         if names is None:
             return torch.empty(shape, dtype=dtype, device=device)
-        rows = [self._shapes[one][0] for one in names]
-        if names not in self._joined:
-            self._joined[names] = torch.empty(sum(rows), *shape[1:], dtype=dtype, device=device)
-        return torch.split(self._joined[names], rows)[names.index(name)]
+        if names not in self._parts:
+            rows = [self._shapes[one][0] for one in names]
+            whole = torch.empty(sum(rows), *shape[1:], dtype=dtype, device=device)
+            self._parts[names] = dict(zip(names, torch.split(whole, rows), strict=True))
+        part = self._parts[names].pop(name)
+        if not self._parts[names]:
+            del self._parts[names]
+        return part
 
 
 def joined_with(name: str) -> tuple[str, ...] | None:
