@@ -125,12 +125,6 @@ class PolicyCalls:
     def largest(self) -> int:
         return self.times.measured_largest
 
-    @property
-    def _sizes(self) -> list[int]:
-        """The batches to measure: 1, 2, 4, 8, … and the largest one."""
-        largest = self.times.largest
-        return [*(2**power for power in range(largest.bit_length()) if 2**power < largest), largest]
-
     # --- warm-up ------------------------------------------------------------------------------------------------------
 
     async def warm_up(self, **arguments: Any) -> None:
@@ -140,7 +134,7 @@ class PolicyCalls:
         """
         warmup = getattr(self._policy, "warmup", None)
         if self.times.largest > 1 and getattr(self._policy, "runs_batches", False):
-            arguments["batches"] = self._sizes
+            arguments["batches"] = _sizes(self.times)
         if warmup is not None:
             await self.worker.call(lambda: warmup(**arguments))
         if self.times.largest > 1:
@@ -148,9 +142,9 @@ class PolicyCalls:
 
     def _measure(self) -> None:
         """Fill the tables T(B), as far as the time for it allows."""
-        self._fill(self.times, {}, "batches")
+        self._fill(self.times, dict, "batches")
         if self.joining.largest > 1:
-            self._fill(self.joining, self._example_of_joining(), "batches that join chunks")
+            self._fill(self.joining, self._example_of_joining, "batches that join chunks")
 
     def _example_of_joining(self) -> dict[str, Any]:
         """Arguments of an `infer` that joins a chunk in the server's mode."""
@@ -160,11 +154,12 @@ class PolicyCalls:
         chunk = RunningChunk(left_over, min(1, len(left_over) - 1), mode=self._execution, anchor=result.get("anchor"))
         return {"previous": chunk, "model_actions": True}
 
-    def _fill(self, times: BatchTimes, arguments: Mapping[str, Any], what: str) -> None:
-        """Fill a table with runs of the example, with these arguments of `infer`. `what` they are, in messages."""
-        asked_for = self._asked_for
-        for size in self._sizes:
+    def _fill(self, times: BatchTimes, make_arguments: Callable[[], dict[str, Any]], what: str) -> None:
+        """Fill a table with runs of the example, with made arguments of `infer`. `what` they are, in messages."""
+        asked_for, arguments = self._asked_for, None
+        for size in _sizes(times):
             try:
+                arguments = make_arguments() if arguments is None else arguments
                 enough = self._measure_size(size, times, arguments)
             except DeviceLost:
                 raise
@@ -379,6 +374,12 @@ class PolicyCalls:
             return Outcome(seconds(), wrong="policy", text=traceback.format_exc())
         finally:
             self._metrics.inference_seconds.observe(seconds())
+
+
+def _sizes(times: BatchTimes) -> list[int]:
+    """The batches to measure: 1, 2, 4, 8, … and the largest one."""
+    largest = times.largest
+    return [*(2**power for power in range(largest.bit_length()) if 2**power < largest), largest]
 
 
 def _largest(policy: Policy, pipelined: bool, options: ServerOptions) -> int:
