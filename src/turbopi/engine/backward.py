@@ -18,6 +18,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.forward import Rope, project
 from turbopi.engine.weights import Weights
+from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.interface import BackwardOps, Ops, State
 
 
@@ -109,6 +110,11 @@ class Expert:
             return plain, None, None
         scale, shift, gate = self.table[index].unbind(0)
         return scale, shift, gate
+
+
+def way_back(ops: Ops, config: ModelConfig, tokens: int, *, masked: bool = False) -> BackwardOps:
+    """The operations that `Expert` takes for so many tokens. masked: with `Expert.hidden`."""
+    return PLAIN_BACKWARD if ops.backward is None else ops.backward(config.expert, tokens, masked)
 
 
 def jacobian_velocity(

@@ -19,14 +19,13 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine import forward
-from turbopi.engine.backward import Expert, jacobian_velocity
+from turbopi.engine.backward import Expert, jacobian_velocity, way_back
 from turbopi.engine.call import Cache, Pictures
 from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.flat import allocate
 from turbopi.engine.packing import most_tiles, pack_rows
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.weights import Weights
-from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.interface import Ops, PairDenoiser, Segments
 from turbopi.kernels.plain_batch import PLAIN_BATCH, visible_to_suffix
 from turbopi.model.conditioning import Conditioning
@@ -265,6 +264,5 @@ class BatchLoop:
 
     def _expert(self, weights: Weights, step: int, rope: forward.Rope, k: Tensor, v: Tensor, hidden: Tensor) -> Expert:
         buffers, table = self._buffers, self._modulation(step)
-        choose, tokens = buffers.ops.backward, buffers.size.batch * self._tokens
-        back = PLAIN_BACKWARD if choose is None else choose(buffers.config.expert, tokens, True)
+        back = way_back(buffers.ops, buffers.config, buffers.size.batch * self._tokens, masked=True)
         return Expert(buffers.config, weights, buffers.ops, back, table, self._seen, k, v, rope, hidden)

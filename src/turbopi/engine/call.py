@@ -15,14 +15,13 @@ from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine import forward
-from turbopi.engine.backward import Expert, jacobian_velocity
+from turbopi.engine.backward import Expert, jacobian_velocity, way_back
 from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.flat import allocate
 from turbopi.engine.graph import Mark
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.resize import Resizer
 from turbopi.engine.weights import Weights
-from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.model.conditioning import Conditioning
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
@@ -307,7 +306,7 @@ class StaticCall:
         if self.shape.loop.form == "tokens":
             return asked.pulled(step, x_t, self._velocity(step, rope))
         tokens, cache = self._suffix_tokens(step), (self.cache_k, self.cache_v)
-        back = PLAIN_BACKWARD if self.ops.backward is None else self.ops.backward(self.config.expert, len(tokens))
+        back = way_back(self.ops, self.config, len(tokens))
         table, length = self._modulation(step), self.inputs.length
         expert = Expert(self.config, self.weights, self.ops, back, table, length, *cache, rope)
         return jacobian_velocity(expert, asked, step, x_t, tokens, self._time(step))
