@@ -57,6 +57,7 @@ def pair_of(p: Problem, lengths: tuple[int, int]) -> tuple[Problem, Problem]:
     """Two observations of one model whose rows lie one behind the other in `p`'s cache, behind BEFORE rows of NaN."""
     p.cache_k[:, :BEFORE] = p.cache_v[:, :BEFORE] = torch.nan
     starts = BEFORE, BEFORE + lengths[0]
+    other = torch.randn(p.noise.shape, generator=torch.Generator().manual_seed(sum(lengths))).to(p.noise)
     first, second = (
         dataclasses.replace(
             p,
@@ -65,7 +66,7 @@ def pair_of(p: Problem, lengths: tuple[int, int]) -> tuple[Problem, Problem]:
             cache_v=p.cache_v[:, start : start + length],
             length=length,
         )
-        for start, length, noise in zip(starts, lengths, (p.noise, torch.randn_like(p.noise)), strict=True)
+        for start, length, noise in zip(starts, lengths, (p.noise, other), strict=True)
     )
     return first, second
 
@@ -98,7 +99,7 @@ def test_each_observation_is_as_exact_as_ordinary_bf16(
     """Of small models over several problems, as each has some luck."""
     ours: list[list[float]] = [[], []]
     ordinary: list[list[float]] = [[], []]
-    for seed in range(1 if name in ("shallow", "full") else 8):
+    for seed in range(1 if name in ("shallow", "full") else 24):
         p = problem(name, steps, horizon, BEFORE + sum(lengths), seed * 1000 + horizon, GPU, outliers=outliers)
         pair = pair_of(p, lengths)
         x_t, v_t = run(p, pair, PackedExpert.pack(p.config, p.layers))

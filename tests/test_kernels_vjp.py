@@ -122,14 +122,15 @@ def test_attention_equals_autograd(tokens: int) -> None:
     given = (q, k, v, out, qkv, (d_y.float() @ out.float()).to(DTYPE))
     found = attention_and_back(FEW_TOKENS, given, upright, seen)[1]
 
-    wide = [one.double().requires_grad_() for one in (q, k[slots:], v[slots:])]
-    keys, values = (torch.cat((x.double()[:slots], own)) for x, own in ((k, wide[1]), (v, wide[2])))
+    q, k, v, out, d_y, found = (one.double().cpu() for one in (q, k, v, out, d_y, found))
+    wide = [one.clone().requires_grad_() for one in (q, k[slots:], v[slots:])]
+    keys, values = (torch.cat((x[:slots], own)) for x, own in ((k, wide[1]), (v, wide[2])))
     logits = wide[0] @ keys.T * dim**-0.5
     logits[:, length:slots] = -torch.inf
-    y = (logits.softmax(-1) @ values).view(tokens, -1) @ out.double().T
-    d_q, d_k, d_v = torch.autograd.grad(y, wide, d_y.double())
+    y = (logits.softmax(-1) @ values).view(tokens, -1) @ out.T
+    d_q, d_k, d_v = torch.autograd.grad(y, wide, d_y)
     exact = torch.cat((d_q.view(tokens, -1), d_k, d_v), 1)
-    assert float((found.double() - exact).norm() / exact.norm()) < (2e-2 if ON_GPU else 1e-5)
+    assert float((found - exact).norm() / exact.norm()) < (2e-2 if ON_GPU else 1e-5)
 
 
 @pytest.mark.parametrize("parts", [1, 4])
