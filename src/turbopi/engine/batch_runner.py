@@ -79,7 +79,7 @@ class BatchRunner(GraphRunner):
     # estimated from single calls: without the denoising kernel, whose time a batch of two doubles, sharing pays sooner
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.6, 4: 2.9, 8: 5.5, 16: 10.7}
     # of guided ones: most of a single call's way back waits for launches. Larger ones would keep gigabytes for it
-    JACOBIAN_COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.3, 4: 1.8, 8: 3}
+    JACOBIAN_COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 1.5, 4: 2.2, 8: 3.5}
 
     def __init__(
         self, config: ModelConfig, weights: Weights, ops: Ops, device: torch.device, *, joint: bool = False
