@@ -39,7 +39,7 @@ mask_libero|control
 kv_reuse_libero|control
 fp8_and_fp4_libero|control
 kv_reuse_libero|full 0.9
-kv_reuse_libero|every 2, another episode's
+kv_reuse_libero|every 2, of another episode
 kv_reuse_libero|patch 0.95
 fp8_and_fp4_libero|W4A8 (MXFP4)
 fp8_and_fp4_libero|NVFP4, weights alone

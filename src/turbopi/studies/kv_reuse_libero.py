@@ -17,7 +17,7 @@ from turbopi.studies.kv_reuse import CLAIMED, NOTHING, Reuse, Reusing, speed_ups
 from turbopi.studies.simulated import Given, Variant, Variants
 
 FILE = "reused.jsonl"  # in a cell's folder: [task, initial state, call, share of image tokens that it reused]
-ANOTHERS = "every 2, another episode's"
+ANOTHERS = "every 2, of another episode"
 CELLS = (
     *(Reuse("full", 0.985), Reuse("full", 0.95), Reuse("full", 0.9)),
     *(Reuse("patch", 0.985), Reuse("patch", 0.95), Reuse("patch", 0.9), Reuse("every", 2)),
