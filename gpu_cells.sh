@@ -28,22 +28,23 @@ steps_libero|exponential, uniform, 3
 mask_libero|padded, not masked
 kv_reuse_libero|every 2
 fp8_and_fp4_libero|NVFP4
-kv_reuse_libero|full 0.95
+kv_reuse_libero|full 0.9
 fp8_and_fp4_libero|W4A8
 kv_reuse_libero|patch 0.9
 fp8_and_fp4_libero|NVFP4, scales ignored
-kv_reuse_libero|full 0.985
+kv_reuse_libero|patch 0.985
 fp8_and_fp4_libero|FP8
 steps_libero|control
 mask_libero|control
 kv_reuse_libero|control
 fp8_and_fp4_libero|control
-kv_reuse_libero|full 0.9
+kv_reuse_libero|full 0.92
 kv_reuse_libero|every 2, of another episode
 kv_reuse_libero|patch 0.95
 fp8_and_fp4_libero|W4A8 (MXFP4)
 fp8_and_fp4_libero|NVFP4, weights alone
-kv_reuse_libero|patch 0.985
+kv_reuse_libero|full 0.985
+kv_reuse_libero|full 0.87
 mask_libero|padded, masked
 LIST
 }

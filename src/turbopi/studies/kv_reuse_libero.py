@@ -18,8 +18,8 @@ from turbopi.studies.simulated import Given, Variant, Variants
 
 FILE = "reused.jsonl"  # in a cell's folder: [task, initial state, call, share of image tokens that it reused]
 ANOTHERS = "every 2, of another episode"
-CELLS = (
-    *(Reuse("full", 0.985), Reuse("full", 0.95), Reuse("full", 0.9)),
+CELLS = (  # in two episodes of LIBERO cosines of two calls' pictures were from 0.86 to 0.94, half of them above 0.90
+    *(Reuse("full", 0.985), Reuse("full", 0.92), Reuse("full", 0.9), Reuse("full", 0.87)),
     *(Reuse("patch", 0.985), Reuse("patch", 0.95), Reuse("patch", 0.9), Reuse("every", 2)),
 )
 
