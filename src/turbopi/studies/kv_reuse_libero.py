@@ -71,7 +71,7 @@ def _variant(reuse: Reuse) -> Variant:
     return Variant(_name(reuse), partial(_open, reuse=reuse), reuse.what)
 
 
-STUDY = Variants(
+VARIANTS = Variants(
     name="kv_reuse_libero",
     question="Can the prefix's keys and values be reused on LIBERO while pictures look alike?",
     claimed=CLAIMED,
@@ -88,4 +88,5 @@ STUDY = Variants(
     would_change="Pictures that stand still for long while the policy needs no answer; a policy that reads the state.",
     x_label="image tokens reused, %",
     measured=_measured,
-).study
+)
+STUDY = VARIANTS.study

@@ -20,7 +20,7 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan, choose_tasks, make_jobs
 from turbopi.evaluate.reading import load_results
-from turbopi.evaluate.results import FILE, Results
+from turbopi.evaluate.results import FILE, Episode, Results
 from turbopi.evaluate.run import default_workers, evaluate, prepare
 from turbopi.evaluate.sources import LocalPolicy, PolicySource
 from turbopi.evaluate.statistics import Paired, PairedDocument, Rate, RateDocument
@@ -113,8 +113,8 @@ class Variants:
     """A study of variants.
 
     few        names of the small form's cells
-    neutral    the plain policy asked for in the study's way: four episodes must end as the plain policy's, `exact`: in
-               the same step, too
+    neutral    the plain policy asked for in the study's way: four episodes must end as the plain policy's, `exact`:
+               after the same commands
     broken     a cell that must lose twenty points, if the study has one
     measured   what else a cell, by its name and folder, tells, by the column's name; the first is the plot's x where
                variants have none
@@ -197,7 +197,7 @@ class Variants:
                 f"ones with the same noise in every cell, run on {first.get('device_name')}. {self.method} "
                 f"Differences are against the plain policy: the float32 reference, ten Euler steps."
             ),
-            controls=self._controls(folder, cells, setup.small),
+            controls=self.controls(folder, cells, setup.small),
             tables=[_table(cells)],
             plots=[self._plot(cells)],
             verdict=_verdict(cells),
@@ -209,15 +209,16 @@ class Variants:
             },
         )
 
-    def _controls(self, folder: Path, cells: Sequence[SimulatorCell], small: bool) -> list[Control]:
-        how = "in the same steps" if self.exact else "alike"
+    def controls(self, folder: Path, cells: Sequence[SimulatorCell], small: bool) -> list[Control]:
+        """Of what is in the folder; one that wasn't run has failed."""
+        how = "alike after the same commands" if self.exact else "alike"
         claim = f"Asked for in this study's way, the plain policy's first episodes end {how}, one request at a time."
         ours, plains = (finished(one) for one in self._control(folder))
         if ours is None or plains is None:
             controls = [Control(claim, False, f"Not run: `--way {CONTROL}`.")]
         else:
             pairs = [(ours.episodes[key], plains.episodes[key]) for key in plains.episodes]
-            same = [a.status == b.status and (a.steps == b.steps or not self.exact) for a, b in pairs]
+            same = [(a.status, *self._way(a)) == (b.status, *self._way(b)) for a, b in pairs]
             ends = ", ".join(f"{b.status} after {b.steps}" for _, b in pairs)
             controls = [Control(claim, all(same), f"{sum(same)} of {len(same)}: {ends}.")]
         for cell in () if small else cells:  # in the small form nobody solves anything of LIBERO
@@ -226,6 +227,10 @@ class Variants:
                 claim = f"{cell.way} isn't as good: it loses {-100 * _LOST:.0f} points at least."
                 controls.append(Control(claim, lost <= _LOST, f"{paired_cell(cell.against_plain)} points."))
         return controls
+
+    def _way(self, episode: Episode) -> tuple[object, ...]:
+        """What tells two episodes' commands apart, to the last bit."""
+        return (episode.steps, episode.motion) if self.exact else ()
 
     def _plot(self, cells: Sequence[SimulatorCell]) -> Plot:
         """Success by x, which is a cell's place in the table where nothing else says."""
