@@ -398,17 +398,3 @@ def test_overlap_finds_actions_that_change_beside_others() -> None:
 
     assert pipelining.overlap([Policy(0.0), Policy(0.0)], None, 3).actions_equal_bit_for_bit
     assert not pipelining.overlap([Policy(0.0), Policy(1e-9)], None, 3).actions_equal_bit_for_bit
-
-
-# --- in a simulator ---------------------------------------------------------------------------------------------------
-
-
-def test_steps_in_a_simulator_are_paired_kept_and_continued(tmp_path: Path) -> None:
-    given = ("study", "steps_libero", CHASE_POLICY, "--simulator", "chase", "--small", "--episodes", "2")
-    result = turbopi(*given, "--device", "cpu", "--workers", "1", "--out", tmp_path)
-    assert result.exit_code == 0, result.output
-    found = read_document(tmp_path / "steps_libero" / report.JSON, Report)
-    assert found.sound and [row[2] for row in found.tables[0].rows] == [10, 2]
-    assert len(list((tmp_path / "episodes").glob("*/results.json"))) == 3  # two cells, and the control
-    said = refusal(turbopi("study", "steps_libero", "--way", "euler, uniform, 4", "--simulator", "chase"))
-    assert "unknown way 'euler, uniform, 4'; choose of: euler, uniform, 10; euler, uniform, 1" in said

@@ -15,6 +15,7 @@ from turbopi.studies import OF_CHECKPOINTS, STUDIES, check_names, load
 
 if TYPE_CHECKING:
     from turbopi.studies.report import Grid, Report
+    from turbopi.studies.study import Study
 
 MOST_EPISODES = 100_000
 
@@ -60,19 +61,35 @@ def study(
         ),
     ] = None,
     simulator: Annotated[
-        str, typer.Option(metavar="NAME", help="Of steps_libero: another simulator of `turbopi eval`.")
+        str, typer.Option(metavar="NAME", help="Of studies on LIBERO: another simulator of `turbopi eval`.")
     ] = "libero",
     way: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="SOLVER, GRID, N",
-            help="Of steps_libero: one cell, such as 'euler, uniform, 1'. May be given again; all unless given.",
+            metavar="NAME",
+            help="Of studies on LIBERO: one cell, such as 'euler, uniform, 1', beside the plain policy and the "
+            "control. May be given again; all unless given.",
             show_default=False,
         ),
     ] = None,
+    episodes_only: Annotated[
+        bool,
+        typer.Option(
+            "--episodes-only",
+            help="Of studies on LIBERO: run the cells of --way alone, and report nothing. Several such commands may "
+            "run at once with one --out.",
+        ),
+    ] = False,
+    report_only: Annotated[
+        bool,
+        typer.Option(
+            "--report-only",
+            help="Of studies on LIBERO: report on the finished cells in --out, with neither GPU nor simulator.",
+        ),
+    ] = False,
     workers: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="Processes at a time: a policy each, or of steps_libero a simulator."),
+        typer.Option(metavar="N", min=1, help="Processes at a time: a policy each, or on LIBERO a simulator."),
     ] = None,
     observation: Annotated[
         Path | None,
@@ -108,6 +125,9 @@ def study(
     output = Output(as_json)
     chosen = which.split(",")
     check_names(chosen)
+    studies = [load(name) for name in chosen]
+    if episodes_only or report_only:
+        _check_parts(studies, episodes_only, report_only, out)
     policies = dict(_named(one) for one in policy or [])
     from turbopi import backends
     from turbopi.cli.build import given_observations
@@ -116,7 +136,6 @@ def study(
     from turbopi.studies.study import Setup
 
     on = backends.resolve_device(device)
-    studies = [load(name) for name in chosen]
     for one in studies:
         one.check(on)
     opened = None
@@ -133,6 +152,7 @@ def study(
         simulator=simulator,
         ways=way or (),
         folder=None if out is None else out / "episodes",
+        report_only=report_only,
         workers=workers,
         episodes=episodes,
         steps=steps,
@@ -142,6 +162,10 @@ def study(
     )
     reports: dict[str, Report] = {}
     for one in studies:
+        if episodes_only:
+            assert one.episodes is not None
+            one.episodes(setup)
+            continue
         reports[one.name] = report = one.run(setup)
         _show(report, output)
         if out is not None:
@@ -150,6 +174,19 @@ def study(
     output.document({name: plain_document(report) for name, report in reports.items()})
     if not all(report.sound for report in reports.values()):
         raise typer.Exit(CHECK_FAILED)
+
+
+def _check_parts(studies: "list[Study]", episodes_only: bool, report_only: bool, out: Path | None) -> None:
+    """Raises ConfigError where episodes can't be run apart from the report."""
+    option = "--episodes-only" if episodes_only else "--report-only"
+    if episodes_only and report_only:
+        raise ConfigError("--episodes-only and --report-only leave nothing to do: give one of them")
+    if out is None:
+        raise ConfigError(f"{option} needs --out: the folder whose episodes/ has a folder for each cell")
+    for one in studies:
+        if one.episodes is None:
+            able = ", ".join(name for name in STUDIES if name.endswith("_libero"))
+            raise ConfigError(f"{option} is for {able}; {one.name} keeps no episodes")
 
 
 def _named(given: str) -> tuple[str, Path]:

@@ -6,6 +6,8 @@ questions, by the name that `turbopi study` takes, are in STUDIES; the reports t
 study.py                what a study is and is given
 solvers.py, spread.py   cells of solvers and time grids; how broad a policy's actions are
 rollouts.py, post.py    closed loop on toy tasks; the task with two ways
+simulated.py            variants of a policy in the episodes of `turbopi eval`: what studies on LIBERO share
+answering.py            a study's own function in a policy's model's place, told of episodes
 problems.py             batches with exact solutions
 formats.py, weights.py  emulated number formats; kinds of weights
 certificates.py         FP8's certificates at full size, without a checkpoint: no question, a tool
@@ -26,8 +28,11 @@ STUDIES: dict[str, str] = {  # name -> what it asks, in a few words; modules are
     "kv_reuse": "keys and values of old pictures, reused while new ones look alike",
     "fp8_and_fp4": "numbers of eight and four bits",
     "pipelining": "the next observation encoded beside this one's denoising",
-    "steps_libero": "the same on LIBERO (any checkpoint for it; else the small policy)",
-    "mask": "a padded cache without its mask (any checkpoint)",
+    "steps_libero": "steps on LIBERO (any checkpoint for it; else the small policy)",
+    "kv_reuse_libero": "kv_reuse on LIBERO",
+    "fp8_and_fp4_libero": "fp8_and_fp4 on LIBERO",
+    "mask_libero": "mask on LIBERO",
+    "mask": "a padded cache without its mask (any checkpoint, and toy tasks)",
     "precision": "attention and precisions inside TensorRT (any checkpoint)",
     "actions": "what backends do to actions (any checkpoint; TensorRT)",
     "throughput": "several observations in flight (any checkpoint; TensorRT)",

@@ -18,7 +18,19 @@ from msgspec import Struct, structs
 from turbopi.errors import ConfigError
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
 from turbopi.reading import plain_document
-from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
+from turbopi.studies.report import (
+    MARGIN,
+    Cell,
+    Control,
+    Grid,
+    Panel,
+    Plot,
+    Report,
+    Series,
+    compared,
+    paired_cell,
+    rate_cells,
+)
 from turbopi.studies.rollouts import POST, Played, ToyPolicy, open_policy, play, sampled, seeds_of
 from turbopi.studies.spread import UNIFORM, Spread, spread, spread_plot, spread_table
 from turbopi.studies.study import Setup, Study, Tell
@@ -29,7 +41,6 @@ RECIPES = {  # and what a student of it learned
     "mean": "regression on the mean of the teacher's actions: control",
 }
 TEACHER, STEPS = "teacher", 10
-MARGIN = 0.05  # as in the steps study
 _JUDGED = 20_000  # number of the first episode that errors are measured on
 
 
@@ -46,8 +57,7 @@ class DistilledCell(Struct, frozen=True):
 
     @property
     def verdict(self) -> str:
-        low, high = self.against_teacher.difference95
-        return "worse" if high < 0 else "as good" if low > -MARGIN else "open"
+        return compared(self.against_teacher)
 
 
 @dataclass(frozen=True)

@@ -219,7 +219,7 @@ def run(setup: Setup) -> Report:
             "Golden cases: their weights are random, too.",
             "Full-size weights, unless the device is a GPU: `turbopi study fp8_and_fp4 --device cuda`.",
             "A kernel: nothing here is faster yet.",
-            "Closed loop on LIBERO.",
+            "LIBERO: `turbopi study fp8_and_fp4_libero`.",
         ],
         data={
             "errors": {name: {f: plain_document(e) for f, e in of.items()} for name, of in found.items()},

@@ -13,7 +13,7 @@ Vision alone, with text and state computed afresh, gives what `full` gives where
 policies here have one instruction and read no state.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from turbopi.evaluate.statistics import PairedDocument, RateDocument
 from turbopi.model.exact import exact_float32
 from turbopi.model.kv_cache import EmbeddedPrefix, KVCache
 from turbopi.model.layers import gated_residual, rope_tables
+from turbopi.model.prefix import camera_slots
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.reading import plain_document
@@ -76,70 +77,97 @@ class ReuseCell(Struct, frozen=True):
 
 @dataclass
 class Memory:
-    """What earlier calls left, a row for each episode: tokens to compare with, embeddings, keys and values."""
+    """What earlier calls left: tokens to compare with, embeddings, keys and values, in the padded prefix's slots.
 
-    hidden: Tensor  # [B, C * T, W]
-    embs: Tensor  # [B, S, D]
-    k: Tensor  # [layer, B, G, S, K]
+    Of one episode. Of several, as a batch: k and v [layer, B, G, S, K], in the slots that are computed.
+    """
+
+    hidden: Tensor  # [C * T, W]
+    embs: Tensor  # [S, D]
+    k: Tensor  # [layer, G, S, K]
     v: Tensor
-
-    def rows(self, rows: list[int]) -> "Memory":
-        return Memory(self.hidden[rows], self.embs[rows], self.k[:, rows], self.v[:, rows])
 
 
 @dataclass
 class Reusing:
-    """Answers calls with what `reuse` allows, and counts. `roll`: each episode has the memory of one so far away."""
+    """Answers calls with what `reuse` allows, and counts. `roll`: each episode has the memory of one so far away.
+
+    compare  also compute what fresh keys and values would give, for `error`
+    """
 
     model: Pi0Model
     reuse: Reuse
     roll: int = 0
-    memory: Memory | None = None
-    episodes: Sequence[int] = ()  # of the memory's rows
+    compare: bool = True
+    memory: dict[Hashable, Memory] = field(default_factory=dict)  # by episode
     shares: list[float] = field(default_factory=list)  # of each episode's call: image tokens that are reused
     errors: list[tuple[float, float]] = field(default_factory=list)
 
     def __call__(self, call: Call) -> Tensor:
-        if call.number == 0:
-            self.memory = None
-        elif self.memory is not None and len(call.episodes) < len(self.episodes):  # others are decided
-            place = {episode: row for row, episode in enumerate(self.episodes)}
-            self.memory = self.memory.rows([place[episode] for episode in call.episodes])
-        self.episodes = call.episodes
-        embedded, hidden = embed(self.model, call.observation)
-        old = self._stale(call, hidden)
-        if self.memory is None or not bool(old.any()):
-            cache = self.model.keys_values(embedded)
-            chunk = self.model.denoise(cache, call.noise, STEPS)
-            keep = old
+        """Of toy tasks: all episodes are at the same call, and those that are decided come no more."""
+        self.memory = {episode: self.memory[episode] for episode in call.episodes if episode in self.memory}
+        numbers = [call.number] * len(call.episodes)
+        return self.answer(call.observation, call.noise, STEPS, call.episodes, numbers)
+
+    def answer(
+        self, observation: Observation, noise: Tensor, steps: int, episodes: Sequence[Hashable], numbers: Sequence[int]
+    ) -> Tensor:
+        """Chunks float32[B, H, A]. episodes: of the rows; numbers: of each one's call, 0 forgets what was before."""
+        for episode, number in zip(episodes, numbers, strict=True):
+            if number == 0:
+                self.memory.pop(episode, None)
+        embedded, hidden = embed(self.model, observation)
+        before = self._recalled(episodes, embedded, hidden)
+        old = self._stale(numbers, hidden, before, [episode in self.memory for episode in episodes])
+        if bool(old.any()):
+            cache = self._reused(embedded, old, self._recalled(self._rolled(episodes), embedded, hidden))
         else:
-            cache, keep = self._reused(embedded, old), old
-            chunk = self.model.denoise(cache, call.noise, STEPS)
-            self._compare(call, embedded, chunk, old)
-        self._remember(hidden, embedded, cache, keep)
+            cache = self.model.keys_values(embedded)
+        chunk = self.model.denoise(cache, noise, steps)
+        if self.compare and bool(old.any()):
+            fresh = self.model.denoise(self.model.keys_values(embedded), noise, steps)
+            rows = old.any(1)
+            difference, size = (x[rows][..., :2].double().square().sum() for x in (chunk - fresh, fresh))
+            self.errors.append((float(difference), float(size)))
+        self._remember(episodes, hidden, embedded, cache, old, before)
         self.shares += old.float().mean(1).tolist()
         return chunk
 
-    def _stale(self, call: Call, hidden: Tensor) -> Tensor:
+    def _rolled(self, episodes: Sequence[Hashable]) -> list[Hashable]:
+        order = list(self.memory)
+        place = {episode: number for number, episode in enumerate(order)}
+        return [order[(place[one] - self.roll) % len(order)] if one in place else one for one in episodes]
+
+    def _recalled(self, episodes: Sequence[Hashable], embedded: EmbeddedPrefix, hidden: Tensor) -> Memory:
+        """The episodes' memories in the slots that are computed now; of those that have none, zeros."""
+        layout, found = embedded.layout, [self.memory.get(episode) for episode in episodes]
+        known = next((one for one in found if one is not None), None)
+        if known is None:
+            nothing = hidden.new_zeros(0)
+            return Memory(torch.zeros_like(hidden), torch.zeros_like(embedded.embs), nothing, nothing)
+
+        def rows(name: str, dim: int | None) -> Tensor:
+            empty = torch.zeros_like(getattr(known, name))
+            stacked = torch.stack([empty if one is None else getattr(one, name) for one in found])
+            return stacked if dim is None or layout.columns is None else stacked.index_select(dim, layout.columns)
+
+        k, v = (rows(name, 3).transpose(0, 1) for name in ("k", "v"))
+        return Memory(rows("hidden", None), rows("embs", 1), k, v)
+
+    def _stale(self, numbers: Sequence[int], hidden: Tensor, before: Memory, known: Sequence[bool]) -> Tensor:
         """bool[B, C * T]: image tokens that are taken from memory."""
         batch, tokens, _ = hidden.shape
-        nothing = torch.zeros(batch, tokens, dtype=torch.bool)
-        if self.memory is None:
-            return nothing
         what, value = self.reuse.what, self.reuse.value
+        there = torch.tensor(known, device=hidden.device)[:, None]
         if what == "every":
-            return torch.full_like(nothing, call.number % int(value) != 0)
-        groups = {"full": 1, "camera": call.observation.images.shape[1], "patch": tokens}[what]
-        now, before = (x.reshape(batch, groups, -1) for x in (hidden, self.memory.hidden))
-        alike = F.cosine_similarity(now, before, dim=-1) >= value  # [B, groups]
-        return alike.repeat_interleave(tokens // groups, dim=1)
+            skipped = torch.tensor([number % int(value) != 0 for number in numbers], device=hidden.device)
+            return (skipped[:, None] & there).expand(-1, tokens)
+        groups = {"full": 1, "camera": tokens // self.model.config.vision.num_tokens, "patch": tokens}[what]
+        now, then = (x.reshape(batch, groups, -1) for x in (hidden, before.hidden))
+        alike = F.cosine_similarity(now, then, dim=-1) >= value  # [B, groups]
+        return alike.repeat_interleave(tokens // groups, dim=1) & there
 
-    def _reused(self, embedded: EmbeddedPrefix, old: Tensor) -> KVCache:
-        assert self.memory is not None
-        memory = self.memory
-        if self.roll:
-            count = len(memory.hidden)
-            memory = memory.rows([(row - self.roll) % count for row in range(count)])
+    def _reused(self, embedded: EmbeddedPrefix, old: Tensor, memory: Memory) -> KVCache:
         text = embedded.embs.shape[1] - old.shape[1]
         if self.reuse.what == "camera":
             stale = F.pad(old, (0, text))
@@ -150,25 +178,23 @@ class Reusing:
         k, v = keys_values(self.model, embedded, stale, memory)
         return KVCache(k, v, embedded.layout.mask, embedded.lengths, embedded.state)
 
-    def _compare(self, call: Call, embedded: EmbeddedPrefix, chunk: Tensor, old: Tensor) -> None:
-        fresh = self.model.denoise(self.model.keys_values(embedded), call.noise, STEPS)
-        rows = old.any(1)
-        difference, size = (x[rows][..., :2].double().square().sum() for x in (chunk - fresh, fresh))
-        self.errors.append((float(difference), float(size)))
-
-    def _remember(self, hidden: Tensor, embedded: EmbeddedPrefix, cache: KVCache, keep: Tensor) -> None:
+    def _remember(
+        self,
+        episodes: Sequence[Hashable],
+        hidden: Tensor,
+        embedded: EmbeddedPrefix,
+        cache: KVCache,
+        keep: Tensor,
+        before: Memory,
+    ) -> None:
         """What was reused stays as it was computed, so that pictures can't drift away unnoticed."""
-        if self.memory is None:
-            self.memory = Memory(hidden, embedded.embs, cache.k, cache.v)
-            return
-        text = embedded.embs.shape[1] - keep.shape[1]
-        stale = F.pad(keep, (0, text))[..., None]
-        self.memory = Memory(
-            torch.where(keep[..., None], self.memory.hidden, hidden),
-            torch.where(stale, self.memory.embs, embedded.embs),
-            cache.k,
-            cache.v,
-        )
+        stale = F.pad(keep, (0, embedded.embs.shape[1] - keep.shape[1]))[..., None]
+        padded = embedded.layout.to_padded
+        hidden = torch.where(keep[..., None], before.hidden, hidden)
+        embs = padded(torch.where(stale, before.embs, embedded.embs), 1)
+        k, v = padded(cache.k, 3), padded(cache.v, 3)
+        for row, episode in enumerate(episodes):
+            self.memory[episode] = Memory(hidden[row], embs[row], k[:, row], v[:, row])
 
     @property
     def error(self) -> float:
@@ -177,18 +203,22 @@ class Reusing:
 
 
 def embed(model: Pi0Model, observation: Observation) -> tuple[EmbeddedPrefix, Tensor]:
-    """An observation as it enters the language model, and the vision tower's tokens [B, C * T, W]."""
+    """An observation as it enters the language model, and the vision tower's tokens [B, C * T, W] of its cameras."""
     trace: dict[str, Tensor] = {}
     embedded = model.embed(observation, trace=trace)
-    return embedded, trace["vision_last_hidden"].transpose(0, 1).flatten(1, 2)
+    hidden, cameras = trace["vision_last_hidden"].transpose(0, 1), camera_slots(observation, compact=True)
+    return embedded, (hidden if cameras is None else hidden[:, cameras]).flatten(1, 2)
 
 
 @torch.no_grad()
 @exact_float32()
 def keys_values(model: Pi0Model, embedded: EmbeddedPrefix, stale: Tensor, memory: Memory) -> tuple[Tensor, Tensor]:
-    """Keys and values as `Pi0Model.keys_values`, with those of stale tokens, bool[B, S], from memory in every layer."""
+    """Keys and values as `Pi0Model.keys_values`, with those of stale tokens, bool[B, S], from memory in every layer.
+
+    memory  of several episodes, k and v [layer, B, G, S, K]
+    """
     layout = embedded.layout
-    assert layout.mask is None, "all tokens of these prompts are valid"
+    mask = None if layout.mask is None else layout.mask[:, None, None, :]
     rope = rope_tables(layout.computed_positions, model.config.vlm.head_dim, model.config.rope_base)
     chosen = stale[:, None, :, None]
     keys, values, x = [], [], embedded.embs
@@ -198,7 +228,7 @@ def keys_values(model: Pi0Model, embedded: EmbeddedPrefix, stale: Tensor, memory
         keys.append(torch.where(chosen, memory.k[i], k))
         values.append(torch.where(chosen, memory.v[i], v))
         if i + 1 < len(model.vlm.layers):
-            x = layer.feed_forward(gated_residual(x, layer.attend(normed, rope, keys[-1], values[-1], None), gate))
+            x = layer.feed_forward(gated_residual(x, layer.attend(normed, rope, keys[-1], values[-1], mask), gate))
     return torch.stack(keys), torch.stack(values)
 
 
@@ -264,7 +294,7 @@ def run(setup: Setup) -> Report:
         not_run=[
             "Vision alone with fresh state: none of these policies reads the state, so it equals full reuse.",
             "Measured calls: no backend reuses keys and values, so speed-ups are arithmetic.",
-            "LIBERO.",
+            "LIBERO: `turbopi study kv_reuse_libero`.",
         ],
         data={"cells": [plain_document(one) for one in found], "call_ms": CALL_MS},
     )

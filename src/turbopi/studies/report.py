@@ -21,6 +21,7 @@ from turbopi.reading import plain_document
 from turbopi.wording import significant
 
 JSON, MARKDOWN = "report.json", "report.md"
+MARGIN = 0.05  # a cell is as good as the baseline if it is worse by less than this, with 95 % confidence
 _DPI = 110
 _MARKERS = "osD^vPX*<>"
 
@@ -108,6 +109,12 @@ def paired_cell(paired: PairedDocument) -> Cell:
         return None
     low, high = (100 * end for end in paired.difference95)
     return f"{100 * paired.difference:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def compared(paired: PairedDocument) -> str:
+    """What the interval of the difference to the baseline says: worse, as good (not worse by MARGIN), or open."""
+    low, high = paired.difference95
+    return "worse" if high < 0 else "as good" if low > -MARGIN else "open"
 
 
 def write(report: Report, folder: Path) -> list[Path]:

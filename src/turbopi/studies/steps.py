@@ -22,14 +22,25 @@ from turbopi.evaluate.statistics import PairedDocument, RateDocument
 from turbopi.reading import plain_document
 from turbopi.studies import solvers
 from turbopi.studies.problems import EXACT, ErrorCell, Problem, errors, learned_grids, libero_problems
-from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
+from turbopi.studies.report import (
+    MARGIN,
+    Cell,
+    Control,
+    Grid,
+    Panel,
+    Plot,
+    Report,
+    Series,
+    compared,
+    paired_cell,
+    rate_cells,
+)
 from turbopi.studies.rollouts import POST, Call, Played, ToyPolicy, met, open_policy, play, seeds_of
 from turbopi.studies.solvers import BASELINE, Learned, Way, grid_times, ways
 from turbopi.studies.spread import UNIFORM, Spread, spread, spread_plot, spread_table
 from turbopi.studies.study import Setup, Study, Tell
 
 WARM = 0.6  # where a warm start begins: that much noise, and the rest is the chunk of before
-MARGIN = 0.05  # a cell is as good as the baseline if it is worse by less than this, with 95 % confidence
 _PRACTICE, _JUDGED = 10_000, 20_000  # numbers of the first episodes that grids are learned on, and errors measured on
 LIBERO, RANDOM = "small policy", "random weights"
 
@@ -48,8 +59,7 @@ class SuccessCell(Struct, frozen=True):
 
     @property
     def verdict(self) -> str:
-        low, high = self.against_baseline.difference95
-        return "worse" if high < 0 else "as good" if low > -MARGIN else "open"
+        return compared(self.against_baseline)
 
 
 # --- closed loop ------------------------------------------------------------------------------------------------------

@@ -2,8 +2,10 @@
 
 import multiprocessing
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -59,6 +61,7 @@ class Setup:
     simulator: str = "libero"  # of the studies in a simulator
     ways: Sequence[str] = ()  # which of their cells; none: all
     folder: Path | None = None  # where they keep episodes, so that they can go on; None: nowhere
+    report_only: bool = False  # they report on the episodes that are there, and run none
     workers: int | None = None  # simulators, or processes with a policy each, at a time
     episodes: int | None = None  # of a cell; None: the form's own number
     steps: int = 10  # of denoising
@@ -76,6 +79,15 @@ class Setup:
         with ProcessPoolExecutor(min(self.workers or 1, len(policies)), multiprocessing.get_context("spawn")) as pool:
             waiting = [pool.submit(work, tell_on_stderr, name, folder) for name, folder in policies.items()]
             return [future.result() for future in waiting]
+
+    @contextmanager
+    def kept_in(self) -> Iterator[Path]:
+        """The folder of episodes; a temporary one if none was given."""
+        if self.folder is not None:
+            yield self.folder
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            yield Path(folder)
 
     @property
     def toy_policies(self) -> dict[str, Path]:
@@ -112,13 +124,16 @@ class Setup:
 
 @dataclass(frozen=True)
 class Study:
-    """A question and what answers it. `claimed`: what an earlier project found."""
+    """A question and what answers it. `claimed`: what an earlier project found. `episodes`: of a study in a simulator,
+    runs the cells that were asked for, and reports nothing.
+    """
 
     name: str
     question: str
     claimed: str
     run: Callable[[Setup], Report]
     needs_tensorrt: bool = False
+    episodes: Callable[[Setup], None] | None = None
 
     def check(self, device: torch.device) -> None:
         """Raise BackendUnavailable where it can't run."""

@@ -1,0 +1,163 @@
+"""Variants of a policy in a simulator: cells that are kept, continued, compared; studies of them; padded caches."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cli_helpers import refusal, turbopi
+
+from turbopi import UnifiedPolicy
+from turbopi.backends.pytorch import reference_model
+from turbopi.checkpoint import open_checkpoint
+from turbopi.evaluate.results import Results
+from turbopi.observation import Observation
+from turbopi.reading import read_document
+from turbopi.shipped import CHASE_POLICY
+from turbopi.studies import kv_reuse_libero, mask, report
+from turbopi.studies.kv_reuse import Reuse, Reusing
+from turbopi.studies.report import Report
+from turbopi.studies.rollouts import CHASE, open_policy, play
+from turbopi.studies.simulated import Running, Variant, finished
+from turbopi.studies.study import Setup
+
+IN_CHASE = (CHASE_POLICY, "--simulator", "chase", "--small", "--device", "cpu", "--workers", "1")
+
+
+def test_cells_in_a_simulator_are_kept_and_continued_and_the_report_needs_nothing_else(tmp_path: Path) -> None:
+    """Cells of several commands into one folder, then a report that runs nothing."""
+    given = ("study", "steps_libero", *IN_CHASE, "--episodes", "2", "--out", tmp_path)
+    report_only = ("study", "steps_libero", "--device", "cpu", "--report-only", "--out", tmp_path)
+    assert "plain holds no finished run; run steps_libero with --way plain" in refusal(turbopi(*report_only))
+    for way in ("plain", "exponential, uniform, 2"):
+        result = turbopi(*given, "--episodes-only", "--way", way)
+        assert result.exit_code == 0, result.output
+    assert {file.parent.name for file in tmp_path.rglob("results.json")} == {"plain", "exponential_uniform_2"}
+    assert not (tmp_path / "steps_libero").exists()
+    assert turbopi(*report_only).exit_code == 1  # the control is missing
+    (control,) = read_document(tmp_path / "steps_libero" / report.JSON, Report).controls
+    assert not control.held and "`--way control`" in control.evidence
+    result = turbopi(*given, "--way", "euler, uniform, 1")  # what is there isn't run again
+    assert result.exit_code == 0, result.output
+    assert turbopi(*report_only).exit_code == 0
+    found = read_document(tmp_path / "steps_libero" / report.JSON, Report)
+    names = ["plain", "euler, uniform, 1", "exponential, uniform, 2"]
+    assert found.sound and [row[0] for row in found.tables[0].rows] == names
+    assert len(found.not_run) == 4 and "ab2, uniform, 2" in "".join(found.not_run)
+    (panel,) = found.plots[0].panels
+    assert {one.label: one.x for one in panel.series} == {"euler": [1.0, 10.0], "exponential": [2.0]}
+
+
+def test_cells_of_other_episodes_or_cut_short_are_not_compared(tmp_path: Path) -> None:
+    given = ("study", "steps_libero", *IN_CHASE, "--out", tmp_path, "--episodes-only", "--way")
+    assert turbopi(*given, "plain", "--episodes", "1").exit_code == 0
+    assert turbopi(*given, "euler, uniform, 1", "--episodes", "2").exit_code == 0
+    report_only = ("study", "steps_libero", "--device", "cpu", "--report-only", "--out", tmp_path)
+    assert "can't be compared: the episodes differ" in refusal(turbopi(*report_only))
+    file = tmp_path / "episodes" / "euler_uniform_1" / "results.json"
+    run = json.loads(file.read_text())
+    run["episodes"].pop()
+    file.write_text(json.dumps(run))
+    turbopi(*report_only)
+    found = read_document(tmp_path / "steps_libero" / report.JSON, Report)
+    assert "euler, uniform, 1, cut short after 1 of 2 episodes: `--way 'euler, uniform, 1'`" in found.not_run
+
+
+@pytest.mark.parametrize("name", ["kv_reuse_libero", "fp8_and_fp4_libero", "mask_libero"])
+def test_a_study_in_a_simulator_runs_and_its_controls_hold(name: str, tmp_path: Path) -> None:
+    result = turbopi("study", name, *IN_CHASE, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    found = read_document(tmp_path / name / report.JSON, Report)
+    assert found.sound and len(found.tables[0].rows) >= 2 and found.not_run
+
+
+def test_what_a_study_in_a_simulator_is_refused(tmp_path: Path) -> None:
+    said = refusal(turbopi("study", "steps_libero", "--way", "euler, uniform, 4", "--simulator", "chase"))
+    assert "unknown way 'euler, uniform, 4' of steps_libero; choose of: plain; euler, uniform, 1" in said
+    given = ("study", "steps", "--device", "cpu", "--out", tmp_path)
+    assert "--report-only is for steps_libero, kv_reuse_libero" in refusal(turbopi(*given, "--report-only"))
+    assert "steps keeps no episodes" in refusal(turbopi(*given, "--episodes-only"))
+    on_libero = ("study", "steps_libero", "--device", "cpu")
+    assert "--episodes-only needs --out" in refusal(turbopi(*on_libero, "--episodes-only"))
+    said = refusal(turbopi(*on_libero, "--out", tmp_path, "--episodes-only", "--report-only"))
+    assert "leave nothing to do" in said
+
+
+def ended(variant: Variant, folder: Path) -> Results:
+    """A variant's first two episodes of the chase, one request at a time."""
+    setup = Setup(small=True, simulator="chase", folder=folder, workers=1, checkpoint=open_checkpoint(CHASE_POLICY))
+    running = Running.of(setup)
+    running.run(variant, folder, running.jobs, max_batch=1)
+    found = finished(folder)
+    assert found is not None
+    return found
+
+
+def test_reuse_is_counted_by_episode_and_a_variant_that_isnt_neutral_fails_the_control(tmp_path: Path) -> None:
+    study = kv_reuse_libero.VARIANTS
+    control, plain = (tmp_path / f"kv_reuse_libero_control{end}" for end in ("", "_plain"))
+    ends = ended(next(cell for cell in study.cells if cell.name == "every 2"), control)
+    lines = [json.loads(line) for line in (control / kv_reuse_libero.FILE).read_text().splitlines()]
+    assert all(share == number % 2 for _, _, number, share in lines)
+    for (task, state), episode in ends.episodes.items():
+        assert [line[2] for line in lines if line[:2] == [task, state]] == list(range(len(episode.call_ms)))
+    share = float(np.mean([share for *_, share in lines]))
+    assert kv_reuse_libero.reused(control) == (share, share)
+    ended(study.plain, plain)
+    (found,) = study.controls(tmp_path, [], small=True)
+    assert not found.held
+
+
+@pytest.mark.parametrize("what", ["full", "camera", "patch", "every"])
+def test_episodes_at_other_calls_and_with_other_prompts_are_reused_together_as_alone(what: str) -> None:
+    """Padding differs from batch to batch, so memory is kept by the padded prefix's slots."""
+    policy = UnifiedPolicy(CHASE_POLICY, backend="pytorch", precision="f32", device="cpu")
+    model, rng = reference_model(policy.backend), np.random.default_rng(0)
+    value = {"full": 0.5, "camera": 0.5, "patch": 0.9, "every": 2}[what]
+
+    def seen(prompt: str, seed: int) -> Observation:
+        return Observation.stack([policy.prepare(policy.example_observation(seed) | {"prompt": prompt})])
+
+    calls = [("a", 0, seen("go", 0)), ("a", 1, seen("go", 1)), ("b", 0, seen("go on", 2)), ("a", 2, seen("go", 3))]
+    calls += [("b", 1, seen("go on", 4))]
+    noise = torch.from_numpy(rng.standard_normal((5, 1, 16, model.config.action_dim), dtype=np.float32))
+    alone, together = (Reusing(model, Reuse(what, value), compare=False) for _ in range(2))
+    one_by_one = [
+        alone.answer(observation, noise[i], 2, [episode], [number])
+        for i, (episode, number, observation) in enumerate(calls)
+    ]
+    batches = []
+    for rows in ([0], [1, 2], [3, 4]):
+        names = Observation.__dataclass_fields__
+        joined = Observation(*(torch.cat([getattr(calls[i][2], name) for i in rows]) for name in names))
+        episodes, numbers = [calls[i][0] for i in rows], [calls[i][1] for i in rows]
+        batches += list(together.answer(joined, noise[rows].flatten(0, 1), 2, episodes, numbers))
+    assert 0 < sum(alone.shares) < 5 and alone.shares == together.shares
+    for one, other in zip(one_by_one, batches, strict=True):
+        torch.testing.assert_close(one[0], other, rtol=0, atol=1e-4)
+
+
+def test_slots_that_are_masked_alone_make_the_unmasked_cache_another() -> None:
+    """Each part of the padding counts, and under the mask none does."""
+    policy, chunks = open_policy("chase"), {}
+    for name in (*mask.CACHES, *mask.PARTS):
+        caching = mask.Caching(policy, name)
+        play(policy, range(2), caching)
+        chunks[name] = caching.error
+    assert chunks["compacted"] == 0 and chunks[mask.MASKED] < 1e-5
+    assert min(chunks[name] for name in (mask.UNMASKED, *mask.PARTS)) > 0.01
+    nothing_padded = mask.Caching(policy, mask.UNMASKED, padding=False)
+    play(policy, range(2), nothing_padded)
+    assert nothing_padded.error < 1e-5
+
+
+def test_padding_is_what_the_policys_own_pipeline_adds() -> None:
+    policy, world = open_policy("chase"), CHASE.start([(7, 0)])
+    pictures = world.draw(policy.config.model.vision.image_size)[0]
+    keys = ("observation/image", "observation/wrist_image")
+    product = UnifiedPolicy(CHASE_POLICY, backend="pytorch", precision="f32", device="cpu")
+    given = dict(zip(keys, pictures, strict=True)) | {"observation/state": np.zeros(8), "prompt": CHASE.instruction}
+    served, ours = Observation.stack([product.prepare(given)]), mask.padded_as_served(policy, policy.observe(world))
+    for name in ("images", "image_mask", "tokens", "token_mask"):
+        assert torch.equal(getattr(served, name), getattr(ours, name)), name
