@@ -85,6 +85,16 @@ def test_help_is_whole_at_eighty_columns(words: tuple[str, ...], monkeypatch: py
     assert "<bool>" not in found, "a flag takes no value"
 
 
+@pytest.mark.parametrize("command", app.registered_commands, ids=lambda command: str(command.name))
+def test_an_option_whose_value_is_called_as_itself_has_its_name_written_out(command: Any) -> None:
+    """Typer 0.27 takes the name from `metavar` otherwise: `--DEVICE`."""
+    for parameter in inspect.signature(command.callback).parameters.values():
+        for told in getattr(parameter.annotation, "__metadata__", ()):
+            if isinstance(told, typer.models.OptionInfo) and str(told.metavar).lower() == parameter.name:
+                names = [told.default, *(told.param_decls or ())]  # Typer moves the first later
+                assert f"--{parameter.name}" in names, parameter.name
+
+
 def unescaped(markup: str) -> str:
     return markup.replace(r"\[", "[")
 

@@ -208,7 +208,7 @@ def bench(
     ] = True,
     ready: Annotated[bool, typer.Option("--ready", help="Also the time from a program's start to its answer.")] = False,
     profile: Annotated[bool, typer.Option("--profile", help="Name the kernels that take longest, by stage.")] = False,
-    device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
+    device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     tokenizer: Annotated[str | None, typer.Option(metavar="FILE", help="SentencePiece model.")] = None,
     quantization: Annotated[
         str | None, typer.Option(metavar="FILE", help="What `turbopi calibrate` wrote, for fp8, fp8-mlp or int8.")

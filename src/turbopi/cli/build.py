@@ -55,7 +55,7 @@ def build(
         Path | None, typer.Option(metavar="DIR", help="Engine cache; else $TURBOPI_ENGINES or the user's cache.")
     ] = None,
     rebuild: Annotated[bool, typer.Option("--rebuild", help="Build engines anew that are in the cache.")] = False,
-    device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cuda or cuda:N.")] = "auto",
+    device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cuda or cuda:N.")] = "auto",
     as_json: JsonFlag = False,
 ) -> None:
     """Build TensorRT engines for a checkpoint ahead of time, so that its backend starts at once.

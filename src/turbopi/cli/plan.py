@@ -29,10 +29,11 @@ MOST_ROBOTS = 10_000
 )
 def plan(
     robots: Annotated[int, typer.Option(metavar="N", min=1, max=MOST_ROBOTS, help="Robots, all alike.")],
-    hz: Annotated[float, typer.Option(metavar="HZ", min=0.1, max=10_000, help="Control steps a second.")],
+    hz: Annotated[float, typer.Option("--hz", metavar="HZ", min=0.1, max=10_000, help="Control steps a second.")],
     horizon: Annotated[int, typer.Option(metavar="H", min=2, max=LIMITS["action_horizon"], help="Actions of a chunk.")],
     gpu: Annotated[
-        str | None, typer.Option(metavar="GPU", help="Such as h100, h200, rtx4090: as of `turbopi bench --predict`.")
+        str | None,
+        typer.Option("--gpu", metavar="GPU", help="Such as h100, h200, rtx4090: as of `turbopi bench --predict`."),
     ] = None,
     times: Annotated[
         Path | None,

@@ -111,7 +111,7 @@ def study(
         int, typer.Option(metavar="N", min=1, max=MOST_CALLS, help="Calls of each measurement of the throughput study.")
     ] = 100,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the precision and mask studies' noise.")] = 0,
-    device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
+    device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Write each study's report there: STUDY/report.json, report.md, plots."),

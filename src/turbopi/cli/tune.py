@@ -62,7 +62,7 @@ def tune(
     ] = None,
     noisy: Annotated[bool, typer.Option("--noisy", help="Measure although other programs use the GPU.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be measured.")] = False,
-    device: Annotated[str, typer.Option(metavar="DEVICE", help="auto, cuda or cuda:N.")] = "auto",
+    device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cuda or cuda:N.")] = "auto",
     as_json: JsonFlag = False,
 ) -> None:
     """Measure which tiles are the fastest on this GPU; backend `fused` uses them from then on.
