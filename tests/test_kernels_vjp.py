@@ -11,6 +11,7 @@ from torch import Tensor
 from turbopi.config import GemmaConfig
 from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.portable.vjp.ops import BETWEEN_PRODUCTS, FEW_TOKENS, way_back
+from turbopi.kernels.portable.vjp.tiles import LEAST_ROWS, attention_span, row_block, streaming
 from turbopi.model.layers import rope_tables
 
 pytestmark = gpu_or_interpreter()
@@ -19,6 +20,10 @@ TOKENS = [1, 10, 16, 17, 50, 64]
 SIZES = [(SMALL, 10), (SMALL, 50), (NARROW, 17), (NARROW, 1)]
 if ON_GPU:
     SIZES += [(FULL, tokens) for tokens in TOKENS]
+
+
+def cdiv(size: int, by: int) -> int:
+    return -(-size // by)
 
 
 def whole(product: Tensor) -> Tensor:
@@ -84,7 +89,7 @@ def attention_and_back(ops: Any, given: tuple[Tensor, ...], turn: list[Tensor], 
     poison_allocator()
     attended, kept = ops.attention(q, k, v, *seen)
     y = ops.out(attended, out)
-    poison_allocator()
+    poison_allocator()  # and kernels between: `attention_vjp` may not follow `out` at once
     gradients = ops.attention_vjp(kept, d, k, v, *seen)
     return whole(y), whole(ops.qkv_vjp(gradients, *turn, qkv))
 
@@ -138,6 +143,20 @@ def test_a_norm_adds_up_parts(parts: int) -> None:
     for ops in (FEW_TOKENS, PLAIN_BACKWARD):
         found, expected = (ops.rms_norm_vjp(one, x.float(), scale, 1e-6, None, None)[0] for one in (d, d.sum(0)))
         torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("tokens", [10, 16, 17, 50, 64])
+def test_hopper_has_all_programs_of_attentions_way_back_at_once(tokens: int) -> None:
+    """One fills a multiprocessor, of which there are 132; two cameras and a prompt."""
+    rows, keys, span = tokens * 8, 2 * 256 + 64 + tokens, attention_span((9, 0))
+    programs = cdiv(rows, row_block(tokens)) * cdiv(keys, span) + cdiv(rows, span) * cdiv(tokens, LEAST_ROWS)
+    assert programs <= 132
+
+
+@pytest.mark.parametrize("tokens", [1, 10, 16])
+def test_few_tokens_take_32_columns(tokens: int) -> None:
+    one, two = (streaming((9, 0), tokens, 4096, 1024, 64, matrices=n) for n in (1, 2))
+    assert one.columns == 2 * two.columns == 32 and one.stages == two.stages == 4
 
 
 def test_other_sizes_keep_the_librarys_products() -> None:

@@ -6,10 +6,16 @@ import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.backward import BetweenProducts
-from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, prefetch, wait_for_producer
 from turbopi.kernels.portable.activations import geglu
 from turbopi.kernels.portable.attention import masked_softmax
 from turbopi.kernels.portable.rope import rope_split
+
+
+@triton.jit
+def _prefetch_row(at, width, PER_LINE: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr):
+    """The lines of a row of `width` numbers, at most BLOCK, of which PER_LINE are 128 bytes."""
+    prefetch(at + tl.minimum(tl.arange(0, max(1, BLOCK // PER_LINE)) * PER_LINE, width - 1), PDL)
 
 
 @triton.jit
@@ -26,6 +32,11 @@ def _rms_norm_kernel(
         if HAS_GATE:
             gate += row * width
     at = row * width + cols
+    # from the forward pass: long out of the L2 cache
+    _prefetch_row(x + row * width, width, 64, BLOCK, PDL)
+    _prefetch_row(scale, width, 32, BLOCK, PDL)
+    if HAS_GATE:
+        _prefetch_row(gate, width, 32, BLOCK, PDL)
     wait_for_producer(PDL)
     launch_dependents(PDL)
     wide = tl.load(x + at, mask, 0.0).to(tl.float32)
