@@ -10,6 +10,7 @@ from torch import Tensor
 
 from turbopi.config import GemmaConfig
 from turbopi.kernels.backward import PLAIN_BACKWARD
+from turbopi.kernels.portable.vjp import attention
 from turbopi.kernels.portable.vjp.ops import BETWEEN_PRODUCTS, FEW_TOKENS, way_back
 from turbopi.kernels.portable.vjp.tiles import LEAST_ROWS, attention_span, row_block, streaming
 from turbopi.model.layers import rope_tables
@@ -113,6 +114,25 @@ def test_attention_and_back(expert: GemmaConfig, tokens: int, state_token: bool,
     exact = attention_and_back(PLAIN_BACKWARD, wide, turn, seen)
     for found, expected, right in zip(ours, twin, exact, strict=True):
         assert_as_good(found, expected, right)
+
+
+@pytest.mark.parametrize(("expert", "tokens"), SIZES)
+@pytest.mark.parametrize("state_token", [False, True])
+def test_what_attention_keeps_of_all_layers_at_once(expert: GemmaConfig, tokens: int, state_token: bool) -> None:
+    """As of one at a time, from a cache whose layers lie apart."""
+    n, dim, slots, length, layers = expert.num_heads, expert.head_dim, 140, 131, 3
+    q, cache = random(layers, tokens * n, dim), random(2, layers, slots + tokens + 7, dim)
+    cache[:, :, length:slots] = 100
+    k, v = cache[:, :, : slots + tokens]
+    seen = (torch.tensor([length], device=DEVICE), slots, n, state_token)
+    poison_allocator()
+    for i, kept in enumerate(attention.kept_attention(q, k, v, *seen)):
+        attended, expected = FEW_TOKENS.attention(q[i], k[i], v[i], *seen)
+        FEW_TOKENS.out(attended, random(expert.width, n * dim))
+        assert kept.q.data_ptr() == q[i].data_ptr()
+        torch.testing.assert_close(kept.lse, expected.lse, atol=1e-5, rtol=1e-5)
+        exact = PLAIN_BACKWARD.attention(q[i].float(), k[i].float(), v[i].float(), *seen)[0].view(q[i].shape)
+        assert_as_good(kept.attended, expected.attended, exact)
 
 
 @pytest.mark.parametrize("tokens", [3, 20])

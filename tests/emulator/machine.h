@@ -32,6 +32,7 @@
 struct float2 { float x, y; };
 struct float4 { float x, y, z, w; };
 struct uint2 { unsigned x, y; };
+struct ushort2 { unsigned short x, y; };
 struct uint4 { unsigned x, y, z, w; };
 inline float2 make_float2(float x, float y) { return {x, y}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
@@ -44,6 +45,7 @@ using std::fmaf; using std::fmaxf;
 inline float __fdividef(float x, float y) { return x / y; }
 inline float __fadd_rn(float x, float y) { return x + y; }
 inline float __fmul_rn(float x, float y) { return x * y; }
+inline float __fsub_rn(float x, float y) { return x - y; }
 inline void sincosf(float x, float* sine, float* cosine) { *sine = std::sin(x), *cosine = std::cos(x); }
 inline float exp2f(float x) { return std::exp2(x); }
 inline float __uint_as_float(unsigned x) { float y; memcpy(&y, &x, 4); return y; }
@@ -489,6 +491,7 @@ inline void ptx_load_acquired(unsigned& value, const unsigned* from) {
     swapcontext(&machine::now->context, &machine::scheduler);  // others go on while somebody looks
     value = *from;
 }
+inline void ptx_put(void* to, unsigned value) { memcpy(to, &value, 4); }
 inline void ptx_load_once(unsigned& x, unsigned& y, unsigned& z, unsigned& w, const void* from) {
     const uint4 v = *(const uint4*)from;
     x = v.x, y = v.y, z = v.z, w = v.w;

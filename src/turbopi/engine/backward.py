@@ -19,7 +19,7 @@ from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.forward import Rope, project
 from turbopi.engine.weights import Weights
 from turbopi.kernels.backward import PLAIN_BACKWARD
-from turbopi.kernels.interface import BackwardOps, Ops, State
+from turbopi.kernels.interface import BackwardOps, KeepingDenoiser, KeptStep, Ops, State
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,13 @@ class Expert:
         x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
         return normed.float(), kept, x
 
+    def kept(self, step: KeptStep) -> tuple[list[KeptLayer], Tensor]:
+        """What `forward` keeps of each layer and the last stream, where a denoiser went forward."""
+        *streams, last = step.stream
+        attended = self.back.kept_attention(step.q, self.cache_k, self.cache_v, *self._heads(last))
+        layers = zip(streams[::2], attended, streams[1::2], step.gate_up, strict=True)
+        return [KeptLayer(*layer) for layer in layers], last
+
     def vjp(self, kept: list[KeptLayer], last: Tensor, d_out: Tensor) -> Tensor:
         """What comes back to the tokens, float32[T, D], of d_out float32[T, D] at the final norm's result."""
         back, eps, g, layers = self.back, self.config.rms_norm_eps, self.config.expert, self.weights.expert
@@ -118,11 +125,16 @@ def way_back(ops: Ops, config: ModelConfig, tokens: int, *, masked: bool = False
 
 
 def jacobian_velocity(
-    expert: Expert, asked: Conditioned, step: int, x_t: Tensor, tokens: Tensor, time: Tensor
+    expert: Expert,
+    asked: Conditioned,
+    step: int,
+    x_t: Tensor,
+    tokens: Tensor | KeepingDenoiser,
+    time: Tensor,
 ) -> Tensor:
     """v_t float32[..., H, A] of x_t, pulled through the expert as `model.conditioning` says.
 
-    tokens  the suffix [T, D] of x_t; of several observations theirs one behind the other
+    tokens  the suffix [T, D] of x_t, of several observations theirs one behind the other; or, of one, what goes forward
     time    as `suffix_vjp`'s
     """
     small, horizon = expert.weights.small, x_t.shape[-2]
@@ -130,14 +142,19 @@ def jacobian_velocity(
     def of_actions(rows: Tensor) -> Tensor:
         return rows.view(*x_t.shape[:-2], -1, rows.shape[-1])[..., -horizon:, :]
 
-    out, kept, last = expert.forward(tokens)
-    v_t = project(small, "action_out_proj", of_actions(out))
+    if isinstance(tokens, Tensor):
+        out, kept, last = expert.forward(tokens)
+        v_t = project(small, "action_out_proj", of_actions(out))
+    else:
+        v_t = torch.empty_like(x_t)
+        caches = expert.cache_k, expert.cache_v
+        kept, last = expert.kept(tokens.launch_step(step, x_t, *caches, expert.length, v_t, asked.tokens))
     error = asked.error(step, x_t, v_t) * asked.weights
     d_out = (asked.tokens.times[step, ..., None] * error) @ small["action_out_proj.weight"]
-    if d_out.numel() == out.numel():
-        d_out = d_out.view(out.shape)
+    if d_out.numel() == last.numel():
+        d_out = d_out.view(last.shape)
     else:  # Pi0's state token has no velocity
-        of_actions(every := torch.zeros_like(out)).copy_(d_out)
+        of_actions(every := d_out.new_zeros(last.shape)).copy_(d_out)
         d_out = every
     d_tokens = of_actions(expert.vjp(kept, last, d_out))
     through = suffix_vjp(expert.config, small, x_t, time, d_tokens)

@@ -22,7 +22,7 @@ from turbopi.engine.graph import Mark
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.resize import Resizer
 from turbopi.engine.weights import Weights
-from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
 from turbopi.model.conditioning import Conditioning
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.preprocess.images import fitted
@@ -189,6 +189,7 @@ class StaticCall:
         self._unseen = slice(shape.prefix_slots(config), rows - suffix)
         self.table = table
         self.denoiser: Denoiser | None = None  # in place of the operations of `denoise`
+        self.keeper: KeepingDenoiser | None = None  # in place of the forward operations of guidance by the Jacobian
         self.rope = forward.rope_of_all_positions(config, rows, device)
         self.suffix_offsets = torch.arange(suffix, device=device)
         self.embs = pictures.embs[: shape.prefix_slots(config)]
@@ -305,8 +306,8 @@ class StaticCall:
         x_t = self.x_t[step]
         if self.shape.loop.form == "tokens":
             return asked.pulled(step, x_t, self._velocity(step, rope))
-        tokens, cache = self._suffix_tokens(step), (self.cache_k, self.cache_v)
-        back = way_back(self.ops, self.config, len(tokens))
+        tokens, cache = self.keeper or self._suffix_tokens(step), (self.cache_k, self.cache_v)
+        back = way_back(self.ops, self.config, self.shape.suffix_tokens(self.config))
         table, length = self._modulation(step), self.inputs.length
         expert = Expert(self.config, self.weights, self.ops, back, table, length, *cache, rope)
         return jacobian_velocity(expert, asked, step, x_t, tokens, self._time(step))

@@ -8,6 +8,7 @@ Shapes: T tokens, D width, F hidden width of an MLP, K head_dim, n query heads o
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -86,6 +87,7 @@ class BetweenProducts:
             out_vjp=torch.matmul,
             attention_vjp=self.attention_vjp,
             qkv_vjp=self.qkv_vjp,
+            kept_attention=self.kept_attention,
             origin=origin,
         )
 
@@ -113,6 +115,10 @@ class BetweenProducts:
             logits.view(-1, heads, len(k)).masked_fill_(hidden, -torch.inf)
         probabilities = self.softmax(logits, length, slots, heads, state_token, scale, v.dtype)
         return (probabilities @ v).view(-1, heads * q.shape[1]), (q, probabilities)
+
+    def kept_attention(self, q: Tensor, k: Tensor, v: Tensor, *seen: Any) -> list[tuple[Tensor, Tensor]]:
+        """Queries [L, T * n, K], k and v [L, R, K] -> what `attention` keeps, of each layer."""
+        return [self.attention(*layer, *seen)[1] for layer in zip(q, k, v, strict=True)]
 
     def gate_up(self, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """x [T, D] times weight [2F, D], which is kept: [T, 2F]; and its GeGLU [T, F]."""

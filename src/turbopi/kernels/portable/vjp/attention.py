@@ -99,6 +99,56 @@ def attention(
     return Attended(sums, tops, totals, kept), kept
 
 
+@triton.jit
+def _kept_kernel(
+    q, k, v, length, attended, lse, rows, keys, slots, heads, stride, scale,
+    DIM: tl.constexpr, ROWS: tl.constexpr, SPAN: tl.constexpr, STATE_TOKEN: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """ROWS of queries of one layer over all keys, SPAN at a time."""
+    layer = tl.program_id(1).to(tl.int64)
+    m, d = tl.program_id(0) * ROWS + tl.arange(0, ROWS), tl.arange(0, DIM)
+    there = (m < rows)[:, None]
+    place = layer * rows * DIM + m[:, None] * DIM + d[None, :]
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    valid = tl.load(length).to(tl.int32)
+    queries = tl.load(q + place, there, 0.0)
+    acc = tl.zeros((ROWS, DIM), tl.float32)
+    top = tl.full((ROWS,), -1e30, tl.float32)
+    total = tl.zeros((ROWS,), tl.float32)
+    for start in range(0, keys, SPAN):
+        key = start + tl.arange(0, SPAN)
+        at = layer * stride + key[:, None] * DIM + d[None, :]
+        loaded = (key < keys)[:, None]
+        seen = _visible(m[:, None], key[None, :], valid, slots, keys, heads, STATE_TOKEN)
+        logits = tl.dot(queries, tl.load(k + at, loaded, 0.0).T, input_precision="ieee") * scale
+        new_top = tl.maximum(top, tl.max(tl.where(seen, logits, -1e30), 1))
+        p = tl.where(seen, tl.exp2(logits - new_top[:, None]), 0.0)
+        shrink = tl.exp2(top - new_top)
+        total = total * shrink + tl.sum(p, 1)
+        top = new_top
+        values = tl.load(v + at, loaded, 0.0)
+        acc = tl.dot(p.to(values.dtype), values, acc * shrink[:, None], input_precision="ieee")
+    tl.store(attended + place, (acc / total[:, None]).to(attended.dtype.element_ty), there)
+    tl.store(lse + (layer * rows + m), top + tl.log2(total), m < rows)
+
+
+def kept_attention(
+    q: Tensor, k: Tensor, v: Tensor, length: Tensor, slots: int, heads: int, state_token: bool
+) -> list[Kept]:
+    """See the twin. q [L, T * n, K], k and v [L, R, K], each layer's rows one behind the other."""
+    (layers, rows, dim), keys = q.shape, k.shape[1]
+    assert q.is_contiguous() and k.stride() == v.stride() and k.stride()[1:] == (dim, 1), (q.stride(), k.stride())
+    attended, lse = torch.empty_like(q), q.new_empty(layers, rows, dtype=torch.float32)
+    block = row_block(rows // heads)
+    _kept_kernel[(triton.cdiv(rows, block), layers)](
+        q, k, v, length, attended, lse, rows, keys, slots, heads, k.stride(0), dim**-0.5 * LOG2_E,
+        DIM=dim, ROWS=block, SPAN=attention_span(capability_of(q)) // 2, STATE_TOKEN=state_token, num_warps=4,
+        num_stages=2, **dependent_launch(q),
+    )  # fmt: skip
+    return [Kept(*layer) for layer in zip(q, attended, lse, strict=True)]
+
+
 def out(attended: Attended, weight: Tensor) -> Tensor:
     """See the twin. weight [D, n * K] -> float32[n, T, D]; what is kept of attention is complete after it."""
     kept = attended.kept

@@ -24,6 +24,7 @@ FEW_TOKENS = BackwardOps(
     out_vjp=products.out_vjp,
     attention_vjp=attention.attention_vjp,
     qkv_vjp=products.qkv_vjp,
+    kept_attention=attention.kept_attention,
     origin="Triton",
 )
 ORIGIN = f"Triton for up to {MOST_TOKENS} tokens, else cuBLAS and Triton"
