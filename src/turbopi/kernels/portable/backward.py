@@ -6,16 +6,10 @@ import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.backward import BetweenProducts
-from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, prefetch, wait_for_producer
+from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, wait_for_producer
 from turbopi.kernels.portable.activations import geglu
 from turbopi.kernels.portable.attention import masked_softmax
 from turbopi.kernels.portable.rope import rope_split
-
-
-@triton.jit
-def _prefetch_row(at, width, PER_LINE: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr):
-    """The lines of a row of `width` numbers, at most BLOCK, of which PER_LINE are 128 bytes."""
-    prefetch(at + tl.minimum(tl.arange(0, max(1, BLOCK // PER_LINE)) * PER_LINE, width - 1), PDL)
 
 
 @triton.jit
@@ -24,6 +18,7 @@ def _rms_norm_kernel(
     PARTS: tl.constexpr, HAS_D_X: tl.constexpr, HAS_GATE: tl.constexpr, BY_ROW: tl.constexpr, BLOCK: tl.constexpr,
     PDL: tl.constexpr,
 ):  # fmt: skip
+    """`d_normed` alone is of the kernel in front: the rest is there when that begins, and is read before it ends."""
     row = tl.program_id(0)
     cols = tl.arange(0, BLOCK)
     mask = cols < width
@@ -32,27 +27,23 @@ def _rms_norm_kernel(
         if HAS_GATE:
             gate += row * width
     at = row * width + cols
-    # from the forward pass: long out of the L2 cache
-    _prefetch_row(x + row * width, width, 64, BLOCK, PDL)
-    _prefetch_row(scale, width, 32, BLOCK, PDL)
-    if HAS_GATE:
-        _prefetch_row(gate, width, 32, BLOCK, PDL)
+    wide = tl.load(x + at, mask, 0.0).to(tl.float32)
+    factor = tl.load(scale + cols, mask, 0.0)
+    d_other = tl.load(d_x + at, mask, 0.0) if HAS_D_X else wide
+    opened = tl.load(gate + cols, mask, 0.0).to(gated.dtype.element_ty).to(tl.float32) if HAS_GATE else wide
+    r = tl.rsqrt(tl.sum(wide * wide, 0) / width + eps)
     wait_for_producer(PDL)
     launch_dependents(PDL)
-    wide = tl.load(x + at, mask, 0.0).to(tl.float32)
     g = tl.load(d_normed + at, mask, 0.0).to(tl.float32)
     for part in tl.static_range(1, PARTS):
         g += tl.load(d_normed + part * rows * width + at, mask, 0.0)
-    g *= tl.load(scale + cols, mask, 0.0)
-    r = tl.rsqrt(tl.sum(wide * wide, 0) / width + eps)
+    g *= factor
     total = r * (g - wide * (r * r * (tl.sum(wide * g, 0) / width)))
     if HAS_D_X:
-        total += tl.load(d_x + at, mask, 0.0)
+        total += d_other
     tl.store(out + at, total, mask)
     if HAS_GATE:
-        dtype = gated.dtype.element_ty
-        factor = tl.load(gate + cols, mask, 0.0).to(dtype).to(tl.float32)
-        tl.store(gated + at, (total * factor).to(dtype), mask)
+        tl.store(gated + at, (total * opened).to(gated.dtype.element_ty), mask)
 
 
 def rms_norm_vjp(

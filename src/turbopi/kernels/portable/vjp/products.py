@@ -133,10 +133,10 @@ def _across_kernel(
     n = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     rows = tl.minimum(tl.arange(0, ROWS), inner - 1)
     prefetch(weight + (rows * columns + tl.program_id(0) * COLUMNS), PDL)
-    if GEGLU:
-        kept = product + (tl.minimum(m, tokens - 1) * 2 * columns + tl.program_id(0) * COLUMNS)
-        prefetch(kept, PDL)
-        prefetch(kept + columns, PDL)
+    if GEGLU:  # kept by a kernel long ago
+        place = m[:, None] * 2 * columns + n[None, :]
+        gate = tl.load(product + place, (m < tokens)[:, None], 0.0)
+        up = tl.load(product + place + columns, (m < tokens)[:, None], 0.0)
     x_at = d_out + (m[:, None] * inner + d[None, :])
     weight_at = weight + (d[:, None] * columns + n[None, :])
     there = (m < tokens)[:, None]
@@ -148,9 +148,7 @@ def _across_kernel(
         acc = tl.dot(a, tl.load(weight_at + at * columns), acc, input_precision="ieee")
     dtype = out.dtype.element_ty
     if GEGLU:
-        place = m[:, None] * 2 * columns + n[None, :]
-        gate = tl.load(product + place, there, 0.0).to(tl.float32)
-        up = tl.load(product + place + columns, there, 0.0).to(tl.float32)
+        gate, up = gate.to(tl.float32), up.to(tl.float32)
         # as in portable/backward.py
         half = 1 / (1 + tl.exp2(gate * (-2.302208198 - 0.1029432397 * gate * gate)))
         slope = half + gate * 2 * half * (1 - half) * 0.7978845608 * (1 + 0.134145 * gate * gate)
