@@ -12,7 +12,7 @@ from torch import Tensor
 
 from turbopi import backends
 from turbopi.config import Kind
-from turbopi.engine.backward import Expert, jacobian_velocity, suffix_vjp
+from turbopi.engine.backward import Expert, jacobian_step, jacobian_velocity, suffix_vjp
 from turbopi.engine.compiled import compiled
 from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.forward import expert_output, project, rope_of_all_positions
@@ -202,19 +202,28 @@ def test_the_forward_pass_is_that_without_a_way_back(kind: Kind) -> None:
 class GoesForward:
     """A `KeepingDenoiser` of `Expert.forward`."""
 
-    def __init__(self, problem: Problem, expert: Expert, time: Tensor) -> None:
-        self.problem, self.expert, self.time = problem, expert, time
+    def __init__(self, problem: Problem, expert: Expert) -> None:
+        self.problem, self.expert = problem, expert
 
     def launch_step(
         self, step: int, x_t: Tensor, k: Tensor, v: Tensor, length: Tensor, v_t: Tensor, _: Any
     ) -> KeptStep:
         assert k is self.expert.cache_k and v is self.expert.cache_v and length is self.expert.length
-        tokens = self.problem.model.embed_suffix(x_t[None], self.problem.cache.state, self.time)[0]
+        problem = self.problem
+        tokens = problem.model.embed_suffix(x_t[None], problem.cache.state, problem.time_embs)[0]
         out, kept, last = self.expert.forward(tokens)
         v_t.copy_(project(self.expert.weights.small, "action_out_proj", out))
         stream = torch.stack([*(x for one in kept for x in (one.x, one.middle)), last])
         q = [one.attention.q if hasattr(one.attention, "q") else one.attention[0] for one in kept]
         return KeptStep(stream, torch.stack(q), torch.stack([one.gate_up for one in kept]))
+
+
+def in_rows(expert: Expert) -> Expert:
+    """The same with a table of rows in another order, of which tokens take theirs."""
+    assert expert.table is not None
+    table = expert.table if expert.table.dim() == 4 else expert.table[:, :, None].expand(-1, -1, 10, -1)
+    rows = torch.arange(10, dtype=torch.int32)
+    return dataclasses.replace(expert, table=table.flip(2).permute(2, 0, 1, 3).contiguous(), rows=rows.flip(0))
 
 
 @pytest.mark.parametrize(
@@ -228,12 +237,15 @@ def test_what_a_denoiser_keeps_serves_as_what_the_operations_keep(times: Times, 
     asked = Conditioned.allocate(config, Loop(1, horizon, "jacobian", (1.0, 0.0)), torch.device("cpu"))
     asked.tokens.times.fill_(0.6), asked.tokens.gain.fill_(0.7)
     asked.tokens.target.copy_(problem.chunk(1)), asked.weights.copy_(torch.linspace(1, 0, horizon)[:, None])
-    tokens, found = problem.model.embed_suffix(x_t[None], problem.cache.state, problem.time_embs)[0], []
-    for denoiser in (False, True):
-        expert = problem.expert(horizon, ops, back)
-        forward = GoesForward(problem, expert, problem.time_embs) if denoiser else tokens
-        found.append(jacobian_velocity(expert, asked, 0, x_t, forward, problem.time_embs[0]))
-    assert found[0].isfinite().all() and relative(found[1], found[0]) < 1e-6
+    asked.tokens.steps.copy_(-torch.linspace(0, 1, horizon))
+    tokens = problem.model.embed_suffix(x_t[None], problem.cache.state, problem.time_embs)[0]
+    expected = jacobian_velocity(problem.expert(horizon, ops, back), asked, 0, x_t, tokens, problem.time_embs[0])
+    v_t, next_x = torch.full_like(x_t, torch.nan), torch.full_like(x_t, torch.nan)
+    expert = problem.expert(horizon, ops, back)
+    forward = GoesForward(problem, expert)
+    jacobian_step(in_rows(expert), asked, 0, forward, x_t, v_t, next_x)
+    assert expected.isfinite().all() and relative(v_t, expected) < 1e-6
+    assert relative(next_x, asked.next_x(0, x_t, expected)) < 1e-6
 
 
 def without_keys(d_q: Tensor, d_k: Tensor, d_v: Tensor, cos: Tensor, sin: Tensor) -> Tensor:

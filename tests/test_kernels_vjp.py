@@ -179,6 +179,38 @@ def test_few_tokens_take_32_columns(tokens: int) -> None:
     assert one.columns == 2 * two.columns == 32 and one.stages == two.stages == 4
 
 
+@pytest.mark.parametrize(("expert", "tokens"), SIZES)
+def test_the_ends_of_a_guided_step(expert: GemmaConfig, tokens: int) -> None:
+    actions, width = 12, expert.width
+    f32 = torch.float32
+    x_t, v_t, target, times, weights = (random(tokens, n, dtype=f32) for n in (actions, actions, actions, 1, 1))
+    out, into = random(actions, width, dtype=f32), random(width, actions, dtype=f32)
+    d_tokens, gain, steps = (random(tokens, n, dtype=f32) for n in (width, 1, 1))
+    steps[0] = 0
+    results = []
+    for ops in (FEW_TOKENS, PLAIN_BACKWARD):
+        v, next_x = v_t.clone(), torch.full_like(x_t, torch.nan)
+        error, d_out = ops.pull(x_t, v, times[:, 0], target, weights, out, torch.float32)
+        poison_allocator()
+        ops.move(d_tokens, into, x_t, v, error, gain[:, 0], steps[:, 0], next_x)
+        results.append((error, d_out, v, next_x))
+    assert torch.equal(results[0][3][0], x_t[0]), "what is held stays to the last bit"
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("gated", [False, True])
+def test_a_norm_takes_rows_of_a_table(gated: bool) -> None:
+    x, d, rows = random(7, 96), random(7, 96), torch.tensor([2, 0, 1, 2, 2, 1, 0], device=DEVICE, dtype=torch.int32)
+    scale, _, gate = random(3, 5, 3, 96, dtype=torch.float32)[:, 2].movedim(1, 0).unbind(0)
+    gates = gate if gated else None
+    expected = FEW_TOKENS.rms_norm_vjp(d, x, scale[rows], 1e-6, None, None if gates is None else gates[rows])
+    for ops in (FEW_TOKENS, PLAIN_BACKWARD):
+        found = ops.rms_norm_vjp(d, x, scale, 1e-6, None, gates, rows)
+        torch.testing.assert_close(found[0], expected[0], atol=1e-5, rtol=1e-5)
+        assert gates is None or torch.testing.assert_close(found[1], expected[1], atol=2e-2, rtol=2e-2) is None
+
+
 def test_other_sizes_keep_the_librarys_products() -> None:
     assert way_back(FULL, 64) is FEW_TOKENS and way_back(NARROW, 1) is FEW_TOKENS
     assert way_back(FULL, 65) is BETWEEN_PRODUCTS

@@ -23,13 +23,22 @@ _CUBIC = 0.044715
 
 
 def rms_norm_vjp(
-    d_normed: Tensor, x: Tensor, scale: Tensor, eps: float, d_x: Tensor | None, gate: Tensor | None
+    d_normed: Tensor,
+    x: Tensor,
+    scale: Tensor,
+    eps: float,
+    d_x: Tensor | None,
+    gate: Tensor | None,
+    rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None]:
     """Back through `residual_rms_norm`: (d_x + the norm's part, float32; that times gate, in x's dtype).
 
     d_normed, x [T, D]; d_x float32[T, D], what reaches x by other ways; scale, gate float32[T, D] or [D]; the gate is
     that of the addition before the norm, rounded as there. None: left out. d_normed may be parts float32[parts, T, D].
+    rows int32[T]: scale and gate are of a table [U, D], of which each token takes a row.
     """
+    if rows is not None:
+        scale, gate = scale[rows], None if gate is None else gate[rows]
     if d_normed.dim() == 3:
         d_normed = d_normed.sum(0)
     g, wide, r = d_normed.float() * scale, x.float(), inverse_rms(x, eps)
@@ -62,6 +71,30 @@ def rope_vjp(d_q: Tensor, d_k: Tensor, d_v: Tensor, cos: Tensor, sin: Tensor) ->
     return torch.cat((q, apply_rope(d_k, cos, -sin)[:, None], d_v[:, None]), dim=1).view(tokens, -1)
 
 
+def pull(
+    x_t: Tensor, v_t: Tensor, times: Tensor, target: Tensor, weights: Tensor, out: Tensor, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """What is missing from the chunk that v_t points to, times weights float32[H, 1]: float32[H, A]; back to the final
+    norm's result: [H, D] in this dtype.
+
+    x_t, v_t, target float32[H, A]; times float32[H]; out: action_out_proj's matrix float32[A, D].
+    """
+    error = (target - (x_t - times[:, None] * v_t)) * weights
+    return error, ((times[:, None] * error) @ out).to(dtype)
+
+
+def move(
+    d_tokens: Tensor, into: Tensor, x_t: Tensor, v_t: Tensor, error: Tensor, gain: Tensor, steps: Tensor, next_x: Tensor
+) -> None:
+    """v_t becomes the guided one, next_x what it moves x_t to: float32[H, A].
+
+    d_tokens float32[H, D], what came back to the tokens of `pull`'s error; into: action_in_proj's matrix float32[D, A];
+    gain, steps float32[H].
+    """
+    v_t -= gain[:, None] * (error - d_tokens @ into)
+    torch.add(x_t, steps[:, None] * v_t, out=next_x)
+
+
 @dataclass(frozen=True)
 class BetweenProducts:
     """The operations around cuBLAS's products, by their twins' names. `softmax` is `plain.masked_softmax`'s."""
@@ -88,6 +121,8 @@ class BetweenProducts:
             attention_vjp=self.attention_vjp,
             qkv_vjp=self.qkv_vjp,
             kept_attention=self.kept_attention,
+            pull=pull,
+            move=move,
             origin=origin,
         )
 

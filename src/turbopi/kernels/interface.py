@@ -115,6 +115,9 @@ class BackwardOps:
     qkv_vjp: Callable[[Any, Tensor, Tensor, Tensor], Tensor]
     # queries [L, T * n, K], k and v [L, R, K] to what `attention` keeps of each layer: one kernel went forward
     kept_attention: Callable[..., Sequence[Any]]
+    # the ends of such a step of one observation: from v_t to the final norm, from the tokens to the next x_t
+    pull: Callable[..., tuple[Tensor, Tensor]]
+    move: Callable[..., None]
     origin: str
 
 
