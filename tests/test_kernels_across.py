@@ -72,7 +72,8 @@ def test_the_full_models_products_fill_a_hopper_gpu_once() -> None:
     for tokens in (1, 10, 16):
         for mode, inner, columns in (("plain", 1024, 2048), ("geglu", 1024, 4096), ("parts", 8192, 1024)):
             one = cut(mode, tokens, inner, columns)
-            assert one is not None and columns // one.columns * (inner // one.depth) == 128
+            blocks = 64 if mode == "plain" else 128  # attention's way back, behind the first, begins on the others
+            assert one is not None and columns // one.columns * (inner // one.depth) == blocks
             assert one.shared_bytes <= 128 * 1024, "beside the next kernel's"
 
 

@@ -143,8 +143,8 @@ def kept_attention(
     block = row_block(rows // heads)
     _kept_kernel[(triton.cdiv(rows, block), layers)](
         q, k, v, length, attended, lse, rows, keys, slots, heads, k.stride(0), dim**-0.5 * LOG2_E,
-        DIM=dim, ROWS=block, SPAN=attention_span(capability_of(q)) // 2, STATE_TOKEN=state_token, num_warps=4,
-        num_stages=2, **dependent_launch(q),
+        DIM=dim, ROWS=block, SPAN=attention_span(capability_of(q)) // 2, STATE_TOKEN=state_token,
+        num_warps=block // 4, num_stages=2, **dependent_launch(q),
     )  # fmt: skip
     return [Kept(*layer) for layer in zip(q, attended, lse, strict=True)]
 

@@ -24,7 +24,9 @@ from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
 Mode = Literal["plain", "parts", "geglu"]
 MODES: Final[dict[Mode, int]] = {"plain": 0, "parts": 1, "geglu": 2}
 WARPS: Final = 16
-PROGRAMS: Final = 132  # at most, where the columns allow it: one on a multiprocessor
+# Blocks at most, where the columns allow it: one on a multiprocessor. Behind `out_vjp` comes attention, whose blocks
+# take a whole one each, and load what they need before it ends.
+BLOCKS: Final[dict[Mode, int]] = {"plain": 64, "parts": 132, "geglu": 132}
 MOST_TOKENS: Final = 16  # beyond them Triton's kernels
 TAKES: Final = Parameters(
     (
@@ -64,7 +66,7 @@ class Cut:
 
 @cache
 def cut(mode: Mode, tokens: int, inner: int, columns: int) -> Cut | None:
-    """The narrowest blocks of which each has a multiprocessor of its own, else the widest; None: not covered."""
+    """The narrowest blocks of which there are at most BLOCKS, else the widest; None: not covered."""
     rows = -(-tokens // 16)
     m_tiles, depth = 4 if rows == 3 else rows, tiles.split_of(inner) if mode == "parts" else inner
     if m_tiles > 4 or depth % (32 * WARPS // m_tiles):
@@ -72,7 +74,7 @@ def cut(mode: Mode, tokens: int, inner: int, columns: int) -> Cut | None:
     chunks = depth * m_tiles // 32 // WARPS  # of a warp
     found = [Cut(depth, wide, m_tiles) for wide in (16, 32, 64) if columns % wide == 0 and chunks in (1, 2, 4, 8)]
     found = [one for one in found if one.shared_bytes <= SHARED_BYTES]
-    fitting = [one for one in found if columns // one.columns * (inner // depth) <= PROGRAMS]
+    fitting = [one for one in found if columns // one.columns * (inner // depth) <= BLOCKS[mode]]
     return fitting[0] if fitting else found[-1] if found else None
 
 
