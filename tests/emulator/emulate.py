@@ -38,7 +38,7 @@ INSTRUCTIONS = (
     *(("cp.async.bulk.tensor.2d", "copy_2d"), ("complete_tx::bytes.L2::cache_hint", "copy_bytes")),
 )
 # No effect on what is computed here: kernels run one by one, registers are plenty, and copies are seen at once.
-IGNORED = ("griddepcontrol", "cp.async.wait_all", "setmaxnreg", "prefetch", "createpolicy", "fence")
+IGNORED = ("griddepcontrol", "setmaxnreg", "prefetch", "createpolicy", "fence")
 
 
 def translated(source: str, in_part: bool = False) -> str:

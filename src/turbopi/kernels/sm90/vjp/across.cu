@@ -17,14 +17,18 @@ constexpr int MODE = TP_MODE, M_TILES = TP_M_TILES, COLUMNS = TP_COLUMNS, DEPTH 
 constexpr int WARPS = 16, THREADS = WARPS * 32;
 constexpr int PARTS_OF_DEPTH = WARPS / M_TILES, SLICE = DEPTH / PARTS_OF_DEPTH;  // a warp has 16 tokens
 constexpr int CHUNKS = SLICE / 32;  // a lane has 16 bytes of a token's 32 columns
-constexpr int AT_ONCE = CHUNKS < 4 ? CHUNKS : 4;
+constexpr int WANTED = M_TILES == 1 ? 4 : COLUMNS == 64 ? 1 : 2;  // at once: more of them spill
+constexpr int AT_ONCE = CHUNKS < WANTED ? CHUNKS : WANTED;
+constexpr int CHUNK_BYTES = 32 * COLUMNS * 2;  // of weights
 constexpr int N_TILES = COLUMNS / 8, ROW_CHUNKS = COLUMNS / 8;  // 16 bytes of a row
+constexpr int ROWS = THREADS / ROW_CHUNKS;                      // of weights, that all threads copy at once
 constexpr int PITCH = COLUMNS + 8;                              // of sums, float32
 constexpr int PAIRS = COLUMNS / 2, ITEMS = 16 * M_TILES * PAIRS, TURNS = (ITEMS + THREADS - 1) / THREADS;
 static_assert(M_TILES == 1 || M_TILES == 2 || M_TILES == 4, "warps share out the tokens");
-static_assert(SLICE % 32 == 0 && CHUNKS % AT_ONCE == 0, "a warp's part of the inner axis");
+static_assert(SLICE % 32 == 0 && CHUNKS % AT_ONCE == 0 && DEPTH % ROWS == 0 && ROWS % 32 == 0, "a warp's part of the inner axis");
 static_assert(COLUMNS == 16 || COLUMNS == 32 || COLUMNS == 64, "see `place`");
-static_assert(TP_SHARED_BYTES >= DEPTH * COLUMNS * 2 && TP_SHARED_BYTES >= WARPS * 16 * PITCH * 4, "room");
+constexpr int BARRIER = TP_SHARED_BYTES - 16;
+static_assert(BARRIER >= DEPTH * COLUMNS * 2 && BARRIER >= WARPS * 16 * PITCH * 4, "room");
 
 // Where 16 bytes of a row lie. What `ldmatrix` reads at once, of rows 8 i + {0, 1} (+ 2, 4, 6), is in different banks.
 __device__ __forceinline__ int place(int row, int chunk) {
@@ -37,7 +41,11 @@ __device__ __forceinline__ int place(int row, int chunk) {
 __device__ __forceinline__ void copy_ahead(u32 to, const void* from) {
   asm volatile("cp.async.cg.shared.global.L2::128B [%0], [%1], 16;" ::"r"(to), "l"(from) : "memory");
 }
-__device__ __forceinline__ void await_copies() { asm volatile("cp.async.wait_all;" ::: "memory"); }
+// This thread's copies arrive at the barrier when they are here. Not `cp.async.wait_all`, which the compiler would put in
+// front of loads.
+__device__ __forceinline__ void arrive_with_copies(u32 bar) {
+  asm volatile("cp.async.mbarrier.arrive.noinc.shared::cta.b64 [%0];" ::"r"(bar) : "memory");
+}
 __device__ __forceinline__ void load_transposed(u32 (&v)[4], u32 address) {
   asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0,%1,%2,%3}, [%4];"
                : "=r"(v[0]), "=r"(v[1]), "=r"(v[2]), "=r"(v[3])
@@ -50,35 +58,46 @@ __device__ __forceinline__ void mma(float (&c)[4], u32 a0, u32 a1, u32 a2, u32 a
       : "r"(a0), "r"(a1), "r"(a2), "r"(a3), "r"(b0), "r"(b1));
 }
 
-// 32 rows of the block's weights, from `row` on, times what lanes have of them: `low` of tokens g, `high` of g + 8. A lane's
-// 8 columns are 4 of either step's 16: so rows come in the same order.
-__device__ __forceinline__ void multiply(float (&sums)[N_TILES][4], u32 smem, int row, int lane, uint4 low, uint4 high) {
+// Where a lane's row of the first weights lies that either step of a chunk takes, by `load_transposed`. A lane's 8 columns of
+// the activations are 4 of either step's 16: so rows come in the same order.
+struct Places {
+  u32 step[2];
+  __device__ __forceinline__ Places(u32 smem, int first, int lane) {
+    const int r = lane % 8, row = first + r / 2 * 8 + lane / 8 % 2 * 2 + r % 2;
+    step[0] = smem + place(row, lane / 16), step[1] = smem + place(row + 4, lane / 16);
+  }
+};
+// A chunk of the weights, 32 rows, times what lanes have of them: `low` of tokens g, `high` of g + 8.
+__device__ __forceinline__ void multiply(float (&sums)[N_TILES][4], const Places& places, int chunk, uint4 low, uint4 high) {
 #pragma unroll
   for (int step = 0; step < 2; ++step) {
-    const int r = lane % 8, at = row + r / 2 * 8 + step * 4 + lane / 8 % 2 * 2 + r % 2;
     const u32 a0 = step ? low.z : low.x, a1 = step ? high.z : high.x;
     const u32 a2 = step ? low.w : low.y, a3 = step ? high.w : high.y;
 #pragma unroll
     for (int tile = 0; tile < N_TILES; tile += 2) {
       u32 b[4];
-      load_transposed(b, smem + place(at, tile + lane / 16));
+      load_transposed(b, (places.step[step] ^ tile * 16) + chunk * CHUNK_BYTES);  // see `place`: `tile` is even
       mma(sums[tile], a0, a1, a2, a3, b[0], b[1]);
       mma(sums[tile + 1], a0, a1, a2, a3, b[2], b[3]);
     }
   }
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS, M_TILES == 1 ? 2 : 1)
+extern "C" __global__ void __launch_bounds__(THREADS, 2)
     turbopi_across(const byte* x, const byte* weights, const byte* product, byte* out, int tokens, int inner, int columns) {
   extern __shared__ __align__(128) byte shared[];
   const u32 smem = shared_address(shared);
   const int thread = threadIdx.x, warp = thread / 32, lane = thread % 32, g = lane / 4, t = lane % 4;
   const int groups = columns / COLUMNS, column = blockIdx.x % groups * COLUMNS, part = blockIdx.x / groups;
-  const byte* const from = weights + ((long long)part * DEPTH * columns + column) * 2;
-#pragma unroll 8
-  for (int i = thread; i < DEPTH * ROW_CHUNKS; i += THREADS) {
-    const int row = i / ROW_CHUNKS, chunk = i % ROW_CHUNKS;
-    copy_ahead(smem + place(row, chunk), from + ((long long)row * columns + chunk * 8) * 2);
+  if (thread == 0) barrier_init(smem + BARRIER, THREADS);
+  __syncthreads();
+  {
+    const int row = thread / ROW_CHUNKS, chunk = thread % ROW_CHUNKS;
+    const byte* from = weights + (((long long)part * DEPTH + row) * columns + column + chunk * 8) * 2;
+    const u32 to = smem + place(row, chunk);
+#pragma unroll 4
+    for (int i = 0; i < DEPTH / ROWS; ++i, from += (long long)ROWS * columns * 2) copy_ahead(to + i * (ROWS * COLUMNS * 2), from);
+    arrive_with_copies(smem + BARRIER);
   }
   u32 gates[TURNS], ups[TURNS];  // kept by a kernel long ago
 #pragma unroll
@@ -92,25 +111,26 @@ extern "C" __global__ void __launch_bounds__(THREADS, M_TILES == 1 ? 2 : 1)
   asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
 
   const int first = warp / M_TILES * SLICE, token = warp % M_TILES * 16 + g;
-  const byte* const mine = x + ((long long)token * inner + part * DEPTH + first + t * 8) * 2;
-  auto load = [&](int chunk, bool high) {
-    uint4 v = make_uint4(0, 0, 0, 0);
-    if (token + (high ? 8 : 0) < tokens) v = *(const uint4*)(mine + (high ? 16ll * inner : 0) + chunk * 64);
-    return v;
-  };
+  const byte* mine = x + ((long long)min(token, tokens - 1) * inner + part * DEPTH + first + t * 8) * 2;
+  const int to_high = token + 8 < tokens ? inner * 16 : 0;  // of tokens that don't exist others, and nobody reads their sums
   uint4 low[AT_ONCE], high[AT_ONCE];
 #pragma unroll
-  for (int i = 0; i < AT_ONCE; ++i) low[i] = load(i, false), high[i] = load(i, true);
-  await_copies();
-  __syncthreads();
+  for (int i = 0; i < AT_ONCE; ++i)
+    low[i] = *(const uint4*)(mine + i * 64), high[i] = *(const uint4*)(mine + to_high + i * 64);
   float sums[N_TILES][4];
 #pragma unroll
   for (int i = 0; i < N_TILES; ++i) sums[i][0] = sums[i][1] = sums[i][2] = sums[i][3] = 0;
+  const Places places(smem, first, lane);
+  barrier_wait(smem + BARRIER, 0);  // all weights are here
+#pragma unroll 1
+  for (int chunk = 0; chunk < CHUNKS; chunk += AT_ONCE) {
+    mine += AT_ONCE * 64;
 #pragma unroll
-  for (int chunk = 0; chunk < CHUNKS; ++chunk) {
-    multiply(sums, smem, first + chunk * 32, lane, low[chunk % AT_ONCE], high[chunk % AT_ONCE]);
-    if (chunk + AT_ONCE < CHUNKS)
-      low[chunk % AT_ONCE] = load(chunk + AT_ONCE, false), high[chunk % AT_ONCE] = load(chunk + AT_ONCE, true);
+    for (int i = 0; i < AT_ONCE; ++i) {
+      multiply(sums, places, chunk + i, low[i], high[i]);
+      if (chunk + AT_ONCE < CHUNKS)
+        low[i] = *(const uint4*)(mine + i * 64), high[i] = *(const uint4*)(mine + to_high + i * 64);
+    }
   }
   __syncthreads();  // the weights have been read
   float* const room = (float*)shared;
@@ -121,7 +141,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, M_TILES == 1 ? 2 : 1)
     *(float2*)(to + 8 * PITCH) = make_float2(sums[tile][2], sums[tile][3]);
   }
   __syncthreads();
-#pragma unroll
+#pragma unroll(MODE == GEGLU ? TURNS : 1)
   for (int i = 0; i < TURNS; ++i) {
     const int item = thread + i * THREADS, of = item / PAIRS, pair = item % PAIRS * 2;
     if (of >= tokens) continue;

@@ -5,6 +5,7 @@ Twins: `kernels.backward`. For sizes and numbers of tokens that it doesn't cover
 
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Final, Literal
 
 import torch
@@ -27,7 +28,7 @@ WARPS: Final = 16
 # Blocks at most, where the columns allow it: one on a multiprocessor. Behind `out_vjp` comes attention, whose blocks
 # take a whole one each, and load what they need before it ends.
 BLOCKS: Final[dict[Mode, int]] = {"plain": 64, "parts": 132, "geglu": 132}
-MOST_TOKENS: Final = 16  # beyond them Triton's kernels
+MOST_TOKENS: Final = tiles.MOST_TOKENS  # beyond them Triton's kernels
 TAKES: Final = Parameters(
     (
         Parameter("const unsigned char*", "x", "bf16 [T][inner]"),
@@ -51,7 +52,7 @@ class Cut:
 
     @property
     def shared_bytes(self) -> int:
-        return max(self.depth * self.columns * 2, WARPS * 16 * (self.columns + 8) * 4)
+        return max(self.depth * self.columns * 2, WARPS * 16 * (self.columns + 8) * 4) + 16  # a barrier
 
     def sizes(self, mode: Mode) -> dict[str, int]:
         """The kernel's compile-time constants."""
@@ -72,7 +73,11 @@ def cut(mode: Mode, tokens: int, inner: int, columns: int) -> Cut | None:
     if m_tiles > 4 or depth % (32 * WARPS // m_tiles):
         return None
     chunks = depth * m_tiles // 32 // WARPS  # of a warp
-    found = [Cut(depth, wide, m_tiles) for wide in (16, 32, 64) if columns % wide == 0 and chunks in (1, 2, 4, 8)]
+    found = [
+        Cut(depth, wide, m_tiles)
+        for wide in (16, 32, 64)
+        if columns % wide == 0 and chunks in (1, 2, 4, 8) and depth % (WARPS * 256 // wide) == 0
+    ]
     found = [one for one in found if one.shared_bytes <= SHARED_BYTES]
     fitting = [one for one in found if columns // one.columns * (inner // depth) <= BLOCKS[mode]]
     return fitting[0] if fitting else found[-1] if found else None
@@ -82,10 +87,15 @@ def source() -> str:
     return instructions.source("vjp/across.cu", generated="")
 
 
+def compiled(one: Cut, mode: Mode, folder: Path | None = None) -> bytes:
+    """The kernel's machine code."""
+    return compile_cubin(source(), "sm_90a", one.sizes(mode), folder=folder)
+
+
 @cache
 def _kernel(one: Cut, mode: Mode, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
-        cubin = compile_cubin(source(), "sm_90a", one.sizes(mode))
+        cubin = compiled(one, mode)
         shared = one.shared_bytes
         return DependentKernel(cubin, "turbopi_across", TAKES, shared_bytes=shared, threads=WARPS * 32, cluster=1)
 
@@ -128,8 +138,8 @@ def _across(one: Cut, mode: Mode, x: Tensor, weight: Tensor, product: Tensor | N
 
 
 ORIGIN: Final = (
-    f"CUDA and Triton for up to {MOST_TOKENS} tokens, Triton for up to {tiles.MOST_TOKENS}, else cuBLAS and Triton; "
-    "forward, of one observation in bfloat16, the denoising kernel"
+    f"CUDA and Triton for up to {MOST_TOKENS} tokens, else cuBLAS and Triton; forward, of one observation in bfloat16, "
+    "the denoising kernel"
 )
 ACROSS = replace(FEW_TOKENS, down_vjp=down_vjp, out_vjp=out_vjp, gate_up_vjp=gate_up_vjp, origin="CUDA and Triton")
 
