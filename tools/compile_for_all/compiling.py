@@ -123,7 +123,8 @@ def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], 
 
 def hopper_way_back() -> dict[str, Callable[[Path | None], bytes]]:
     """What the true Jacobian's way back has of its own on Hopper."""
-    expert, made = preset("pi05_libero").model.expert, {}
+    expert = preset("pi05_libero").model.expert
+    made: dict[str, Callable[[Path | None], bytes]] = {}
     heads = expert.num_heads * expert.head_dim
     for tokens in (10, 50):
         keeping = partial(machine_code._denoising, tokens, False, True, keep=True)
