@@ -132,8 +132,10 @@ class FusedBackend(CudaGraphBackend):
 
         by_kernel = sorted({str(loop) for loop, _ in list(self._denoisers)})
         by_operations: dict[str, list[str]] = {}
-        for (loop, _), why in list(self._refused.items()):
-            calls = by_operations.setdefault(f"operations, as {why}", [])
+        for (loop, rows), why in list(self._refused.items()):
+            kept = (loop, rows) in self._keepers
+            how = "one CUDA kernel a step forward, operations back" if kept else f"operations, as {why}"
+            calls = by_operations.setdefault(how, [])
             if str(loop) not in calls:
                 calls.append(str(loop))
         kernel = "one CUDA kernel" if self._on_hopper else "one portable CUDA kernel"
