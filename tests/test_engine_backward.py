@@ -12,13 +12,15 @@ from torch import Tensor
 
 from turbopi import backends
 from turbopi.config import Kind
-from turbopi.engine.backward import Expert, suffix_vjp
+from turbopi.engine.backward import Expert, jacobian_step, jacobian_velocity, suffix_vjp
 from turbopi.engine.compiled import compiled
-from turbopi.engine.forward import expert_output, rope_of_all_positions
+from turbopi.engine.conditioned import Conditioned
+from turbopi.engine.forward import expert_output, project, rope_of_all_positions
+from turbopi.engine.recent_loops import Loop
 from turbopi.engine.weights import pack
 from turbopi.kernels.backward import PLAIN as PIECES
 from turbopi.kernels.backward import PLAIN_BACKWARD, rope_vjp
-from turbopi.kernels.interface import BackwardOps, Ops
+from turbopi.kernels.interface import BackwardOps, KeptStep, Ops
 from turbopi.kernels.plain import PLAIN
 from turbopi.model.denoise import suffix_mask, suffix_rope, time_embedding
 from turbopi.model.kv_cache import KVCache
@@ -146,18 +148,26 @@ def test_equals_autograd_of_the_reference(
         assert relative(gradient, exact) < tolerance
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("times", ["one time", "by token"])
-@pytest.mark.skipif(torch.cuda.is_available(), reason="Triton interprets where there is no GPU")
-@pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::DeprecationWarning")  # the interpreter is NumPy
-def test_kernels_for_few_tokens_equal_autograd(kind: Kind, times: Times) -> None:
+def few_tokens() -> tuple[Ops, BackwardOps]:
     pytest.importorskip("triton", reason="Triton isn't installed")
     from turbopi.kernels.portable.norms import residual_rms_norm
     from turbopi.kernels.portable.vjp.ops import FEW_TOKENS
 
+    return dataclasses.replace(PLAIN, residual_rms_norm=residual_rms_norm), FEW_TOKENS
+
+
+IN_THE_INTERPRETER = (
+    pytest.mark.skipif(torch.cuda.is_available(), reason="Triton interprets where there is no GPU"),
+    pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::DeprecationWarning"),  # it is NumPy
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("times", [pytest.param(one, marks=IN_THE_INTERPRETER) for one in ("one time", "by token")])
+def test_kernels_for_few_tokens_equal_autograd(kind: Kind, times: Times) -> None:
     problem = Problem.of(kind, times)
     given = (problem.chunk(0), problem.chunk(1))
-    v, gradient = problem.engine(dataclasses.replace(PLAIN, residual_rms_norm=residual_rms_norm), FEW_TOKENS)(*given)
+    v, gradient = problem.engine(*few_tokens())(*given)
     exact_v, exact = problem.reference(*given)
     assert relative(v, exact_v) < 1e-5 and relative(gradient, exact) < 1e-5
 
@@ -187,6 +197,55 @@ def test_the_forward_pass_is_that_without_a_way_back(kind: Kind) -> None:
     out = expert.forward(tokens)[0]
     rest = (expert.table, expert.length, expert.cache_k, expert.cache_v, expert.rope)
     assert torch.equal(out, expert_output(problem.model.config, expert.weights, PLAIN, tokens, *rest))
+
+
+class GoesForward:
+    """A `KeepingDenoiser` of `Expert.forward`."""
+
+    def __init__(self, problem: Problem, expert: Expert) -> None:
+        self.problem, self.expert = problem, expert
+
+    def launch_step(
+        self, step: int, x_t: Tensor, k: Tensor, v: Tensor, length: Tensor, v_t: Tensor, _: Any
+    ) -> KeptStep:
+        assert k is self.expert.cache_k and v is self.expert.cache_v and length is self.expert.length
+        problem = self.problem
+        tokens = problem.model.embed_suffix(x_t[None], problem.cache.state, problem.time_embs)[0]
+        out, kept, last = self.expert.forward(tokens)
+        v_t.copy_(project(self.expert.weights.small, "action_out_proj", out))
+        stream = torch.stack([*(x for one in kept for x in (one.x, one.middle)), last])
+        q = [one.attention.q if hasattr(one.attention, "q") else one.attention[0] for one in kept]
+        return KeptStep(stream, torch.stack(q), torch.stack([one.gate_up for one in kept]))
+
+
+def in_rows(expert: Expert) -> Expert:
+    """The same with a table of rows in another order, of which tokens take theirs."""
+    assert expert.table is not None
+    table = expert.table if expert.table.dim() == 4 else expert.table[:, :, None].expand(-1, -1, 10, -1)
+    rows = torch.arange(10, dtype=torch.int32)
+    return dataclasses.replace(expert, table=table.flip(2).permute(2, 0, 1, 3).contiguous(), rows=rows.flip(0))
+
+
+@pytest.mark.parametrize(
+    ("times", "kernels"),
+    [("one time", False), ("by token", False), pytest.param("by token", True, marks=IN_THE_INTERPRETER)],
+)
+def test_what_a_denoiser_keeps_serves_as_what_the_operations_keep(times: Times, kernels: bool) -> None:
+    problem = Problem.of("pi05", times)
+    ops, back = few_tokens() if kernels else (PLAIN, PLAIN_BACKWARD)
+    x_t, horizon, config = problem.chunk(0), problem.horizon, problem.model.config
+    asked = Conditioned.allocate(config, Loop(1, horizon, "jacobian", (1.0, 0.0)), torch.device("cpu"))
+    asked.tokens.times.fill_(0.6), asked.tokens.gain.fill_(0.7)
+    asked.tokens.target.copy_(problem.chunk(1)), asked.weights.copy_(torch.linspace(1, 0, horizon)[:, None])
+    asked.tokens.steps.copy_(-torch.linspace(0, 1, horizon))
+    tokens = problem.model.embed_suffix(x_t[None], problem.cache.state, problem.time_embs)[0]
+    expected = jacobian_velocity(problem.expert(horizon, ops, back), asked, 0, x_t, tokens, problem.time_embs[0])
+    v_t, next_x = torch.full_like(x_t, torch.nan), torch.full_like(x_t, torch.nan)
+    expert = problem.expert(horizon, ops, back)
+    forward = GoesForward(problem, expert)
+    jacobian_step(in_rows(expert), asked, 0, forward, x_t, v_t, next_x)
+    assert expected.isfinite().all() and relative(v_t, expected) < 1e-6
+    assert relative(next_x, asked.next_x(0, x_t, expected)) < 1e-6
 
 
 def without_keys(d_q: Tensor, d_k: Tensor, d_v: Tensor, cos: Tensor, sin: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from turbopi.config import Kind, ModelConfig
 from turbopi.engine.call import CallShape
 from turbopi.engine.recent_loops import Loop
 from turbopi.errors import BackendUnavailable, DeviceLost
-from turbopi.kernels.interface import GemmaLayer, Ops, TokenInputs
+from turbopi.kernels.interface import GemmaLayer, KeptStep, Ops, TokenInputs
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise import packing as denoise_packing
@@ -43,13 +43,14 @@ class TwinKernel:
         device: torch.device,
         num_steps: int | None = None,
         by_token: bool = False,
+        keep: bool = False,
     ) -> None:
-        assert by_token == (num_steps is not None)
+        assert by_token == (num_steps is not None) and (not keep or num_steps == 1)
         if self.refuse is not None:
             raise BackendUnavailable(self.refuse)
         self.config, self.packed, self.small, self.table = config, packed, small, table
         self.cache_rows, self.suffix, self.device, self.by_token = cache_rows, suffix, device, by_token
-        self.launches = 0
+        self.launches, self.keep = 0, keep
         self.trapped: str | None = None
         self.made.append(self)
 
@@ -63,7 +64,33 @@ class TwinKernel:
         v_t: Tensor,
         tokens: TokenInputs | None = None,
     ) -> None:
-        assert (tokens is not None) == self.by_token
+        assert (tokens is not None) == self.by_token and not self.keep
+        x_t[:], v_t[:] = self._loop(noise, cache_k, cache_v, length, tokens)
+
+    def launch_step(
+        self, step: int, x_t: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, v_t: Tensor, tokens: TokenInputs
+    ) -> KeptStep:
+        assert self.keep
+        g = self.config.expert
+        kept = KeptStep(
+            torch.full((2 * g.depth + 1, self.suffix, g.width), torch.nan),
+            torch.full((g.depth, self.suffix * g.num_heads, g.head_dim), torch.nan),
+            torch.full((g.depth, self.suffix, 2 * g.mlp_dim), torch.nan),
+        )
+        rows, steps, times = (one[step : step + 1] for one in (tokens.rows, tokens.steps, tokens.times))
+        unguided = TokenInputs(rows, steps, times, tokens.target, torch.zeros_like(times))
+        v_t[:] = self._loop(x_t, cache_k, cache_v, length, unguided, kept)[1][0]
+        return kept
+
+    def _loop(
+        self,
+        noise: Tensor,
+        cache_k: Tensor,
+        cache_v: Tensor,
+        length: Tensor,
+        tokens: TokenInputs | None,
+        kept: KeptStep | None = None,
+    ) -> tuple[Tensor, Tensor]:
         assert noise.shape[0] == self.suffix and int(length) <= self.cache_rows
         self.launches += 1
         layers: Any = [
@@ -71,7 +98,7 @@ class TwinKernel:
             for i in range(self.config.expert.depth)
         ]
         rest = (self.small, self.table, noise, cache_k, cache_v, int(length))
-        x_t[:], v_t[:] = denoise_plain(self.config, layers, *rest, tokens=tokens)
+        return denoise_plain(self.config, layers, *rest, tokens=tokens, kept=kept)
 
     def clock_mhz(self) -> float | None:
         return 1800.4 if self.launches else None
@@ -132,18 +159,28 @@ def test_conditioned_loops_have_a_kernel_of_their_own(kernels: type[TwinKernel],
     assert told == "one CUDA kernel" and call.startswith("H=10, 3 steps, by token, ")
 
 
-def test_the_true_jacobian_takes_operations_beside_the_kernel_and_finds_the_expert_there(
-    kernels: type[TwinKernel],
+@pytest.mark.parametrize("how", ["kernel", "refused", "operations"])
+def test_the_true_jacobian_goes_forward_in_a_kernel_and_back_by_operations_that_find_the_expert_there(
+    kernels: type[TwinKernel], how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if how == "operations":  # sizes that the way back's kernels for few tokens don't take
+        monkeypatch.setattr("turbopi.kernels.portable.vjp.tiles.takes", lambda expert, tokens: False)
     backend, case = fused(), golden_cases()["b_third_masked"]
     plain = actions(backend)
     asked = conditioned("jacobian", 3, *case.noise.shape[1:])
     expected = golden_model("pi05").sample(case.observation, case.noise, 3, conditioning=asked)
-    found = backend.sample(case.observation, case.noise, 3, conditioning=asked).actions
-    torch.testing.assert_close(found, expected, rtol=0, atol=3e-4)
+    kernels.refuse = "too small" if how == "refused" else None
+    for _ in range(2):
+        found = backend.sample(case.observation, case.noise, 3, conditioning=asked).actions
+        torch.testing.assert_close(found, expected, rtol=0, atol=3e-4)
+    kernels.refuse = None
+    launches = [kernel.launches for kernel in kernels.made]  # one at its capture, a step a launch
+    assert launches == ([2, 3 * 3] if how == "kernel" else [2])
     told = backend.describe()["denoising"]
     assert told["one CUDA kernel"] == ["H=10, 3 steps"]
     reason = "operations, as the denoising kernel has no way back, which the true Jacobian takes"
+    if how == "kernel":
+        reason = "one CUDA kernel a step forward, operations back"
     assert told[reason] == ["H=10, 3 steps, guided by the Jacobian, 4 times"]
     assert torch.equal(actions(backend), plain)
 

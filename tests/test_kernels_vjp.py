@@ -10,7 +10,9 @@ from torch import Tensor
 
 from turbopi.config import GemmaConfig
 from turbopi.kernels.backward import PLAIN_BACKWARD
+from turbopi.kernels.portable.vjp import attention
 from turbopi.kernels.portable.vjp.ops import BETWEEN_PRODUCTS, FEW_TOKENS, way_back
+from turbopi.kernels.portable.vjp.tiles import LEAST_ROWS, attention_span, row_block, streaming
 from turbopi.model.layers import rope_tables
 
 pytestmark = gpu_or_interpreter()
@@ -19,6 +21,10 @@ TOKENS = [1, 10, 16, 17, 50, 64]
 SIZES = [(SMALL, 10), (SMALL, 50), (NARROW, 17), (NARROW, 1)]
 if ON_GPU:
     SIZES += [(FULL, tokens) for tokens in TOKENS]
+
+
+def cdiv(size: int, by: int) -> int:
+    return -(-size // by)
 
 
 def whole(product: Tensor) -> Tensor:
@@ -84,7 +90,7 @@ def attention_and_back(ops: Any, given: tuple[Tensor, ...], turn: list[Tensor], 
     poison_allocator()
     attended, kept = ops.attention(q, k, v, *seen)
     y = ops.out(attended, out)
-    poison_allocator()
+    poison_allocator()  # and kernels between: `attention_vjp` may not follow `out` at once
     gradients = ops.attention_vjp(kept, d, k, v, *seen)
     return whole(y), whole(ops.qkv_vjp(gradients, *turn, qkv))
 
@@ -108,6 +114,25 @@ def test_attention_and_back(expert: GemmaConfig, tokens: int, state_token: bool,
     exact = attention_and_back(PLAIN_BACKWARD, wide, turn, seen)
     for found, expected, right in zip(ours, twin, exact, strict=True):
         assert_as_good(found, expected, right)
+
+
+@pytest.mark.parametrize(("expert", "tokens"), SIZES)
+@pytest.mark.parametrize("state_token", [False, True])
+def test_what_attention_keeps_of_all_layers_at_once(expert: GemmaConfig, tokens: int, state_token: bool) -> None:
+    """As of one at a time, from a cache whose layers lie apart."""
+    n, dim, slots, length, layers = expert.num_heads, expert.head_dim, 140, 131, 3
+    q, cache = random(layers, tokens * n, dim), random(2, layers, slots + tokens + 7, dim)
+    cache[:, :, length:slots] = 100
+    k, v = cache[:, :, : slots + tokens]
+    seen = (torch.tensor([length], device=DEVICE), slots, n, state_token)
+    poison_allocator()
+    for i, kept in enumerate(attention.kept_attention(q, k, v, *seen)):
+        attended, expected = FEW_TOKENS.attention(q[i], k[i], v[i], *seen)
+        FEW_TOKENS.out(attended, random(expert.width, n * dim))
+        assert kept.q.data_ptr() == q[i].data_ptr()
+        torch.testing.assert_close(kept.lse, expected.lse, atol=1e-5, rtol=1e-5)
+        exact = PLAIN_BACKWARD.attention(q[i].float(), k[i].float(), v[i].float(), *seen)[0].view(q[i].shape)
+        assert_as_good(kept.attended, expected.attended, exact)
 
 
 @pytest.mark.parametrize("tokens", [3, 20])
@@ -139,6 +164,52 @@ def test_a_norm_adds_up_parts(parts: int) -> None:
     for ops in (FEW_TOKENS, PLAIN_BACKWARD):
         found, expected = (ops.rms_norm_vjp(one, x.float(), scale, 1e-6, None, None)[0] for one in (d, d.sum(0)))
         torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("tokens", [10, 16, 17, 50, 64])
+def test_hopper_has_all_programs_of_attentions_way_back_at_once(tokens: int) -> None:
+    """One fills a multiprocessor, of which there are 132; two cameras and a prompt."""
+    rows, keys, span = tokens * 8, 2 * 256 + 64 + tokens, attention_span((9, 0))
+    programs = cdiv(rows, row_block(tokens)) * cdiv(keys, span) + cdiv(rows, span) * cdiv(tokens, LEAST_ROWS)
+    assert programs <= 132
+
+
+@pytest.mark.parametrize("tokens", [1, 10, 16])
+def test_few_tokens_take_32_columns(tokens: int) -> None:
+    one, two = (streaming((9, 0), tokens, 4096, 1024, 64, matrices=n) for n in (1, 2))
+    assert one.columns == 2 * two.columns == 32 and one.stages == two.stages == 4
+
+
+@pytest.mark.parametrize(("expert", "tokens"), SIZES)
+def test_the_ends_of_a_guided_step(expert: GemmaConfig, tokens: int) -> None:
+    actions, width = 12, expert.width
+    f32 = torch.float32
+    x_t, v_t, target, times, weights = (random(tokens, n, dtype=f32) for n in (actions, actions, actions, 1, 1))
+    out, into = random(actions, width, dtype=f32), random(width, actions, dtype=f32)
+    d_tokens, gain, steps = (random(tokens, n, dtype=f32) for n in (width, 1, 1))
+    steps[0] = 0
+    results = []
+    for ops in (FEW_TOKENS, PLAIN_BACKWARD):
+        v, next_x = v_t.clone(), torch.full_like(x_t, torch.nan)
+        error, d_out = ops.pull(x_t, v, times[:, 0], target, weights, out, torch.float32)
+        poison_allocator()
+        ops.move(d_tokens, into, x_t, v, error, gain[:, 0], steps[:, 0], next_x)
+        results.append((error, d_out, v, next_x))
+    assert torch.equal(results[0][3][0], x_t[0]), "what is held stays to the last bit"
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("gated", [False, True])
+def test_a_norm_takes_rows_of_a_table(gated: bool) -> None:
+    x, d, rows = random(7, 96), random(7, 96), torch.tensor([2, 0, 1, 2, 2, 1, 0], device=DEVICE, dtype=torch.int32)
+    scale, _, gate = random(3, 5, 3, 96, dtype=torch.float32)[:, 2].movedim(1, 0).unbind(0)
+    gates = gate if gated else None
+    expected = FEW_TOKENS.rms_norm_vjp(d, x, scale[rows], 1e-6, None, None if gates is None else gates[rows])
+    for ops in (FEW_TOKENS, PLAIN_BACKWARD):
+        found = ops.rms_norm_vjp(d, x, scale, 1e-6, None, gates, rows)
+        torch.testing.assert_close(found[0], expected[0], atol=1e-5, rtol=1e-5)
+        assert gates is None or torch.testing.assert_close(found[1], expected[1], atol=2e-2, rtol=2e-2) is None
 
 
 def test_other_sizes_keep_the_librarys_products() -> None:

@@ -29,7 +29,14 @@ SECTIONS = (".text.", ".nv.constant", ".nv.info.", ".nv.shared.")
 
 
 def _denoising(
-    suffix: int, in_fp8: bool, by_token: bool, folder: Path | None, *, rows: int = CACHE_ROWS, pair: bool = False
+    suffix: int,
+    in_fp8: bool,
+    by_token: bool,
+    folder: Path | None,
+    *,
+    rows: int = CACHE_ROWS,
+    pair: bool = False,
+    keep: bool = False,
 ) -> bytes:
     arrangement = Arrangement(preset("pi05_libero").model)
     sizes = denoise.kernel_sizes(
@@ -40,6 +47,7 @@ def _denoising(
         fp8=in_fp8,
         by_token=by_token,
         pair=pair,
+        keep=keep,
     )
     return denoise.compiled(ARCH, sizes, folder=folder)
 

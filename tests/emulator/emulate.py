@@ -33,6 +33,8 @@ INSTRUCTIONS = (
     *(("m16n8k16.row.col.f32.bf16", "mma_bf16"), ("m16n8k16.row.col.f32.f16", "mma_half")),
     *(("m16n8k32.row.col.f32.e4m3", "mma_e4m3"), ("red.release.gpu.global.add.u32", "add_released")),
     *(("ld.acquire.gpu.global.u32", "load_acquired"), ("ld.global.nc.L1::no_allocate", "load_once")),
+    *(("st.relaxed.gpu.global.u32", "put"), ("cp.async.cg.shared.global", "copy_16")),
+    ("m8n8.x4.trans.shared.b16", "ldmatrix_transposed"),
     *(("cp.async.bulk.tensor.2d", "copy_2d"), ("complete_tx::bytes.L2::cache_hint", "copy_bytes")),
 )
 # No effect on what is computed here: kernels run one by one, registers are plenty, and copies are seen at once.

@@ -32,6 +32,7 @@
 struct float2 { float x, y; };
 struct float4 { float x, y, z, w; };
 struct uint2 { unsigned x, y; };
+struct ushort2 { unsigned short x, y; };
 struct uint4 { unsigned x, y, z, w; };
 inline float2 make_float2(float x, float y) { return {x, y}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
@@ -44,6 +45,7 @@ using std::fmaf; using std::fmaxf;
 inline float __fdividef(float x, float y) { return x / y; }
 inline float __fadd_rn(float x, float y) { return x + y; }
 inline float __fmul_rn(float x, float y) { return x * y; }
+inline float __fsub_rn(float x, float y) { return x - y; }
 inline void sincosf(float x, float* sine, float* cosine) { *sine = std::sin(x), *cosine = std::cos(x); }
 inline float exp2f(float x) { return std::exp2(x); }
 inline float __uint_as_float(unsigned x) { float y; memcpy(&y, &x, 4); return y; }
@@ -444,6 +446,17 @@ inline void ptx_ldmatrix(unsigned& v0, unsigned& v1, unsigned& v2, unsigned& v3,
         return 0;
     });
 }
+// The same, transposed: numbers c of its rows 2 r and 2 r + 1, for lane 4 c + r.
+inline void ptx_ldmatrix_transposed(unsigned& v0, unsigned& v1, unsigned& v2, unsigned& v3, unsigned address) {
+    unsigned* const v[4] = {&v0, &v1, &v2, &v3};
+    const int lane = threadIdx.x % 32;
+    exchanged(address, [&](auto of_lane) {
+        for (int i = 0; i < 4; ++i)
+            for (int half = 0; half < 2; ++half)
+                memcpy((char*)v[i] + half * 2, machine::at(of_lane(i * 8 + lane % 4 * 2 + half) + lane / 4 * 2), 2);
+        return 0;
+    });
+}
 // c += a b of mma.m16n8k16, whose fragments PTX draws: lane 4 g + t has of a the columns 2 t, 2 t + 1 of row g, of row g +
 // 8, and the columns 8 further of both; of b the rows 2 t, 2 t + 1 and 8 further of column g; of c the columns 2 t, 2 t + 1
 // of row g and of row g + 8.
@@ -489,6 +502,8 @@ inline void ptx_load_acquired(unsigned& value, const unsigned* from) {
     swapcontext(&machine::now->context, &machine::scheduler);  // others go on while somebody looks
     value = *from;
 }
+inline void ptx_copy_16(unsigned to, const void* from) { memcpy(machine::at(to), from, 16); }
+inline void ptx_put(void* to, unsigned value) { memcpy(to, &value, 4); }
 inline void ptx_load_once(unsigned& x, unsigned& y, unsigned& z, unsigned& w, const void* from) {
     const uint4 v = *(const uint4*)from;
     x = v.x, y = v.y, z = v.z, w = v.w;

@@ -234,6 +234,16 @@ def _way_back() -> Calls:
         ops.down(hidden, down)
         ops.gate_up_vjp(ops.down_vjp(x, down, product), gate_up)
         ops.qkv_vjp(ops.attention_vjp(kept, ops.out_vjp(x, out), k, k, *heads), cos, cos, qkv)
+        cache, chunk, one = of(18, slots + tokens, 256), of(tokens, 32, dtype=F32), of(tokens, dtype=F32)
+        ops.kept_attention(of(18, tokens * 8, 256), cache, cache, *heads)
+        into, table, rows = of(1024, 32, dtype=F32), of(11, 1024, dtype=F32), of(tokens, dtype=torch.int32)
+        ops.pull(chunk, chunk, one, chunk, of(tokens, 1, dtype=F32), of(32, 1024, dtype=F32), BF16)
+        ops.move(of(tokens, 1024, dtype=F32), into, chunk, chunk, chunk, one, one, chunk)
+        for parts in (8, 10):
+            d = of(parts, tokens, 1024, dtype=F32)
+            ops.rms_norm_vjp(d, x, table, 1e-6, of(tokens, 1024, dtype=F32), table, rows)
+        ops.rms_norm_vjp(x, x, table, 1e-6, None, table, rows)
+        ops.rms_norm_vjp(d, x, table, 1e-6, of(tokens, 1024, dtype=F32), None, rows)
 
     return [
         partial(layer, tokens, slots, tokens == 51)

@@ -32,6 +32,7 @@ from turbopi.kernels import portable
 from turbopi.kernels.portable.denoise import kernel as denoise
 from turbopi.kernels.portable.denoise.packing import WeightNumbers
 from turbopi.kernels.portable.gemm.tiles import fp8_refusal
+from turbopi.kernels.sm90.vjp import products as vjp
 from turbopi.toolchain import PTXAS_BLACKWELL_VARIABLE, cuda_13_ptxas
 
 HOPPER, THOR = (9, 0), (11, 0)
@@ -112,12 +113,32 @@ def compiled_cuda(target: Target, name: str, make: Callable[[Path | None], bytes
 def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], bytes]]]:
     """(name, what compiles it): Hopper's for 9.0, and the portable denoising loop of 10 and of 50 actions."""
     if target.capability == HOPPER:
-        yield from ((f"sm90: {name}", make) for name, make in machine_code.SHAPES.items())
+        yield from ((f"sm90: {name}", make) for name, make in (machine_code.SHAPES | hopper_way_back()).items())
     for suffix in (10, 50):
         numbers: tuple[WeightNumbers, ...] = ("bf16", "fp8" if fp8_refusal(target.capability) is None else "int8")
         for weights in numbers:
             label = weights if weights == "bf16" else weights.upper()
             yield f"denoise.kernel, H={suffix}, {label}", partial(_denoising, target, suffix, weights)
+
+
+def hopper_way_back() -> dict[str, Callable[[Path | None], bytes]]:
+    """What the true Jacobian's way back has of its own on Hopper."""
+    expert = preset("pi05_libero").model.expert
+    made: dict[str, Callable[[Path | None], bytes]] = {}
+    heads = expert.num_heads * expert.head_dim
+    for tokens in (10, 50):
+        keeping = partial(machine_code._denoising, tokens, False, True, keep=True)
+        made[f"denoising of a step that is kept, H={tokens}, bf16"] = keeping
+        shapes: dict[vjp.Mode, tuple[int, int]] = {
+            "geglu": (expert.width, expert.mlp_dim),
+            "parts": (2 * expert.mlp_dim, expert.width),
+            "plain": (expert.width, heads),
+        }
+        for mode, shape in shapes.items():
+            one = vjp.cut(mode, tokens, *shape)
+            assert one is not None, (mode, tokens)
+            made[f"way back, {mode}, H={tokens}"] = partial(vjp.compiled, one, mode)
+    return made
 
 
 def _denoising(target: Target, suffix: int, weights: WeightNumbers, folder: Path | None) -> bytes:

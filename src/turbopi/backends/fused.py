@@ -26,7 +26,7 @@ from turbopi.engine.room import HOST, PackingRoom, is_conditioning
 from turbopi.engine.runner import MAX_CAMERAS, bucket
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendUnavailable, DeviceLost
-from turbopi.kernels.interface import Denoiser, Ops, PairDenoiser
+from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops, PairDenoiser
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import NO_TILES
 from turbopi.quantization.calibration_file import Quantization, check_given
@@ -78,6 +78,7 @@ class FusedBackend(CudaGraphBackend):
         self._packed_expert: Any = None  # as the denoising kernels have it
         self._denoisers: dict[tuple[Loop, int], Denoiser] = {}  # by loop and cache rows
         self._pair_denoisers: dict[tuple[Loop, int], PairDenoiser] = {}  # of two observations, for batches
+        self._keepers: dict[tuple[Loop, int], KeepingDenoiser] = {}  # forward, where the true Jacobian goes back
         self._refused: dict[tuple[Loop, int], str] = {}  # what operations denoise, and why
         super().__init__(config, load, device=device, precision=precision)
 
@@ -131,8 +132,10 @@ class FusedBackend(CudaGraphBackend):
 
         by_kernel = sorted({str(loop) for loop, _ in list(self._denoisers)})
         by_operations: dict[str, list[str]] = {}
-        for (loop, _), why in list(self._refused.items()):
-            calls = by_operations.setdefault(f"operations, as {why}", [])
+        for (loop, rows), why in list(self._refused.items()):
+            kept = (loop, rows) in self._keepers
+            how = "one CUDA kernel a step forward, operations back" if kept else f"operations, as {why}"
+            calls = by_operations.setdefault(how, [])
             if str(loop) not in calls:
                 calls.append(str(loop))
         kernel = "one CUDA kernel" if self._on_hopper else "one portable CUDA kernel"
@@ -191,8 +194,7 @@ class FusedBackend(CudaGraphBackend):
 
     def _make_denoiser(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """The kernel of all steps; None, with the reason noted, where it doesn't cover the model, loop or GPU."""
-        cameras = min(max(shape.cameras, 3), MAX_CAMERAS)
-        rows = cameras * self.config.vision.num_tokens + bucket(self.config.max_prompt_tokens)
+        rows = self._most_rows(shape)
         key = (shape.loop, rows)
         if key not in self._denoisers and key not in self._refused:
             try:
@@ -201,10 +203,45 @@ class FusedBackend(CudaGraphBackend):
                 self._refused[key] = str(e)
         if key in self._denoisers:
             return self._denoisers[key]
-        if not self._denoisers:
+        if not self._denoisers and not self._keepers:
             self._packed_expert = None
         self._keep_expert_on(self.device)  # while such a graph is kept, as it points to it
         return None
+
+    def _most_rows(self, shape: CallShape) -> int:
+        """Of the cache's prefix, of all calls that one denoising kernel serves."""
+        cameras = min(max(shape.cameras, 3), MAX_CAMERAS)
+        return cameras * self.config.vision.num_tokens + bucket(self.config.max_prompt_tokens)
+
+    def _make_keeper(self, shape: CallShape, table: Tensor | None) -> KeepingDenoiser | None:
+        """Hopper's denoising kernel of one step, in bfloat16."""
+        if not self._on_hopper or (self._plan is not None and self._plan.expert != "bf16") or table is None:
+            return None
+        from turbopi.kernels.portable.vjp.tiles import takes
+        from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, DenoiseKernel, unavailable
+        from turbopi.kernels.sm90.denoise.packing import PackedExpert, refusal
+
+        horizon, rows = shape.loop.horizon, self._most_rows(shape)
+        if unavailable(self.device) or refusal(self.config) or horizon > MAX_SUFFIX:
+            return None
+        if not takes(self.config.expert, horizon):
+            return None
+        key = (shape.loop, rows)
+        if key not in self._keepers:
+            try:
+                self._keepers[key] = DenoiseKernel(
+                    *(self.config, self._packed(PackedExpert), self._weights.small, table),
+                    cache_rows=rows,
+                    suffix=horizon,
+                    device=self.device,
+                    num_steps=1,
+                    by_token=True,
+                    keep=True,
+                )
+            except BackendUnavailable as e:
+                logger.info("operations go forward where the true Jacobian goes back: %s", e)
+                return None
+        return self._keepers[key]
 
     @property
     def batch_costs(self) -> Mapping[int, float]:
@@ -283,7 +320,7 @@ class FusedBackend(CudaGraphBackend):
     def _forget(self, loop: Loop) -> None:
         super()._forget(loop)
         kept: dict[tuple[Loop, int], Any]
-        for kept in (self._denoisers, self._pair_denoisers, self._refused):
+        for kept in (self._denoisers, self._pair_denoisers, self._keepers, self._refused):
             for key in [key for key in kept if key[0] == loop]:
                 del kept[key]
         if self._denoisers:  # if no graph of operations is left, none points to the matrices on the device
@@ -350,7 +387,7 @@ class FusedBackend(CudaGraphBackend):
         return self._packed_expert
 
     def _explain(self, error: RuntimeError) -> None:
-        for kernel in (*self._denoisers.values(), *self._pair_denoisers.values()):
+        for kernel in (*self._denoisers.values(), *self._pair_denoisers.values(), *self._keepers.values()):
             if isinstance(kernel, Watched) and (why := kernel.why_it_trapped()) is not None:
                 raise DeviceLost(
                     f"{why}; {ADVICE}, and free the GPU of other work; if that doesn't help, use backend 'cuda_graph'"

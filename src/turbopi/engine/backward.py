@@ -19,7 +19,7 @@ from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.forward import Rope, project
 from turbopi.engine.weights import Weights
 from turbopi.kernels.backward import PLAIN_BACKWARD
-from turbopi.kernels.interface import BackwardOps, Ops, State
+from turbopi.kernels.interface import BackwardOps, KeepingDenoiser, KeptStep, Ops, State
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Expert:
     cache_v: Tensor
     rope: Rope
     hidden: Tensor | None = None  # bool[T, 1, R]: which rows a token doesn't see, of several observations' together
+    rows: Tensor | None = None  # int32[T]: a token's row of a table float32[U, 2 * layers + 1, 3, D]; to go back alone
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, list[KeptLayer], Tensor]:
         """Suffix tokens [T, D] -> (the final norm's result float32[T, D], what each layer keeps, the last stream)."""
@@ -72,6 +73,13 @@ class Expert:
         x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
         return normed.float(), kept, x
 
+    def kept(self, step: KeptStep) -> tuple[list[KeptLayer], Tensor]:
+        """What `forward` keeps of each layer and the last stream, where a denoiser went forward."""
+        *streams, last = step.stream
+        attended = self.back.kept_attention(step.q, self.cache_k, self.cache_v, *self._heads(last))
+        layers = zip(streams[::2], attended, streams[1::2], step.gate_up, strict=True)
+        return [KeptLayer(*layer) for layer in layers], last
+
     def vjp(self, kept: list[KeptLayer], last: Tensor, d_out: Tensor) -> Tensor:
         """What comes back to the tokens, float32[T, D], of d_out float32[T, D] at the final norm's result."""
         back, eps, g, layers = self.back, self.config.rms_norm_eps, self.config.expert, self.weights.expert
@@ -80,10 +88,11 @@ class Expert:
         def norm(d: Tensor, x: Tensor, index: int, plain: Tensor | None, d_x: Tensor | None) -> tuple[Tensor, Any]:
             """Back through norm number `index` and the addition before it: to the stream, and to what was added."""
             scale = self._modulation(index, plain)[0]
+            gate = None if index == 0 else self._modulation(index - 1, None)[2]
+            rows = () if self.rows is None else (self.rows,)
+            d_x, d_y = back.rms_norm_vjp(d, x, scale, eps, d_x, gate, *rows)
             if index == 0:
-                return back.rms_norm_vjp(d, x, scale, eps, d_x, None)
-            gate = self._modulation(index - 1, None)[2]
-            d_x, d_y = back.rms_norm_vjp(d, x, scale, eps, d_x, gate)
+                return d_x, None
             return d_x, d_x.to(x.dtype) if gate is None else d_y
 
         d_x, d_y = norm(d_out.to(last.dtype), last, 2 * g.depth, self.weights.expert_norm, None)
@@ -108,7 +117,8 @@ class Expert:
         """Scale, shift and gate of norm number `index`; the shift and the gate may be None."""
         if self.table is None:
             return plain, None, None
-        scale, shift, gate = self.table[index].unbind(0)
+        of_norm = self.table[index] if self.rows is None else self.table[:, index].movedim(1, 0)
+        scale, shift, gate = of_norm.unbind(0)
         return scale, shift, gate
 
 
@@ -142,6 +152,18 @@ def jacobian_velocity(
     d_tokens = of_actions(expert.vjp(kept, last, d_out))
     through = suffix_vjp(expert.config, small, x_t, time, d_tokens)
     return v_t - asked.tokens.gain[step, ..., None] * (error - through)
+
+
+def jacobian_step(
+    expert: Expert, asked: Conditioned, step: int, forward: KeepingDenoiser, x_t: Tensor, v_t: Tensor, next_x: Tensor
+) -> None:
+    """The same of one observation of Pi0.5, where a denoiser goes forward: v_t and next_x float32[H, A] are written."""
+    caches, small, tokens, back = (expert.cache_k, expert.cache_v), expert.weights.small, asked.tokens, expert.back
+    kept, last = expert.kept(forward.launch_step(step, x_t, *caches, expert.length, v_t, tokens))
+    out, into = small["action_out_proj.weight"], small["action_in_proj.weight"]
+    error, d_out = back.pull(x_t, v_t, tokens.times[step], tokens.target, asked.weights, out, last.dtype)
+    d_tokens = expert.vjp(kept, last, d_out)
+    back.move(d_tokens, into, x_t, v_t, error, tokens.gain[step], tokens.steps[step], next_x)
 
 
 def suffix_vjp(config: ModelConfig, small: State, x_t: Tensor, time: Tensor, d_tokens: Tensor) -> Tensor:

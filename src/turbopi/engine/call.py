@@ -15,14 +15,14 @@ from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine import forward
-from turbopi.engine.backward import Expert, jacobian_velocity, way_back
+from turbopi.engine.backward import Expert, jacobian_step, jacobian_velocity, way_back
 from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.flat import allocate
 from turbopi.engine.graph import Mark
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.resize import Resizer
 from turbopi.engine.weights import Weights
-from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
 from turbopi.model.conditioning import Conditioning
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.preprocess.images import fitted
@@ -189,6 +189,7 @@ class StaticCall:
         self._unseen = slice(shape.prefix_slots(config), rows - suffix)
         self.table = table
         self.denoiser: Denoiser | None = None  # in place of the operations of `denoise`
+        self.keeper: KeepingDenoiser | None = None  # in place of the forward operations of guidance by the Jacobian
         self.rope = forward.rope_of_all_positions(config, rows, device)
         self.suffix_offsets = torch.arange(suffix, device=device)
         self.embs = pictures.embs[: shape.prefix_slots(config)]
@@ -277,6 +278,10 @@ class StaticCall:
                 self.v_t[step] = self._velocity(step, rope)
                 self.x_t[step + 1] = self.shape.loop.integration.next_x(step, self.x_t, self.v_t)
                 continue
+            if self.keeper is not None and self.asked is not None:
+                expert = self._expert(self.table, rope, self.asked.tokens.rows[step])
+                jacobian_step(expert, self.asked, step, self.keeper, x_t, self.v_t[step], self.x_t[step + 1])
+                continue
             if self.asked is None:
                 v_t = self._velocity(step, rope)
                 self.x_t[step + 1] = euler_step(x_t, v_t, self.shape.num_steps)
@@ -305,11 +310,15 @@ class StaticCall:
         x_t = self.x_t[step]
         if self.shape.loop.form == "tokens":
             return asked.pulled(step, x_t, self._velocity(step, rope))
-        tokens, cache = self._suffix_tokens(step), (self.cache_k, self.cache_v)
-        back = way_back(self.ops, self.config, len(tokens))
-        table, length = self._modulation(step), self.inputs.length
-        expert = Expert(self.config, self.weights, self.ops, back, table, length, *cache, rope)
+        tokens = self._suffix_tokens(step)
+        expert = self._expert(self._modulation(step), rope)
         return jacobian_velocity(expert, asked, step, x_t, tokens, self._time(step))
+
+    def _expert(self, table: Tensor | None, rope: forward.Rope, rows: Tensor | None = None) -> Expert:
+        """With a way back."""
+        back = way_back(self.ops, self.config, self.shape.suffix_tokens(self.config))
+        cache = self.cache_k, self.cache_v
+        return Expert(self.config, self.weights, self.ops, back, table, self.inputs.length, *cache, rope, rows=rows)
 
     def _time(self, step: int) -> Tensor:
         """The time embedding float32[D], or [H, D] by token."""

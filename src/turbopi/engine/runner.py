@@ -29,7 +29,7 @@ from turbopi.engine.recent_loops import Loop, RecentLoops
 from turbopi.engine.solving import evaluation_loops, solving
 from turbopi.engine.weights import Weights, modulation, modulation_at
 from turbopi.errors import BackendError
-from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
 from turbopi.model.conditioning import Conditioning, Conditionings, Form, of_rows
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import Trace
@@ -235,6 +235,10 @@ class GraphRunner:
         """All denoising steps at once; None: the engine's operations one by one."""
         return None
 
+    def _make_keeper(self, shape: CallShape, table: Tensor | None) -> KeepingDenoiser | None:
+        """What goes forward through the expert where guidance by the Jacobian goes back; None: operations."""
+        return None
+
     def _denoiser_of(self, shape: CallShape, table: Tensor | None) -> Denoiser | None:
         """`_make_denoiser`'s, or of a solver's loop one that launches it for each evaluation."""
         if shape.loop.integration is None:
@@ -311,6 +315,8 @@ class GraphRunner:
         call = self._call(of)
         if part != "prefix" and call.denoiser is None:
             call.denoiser = self._denoiser_of(of, call.table)
+        if part != "prefix" and of.loop.form == "jacobian" and call.keeper is None:
+            call.keeper = self._make_keeper(of, call.table)
         run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
         return self._capture(run, None if part == "denoise" else self._graph(call.pictures, "vision"))
 

@@ -8,6 +8,7 @@ Shapes: T tokens, D width, F hidden width of an MLP, K head_dim, n query heads o
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -22,13 +23,22 @@ _CUBIC = 0.044715
 
 
 def rms_norm_vjp(
-    d_normed: Tensor, x: Tensor, scale: Tensor, eps: float, d_x: Tensor | None, gate: Tensor | None
+    d_normed: Tensor,
+    x: Tensor,
+    scale: Tensor,
+    eps: float,
+    d_x: Tensor | None,
+    gate: Tensor | None,
+    rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None]:
     """Back through `residual_rms_norm`: (d_x + the norm's part, float32; that times gate, in x's dtype).
 
     d_normed, x [T, D]; d_x float32[T, D], what reaches x by other ways; scale, gate float32[T, D] or [D]; the gate is
     that of the addition before the norm, rounded as there. None: left out. d_normed may be parts float32[parts, T, D].
+    rows int32[T]: scale and gate are of a table [U, D], of which each token takes a row.
     """
+    if rows is not None:
+        scale, gate = scale[rows], None if gate is None else gate[rows]
     if d_normed.dim() == 3:
         d_normed = d_normed.sum(0)
     g, wide, r = d_normed.float() * scale, x.float(), inverse_rms(x, eps)
@@ -61,6 +71,30 @@ def rope_vjp(d_q: Tensor, d_k: Tensor, d_v: Tensor, cos: Tensor, sin: Tensor) ->
     return torch.cat((q, apply_rope(d_k, cos, -sin)[:, None], d_v[:, None]), dim=1).view(tokens, -1)
 
 
+def pull(
+    x_t: Tensor, v_t: Tensor, times: Tensor, target: Tensor, weights: Tensor, out: Tensor, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """What is missing from the chunk that v_t points to, times weights float32[H, 1]: float32[H, A]; back to the final
+    norm's result: [H, D] in this dtype.
+
+    x_t, v_t, target float32[H, A]; times float32[H]; out: action_out_proj's matrix float32[A, D].
+    """
+    error = (target - (x_t - times[:, None] * v_t)) * weights
+    return error, ((times[:, None] * error) @ out).to(dtype)
+
+
+def move(
+    d_tokens: Tensor, into: Tensor, x_t: Tensor, v_t: Tensor, error: Tensor, gain: Tensor, steps: Tensor, next_x: Tensor
+) -> None:
+    """v_t becomes the guided one, next_x what it moves x_t to: float32[H, A].
+
+    d_tokens float32[H, D], what came back to the tokens of `pull`'s error; into: action_in_proj's matrix float32[D, A];
+    gain, steps float32[H].
+    """
+    v_t -= gain[:, None] * (error - d_tokens @ into)
+    torch.add(x_t, steps[:, None] * v_t, out=next_x)
+
+
 @dataclass(frozen=True)
 class BetweenProducts:
     """The operations around cuBLAS's products, by their twins' names. `softmax` is `plain.masked_softmax`'s."""
@@ -86,6 +120,9 @@ class BetweenProducts:
             out_vjp=torch.matmul,
             attention_vjp=self.attention_vjp,
             qkv_vjp=self.qkv_vjp,
+            kept_attention=self.kept_attention,
+            pull=pull,
+            move=move,
             origin=origin,
         )
 
@@ -113,6 +150,10 @@ class BetweenProducts:
             logits.view(-1, heads, len(k)).masked_fill_(hidden, -torch.inf)
         probabilities = self.softmax(logits, length, slots, heads, state_token, scale, v.dtype)
         return (probabilities @ v).view(-1, heads * q.shape[1]), (q, probabilities)
+
+    def kept_attention(self, q: Tensor, k: Tensor, v: Tensor, *seen: Any) -> list[tuple[Tensor, Tensor]]:
+        """Queries [L, T * n, K], k and v [L, R, K] -> what `attention` keeps, of each layer."""
+        return [self.attention(*layer, *seen)[1] for layer in zip(q, k, v, strict=True)]
 
     def gate_up(self, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """x [T, D] times weight [2F, D], which is kept: [T, 2F]; and its GeGLU [T, F]."""

@@ -1,8 +1,9 @@
 """Programmatic dependent launch: a kernel's blocks start while the kernel before it ends, and wait for its results.
 
 Every kernel here that is launched so waits before it touches anything another kernel writes; so work that a kernel
-may overlap with is only ever its own constants' loading: into registers, or by `prefetch` into the L2 cache. Needs
-compute capability 9.0.
+may overlap with is only ever its own constants' loading: into registers, or by `prefetch` into the L2 cache. Those
+of the true Jacobian's way back (portable/backward.py, portable/vjp) also read what was complete when the kernel in
+front began, which lets it start after a wait of its own. Needs compute capability 9.0.
 """
 
 from functools import lru_cache

@@ -3,7 +3,7 @@
 Shapes: D, W widths, F hidden width of an MLP, K head_dim, A action_dim.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -113,6 +113,11 @@ class BackwardOps:
     out_vjp: Callable[[Tensor, Tensor], Tensor]
     attention_vjp: Callable[..., Any]
     qkv_vjp: Callable[[Any, Tensor, Tensor, Tensor], Tensor]
+    # queries [L, T * n, K], k and v [L, R, K] to what `attention` keeps of each layer: one kernel went forward
+    kept_attention: Callable[..., Sequence[Any]]
+    # the ends of such a step of one observation: from v_t to the final norm, from the tokens to the next x_t
+    pull: Callable[..., tuple[Tensor, Tensor]]
+    move: Callable[..., None]
     origin: str
 
 
@@ -167,6 +172,29 @@ class Denoiser(Protocol):
         """From noise float32[H, A] and the cache's first `length` rows: x_t float32[N + 1, H, A], v_t [N, H, A].
 
         `tokens` of a loop that was made for them, and of no other; v_t then is the guided v that was integrated.
+        """
+
+
+@dataclass(frozen=True)
+class KeptStep:
+    """What one evaluation of the expert leaves for a way back, all bfloat16. L layers, T tokens, F hidden units.
+
+    Beside it the suffix's keys and values are in the cache's last rows.
+    """
+
+    stream: Tensor  # [2L + 1, T, D]  the residual stream in front of each norm
+    q: Tensor  # [L, T * n, K]  turned queries
+    gate_up: Tensor  # [L, T, 2F]
+
+
+class KeepingDenoiser(Protocol):
+    """One evaluation of the expert in one launch, with what its way back needs."""
+
+    def launch_step(
+        self, step: int, x_t: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, v_t: Tensor, tokens: TokenInputs
+    ) -> KeptStep:
+        """Of x_t float32[H, A] in one step of a loop: v_t float32[H, A], without guidance. Steps come in order, and
+        what one leaves is there until the next.
         """
 
 

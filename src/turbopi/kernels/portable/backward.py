@@ -14,52 +14,64 @@ from turbopi.kernels.portable.rope import rope_split
 
 @triton.jit
 def _rms_norm_kernel(
-    d_normed, x, scale, d_x, gate, out, gated, rows, width, eps,
-    PARTS: tl.constexpr, HAS_D_X: tl.constexpr, HAS_GATE: tl.constexpr, BY_ROW: tl.constexpr, BLOCK: tl.constexpr,
-    PDL: tl.constexpr,
+    d_normed, x, scale, d_x, gate, which, out, gated, rows, width, stride, eps,
+    PARTS: tl.constexpr, HAS_D_X: tl.constexpr, HAS_GATE: tl.constexpr, BY_ROW: tl.constexpr, BY_TABLE: tl.constexpr,
+    BLOCK: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
+    """`d_normed` alone is of the kernel in front: the rest is there when that begins, and is read before it ends."""
     row = tl.program_id(0)
     cols = tl.arange(0, BLOCK)
     mask = cols < width
     if BY_ROW:
-        scale += row * width
+        own = tl.load(which + row).to(tl.int64) if BY_TABLE else row
+        scale += own * stride
         if HAS_GATE:
-            gate += row * width
+            gate += own * stride
     at = row * width + cols
+    wide = tl.load(x + at, mask, 0.0).to(tl.float32)
+    factor = tl.load(scale + cols, mask, 0.0)
+    d_other = tl.load(d_x + at, mask, 0.0) if HAS_D_X else wide
+    opened = tl.load(gate + cols, mask, 0.0).to(gated.dtype.element_ty).to(tl.float32) if HAS_GATE else wide
+    r = tl.rsqrt(tl.sum(wide * wide, 0) / width + eps)
     wait_for_producer(PDL)
     launch_dependents(PDL)
-    wide = tl.load(x + at, mask, 0.0).to(tl.float32)
     g = tl.load(d_normed + at, mask, 0.0).to(tl.float32)
     for part in tl.static_range(1, PARTS):
         g += tl.load(d_normed + part * rows * width + at, mask, 0.0)
-    g *= tl.load(scale + cols, mask, 0.0)
-    r = tl.rsqrt(tl.sum(wide * wide, 0) / width + eps)
+    g *= factor
     total = r * (g - wide * (r * r * (tl.sum(wide * g, 0) / width)))
     if HAS_D_X:
-        total += tl.load(d_x + at, mask, 0.0)
+        total += d_other
     tl.store(out + at, total, mask)
     if HAS_GATE:
-        dtype = gated.dtype.element_ty
-        factor = tl.load(gate + cols, mask, 0.0).to(dtype).to(tl.float32)
-        tl.store(gated + at, (total * factor).to(dtype), mask)
+        tl.store(gated + at, (total * opened).to(gated.dtype.element_ty), mask)
 
 
 def rms_norm_vjp(
-    d_normed: Tensor, x: Tensor, scale: Tensor, eps: float, d_x: Tensor | None, gate: Tensor | None
+    d_normed: Tensor,
+    x: Tensor,
+    scale: Tensor,
+    eps: float,
+    d_x: Tensor | None,
+    gate: Tensor | None,
+    which: Tensor | None = None,
 ) -> tuple[Tensor, Tensor | None]:
-    """See the twin. x [T, D]; scale and gate float32 [D] or [T, D], both the same; all contiguous."""
-    given = (d_normed, x, scale, d_x, gate)
+    """See the twin. x [T, D]; scale and gate float32 [D] or [T, D], or [U, D] of which each token takes row `which`;
+    both the same; rows lie in one piece.
+    """
+    given = (d_normed, x, d_x, which)
     assert all(one is None or one.is_contiguous() for one in given), "rows are read as they lie in memory"
-    assert gate is None or gate.dim() == scale.dim()
+    assert scale.stride(-1) == 1 and (gate is None or gate.stride() == scale.stride()), "rows of one table"
     rows, width = x.shape
     out = torch.empty_like(x, dtype=torch.float32)
     gated = None if gate is None else torch.empty_like(x)
     block = triton.next_power_of_2(width)
     _rms_norm_kernel[(rows,)](
-        d_normed, x, scale, out if d_x is None else d_x, scale if gate is None else gate, out,
-        out if gated is None else gated, rows, width, eps,
+        d_normed, x, scale, out if d_x is None else d_x, scale if gate is None else gate, x if which is None else which,
+        out, out if gated is None else gated, rows, width, scale.stride(0), eps,
         PARTS=1 if d_normed.dim() == 2 else len(d_normed), HAS_D_X=d_x is not None, HAS_GATE=gate is not None,
-        BY_ROW=scale.dim() == 2, BLOCK=block, num_warps=max(1, min(8, block // 256)), **dependent_launch(x),
+        BY_ROW=scale.dim() == 2, BY_TABLE=which is not None, BLOCK=block, num_warps=max(1, min(8, block // 256)),
+        **dependent_launch(x),
     )  # fmt: skip
     return out, gated
 

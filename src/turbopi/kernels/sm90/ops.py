@@ -19,6 +19,7 @@ from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
 from turbopi.kernels.sm90.gemm.tiles import PARTS_TILES, RESIDUAL_TILES, VISION_TILES
 from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
+from turbopi.kernels.sm90.vjp import products as vjp
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 
 
@@ -31,6 +32,7 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
         "product behind the prefix's GeGLU": "in parts that the norm behind it adds up: "
         f"CUDA for {_rows(PARTS_TILES, Tile)} rows, cuBLAS for {_rows(PARTS_TILES, int)}, in whole 64; else "
         "cuBLAS at once",
+        "the expert with a way back": vjp.ORIGIN,
         "vision and prefix attention": "CUDA; Triton where head_dim isn't a multiple of 8 from 16 to 256",
     }
     if products.num_sms(device) >= GATHERING_SMS:
@@ -44,6 +46,7 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
         linear_geglu=partial(products.tuned_linear_geglu, tiles=tiles),
         vision_attention=partial(vision_attention, tiles=tiles),
         attention=partial(attend, tiles=tiles),
+        backward=vjp.way_back,
         batch=replace(
             batch,
             packed_attention=partial(packed_attention, tiles=tiles),

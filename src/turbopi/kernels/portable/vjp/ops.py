@@ -8,7 +8,7 @@ attention, q|k|v with RoPE, norm. Products whose result only a norm reads leave 
 from turbopi.config import GemmaConfig
 from turbopi.kernels.interface import BackwardOps
 from turbopi.kernels.portable import backward
-from turbopi.kernels.portable.vjp import attention, products
+from turbopi.kernels.portable.vjp import attention, ends, products
 from turbopi.kernels.portable.vjp.tiles import MOST_TOKENS, takes
 
 BETWEEN_PRODUCTS = backward.PIECES.ops("Triton, between cuBLAS's products")
@@ -24,6 +24,9 @@ FEW_TOKENS = BackwardOps(
     out_vjp=products.out_vjp,
     attention_vjp=attention.attention_vjp,
     qkv_vjp=products.qkv_vjp,
+    kept_attention=attention.kept_attention,
+    pull=ends.pull,
+    move=ends.move,
     origin="Triton",
 )
 ORIGIN = f"Triton for up to {MOST_TOKENS} tokens, else cuBLAS and Triton"

@@ -15,7 +15,7 @@ from torch import Tensor
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, prefetch, wait_for_producer
 from turbopi.kernels.portable.activations import gelu_tanh
 from turbopi.kernels.portable.shared_memory import capability_of
-from turbopi.kernels.portable.vjp.tiles import LINE, power_dividing, split_of, streaming, token_rows
+from turbopi.kernels.portable.vjp.tiles import LINE, power_dividing, row_block, split_of, streaming
 
 
 @triton.jit
@@ -27,6 +27,30 @@ def _prefetch(weight, row, length, stride, ROWS: tl.constexpr, LINES: tl.constex
 
 
 @triton.jit
+def _two_products(
+    x, weight, row, apart, tokens, inner,
+    BLOCK_M: tl.constexpr, PAIRS: tl.constexpr, DEPTH: tl.constexpr, LINES: tl.constexpr, PDL: tl.constexpr,
+):  # fmt: skip
+    """x [tokens, inner] times PAIRS of the matrix's rows from `row` on, and times as many that are `apart` behind.
+
+    As one product of rows in turn: in 16 columns, two would each keep half of the warps busy.
+    """
+    _prefetch(weight, row, inner, inner, PAIRS, LINES, PDL)
+    _prefetch(weight, row + apart, inner, inner, PAIRS, LINES, PDL)
+    m, n, d = tl.arange(0, BLOCK_M), tl.arange(0, 2 * PAIRS), tl.arange(0, DEPTH)
+    weight_at = weight + ((row + n // 2 + n % 2 * apart)[:, None] * inner + d[None, :])
+    x_at = x + (m[:, None] * inner + d[None, :])
+    there = (m < tokens)[:, None]
+    acc = tl.zeros((BLOCK_M, 2 * PAIRS), tl.float32)
+    wait_for_producer(PDL)
+    launch_dependents(PDL)
+    for at in range(0, inner, DEPTH):
+        a = tl.load(x_at + at, there, 0.0)
+        acc = tl.dot(a, tl.load(weight_at + at).T, acc, input_precision="ieee")
+    return tl.split(tl.reshape(acc, (BLOCK_M, PAIRS, 2)))
+
+
+@triton.jit
 def _qkv_kernel(
     x, weight, cos, sin, q, k, v, tokens, inner, heads,
     HALF: tl.constexpr, PAIRS: tl.constexpr, BLOCK_M: tl.constexpr, DEPTH: tl.constexpr, LINES: tl.constexpr,
@@ -34,23 +58,10 @@ def _qkv_kernel(
 ):  # fmt: skip
     """PAIRS of columns of one head, each of one column of either half."""
     head, part = tl.program_id(0) // (HALF // PAIRS), tl.program_id(0) % (HALF // PAIRS)
-    m, d = tl.arange(0, BLOCK_M), tl.arange(0, DEPTH)
-    pair = part * PAIRS + tl.arange(0, PAIRS)
     row = head * 2 * HALF + part * PAIRS
-    _prefetch(weight, row, inner, inner, PAIRS, LINES, PDL)
-    _prefetch(weight, row + HALF, inner, inner, PAIRS, LINES, PDL)
-    first_at = weight + ((head * 2 * HALF + pair)[:, None] * inner + d[None, :])
-    second_at = first_at + HALF * inner
-    x_at = x + (m[:, None] * inner + d[None, :])
+    first, second = _two_products(x, weight, row, HALF, tokens, inner, BLOCK_M, PAIRS, DEPTH, LINES, PDL)
+    m, pair = tl.arange(0, BLOCK_M), part * PAIRS + tl.arange(0, PAIRS)
     there = (m < tokens)[:, None]
-    first = tl.zeros((BLOCK_M, PAIRS), tl.float32)
-    second = tl.zeros((BLOCK_M, PAIRS), tl.float32)
-    wait_for_producer(PDL)
-    launch_dependents(PDL)
-    for at in range(0, inner, DEPTH):
-        a = tl.load(x_at + at, there, 0.0)
-        first = tl.dot(a, tl.load(first_at + at).T, first, input_precision="ieee")
-        second = tl.dot(a, tl.load(second_at + at).T, second, input_precision="ieee")
     turned = m[:, None] * HALF + pair[None, :]
     c = tl.load(cos + turned, there & (head <= heads), 1.0)  # values aren't turned
     s = tl.load(sin + turned, there & (head <= heads), 0.0)
@@ -84,23 +95,10 @@ def _gate_up_kernel(
     x, weight, product, out, tokens, inner, hidden,
     COLUMNS: tl.constexpr, BLOCK_M: tl.constexpr, DEPTH: tl.constexpr, LINES: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
-    m, d = tl.arange(0, BLOCK_M), tl.arange(0, DEPTH)
     row = tl.program_id(0) * COLUMNS
-    n = row + tl.arange(0, COLUMNS)
-    _prefetch(weight, row, inner, inner, COLUMNS, LINES, PDL)
-    _prefetch(weight, row + hidden, inner, inner, COLUMNS, LINES, PDL)
-    gate_at = weight + (n[:, None] * inner + d[None, :])
-    up_at = gate_at + hidden * inner
-    x_at = x + (m[:, None] * inner + d[None, :])
+    gate, up = _two_products(x, weight, row, hidden, tokens, inner, BLOCK_M, COLUMNS, DEPTH, LINES, PDL)
+    m, n = tl.arange(0, BLOCK_M), row + tl.arange(0, COLUMNS)
     there = (m < tokens)[:, None]
-    gate = tl.zeros((BLOCK_M, COLUMNS), tl.float32)
-    up = tl.zeros((BLOCK_M, COLUMNS), tl.float32)
-    wait_for_producer(PDL)
-    launch_dependents(PDL)
-    for at in range(0, inner, DEPTH):
-        a = tl.load(x_at + at, there, 0.0)
-        gate = tl.dot(a, tl.load(gate_at + at).T, gate, input_precision="ieee")
-        up = tl.dot(a, tl.load(up_at + at).T, up, input_precision="ieee")
     dtype = out.dtype.element_ty
     to = product + (m[:, None] * 2 * hidden + n[None, :])
     tl.store(to, gate.to(dtype), there)
@@ -135,6 +133,10 @@ def _across_kernel(
     n = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     rows = tl.minimum(tl.arange(0, ROWS), inner - 1)
     prefetch(weight + (rows * columns + tl.program_id(0) * COLUMNS), PDL)
+    if GEGLU:  # kept by a kernel long ago
+        place = m[:, None] * 2 * columns + n[None, :]
+        gate = tl.load(product + place, (m < tokens)[:, None], 0.0)
+        up = tl.load(product + place + columns, (m < tokens)[:, None], 0.0)
     x_at = d_out + (m[:, None] * inner + d[None, :])
     weight_at = weight + (d[:, None] * columns + n[None, :])
     there = (m < tokens)[:, None]
@@ -146,9 +148,7 @@ def _across_kernel(
         acc = tl.dot(a, tl.load(weight_at + at * columns), acc, input_precision="ieee")
     dtype = out.dtype.element_ty
     if GEGLU:
-        place = m[:, None] * 2 * columns + n[None, :]
-        gate = tl.load(product + place, there, 0.0).to(tl.float32)
-        up = tl.load(product + place + columns, there, 0.0).to(tl.float32)
+        gate, up = gate.to(tl.float32), up.to(tl.float32)
         # as in portable/backward.py
         half = 1 / (1 + tl.exp2(gate * (-2.302208198 - 0.1029432397 * gate * gate)))
         slope = half + gate * 2 * half * (1 - half) * 0.7978845608 * (1 + 0.134145 * gate * gate)
@@ -240,8 +240,10 @@ def _out_kernel(
     sums, tops, totals, weight, attended, lse, out, tokens, columns, heads,
     DIM: tl.constexpr, SPLITS: tl.constexpr, COLUMNS: tl.constexpr, BLOCK_M: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
-    """One head's part: its attention's splits become one, which is also stored, times its columns of the matrix."""
-    m, d = tl.arange(0, BLOCK_M), tl.arange(0, DIM)
+    """One head's part of some tokens: its attention's splits become one, which is also stored, times its columns of the
+    matrix.
+    """
+    m, d = tl.program_id(2) * BLOCK_M + tl.arange(0, BLOCK_M), tl.arange(0, DIM)
     n = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     head = tl.program_id(1)
     matrix = tl.load(weight + (n[:, None] * heads * DIM + (head * DIM + d)[None, :]))
@@ -256,7 +258,7 @@ def _out_kernel(
             top = tl.maximum(top, tl.load(tops + split * tokens * heads + row, there, 0.0))
         total = tl.zeros((BLOCK_M,), tl.float32)
         acc = tl.zeros((BLOCK_M, DIM), tl.float32)
-        for split in tl.static_range(SPLITS):
+        for split in tl.range(SPLITS, loop_unroll_factor=5):  # more at once spill
             place = split * tokens * heads + row
             weighed = tl.exp2(tl.load(tops + place, there, 0.0) - top)
             total += weighed * tl.load(totals + place, there, 1.0)
@@ -278,13 +280,11 @@ def out_of_splits(sums: Tensor, tops: Tensor, totals: Tensor, weight: Tensor, at
     splits, rows, dim = sums.shape
     heads, columns = weight.shape[1] // dim, weight.shape[0]
     tokens = rows // heads
-    block = token_rows(tokens)
-    taken = power_dividing(columns, 64)
+    block, taken, warps = _of_splits(tokens, columns)
     out = weight.new_empty(heads, tokens, columns, dtype=torch.float32)
-    _out_kernel[(columns // taken, heads)](
+    _out_kernel[(columns // taken, heads, triton.cdiv(tokens, block))](
         sums, tops, totals, weight, attended, lse, out, tokens, columns, heads,
-        DIM=dim, SPLITS=splits, COLUMNS=taken, BLOCK_M=block, num_warps=4 if block == 16 else 8,
-        **dependent_launch(weight),
+        DIM=dim, SPLITS=splits, COLUMNS=taken, BLOCK_M=block, num_warps=warps, **dependent_launch(weight),
     )  # fmt: skip
     return out
 
@@ -304,8 +304,10 @@ def _qkv_vjp_kernel(
     HALF: tl.constexpr, BLOCK_HALF: tl.constexpr, SPLITS: tl.constexpr, GROUPS: tl.constexpr, COLUMNS: tl.constexpr,
     BLOCK_M: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
-    """One head's part, queries before key and value: its gradient's splits added up and turned back, times its rows."""
-    m, pair = tl.arange(0, BLOCK_M), tl.arange(0, BLOCK_HALF)
+    """One head's part of some tokens, queries before key and value: its gradient's splits added up and turned back,
+    times its rows.
+    """
+    m, pair = tl.program_id(2) * BLOCK_M + tl.arange(0, BLOCK_M), tl.arange(0, BLOCK_HALF)
     n = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     head = tl.program_id(1)
     row = head * 2 * HALF + pair
@@ -338,15 +340,20 @@ def qkv_vjp(gradients: tuple[Tensor, Tensor], cos: Tensor, sin: Tensor, weight: 
     _check(d_q, d_kv, cos, sin, weight)
     (tokens, half), columns = cos.shape, weight.shape[1]
     heads = d_q.shape[1] // tokens
-    block = token_rows(tokens)
-    taken = power_dividing(columns, 64)
+    block, taken, warps = _of_splits(tokens, columns)
     out = weight.new_empty(heads + 2, tokens, columns, dtype=torch.float32)
-    _qkv_vjp_kernel[(columns // taken, heads + 2)](
+    _qkv_vjp_kernel[(columns // taken, heads + 2, triton.cdiv(tokens, block))](
         d_q, d_kv, cos, sin, weight, out, tokens, columns, heads,
         HALF=half, BLOCK_HALF=max(16, half), SPLITS=len(d_q), GROUPS=len(d_kv), COLUMNS=taken, BLOCK_M=block,
-        num_warps=4 if block == 16 else 8, **dependent_launch(weight),
+        num_warps=warps, **dependent_launch(weight),
     )  # fmt: skip
     return out
+
+
+def _of_splits(tokens: int, columns: int) -> tuple[int, int, int]:
+    """(rows, columns, warps) of a program that adds up splits: every program of the same rows reads them all."""
+    block = row_block(tokens)
+    return (block, power_dividing(columns, 64), 4) if block == 16 else (block, power_dividing(columns, 128), 8)
 
 
 def _lines(length: int) -> int:

@@ -51,38 +51,28 @@ def split_of(inner: int) -> int:
 def streaming(
     capability: Capability, tokens: int, columns: int, inner: int, most_columns: int, matrices: int = 1
 ) -> Tile:
-    """`matrices` are read at once, each in `columns` columns; two blocks shall fit a multiprocessor."""
+    """`matrices` are read at once, each in at most `most_columns` columns; two blocks shall fit a multiprocessor.
+
+    Up to 16 tokens a product has 32 columns at most, 8 a warp: what bounds it is a warp's chain of instructions, which
+    more programs hide.
+    """
     rows = token_rows(tokens)
+    most_columns = min(most_columns, 32 // matrices) if rows == LEAST_ROWS else most_columns
     taken, depth = power_dividing(columns, most_columns), power_dividing(inner, 128)
     stage = (rows + matrices * taken) * depth * 2
     room = BLOCK_SHARED.get(capability, LEAST_SHARED) // 2
     return Tile(rows, taken, depth, warps=4, stages=max(2, min(4, room // stage)))
 
 
-@dataclass(frozen=True)
-class AttentionCut:
-    """Of attention over a suffix and its prefix."""
-
-    rows: int  # of queries, of any head
-    keys: int  # at a time
-    split: int  # keys of a program
-    own_rows: int  # rows at a time where a suffix's own keys gather gradient
-    group: int  # rows of one such program
-    back_warps: int = 8
-    warps: int = 4
-    stages: int = 2
-
-    def splits(self, keys: int) -> int:
-        return -(-keys // self.split)
+def row_block(tokens: int) -> int:
+    """Rows of a tile where attention's splits are made or added up: of tokens, or of queries."""
+    return min(32, token_rows(tokens))
 
 
-OWN_KEYS = 16  # of a program that gathers their gradient
-
-
-def attention_cut(capability: Capability, tokens: int, keys: int) -> AttentionCut:
-    """Few splits, as the product behind adds them up. Each is a multiple of the keys at a time."""
-    at_once = 64 if BLOCK_SHARED.get(capability, LEAST_SHARED) > 128 * 1024 else 32
-    least, most = (128, SPLITS) if tokens <= 16 else (256, 3)
-    split = max(least, -(-keys // most))
-    split = -(-split // at_once) * at_once
-    return AttentionCut(16, at_once, split, own_rows=32, group=64 if tokens <= 16 else 128)
+def attention_span(capability: Capability) -> int:
+    """Keys of one program, or rows of queries where a suffix's own keys gather gradient. Two such tiles, and one of
+    them in another order, are in shared memory at a time. With 128 the compiler spills registers but for Hopper.
+    """
+    if capability == (9, 0):
+        return 128
+    return 64 if BLOCK_SHARED.get(capability, LEAST_SHARED) >= 163 * 1024 else 32

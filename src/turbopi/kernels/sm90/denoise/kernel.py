@@ -18,7 +18,7 @@ from torch import Tensor
 from turbopi.config import ModelConfig
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct, enumeration
-from turbopi.kernels.interface import State, TokenInputs
+from turbopi.kernels.interface import KeptStep, State, TokenInputs
 from turbopi.kernels.nvrtc import Kernel, compile_cubin
 from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
 from turbopi.kernels.sm90 import instructions
@@ -34,10 +34,10 @@ from turbopi.kernels.sm90.denoise.packing import (
 
 FOLDER = Path(__file__).parent.parent  # has instructions.cu, too
 # Of the kernel, in their order; {form}: "few" or "many" tokens; {times}: "one_time" or "token_times"; {observations}:
-# "alone" or a "pair".
+# "alone" or a "pair"; {kept}: "kept" for a way back or "nothing_kept".
 PARTS = (
     *("sizes", "{form}/memory", "cta", "{observations}", "primitives", "wgmma", "producer", "product"),
-    *("stream", "{form}/stream", "residual", "project", "feed_forward", "{times}"),
+    *("stream", "{form}/stream", "residual", "{kept}", "project", "feed_forward", "{times}"),
     *("{form}/project", "{form}/feed_forward", "score", "attention", "{form}/attention", "combine"),
     *("layer", "step", "{form}/step", "watch", "{form}/loop", "kernel"),
 )
@@ -157,6 +157,20 @@ ARGS_BY_TOKEN = Struct(
 )
 
 
+ARGS_KEEPING = Struct(
+    "Args",
+    (
+        *ARGS_BY_TOKEN.fields,
+        Parameter("unsigned short*", "kept_x", "bf16 [2L+1][T][D] the stream in front of each norm"),
+        Parameter("unsigned short*", "kept_q", "bf16 [L][T * n][HD]"),
+        Parameter("unsigned short*", "kept_gate_up", "bf16 [L][T][2F]"),
+        Parameter("unsigned char*", "own_k", "bf16 [L][T][HD] the suffix's keys, layer_stride bytes a layer"),
+        Parameter("unsigned char*", "own_v"),
+        Parameter("int", "keys_ready", "`keys` is as a launch before made it"),
+    ),
+)
+
+
 def kernel_sizes(
     arrangement: Arrangement,
     *,
@@ -166,10 +180,12 @@ def kernel_sizes(
     fp8: bool = False,
     by_token: bool = False,
     pair: bool = False,
+    keep: bool = False,
 ) -> dict[str, int]:
     """The kernel's compile-time constants.
 
     by_token  every token has its own time (token_times.cu)
+    keep      by token, what a way back needs is kept (kept.cu)
     pair      the suffix is that of two observations (pair.cu), the cache's rows, too
     """
     config, g = arrangement.config, arrangement.config.expert
@@ -198,10 +214,11 @@ def kernel_sizes(
         "TP_SCRATCH_WORDS": scratch,
         **({"TP_BY_TOKEN": 1} if by_token else {}),
         **({"TP_PAIR": 1} if pair else {}),
+        **({"TP_KEEP": 1} if keep else {}),
     }
 
 
-def source(suffix: int, fp8: bool, by_token: bool = False, pair: bool = False) -> str:
+def source(suffix: int, fp8: bool, by_token: bool = False, pair: bool = False, keep: bool = False) -> str:
     columns = most(suffix, 8) * 8
     numbers: instructions.Numbers = "e4m3" if fp8 else "bf16"
     products = (
@@ -210,12 +227,13 @@ def source(suffix: int, fp8: bool, by_token: bool = False, pair: bool = False) -
         instructions.wgmma("add_rows", columns, from_registers=True),
         instructions.wgmma("add_keys", 2 * 8),
     )
-    args = ARGS_BY_TOKEN if by_token else ARGS_OF_PAIR if pair else ARGS
+    args = ARGS_KEEPING if keep else ARGS_BY_TOKEN if by_token else ARGS_OF_PAIR if pair else ARGS
     generated = (*products, enumeration("What", tuple(WAITS)), enumeration("Mark", tuple(MARKS)), args.source)
     which = {
         "form": "few" if suffix <= FEW else "many",
         "times": "token_times" if by_token else "one_time",
         "observations": "pair" if pair else "alone",
+        "kept": "kept" if keep else "nothing_kept",
     }
     files = (f"denoise/{part.format(**which)}.cu" for part in PARTS)
     return instructions.source(*files, generated="\n".join(generated) + "\n", folder=FOLDER)
@@ -224,7 +242,8 @@ def source(suffix: int, fp8: bool, by_token: bool = False, pair: bool = False) -
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
     """The kernel's machine code. Raises BackendUnavailable if a block has too little shared memory for these sizes."""
     try:
-        text = source(sizes["TP_TOKENS"], bool(sizes["TP_FP8"]), "TP_BY_TOKEN" in sizes, "TP_PAIR" in sizes)
+        which = (name in sizes for name in ("TP_BY_TOKEN", "TP_PAIR", "TP_KEEP"))
+        text = source(sizes["TP_TOKENS"], bool(sizes["TP_FP8"]), *which)
         return compile_cubin(text, arch, sizes, folder=folder)
     except BackendError as e:
         if "too little shared memory" not in str(e):
@@ -254,6 +273,22 @@ def _beside_each_other(shifted: Tensor) -> Tensor:
     return shifted.view(*shifted.shape[:-1], 2, 8).mT.contiguous()
 
 
+def _room_to_keep(config: ModelConfig, suffix: int, device: torch.device) -> tuple[KeptStep, dict[str, Tensor]]:
+    """And what a launch of one step reads or writes beside it: no guidance, and x_t behind the step, for nobody."""
+    g = config.expert
+
+    def room(*shape: int) -> Tensor:
+        return torch.zeros(*shape, dtype=torch.bfloat16, device=device)
+
+    kept = KeptStep(
+        stream=room(2 * g.depth + 1, suffix, g.width),
+        q=room(g.depth, suffix * g.num_heads, g.head_dim),
+        gate_up=room(g.depth, suffix, 2 * g.mlp_dim),
+    )
+    shapes = {"gain": (1, suffix), "x_t": (2, suffix, config.action_dim)}
+    return kept, {name: torch.zeros(*shape, device=device) for name, shape in shapes.items()}
+
+
 class DenoiseKernel:
     """The loop for a fixed number of steps and suffix tokens; capturable in a CUDA graph.
 
@@ -264,6 +299,7 @@ class DenoiseKernel:
     by_token  every token has a time of its own in each of `num_steps` steps: a launch then takes `TokenInputs`, and
         `table` float32[U, 2L + 1, 3, D] has a row for each time that occurs
     pair  the suffix is that of two observations, half of it each, and so are the cache's rows: for `launch_pair`
+    keep  of a kernel by token with one step: for `launch_step`, which keeps what a way back needs
     """
 
     def __init__(
@@ -279,7 +315,9 @@ class DenoiseKernel:
         num_steps: int | None = None,
         by_token: bool = False,
         pair: bool = False,
+        keep: bool = False,
     ) -> None:
+        assert not keep or (by_token and num_steps == 1 and not packed.fp8), "bfloat16 is kept, of one step"
         assert by_token == (num_steps is not None), "by token the table doesn't tell the number of steps"
         assert not (pair and by_token), "two observations have one time"
         assert not by_token or len(table) <= MAX_ROWS, len(table)
@@ -303,6 +341,7 @@ class DenoiseKernel:
             shared_bytes=properties.shared_memory_per_block_optin,  # type: ignore[attr-defined]
             by_token=by_token,
             pair=pair,
+            keep=keep,
         )
         with torch.cuda.device(device):
             arch = f"sm_{properties.major}{properties.minor}a"
@@ -317,6 +356,7 @@ class DenoiseKernel:
                     f"{torch.cuda.get_device_name(device)} holds {fitting}"
                 )
         self._suffix, self._blocks, self._by_token, self._pair = suffix, arrangement.blocks, by_token, pair
+        self._kept = _room_to_keep(config, suffix, device) if keep else None
         self._steps = len(table) if num_steps is None else num_steps
         self._table = table.to(device).float().contiguous()
         tables = Tables.make(self._packed, self._table)
@@ -363,6 +403,28 @@ class DenoiseKernel:
             self._launch(ARGS.value(values))
         else:
             self._launch(ARGS_BY_TOKEN.value(values | self._token_pointers(tokens)))
+
+    def launch_step(
+        self, step: int, x_t: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, v_t: Tensor, tokens: TokenInputs
+    ) -> KeptStep:
+        """See `kernels.interface.KeepingDenoiser`."""
+        assert self._kept is not None and length.dtype == torch.int64, length.dtype
+        kept, beside = self._kept
+        of_step = {name: getattr(tokens, name)[step : step + 1] for name in ("rows", "steps", "times")}
+        one = TokenInputs(**of_step, target=tokens.target, gain=beside["gain"])
+        own_k, own_v = (cache[:, cache.shape[1] - self._suffix :] for cache in (cache_k, cache_v))
+        values = self._values(x_t, cache_k, cache_v, beside["x_t"], v_t[None]) | self._token_pointers(one)
+        pointers = {
+            "length": length,
+            "kept_x": kept.stream,
+            "kept_q": kept.q,
+            "kept_gate_up": kept.gate_up,
+            "own_k": own_k,
+            "own_v": own_v,
+        }
+        values |= {name: t.data_ptr() for name, t in pointers.items()}
+        self._launch(ARGS_KEEPING.value(values | {"keys_ready": int(step > 0)}))
+        return kept
 
     def launch_pair(
         self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, segments: Tensor, x_t: Tensor, v_t: Tensor

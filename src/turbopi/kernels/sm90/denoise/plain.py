@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.config import ModelConfig
-from turbopi.kernels.interface import GemmaLayer, State, TokenInputs
+from turbopi.kernels.interface import GemmaLayer, KeptStep, State, TokenInputs
 from turbopi.kernels.portable.denoise.host import affine
 from turbopi.model.denoise import euler_step
 from turbopi.model.layers import rope_tables
@@ -27,12 +27,14 @@ def denoise_plain(
     length: int,
     operand: Operand = lambda x, layer, product: x,
     tokens: TokenInputs | None = None,
+    kept: KeptStep | None = None,
 ) -> tuple[Tensor, Tensor]:
     """What the kernel computes, in PyTorch and in `noise`'s dtype throughout: (x_t [N + 1, T, A], v_t [N, T, A]).
 
     operand  what becomes of the activations that meet a layer's weights: (x, layer, which of `KINDS`) -> x. The
         stream comes without its 1 / rms and the norm's shift, as the kernel adds both behind the product.
     tokens  every token's time in each step; `table` [U, 2L + 1, 3, D] then has a row for each time that occurs
+    kept    takes what a way back needs of the last step, and the cache's last rows the suffix's keys and values
     """
     g, dtype, suffix = config.expert, noise.dtype, noise.shape[0]
     positions = length + torch.arange(suffix, device=noise.device)
@@ -44,6 +46,8 @@ def denoise_plain(
     for step, modulation in enumerate(by_step):  # [2L + 1, 3, T or 1, D]
 
         def normed(x: Tensor, index: int, modulation: Tensor = modulation) -> tuple[Tensor, Tensor]:
+            if kept is not None:
+                kept.stream[index] = x
             scale, shift, gate = modulation[index]
             inverse = torch.rsqrt(x.square().mean(-1, keepdim=True) + config.rms_norm_eps)
             scaled = x * scale if index == 2 * g.depth else operand(x * scale, *divmod(2 * index, 4))
@@ -57,10 +61,15 @@ def denoise_plain(
             q, k = (_rotate(part, cos, sin) for part in (q, k))
             keys = torch.cat((cache_k[i, :length].to(dtype), k[:, 0]))
             values = torch.cat((cache_v[i, :length].to(dtype), v[:, 0]))
+            if kept is not None:
+                kept.q[i], cache_k[i, -suffix:], cache_v[i, -suffix:] = q.flatten(0, 1), k[:, 0], v[:, 0]
             attended = (q @ keys.T * g.head_dim**-0.5).softmax(-1) @ values
             x = x + operand(attended.reshape(suffix, -1), i, 1) @ layer.out.to(dtype).T * gate
             y, gate = normed(x, 2 * i + 1)
-            up_gate, up = (y @ layer.gate_up.to(dtype).T).chunk(2, dim=-1)
+            product = y @ layer.gate_up.to(dtype).T
+            if kept is not None:
+                kept.gate_up[i] = product
+            up_gate, up = product.chunk(2, dim=-1)
             x = x + operand(F.gelu(up_gate, approximate="tanh") * up, i, 3) @ layer.down.to(dtype).T * gate
         v_t.append(affine(small, "action_out_proj", normed(x, 2 * g.depth)[0]))
         if tokens is None:

@@ -103,6 +103,9 @@ extern "C" __global__ void __launch_bounds__(256) turbopi_denoise_prepare(const 
   }
   const int l = blockIdx.x / KEY_TILES, tile = blockIdx.x % KEY_TILES, length = PREFIX_ROWS(a);
   if (tile * 16 >= length) return;
+#ifdef TP_KEEP
+  if (a.keys_ready) return;
+#endif
   typedef unsigned short half;
   const half* k = (const half*)(a.cache_k + l * a.layer_stride)FIRST_ROW(a);
   const half* v = (const half*)(a.cache_v + l * a.layer_stride)FIRST_ROW(a);

@@ -48,12 +48,14 @@ __device__ __forceinline__ void finish_item(const Cta& b, QkvItem item, float4 c
     unsigned short* p = (unsigned short*)(staged + b.t() * 32) + b.g();
     p[0] = (unsigned short)f, p[8] = (unsigned short)(f >> 16);
     p[OTHER_HALF] = (unsigned short)s, p[OTHER_HALF + 8] = (unsigned short)(s >> 16);
+    KEEP(keep_queries(b, token, (b.q0() + item.at) * 8 + b.g(), make_float4(f0, s0, f1, s1));)
   } else {
     const int tile = b.kv0() + item.kv_tile, col = tile < QT ? tile * 8 + b.g() : HD + (tile - QT) * 16 + b.g(),
               up = tile < QT ? HD / 2 : 8;
     float* p = kv + size_t(token) * 2 * HD + col;
     if (token < T) publish(p, f0, bit), publish(p + up, s0, bit);
     if (token + 1 < T) publish(p + 2 * HD, f1, bit), publish(p + 2 * HD + up, s1, bit);
+    KEEP(keep_keys(b, tile < QT ? b.a.own_k : b.a.own_v, token, tile < QT ? col : col - HD, up, make_float4(f0, s0, f1, s1));)
   }
 }
 

@@ -36,6 +36,7 @@ __device__ __forceinline__ void gate_up(Cta& b, const Shifts& shifts, const floa
           static_assert(QUARTER == 2, "what `sent` has room for");
           sent = {units, make_uint4(data[0], data[1], bars[0], bars[1])};
         }
+        KEEP(keep_gate_up(b, own.tile[i], n, c, known_rms(b, n * 8 + 2 * b.t()), shift(i, k));)
       }
   if (IDLE) send_no_units(b);
 }

@@ -20,6 +20,7 @@ __device__ __forceinline__ void consume(Cta& b) {
   const Embedding first(b, a.table, 0);
   consumers_sync();
   first.multiply(b, x), first.send(b, x);
+  KEEP(keep_stream(b, x, 0);)
 #pragma unroll 1
   for (int step = 0; step < a.steps; ++step) {
     const float* const table = step_table(b, step);
@@ -54,6 +55,7 @@ __device__ __forceinline__ void consume(Cta& b) {
         MARK(half ? MARK_DOWN_PUBLISHED : MARK_OUT_PUBLISHED)
         note(b, half ? WAIT_X1 : WAIT_X2);
         gather(b, x, buffer, bit, gates, scales, !half || !last, half, half && last);
+        KEEP(keep_stream(b, x, 2 * b.n + half + 1);)
         MARK(half ? MARK_SLICE_AFTER_FEED_FORWARD : MARK_SLICE_AFTER_ATTENTION)
       }
     }

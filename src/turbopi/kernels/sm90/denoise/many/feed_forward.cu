@@ -36,6 +36,7 @@ __device__ __forceinline__ void gate_up(Cta& b, const Shifts& shifts, const floa
         const int n = own.n[i][k];
         const float4 c = FP8 ? scaled(own.sums[i][k], scale.of[i]) : own.sums[i][k];
         const u32 two = two_units(b, c, known_rms(b, n * 8 + 2 * b.t()), shift(i, k));
+        KEEP(keep_gate_up(b, own.tile[i], n, c, known_rms(b, n * 8 + 2 * b.t()), shift(i, k));)
         if constexpr (COPY_HIDDEN) {  // of a token that doesn't exist any
           byte* const p = b.smem + (place[i][k] - b.base) + (b.g() >> 1) * (FP8 ? 2 : 4);
           if (FP8)

@@ -20,6 +20,7 @@ __device__ __forceinline__ void consume(Cta& b) {
   for (int step = 0; step < a.steps; ++step) {
     const float* const table = step_table(b, step);
     embed_own(b, actions, x, table);
+    KEEP(keep_stream(b, x, 0);)
     MARK(MARK_EMBEDDED)
 #pragma unroll 1
     for (; b.n < u32(step + 1) * L; ++b.n) {
@@ -53,6 +54,7 @@ __device__ __forceinline__ void consume(Cta& b) {
         MARK(half ? MARK_DOWN_PUBLISHED : MARK_OUT_PUBLISHED)
         note(b, half ? WAIT_X1 : WAIT_X2);
         gather(b, x, buffer, bit, gates, scales, !half || !last, half);
+        KEEP(keep_stream(b, x, 2 * b.n + half + 1);)
         MARK(half ? MARK_SLICE_AFTER_FEED_FORWARD : MARK_SLICE_AFTER_ATTENTION)
       }
     }
