@@ -43,10 +43,9 @@ def exact(mode: Mode, x: Tensor, weights: Tensor, product: Tensor) -> Tensor:
 @pytest.mark.parametrize(
     ("mode", "tokens", "inner", "one"),
     [
-        *(("plain", 10, 512, Cut(512, 16, 1)), ("plain", 16, 1024, Cut(1024, 32, 1))),
-        *(("geglu", 10, 512, Cut(512, 32, 1)), ("geglu", 1, 512, Cut(512, 64, 1))),
-        *(("parts", 13, 1024, Cut(512, 64, 1)), ("plain", 29, 512, Cut(512, 64, 2))),
-        *(("geglu", 50, 256, Cut(256, 16, 4)), ("parts", 64, 512, Cut(256, 32, 4))),
+        *(("plain", 10, 512, Cut(512, 16)), ("plain", 16, 1024, Cut(1024, 32))),
+        *(("geglu", 10, 512, Cut(512, 32)), ("geglu", 1, 512, Cut(512, 64))),
+        *(("parts", 13, 1024, Cut(512, 64)), ("plain", 3, 512, Cut(512, 64))),
     ],
 )  # fmt: skip
 def test_on_a_cpu_it_is_the_product(mode: Mode, tokens: int, inner: int, one: Cut, seed: int, tmp_path: Path) -> None:
@@ -69,7 +68,7 @@ def test_on_a_cpu_it_is_the_product(mode: Mode, tokens: int, inner: int, one: Cu
 
 
 def test_the_full_models_products_fill_a_hopper_gpu_once() -> None:
-    for tokens in (1, 10, 16, 17, 50, 64):
+    for tokens in (1, 10, 16):
         for mode, inner, columns in (("plain", 1024, 2048), ("geglu", 1024, 4096), ("parts", 8192, 1024)):
             one = cut(mode, tokens, inner, columns)
             blocks = 64 if mode == "plain" else 128  # attention's way back, behind the first, begins on the others
@@ -78,14 +77,14 @@ def test_the_full_models_products_fill_a_hopper_gpu_once() -> None:
 
 
 def test_other_sizes_and_more_tokens_keep_other_kernels() -> None:
-    assert way_back(FULL, 10) is ACROSS and way_back(FULL, 64) is ACROSS
+    assert way_back(FULL, 10) is ACROSS and way_back(FULL, 17) is FEW_TOKENS is way_back(FULL, 64)
     assert way_back(FULL, 65) is BETWEEN_PRODUCTS and way_back(FULL, 10, masked=True) is BETWEEN_PRODUCTS
     for mode in ("plain", "geglu", "parts"):
-        assert cut(mode, 10, 96, 64) is None and cut(mode, 10, 512, 24) is None and cut(mode, 65, 1024, 64) is None
+        assert cut(mode, 10, 96, 64) is None and cut(mode, 10, 512, 24) is None and cut(mode, 17, 1024, 64) is None
 
 
 @on_hopper
-@pytest.mark.parametrize("tokens", [1, 10, 16, 17, 50, 64])
+@pytest.mark.parametrize("tokens", [1, 10, 16])
 @pytest.mark.parametrize("name", ["down_vjp", "out_vjp", "gate_up_vjp"])
 def test_on_a_gpu_it_is_as_exact_as_tritons(name: str, tokens: int) -> None:
     modes: dict[str, tuple[Mode, int, int]] = {

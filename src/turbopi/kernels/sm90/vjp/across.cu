@@ -1,5 +1,5 @@
 // x [T, inner] times a matrix [inner, columns] whose rows are read as they lie in memory, inner axis first: the way back
-// through a product of few tokens.
+// through a product of up to 16 tokens.
 //
 // A block takes COLUMNS columns and DEPTH of the inner axis, and asks for all of them, into shared memory, before it
 // waits for the kernel in front: memory is read while that one works. Behind the wait a warp multiplies its part of the
@@ -13,18 +13,16 @@
 typedef unsigned char byte;
 
 enum Mode { PLAIN, PARTS, GEGLU };
-constexpr int MODE = TP_MODE, M_TILES = TP_M_TILES, COLUMNS = TP_COLUMNS, DEPTH = TP_DEPTH;
+constexpr int MODE = TP_MODE, COLUMNS = TP_COLUMNS, DEPTH = TP_DEPTH;
 constexpr int WARPS = 16, THREADS = WARPS * 32;
-constexpr int PARTS_OF_DEPTH = WARPS / M_TILES, SLICE = DEPTH / PARTS_OF_DEPTH;  // a warp has 16 tokens
+constexpr int SLICE = DEPTH / WARPS;
 constexpr int CHUNKS = SLICE / 32;  // a lane has 16 bytes of a token's 32 columns
-constexpr int WANTED = M_TILES == 1 ? 4 : COLUMNS == 64 ? 1 : 2;  // at once: more of them spill
-constexpr int AT_ONCE = CHUNKS < WANTED ? CHUNKS : WANTED;
+constexpr int AT_ONCE = CHUNKS < 4 ? CHUNKS : 4;  // more of them spill
 constexpr int CHUNK_BYTES = 32 * COLUMNS * 2;  // of weights
 constexpr int N_TILES = COLUMNS / 8, ROW_CHUNKS = COLUMNS / 8;  // 16 bytes of a row
 constexpr int ROWS = THREADS / ROW_CHUNKS;                      // of weights, that all threads copy at once
 constexpr int PITCH = COLUMNS + 8;                              // of sums, float32
-constexpr int PAIRS = COLUMNS / 2, ITEMS = 16 * M_TILES * PAIRS, TURNS = (ITEMS + THREADS - 1) / THREADS;
-static_assert(M_TILES == 1 || M_TILES == 2 || M_TILES == 4, "warps share out the tokens");
+constexpr int PAIRS = COLUMNS / 2, ITEMS = 16 * PAIRS, TURNS = (ITEMS + THREADS - 1) / THREADS;
 static_assert(SLICE % 32 == 0 && CHUNKS % AT_ONCE == 0 && DEPTH % ROWS == 0 && ROWS % 32 == 0, "a warp's part of the inner axis");
 static_assert(COLUMNS == 16 || COLUMNS == 32 || COLUMNS == 64, "see `place`");
 constexpr int BARRIER = TP_SHARED_BYTES - 16;
@@ -110,9 +108,9 @@ extern "C" __global__ void __launch_bounds__(THREADS, 2)
   asm volatile("griddepcontrol.wait;" ::: "memory");
   asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
 
-  const int first = warp / M_TILES * SLICE, token = warp % M_TILES * 16 + g;
-  const byte* mine = x + ((long long)min(token, tokens - 1) * inner + part * DEPTH + first + t * 8) * 2;
-  const int to_high = token + 8 < tokens ? inner * 16 : 0;  // of tokens that don't exist others, and nobody reads their sums
+  const int first = warp * SLICE;
+  const byte* mine = x + ((long long)min(g, tokens - 1) * inner + part * DEPTH + first + t * 8) * 2;
+  const int to_high = g + 8 < tokens ? inner * 16 : 0;  // of tokens that don't exist others, and nobody reads their sums
   uint4 low[AT_ONCE], high[AT_ONCE];
 #pragma unroll
   for (int i = 0; i < AT_ONCE; ++i)
@@ -147,8 +145,8 @@ extern "C" __global__ void __launch_bounds__(THREADS, 2)
     if (of >= tokens) continue;
     float2 sum = make_float2(0, 0);
 #pragma unroll
-    for (int k = 0; k < PARTS_OF_DEPTH; ++k) {
-      const float2 v = *(const float2*)(room + ((k * M_TILES + of / 16) * 16 + of % 16) * PITCH + pair);
+    for (int k = 0; k < WARPS; ++k) {
+      const float2 v = *(const float2*)(room + (k * 16 + of) * PITCH + pair);
       sum.x += v.x, sum.y += v.y;
     }
     if (MODE == PARTS) {

@@ -28,7 +28,7 @@ WARPS: Final = 16
 # Blocks at most, where the columns allow it: one on a multiprocessor. Behind `out_vjp` comes attention, whose blocks
 # take a whole one each, and load what they need before it ends.
 BLOCKS: Final[dict[Mode, int]] = {"plain": 64, "parts": 132, "geglu": 132}
-MOST_TOKENS: Final = tiles.MOST_TOKENS  # beyond them Triton's kernels
+MOST_TOKENS: Final = 16  # beyond them Triton's kernels: at 50 they were faster on an H200
 TAKES: Final = Parameters(
     (
         Parameter("const unsigned char*", "x", "bf16 [T][inner]"),
@@ -44,11 +44,10 @@ TAKES: Final = Parameters(
 
 @dataclass(frozen=True)
 class Cut:
-    """Of the inner axis, columns and tokens: what a block takes."""
+    """Of the inner axis and the columns: what a block takes."""
 
     depth: int
     columns: int
-    m_tiles: int  # of 16 tokens
 
     @property
     def shared_bytes(self) -> int:
@@ -58,7 +57,6 @@ class Cut:
         """The kernel's compile-time constants."""
         return {
             "TP_MODE": MODES[mode],
-            "TP_M_TILES": self.m_tiles,
             "TP_COLUMNS": self.columns,
             "TP_DEPTH": self.depth,
             "TP_SHARED_BYTES": self.shared_bytes,
@@ -68,13 +66,12 @@ class Cut:
 @cache
 def cut(mode: Mode, tokens: int, inner: int, columns: int) -> Cut | None:
     """The narrowest blocks of which there are at most BLOCKS, else the widest; None: not covered."""
-    rows = -(-tokens // 16)
-    m_tiles, depth = 4 if rows == 3 else rows, tiles.split_of(inner) if mode == "parts" else inner
-    if m_tiles > 4 or depth % (32 * WARPS // m_tiles):
+    depth = tiles.split_of(inner) if mode == "parts" else inner
+    if tokens > MOST_TOKENS or depth % (32 * WARPS):
         return None
-    chunks = depth * m_tiles // 32 // WARPS  # of a warp
+    chunks = depth // 32 // WARPS  # of a warp
     found = [
-        Cut(depth, wide, m_tiles)
+        Cut(depth, wide)
         for wide in (16, 32, 64)
         if columns % wide == 0 and chunks in (1, 2, 4, 8) and depth % (WARPS * 256 // wide) == 0
     ]
@@ -138,8 +135,8 @@ def _across(one: Cut, mode: Mode, x: Tensor, weight: Tensor, product: Tensor | N
 
 
 ORIGIN: Final = (
-    f"CUDA and Triton for up to {MOST_TOKENS} tokens, else cuBLAS and Triton; forward, of one observation in bfloat16, "
-    "the denoising kernel"
+    f"CUDA and Triton for up to {MOST_TOKENS} tokens, Triton for up to {tiles.MOST_TOKENS}, else cuBLAS and Triton; "
+    "forward, of one observation in bfloat16, the denoising kernel"
 )
 ACROSS = replace(FEW_TOKENS, down_vjp=down_vjp, out_vjp=out_vjp, gate_up_vjp=gate_up_vjp, origin="CUDA and Triton")
 
