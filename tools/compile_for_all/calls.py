@@ -8,8 +8,19 @@ import torch
 from torch import Tensor
 
 from compile_for_all.targets import Target
-from turbopi.kernels.interface import SOURCE, Segments
-from turbopi.kernels.portable import activations, attention, backward, batch, embedding, norms, resize, rope, rounding
+from turbopi.kernels.interface import SOURCE, Segments, StepEnd
+from turbopi.kernels.portable import (
+    activations,
+    attention,
+    backward,
+    batch,
+    batch_steps,
+    embedding,
+    norms,
+    resize,
+    rope,
+    rounding,
+)
 from turbopi.kernels.portable.attention_tiles import Attention, AttentionTile
 from turbopi.kernels.portable.attention_tiles import candidates as attention_candidates
 from turbopi.kernels.portable.gemm import tiles
@@ -164,12 +175,26 @@ def _batch(target: Target, inverses: tuple[Input, ...]) -> Calls:
         return batch.packed_attention(of(2 * PREFIX * 8, 256), k, k, segments, 8, tile=tile, **input)
 
     def suffix(count: int, state_token: bool, tile: AttentionTile, input: Input) -> Tensor:
-        prefix, own, rows = of(count * PREFIX, 256), of(count * SUFFIX, 256), of(count + 1, dtype=torch.int32)
-        queries, inverse = of(count * SUFFIX * 8, 256), input.get("inverse")
-        return batch.suffix_attention(queries, prefix, prefix, own, own, rows, rows, 8, state_token, inverse, tile=tile)
+        prefix, rows, inverse = of(count * PREFIX, 256), of(count + 1, dtype=torch.int32), input.get("inverse")
+        given = of(count * SUFFIX, 2560), *[of(count * SUFFIX, 128, dtype=F32)] * 2, prefix, prefix, rows, rows
+        return batch.suffix_attention(*given, 8, state_token, inverse, tile=tile)
 
     def embed() -> None:
         batch.embed_rows(of(2 * PREFIX, dtype=torch.int64), of(4 * 256, 2048), of(257152, 2048), of(2 * PREFIX, 2048))
+
+    def norm(parts: int | None, input: Input) -> Any:
+        """Of a modulated norm, and of Pi0's."""
+        y, of_all = None if parts is None else of(*([parts] if parts else []), SUFFIX, 1024), of(1024, dtype=F32)
+        modulated = (None if y is None else of_all, of_all, of_all) if parts != 1 else (None, of_all, None)
+        return batch_steps.residual_rms_norm(of(SUFFIX, 1024), y, *modulated, 1e-6, **input)
+
+    def end(parts: int) -> Tensor:
+        width, actions, of_all = 1024, 32, of(1024, dtype=F32)
+        out = of(actions, width, dtype=F32), of(actions, dtype=F32)
+        into = of(width, actions, dtype=F32), of(width, dtype=F32)
+        x, y = of(SUFFIX, width), of(*([parts] if parts else []), SUFFIX, width)
+        chunks = [of(SUFFIX, actions, dtype=F32)] * 3
+        return batch_steps.end_step(x, y, of_all, StepEnd(of_all, of_all, 1e-6, out, -0.1, into), *chunks)
 
     beside = tuple(one for one in inverses if one.get("numbers") != torch.int8)  # of INT8's expert: bfloat16
     suffixes = _in_tiles(target, "suffix_attention", 256, beside)
@@ -178,6 +203,8 @@ def _batch(target: Target, inverses: tuple[Input, ...]) -> Calls:
         *(partial(packed, *one) for one in _in_tiles(target, "packed_attention", 256, inverses)),
         *(partial(suffix, count, False, *one) for count in (2, 16) for one in suffixes),
         *(partial(suffix, count, True, *one) for count in (2, 16) for one in suffixes if not one[1]),
+        *(partial(norm, parts, one) for parts in (None, 0, 1, 4, 8) for one in beside),
+        *(partial(end, parts) for parts in (0, 4, 8)),
     ]
 
 
