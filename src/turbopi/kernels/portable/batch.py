@@ -145,7 +145,7 @@ def _logits(lower, upper, k_lower, k_upper, visible, scale):
 def _suffix_kernel(
     qkv, cos, sin, prefix_k, prefix_v, starts, lengths, out, parts, weights, rows, tokens, heads, scale, inverse,
     HALF: tl.constexpr, BLOCK_HALF: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr,
-    LINES: tl.constexpr, SPLITS: tl.constexpr, STATE_TOKEN: tl.constexpr, SCALED: tl.constexpr, PDL: tl.constexpr,
+    BLOCK_T: tl.constexpr, LINES: tl.constexpr, SPLITS: tl.constexpr, STATE_TOKEN: tl.constexpr, SCALED: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     """BLOCK_M rows of one observation's queries over every SPLITS-th tile of its prefix; the last split has its suffix.
 
@@ -185,17 +185,18 @@ def _suffix_kernel(
         logits = _logits(lower, upper, k_lower, k_upper, valid[None, :], scale)
         acc, top, total = _softmax_step(logits, values, acc, top, total)
     if split == SPLITS - 1:
-        for start in range(0, tokens, BLOCK_N):
-            valid = start + n < tokens
+        t = tl.arange(0, BLOCK_T)
+        for start in tl.range(0, tokens, BLOCK_T, num_stages=1):  # RoPE's float32 would fill shared memory
+            valid = start + t < tokens
             halves = valid[:, None] & (pair < HALF)[None, :]
-            beside = batch * tokens + start + n
+            beside = batch * tokens + start + t
             k_at = qkv + (beside.to(tl.int64)[:, None] * width + heads * DIM)
             turn = beside[:, None] * HALF + pair[None, :]
             k_lower, k_upper = _turned(k_at + pair[None, :], cos, sin, turn, halves, HALF)
             values = tl.load(k_at + DIM + d[None, :], valid[:, None] & (d < DIM)[None, :], 0.0)
             visible = valid[None, :]
             if STATE_TOKEN:
-                visible = visible & ((own >= heads)[:, None] | (start + n == 0)[None, :])
+                visible = visible & ((own >= heads)[:, None] | (start + t == 0)[None, :])
             logits = _logits(lower, upper, k_lower, k_upper, visible, scale)
             acc, top, total = _softmax_step(logits, values, acc, top, total)
     m = batch * rows + own
@@ -271,7 +272,7 @@ def suffix_attention(
     _suffix_kernel[(along, batch, splits)](
         *given, out, parts, weights, rows, count // batch, heads, dim**-0.5 * LOG2_E, inverse or 1.0,
         HALF=dim // 2, BLOCK_HALF=max(16, triton.next_power_of_2(dim // 2)), BLOCK_M=tile.rows, BLOCK_N=tile.keys,
-        LINES=triton.cdiv(triton.next_power_of_2(dim), 64), STATE_TOKEN=state_token,
+        BLOCK_T=16 if count // batch <= 16 else 32, LINES=triton.cdiv(triton.next_power_of_2(dim), 64), STATE_TOKEN=state_token,
         num_warps=tile.warps, num_stages=tile.stages, **sizes, **dependent_launch(qkv),
     )  # fmt: skip
     if splits > 1:
