@@ -139,9 +139,7 @@ def test_embedding_rows() -> None:
 @pytest.mark.parametrize("parts", [None, 0, 3])
 @pytest.mark.parametrize(("gated", "shifted"), [(True, True), (False, True), (False, False)])
 @pytest.mark.parametrize("width", [64, 96])
-def test_the_experts_norm_is_that_of_one_observation(
-    parts: int | None, gated: bool, shifted: bool, width: int
-) -> None:
+def test_the_experts_norm_is_that_of_one_observation(parts: int | None, gated: bool, shifted: bool, width: int) -> None:
     """`norms.residual_rms_norm`, whose twin is compared with it elsewhere: the same to the last bit."""
     tokens = 5
     y = None if parts is None else random(*([parts] if parts else []), tokens, width, seed=1)

@@ -176,8 +176,8 @@ def _batch(target: Target, inverses: tuple[Input, ...]) -> Calls:
 
     def suffix(count: int, state_token: bool, tile: AttentionTile, input: Input) -> Tensor:
         prefix, rows, inverse = of(count * PREFIX, 256), of(count + 1, dtype=torch.int32), input.get("inverse")
-        given = of(count * SUFFIX, 2560), *[of(count * SUFFIX, 128, dtype=F32)] * 2, prefix, prefix, rows, rows
-        return batch.suffix_attention(*given, 8, state_token, inverse, tile=tile)
+        qkv, cos = of(count * SUFFIX, 2560), of(count * SUFFIX, 128, dtype=F32)
+        return batch.suffix_attention(qkv, cos, cos, prefix, prefix, rows, rows, 8, state_token, inverse, tile=tile)
 
     def embed() -> None:
         batch.embed_rows(of(2 * PREFIX, dtype=torch.int64), of(4 * 256, 2048), of(257152, 2048), of(2 * PREFIX, 2048))
@@ -185,8 +185,8 @@ def _batch(target: Target, inverses: tuple[Input, ...]) -> Calls:
     def norm(parts: int | None, input: Input) -> Any:
         """Of a modulated norm, and of Pi0's."""
         y, of_all = None if parts is None else of(*([parts] if parts else []), SUFFIX, 1024), of(1024, dtype=F32)
-        modulated = (None if y is None else of_all, of_all, of_all) if parts != 1 else (None, of_all, None)
-        return batch_steps.residual_rms_norm(of(SUFFIX, 1024), y, *modulated, 1e-6, **input)
+        shift, gate = (None, None) if parts == 1 else (of_all, None if y is None else of_all)
+        return batch_steps.residual_rms_norm(of(SUFFIX, 1024), y, gate, of_all, shift, 1e-6, **input)
 
     def end(parts: int) -> Tensor:
         width, actions, of_all = 1024, 32, of(1024, dtype=F32)

@@ -217,9 +217,7 @@ class BatchLoop:
         config, small = self._buffers.config, weights.small
         batched, table = self._buffers.ops.batch or PLAIN_BATCH, self._table
         assert table is not None, "Pi0.5's norms are modulated"
-        out, into = (
-            (small[f"{name}.weight"], small[f"{name}.bias"]) for name in ("action_out_proj", "action_in_proj")
-        )
+        out, into = ((small[f"{name}.weight"], small[f"{name}.bias"]) for name in ("action_out_proj", "action_in_proj"))
         tokens = self._suffix(weights, 0)
         for step in range(self._steps):
             x, y, gate = self._layers(weights, step, rope, tokens)

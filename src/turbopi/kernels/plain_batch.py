@@ -52,8 +52,9 @@ def suffix_attention(
     state_token: bool = False,
     inverse: float | None = None,
 ) -> Tensor:
-    """Each observation's T tokens over its prefix and each other: q|k|v [B * T, (n + 2) * K], before RoPE of cos and sin
-    float32[B * T, K/2] -> [B * T, n * K].
+    """Each observation's T tokens over its prefix and each other: q|k|v [B * T, (n + 2) * K] -> [B * T, n * K].
+
+    cos, sin float32[B * T, K/2]: RoPE, which the suffix's queries and keys haven't had.
 
     prefix_k, prefix_v [rows, K]; those of observation b begin at starts[b], int32[B + 1], and are lengths[b] many. With
     `state_token` the first token of an observation sees no other one of them (Pi0).

@@ -125,7 +125,7 @@ def packed_attention(
 
 @triton.jit
 def _turned(at, cos, sin, turn, there, HALF: tl.constexpr):
-    """Both halves of heads after RoPE, in their own dtype: HALF columns at `at` and HALF more; `turn`: in the tables."""
+    """Both halves of heads after RoPE, in their dtype: HALF columns at `at` and HALF more. turn: where the angle is."""
     first = tl.load(at, there, 0.0).to(tl.float32)
     second = tl.load(at + HALF, there, 0.0).to(tl.float32)
     c, s = tl.load(cos + turn, there, 0.0), tl.load(sin + turn, there, 0.0)
@@ -145,7 +145,8 @@ def _logits(lower, upper, k_lower, k_upper, visible, scale):
 def _suffix_kernel(
     qkv, cos, sin, prefix_k, prefix_v, starts, lengths, out, parts, weights, rows, tokens, heads, scale, inverse,
     HALF: tl.constexpr, BLOCK_HALF: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr,
-    BLOCK_T: tl.constexpr, LINES: tl.constexpr, SPLITS: tl.constexpr, STATE_TOKEN: tl.constexpr, SCALED: tl.constexpr, PDL: tl.constexpr,
+    BLOCK_T: tl.constexpr, LINES: tl.constexpr, SPLITS: tl.constexpr, STATE_TOKEN: tl.constexpr, SCALED: tl.constexpr,
+    PDL: tl.constexpr,
 ):  # fmt: skip
     """BLOCK_M rows of one observation's queries over every SPLITS-th tile of its prefix; the last split has its suffix.
 
@@ -272,8 +273,8 @@ def suffix_attention(
     _suffix_kernel[(along, batch, splits)](
         *given, out, parts, weights, rows, count // batch, heads, dim**-0.5 * LOG2_E, inverse or 1.0,
         HALF=dim // 2, BLOCK_HALF=max(16, triton.next_power_of_2(dim // 2)), BLOCK_M=tile.rows, BLOCK_N=tile.keys,
-        BLOCK_T=16 if count // batch <= 16 else 32, LINES=triton.cdiv(triton.next_power_of_2(dim), 64), STATE_TOKEN=state_token,
-        num_warps=tile.warps, num_stages=tile.stages, **sizes, **dependent_launch(qkv),
+        BLOCK_T=16 if count // batch <= 16 else 32, LINES=triton.cdiv(triton.next_power_of_2(dim), 64),
+        STATE_TOKEN=state_token, num_warps=tile.warps, num_stages=tile.stages, **sizes, **dependent_launch(qkv),
     )  # fmt: skip
     if splits > 1:
         _combine_kernel[(batch * rows,)](
