@@ -149,10 +149,10 @@ class Pictures:
                     self._array[camera] = picture
                     self.images[camera].copy_(self.host[camera], non_blocking=True)
         elif pictures:
-            assert len(pictures) == self.cameras, f"{len(pictures)} pictures, {self.cameras} places"
-            for first in range(0, self.cameras, AT_ONCE):  # some travel while the host copies the next ones
+            placed = list(zip(self._array, pictures, strict=True))
+            for first in range(0, len(placed), AT_ONCE):  # some travel while the host copies the next ones
                 some = slice(first, first + AT_ONCE)
-                for target, picture in zip(self._array[some], pictures[some], strict=True):
+                for target, picture in placed[some]:
                     target[:] = picture
                 self.images[some].copy_(self.host[some], non_blocking=True)
 
