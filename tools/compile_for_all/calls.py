@@ -167,16 +167,18 @@ def _in_tiles(
 
 
 def _batch(target: Target, inverses: tuple[Input, ...]) -> Calls:
-    """Of two and sixteen observations: keys of a suffix split over blocks, and in one. In every tile."""
+    """Of two and sixteen observations: keys of a suffix split over blocks, and in one; of eight with few actions. In
+    every tile.
+    """
 
     def packed(tile: AttentionTile, input: Input) -> Tensor:
         k, rows = of(2 * PREFIX, 256), of(3, dtype=torch.int32)
         segments = Segments(rows, rows, of(143, 4, dtype=torch.int32))
         return batch.packed_attention(of(2 * PREFIX * 8, 256), k, k, segments, 8, tile=tile, **input)
 
-    def suffix(count: int, state_token: bool, tile: AttentionTile, input: Input) -> Tensor:
+    def suffix(count: int, tokens: int, state_token: bool, tile: AttentionTile, input: Input) -> Tensor:
         prefix, rows, inverse = of(count * PREFIX, 256), of(count + 1, dtype=torch.int32), input.get("inverse")
-        qkv, cos = of(count * SUFFIX, 2560), of(count * SUFFIX, 128, dtype=F32)
+        qkv, cos = of(count * tokens, 2560), of(count * tokens, 128, dtype=F32)
         return batch.suffix_attention(qkv, cos, cos, prefix, prefix, rows, rows, 8, state_token, inverse, tile=tile)
 
     def embed() -> None:
@@ -201,8 +203,9 @@ def _batch(target: Target, inverses: tuple[Input, ...]) -> Calls:
     return [
         embed,
         *(partial(packed, *one) for one in _in_tiles(target, "packed_attention", 256, inverses)),
-        *(partial(suffix, count, False, *one) for count in (2, 16) for one in suffixes),
-        *(partial(suffix, count, True, *one) for count in (2, 16) for one in suffixes if not one[1]),
+        *(partial(suffix, 8, 10, False, *one) for one in suffixes),
+        *(partial(suffix, count, SUFFIX, False, *one) for count in (2, 16) for one in suffixes),
+        *(partial(suffix, count, SUFFIX, True, *one) for count in (2, 16) for one in suffixes if not one[1]),
         *(partial(norm, parts, one) for parts in (None, 0, 1, 4, 8) for one in beside),
         *(partial(end, parts) for parts in (0, 4, 8)),
     ]
