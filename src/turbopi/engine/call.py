@@ -27,7 +27,6 @@ from turbopi.model.conditioning import Conditioning
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.preprocess.images import fitted
 
-
 AT_ONCE = 4  # pictures that one copy to the device has, 0.6 MB: a copy costs the host a tenth of what it takes to fill
 
 
