@@ -16,9 +16,10 @@ ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine.packing import pack_rows  # noqa: E402
-from turbopi.kernels import plain_batch  # noqa: E402
-from turbopi.kernels.interface import Segments  # noqa: E402
+from turbopi.kernels import plain, plain_batch  # noqa: E402
+from turbopi.kernels.interface import Segments, StepEnd  # noqa: E402
 from turbopi.kernels.portable import batch as portable_batch  # noqa: E402
+from turbopi.kernels.portable import batch_steps, norms  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
@@ -97,11 +98,12 @@ def test_suffix_attention(lengths: list[int], blocks: int, state_token: bool, mo
     batch, tokens = len(lengths), 3
     prefix_k, prefix_v = random(sum(lengths) + 400, DIM), random(sum(lengths) + 400, DIM, seed=1)
     prefix_k[sum(lengths) :] = prefix_v[sum(lengths) :] = torch.nan
-    q = random(batch * tokens * HEADS, DIM, seed=2)
-    k, v = random(batch * tokens, DIM, seed=3), random(batch * tokens, DIM, seed=4)
-    given = (q, prefix_k, prefix_v, k, v, segments.starts, segments.lengths, HEADS, state_token)
+    qkv, turn = random(batch * tokens, (HEADS + 2) * DIM, seed=2), angles(batch * tokens)
+    given = (qkv, *turn, prefix_k, prefix_v, segments.starts, segments.lengths, HEADS, state_token)
     ours = portable_batch.suffix_attention(*given)
     torch.testing.assert_close(ours, plain_batch.suffix_attention(*given), atol=TOLERANCE, rtol=TOLERANCE)
+    k, v = torch.empty(batch * tokens, DIM, device=DEVICE, dtype=DTYPE), qkv[:, -DIM:]
+    q = plain.rope_split(qkv, *turn, k, torch.empty_like(k))
     at = 0
     for row, length in enumerate(lengths):
         own, mine = slice(at, at + length), slice(row * tokens, (row + 1) * tokens)
@@ -115,6 +117,12 @@ def test_suffix_attention(lengths: list[int], blocks: int, state_token: bool, mo
         at += length
 
 
+def angles(tokens: int) -> tuple[Tensor, Tensor]:
+    """Cosines and sines float32[tokens, K/2]: other ones for each token, so that a row's neighbour's show."""
+    turned = torch.rand(tokens, DIM // 2, generator=torch.Generator().manual_seed(9)).to(DEVICE) * 6
+    return turned.cos(), turned.sin()
+
+
 def test_keys_are_split_as_there_are_blocks_to_fill() -> None:
     assert portable_batch.suffix_splits(40, 720, 64) == 6
     assert portable_batch.suffix_splits(40, 100, 64) == 1 and portable_batch.suffix_splits(1000, 720, 64) == 1
@@ -126,3 +134,46 @@ def test_embedding_rows() -> None:
     portable_batch.embed_rows(source, pictures, table, ours)
     plain_batch.embed_rows(source, pictures, table, twin)
     assert torch.equal(ours, twin) and torch.equal(ours[[0, 3, 4]], pictures[[2, 5, 0]])
+
+
+@pytest.mark.parametrize("parts", [None, 0, 3])
+@pytest.mark.parametrize(("gated", "shifted"), [(True, True), (False, True), (False, False)])
+@pytest.mark.parametrize("width", [64, 96])
+def test_the_experts_norm_is_that_of_one_observation(parts: int | None, gated: bool, shifted: bool, width: int) -> None:
+    """`norms.residual_rms_norm`, whose twin is compared with it elsewhere: the same to the last bit."""
+    tokens = 5
+    y = None if parts is None else random(*([parts] if parts else []), tokens, width, seed=1)
+    gate, scale, shift = (random(width, seed=seed).float() for seed in (2, 3, 4))
+    given = (random(tokens, width), y, gate if gated and y is not None else None, scale, shift if shifted else None)
+    for rounded in ({}, {"inverse": 30.0, "numbers": torch.int8}):
+        ours, theirs = (one.residual_rms_norm(*given, 1e-6, **rounded) for one in (batch_steps, norms))
+        assert torch.equal(ours[0], theirs[0]) and torch.equal(ours[1], theirs[1])
+        assert ours[1].dtype == rounded.get("numbers", DTYPE) and bool(ours[1].float().abs().max() > 0)
+
+
+def test_the_experts_norm_of_rows_with_their_own_modulation() -> None:
+    x, y = random(5, 64), random(5, 64, seed=1)
+    gate, scale, shift = (random(5, 64, seed=seed).float() for seed in (2, 3, 4))
+    ours = batch_steps.residual_rms_norm(x, y, gate, scale, shift, 1e-6)
+    twin = plain.residual_rms_norm(x, y, gate, scale, shift, 1e-6)
+    torch.testing.assert_close(ours, twin, atol=TOLERANCE, rtol=TOLERANCE)
+
+
+@pytest.mark.parametrize("parts", [0, 2])
+@pytest.mark.parametrize("gated", [False, True])
+@pytest.mark.parametrize(("rows", "width", "actions"), [(6, 64, 32), (3, 96, 7), (265, 64, 8)])
+def test_a_steps_end(rows: int, width: int, actions: int, gated: bool, parts: int) -> None:
+    x, y = random(rows, width), random(*([parts] if parts else []), rows, width, seed=1)
+    gate, scale, shift = (random(width, seed=seed).float() for seed in (2, 3, 4))
+    out = random(actions, width, seed=5).float() / width**0.5, random(actions, seed=6).float()
+    into = random(width, actions, seed=7).float() / actions**0.5, random(width, seed=8).float()
+    end = StepEnd(scale, shift, 1e-6, out, -0.1, into)
+    x_t = random(rows, actions, seed=9).float()
+    ours, twin = ([torch.full((rows, actions), torch.nan, device=DEVICE) for _ in range(2)] for _ in range(2))
+    given = gate if gated else None, end, x_t
+    tokens = batch_steps.end_step(x.clone(), y, *given, *ours)
+    whole = y.float().sum(0).to(DTYPE) if parts else y
+    expected = plain_batch.end_step(x, whole, *given, *twin)
+    torch.testing.assert_close(ours, twin, atol=TOLERANCE, rtol=TOLERANCE)
+    torch.testing.assert_close(tokens, expected, atol=TOLERANCE, rtol=TOLERANCE)
+    assert tokens.dtype == x.dtype and torch.equal(ours[0], ours[0]) and bool((ours[0] != x_t).any())

@@ -51,9 +51,9 @@ def recording(ran: Ran) -> Ops:
         ran["packed_attention", len(k), heads, q.shape[1]] += 1
         return PLAIN_BATCH.packed_attention(q, k, v, segments, heads)
 
-    def suffix(q: Tensor, pk: Tensor, pv: Tensor, k: Tensor, v: Tensor, *rest: Any) -> Tensor:
-        ran["suffix_attention", len(k), rest[2], q.shape[1]] += 1
-        return PLAIN_BATCH.suffix_attention(q, pk, pv, k, v, *rest)
+    def suffix(qkv: Tensor, cos: Tensor, sin: Tensor, k: Tensor, *rest: Any) -> Tensor:
+        ran["suffix_attention", len(qkv), rest[3], k.shape[1]] += 1
+        return PLAIN_BATCH.suffix_attention(qkv, cos, sin, k, *rest)
 
     return replace(
         PLAIN,

@@ -8,8 +8,19 @@ import torch
 from torch import Tensor
 
 from compile_for_all.targets import Target
-from turbopi.kernels.interface import SOURCE, Segments
-from turbopi.kernels.portable import activations, attention, backward, batch, embedding, norms, resize, rope, rounding
+from turbopi.kernels.interface import SOURCE, Segments, StepEnd
+from turbopi.kernels.portable import (
+    activations,
+    attention,
+    backward,
+    batch,
+    batch_steps,
+    embedding,
+    norms,
+    resize,
+    rope,
+    rounding,
+)
 from turbopi.kernels.portable.attention_tiles import Attention, AttentionTile
 from turbopi.kernels.portable.attention_tiles import candidates as attention_candidates
 from turbopi.kernels.portable.gemm import tiles
@@ -156,28 +167,47 @@ def _in_tiles(
 
 
 def _batch(target: Target, inverses: tuple[Input, ...]) -> Calls:
-    """Of two and sixteen observations: keys of a suffix split over blocks, and in one. In every tile."""
+    """Of two and sixteen observations: keys of a suffix split over blocks, and in one; of eight with few actions. In
+    every tile.
+    """
 
     def packed(tile: AttentionTile, input: Input) -> Tensor:
         k, rows = of(2 * PREFIX, 256), of(3, dtype=torch.int32)
         segments = Segments(rows, rows, of(143, 4, dtype=torch.int32))
         return batch.packed_attention(of(2 * PREFIX * 8, 256), k, k, segments, 8, tile=tile, **input)
 
-    def suffix(count: int, state_token: bool, tile: AttentionTile, input: Input) -> Tensor:
-        prefix, own, rows = of(count * PREFIX, 256), of(count * SUFFIX, 256), of(count + 1, dtype=torch.int32)
-        queries, inverse = of(count * SUFFIX * 8, 256), input.get("inverse")
-        return batch.suffix_attention(queries, prefix, prefix, own, own, rows, rows, 8, state_token, inverse, tile=tile)
+    def suffix(count: int, tokens: int, state_token: bool, tile: AttentionTile, input: Input) -> Tensor:
+        prefix, rows, inverse = of(count * PREFIX, 256), of(count + 1, dtype=torch.int32), input.get("inverse")
+        qkv, cos = of(count * tokens, 2560), of(count * tokens, 128, dtype=F32)
+        return batch.suffix_attention(qkv, cos, cos, prefix, prefix, rows, rows, 8, state_token, inverse, tile=tile)
 
     def embed() -> None:
         batch.embed_rows(of(2 * PREFIX, dtype=torch.int64), of(4 * 256, 2048), of(257152, 2048), of(2 * PREFIX, 2048))
+
+    def norm(parts: int | None, input: Input) -> Any:
+        """Of a modulated norm, and of Pi0's."""
+        y, of_all = None if parts is None else of(*([parts] if parts else []), SUFFIX, 1024), of(1024, dtype=F32)
+        shift, gate = (None, None) if parts == 1 else (of_all, None if y is None else of_all)
+        return batch_steps.residual_rms_norm(of(SUFFIX, 1024), y, gate, of_all, shift, 1e-6, **input)
+
+    def end(parts: int) -> Tensor:
+        width, actions, of_all = 1024, 32, of(1024, dtype=F32)
+        out = of(actions, width, dtype=F32), of(actions, dtype=F32)
+        into = of(width, actions, dtype=F32), of(width, dtype=F32)
+        x, y = of(SUFFIX, width), of(*([parts] if parts else []), SUFFIX, width)
+        chunks = [of(SUFFIX, actions, dtype=F32)] * 3
+        return batch_steps.end_step(x, y, of_all, StepEnd(of_all, of_all, 1e-6, out, -0.1, into), *chunks)
 
     beside = tuple(one for one in inverses if one.get("numbers") != torch.int8)  # of INT8's expert: bfloat16
     suffixes = _in_tiles(target, "suffix_attention", 256, beside)
     return [
         embed,
         *(partial(packed, *one) for one in _in_tiles(target, "packed_attention", 256, inverses)),
-        *(partial(suffix, count, False, *one) for count in (2, 16) for one in suffixes),
-        *(partial(suffix, count, True, *one) for count in (2, 16) for one in suffixes if not one[1]),
+        *(partial(suffix, 8, 10, False, *one) for one in suffixes),
+        *(partial(suffix, count, SUFFIX, False, *one) for count in (2, 16) for one in suffixes),
+        *(partial(suffix, count, SUFFIX, True, *one) for count in (2, 16) for one in suffixes if not one[1]),
+        *(partial(norm, parts, one) for parts in (None, 0, 1, 4, 8) for one in beside),
+        *(partial(end, parts) for parts in (0, 4, 8)),
     ]
 
 

@@ -202,8 +202,8 @@ FAULTS = (
     Fault(
         "an Euler step in the wrong direction",
         "turbopi.model",
-        "return x_t + float(np.float32(-1.0 / num_steps)) * v_t",
-        "return x_t - float(np.float32(-1.0 / num_steps)) * v_t",
+        "return x_t + step_size(num_steps) * v_t",
+        "return x_t - step_size(num_steps) * v_t",
         "denoising adds noise",
         (PARITY,),
     ),

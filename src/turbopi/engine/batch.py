@@ -26,10 +26,10 @@ from turbopi.engine.flat import allocate
 from turbopi.engine.packing import most_tiles, pack_rows
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.weights import Weights
-from turbopi.kernels.interface import Ops, PairDenoiser, Segments
+from turbopi.kernels.interface import Ops, PairDenoiser, Segments, StepEnd
 from turbopi.kernels.plain_batch import PLAIN_BATCH, visible_to_suffix
 from turbopi.model.conditioning import Conditioning
-from turbopi.model.denoise import euler_step, time_embedding, time_grid
+from turbopi.model.denoise import euler_step, step_size, time_embedding, time_grid
 
 PLAIN_ROW = Conditioning()  # of an observation that asks for nothing, or an empty place
 
@@ -153,10 +153,9 @@ class BatchLoop:
         self._rope = forward.rope_of_all_positions(config, buffers.rows + self._tokens, device)
         self.x_t = torch.empty(loop.steps + 1, *chunk, device=device)
         self.v_t = torch.empty(loop.steps, *chunk, device=device)
-        size, dtype = (batch * self._tokens, config.vlm.head_dim), buffers.weights.embed_tokens.dtype
-        self._keys, self._values = (torch.empty(size, device=device, dtype=dtype) for _ in range(2))
-        self._whole_rows = -(-(buffers.rows + len(self._keys)) // 16) * 16  # of `_whole_cache`; as `cache_rows`
-        self._seen = torch.tensor([self._whole_rows - len(self._keys)], device=device)  # all: `hidden` says what isn't
+        self._suffix_rows = batch * self._tokens
+        self._whole_rows = -(-(buffers.rows + self._suffix_rows) // 16) * 16  # of `_whole_cache`; as `cache_rows`
+        self._seen = torch.tensor([self._whole_rows - self._suffix_rows], device=device)  # all: `hidden` has what isn't
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
 
     def write(
@@ -195,6 +194,9 @@ class BatchLoop:
         positions = (lengths[:, None] + self._offsets).flatten()
         rope = (self._rope[0][positions], self._rope[1][positions])
         self.x_t[0] = self._noise
+        if self._asked is None and self._buffers.config.kind == "pi05":
+            self._run_plain_steps(weights, rope)
+            return
         whole = self._whole_cache() if self._loop.form == "jacobian" else None
         for step in range(self._steps):
             x_t, asked = self.x_t[step], self._asked
@@ -210,23 +212,38 @@ class BatchLoop:
                 self.x_t[step + 1] = asked.next_x(step, x_t, v_t)
             self.v_t[step] = v_t
 
-    def _velocity(self, weights: Weights, step: int, rope: forward.Rope) -> Tensor:
-        """v_t float32[B, H, A]"""
-        buffers = self._buffers
-        config, ops = buffers.config, buffers.ops
-        batched, heads = ops.batch or PLAIN_BATCH, config.expert.num_heads
+    def _run_plain_steps(self, weights: Weights, rope: forward.Rope) -> None:
+        """Pi0.5's, where one operation leads from a step's last layer to the next one's tokens."""
+        config, small = self._buffers.config, weights.small
+        batched, table = self._buffers.ops.batch or PLAIN_BATCH, self._table
+        assert table is not None, "Pi0.5's norms are modulated"
+        out, into = ((small[f"{name}.weight"], small[f"{name}.bias"]) for name in ("action_out_proj", "action_in_proj"))
+        tokens = self._suffix(weights, 0)
+        for step in range(self._steps):
+            x, y, gate = self._layers(weights, step, rope, tokens)
+            scale, shift, _ = table[step, -1].unbind(0)
+            end = StepEnd(scale, shift, config.rms_norm_eps, out, step_size(self._steps), into)
+            chunks = (one.flatten(0, 1) for one in (self.x_t[step], self.x_t[step + 1], self.v_t[step]))
+            tokens = batched.end_step(x, y, gate, end, *chunks)
 
-        def places(i: int) -> tuple[Tensor, Tensor]:
-            return self._keys, self._values
+    def _layers(self, weights: Weights, step: int, rope: forward.Rope, tokens: Tensor) -> forward.Stream:
+        buffers, config = self._buffers, self._buffers.config
+        batched, heads = buffers.ops.batch or PLAIN_BATCH, config.expert.num_heads
 
-        def attend(i: int, q: Tensor, **input: Any) -> Tensor:
-            prefix, suffix = (buffers.cache.k[i], buffers.cache.v[i]), (self._keys, self._values)
+        def attend(i: int, qkv: Tensor, **input: Any) -> Tensor:
+            prefix = buffers.cache.k[i], buffers.cache.v[i]
             return batched.suffix_attention(
-                q, *prefix, *suffix, *buffers.segments, heads, config.kind == "pi0", **input
+                qkv, *rope, *prefix, *buffers.segments, heads, config.kind == "pi0", **input
             )
 
-        tokens, table = self._suffix(weights, step), self._modulation(step)
-        out = forward.expert_layers(config, weights, ops, tokens, table, rope, places, attend)
+        ops, table = batched.expert(buffers.ops, weights.expert), self._modulation(step)
+        return forward.expert_layers(config, weights, ops, tokens, table, attend)
+
+    def _velocity(self, weights: Weights, step: int, rope: forward.Rope) -> Tensor:
+        """v_t float32[B, H, A]"""
+        config, ops = self._buffers.config, self._buffers.ops
+        stream = self._layers(weights, step, rope, self._suffix(weights, step))
+        out = forward.final_norm(config, weights, ops, self._modulation(step), *stream)
         out = out.view(-1, self._tokens, out.shape[-1])[:, -self._horizon :]
         return forward.project(weights.small, "action_out_proj", out)
 
@@ -252,7 +269,7 @@ class BatchLoop:
         One product over the rows of all observations, most of them hidden: the way back has no attention of its own.
         Rows that nothing was written to are 0, as 0 * NaN is NaN.
         """
-        buffers, count, end = self._buffers, len(self._keys), self._whole_rows
+        buffers, count, end = self._buffers, self._suffix_rows, self._whole_rows
         starts, lengths = buffers.segments
         unwritten = torch.arange(buffers.rows, device=buffers.device)[:, None] >= starts[-1]
         k, v = (
@@ -264,5 +281,5 @@ class BatchLoop:
 
     def _expert(self, weights: Weights, step: int, rope: forward.Rope, k: Tensor, v: Tensor, hidden: Tensor) -> Expert:
         buffers, table = self._buffers, self._modulation(step)
-        back = way_back(buffers.ops, buffers.config, buffers.size.batch * self._tokens, masked=True)
+        back = way_back(buffers.ops, buffers.config, self._suffix_rows, masked=True)
         return Expert(buffers.config, weights, buffers.ops, back, table, self._seen, k, v, rope, hidden)

@@ -59,14 +59,14 @@ class BegunBatch:
         """See `turbopi.backends.base.RunsBatches`."""
         asked, samples = of_rows(conditioning, len(tokens)), []
         check_rows(asked, num_steps, *noise.shape[1:])
-        actions = torch.empty(noise.shape)
+        actions = np.empty(noise.shape, np.float32)
         for number, (_, rows) in enumerate(self._calls):
             finish = self._begun(number) if number else self._first
             these = [tokens[row] for row in rows], state[rows], noise[rows]
             samples.append(finish(*these, num_steps, [asked[row] for row in rows]))
-            actions[rows] = samples[-1].actions
+            actions[rows] = samples[-1].actions.numpy()
         stages = {name: sum(one.stage_ms[name] for one in samples) for name in samples[0].stage_ms}
-        return Sample(actions, stages)
+        return Sample(torch.from_numpy(actions), stages)
 
     def _begun(self, number: int) -> Finish:
         bucket, rows = self._calls[number]

@@ -25,11 +25,12 @@ from turbopi.config import ModelConfig
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, State
 from turbopi.model.layers import rope_tables
-from turbopi.quantization.fp8 import Matrix, input_of
+from turbopi.quantization.fp8 import input_of
 
 Rope = tuple[Tensor, Tensor]  # cos, sin float32[tokens, K/2]
-Normed = tuple[Tensor, Tensor, Tensor | None]  # residual stream, its norm, the gate of the next residual
-Attend = Callable[..., Tensor]  # a layer's number and its queries [tokens * n, K] -> [tokens, n * K]
+Stream = tuple[Tensor, Tensor | None, Tensor | None]  # residual stream, what is to be added to it, times which gate
+# a layer's number and its queries [tokens * n, K], of the expert its product q|k|v [T, (n + 2) * K] -> [tokens, n * K]
+Attend = Callable[..., Tensor]
 Places = Callable[[int], tuple[Tensor, Tensor]]  # a layer's number -> where its keys and values go, each [tokens, K]
 
 
@@ -106,43 +107,53 @@ def expert_output(
     """
     slots, heads = cache_k.shape[1] - tokens.shape[0], config.expert.num_heads
 
-    def places(i: int) -> tuple[Tensor, Tensor]:
-        return cache_k[i, slots:], cache_v[i, slots:]
-
-    def attend(i: int, q: Tensor, **input: Any) -> Tensor:
+    def attend(i: int, qkv: Tensor, **input: Any) -> Tensor:
+        q = ops.rope_split(qkv, *rope, cache_k[i, slots:], cache_v[i, slots:])
         return ops.attention(q, cache_k[i], cache_v[i], length, slots, heads, config.kind == "pi0", **input)
 
-    return expert_layers(config, weights, ops, tokens, table, rope, places, attend)
+    return final_norm(config, weights, ops, table, *expert_layers(config, weights, ops, tokens, table, attend))
 
 
 def expert_layers(
+    config: ModelConfig, weights: Weights, ops: Ops, tokens: Tensor, table: Tensor | None, attend: Attend
+) -> Stream:
+    """Suffix tokens [T, D] through all layers. What attention does with the product q|k|v is `attend`'s affair."""
+    eps = config.rms_norm_eps
+    x, y, gate = tokens, None, None
+    for i, layer in enumerate(weights.expert):
+        scale, shift, next_gate = norm_weights(table, 2 * i, layer.norm1)
+        x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, eps, **input_of(layer.qkv))
+        attended = attend(i, ops.linear(normed, layer.qkv), **input_of(layer.out))
+        y, gate = ops.residual_linear(attended, layer.out), next_gate
+        scale, shift, next_gate = norm_weights(table, 2 * i + 1, layer.norm2)
+        x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, eps, **input_of(layer.gate_up))
+        hidden = ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down))
+        y, gate = ops.residual_linear(hidden, layer.down), next_gate
+    return x, y, gate
+
+
+def final_norm(
     config: ModelConfig,
     weights: Weights,
     ops: Ops,
-    tokens: Tensor,
     table: Tensor | None,
-    rope: Rope,
-    places: Places,
-    attend: Attend,
+    x: Tensor,
+    y: Tensor | None,
+    gate: Tensor | None,
 ) -> Tensor:
-    """`expert_output`, wherever its keys and values go and whatever its queries see."""
-    g, eps = config.expert, config.rms_norm_eps
+    """float32[T, D]: the expert's last norm, of what `expert_layers` returns."""
+    scale, shift, _ = norm_weights(table, 2 * config.expert.depth, weights.expert_norm)
+    return ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)[1].float()
 
-    def norm(
-        x: Tensor, y: Tensor | None, gate: Tensor | None, plain: Tensor | None, index: int, before: Matrix | None = None
-    ) -> Normed:
-        scale, shift, next_gate = (plain, None, None) if table is None else table[index].unbind(0)
-        input = {} if before is None else input_of(before)
-        return (*ops.residual_rms_norm(x, y, gate, scale, shift, eps, **input), next_gate)
 
-    x, y, gate = tokens, None, None
-    for i, layer in enumerate(weights.expert):
-        x, normed, gate = norm(x, y, gate, layer.norm1, 2 * i, layer.qkv)
-        q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, *places(i))
-        y = ops.residual_linear(attend(i, q, **input_of(layer.out)), layer.out)
-        x, normed, gate = norm(x, y, gate, layer.norm2, 2 * i + 1, layer.gate_up)
-        y = ops.residual_linear(ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down)), layer.down)
-    return norm(x, y, gate, weights.expert_norm, 2 * g.depth)[1].float()
+def norm_weights(
+    table: Tensor | None, index: int, plain: Tensor | None
+) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """Scale and shift of the expert's norm of that number, and the gate of the residual behind it."""
+    if table is None:
+        return plain, None, None
+    scale, shift, gate = table[index].unbind(0)
+    return scale, shift, gate
 
 
 def suffix_tokens(config: ModelConfig, small: State, x_t: Tensor, time: Tensor, state: Tensor) -> Tensor:

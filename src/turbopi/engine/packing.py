@@ -8,6 +8,7 @@ Shapes: B observations of the call, R rows, n query heads.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -72,11 +73,16 @@ def split(count: int, costs: Mapping[int, float]) -> list[int]:
     costs  by the number of observations that a call holds, 1 among them: how long it takes, in any unit
     """
     assert count >= 1 and 1 in costs, (count, costs)
+    return list(_split(count, tuple(costs.items())))
+
+
+@lru_cache(maxsize=256)  # a call waits for it before it sends its pictures
+def _split(count: int, costs: tuple[tuple[int, float], ...]) -> tuple[int, ...]:
     best: list[tuple[float, tuple[int, ...]]] = [(0.0, ())]
     for wanted in range(1, count + 1):
         options = []
-        for bucket, own in costs.items():
+        for bucket, own in costs:
             cost, others = best[max(wanted - bucket, 0)]
             options.append((cost + own, tuple(sorted((*others, bucket), reverse=True))))
         best.append(min(options, key=lambda option: (round(option[0], 6), len(option[1]))))
-    return list(best[count][1])
+    return best[count][1]

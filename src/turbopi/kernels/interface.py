@@ -133,12 +133,31 @@ class Segments:
 
 
 @dataclass(frozen=True)
+class StepEnd:
+    """What is between the expert's last layer and the next step's tokens (Pi0.5), all float32.
+
+    The last norm's scale and shift [D]; the projection of the expert's output to v [A, D], [A]; Euler's step, by which
+    v is multiplied before it is added to x; the projection of x to tokens [D, A], [D].
+    """
+
+    scale: Tensor
+    shift: Tensor
+    eps: float
+    out: Affine
+    step: float
+    into: Affine
+
+
+@dataclass(frozen=True)
 class BatchOps:
     """What a batch takes beside `Ops`: see `kernels.plain_batch` for the twins."""
 
     embed_rows: Callable[[Tensor, Tensor, Tensor, Tensor], None]
     packed_attention: Callable[..., Tensor]
     suffix_attention: Callable[..., Tensor]
+    end_step: Callable[..., Tensor]
+    # the expert's operations on a batch's tokens, of the usual ones and its layers
+    expert: "Callable[[Ops, Sequence[GemmaLayer[Any]]], Ops]"
     origin: str
 
 

@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from turbopi.kernels.interface import BatchOps, Segments
-from turbopi.kernels.plain import as_input, matmul_f32
+from turbopi.kernels.interface import BatchOps, Segments, StepEnd
+from turbopi.kernels.plain import as_input, matmul_f32, residual_rms_norm, rope_split
 from turbopi.quantization.fp8 import E4M3
 
 
@@ -41,29 +41,54 @@ def packed_attention(
 
 
 def suffix_attention(
-    q: Tensor,
+    qkv: Tensor,
+    cos: Tensor,
+    sin: Tensor,
     prefix_k: Tensor,
     prefix_v: Tensor,
-    k: Tensor,
-    v: Tensor,
     starts: Tensor,
     lengths: Tensor,
     heads: int,
     state_token: bool = False,
     inverse: float | None = None,
 ) -> Tensor:
-    """Each observation's T tokens over its prefix and each other: q [B * T * n, K] -> [B * T, n * K].
+    """Each observation's T tokens over its prefix and each other: q|k|v [B * T, (n + 2) * K] -> [B * T, n * K].
 
-    prefix_k, prefix_v [rows, K]; those of observation b begin at starts[b], int32[B + 1], and are lengths[b] many. k, v
-    [B * T, K]. With `state_token` the first token of an observation sees no other one of them (Pi0).
+    cos, sin float32[B * T, K/2]: RoPE, which the suffix's queries and keys haven't had.
+
+    prefix_k, prefix_v [rows, K]; those of observation b begin at starts[b], int32[B + 1], and are lengths[b] many. With
+    `state_token` the first token of an observation sees no other one of them (Pi0).
     """
-    count, dim = k.shape
+    (count, width), dim = qkv.shape, prefix_k.shape[1]
+    assert width == (heads + 2) * dim, f"{heads} heads of {dim} columns, a key and a value aren't {width} columns"
+    k, v = qkv.new_empty(count, dim), qkv.new_empty(count, dim)
+    q = rope_split(qkv, cos, sin, k, v)
     visible = visible_to_suffix(starts, lengths, len(prefix_k), count, state_token).repeat_interleave(heads, 0)
     # what nobody has written yet counts with 0, but 0 * NaN is NaN
     keys, values = torch.cat((prefix_k, k)), torch.cat((prefix_v, v)).nan_to_num(0.0)
     logits = (matmul_f32(q, keys.t()) * dim**-0.5).masked_fill(~visible, -torch.inf)
     attended = (logits.softmax(-1).to(v.dtype) @ values).view(count, heads * dim)
     return as_input(attended, q.dtype, inverse)
+
+
+def end_step(
+    x: Tensor,
+    y: Tensor,
+    gate: Tensor | None,
+    end: StepEnd,
+    x_t: Tensor,
+    x_next: Tensor,
+    v_t: Tensor,
+) -> Tensor:
+    """From the expert's residual stream x + y * gate, [B * T, D], to the next step's tokens [B * T, D].
+
+    y may come as parts, as to norms. x_t float32[B * T, A]; x_next and v_t, the same, are written. x isn't needed after
+    it and may be overwritten.
+    """
+    _, normed = residual_rms_norm(x, y, gate, end.scale, end.shift, end.eps)
+    v_t.copy_(F.linear(normed.float(), *end.out))
+    x_next.copy_(x_t + end.step * v_t)
+    return F.linear(x_next, *end.into).to(x.dtype)
 
 
 def visible_to_suffix(starts: Tensor, lengths: Tensor, rows: int, count: int, state_token: bool) -> Tensor:
@@ -89,5 +114,7 @@ PLAIN_BATCH = BatchOps(
     embed_rows=embed_rows,
     packed_attention=packed_attention,
     suffix_attention=suffix_attention,
+    end_step=end_step,
+    expert=lambda ops, layers: ops,
     origin="PyTorch; attention over the rows of all observations, masked",
 )

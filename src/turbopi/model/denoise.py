@@ -45,7 +45,12 @@ def time_embedding(times: np.ndarray, width: int) -> Tensor:
 
 def euler_step(x_t: Tensor, v_t: Tensor, num_steps: int) -> Tensor:
     """x + dt · v in float32, dt = float32(-1/N)."""
-    return x_t + float(np.float32(-1.0 / num_steps)) * v_t
+    return x_t + step_size(num_steps) * v_t
+
+
+def step_size(num_steps: int) -> float:
+    """dt of N equal steps from 1 to 0, as float32 has it: negative."""
+    return float(np.float32(-1.0 / num_steps))
 
 
 @dataclass(frozen=True)

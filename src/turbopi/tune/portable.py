@@ -166,18 +166,19 @@ class PackedAttention(PrefixAttention):
 class SuffixAttention(Attention):
     def _allocate(self, one: Operation) -> None:
         prefix = one.batch * one.prefix_rows
-        self.q = self.random(one.rows * self.heads, self.dim)
+        self.qkv = self.random(one.rows, (self.heads + 2) * self.dim)
+        angles = 6 * self.random(one.rows, self.dim // 2).float()
+        self.rope = angles.cos(), angles.sin()
         self.prefix = self.random(prefix, self.dim), self.random(prefix, self.dim)
-        self.suffix = self.random(one.rows, self.dim), self.random(one.rows, self.dim)
         firsts = torch.arange(one.batch + 1, dtype=torch.int32, device=self.device) * one.prefix_rows
         lengths = torch.full((one.batch + 1,), one.prefix_rows, dtype=torch.int32, device=self.device)
         lengths[-1] = 0  # of the padding
         self.places = firsts, lengths
 
     def _plain(self, dtype: torch.dtype) -> Tensor:
-        q, prefix_k, prefix_v, k, v = (one.to(dtype) for one in (self.q, *self.prefix, *self.suffix))
-        return plain_batch.suffix_attention(q, prefix_k, prefix_v, k, v, *self.places, self.heads)
+        qkv, prefix_k, prefix_v = (one.to(dtype) for one in (self.qkv, *self.prefix))
+        return plain_batch.suffix_attention(qkv, *self.rope, prefix_k, prefix_v, *self.places, self.heads)
 
     def run(self, knobs: Knobs, copy: int, out: Tensor | None = None) -> Tensor:
-        given = (self.q, *self.prefix, *self.suffix, *self.places, self.heads)
+        given = (self.qkv, *self.rope, *self.prefix, *self.places, self.heads)
         return batch.suffix_attention(*given, inverse=self.inverse, tile=AttentionTile(**knobs))

@@ -11,8 +11,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
+from turbopi.kernels.dependent_launch import (
+    dependent_launch,
+    launch_dependents,
+    prefetch,
+    result_dtype,
+    wait_for_producer,
+)
 from turbopi.kernels.interface import BatchOps, Segments
+from turbopi.kernels.portable import batch_steps
 from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.portable.attention_tiles import PACKED_ROWS, AttentionTile, chosen_tile
 from turbopi.kernels.portable.rounding import as_stored
@@ -48,14 +55,11 @@ def embed_rows(source: Tensor, pictures: Tensor, table: Tensor, out: Tensor) -> 
 
 
 @triton.jit
-def _keys(queries, k, v, at, loaded, valid, acc, top, total, scale):
-    """One tile of keys and values into the running sums of a softmax."""
-    logits = tl.dot(queries, tl.load(k + at, loaded, 0.0).T, input_precision="ieee") * scale
-    logits = tl.where(valid, logits, -float("inf"))
+def _softmax_step(logits, values, acc, top, total):
+    """One tile of keys' logits (base 2) and values into the running sums of a softmax."""
     new_top = tl.maximum(top, tl.max(logits, 1))
     p = tl.exp2(logits - new_top[:, None])
     shrink = tl.exp2(top - new_top)
-    values = tl.load(v + at, loaded, 0.0)
     acc = tl.dot(p.to(values.dtype), values, acc * shrink[:, None], input_precision="ieee")
     return acc, new_top, total * shrink + tl.sum(p, 1)
 
@@ -84,7 +88,9 @@ def _packed_kernel(
             valid = start + n < count
             loaded = valid[:, None] & (d < DIM)[None, :]
             at = (key + start + n)[:, None] * DIM + d[None, :]
-            acc, top, total = _keys(queries, k, v, at, loaded, valid[None, :], acc, top, total, scale)
+            logits = tl.dot(queries, tl.load(k + at, loaded, 0.0).T, input_precision="ieee") * scale
+            logits = tl.where(valid[None, :], logits, -float("inf"))
+            acc, top, total = _softmax_step(logits, tl.load(v + at, loaded, 0.0), acc, top, total)
         if SCALED:
             total /= inverse
         tl.store(out + m[:, None] * DIM + d[None, :], as_stored(acc / total[:, None], out), inside)
@@ -118,42 +124,84 @@ def packed_attention(
 
 
 @triton.jit
+def _turned(at, cos, sin, turn, there, HALF: tl.constexpr):
+    """Both halves of heads after RoPE, in their dtype: HALF columns at `at` and HALF more. turn: where the angle is."""
+    first = tl.load(at, there, 0.0).to(tl.float32)
+    second = tl.load(at + HALF, there, 0.0).to(tl.float32)
+    c, s = tl.load(cos + turn, there, 0.0), tl.load(sin + turn, there, 0.0)
+    dtype = at.dtype.element_ty
+    return (first * c - second * s).to(dtype), (second * c + first * s).to(dtype)
+
+
+@triton.jit
+def _logits(lower, upper, k_lower, k_upper, visible, scale):
+    """Of queries and keys in two halves."""
+    logits = tl.dot(lower, k_lower.T, input_precision="ieee")
+    logits = tl.dot(upper, k_upper.T, logits, input_precision="ieee") * scale
+    return tl.where(visible, logits, -float("inf"))
+
+
+@triton.jit
 def _suffix_kernel(
-    q, prefix_k, prefix_v, k, v, starts, lengths, out, parts, weights, rows, tokens, heads, scale, inverse,
-    DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SPLITS: tl.constexpr,
-    STATE_TOKEN: tl.constexpr, SCALED: tl.constexpr, PDL: tl.constexpr,
+    qkv, cos, sin, prefix_k, prefix_v, starts, lengths, out, parts, weights, rows, tokens, heads, scale, inverse,
+    HALF: tl.constexpr, BLOCK_HALF: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr,
+    BLOCK_T: tl.constexpr, LINES: tl.constexpr, SPLITS: tl.constexpr, STATE_TOKEN: tl.constexpr, SCALED: tl.constexpr,
+    PDL: tl.constexpr,
 ):  # fmt: skip
     """BLOCK_M rows of one observation's queries over every SPLITS-th tile of its prefix; the last split has its suffix.
 
-    With one split the result goes to `out`, else sums to `parts` and (top, total) to `weights`, by split and row.
+    A row is a head of a token. RoPE comes to queries and to the suffix's keys as they are loaded. With one split the
+    result goes to `out`, else sums to `parts` and (top, total) to `weights`, by split and row.
     """
+    DIM: tl.constexpr = 2 * HALF
     batch, split = tl.program_id(1), tl.program_id(2)
     own = tl.program_id(0) * BLOCK_M + tl.arange(0, BLOCK_M)
     n = tl.arange(0, BLOCK_N)
+    pair = tl.arange(0, BLOCK_HALF)
     d = tl.arange(0, BLOCK_D)
     begin, end = tl.load(starts + batch), tl.load(lengths + batch)
-    wait_for_producer(PDL)
+    if PDL and tl.program_id(0) == 0:  # the prefix was there long before
+        line = tl.arange(0, LINES) * 64
+        for start in range(split * BLOCK_N, end, SPLITS * BLOCK_N):
+            row = (begin + tl.minimum(start + n, end - 1)).to(tl.int64)
+            prefetch(prefix_k + (row[:, None] * DIM + line[None, :]), PDL)
+            prefetch(prefix_v + (row[:, None] * DIM + line[None, :]), PDL)
     launch_dependents(PDL)
-    m = batch * rows + own
-    inside = (own < rows)[:, None] & (d < DIM)[None, :]
-    queries = tl.load(q + m[:, None] * DIM + d[None, :], inside, 0.0)
+    wait_for_producer(PDL)
+    width = (heads + 2) * DIM
+    token = batch * tokens + own // heads
+    there = (own < rows)[:, None] & (pair < HALF)[None, :]
+    q_at = qkv + (token.to(tl.int64)[:, None] * width + (own % heads)[:, None] * DIM + pair[None, :])
+    lower, upper = _turned(q_at, cos, sin, token[:, None] * HALF + pair[None, :], there, HALF)
     acc = tl.zeros((BLOCK_M, BLOCK_D), tl.float32)
     top = tl.full((BLOCK_M,), -float("inf"), tl.float32)
     total = tl.zeros((BLOCK_M,), tl.float32)
     for start in range(split * BLOCK_N, end, SPLITS * BLOCK_N):
         valid = start + n < end
-        loaded = valid[:, None] & (d < DIM)[None, :]
-        at = (begin + start + n).to(tl.int64)[:, None] * DIM + d[None, :]
-        acc, top, total = _keys(queries, prefix_k, prefix_v, at, loaded, valid[None, :], acc, top, total, scale)
+        halves = valid[:, None] & (pair < HALF)[None, :]
+        row = (begin + start + n).to(tl.int64)[:, None] * DIM
+        k_at = prefix_k + (row + pair[None, :])
+        k_lower, k_upper = tl.load(k_at, halves, 0.0), tl.load(k_at + HALF, halves, 0.0)
+        values = tl.load(prefix_v + (row + d[None, :]), valid[:, None] & (d < DIM)[None, :], 0.0)
+        logits = _logits(lower, upper, k_lower, k_upper, valid[None, :], scale)
+        acc, top, total = _softmax_step(logits, values, acc, top, total)
     if split == SPLITS - 1:
-        for start in range(0, tokens, BLOCK_N):
-            valid = start + n < tokens
-            loaded = valid[:, None] & (d < DIM)[None, :]
-            at = (batch * tokens + start + n)[:, None] * DIM + d[None, :]
+        t = tl.arange(0, BLOCK_T)
+        for start in tl.range(0, tokens, BLOCK_T, num_stages=1):  # RoPE's float32 would fill shared memory
+            valid = start + t < tokens
+            halves = valid[:, None] & (pair < HALF)[None, :]
+            beside = batch * tokens + start + t
+            k_at = qkv + (beside.to(tl.int64)[:, None] * width + heads * DIM)
+            turn = beside[:, None] * HALF + pair[None, :]
+            k_lower, k_upper = _turned(k_at + pair[None, :], cos, sin, turn, halves, HALF)
+            values = tl.load(k_at + DIM + d[None, :], valid[:, None] & (d < DIM)[None, :], 0.0)
             visible = valid[None, :]
             if STATE_TOKEN:
-                visible = visible & ((own >= heads)[:, None] | (start + n == 0)[None, :])
-            acc, top, total = _keys(queries, k, v, at, loaded, visible, acc, top, total, scale)
+                visible = visible & ((own >= heads)[:, None] | (start + t == 0)[None, :])
+            logits = _logits(lower, upper, k_lower, k_upper, visible, scale)
+            acc, top, total = _softmax_step(logits, values, acc, top, total)
+    m = batch * rows + own
+    inside = (own < rows)[:, None] & (d < DIM)[None, :]
     if SPLITS == 1:
         if SCALED:
             total /= inverse
@@ -175,8 +223,8 @@ def _combine_kernel(
     d = tl.arange(0, BLOCK_D)
     split = tl.arange(0, BLOCK_S)
     place = split * count + row
-    wait_for_producer(PDL)
     launch_dependents(PDL)
+    wait_for_producer(PDL)
     top = tl.load(weights + place * 2, split < SPLITS, -float("inf"))
     total = tl.load(weights + place * 2 + 1, split < SPLITS, 0.0)
     sums = tl.load(
@@ -191,11 +239,11 @@ def _combine_kernel(
 
 
 def suffix_attention(
-    q: Tensor,
+    qkv: Tensor,
+    cos: Tensor,
+    sin: Tensor,
     prefix_k: Tensor,
     prefix_v: Tensor,
-    k: Tensor,
-    v: Tensor,
     starts: Tensor,
     lengths: Tensor,
     heads: int,
@@ -205,29 +253,33 @@ def suffix_attention(
     tile: AttentionTile | None = None,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
-    """See `kernels.plain_batch.suffix_attention`. All contiguous. With `inverse` the result leaves as E4M3."""
-    assert all(t.is_contiguous() for t in (q, prefix_k, prefix_v, k, v, starts, lengths)), "rows are read as they lie"
-    batch, (count, dim) = len(starts) - 1, k.shape
-    assert dim >= 16, f"heads of {dim} columns are narrower than a tensor core's 16"
+    """See `kernels.plain_batch.suffix_attention`. All contiguous. With `inverse` the result leaves as E4M3.
+
+    The prefix's keys and values and the segments must have been written before the kernel in front of this one began.
+    """
+    given = (qkv, cos, sin, prefix_k, prefix_v, starts, lengths)
+    assert all(one.is_contiguous() for one in given), "rows are read as they lie in memory"
+    batch, count, dim = len(starts) - 1, len(qkv), prefix_k.shape[1]
+    assert dim >= 16 and dim % 2 == 0, f"heads of {dim} columns: RoPE turns pairs, a tensor core takes 16"
+    assert qkv.shape[1] == (heads + 2) * dim and cos.shape == sin.shape == (count, dim // 2)
     rows = count // batch * heads  # of queries of an observation
-    tile = tile or chosen_tile(tiles, "suffix_attention", capability_of(q), count, heads, dim)
+    tile = tile or chosen_tile(tiles, "suffix_attention", capability_of(qkv), count, heads, dim)
     along = triton.cdiv(rows, tile.rows)
     splits = suffix_splits(along * batch, len(prefix_k) // batch, tile.keys)
-    out = q.new_empty(count, heads * dim, dtype=result_dtype(q, inverse))
-    parts = torch.empty(splits, batch * rows, dim, device=q.device) if splits > 1 else out
-    weights = torch.empty(splits, batch * rows, 2, device=q.device) if splits > 1 else out
-    sizes = {
-        "DIM": dim, "BLOCK_D": triton.next_power_of_2(dim), "SPLITS": splits, "SCALED": inverse is not None,
-    }  # fmt: skip
+    out = qkv.new_empty(count, heads * dim, dtype=result_dtype(qkv, inverse))
+    parts = torch.empty(splits, batch * rows, dim, device=qkv.device) if splits > 1 else out
+    weights = torch.empty(splits, batch * rows, 2, device=qkv.device) if splits > 1 else out
+    sizes = {"BLOCK_D": triton.next_power_of_2(dim), "SPLITS": splits, "SCALED": inverse is not None}
     _suffix_kernel[(along, batch, splits)](
-        q, prefix_k, prefix_v, k, v, starts, lengths, out, parts, weights, rows, count // batch, heads,
-        dim**-0.5 * LOG2_E, inverse or 1.0, BLOCK_M=tile.rows, BLOCK_N=tile.keys, STATE_TOKEN=state_token,
-        num_warps=tile.warps, num_stages=tile.stages, **sizes, **dependent_launch(q),
+        *given, out, parts, weights, rows, count // batch, heads, dim**-0.5 * LOG2_E, inverse or 1.0,
+        HALF=dim // 2, BLOCK_HALF=max(16, triton.next_power_of_2(dim // 2)), BLOCK_M=tile.rows, BLOCK_N=tile.keys,
+        BLOCK_T=16 if count // batch <= 16 else 32, LINES=triton.cdiv(triton.next_power_of_2(dim), 64),
+        STATE_TOKEN=state_token, num_warps=tile.warps, num_stages=tile.stages, **sizes, **dependent_launch(qkv),
     )  # fmt: skip
     if splits > 1:
         _combine_kernel[(batch * rows,)](
-            parts, weights, out, batch * rows, inverse or 1.0,
-            BLOCK_S=triton.next_power_of_2(splits), num_warps=1, **sizes, **dependent_launch(q),
+            parts, weights, out, batch * rows, inverse or 1.0, DIM=dim, BLOCK_S=triton.next_power_of_2(splits),
+            num_warps=1, **sizes, **dependent_launch(qkv),
         )  # fmt: skip
     return out
 
@@ -243,6 +295,8 @@ def batch_ops(tiles: TileTable = NO_TILES) -> BatchOps:
         embed_rows=embed_rows,
         packed_attention=partial(packed_attention, tiles=tiles),
         suffix_attention=partial(suffix_attention, tiles=tiles),
+        end_step=batch_steps.end_step,
+        expert=batch_steps.expert,
         origin="Triton",
     )
 
