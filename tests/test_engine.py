@@ -14,7 +14,7 @@ from torch import Tensor
 from turbopi import backends
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.config import Kind
-from turbopi.engine.call import AT_ONCE, Cache, CallShape, Pictures, StaticCall
+from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.compiled import compiled
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.runner import HostRow
@@ -178,15 +178,6 @@ def test_every_valid_picture_must_be_given() -> None:
     call = static_call("pi05", shape_of(observation, noise, 1))
     with pytest.raises(ValueError, match="shorter"):
         call.pictures.upload(list(observation.images[0, :1].numpy()))
-
-
-@pytest.mark.parametrize("count", [1, AT_ONCE, 2 * AT_ONCE + 1])
-def test_all_pictures_travel_however_many_go_at_once(count: int) -> None:
-    model = golden_model("pi05")
-    pictures = Pictures(model.config, pack(model.config, dict(model.state_dict())), PLAIN, count, False, 0)
-    given = torch.randint(0, 256, pictures.images.shape, dtype=torch.uint8)
-    pictures.upload(list(given.numpy()))
-    assert torch.equal(pictures.images, given)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

@@ -56,6 +56,8 @@ class FusedBackend(CudaGraphBackend):
     # docs/dev/log.md; in FP8 four take 3.4, eight 5.3, sixteen 9.9
     COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.2, 8: 5.4, 16: 10.6}
     COSTS_WITH_PAIRS: ClassVar[Mapping[int, float]] = {**COSTS, 2: 1.75}
+    # where one guided call alone goes forward in the denoising kernel; of two estimated
+    JACOBIAN_COSTS_BESIDE_KERNEL: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.3, 8: 5.2}
     _tiles = Tiles(NO_TILES, BY_MODEL)  # measured ones, as they were when this backend was made
     _on_hopper = True  # whether kernels for compute capability 9.0 run
     _batches_denoise_in_bf16 = False  # for good, as their graphs point to the matrices on the device
@@ -215,17 +217,12 @@ class FusedBackend(CudaGraphBackend):
 
     def _make_keeper(self, shape: CallShape, table: Tensor | None) -> KeepingDenoiser | None:
         """Hopper's denoising kernel of one step, in bfloat16."""
-        if not self._on_hopper or (self._plan is not None and self._plan.expert != "bf16") or table is None:
-            return None
-        from turbopi.kernels.portable.vjp.tiles import takes
-        from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, DenoiseKernel, unavailable
-        from turbopi.kernels.sm90.denoise.packing import PackedExpert, refusal
-
         horizon, rows = shape.loop.horizon, self._most_rows(shape)
-        if unavailable(self.device) or refusal(self.config) or horizon > MAX_SUFFIX:
+        if table is None or not self._guides_by_kernel(horizon):
             return None
-        if not takes(self.config.expert, horizon):
-            return None
+        from turbopi.kernels.sm90.denoise.kernel import DenoiseKernel
+        from turbopi.kernels.sm90.denoise.packing import PackedExpert
+
         key = (shape.loop, rows)
         if key not in self._keepers:
             try:
@@ -242,6 +239,23 @@ class FusedBackend(CudaGraphBackend):
                 logger.info("operations go forward where the true Jacobian goes back: %s", e)
                 return None
         return self._keepers[key]
+
+    def _guides_by_kernel(self, horizon: int) -> bool:
+        """Whether one call guided by the true Jacobian goes forward in Hopper's denoising kernel."""
+        if not self._on_hopper or (self._plan is not None and self._plan.expert != "bf16"):
+            return False
+        from turbopi.kernels.portable.vjp.tiles import takes
+        from turbopi.kernels.sm90.denoise.kernel import MAX_SUFFIX, unavailable
+        from turbopi.kernels.sm90.denoise.packing import refusal
+
+        if unavailable(self.device) or refusal(self.config) or horizon > MAX_SUFFIX:
+            return False
+        return takes(self.config.expert, horizon)
+
+    @property
+    def jacobian_costs(self) -> Mapping[int, float]:
+        by_kernel = self._guides_by_kernel(self.config.action_horizon)
+        return self.JACOBIAN_COSTS_BESIDE_KERNEL if by_kernel else self.JACOBIAN_COSTS
 
     @property
     def batch_costs(self) -> Mapping[int, float]:

@@ -236,7 +236,7 @@ class BatchLoop:
                 qkv, *rope, *prefix, *buffers.segments, heads, config.kind == "pi0", **input
             )
 
-        ops, table = batched.expert(buffers.ops, weights.expert), self._modulation(step)
+        ops, table = batched.expert(buffers.ops), self._modulation(step)
         return forward.expert_layers(config, weights, ops, tokens, table, attend)
 
     def _velocity(self, weights: Weights, step: int, rope: forward.Rope) -> Tensor:

@@ -156,8 +156,8 @@ class BatchOps:
     packed_attention: Callable[..., Tensor]
     suffix_attention: Callable[..., Tensor]
     end_step: Callable[..., Tensor]
-    # the expert's operations on a batch's tokens, of the usual ones and its layers
-    expert: "Callable[[Ops, Sequence[GemmaLayer[Any]]], Ops]"
+    # the expert's operations on a batch's tokens, of the usual ones
+    expert: "Callable[[Ops], Ops]"
     origin: str
 
 

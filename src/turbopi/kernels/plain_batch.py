@@ -115,6 +115,6 @@ PLAIN_BATCH = BatchOps(
     packed_attention=packed_attention,
     suffix_attention=suffix_attention,
     end_step=end_step,
-    expert=lambda ops, layers: ops,
+    expert=lambda ops: ops,
     origin="PyTorch; attention over the rows of all observations, masked",
 )

@@ -4,9 +4,7 @@ Twins: `kernels.plain.residual_rms_norm`, `kernels.plain_batch.end_step`. Both l
 kernel's blocks start and load theirs, before they wait for the kernel in front.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 import triton
@@ -21,7 +19,7 @@ from turbopi.kernels.dependent_launch import (
     result_dtype,
     wait_for_producer,
 )
-from turbopi.kernels.interface import GemmaLayer, Ops, StepEnd
+from turbopi.kernels.interface import Ops, StepEnd
 from turbopi.kernels.portable import norms
 from turbopi.kernels.portable.norms import _add_residual
 from turbopi.kernels.portable.rounding import as_stored
@@ -148,7 +146,7 @@ def end_step(
     return tokens
 
 
-def expert(ops: Ops, layers: Sequence[GemmaLayer[Any]]) -> Ops:
+def expert(ops: Ops) -> Ops:
     """The expert's operations on a batch's tokens, of any `ops`."""
     return replace(ops, residual_rms_norm=residual_rms_norm)
 

@@ -13,7 +13,6 @@ from turbopi.kernels.portable import attention as portable_attention
 from turbopi.kernels.portable import batch as portable_batch
 from turbopi.kernels.portable.ops import attend as attend_portably
 from turbopi.kernels.portable.ops import portable_ops
-from turbopi.kernels.sm90 import expert
 from turbopi.kernels.sm90.attention import kernel as attention
 from turbopi.kernels.sm90.gemm import products
 from turbopi.kernels.sm90.gemm.bf16 import Tile
@@ -51,7 +50,6 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
         batch=replace(
             batch,
             packed_attention=partial(packed_attention, tiles=tiles),
-            expert=partial(expert.expert, tiles=tiles),
             origin="CUDA for prefixes, Triton for suffixes",
         ),
         origin={**portable.origin, **origin},
