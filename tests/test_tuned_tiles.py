@@ -99,6 +99,12 @@ def test_the_shipped_files_are_read_and_hold_for_their_own_gpus() -> None:
     assert not find_tiles(Machine("No such GPU", (8, 9), 1, "1"), cache=Path("/nonexistent")).table.tiles
 
 
+def test_the_tiles_that_ship_for_an_h200_are_of_todays_kernels() -> None:
+    """Otherwise they lie unused: measure them again, with `turbopi tune --out`."""
+    found = find_tiles(Machine("NVIDIA H200", (9, 0), 132, "any"), cache=Path("/nonexistent"))
+    assert sum(key.kernels == "hopper" for key in found.table) > 100
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
