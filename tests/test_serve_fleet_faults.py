@@ -7,6 +7,7 @@ Nothing here depends on how fast the machine is: what takes its time is waited f
 import asyncio
 import contextlib
 import importlib.util
+import itertools
 import json
 import os
 import secrets
@@ -27,6 +28,7 @@ from test_cli_serve import serving
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from turbopi.serve.homes import SOON_SECONDS
 from turbopi.shipped import load_frames
 from turbopi.wire import pack, unpack
 
@@ -166,6 +168,7 @@ def processes(robot: Robot, count: int = 2, apart_from: int | None = None) -> se
     seen: set[int] = set()
 
     def all_of_them() -> bool:
+        time.sleep(SOON_SECONDS)  # who asks again sooner stays where it is
         seen.add(robot.actions()["pid"])
         return len(seen - {apart_from}) == count
 
@@ -181,6 +184,14 @@ def test_the_greeting_and_errors_are_the_servers(fleet: FleetProcess) -> None:
         robot.connection.send(b"\xc1")
         assert str(robot.answer()).startswith("bad request: ")
         np.testing.assert_array_equal(robot.actions()["actions"][0], np.arange(8.0))
+
+
+def test_a_robot_that_asks_again_at_once_stays_at_its_replica(fleet: FleetProcess) -> None:
+    with fleet.robot() as robot:
+        pids = [robot.actions()["pid"] for _ in range(41)]
+        moves = sum(before != after for before, after in itertools.pairwise(pids))
+        assert moves <= 8, f"{moves} of 40: at random it would be 20"
+        assert len(processes(robot)) == 2, "one that takes its time goes to either"
 
 
 def test_a_request_that_takes_long_holds_up_its_own_replica_alone(fleet: FleetProcess, tmp_path: Path) -> None:

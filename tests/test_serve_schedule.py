@@ -635,6 +635,23 @@ def test_clients_that_take_longer_than_they_save_are_not_waited_for() -> None:
     assert set(rows[12:]) == {4}, rows
 
 
+def test_a_client_that_is_late_is_waited_for_no_longer_than_it_saves() -> None:
+    """It may have gone elsewhere: to another replica of a fleet."""
+    schedule, now = Schedule(16, table(PAYING)), 0.0
+    for _ in range(5):  # client 1 asks again 0.3 s after its answer, again and again
+        schedule.add(request(now, source=1), now)
+        begin(schedule, now)
+        schedule.freed(now, None)
+        now += 0.3
+    late = now + 0.001  # it was expected, and isn't there
+    one = request(late, source=0)
+    schedule.add(one, late)
+    saves = 2 * PAYING[1] - PAYING[2]
+    wake = schedule.decide(late).wake
+    assert wake is not None and late < wake <= now + saves + 1e-9
+    assert begin(schedule, wake) == [one]
+
+
 def test_a_client_that_left_is_waited_for_once() -> None:
     schedule = Schedule(16, table(PAYING))
     rows = closed_loop(schedule, 2.0, [0.002] * 8, [0.0] * 8, leave=1.0)

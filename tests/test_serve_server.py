@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 import logging
 import os
 import random
@@ -437,17 +438,20 @@ def test_serving_for_ever_ends_with_the_reason_when_the_device_is_lost(monkeypat
     assert not threads[0].is_alive()
 
 
-def test_threads_give_way_sooner_while_a_server_runs_and_as_before_after_it() -> None:
-    usual, met = sys.getswitchinterval(), list[float]()
+def test_threads_and_the_garbage_collector_are_as_before_after_a_server() -> None:
+    usual, met, kept = sys.getswitchinterval(), list[float](), list[int]()
 
     def look(_: PolicyServer) -> None:
         met.append(sys.getswitchinterval())
+        kept.append(gc.get_freeze_count())
         raise RuntimeError("seen")
 
     with pytest.raises(RuntimeError, match="seen"):
         PolicyServer(FakePolicy(), port=0).serve_forever(on_ready=look)
     assert met == [pytest.approx(SWITCH_SECONDS)] and usual > SWITCH_SECONDS
     assert sys.getswitchinterval() == usual
+    assert kept[0] > 10_000, "a full collection would look through all modules among requests"
+    assert gc.get_freeze_count() < 1_000
 
 
 # --- health, pings, metrics -------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@
 
 The server in front is the one of `turbopi serve`, with its whole protocol, limits and metrics; only its requests are
 computed elsewhere (remote_calls.py). It keeps the running chunks of real-time sessions. So a session belongs to the
-server, not to a replica: each request goes to the replica that has the fewest, and a replica that dies takes no session
+server, not to a replica: any replica may answer any request (ray_router.py chooses), and one that dies takes no session
 along. Which processes there are and where, whether they are well, and how they are replaced: that is Ray Serve's part.
 
 A request whose replica died is not tried again on another one: if it was the observation that killed it, one robot

@@ -377,8 +377,9 @@ class Schedule:
         """Until when to wait for company; it is over if that isn't later than now.
 
         Company is waited for if it saves more time than it takes to come: clients that were answered and usually ask
-        again so soon, or else anybody at the usual pace, as long as the saving and not longer than a few usual gaps
-        after the last arrival. Only while all deadlines of the group leave room for T(B).
+        again so soon, as long as the saving after they were expected; or else anybody at the usual pace, as long as the
+        saving and not longer than a few usual gaps after the last arrival. Only while all deadlines of the group leave
+        room for T(B).
         """
         times = self._times(group)
         sources = {request.source for request in group}
@@ -399,7 +400,7 @@ class Schedule:
         expected = self._returns.expected(now, ACTIVE_SECONDS, sources)[:places]
         for more in range(len(expected), 0, -1):
             when, last = expected[more - 1]
-            if when - now < saving(more) and (until := min(last, latest(more))) > now:
+            if when - now < saving(more) and (until := min(last, when + saving(more), latest(more))) > now:
                 return until
         most = min(places, len(self._active.values(now).keys() - sources))
         if most < 1 or len(self._gaps) < GAPS // 4:

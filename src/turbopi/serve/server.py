@@ -15,6 +15,7 @@ may send it. See docs/serving.md for the limits, and for what differs from openp
 
 import asyncio
 import contextlib
+import gc
 import logging
 import sys
 import time
@@ -226,6 +227,7 @@ class PolicyServer:
                     await starting
                     try:
                         if not early:
+                            _set_aside_what_stays()
                             on_ready(self)
                             lost = asyncio.wrap_future(self._lost)
                             await asyncio.wait((stopped, lost), return_when=asyncio.FIRST_COMPLETED)
@@ -244,6 +246,7 @@ class PolicyServer:
             asyncio.run(main())
         finally:
             sys.setswitchinterval(usual)
+            gc.unfreeze()
         if self.lost is not None:
             raise DeviceLost(self.lost)
 
@@ -406,6 +409,16 @@ class PolicyServer:
         finally:
             gone.remove_done_callback(leave)
             self._askings.release(asking)
+
+
+def _set_aside_what_stays() -> None:
+    """Let the garbage collector leave alone what was made up to here.
+
+    Libraries and the policy are hundreds of thousands of objects: a full collection among requests held all of them up
+    for 160 ms in a fleet's server.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 def _said(closed: ConnectionClosed) -> str:
