@@ -21,6 +21,7 @@ from turbopi.engine.flat import allocate
 from turbopi.engine.graph import Mark
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.resize import Resizer
+from turbopi.engine.schedule import SCHEDULE
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Denoiser, Ops
 from turbopi.model.conditioning import Conditioning
@@ -123,6 +124,7 @@ class Pictures:
         self.host = torch.zeros(dims, dtype=dtype, pin_memory=table.is_cuda)
         self._array = self.host.numpy()
         self.images = torch.zeros(dims, dtype=dtype, device=table.device)
+        self._fetch = ops.transfer if SCHEDULE.ends_by_kernel and table.is_cuda else None
         self._resizer = Resizer(self.images)
         size = (self.rows + prompt_slots, config.vlm.width)
         self.embs = torch.full(size, torch.nan, device=table.device, dtype=table.dtype)  # as in `Cache`
@@ -148,7 +150,8 @@ class Pictures:
         elif pictures:
             for target, picture in zip(self._array, pictures, strict=True):
                 target[:] = picture
-            self.images.copy_(self.host, non_blocking=True)
+            if self._fetch is None:
+                self.images.copy_(self.host, non_blocking=True)
 
     def _fits(self, picture: np.ndarray) -> bool:
         return picture.dtype == self._array.dtype and picture.shape == self._array.shape[1:]
@@ -157,10 +160,15 @@ class Pictures:
         """`run`, once `images` has been made of pictures of other sizes."""
         if self.ops.resize_pictures is not None and self.cameras:
             self.ops.resize_pictures(self._resizer.table, self.images)
-        self.run(mark)
+        self._see(mark)
 
     def run(self, mark: Mark = lambda stage: None) -> None:
-        """`images` to the first rows of `embs`."""
+        """`images`, or what `upload` has put on the host for them, to the first rows of `embs`."""
+        if self.cameras and self._fetch is not None:
+            self._fetch(self.host, self.images)
+        self._see(mark)
+
+    def _see(self, mark: Mark) -> None:
         if self.cameras:
             forward.vision_tokens(self.config, self.weights, self.ops, self.images, self.embs[: self.rows])
         mark("vision")
@@ -204,6 +212,7 @@ class StaticCall:
         self.x_t = torch.empty(shape.num_steps + 1, *chunk, device=device)
         self.v_t = torch.empty(shape.num_steps, *chunk, device=device)
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
+        self._send = ops.transfer if SCHEDULE.ends_by_kernel and on_gpu else None
         self.actions_array = self.actions.numpy()
 
     def write_inputs(
@@ -262,7 +271,10 @@ class StaticCall:
         else:
             inputs, by_token = self.inputs, () if self.asked is None else (self.asked.tokens,)
             self.denoiser.launch(inputs.noise, self.cache_k, self.cache_v, inputs.length, self.x_t, self.v_t, *by_token)
-        self.actions.copy_(self.x_t[-1], non_blocking=True)
+        if self._send is None:
+            self.actions.copy_(self.x_t[-1], non_blocking=True)
+        else:
+            self._send(self.x_t[-1], self.actions)
         mark("denoise")
 
     def _denoise_by_operations(self) -> None:

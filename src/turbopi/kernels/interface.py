@@ -84,6 +84,7 @@ class Ops:
     vision_attention: Callable[..., Tensor]
     attention: Callable[..., Tensor]
     prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
+    transfer: Callable[[Tensor, Tensor], None] | None = None  # from, to pinned memory of the host; None: by copies
     resize_pictures: Callable[[Tensor, Tensor], None] | None = None  # as `SOURCE` says; None: the host resizes them
     # by the expert's sizes, the number of its tokens, and whether keys are hidden from some of them (`Expert.hidden`);
     # None: `kernels.backward.PLAIN_BACKWARD`

@@ -22,6 +22,11 @@ from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
 from turbopi.quantization.int8 import to_int8
 
 
+def transfer(source: Tensor, to: Tensor) -> None:
+    """`to` becomes `source`, of the same shape and dtype, on the host or on the device."""
+    to.copy_(source)
+
+
 def resize_picture(picture: Tensor, out: Tensor, rows: Taps, columns: Taps, top: int, left: int, low: float) -> None:
     """Picture uint8[h, w, 3] into `out` [S, S, 3], from row `top` and column `left` on; around it is padding.
 
