@@ -212,6 +212,7 @@ class StaticCall:
         self.x_t = torch.empty(shape.num_steps + 1, *chunk, device=device)
         self.v_t = torch.empty(shape.num_steps, *chunk, device=device)
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
+        self.asked_before = SCHEDULE.prompt_beside_vision and on_gpu  # `ask` isn't a part of `encode`
         self._send = ops.transfer if SCHEDULE.ends_by_kernel and on_gpu else None
         self.actions_array = self.actions.numpy()
 
@@ -251,12 +252,17 @@ class StaticCall:
         self.encode(mark)
         self.denoise(mark)
 
-    def encode(self, mark: Mark = lambda stage: None) -> None:
-        """Upload; then the pictures' rows, which are there, and the prompt to the cache's first rows."""
+    def ask(self) -> None:
+        """Upload what `write_inputs` wrote, and the prompt's rows to `embs`."""
         self.inputs.flat.copy_(self.host.flat, non_blocking=True)
+        self.ops.embed_prompt(self.inputs.tokens, self.weights.embed_tokens, self.embs[self.pictures.rows :])
+
+    def encode(self, mark: Mark = lambda stage: None) -> None:
+        """`ask`; then the pictures' rows, which are there, and the prompt to the cache's first rows."""
+        if not self.asked_before:
+            self.ask()
         config, weights, ops, inputs = self.config, self.weights, self.ops, self.inputs
         slots = self.shape.prefix_slots(config)
-        ops.embed_prompt(inputs.tokens, weights.embed_tokens, self.embs[self.pictures.rows :])
         rope = (self.rope[0][:slots], self.rope[1][:slots])
         prefix_cache = ops.prefix_cache or forward.prefix_cache
         prefix_cache(config, weights, ops, self.embs, inputs.length, self.cache_k, self.cache_v, rope)

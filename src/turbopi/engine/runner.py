@@ -105,6 +105,7 @@ class GraphRunner:
         self._begun: Begun | None = None  # what may be finished
         self._pool: Any = None
         self._stream: torch.cuda.Stream | None = None  # that graphs are captured on
+        self._beside: torch.cuda.Stream | None = None  # for what runs while vision does
         self._warming = False
 
     def warmup(
@@ -267,9 +268,19 @@ class GraphRunner:
         with self._explaining():
             graph, call = self._graph(shape, part), self._calls[shape]
             call.write_inputs(noise, state, tokens, conditioning)
+            if call.asked_before:
+                self._ask_beside(call)
             graph.replay()
         self._begun = None
         return call, graph
+
+    def _ask_beside(self, call: StaticCall) -> None:
+        """`call.ask()` beside vision; what is launched next waits for both. The calls before are over."""
+        if self._beside is None:
+            self._beside = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
+        with torch.cuda.stream(self._beside):
+            call.ask()
+        torch.cuda.current_stream(self.device).wait_stream(self._beside)
 
     @contextmanager
     def _explaining(self) -> Iterator[None]:

@@ -8,9 +8,12 @@ from dataclasses import dataclass
 
 @dataclass
 class Schedule:
-    """ends_by_kernel  pictures come and actions leave by kernels of the graphs, not by the copy engine"""
+    """ends_by_kernel  pictures come and actions leave by kernels of the graphs, not by the copy engine
+    prompt_beside_vision  prompt, state and noise go up and are embedded while vision runs, on a stream of their own
+    """
 
     ends_by_kernel: bool = False
+    prompt_beside_vision: bool = False
 
 
 SCHEDULE = Schedule()
