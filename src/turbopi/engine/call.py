@@ -23,7 +23,7 @@ from turbopi.engine.recent_loops import Loop
 from turbopi.engine.resize import Resizer
 from turbopi.engine.schedule import SCHEDULE
 from turbopi.engine.weights import Weights
-from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.kernels.interface import Denoiser, EarlyDenoiser, Ops
 from turbopi.model.conditioning import Conditioning
 from turbopi.model.denoise import euler_step, time_embedding, time_grid
 from turbopi.preprocess.images import fitted
@@ -212,6 +212,8 @@ class StaticCall:
         self.x_t = torch.empty(shape.num_steps + 1, *chunk, device=device)
         self.v_t = torch.empty(shape.num_steps, *chunk, device=device)
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
+        self._keys_early = SCHEDULE.keys_beside_prefix and on_gpu
+        self._beside: torch.cuda.Stream | None = None  # a branch of the graph
         self.asked_before = SCHEDULE.prompt_beside_vision and on_gpu  # `ask` isn't a part of `encode`
         self._send = ops.transfer if SCHEDULE.ends_by_kernel and on_gpu else None
         self.actions_array = self.actions.numpy()
@@ -249,34 +251,61 @@ class StaticCall:
 
     def answer(self, mark: Mark = lambda stage: None) -> None:
         """What comes after `pictures.run`: prompt, state and noise to actions on the host."""
-        self.encode(mark)
-        self.denoise(mark)
+        early = self.config.vlm.depth - 1 if self._keys_early and isinstance(self.denoiser, EarlyDenoiser) else 0
+        if self.asked is not None or self.shape.loop.form != "plain":
+            early = 0
+        self.encode(mark, early)
+        self.denoise(mark, early)
 
     def ask(self) -> None:
         """Upload what `write_inputs` wrote, and the prompt's rows to `embs`."""
         self.inputs.flat.copy_(self.host.flat, non_blocking=True)
         self.ops.embed_prompt(self.inputs.tokens, self.weights.embed_tokens, self.embs[self.pictures.rows :])
 
-    def encode(self, mark: Mark = lambda stage: None) -> None:
-        """`ask`; then the pictures' rows, which are there, and the prompt to the cache's first rows."""
+    def encode(self, mark: Mark = lambda stage: None, early: int = 0) -> None:
+        """`ask`; then the pictures' rows, which are there, and the prompt to the cache's first rows.
+
+        early  of so many layers the denoiser gets keys and values beside the layers behind them: see `EarlyDenoiser`
+        """
         if not self.asked_before:
             self.ask()
         config, weights, ops, inputs = self.config, self.weights, self.ops, self.inputs
         slots = self.shape.prefix_slots(config)
         rope = (self.rope[0][:slots], self.rope[1][:slots])
         prefix_cache = ops.prefix_cache or forward.prefix_cache
-        prefix_cache(config, weights, ops, self.embs, inputs.length, self.cache_k, self.cache_v, rope)
+        given = (config, weights, ops, self.embs, inputs.length, self.cache_k, self.cache_v, rope)
+        if early:
+            prefix_cache(*given, lambda layer: self._prepare_beside(early) if layer + 1 == early else None)
+            assert self._beside is not None, early
+            torch.cuda.current_stream().wait_stream(self._beside)
+        else:
+            prefix_cache(*given)
         mark("prefix")
 
-    def denoise(self, mark: Mark = lambda stage: None) -> None:
-        """Noise to actions on the host, all steps, from the cache's first rows."""
+    def _prepare_beside(self, layers: int) -> None:
+        """The denoiser's part that needs no more than these layers, on a branch."""
+        assert isinstance(self.denoiser, EarlyDenoiser)
+        if self._beside is None:
+            self._beside = torch.cuda.Stream(self.cache_k.device)
+        self._beside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._beside):
+            self.denoiser.prepare(*self._loop_arguments, layers=layers)
+
+    @property
+    def _loop_arguments(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+        return self.inputs.noise, self.cache_k, self.cache_v, self.inputs.length, self.x_t, self.v_t
+
+    def denoise(self, mark: Mark = lambda stage: None, early: int = 0) -> None:
+        """Noise to actions on the host, all steps, from the cache's first rows. `early`: as `encode` was told."""
         if self.asked is not None:
             self.asked.upload()
         if self.denoiser is None:
             self._denoise_by_operations()
+        elif early and isinstance(self.denoiser, EarlyDenoiser):
+            self.denoiser.launch_prepared(*self._loop_arguments, layers=early)
         else:
-            inputs, by_token = self.inputs, () if self.asked is None else (self.asked.tokens,)
-            self.denoiser.launch(inputs.noise, self.cache_k, self.cache_v, inputs.length, self.x_t, self.v_t, *by_token)
+            by_token = () if self.asked is None else (self.asked.tokens,)
+            self.denoiser.launch(*self._loop_arguments, *by_token)
         if self._send is None:
             self.actions.copy_(self.x_t[-1], non_blocking=True)
         else:

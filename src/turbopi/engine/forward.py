@@ -58,8 +58,12 @@ def prefix_cache(
     cache_k: Tensor,
     cache_v: Tensor,
     rope: Rope,
+    behind: Callable[[int], None] = lambda layer: None,
 ) -> None:
-    """Run prefix embeddings [S, D] through the language model, writing the first S rows of [layer, S + H, K]."""
+    """Run prefix embeddings [S, D] through the language model, writing the first S rows of [layer, S + H, K].
+
+    behind  is called with each layer but the last when its keys and values have been launched
+    """
     slots, heads = x.shape[0], config.vlm.num_heads
 
     def places(i: int) -> tuple[Tensor, Tensor]:
@@ -68,11 +72,18 @@ def prefix_cache(
     def attend(i: int, q: Tensor, **input: Any) -> Tensor:
         return ops.attention(q, *places(i), length, slots, heads, **input)
 
-    prefix_layers(config, weights, ops, x, rope, places, attend)
+    prefix_layers(config, weights, ops, x, rope, places, attend, behind)
 
 
 def prefix_layers(
-    config: ModelConfig, weights: Weights, ops: Ops, x: Tensor, rope: Rope, places: Places, attend: Attend
+    config: ModelConfig,
+    weights: Weights,
+    ops: Ops,
+    x: Tensor,
+    rope: Rope,
+    places: Places,
+    attend: Attend,
+    behind: Callable[[int], None] = lambda layer: None,
 ) -> None:
     """Prefix embeddings [S, D] through the language model; nothing is left of it but keys and values."""
     g, eps = config.vlm, config.rms_norm_eps
@@ -83,6 +94,7 @@ def prefix_layers(
             ops.rope_split(ops.linear(normed, layer.qkv[-2 * g.head_dim :]), *rope, *places(i))
             return
         q = ops.rope_split(ops.linear(normed, layer.qkv), *rope, *places(i))
+        behind(i)
         y = ops.residual_linear(attend(i, q, **input_of(layer.out)), layer.out)
         x, normed = ops.residual_rms_norm(x, y, None, layer.norm2, None, eps, **input_of(layer.gate_up))
         y = ops.residual_linear(ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down)), layer.down)

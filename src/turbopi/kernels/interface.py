@@ -5,7 +5,7 @@ Shapes: D, W widths, F hidden width of an MLP, K head_dim, A action_dim.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from torch import Tensor
 
@@ -169,6 +169,21 @@ class Denoiser(Protocol):
 
         `tokens` of a loop that was made for them, and of no other; v_t then is the guided v that was integrated.
         """
+
+
+@runtime_checkable
+class EarlyDenoiser(Protocol):
+    """A `Denoiser` that may be given the cache's first layers before the others are there."""
+
+    def prepare(
+        self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor, *, layers: int
+    ) -> None:
+        """What `launch` would do first, for so many layers. All arguments as that launch's."""
+
+    def launch_prepared(
+        self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor, *, layers: int
+    ) -> None:
+        """`launch` behind `prepare` of so many layers."""
 
 
 class PairDenoiser(Protocol):

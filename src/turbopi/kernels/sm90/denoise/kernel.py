@@ -309,7 +309,7 @@ class DenoiseKernel:
             cubin = compiled(arch, sizes)
             self._kernel = Kernel(cubin, "turbopi_denoise", sizes["TP_SHARED_BYTES"])
             self._prepare = Kernel(cubin, "turbopi_denoise_prepare", 0)
-            self._tiles = g.depth * sizes["TP_KEY_TILES"]
+            self._tiles_a_layer = sizes["TP_KEY_TILES"]
             fitting = self._kernel.max_active_clusters(RANKS, THREADS)
             if fitting < arrangement.clusters:
                 raise BackendUnavailable(
@@ -364,6 +364,29 @@ class DenoiseKernel:
         else:
             self._launch(ARGS_BY_TOKEN.value(values | self._token_pointers(tokens)))
 
+    def prepare(
+        self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor, *, layers: int
+    ) -> None:
+        """See `kernels.interface.EarlyDenoiser`."""
+        self._prepare_layers(self._values(noise, cache_k, cache_v, x_t, v_t) | {"length": length.data_ptr()}, 0, layers)
+
+    def launch_prepared(
+        self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, length: Tensor, x_t: Tensor, v_t: Tensor, *, layers: int
+    ) -> None:
+        """See `kernels.interface.EarlyDenoiser`."""
+        values = self._values(noise, cache_k, cache_v, x_t, v_t) | {"length": length.data_ptr()}
+        self._prepare_layers(values, layers, self._config.expert.depth)
+        self._kernel.launch_cooperative(self._blocks, THREADS, ARGS.value(values))
+
+    def _prepare_layers(self, values: dict[str, Any], first: int, end: int) -> None:
+        """The kernel counts layers from 0, so it is told where layer `first` begins."""
+        assert not self._pair and not self._by_token, "of one observation, with one time for all actions"
+        stride = values["layer_stride"]
+        size = 2 * self._tiles_a_layer * BLOCK * self._config.expert.head_dim * 2  # bytes of a layer's tiles
+        strides = {"cache_k": stride, "cache_v": stride, "keys": size, "values_times": 4}
+        begin = values | {name: values[name] + first * stride for name, stride in strides.items()}
+        self._prepare.launch((end - first) * self._tiles_a_layer, 256, ARGS.value(begin))
+
     def launch_pair(
         self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, segments: Tensor, x_t: Tensor, v_t: Tensor
     ) -> None:
@@ -374,7 +397,7 @@ class DenoiseKernel:
         self._launch(ARGS_OF_PAIR.value(self._values(*beside) | {"segments": segments.data_ptr()}))
 
     def _launch(self, args: Any) -> None:
-        self._prepare.launch(self._tiles, 256, args)
+        self._prepare.launch(self._config.expert.depth * self._tiles_a_layer, 256, args)
         self._kernel.launch_cooperative(self._blocks, THREADS, args)  # clusters wait for one another
 
     def _values(self, noise: Tensor, cache_k: Tensor, cache_v: Tensor, x_t: Tensor, v_t: Tensor) -> dict[str, Any]:
