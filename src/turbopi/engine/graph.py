@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 
+from turbopi.engine.schedule import SCHEDULE
 from turbopi.model.exact import exact_float32
 
 Mark = Callable[[str], None]  # is told the end of each stage
@@ -94,6 +95,10 @@ class Graph:
             self._start, self._events = like._start, like._events
         elif after is None:
             self._start = self._events["start"] = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
+        self._aside: torch.cuda.Stream | None = None
+        if SCHEDULE.marks_aside:
+            self._aside = torch.cuda.Stream(stream.device)  # type: ignore[no-untyped-call]
+        self._marked_aside = False
         self._graph = torch.cuda.CUDAGraph()
         with building(stream.device):
             stream.wait_stream(torch.cuda.current_stream(stream.device))
@@ -106,6 +111,8 @@ class Graph:
                 torch.cuda.graph(self._graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
             ):
                 run(self._mark)
+                if self._aside is not None and self._marked_aside:
+                    torch.cuda.current_stream(self._device).wait_stream(self._aside)
 
     def launch(self, first: Callable[[], None] = lambda: None) -> None:
         """Do `first`, which may launch kernels, then run the graph's again on what their input buffers hold now.
@@ -130,4 +137,10 @@ class Graph:
     def _mark(self, stage: str) -> None:
         if stage not in self._events:
             self._events[stage] = torch.cuda.Event(enable_timing=True, external=True)  # type: ignore[no-untyped-call]
-        self._events[stage].record(torch.cuda.current_stream(self._device))
+        current = torch.cuda.current_stream(self._device)
+        if self._aside is None:
+            self._events[stage].record(current)
+        else:
+            self._aside.wait_stream(current)
+            self._marked_aside = True
+            self._events[stage].record(self._aside)

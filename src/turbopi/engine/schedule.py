@@ -13,11 +13,13 @@ class Schedule:
     prompt_beside_vision  prompt, state and noise go up and are embedded while vision runs, on a stream of their own
     keys_beside_prefix    keys and values of all layers but the last are put in the denoising kernel's order on a branch
                           of the graph, while the rest of the prefix runs
+    marks_aside           timing events are recorded on a branch, so that no kernel waits for one
     """
 
     ends_by_kernel: bool = False
     prompt_beside_vision: bool = False
     keys_beside_prefix: bool = False
+    marks_aside: bool = False
 
 
 SCHEDULE = Schedule()
