@@ -19,12 +19,16 @@ from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
 from turbopi.kernels.sm90.gemm.tiles import PARTS_TILES, RESIDUAL_TILES, VISION_TILES
 from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
+from turbopi.kernels.sm90.weights_ahead import ProductsAhead
 from turbopi.kernels.tile_table import NO_TILES, TileTable
+
+WEIGHTS_AHEAD = False  # a try: see weights_ahead.py
 
 
 def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     """With these measured tiles, and in sizes that they don't have those of gemm/tiles.py."""
     portable, vision, batch = portable_ops(tiles), VisionProducts(tiles), portable_batch.batch_ops(tiles)
+    products_of_models = ProductsAhead(vision, tiles) if WEIGHTS_AHEAD else vision
     origin = {
         "vision products": f"CUDA for {_rows(VISION_TILES)} rows, else cuBLAS",
         "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS",
@@ -38,8 +42,8 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     return replace(
         portable,
         residual_layer_norm=vision.residual_layer_norm,
-        linear=vision.linear,
-        residual_linear=vision.residual_linear,
+        linear=products_of_models.linear,
+        residual_linear=products_of_models.residual_linear,
         linear_gelu=vision.linear_gelu,
         linear_geglu=partial(products.tuned_linear_geglu, tiles=tiles),
         vision_attention=partial(vision_attention, tiles=tiles),
