@@ -1,0 +1,256 @@
+"""Time variants of a whole call in turns, and write the timeline of one. Run from the repository, on a Hopper GPU:
+
+    export PYTHONPATH=src:tools
+    python -m call_turns --precisions bf16,fp8 --calls 300 --out FOLDER
+
+Weights are random. FP8 takes a calibration file's scales without directions: its times are those of any calibration.
+A variant is what VARIANTS has; each is captured once, and in every round has its share of the calls.
+"""
+
+import argparse
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from call_turns.timeline import in_full, profiled, steps, summary
+from turbopi.backends import Precision, resolve_device
+from turbopi.backends.fused import FusedBackend
+from turbopi.bench.measure import Observations, bench_policy
+from turbopi.bench.profile import start_profiler
+from turbopi.bench.work import Job
+from turbopi.checkpoint import random_checkpoint
+from turbopi.engine.schedule import SCHEDULE, Schedule
+from turbopi.kernels.ops import fused_ops
+from turbopi.kernels.sm90 import ops as hopper
+from turbopi.kernels.tile_table import Knobs, Numbers, TileKey, TileTable
+from turbopi.policy import UnifiedPolicy
+from turbopi.quantization.calibration_file import Quantization
+
+CALIBRATION = Path("benchmarks/results/h200_2026-11-24_pi05_libero/calibrate.json")
+ROUNDS, PROFILED = 6, 5
+TIMES = ("total", "infer", "preprocess", "postprocess", "vision", "prefix", "denoise", "device")
+STATE = ("_ops", "_graphs", "_calls", "_pictures", "_begun")  # of a runner, by variant
+
+
+def _tile(
+    numbers: Numbers, operation: str, out: int, inner: int, rows: int = 576, **knobs: int
+) -> tuple[TileKey, Knobs]:
+    usual = {"cluster_m": 1, "cluster_n": 1, "splits": 1, "overlap": 0, "ring": 16, "gather": 0}
+    return TileKey("hopper", operation, numbers, rows, out, inner), usual | knobs
+
+
+# benchmarks/results/h200_2026-11-26_tune, where they are faster than the usual ones
+TILES = TileTable(
+    dict(
+        (
+            _tile("bf16", "plain", 2560, 2048, warpgroups=3, columns=64),
+            _tile("bf16", "parts", 2048, 2048, warpgroups=3, columns=96, splits=2, ring=5),
+            _tile("bf16", "plain", 512, 2048, warpgroups=1, columns=48),
+            _tile("bf16", "residual", 1152, 1152, 512, warpgroups=1, columns=80),
+            _tile("bf16", "bias", 2048, 1152, 512, warpgroups=1, columns=128, cluster_m=2),
+            _tile("fp8", "plain", 512, 2048, warpgroups=1, columns=64),
+            _tile("fp8", "gelu", 4304, 1152, 512, warpgroups=2, columns=144, cluster_m=2),
+        )
+    )
+)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What differs from the calls as they are."""
+
+    schedule: Mapping[str, bool] = field(default_factory=dict)
+    ahead: bool = False
+    tiles: bool = False
+
+
+ENDS = {"ends_by_kernel": True}
+VARIANTS = {
+    "as is": Variant(),
+    "ends by kernel": Variant(ENDS),
+    "prompt beside": Variant({"prompt_beside_vision": True}),
+    "keys beside": Variant({"keys_beside_prefix": True}),
+    "marks aside": Variant({"marks_aside": True}),
+    "ahead": Variant(ahead=True),
+    "tiles": Variant(tiles=True),
+    "tiles and ahead": Variant(ahead=True, tiles=True),
+    "all but marks": Variant(ENDS | {"prompt_beside_vision": True, "keys_beside_prefix": True}, ahead=True, tiles=True),
+    "all": Variant({one.name: True for one in dataclasses.fields(Schedule)}, ahead=True, tiles=True),
+}
+
+
+class Turns:
+    """One policy whose runner takes on each variant's graphs and operations in turn."""
+
+    def __init__(self, precision: Precision, job: Job) -> None:
+        checkpoint, quantization = random_checkpoint("pi05_libero"), None
+        if precision == "fp8":
+            quantization = Quantization.load(CALIBRATION)
+            checkpoint.__dict__["_fingerprint"] = quantization.fingerprint  # hashing all weights takes a minute
+        self.policy: UnifiedPolicy = bench_policy(
+            checkpoint,
+            "fused",
+            precision,
+            resolve_device("cuda"),
+            job,
+            quantization=quantization,  # type: ignore[arg-type]
+        )
+        assert isinstance(self.policy.backend, FusedBackend)
+        self.backend, self.job = self.policy.backend, job
+        self.observations = Observations(self.policy, job)
+        self._kept: dict[str, dict[str, Any]] = {}
+        self._ops = {(False, False): self.backend._ops}
+
+    def take(self, name: str) -> None:
+        """From now on the policy is this variant."""
+        if name not in self._kept:
+            variant = VARIANTS[name]
+            for one in dataclasses.fields(Schedule):
+                setattr(SCHEDULE, one.name, variant.schedule.get(one.name, False))
+            key = (variant.ahead, variant.tiles)
+            if key not in self._ops:
+                hopper.WEIGHTS_AHEAD = variant.ahead
+                self._ops[key] = fused_ops(self.backend.device, TILES if variant.tiles else TileTable())
+                hopper.WEIGHTS_AHEAD = False
+            self._kept[name] = {"_ops": self._ops[key], "_graphs": {}, "_calls": {}, "_pictures": {}, "_begun": None}
+        for attribute in STATE:
+            setattr(self.backend, attribute, self._kept[name][attribute])
+
+    def call(self) -> dict[str, float]:
+        timing: dict[str, float] = self.policy.infer(next(self.observations), num_steps=self.job.steps)["policy_timing"]
+        found = {name.removesuffix("_ms"): milliseconds for name, milliseconds in timing.items()}
+        return found | {"device": sum(found[stage] for stage in ("vision", "prefix", "denoise"))}
+
+    def outputs(self) -> list[np.ndarray]:
+        """Actions, then keys and values of the prefix, of two observations that are the same for every variant."""
+        source, found = Observations(self.policy, self.job, seed=1), []
+        for seed in range(2):
+            found.append(self.policy.infer(next(source), seed=seed, num_steps=self.job.steps)["actions"])
+            call = next(iter(self.backend._calls.values()))
+            length = int(call.host.length[0])
+            found += [one[:, :length].float().cpu().numpy() for one in (call.cache_k, call.cache_v)]
+        return found
+
+
+def compared(ours: list[np.ndarray], usual: list[np.ndarray]) -> str:
+    """ "the same bits", or the largest relative difference of actions and of the cache."""
+    if all(np.array_equal(x, y) for x, y in zip(ours, usual, strict=True)):
+        return "the same bits"
+
+    def off(x: np.ndarray, y: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((x - y) ** 2) / np.mean(y**2)))
+
+    each = [off(x, y) for x, y in zip(ours, usual, strict=True)]
+    return f"actions {max(each[::3]):.1e}, cache {max(each[1::3] + each[2::3]):.1e} off"
+
+
+def timed(turns: Turns, names: list[str], calls: int) -> dict[str, dict[str, float]]:
+    """Medians by variant, milliseconds."""
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in names}
+    for turn in range(ROUNDS):
+        for name in names[turn % len(names) :] + names[: turn % len(names)]:
+            turns.take(name)
+            for i in range(calls // ROUNDS + 3):
+                timing = turns.call()
+                if i >= 3:
+                    found[name].append(timing)
+    return {name: {key: statistics.median(one[key] for one in rows) for key in TIMES} for name, rows in found.items()}
+
+
+def report(turns: Turns, names: list[str], calls: int) -> Iterator[str]:
+    usual: list[np.ndarray] = []
+    differs, working = {}, []
+    for name in names:
+        start = time.perf_counter()
+        turns.take(name)
+        try:
+            turns.call()
+            outputs = turns.outputs()
+        except Exception as error:  # one try that fails doesn't cost the others their turn
+            yield f"{name}: FAILED, {type(error).__name__}: {error}"
+            if name == names[0]:
+                raise
+            continue
+        usual = usual or outputs
+        differs[name] = compared(outputs, usual)
+        working.append(name)
+        yield f"({name} captured in {time.perf_counter() - start:.1f} s)"
+    rows = timed(turns, working, calls)
+    yield f"{'ms, medians':16}" + "".join(f"{key:>12}" for key in TIMES) + "  against as is"
+    for name, row in rows.items():
+        yield f"{name:16}" + "".join(f"{row[key]:12.4f}" for key in TIMES) + f"  {differs[name]}"
+    yield "less than as is, us"
+    for name, row in rows.items():
+        yield f"{name:16}" + "".join(f"{(row[key] - rows[working[0]][key]) * 1e3:12.1f}" for key in TIMES)
+
+
+def timelines(turns: Turns, names: list[str]) -> Iterator[str]:
+    for name in names:
+        turns.take(name)
+        for _ in range(20):  # the clock and caches as in a row of calls
+            turns.call()
+        ran, host = zip(*(profiled(turns.call) for _ in range(PROFILED)), strict=True)
+        try:
+            found = steps(ran)
+        except ValueError as error:
+            yield f"timeline of {name!r}: {error}"
+            found = steps(ran[:1])
+        yield f"\n==== {name}: by kernel, us, medians of {PROFILED} calls; step: from the end before to its end"
+        yield from summary(found)
+        yield "---- in order"
+        yield from in_full(found)
+        yield "---- CUDA calls of the host in the last one (start against the first kernel, us)"
+        for what, start, duration in host[-1]:
+            yield f"{what:40} {start:10.1f} {duration:8.1f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m call_turns", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--precisions", default="bf16,fp8")
+    parser.add_argument("--cameras", type=int, default=2)
+    parser.add_argument("--calls", type=int, default=300, help="of each variant")
+    parser.add_argument("--variants", default=",".join(VARIANTS), help="by comma")
+    parser.add_argument("--timelines", default="as is", help="of these variants; empty: of none")
+    parser.add_argument("--out", type=Path, required=True, help="folder for turns.txt and timeline.txt")
+    arguments = parser.parse_args()
+    precisions: list[Precision] = arguments.precisions.split(",")
+    names = [name.strip() for name in arguments.variants.split(",")]
+    profiles = [name.strip() for name in arguments.timelines.split(",") if name.strip()]
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    start_profiler(resolve_device("cuda"))
+    with (arguments.out / "turns.txt").open("w") as text, (arguments.out / "timeline.txt").open("w") as order:
+        for precision in precisions:
+            _write(text, _told(precision, arguments.cameras, names, profiles, arguments.calls, order))
+
+
+def _told(precision: Precision, cameras: int, names: list[str], profiles: list[str], calls: int, order: Any) -> Iterator[str]:
+    start = time.perf_counter()
+    turns = Turns(precision, Job(cameras=cameras))
+    clock: Callable[[], str] = lambda: f"{time.perf_counter() - start:.1f} s"  # noqa: E731
+    yield f"\n{precision}, {turns.job}, {torch.cuda.get_device_name()}, torch {torch.__version__}; loaded in {clock()}"
+    yield from report(turns, names, calls)
+    print(f"# {precision} timelines", file=order)
+    for line in timelines(turns, profiles):
+        print(line, file=order, flush=True)
+    yield f"({precision} took {clock()})"
+    del turns
+    torch.cuda.empty_cache()
+
+
+def _write(text: Any, lines: Iterator[str]) -> None:
+    for line in lines:
+        print(line, flush=True)
+        print(line, file=text, flush=True)
+
+
+if __name__ == "__main__":
+    main()
