@@ -3,6 +3,7 @@
 The launch is the production code's; g++ stands for NVRTC and tests/emulator/machine.h for a cluster of Hopper.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -156,6 +157,41 @@ def test_an_fp8_product_leaves_a_copy_that_is_normed_with_the_norms_scale_and_sh
     torch.testing.assert_close(
         unmade.parts.sum(0), torch.stack((out.sum(1), out.square().sum(1)), dim=1), rtol=1e-4, atol=1e-2
     )
+
+
+@pytest.mark.parametrize("in_fp8", [False, True], ids=["bf16", "fp8"])
+def test_geglu_makes_up_for_what_a_copy_lacks_of_its_rmsnorm(machine: Callable[[int], None], in_fp8: bool) -> None:
+    m, n, k, hidden, eps = 120, 528 if in_fp8 else 200, 256, 40, 1e-6
+    out_tile, geglu_tile = Tile(1, 24, ring=3), Tile(1, 32, ring=3, overlap=True)
+    weight, gate_up = random(n, k, seed=1) / k**0.5, random(2 * hidden, n, seed=2) / n**0.5
+    x, residual, scale = random(m, k), 4 * random(m, n, seed=9), 1 + torch.rand(n)
+    residual[3] *= 30  # a row whose numbers E4M3 wouldn't hold
+    squares = residual.float().square().sum(1) if in_fp8 else torch.full((m,), n * (1 - eps))
+    before = Sums(torch.stack((torch.zeros(m), squares), dim=1)[None].contiguous())
+    sums, unread = Sums.allocate(out_tile, m, n, CPU), Sums.allocate(out_tile, m, n, CPU)
+    matrix, by = quantize(gate_up, 0.02), 1.0
+    if in_fp8:
+        by = matrix.inverse / fp8.HEADROOM
+        gate_up = matrix.dequantized().bfloat16()
+    numbers = E4M3 if in_fp8 else torch.bfloat16
+    copy = Copy(torch.empty(m, n).to(numbers), before, scale * by, torch.zeros(n), eps, unread)
+    for seed in SEEDS[:2]:
+        machine(seed)
+        stream = bf16.matmul(x, weight, out_tile, "bias", residual=residual, sums_out=sums, copy=copy)
+        if in_fp8:
+            larger = dataclasses.replace(matrix, scale=matrix.scale * fp8.HEADROOM)
+            out = fp8.matmul_fp8(copy.out, larger, geglu_tile, "geglu", inverse=10.0, sums=sums).float() / 10
+        else:
+            out = bf16.matmul(copy.out, gate_up, geglu_tile, "geglu", sums=sums, eps=fp8.NO_EPS).float()
+        wide = stream.float()
+        torch.testing.assert_close(wide, x.float() @ weight.float().T + residual.float(), rtol=1e-2, atol=2e-2)
+        normed = wide * (wide.square().mean(1, keepdim=True) + eps).rsqrt() * scale
+        wanted = product(normed, gate_up, None, "geglu")
+        usual = product(normed.bfloat16(), gate_up, None, "geglu").bfloat16()
+        if in_fp8:
+            usual = to_e4m3(plain.geglu(matrix.product(to_e4m3(normed, matrix.inverse))), 10.0).float() / 10
+        ours, theirs = ((one.float() - wanted).norm(dim=1) / wanted.norm(dim=1) for one in (out, usual))
+        assert ours.mean() < 1.1 * theirs.mean() and ours.max() < 1.3 * theirs.max(), (ours.max(), theirs.max())
 
 
 def test_an_instruction_that_the_machine_does_not_know_is_named() -> None:

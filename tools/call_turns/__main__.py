@@ -68,6 +68,7 @@ class Variant:
 
     schedule: Mapping[str, bool] = field(default_factory=dict)
     ahead: bool = False
+    norms: bool = False
     tiles: bool = False
 
 
@@ -81,8 +82,11 @@ VARIANTS = {
     "ahead": Variant(ahead=True),
     "tiles": Variant(tiles=True),
     "tiles and ahead": Variant(ahead=True, tiles=True),
-    "all but marks": Variant(ENDS | {"prompt_beside_vision": True, "keys_beside_prefix": True}, ahead=True, tiles=True),
-    "all": Variant({one.name: True for one in dataclasses.fields(Schedule)}, ahead=True, tiles=True),
+    "norms": Variant(norms=True),
+    "all but marks": Variant(
+        ENDS | {"prompt_beside_vision": True, "keys_beside_prefix": True}, ahead=True, norms=True, tiles=True
+    ),
+    "all": Variant({one.name: True for one in dataclasses.fields(Schedule)}, ahead=True, norms=True, tiles=True),
 }
 
 
@@ -106,7 +110,7 @@ class Turns:
         self.backend, self.job = self.policy.backend, job
         self.observations = Observations(self.policy, job)
         self._kept: dict[str, dict[str, Any]] = {}
-        self._ops = {(False, False): self.backend._ops}
+        self._ops = {(False, False, False): self.backend._ops}
 
     def take(self, name: str) -> None:
         """From now on the policy is this variant."""
@@ -114,11 +118,11 @@ class Turns:
             variant = VARIANTS[name]
             for one in dataclasses.fields(Schedule):
                 setattr(SCHEDULE, one.name, variant.schedule.get(one.name, False))
-            key = (variant.ahead, variant.tiles)
+            key = (variant.ahead, variant.norms, variant.tiles)
             if key not in self._ops:
-                hopper.WEIGHTS_AHEAD = variant.ahead
+                hopper.WEIGHTS_AHEAD, hopper.NORMS_IN_PRODUCTS = variant.ahead, variant.norms
                 self._ops[key] = fused_ops(self.backend.device, TILES if variant.tiles else TileTable())
-                hopper.WEIGHTS_AHEAD = False
+                hopper.WEIGHTS_AHEAD = hopper.NORMS_IN_PRODUCTS = False
             self._kept[name] = {"_ops": self._ops[key], "_graphs": {}, "_calls": {}, "_pictures": {}, "_begun": None}
         for attribute in STATE:
             setattr(self.backend, attribute, self._kept[name][attribute])
@@ -232,7 +236,9 @@ def main() -> None:
             _write(text, _told(precision, arguments.cameras, names, profiles, arguments.calls, order))
 
 
-def _told(precision: Precision, cameras: int, names: list[str], profiles: list[str], calls: int, order: Any) -> Iterator[str]:
+def _told(
+    precision: Precision, cameras: int, names: list[str], profiles: list[str], calls: int, order: Any
+) -> Iterator[str]:
     start = time.perf_counter()
     turns = Turns(precision, Job(cameras=cameras))
     clock: Callable[[], str] = lambda: f"{time.perf_counter() - start:.1f} s"  # noqa: E731

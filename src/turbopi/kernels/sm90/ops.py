@@ -19,10 +19,12 @@ from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
 from turbopi.kernels.sm90.gemm.tiles import PARTS_TILES, RESIDUAL_TILES, VISION_TILES
 from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
+from turbopi.kernels.sm90.prefix_norms import PrefixNorms
 from turbopi.kernels.sm90.weights_ahead import ProductsAhead
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 
 WEIGHTS_AHEAD = False  # a try: see weights_ahead.py
+NORMS_IN_PRODUCTS = False  # a try: see prefix_norms.py
 
 
 def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
@@ -39,7 +41,7 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     }
     if products.num_sms(device) >= GATHERING_SMS:
         origin["LayerNorm"] = f"most in the products around them for {_rows(RESIDUAL_TILES)} rows, else Triton"
-    return replace(
+    ops = replace(
         portable,
         residual_layer_norm=vision.residual_layer_norm,
         linear=products_of_models.linear,
@@ -54,6 +56,15 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
             origin="CUDA for prefixes, Triton for suffixes",
         ),
         origin={**portable.origin, **origin},
+    )
+    if not NORMS_IN_PRODUCTS:
+        return ops
+    prefix = PrefixNorms(ops, tiles)
+    return replace(
+        ops,
+        residual_linear=prefix.residual_linear,
+        residual_rms_norm=prefix.residual_rms_norm,
+        linear_geglu=prefix.linear_geglu,
     )
 
 

@@ -30,6 +30,9 @@
 // the norm's would be; TP_NORMED then makes up for the difference, in which w times the shift is in `offset`, as it is
 // in the copy already, and the bias goes apart.
 //
+// The same for RMSNorm in front of GeGLU: TP_COPY_WIDE leaves the copy in bfloat16, and TP_RMS (parts of a row's sums,
+// or 0) multiplies a row's gates and ups by what its copy lacks of the norm.
+//
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
 // TP_OVERLAP: see geglu.cu.
 
@@ -39,11 +42,17 @@ constexpr bool GATHER = TP_GATHER;
 constexpr int EPILOGUE = TP_EPILOGUE, PARTS = EPILOGUE == 3 ? 2 : 1;
 constexpr int SHARING = CM * CN, CLUSTER = SHARING * (GATHER ? SPLITS : 1);
 constexpr bool FP8 = TP_FP8, OUT_FP8 = TP_OUT_FP8;
+static_assert(!TP_RMS || TP_OVERLAP, "other tiles don't multiply an RMSNorm");
 static_assert(!(TP_COPY && TP_NORMED) && !(TP_COPY && TP_OUT_FP8), "copies leave beside a bfloat16 stream");
 #if TP_OUT_FP8
 typedef unsigned char Element;
 #else
 typedef u16 Element;
+#endif
+#if TP_COPY_WIDE
+typedef u16 Copied;
+#else
+typedef unsigned char Copied;
 #endif
 constexpr int ROW_BYTES = 128;  // of a block of an operand: as much as a swizzle spans
 constexpr int BM = 64 * WGS, BK = FP8 ? ROW_BYTES : ROW_BYTES / 2, TILE_N = BN / PARTS;

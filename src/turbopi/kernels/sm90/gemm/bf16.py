@@ -91,13 +91,13 @@ class Sums:
 
 @dataclass(frozen=True)
 class Copy:
-    """An E4M3 copy of the result x: round((x - mean) / deviation * scale + shift).
+    """A copy of the result x in E4M3 or bfloat16: round((x - mean) / deviation * scale + shift).
 
     Mean and deviation are those of the *residual*'s rows. `sums_out` are then of (x - mean) / deviation, and what the
     norm adds to the variance of x is in the squares; `plain` are of x.
     """
 
-    out: Tensor  # e4m3[M, N]
+    out: Tensor  # (e4m3|bfloat16)[M, N]
     sums: Sums  # of the residual
     scale: Tensor  # float32[N]  of the LayerNorm behind, over the scale of the copy
     shift: Tensor  # float32[N]  the same
@@ -143,11 +143,15 @@ def matmul(
 
     weight [N, K], for "geglu" [2N, K]. All bfloat16 and contiguous, K and N multiples of 8. With "bias" alone,
     `residual` [M, N] is added, the sums of the result's rows go into `sums_out`, and a `copy` may leave, too. With a
-    `Folded` weight, whose bias is in it, a's LayerNorm is multiplied, made of the `sums` of a's rows. `ahead` is
-    fetched into L2 in the end.
+    `Folded` weight, whose bias is in it, a's LayerNorm is multiplied, made of the `sums` of a's rows. With "geglu", in
+    a tile that overlaps, a is a `Copy` and `sums` its `sums_out`: its RMSNorm is multiplied. `ahead` is fetched into L2
+    in the end.
     """
     folded, weight = (weight, weight.data) if isinstance(weight, Folded) else (None, weight)
-    assert (folded is None) == (sums is None) and (folded is None or (bias is None and epilogue in ("bias", "gelu")))
+    scaled = epilogue == "geglu" and sums is not None
+    assert (folded is None) == (sums is None or scaled), "sums are of a norm"
+    assert folded is None or (bias is None and epilogue in ("bias", "gelu"))
+    assert not scaled or tile.overlap, "other tiles don't multiply an RMSNorm"
     assert not tile.gather or folded is None, "sums are gathered after that"
     m, k = a.shape
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
@@ -159,14 +163,14 @@ def matmul(
         out = torch.empty(shape, dtype=torch.float32 if epilogue == "partial" else torch.bfloat16, device=a.device)
     assert out.is_contiguous()
     assert copy is None or (residual is not None and sums is None)
-    kernel = _kernel(
-        tile, epilogue, residual is not None, 0 if sums is None else sums.count, copied_parts(copy, m, n), a.device
-    )
+    normed = 0 if sums is None else sums.count
+    kernel = _kernel(tile, epilogue, residual is not None, normed, *copied_form(copy, m, n), a.device)
     given = {
         "map_a": matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
         "map_w": matrix_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
         **product_arguments(out, bias, residual, sums_out),
         **({} if folded is None else norm_arguments(sums, k, eps, folded.sums, folded.offset)),
+        **(row_arguments(sums, k, eps) if scaled else {}),
         **copy_arguments(copy, n),
         **size_arguments(m, n, -(-k // DEPTH), groups),
     }
@@ -198,10 +202,13 @@ def launch(
     blocks = clusters(tile, groups[0] * groups[1], kernel.max_clusters) * tile.cluster
     share = 0 if ahead is None else ahead.numel() * ahead.element_size() // blocks // 16 * 16
     place = ahead.data_ptr() if ahead is not None and share else None
+    assert "sums_in" not in given or not tile.overlap or blocks // tile.cluster % groups[0] == 0, (
+        f"{blocks // tile.cluster} clusters with tiles of {groups[0]} groups of rows: a CTA has to keep to its rows"
+    )
     kernel.launch_dependent(blocks, given | {"ahead": place, "ahead_bytes": share})
 
 
-def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool) -> Parameters:
+def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool, rms: bool = False) -> Parameters:
     """What kernel.cu's kernel takes in these forms."""
     rows = (
         Parameter("const float2*", "sums_in", "[parts][M]: the sum and the sum of squares of a row"),
@@ -216,7 +223,7 @@ def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool) -> Para
             Parameter("const u32*", "bias"),
             *((Parameter("const float*", "scale"), Parameter("float", "inverse")) if fp8 else ()),
             *((Parameter("const u32*", "residual"), Parameter("float2*", "sums_out")) if residual else ()),
-            *(rows if normed or copied else ()),
+            *(rows if normed or copied or rms else ()),
             *((Parameter("const float*", "sums_of_w"), Parameter("const float*", "offset")) if normed else ()),
             *((Parameter("const float2*", "norm_scale"), Parameter("const float2*", "norm_shift")) if copied else ()),
             *((Parameter("unsigned char*", "copy"), Parameter("float2*", "plain_sums")) if copied else ()),
@@ -242,24 +249,23 @@ def size_arguments(m: int, n: int, k_blocks: int, groups: tuple[int, int]) -> di
 
 
 def norm_arguments(sums: Sums | None, width: int, eps: float, of_weight: Tensor, offset: Tensor) -> dict[str, Any]:
-    assert sums is not None
-    return _row_arguments(sums, width, eps) | {"sums_of_w": of_weight.data_ptr(), "offset": offset.data_ptr()}
+    return row_arguments(sums, width, eps) | {"sums_of_w": of_weight.data_ptr(), "offset": offset.data_ptr()}
 
 
-def copied_parts(copy: Copy | None, m: int, n: int) -> int:
-    """TP_COPY of kernel.cu."""
+def copied_form(copy: Copy | None, m: int, n: int) -> tuple[int, bool]:
+    """TP_COPY and TP_COPY_WIDE of kernel.cu."""
     if copy is None:
-        return 0
+        return 0, False
     assert (
         copy.out.is_contiguous() and copy.out.shape == (m, n) and copy.scale.dtype == copy.shift.dtype == torch.float32
     )
-    return copy.sums.count
+    return copy.sums.count, copy.out.dtype == torch.bfloat16
 
 
 def copy_arguments(copy: Copy | None, width: int) -> dict[str, Any]:
     if copy is None:
         return {}
-    return _row_arguments(copy.sums, width, copy.eps) | {
+    return row_arguments(copy.sums, width, copy.eps) | {
         "norm_scale": copy.scale.data_ptr(),
         "norm_shift": copy.shift.data_ptr(),
         "copy": copy.out.data_ptr(),
@@ -267,7 +273,8 @@ def copy_arguments(copy: Copy | None, width: int) -> dict[str, Any]:
     }
 
 
-def _row_arguments(sums: Sums, width: int, eps: float) -> dict[str, Any]:
+def row_arguments(sums: Sums | None, width: int, eps: float) -> dict[str, Any]:
+    assert sums is not None
     return {"sums_in": sums.parts.data_ptr(), "inverse_width": 1 / width, "eps": eps}
 
 
@@ -278,13 +285,21 @@ def clusters(tile: Tile, groups: int, at_once: int) -> int:
 
 
 def constants(
-    tile: Tile, epilogue: Epilogue, residual: bool = False, normed: int = 0, copied: int = 0
+    tile: Tile, epilogue: Epilogue, residual: bool = False, normed: int = 0, copied: int = 0, wide: bool = False
 ) -> dict[str, int]:
     """What kernel.cu is compiled with."""
-    return tile_constants(tile, epilogue, residual, factors=normed > 0) | {
-        "TP_NORMED": normed,
+    forms = norm_constants(epilogue, normed, copied, wide)
+    return tile_constants(tile, epilogue, residual, factors=forms["TP_NORMED"] > 0) | forms | BF16
+
+
+def norm_constants(epilogue: Epilogue, normed: int, copied: int, wide: bool) -> dict[str, int]:
+    """Of these, whose norms a product makes up: its input's, in so many parts, or the next one's, in a copy."""
+    rms = epilogue == "geglu"
+    return {
+        "TP_NORMED": 0 if rms else normed,
+        "TP_RMS": normed if rms else 0,
         "TP_COPY": copied,
-        **BF16,
+        "TP_COPY_WIDE": int(wide),
     }
 
 
@@ -307,10 +322,16 @@ def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: i
 
 @cache
 def _kernel(
-    tile: Tile, epilogue: Epilogue, residual: bool, normed: int, copied: int, device: torch.device
+    tile: Tile, epilogue: Epilogue, residual: bool, normed: int, copied: int, wide: bool, device: torch.device
 ) -> DependentKernel:
-    takes = parameters(fp8=False, residual=residual, normed=normed > 0, copied=copied > 0)
-    return build(takes, constants(tile, epilogue, residual, normed, copied), tile, device)
+    sizes = constants(tile, epilogue, residual, normed, copied, wide)
+    return build(parameters_of(sizes), sizes, tile, device)
+
+
+def parameters_of(sizes: dict[str, int]) -> Parameters:
+    """What the kernel with these constants takes."""
+    names = {"fp8": "TP_FP8", "residual": "TP_RESIDUAL", "normed": "TP_NORMED", "copied": "TP_COPY", "rms": "TP_RMS"}
+    return parameters(**{name: sizes[constant] > 0 for name, constant in names.items()})
 
 
 def build(takes: Parameters, sizes: dict[str, int], tile: Tile, device: torch.device) -> DependentKernel:

@@ -17,14 +17,16 @@ from turbopi.kernels.sm90.gemm.bf16 import (
     Sums,
     Tile,
     build,
-    copied_parts,
+    copied_form,
     copy_arguments,
     launch,
     layout,
     matrix_map,
     norm_arguments,
-    parameters,
+    norm_constants,
+    parameters_of,
     product_arguments,
+    row_arguments,
     size_arguments,
     tile_constants,
 )
@@ -87,12 +89,14 @@ def matmul_fp8(
 
     With "bias" alone, `residual` bfloat16[M, N] is added, the sums of the result's rows go into `sums_out`, and a
     `copy` may leave, too. With a `FoldedFp8` ("bias" or "gelu"), a is a `Copy` and `sums` its `sums_out`: its LayerNorm
-    is multiplied.
+    is multiplied; so is with "geglu", in a tile that overlaps, its RMSNorm, HEADROOM in the weight's scale.
     weight [N, K], for "geglu" [2N, K]; bias bfloat16[N] of any epilogue but "geglu" and "parts". All contiguous, K a
     multiple of 16, N of 8.
     """
     folded, weight = (weight, weight.matrix) if isinstance(weight, FoldedFp8) else (None, weight)
-    assert (folded is None) == (sums is None) and (folded is None or epilogue in ("bias", "gelu"))
+    scaled = epilogue == "geglu" and sums is not None
+    assert (folded is None) == (sums is None or scaled) and (folded is None or epilogue in ("bias", "gelu"))
+    assert not scaled or tile.overlap, "other tiles don't multiply an RMSNorm"
     assert not tile.gather or folded is None, "sums are gathered after that"
     assert copy is None or (residual is not None and sums is None and inverse is None)
     m, k = a.shape
@@ -108,8 +112,8 @@ def matmul_fp8(
     assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
     promote = promotion(tile, k) if promote is None else promote
     normed = 0 if sums is None else sums.count
-    copied = copied_parts(copy, m, n)
-    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, copied, a.device)
+    copied, wide = copied_form(copy, m, n)
+    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, copied, wide, a.device)
     given = {
         "map_a": matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
         "map_w": matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
@@ -117,6 +121,7 @@ def matmul_fp8(
         "scale": (weight if folded is None else folded).scale.data_ptr(),
         "inverse": 1.0 if inverse is None else inverse,
         **({} if folded is None else norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),
+        **(row_arguments(sums, k, NO_EPS) if scaled else {}),
         **copy_arguments(copy, n),
         **size_arguments(m, n, -(-k // DEPTH), groups),
     }
@@ -136,12 +141,14 @@ def constants(
     residual: bool = False,
     normed: int = 0,
     copied: int = 0,
+    wide: bool = False,
 ) -> dict[str, int]:
     """What kernel.cu is compiled with."""
-    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": copied}
+    forms = norm_constants(epilogue, normed, copied, wide)
+    own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, **forms}
     if out_fp8:
         own["TP_APART"] = 0  # such blocks go in fours, which may need more room than `Tile.apart` counts
-    return tile_constants(tile, epilogue, residual, factors=2 if normed else 1) | own
+    return tile_constants(tile, epilogue, residual, factors=2 if forms["TP_NORMED"] else 1) | own
 
 
 @cache
@@ -153,10 +160,11 @@ def _kernel(
     residual: bool,
     normed: int,
     copied: int,
+    wide: bool,
     device: torch.device,
 ) -> DependentKernel:
-    takes = parameters(fp8=True, residual=residual, normed=normed > 0, copied=copied > 0)
-    return build(takes, constants(tile, epilogue, out_fp8, promote, residual, normed, copied), tile, device)
+    sizes = constants(tile, epilogue, out_fp8, promote, residual, normed, copied, wide)
+    return build(parameters_of(sizes), sizes, tile, device)
 
 
 # -- which tile --------------------------------------------------------------------------------------------------------

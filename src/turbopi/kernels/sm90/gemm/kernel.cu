@@ -105,6 +105,9 @@ gemm(GEMM_PARAMETERS) {
         [[maybe_unused]] float2* const behind_barriers =
             (float2*)(raw + (gathered + 16 - shared_address(raw)));  // for `Factors` and lines
 #if TP_OVERLAP
+#if TP_RMS
+        asm volatile("griddepcontrol.wait;" ::: "memory");
+#endif
         auto step = [&](float(&sums)[BN / 2], bool first, bool keep) {
             multiply(sums, keep);
             if (!first) release(last);
@@ -115,6 +118,11 @@ gemm(GEMM_PARAMETERS) {
         geglu_tiles(step, end, tile_at, first, units, stride, k_blocks, (Element*)out, M, N, group
 #if TP_FP8
                     , scale, inverse, behind_barriers + group * BN
+#else
+                    , nullptr, 1.0f, nullptr
+#endif
+#if TP_RMS
+                    , (float*)(behind_barriers + FP8 * WGS * BN), sums_in, inverse_width, eps
 #endif
         );
 #else
@@ -327,7 +335,9 @@ gemm(GEMM_PARAMETERS) {
 #if TP_COPY
                         plain_sum += x + y, plain_squares = fmaf(x, x, fmaf(y, y, plain_squares));
                         x = fmaf(x, factor[half], shift), y = fmaf(y, factor[half], shift);
-                        copies[j] = pack_e4m3(fmaf(x, scales[j].x, shifts[j].x), fmaf(y, scales[j].y, shifts[j].y));
+                        const float near_x = fmaf(x, scales[j].x, shifts[j].x);
+                        const float near_y = fmaf(y, scales[j].y, shifts[j].y);
+                        copies[j] = TP_COPY_WIDE ? pack(near_x, near_y) : pack_e4m3(near_x, near_y);
 #endif
                         sum += x + y, squares = fmaf(x, x, fmaf(y, y, squares));
                         return both;
@@ -341,7 +351,7 @@ gemm(GEMM_PARAMETERS) {
                     store_row(settled((Element*)out + begin + t.n), in_row[half], t.split, lane, value);
 #if TP_COPY
                     auto copied = [&](int j) { return copies[j]; };
-                    store_row(settled(copy + begin + t.n), in_row[half], t.split, lane, copied);
+                    store_row(settled((Copied*)copy + begin + t.n), in_row[half], t.split, lane, copied);
                     if (t.n == 0 && t.split == 0 && lane % 4 == 0)  // so that no eps is needed any more
                         squares += eps * factor[half] * factor[half] / inverse_width;
 #endif
