@@ -30,7 +30,8 @@ NORMS_IN_PRODUCTS = False  # a try: see prefix_norms.py
 def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     """With these measured tiles, and in sizes that they don't have those of gemm/tiles.py."""
     portable, vision, batch = portable_ops(tiles), VisionProducts(tiles), portable_batch.batch_ops(tiles)
-    products_of_models = ProductsAhead(vision, tiles) if WEIGHTS_AHEAD else vision
+    ahead = ProductsAhead(vision, tiles) if WEIGHTS_AHEAD else None
+    products_of_models = ahead or vision
     origin = {
         "vision products": f"CUDA for {_rows(VISION_TILES)} rows, else cuBLAS",
         "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS",
@@ -59,7 +60,7 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     )
     if not NORMS_IN_PRODUCTS:
         return ops
-    prefix = PrefixNorms(ops, tiles)
+    prefix = PrefixNorms(ops, tiles) if ahead is None else PrefixNorms(ops, tiles, ahead.behind)
     return replace(
         ops,
         residual_linear=prefix.residual_linear,

@@ -86,10 +86,15 @@ class NearlyNormed:
 
 
 class PrefixNorms:
-    """`residual_linear`, `residual_rms_norm` and `linear_geglu` around those of `ops`, for sizes that OUT_TILES has."""
+    """`residual_linear`, `residual_rms_norm` and `linear_geglu` around those of `ops`, for sizes that OUT_TILES has.
 
-    def __init__(self, ops: Ops, tiles: TileTable = NO_TILES) -> None:
-        self._ops, self._tiles = ops, tiles
+    multiplying  is told each matrix that `ops` aren't given
+    """
+
+    def __init__(
+        self, ops: Ops, tiles: TileTable = NO_TILES, multiplying: Callable[[Matrix], object] = lambda matrix: None
+    ) -> None:
+        self._ops, self._tiles, self._multiplying = ops, tiles, multiplying
         self._before: tuple[Tensor, Sums] | None = None  # the stream and its sums, as the last norm left it
         self._squares: dict[tuple[int, torch.device], Sums] = {}  # by rows: what `norm_and_squares` writes
         self._ones: dict[tuple[int, torch.device], Sums] = {}  # by rows: sums of a stream that is copied as it is
@@ -100,6 +105,7 @@ class PrefixNorms:
         tile = OUT_TILES.get((whole_64(len(x)), weight.shape[0], weight.shape[1]))
         if bias is not None or tile is None:
             return self._ops.residual_linear(x, weight, bias)
+        self._multiplying(weight)
         return OutProduct(x, weight, tile)
 
     def residual_rms_norm(

@@ -30,7 +30,7 @@ class ProductsAhead:
     ) -> Tensor:
         if bias is not None or not isinstance(x, Tensor):
             return self._vision.linear(x, weight, bias, out)
-        ahead = self._next(weight)
+        ahead = self.behind(weight)
         if isinstance(weight, ScaledMatrix):
             fp8 = chosen_fp8(self._tiles, "plain", x.shape[0], weight.shape[0], weight.shape[1], num_sms(x.device))
             assert fp8 is not None, "the library has no such product"
@@ -43,10 +43,10 @@ class ProductsAhead:
     def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
         if bias is not None:
             return self._vision.residual_linear(x, weight, bias)
-        return tuned_residual_linear(x, weight, None, self._next(weight), tiles=self._tiles)
+        return tuned_residual_linear(x, weight, None, self.behind(weight), tiles=self._tiles)
 
-    def _next(self, matrix: Matrix) -> Tensor | None:
-        """The matrix that came behind this one last time, unless it is too large."""
+    def behind(self, matrix: Matrix) -> Tensor | None:
+        """This one is multiplied now: which one came behind it last time, unless that is too large."""
         data: torch.Tensor = matrix.data if isinstance(matrix, ScaledMatrix) else matrix
         if self._last is not None:
             self._behind[self._last.data_ptr()] = data
