@@ -69,6 +69,7 @@ class Variant:
     schedule: Mapping[str, bool] = field(default_factory=dict)
     ahead: bool = False
     norms: bool = False
+    rope: bool = False
     tiles: bool = False
 
 
@@ -83,10 +84,13 @@ VARIANTS = {
     "tiles": Variant(tiles=True),
     "tiles and ahead": Variant(ahead=True, tiles=True),
     "norms": Variant(norms=True),
+    "rope": Variant(rope=True),
     "all but marks": Variant(
-        ENDS | {"prompt_beside_vision": True, "keys_beside_prefix": True}, ahead=True, norms=True, tiles=True
+        ENDS | {"prompt_beside_vision": True, "keys_beside_prefix": True}, ahead=True, norms=True, rope=True, tiles=True
     ),
-    "all": Variant({one.name: True for one in dataclasses.fields(Schedule)}, ahead=True, norms=True, tiles=True),
+    "all": Variant(
+        {one.name: True for one in dataclasses.fields(Schedule)}, ahead=True, norms=True, rope=True, tiles=True
+    ),
 }
 
 
@@ -110,7 +114,7 @@ class Turns:
         self.backend, self.job = self.policy.backend, job
         self.observations = Observations(self.policy, job)
         self._kept: dict[str, dict[str, Any]] = {}
-        self._ops = {(False, False, False): self.backend._ops}
+        self._ops = {(False, False, False, False): self.backend._ops}
 
     def take(self, name: str) -> None:
         """From now on the policy is this variant."""
@@ -118,11 +122,11 @@ class Turns:
             variant = VARIANTS[name]
             for one in dataclasses.fields(Schedule):
                 setattr(SCHEDULE, one.name, variant.schedule.get(one.name, False))
-            key = (variant.ahead, variant.norms, variant.tiles)
+            key = (variant.ahead, variant.norms, variant.rope, variant.tiles)
             if key not in self._ops:
-                hopper.WEIGHTS_AHEAD, hopper.NORMS_IN_PRODUCTS = variant.ahead, variant.norms
+                hopper.WEIGHTS_AHEAD, hopper.NORMS_IN_PRODUCTS, hopper.ROPE_IN_PRODUCTS = key[:3]
                 self._ops[key] = fused_ops(self.backend.device, TILES if variant.tiles else TileTable())
-                hopper.WEIGHTS_AHEAD = hopper.NORMS_IN_PRODUCTS = False
+                hopper.WEIGHTS_AHEAD = hopper.NORMS_IN_PRODUCTS = hopper.ROPE_IN_PRODUCTS = False
             self._kept[name] = {"_ops": self._ops[key], "_graphs": {}, "_calls": {}, "_pictures": {}, "_begun": None}
         for attribute in STATE:
             setattr(self.backend, attribute, self._kept[name][attribute])

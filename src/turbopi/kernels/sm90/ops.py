@@ -20,11 +20,13 @@ from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
 from turbopi.kernels.sm90.gemm.tiles import PARTS_TILES, RESIDUAL_TILES, VISION_TILES
 from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
 from turbopi.kernels.sm90.prefix_norms import PrefixNorms
+from turbopi.kernels.sm90.rope_products import RopeProducts
 from turbopi.kernels.sm90.weights_ahead import ProductsAhead
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 
 WEIGHTS_AHEAD = False  # a try: see weights_ahead.py
 NORMS_IN_PRODUCTS = False  # a try: see prefix_norms.py
+ROPE_IN_PRODUCTS = False  # a try: see rope_products.py
 
 
 def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
@@ -58,6 +60,9 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
         ),
         origin={**portable.origin, **origin},
     )
+    if ROPE_IN_PRODUCTS:
+        rope = RopeProducts(ops) if ahead is None else RopeProducts(ops, ahead.behind)
+        ops = replace(ops, linear=rope.linear, rope_split=rope.rope_split)
     if not NORMS_IN_PRODUCTS:
         return ops
     prefix = PrefixNorms(ops, tiles) if ahead is None else PrefixNorms(ops, tiles, ahead.behind)

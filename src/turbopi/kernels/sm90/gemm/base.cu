@@ -33,6 +33,9 @@
 // The same for RMSNorm in front of GeGLU: TP_COPY_WIDE leaves the copy in bfloat16, and TP_RMS (parts of a row's sums,
 // or 0) multiplies a row's gates and ups by what its copy lacks of the norm.
 //
+// TP_ROPE (columns of a head, of which a tile is a part): the result is queries, a head of keys, one of values, and
+// leaves rotated and split: to `out`, `k_out`, `v_out`. Rows of w are so that the two numbers of a pair are neighbours.
+//
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
 // TP_OVERLAP: see geglu.cu.
 
@@ -253,6 +256,27 @@ __device__ __forceinline__ void store_row(unsigned char* to, int count, int spli
         if (j < count) *(u16*)(to + j * 8 + lane % 4 * 2) = (u16)x;
     }
 }
+
+#if TP_ROPE
+static_assert(TP_ROPE % TILE_N == 0 && EPILOGUE == 0 && !GATHER && SPLITS == 1 && !OUT_FP8 && !TP_NORMED);
+// Where a row of head `head` begins; queries have `heads` of them beside each other.
+__device__ __forceinline__ u16* row_of_head(int head, int heads, size_t row, void* q, u16* k, u16* v) {
+    return head < heads ? (u16*)q + (row * heads + head) * TP_ROPE : (head == heads ? k : v) + row * TP_ROPE;
+}
+// A lane's pairs of a row, sums[4 j], sums[4 j + 1] by turns[j] (cosine, sine), from pair `first` of the head on.
+__device__ __forceinline__ void store_rotated(u16* to, int first, bool inside, int lane, const float* sums,
+                                              const float2* turns) {
+    const bool odd = lane & 1;
+#pragma unroll
+    for (int j = 0; j < BLOCKS; ++j) {
+        const float x = sums[4 * j], y = sums[4 * j + 1], c = turns[j].x, s = turns[j].y;
+        const float lower = x * c - y * s, upper = y * c + x * s;
+        const float other = __shfl_xor_sync(~0u, odd ? lower : upper, 1);  // lanes of a pair exchange halves
+        const int pair = first + 4 * j + lane % 4;
+        if (inside) *(u32*)(to + (odd ? TP_ROPE / 2 + pair - 1 : pair)) = odd ? pack(other, upper) : pack(lower, other);
+    }
+}
+#endif
 
 // A warp's 16 rows of a part of the sums, in bfloat16, to where its first one begins. They take the way through shared
 // memory, as whole lines of 128 bytes leave several times as fast as what a lane has of 8 rows.

@@ -90,6 +90,43 @@ class Sums:
 
 
 @dataclass(frozen=True)
+class Turning:
+    """What RoPE is told: the result [M, (n + 2) * K] is n heads of queries, one of keys, one of values.
+
+    The matrix has rows as `beside_each_other` makes them. Queries are the product's result, [M, n * K].
+    """
+
+    cos: Tensor  # float32[M, K/2]
+    sin: Tensor
+    k: Tensor  # bfloat16[M, K], written
+    v: Tensor
+
+    @property
+    def head_dim(self) -> int:
+        return self.k.shape[1]
+
+    def heads(self, columns: int) -> int:
+        """Of queries."""
+        return columns // self.head_dim - 2
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        assert all(one.is_contiguous() for one in (self.cos, self.sin, self.k, self.v))
+        assert self.cos.shape == self.sin.shape == (len(self.k), self.head_dim // 2) and self.k.shape == self.v.shape
+        named = {"cosines": self.cos, "sines": self.sin, "k_out": self.k, "v_out": self.v}
+        return {name: one.data_ptr() for name, one in named.items()}
+
+
+def beside_each_other(rows: int, head_dim: int, device: torch.device) -> Tensor:
+    """int64[rows]: rows of a matrix of queries, keys and values in an order in which pairs that RoPE turns, i and
+    i + K/2 of a head, are neighbours. Values stay as they are.
+    """
+    order = torch.arange(rows, device=device).view(-1, head_dim)
+    order[:-1] = order[:-1].view(-1, 2, head_dim // 2).transpose(1, 2).reshape(-1, head_dim)
+    return order.flatten()
+
+
+@dataclass(frozen=True)
 class Copy:
     """A copy of the result x in E4M3 or bfloat16: round((x - mean) / deviation * scale + shift).
 
@@ -137,6 +174,7 @@ def matmul(
     sums: Sums | None = None,
     eps: float = 0.0,
     copy: Copy | None = None,
+    turning: Turning | None = None,
     ahead: Tensor | None = None,
 ) -> Tensor:
     """a [M, K] @ weightᵀ with the epilogue -> bfloat16[M, N]; "partial" -> float32, "parts" -> bfloat16[splits, M, N].
@@ -144,8 +182,8 @@ def matmul(
     weight [N, K], for "geglu" [2N, K]. All bfloat16 and contiguous, K and N multiples of 8. With "bias" alone,
     `residual` [M, N] is added, the sums of the result's rows go into `sums_out`, and a `copy` may leave, too. With a
     `Folded` weight, whose bias is in it, a's LayerNorm is multiplied, made of the `sums` of a's rows. With "geglu", in
-    a tile that overlaps, a is a `Copy` and `sums` its `sums_out`: its RMSNorm is multiplied. `ahead` is fetched into L2
-    in the end.
+    a tile that overlaps, a is a `Copy` and `sums` its `sums_out`: its RMSNorm is multiplied. With "plain" and
+    `turning` queries are returned, and keys and values written, after RoPE. `ahead` is fetched into L2 in the end.
     """
     folded, weight = (weight, weight.data) if isinstance(weight, Folded) else (None, weight)
     scaled = epilogue == "geglu" and sums is not None
@@ -159,12 +197,20 @@ def matmul(
     assert k % 8 == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
     columns, groups = layout(tile, epilogue, m, n, -(-k // DEPTH), residual, sums_out)
     if out is None:
-        shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
+        shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n if turning is None else n - 2 * turning.head_dim)
         out = torch.empty(shape, dtype=torch.float32 if epilogue == "partial" else torch.bfloat16, device=a.device)
     assert out.is_contiguous()
     assert copy is None or (residual is not None and sums is None)
     normed = 0 if sums is None else sums.count
-    kernel = _kernel(tile, epilogue, residual is not None, normed, *copied_form(copy, m, n), a.device)
+    kernel = _kernel(
+        tile,
+        epilogue,
+        residual is not None,
+        normed,
+        *copied_form(copy, m, n),
+        turned(turning, tile, epilogue),
+        a.device,
+    )
     given = {
         "map_a": matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n),
         "map_w": matrix_map(weight.data_ptr(), weight.shape[0], k, columns // tile.cluster_m),
@@ -172,10 +218,23 @@ def matmul(
         **({} if folded is None else norm_arguments(sums, k, eps, folded.sums, folded.offset)),
         **(row_arguments(sums, k, eps) if scaled else {}),
         **copy_arguments(copy, n),
+        **turning_arguments(turning, n),
         **size_arguments(m, n, -(-k // DEPTH), groups),
     }
     launch(kernel, tile, groups, given, ahead)
     return out
+
+
+def turned(turning: Turning | None, tile: Tile, epilogue: Epilogue) -> int:
+    """TP_ROPE of kernel.cu."""
+    if turning is None:
+        return 0
+    assert epilogue == "plain" and turning.head_dim % tile.columns == 0, f"a head is whole tiles, not {tile}"
+    return turning.head_dim
+
+
+def turning_arguments(turning: Turning | None, columns: int) -> dict[str, Any]:
+    return {} if turning is None else {**turning.arguments, "heads": turning.heads(columns)}
 
 
 def layout(
@@ -208,7 +267,9 @@ def launch(
     kernel.launch_dependent(blocks, given | {"ahead": place, "ahead_bytes": share})
 
 
-def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool, rms: bool = False) -> Parameters:
+def parameters(
+    *, fp8: bool, residual: bool, normed: bool, copied: bool, rms: bool = False, rope: bool = False
+) -> Parameters:
     """What kernel.cu's kernel takes in these forms."""
     rows = (
         Parameter("const float2*", "sums_in", "[parts][M]: the sum and the sum of squares of a row"),
@@ -227,6 +288,8 @@ def parameters(*, fp8: bool, residual: bool, normed: bool, copied: bool, rms: bo
             *((Parameter("const float*", "sums_of_w"), Parameter("const float*", "offset")) if normed else ()),
             *((Parameter("const float2*", "norm_scale"), Parameter("const float2*", "norm_shift")) if copied else ()),
             *((Parameter("unsigned char*", "copy"), Parameter("float2*", "plain_sums")) if copied else ()),
+            *((Parameter("const float*", "cosines"), Parameter("const float*", "sines")) if rope else ()),
+            *((Parameter("u16*", "k_out"), Parameter("u16*", "v_out"), Parameter("int", "heads")) if rope else ()),
             *(Parameter("int", name) for name in ("M", "N", "k_blocks", "m_groups", "n_groups")),
             Parameter("const char*", "ahead"),
             Parameter("u32", "ahead_bytes"),
@@ -285,10 +348,16 @@ def clusters(tile: Tile, groups: int, at_once: int) -> int:
 
 
 def constants(
-    tile: Tile, epilogue: Epilogue, residual: bool = False, normed: int = 0, copied: int = 0, wide: bool = False
+    tile: Tile,
+    epilogue: Epilogue,
+    residual: bool = False,
+    normed: int = 0,
+    copied: int = 0,
+    wide: bool = False,
+    rope: int = 0,
 ) -> dict[str, int]:
     """What kernel.cu is compiled with."""
-    forms = norm_constants(epilogue, normed, copied, wide)
+    forms = norm_constants(epilogue, normed, copied, wide) | {"TP_ROPE": rope}
     return tile_constants(tile, epilogue, residual, factors=forms["TP_NORMED"] > 0) | forms | BF16
 
 
@@ -322,15 +391,23 @@ def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: i
 
 @cache
 def _kernel(
-    tile: Tile, epilogue: Epilogue, residual: bool, normed: int, copied: int, wide: bool, device: torch.device
+    tile: Tile,
+    epilogue: Epilogue,
+    residual: bool,
+    normed: int,
+    copied: int,
+    wide: bool,
+    rope: int,
+    device: torch.device,
 ) -> DependentKernel:
-    sizes = constants(tile, epilogue, residual, normed, copied, wide)
+    sizes = constants(tile, epilogue, residual, normed, copied, wide, rope)
     return build(parameters_of(sizes), sizes, tile, device)
 
 
 def parameters_of(sizes: dict[str, int]) -> Parameters:
     """What the kernel with these constants takes."""
     names = {"fp8": "TP_FP8", "residual": "TP_RESIDUAL", "normed": "TP_NORMED", "copied": "TP_COPY", "rms": "TP_RMS"}
+    names |= {"rope": "TP_ROPE"}
     return parameters(**{name: sizes[constant] > 0 for name, constant in names.items()})
 
 

@@ -16,6 +16,7 @@ from turbopi.kernels.sm90.gemm.bf16 import (
     Epilogue,
     Sums,
     Tile,
+    Turning,
     build,
     copied_form,
     copy_arguments,
@@ -29,6 +30,8 @@ from turbopi.kernels.sm90.gemm.bf16 import (
     row_arguments,
     size_arguments,
     tile_constants,
+    turned,
+    turning_arguments,
 )
 from turbopi.kernels.sm90.gemm.tiles import TILES_FP8
 from turbopi.kernels.sm90.instructions import DependentKernel
@@ -82,6 +85,7 @@ def matmul_fp8(
     sums_out: Sums | None = None,
     sums: Sums | None = None,
     copy: Copy | None = None,
+    turning: Turning | None = None,
     ahead: Tensor | None = None,
 ) -> Tensor:
     """a e4m3[M, K] @ weightᵀ with the epilogue -> bfloat16[M, N], or with `inverse` e4m3[M, N] = round(… * inverse);
@@ -90,6 +94,7 @@ def matmul_fp8(
     With "bias" alone, `residual` bfloat16[M, N] is added, the sums of the result's rows go into `sums_out`, and a
     `copy` may leave, too. With a `FoldedFp8` ("bias" or "gelu"), a is a `Copy` and `sums` its `sums_out`: its LayerNorm
     is multiplied; so is with "geglu", in a tile that overlaps, its RMSNorm, HEADROOM in the weight's scale.
+    `turning`: as `bf16.matmul`'s.
     weight [N, K], for "geglu" [2N, K]; bias bfloat16[N] of any epilogue but "geglu" and "parts". All contiguous, K a
     multiple of 16, N of 8.
     """
@@ -107,13 +112,16 @@ def matmul_fp8(
     partial = epilogue == "partial"
     assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu", "parts"))
     if out is None:
-        shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
+        shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n if turning is None else n - 2 * turning.head_dim)
         out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)
     assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
     promote = promotion(tile, k) if promote is None else promote
     normed = 0 if sums is None else sums.count
     copied, wide = copied_form(copy, m, n)
-    kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, copied, wide, a.device)
+    rope = turned(turning, tile, epilogue)
+    kernel = _kernel(
+        *(tile, epilogue, inverse is not None, promote, residual is not None, normed, copied, wide, rope), a.device
+    )
     given = {
         "map_a": matrix_map(a.data_ptr(), m, k, tile.rows // tile.cluster_n, fp8=True),
         "map_w": matrix_map(weight.data.data_ptr(), weight.shape[0], k, columns // tile.cluster_m, fp8=True),
@@ -123,6 +131,7 @@ def matmul_fp8(
         **({} if folded is None else norm_arguments(sums, k, NO_EPS, folded.of_scale, folded.of_shift)),
         **(row_arguments(sums, k, NO_EPS) if scaled else {}),
         **copy_arguments(copy, n),
+        **turning_arguments(turning, n),
         **size_arguments(m, n, -(-k // DEPTH), groups),
     }
     launch(kernel, tile, groups, given, ahead)
@@ -142,9 +151,10 @@ def constants(
     normed: int = 0,
     copied: int = 0,
     wide: bool = False,
+    rope: int = 0,
 ) -> dict[str, int]:
     """What kernel.cu is compiled with."""
-    forms = norm_constants(epilogue, normed, copied, wide)
+    forms = norm_constants(epilogue, normed, copied, wide) | {"TP_ROPE": rope}
     own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, **forms}
     if out_fp8:
         own["TP_APART"] = 0  # such blocks go in fours, which may need more room than `Tile.apart` counts
@@ -161,9 +171,10 @@ def _kernel(
     normed: int,
     copied: int,
     wide: bool,
+    rope: int,
     device: torch.device,
 ) -> DependentKernel:
-    sizes = constants(tile, epilogue, out_fp8, promote, residual, normed, copied, wide)
+    sizes = constants(tile, epilogue, out_fp8, promote, residual, normed, copied, wide, rope)
     return build(parameters_of(sizes), sizes, tile, device)
 
 

@@ -154,6 +154,16 @@ gemm(GEMM_PARAMETERS) {
                     offsets[j] = bias && j < blocks && needed ? bias[col / 2 + 4 * j] : 0;
                 }
             }
+#if TP_ROPE
+            const int head = t.n / TP_ROPE, first_pair = t.n % TP_ROPE / 2;
+            float2 turns[2][BN / 8];
+#pragma unroll
+            for (int i = 0; i < BN / 4; ++i) {
+                const size_t at = (size_t)(row + i % 2 * 8) * (TP_ROPE / 2) + first_pair + i / 2 * 4 + lane % 4;
+                const bool needed = head <= heads && in_row[i % 2];
+                turns[i % 2][i / 2] = needed ? make_float2(cosines[at], sines[at]) : make_float2(0.0f, 0.0f);
+            }
+#endif
 #if TP_COPY
             float2 scales[BN / 8], shifts[BN / 8];  // of the next norm
 #pragma unroll
@@ -305,6 +315,13 @@ gemm(GEMM_PARAMETERS) {
                         if (j < in_row[half]) *(float2*)(to + 8 * j) = make_float2(x, y);
                     }
                 } else {
+#if TP_ROPE
+                    u16* const of_head = row_of_head(head, heads, row + half * 8, out, k_out, v_out);
+                    if (head <= heads) {
+                        store_rotated(of_head, first_pair, in_row[half], lane, sums + 2 * half, turns[half]);
+                        continue;
+                    }
+#endif
 #if TP_COPY
                     const float shift = -mean[half] * factor[half];
                     int missing = 0;  // blocks beyond the matrix, which are zeros, in these units `shift`
@@ -348,7 +365,11 @@ gemm(GEMM_PARAMETERS) {
 #endif
                         return pack(x, y);
                     };
+#if TP_ROPE
+                    store_row(of_head + t.n % TP_ROPE, in_row[half], t.split, lane, value);
+#else
                     store_row(settled((Element*)out + begin + t.n), in_row[half], t.split, lane, value);
+#endif
 #if TP_COPY
                     auto copied = [&](int j) { return copies[j]; };
                     store_row(settled((Copied*)copy + begin + t.n), in_row[half], t.split, lane, copied);
