@@ -31,12 +31,15 @@ from turbopi.engine.schedule import SCHEDULE, Schedule
 from turbopi.kernels.ops import fused_ops
 from turbopi.kernels.sm90 import ops as hopper
 from turbopi.kernels.tile_table import Knobs, Numbers, TileKey, TileTable
+from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import Quantization
 
 CALIBRATION = Path("benchmarks/results/h200_2026-11-24_pi05_libero/calibrate.json")
 ROUNDS, PROFILED = 6, 5
 TIMES = ("total", "infer", "preprocess", "postprocess", "vision", "prefix", "denoise", "device")
+COMPARED = ("kv_k", "kv_v", "actions")
+Outputs = list[dict[str, torch.Tensor]]  # by observation: what COMPARED names
 STATE = ("_ops", "_graphs", "_calls", "_pictures", "_begun")  # of a runner, by variant
 
 
@@ -137,27 +140,45 @@ class Turns:
         found = {name.removesuffix("_ms"): milliseconds for name, milliseconds in timing.items()}
         return found | {"device": sum(found[stage] for stage in ("vision", "prefix", "denoise"))}
 
-    def outputs(self) -> list[np.ndarray]:
-        """Actions, then keys and values of the prefix, of two observations that are the same for every variant."""
-        source, found = Observations(self.policy, self.job, seed=1), []
-        for seed in range(2):
-            found.append(self.policy.infer(next(source), seed=seed, num_steps=self.job.steps)["actions"])
-            call = next(iter(self.backend._calls.values()))
-            length = int(call.host.length[0])
-            found += [one[:, :length].float().cpu().numpy() for one in (call.cache_k, call.cache_v)]
-        return found
+    def outputs(self) -> Outputs:
+        return outputs(self.policy, self.job)
 
 
-def compared(ours: list[np.ndarray], usual: list[np.ndarray]) -> str:
-    """ "the same bits", or the largest relative difference of actions and of the cache."""
-    if all(np.array_equal(x, y) for x, y in zip(ours, usual, strict=True)):
-        return "the same bits"
+def outputs(policy: UnifiedPolicy, job: Job) -> Outputs:
+    """What becomes of two observations that are the same for every policy."""
+    source, found = Observations(policy, job, seed=1), []
+    for seed in range(2):
+        shape = (1, job.horizon, policy.config.model.action_dim)
+        noise = torch.from_numpy(np.random.default_rng(seed).standard_normal(shape, dtype=np.float32))
+        seen = Observation.stack([policy.prepare(next(source))])
+        trace = policy.backend.intermediates(seen, noise, job.steps)
+        cameras = seen.image_mask[0].repeat_interleave(policy.config.model.vision.num_tokens)
+        valid = torch.cat((cameras, seen.token_mask[0]))
+        made = {name: trace[name].float().cpu() for name in COMPARED}
+        found.append({name: one if name == "actions" else one[:, :, valid] for name, one in made.items()})
+    return found
 
-    def off(x: np.ndarray, y: np.ndarray) -> float:
-        return float(np.sqrt(np.mean((x - y) ** 2) / np.mean(y**2)))
 
-    each = [off(x, y) for x, y in zip(ours, usual, strict=True)]
-    return f"actions {max(each[::3]):.1e}, cache {max(each[1::3] + each[2::3]):.1e} off"
+def exact_outputs(job: Job) -> Outputs:
+    """The same in float32."""
+    policy = bench_policy(random_checkpoint("pi05_libero"), "pytorch", "f32", resolve_device("cuda"), job)
+    found = outputs(policy, job)
+    del policy
+    torch.cuda.empty_cache()
+    return found
+
+
+def compared(ours: Outputs, usual: Outputs, exact: Outputs) -> str:
+    """Whether they are the usual bits, and the relative rms errors of keys, values and actions against float32."""
+    pairs = list(zip(ours, usual, exact, strict=True))
+    same = all(torch.equal(one[name], other[name]) for one, other, _ in pairs for name in COMPARED)
+
+    def error(name: str) -> float:
+        off = sum(float((one[name] - right[name]).square().sum()) for one, _, right in pairs)
+        return float((off / sum(float(right[name].square().sum()) for *_, right in pairs)) ** 0.5)
+
+    errors = ", ".join(f"{name} {error(name):.5f}" for name in COMPARED)
+    return f"{'the same bits' if same else 'other bits'}; {errors}"
 
 
 def timed(turns: Turns, names: list[str], calls: int) -> dict[str, dict[str, float]]:
@@ -173,29 +194,29 @@ def timed(turns: Turns, names: list[str], calls: int) -> dict[str, dict[str, flo
     return {name: {key: statistics.median(one[key] for one in rows) for key in TIMES} for name, rows in found.items()}
 
 
-def report(turns: Turns, names: list[str], calls: int) -> Iterator[str]:
-    usual: list[np.ndarray] = []
+def report(turns: Turns, names: list[str], calls: int, exact: Outputs) -> Iterator[str]:
+    usual: Outputs = []
     differs, working = {}, []
     for name in names:
         start = time.perf_counter()
         turns.take(name)
         try:
             turns.call()
-            outputs = turns.outputs()
+            made = turns.outputs()
         except Exception as error:  # one try that fails doesn't cost the others their turn
             yield f"{name}: FAILED, {type(error).__name__}: {error}"
             if name == names[0]:
                 raise
             continue
-        usual = usual or outputs
-        differs[name] = compared(outputs, usual)
+        usual = usual or made
+        differs[name] = compared(made, usual, exact)
         working.append(name)
         yield f"({name} captured in {time.perf_counter() - start:.1f} s)"
     rows = timed(turns, working, calls)
-    yield f"{'ms, medians':16}" + "".join(f"{key:>12}" for key in TIMES) + "  against as is"
+    yield f"{'ms, medians':16}" + "".join(f"{key:>12}" for key in TIMES) + "  bits of the first one? errors"
     for name, row in rows.items():
         yield f"{name:16}" + "".join(f"{row[key]:12.4f}" for key in TIMES) + f"  {differs[name]}"
-    yield "less than as is, us"
+    yield "against the first one, us; negative is faster"
     for name, row in rows.items():
         yield f"{name:16}" + "".join(f"{(row[key] - rows[working[0]][key]) * 1e3:12.1f}" for key in TIMES)
 
@@ -236,24 +257,26 @@ def main() -> None:
     profiles = [name.strip() for name in arguments.timelines.split(",") if name.strip()]
     arguments.out.mkdir(parents=True, exist_ok=True)
     start_profiler(resolve_device("cuda"))
+    job = Job(cameras=arguments.cameras)
+    exact = exact_outputs(job)
     with (arguments.out / "turns.txt").open("w") as text, (arguments.out / "timeline.txt").open("w") as order:
         for precision in precisions:
-            _write(text, _told(precision, arguments.cameras, names, profiles, arguments.calls, order))
+            _write(text, _told(precision, job, exact, names, profiles, arguments.calls, order))
 
 
 def _told(
-    precision: Precision, cameras: int, names: list[str], profiles: list[str], calls: int, order: Any
+    precision: Precision, job: Job, exact: Outputs, names: list[str], profiles: list[str], calls: int, order: Any
 ) -> Iterator[str]:
     """Kernels that no GPU has run yet come last: an error in one may be for good, and the rest has been told then."""
     start, told = time.perf_counter(), set[str]()
-    turns = Turns(precision, Job(cameras=cameras))
+    turns = Turns(precision, job)
     clock: Callable[[], str] = lambda: f"{time.perf_counter() - start:.1f} s"  # noqa: E731
     yield f"\n{precision}, {turns.job}, {torch.cuda.get_device_name()}, torch {torch.__version__}; loaded in {clock()}"
     print(f"# {precision} timelines", file=order)
     kernels = [name for name in names if VARIANTS[name].norms or VARIANTS[name].rope]
     others = [name for name in names if name not in kernels]
     for these in (others, [*others[:1], *kernels]) if kernels else (others,):
-        yield from report(turns, these, calls)
+        yield from report(turns, these, calls, exact)
         for line in timelines(turns, [name for name in profiles if name in these and name not in told]):
             print(line, file=order, flush=True)
         told.update(these)
