@@ -30,7 +30,8 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.engine.schedule import SCHEDULE, Schedule
 from turbopi.kernels.ops import fused_ops
 from turbopi.kernels.sm90 import ops as hopper
-from turbopi.kernels.tile_table import Knobs, Numbers, TileKey, TileTable
+from turbopi.kernels.sm90.attention import kernel as attention
+from turbopi.kernels.tile_table import LIBRARY, Knobs, Numbers, TileKey, TileTable
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
 from turbopi.quantization.calibration_file import Quantization
@@ -50,20 +51,36 @@ def _tile(
     return TileKey("hopper", operation, numbers, rows, out, inner), usual | knobs
 
 
-# benchmarks/results/h200_2026-11-26_tune, where they are faster than the usual ones
-TILES = TileTable(
-    dict(
-        (
-            _tile("bf16", "plain", 2560, 2048, warpgroups=3, columns=64),
-            _tile("bf16", "parts", 2048, 2048, warpgroups=3, columns=96, splits=2, ring=5),
-            _tile("bf16", "plain", 512, 2048, warpgroups=1, columns=48),
-            _tile("bf16", "residual", 1152, 1152, 512, warpgroups=1, columns=80),
-            _tile("bf16", "bias", 2048, 1152, 512, warpgroups=1, columns=128, cluster_m=2),
-            _tile("fp8", "plain", 512, 2048, warpgroups=1, columns=64),
-            _tile("fp8", "gelu", 4304, 1152, 512, warpgroups=2, columns=144, cluster_m=2),
+TABLES = {
+    "usual": TileTable(),
+    # benchmarks/results/h200_2026-11-26_tune, where they are faster than the usual ones
+    "tuned": TileTable(
+        dict(
+            (
+                _tile("bf16", "plain", 2560, 2048, warpgroups=3, columns=64),
+                _tile("bf16", "parts", 2048, 2048, warpgroups=3, columns=96, splits=2, ring=5),
+                _tile("bf16", "plain", 512, 2048, warpgroups=1, columns=48),
+                _tile("bf16", "residual", 1152, 1152, 512, warpgroups=1, columns=80),
+                _tile("bf16", "bias", 2048, 1152, 512, warpgroups=1, columns=128, cluster_m=2),
+                _tile("fp8", "plain", 512, 2048, warpgroups=1, columns=64),
+                _tile("fp8", "gelu", 4304, 1152, 512, warpgroups=2, columns=144, cluster_m=2),
+            )
         )
-    )
-)
+    ),
+    # cuBLAS's two parts at once were 1.1 us faster alone; a pair of blocks that share rows takes 43 bytes a cycle from
+    # L2 instead of 64
+    "down": TileTable(
+        dict(
+            (
+                (TileKey("hopper", "parts", "bf16", 576, 2048, 16384), {LIBRARY: 2}),
+                _tile("fp8", "parts", 2048, 16384, warpgroups=3, columns=96, splits=2, cluster_n=2),
+            )
+        )
+    ),
+    "out": TileTable(  # as many results a block as the usual one in FP8, fewer bytes of operands
+        dict(_tile(numbers, "parts", 2048, 2048, warpgroups=2, columns=80) for numbers in ("bf16", "fp8"))
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -74,7 +91,8 @@ class Variant:
     ahead: bool = False
     norms: bool = False
     rope: bool = False
-    tiles: bool = False
+    tiles: str = "usual"  # of TABLES
+    keys: int = 64  # of prefix attention
 
 
 ENDS = {"ends_by_kernel": True}
@@ -85,15 +103,23 @@ VARIANTS = {
     "keys beside": Variant({"keys_beside_prefix": True}),
     "marks aside": Variant({"marks_aside": True}),
     "ahead": Variant(ahead=True),
-    "tiles": Variant(tiles=True),
-    "tiles and ahead": Variant(ahead=True, tiles=True),
+    "tiles": Variant(tiles="tuned"),
+    "tiles of down": Variant(tiles="down"),
+    "tiles of out": Variant(tiles="out"),
+    "48 keys": Variant(keys=48),
+    "96 keys": Variant(keys=96),
+    "tiles and ahead": Variant(ahead=True, tiles="tuned"),
     "norms": Variant(norms=True),
     "rope": Variant(rope=True),
     "all but marks": Variant(
-        ENDS | {"prompt_beside_vision": True, "keys_beside_prefix": True}, ahead=True, norms=True, rope=True, tiles=True
+        ENDS | {"prompt_beside_vision": True, "keys_beside_prefix": True},
+        ahead=True,
+        norms=True,
+        rope=True,
+        tiles="tuned",
     ),
     "all": Variant(
-        {one.name: True for one in dataclasses.fields(Schedule)}, ahead=True, norms=True, rope=True, tiles=True
+        {one.name: True for one in dataclasses.fields(Schedule)}, ahead=True, norms=True, rope=True, tiles="tuned"
     ),
 }
 
@@ -118,7 +144,7 @@ class Turns:
         self.backend, self.job = self.policy.backend, job
         self.observations = Observations(self.policy, job)
         self._kept: dict[str, dict[str, Any]] = {}
-        self._ops = {(False, False, False, False): self.backend._ops}
+        self._ops = {(False, False, False, "usual"): self.backend._ops}
 
     def take(self, name: str) -> None:
         """From now on the policy is this variant."""
@@ -126,10 +152,11 @@ class Turns:
             variant = VARIANTS[name]
             for one in dataclasses.fields(Schedule):
                 setattr(SCHEDULE, one.name, variant.schedule.get(one.name, False))
+            attention.KEYS = variant.keys
             key = (variant.ahead, variant.norms, variant.rope, variant.tiles)
             if key not in self._ops:
                 hopper.WEIGHTS_AHEAD, hopper.NORMS_IN_PRODUCTS, hopper.ROPE_IN_PRODUCTS = key[:3]
-                self._ops[key] = fused_ops(self.backend.device, TILES if variant.tiles else TileTable())
+                self._ops[key] = fused_ops(self.backend.device, TABLES[variant.tiles])
                 hopper.WEIGHTS_AHEAD = hopper.NORMS_IN_PRODUCTS = hopper.ROPE_IN_PRODUCTS = False
             self._kept[name] = {"_ops": self._ops[key], "_graphs": {}, "_calls": {}, "_pictures": {}, "_begun": None}
         for attribute in STATE:

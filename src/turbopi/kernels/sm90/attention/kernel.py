@@ -19,6 +19,7 @@ from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
 
+KEYS = 64  # of the prefix, at a time for each of two warpgroups
 PARAMETERS = Parameters(
     (
         *(Parameter(TENSOR_MAP, f"map_{name}") for name in "qkv"),
@@ -73,7 +74,7 @@ def prefix_attention(
     """
     assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
     rows, dim = q.shape
-    tile = tile or AttentionTile(dim, keys=64)
+    tile = tile or AttentionTile(dim, keys=KEYS)
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
     _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, length, rows, k.shape[0], 1, inverse)
     return out
@@ -86,7 +87,7 @@ def packed_attention(
     assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
     rows, dim = q.shape
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
-    tile = AttentionTile(dim, keys=64)
+    tile = AttentionTile(dim, keys=KEYS)
     _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, None, rows, k.shape[0], 1, inverse, segments.tiles)
     return out
 
