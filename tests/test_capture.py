@@ -53,6 +53,23 @@ def test_a_capture_is_thread_local(monkeypatch: pytest.MonkeyPatch) -> None:
     assert options["capture_error_mode"] == "thread_local"
 
 
+def test_marks_on_a_branch_are_joined_before_the_capture_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a capture without a mark has no branch to join."""
+    FakeCuda(monkeypatch)
+    waits: list[str] = []
+    main, aside = (
+        SimpleNamespace(wait_stream=lambda other, name=name: waits.append(name)) for name in ("main", "aside")
+    )
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: main)
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: aside)
+    monkeypatch.setattr(graph.SCHEDULE, "marks_aside", True)
+    capture(lambda mark: (mark("prefix"), mark("denoise")))
+    assert waits[-3:] == ["aside", "aside", "main"]
+    waits.clear()
+    capture(lambda mark: None)
+    assert waits == []
+
+
 def test_a_replay_is_waited_for_and_a_launch_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     FakeCuda(monkeypatch)
     graph = capture(lambda mark: mark("vision"))

@@ -101,6 +101,7 @@ VARIANTS = {
     "ends by kernel": Variant(ENDS),
     "prompt beside": Variant({"prompt_beside_vision": True}),
     "keys beside": Variant({"keys_beside_prefix": True}),
+    "vision in two": Variant({"vision_in_two": True}),
     "marks aside": Variant({"marks_aside": True}),
     "ahead": Variant(ahead=True),
     "tiles": Variant(tiles="tuned"),
@@ -112,7 +113,7 @@ VARIANTS = {
     "norms": Variant(norms=True),
     "rope": Variant(rope=True),
     "all but marks": Variant(
-        ENDS | {"prompt_beside_vision": True, "keys_beside_prefix": True},
+        {one.name: one.name != "marks_aside" for one in dataclasses.fields(Schedule)},
         ahead=True,
         norms=True,
         rope=True,

@@ -125,6 +125,8 @@ class Pictures:
         self._array = self.host.numpy()
         self.images = torch.zeros(dims, dtype=dtype, device=table.device)
         self._fetch = ops.transfer if SCHEDULE.ends_by_kernel and table.is_cuda else None
+        self.in_two = SCHEDULE.vision_in_two and table.is_cuda and cameras > 0  # `embed`, then `encode`
+        self._embedded: Tensor | None = None
         self._resizer = Resizer(self.images)
         size = (self.rows + prompt_slots, config.vlm.width)
         self.embs = torch.full(size, torch.nan, device=table.device, dtype=table.dtype)  # as in `Cache`
@@ -164,9 +166,25 @@ class Pictures:
 
     def run(self, mark: Mark = lambda stage: None) -> None:
         """`images`, or what `upload` has put on the host for them, to the first rows of `embs`."""
+        self._bring()
+        self._see(mark)
+
+    def embed(self, mark: Mark = lambda stage: None) -> None:
+        """The first part of `run`: nothing is marked."""
+        self._bring()
+        weights, dtype = self.weights, self.embs.dtype
+        self._embedded = self.ops.embed_patches(self.images, weights.patch, weights.position, dtype)
+
+    def encode(self, mark: Mark = lambda stage: None) -> None:
+        """The rest of it, behind `embed`."""
+        assert self._embedded is not None, "`embed` is captured first"
+        out = self.embs[: self.rows]
+        forward.vision_layers(self.config, self.weights, self.ops, self._embedded, self.cameras, out)
+        mark("vision")
+
+    def _bring(self) -> None:
         if self.cameras and self._fetch is not None:
             self._fetch(self.host, self.images)
-        self._see(mark)
 
     def _see(self, mark: Mark) -> None:
         if self.cameras:

@@ -35,9 +35,13 @@ Places = Callable[[int], tuple[Tensor, Tensor]]  # a layer's number -> where its
 
 def vision_tokens(config: ModelConfig, weights: Weights, ops: Ops, images: Tensor, out: Tensor) -> None:
     """Pictures (uint8|float32)[V, 224, 224, 3] -> language-model tokens, into `out` [V * 256, D]."""
-    v, n = config.vision, images.shape[0]
-    x = ops.embed_patches(images, weights.patch, weights.position, out.dtype)  # [V * 256, W]
-    y = None
+    x = ops.embed_patches(images, weights.patch, weights.position, out.dtype)
+    vision_layers(config, weights, ops, x, images.shape[0], out)
+
+
+def vision_layers(config: ModelConfig, weights: Weights, ops: Ops, x: Tensor, n: int, out: Tensor) -> None:
+    """Embedded patches [V * 256, W] of n pictures -> language-model tokens, into `out` [V * 256, D]."""
+    v, y = config.vision, None
     for layer in weights.vision:
         x, normed = ops.residual_layer_norm(x, y, *layer.norm1, v.layer_norm_eps, **input_of(layer.qkv[0]))
         attended = ops.vision_attention(ops.linear(normed, *layer.qkv), n, v.num_heads, **input_of(layer.out[0]))

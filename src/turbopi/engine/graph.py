@@ -124,6 +124,10 @@ class Graph:
         first()
         self._graph.replay()
 
+    def launch_behind(self) -> None:
+        """`launch` within another graph's: it has no stage of its own."""
+        self._graph.replay()
+
     def replay(self) -> None:
         """`launch`, and wait for whatever the current stream has to do."""
         self.launch()

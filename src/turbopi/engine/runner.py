@@ -176,7 +176,14 @@ class GraphRunner:
         with self._explaining():
             resized = resize is not None and self._ops.resize_pictures is not None and buffers.resizes(pictures)
             vision = self._graph(buffers, RESIZED if resized else "vision")
-            vision.launch(lambda: buffers.upload(pictures, resize))
+            embedding = self._graph(buffers, "embed") if buffers.in_two and not resized else None
+
+            def first() -> None:
+                buffers.upload(pictures, resize)
+                if embedding is not None:
+                    embedding.launch_behind()
+
+            vision.launch(first)
         self._begun = begun
         return begun
 
@@ -318,7 +325,11 @@ class GraphRunner:
         if isinstance(of, Pictures):
             if part == RESIZED:
                 return self._capture(of.run_resized, None, like=self._graph(of, "vision"))
-            return self._capture(of.run, None)
+            if part == "embed":
+                return self._capture(of.embed, None)
+            if of.in_two:
+                self._graph(of, "embed")
+            return self._capture(of.encode if of.in_two else of.run, None)
         call = self._call(of)
         if part != "prefix" and call.denoiser is None:
             call.denoiser = self._denoiser_of(of, call.table)

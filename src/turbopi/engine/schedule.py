@@ -13,12 +13,15 @@ class Schedule:
     prompt_beside_vision  prompt, state and noise go up and are embedded while vision runs, on a stream of their own
     keys_beside_prefix    keys and values of all layers but the last are put in the denoising kernel's order on a branch
                           of the graph, while the rest of the prefix runs
+    vision_in_two         patches are embedded by a graph of their own: the device has begun while the host is still
+                          launching the large one
     marks_aside           timing events are recorded on a branch, so that no kernel waits for one
     """
 
     ends_by_kernel: bool = False
     prompt_beside_vision: bool = False
     keys_beside_prefix: bool = False
+    vision_in_two: bool = False
     marks_aside: bool = False
 
 
