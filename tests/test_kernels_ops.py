@@ -15,9 +15,10 @@ ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.kernels import plain  # noqa: E402
-from turbopi.kernels.portable import activations, attention, embedding, norms, rope, transfer  # noqa: E402
+from turbopi.kernels.portable import activations, attention, embedding, norms, rope  # noqa: E402
 from turbopi.kernels.portable import products as portable_products  # noqa: E402
 from turbopi.kernels.portable.ops import EmbedPatches  # noqa: E402
+from turbopi.kernels.sm90 import transfer  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
 from turbopi.kernels.sm90.gemm import products, tiles  # noqa: E402
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile, matmul  # noqa: E402

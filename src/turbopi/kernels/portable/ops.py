@@ -10,7 +10,7 @@ from torch import Tensor
 
 from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
-from turbopi.kernels.portable import attention, batch, embedding, norms, products, resize, rope, transfer
+from turbopi.kernels.portable import attention, batch, embedding, norms, products, resize, rope
 from turbopi.kernels.portable.vjp import ops as vjp
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, TileTable
 from turbopi.quantization.fp8 import E4M3
@@ -30,7 +30,6 @@ def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
         rope_split=rope.rope_split,
         vision_attention=partial(attention.vision_attention, tiles=tiles),
         attention=partial(attend, tiles=tiles),
-        transfer=transfer.transfer,
         resize_pictures=resize.resize_pictures,
         backward=vjp.way_back,
         batch=batch.batch_ops(tiles),

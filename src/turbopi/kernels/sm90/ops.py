@@ -21,6 +21,7 @@ from turbopi.kernels.sm90.gemm.tiles import PARTS_TILES, RESIDUAL_TILES, VISION_
 from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
 from turbopi.kernels.sm90.prefix_norms import PrefixNorms
 from turbopi.kernels.sm90.rope_products import RopeProducts
+from turbopi.kernels.sm90.transfer import transfer
 from turbopi.kernels.sm90.weights_ahead import ProductsAhead
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 
@@ -53,6 +54,7 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
         linear_geglu=partial(products.tuned_linear_geglu, tiles=tiles),
         vision_attention=partial(vision_attention, tiles=tiles),
         attention=partial(attend, tiles=tiles),
+        transfer=transfer,
         batch=replace(
             batch,
             packed_attention=partial(packed_attention, tiles=tiles),
