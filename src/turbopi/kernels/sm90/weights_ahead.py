@@ -4,7 +4,6 @@ Each product of our own brings the matrix behind it into L2 when it has asked fo
 tower's do so already: gemm/vision_products.py.
 """
 
-import torch
 from torch import Tensor
 
 from turbopi.kernels.sm90.gemm.bf16 import matmul
@@ -23,6 +22,7 @@ class ProductsAhead:
     def __init__(self, vision: VisionProducts, tiles: TileTable = NO_TILES) -> None:
         self._vision, self._tiles = vision, tiles
         self._behind: dict[int, Tensor] = {}  # which matrix came behind the one at this address last time: a hint
+        self._first: int | None = None  # the address of the one that a call begins with: behind the last is no other
         self._last: Tensor | None = None
 
     def linear(
@@ -47,8 +47,10 @@ class ProductsAhead:
 
     def behind(self, matrix: Matrix) -> Tensor | None:
         """This one is multiplied now: which one came behind it last time, unless that is too large."""
-        data: torch.Tensor = matrix.data if isinstance(matrix, ScaledMatrix) else matrix
-        if self._last is not None:
+        data: Tensor = matrix.data if isinstance(matrix, ScaledMatrix) else matrix
+        if self._first is None:
+            self._first = data.data_ptr()
+        if self._last is not None and data.data_ptr() != self._first:
             self._behind[self._last.data_ptr()] = data
         self._last = data
         behind = self._behind.get(data.data_ptr())
