@@ -90,3 +90,11 @@ def test_what_may_spill_is_what_does(kernel: str, number: int) -> None:
 
 def test_what_is_not_named_may_not_spill() -> None:
     assert allowed("attention.vision", 90) == allowed("batch.suffix", 80) == 0
+
+
+def test_hoppers_way_back_is_compiled_in_every_form_that_runs() -> None:
+    """In CUDA up to 16 tokens, and what goes forward for it, at both of openpi's horizons."""
+    asked = "import json; from compile_for_all.compiling import hopper_way_back as made; print(json.dumps([*made()]))"
+    names = json.loads(ours("-c", asked).stdout)
+    assert sum("is kept" in name for name in names) == 2
+    assert sum(name.startswith("way back, ") and name.endswith("H=10") for name in names) == 3
