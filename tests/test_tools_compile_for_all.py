@@ -61,6 +61,18 @@ def test_every_triton_kernel_is_among_the_calls() -> None:
     assert json.loads(left) == [] and int(count) > 15, done.stderr
 
 
+def test_the_checked_in_result_has_every_cuda_kernel() -> None:
+    done = ours(
+        "-c",
+        "import json; from compile_for_all import compiling, targets;"
+        "print(json.dumps([[one.arch, name] for one in targets.TARGETS for name, _ in compiling.cuda_kernels(one)]))",
+    )
+    assert done.returncode == 0, done.stderr
+    rows = read_compiled(ROOT / "benchmarks/results/compiled_for_all.json").rows
+    found = {(row.target, row.kernel) for row in rows}
+    assert [one for one in map(tuple, json.loads(done.stdout)) if one not in found] == []
+
+
 def test_what_is_over_a_limit_is_named() -> None:
     ada = next(target for target in TARGETS if target.number == 89)
     assert over_limit(ada, 255, 99 * 1024, 256) is None
