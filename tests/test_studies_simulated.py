@@ -15,7 +15,7 @@ from turbopi.evaluate.results import Results
 from turbopi.observation import Observation
 from turbopi.reading import read_document
 from turbopi.shipped import CHASE_POLICY
-from turbopi.studies import kv_reuse_libero, mask, report
+from turbopi.studies import kv_reuse, kv_reuse_libero, mask, report
 from turbopi.studies.kv_reuse import Reuse, Reusing
 from turbopi.studies.report import Report
 from turbopi.studies.rollouts import CHASE, open_policy, play
@@ -136,6 +136,27 @@ def test_episodes_at_other_calls_and_with_other_prompts_are_reused_together_as_a
     assert 0 < sum(alone.shares) < 5 and alone.shares == together.shares
     for one, other in zip(one_by_one, batches, strict=True):
         torch.testing.assert_close(one[0], other, rtol=0, atol=1e-4)
+
+
+def test_memory_of_episodes_that_ended_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody says which have ended: those that asked last are kept, all of the last batch. None keeps another's."""
+    monkeypatch.setattr(kv_reuse, "MOST_REMEMBERED", 2)
+    policy = UnifiedPolicy(CHASE_POLICY, backend="pytorch", precision="f32", device="cpu")
+    reusing = Reusing(reference_model(policy.backend), Reuse("every", 2), compare=False)
+
+    def ask(episodes: str, number: int) -> None:
+        seen = Observation.stack([policy.prepare(policy.example_observation(0)) for _ in episodes])
+        noise = torch.zeros(len(episodes), 16, policy.config.model.action_dim)
+        reusing.answer(seen, noise, 1, list(episodes), [number] * len(episodes))
+
+    ask("abc", 0)
+    assert list(reusing.memory) == ["a", "b", "c"]
+    ask("b", 1)
+    assert list(reusing.memory) == ["c", "b"]
+    ask("d", 0)
+    assert list(reusing.memory) == ["b", "d"] and reusing.shares[-2:] == [1.0, 0.0]
+    for tensor in vars(reusing.memory["b"]).values():
+        assert tensor.untyped_storage().nbytes() == tensor.nbytes
 
 
 def test_slots_that_are_masked_alone_make_the_unmasked_cache_another() -> None:

@@ -61,6 +61,18 @@ def test_every_triton_kernel_is_among_the_calls() -> None:
     assert json.loads(left) == [] and int(count) > 15, done.stderr
 
 
+def test_the_checked_in_result_has_every_cuda_kernel() -> None:
+    done = ours(
+        "-c",
+        "import json; from compile_for_all import compiling, targets;"
+        "print(json.dumps([[one.arch, name] for one in targets.TARGETS for name, _ in compiling.cuda_kernels(one)]))",
+    )
+    assert done.returncode == 0, done.stderr
+    rows = read_compiled(ROOT / "benchmarks/results/compiled_for_all.json").rows
+    found = {(row.target, row.kernel) for row in rows}
+    assert [one for one in map(tuple, json.loads(done.stdout)) if one not in found] == []
+
+
 def test_what_is_over_a_limit_is_named() -> None:
     ada = next(target for target in TARGETS if target.number == 89)
     assert over_limit(ada, 255, 99 * 1024, 256) is None
@@ -90,11 +102,3 @@ def test_what_may_spill_is_what_does(kernel: str, number: int) -> None:
 
 def test_what_is_not_named_may_not_spill() -> None:
     assert allowed("attention.vision", 90) == allowed("batch.suffix", 80) == 0
-
-
-def test_hoppers_way_back_is_compiled_in_every_form_that_runs() -> None:
-    """In CUDA up to 16 tokens, and what goes forward for it, at both of openpi's horizons."""
-    asked = "import json; from compile_for_all.compiling import hopper_way_back as made; print(json.dumps([*made()]))"
-    names = json.loads(ours("-c", asked).stdout)
-    assert sum("is kept" in name for name in names) == 2
-    assert sum(name.startswith("way back, ") and name.endswith("H=10") for name in names) == 3

@@ -122,19 +122,25 @@ def cuda_kernels(target: Target) -> Iterator[tuple[str, Callable[[Path | None], 
 
 
 def hopper_way_back() -> dict[str, Callable[[Path | None], bytes]]:
-    """What the true Jacobian's way back has of its own on Hopper."""
+    """What the true Jacobian's way back has of its own on Hopper, for 10 actions and for 50.
+
+    Products of more tokens than vjp.MOST_TOKENS are Triton's, which are compiled for every target.
+    """
     expert = preset("pi05_libero").model.expert
     made: dict[str, Callable[[Path | None], bytes]] = {}
-    shapes: dict[vjp.Mode, tuple[int, int]] = {
-        "geglu": (expert.width, expert.mlp_dim),
-        "parts": (2 * expert.mlp_dim, expert.width),
-        "plain": (expert.width, expert.num_heads * expert.head_dim),
-    }
+    heads = expert.num_heads * expert.head_dim
     for tokens in (10, 50):
         keeping = partial(machine_code._denoising, tokens, False, True, keep=True)
         made[f"denoising of a step that is kept, H={tokens}, bf16"] = keeping
+        shapes: dict[vjp.Mode, tuple[int, int]] = {
+            "geglu": (expert.width, expert.mlp_dim),
+            "parts": (2 * expert.mlp_dim, expert.width),
+            "plain": (expert.width, heads),
+        }
         for mode, shape in shapes.items():
-            if (one := vjp.cut(mode, tokens, *shape)) is not None:
+            one = vjp.cut(mode, tokens, *shape)
+            assert (one is None) == (tokens > vjp.MOST_TOKENS), (mode, tokens)
+            if one is not None:
                 made[f"way back, {mode}, H={tokens}"] = partial(vjp.compiled, one, mode)
     return made
 

@@ -46,7 +46,7 @@ class Expert:
     cache_v: Tensor
     rope: Rope
     hidden: Tensor | None = None  # bool[T, 1, R]: which rows a token doesn't see, of several observations' together
-    rows: Tensor | None = None  # int32[T]: a token's row of a table float32[U, 2 * layers + 1, 3, D]; to go back alone
+    rows: Tensor | None = None  # int32[T]: rows of a table float32[U, 2 * layers + 1, 3, D]; then there is no `forward`
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, list[KeptLayer], Tensor]:
         """Suffix tokens [T, D] -> (the final norm's result float32[T, D], what each layer keeps, the last stream)."""
@@ -157,7 +157,10 @@ def jacobian_velocity(
 def jacobian_step(
     expert: Expert, asked: Conditioned, step: int, forward: KeepingDenoiser, x_t: Tensor, v_t: Tensor, next_x: Tensor
 ) -> None:
-    """The same of one observation of Pi0.5, where a denoiser goes forward: v_t and next_x float32[H, A] are written."""
+    """`jacobian_velocity` and Euler's step behind it, of one observation of Pi0.5, where a denoiser goes forward.
+
+    x_t float32[H, A]; v_t and next_x, the same, are written.
+    """
     caches, small, tokens, back = (expert.cache_k, expert.cache_v), expert.weights.small, asked.tokens, expert.back
     kept, last = expert.kept(forward.launch_step(step, x_t, *caches, expert.length, v_t, tokens))
     out, into = small["action_out_proj.weight"], small["action_in_proj.weight"]

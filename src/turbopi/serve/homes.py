@@ -28,7 +28,7 @@ class Homes:
     def of(self, client: Hashable, requests: Mapping[Any, int], now: float) -> Hashable | None:
         """The replica that answered it a moment ago; None if that is longer ago, or if it has its share already.
 
-        requests  that each replica has now, one at least. Its share: an equal part of the clients that are active
+        requests  how many each replica has now; its share is an equal part of the clients that are active
         """
         home, when = self._answered.get(client, (None, 0.0))
         if home not in requests or now - when > SOON_SECONDS:

@@ -1,5 +1,6 @@
 """To which replica a request goes: a request router in Ray Serve's sense, which imports this module by its name."""
 
+import asyncio
 import random
 import time
 from typing import Any
@@ -25,16 +26,23 @@ class FewestRequests(RequestRouter):  # type: ignore[misc]  # Ray's types aren't
         self._homes = Homes()
 
     async def choose_replicas(self, candidate_replicas: list[Any], pending_request: Any = None) -> list[list[Any]]:
-        """Groups, tried in order: of one, Ray Serve takes the replica with the fewest requests, of equals the first."""
+        """The client's home, if it has one, then all: Ray Serve tries groups in their order, and takes of a group the
+        replica with the fewest requests, of equals the first.
+        """
         some = random.sample(candidate_replicas, len(candidate_replicas))
         counts = {one.replica_id: self.replica_queue_len_cache.get(one.replica_id) or 0 for one in some}
         home = self._homes.of(_client(pending_request), counts, time.monotonic())
         return [[one for one in some if one.replica_id == home], some]
 
     def on_request_routed(self, pending_request: Any, replica_id: Any, result: Any) -> None:
-        client = _client(pending_request)
+        """Notes the answer when it is there: Ray says so on a thread of its own, and homes are this loop's alone."""
+        client, loop = _client(pending_request), asyncio.get_running_loop()
+
+        def answered(_: Any) -> None:
+            loop.call_soon_threadsafe(self._homes.answered, client, replica_id, time.monotonic())
+
         if client is not None:
-            result.add_done_callback(lambda _: self._homes.answered(client, replica_id, time.monotonic()))
+            result.add_done_callback(answered)
 
     def on_new_queue_len_info(self, replica_id: Any, num_ongoing_requests: int) -> None:
         """Leaves the count as it is: one more for each request that is sent, one less for each that ends."""
@@ -42,4 +50,5 @@ class FewestRequests(RequestRouter):  # type: ignore[misc]  # Ray's types aren't
 
 def _client(request: Any) -> str | None:
     """Who asks, of a call of Replica.infer; None of another method."""
-    return next((one.source for one in request.args if isinstance(one, Line)), None) if request is not None else None
+    arguments = () if request is None else request.args
+    return next((one.source for one in arguments if isinstance(one, Line)), None)

@@ -67,6 +67,7 @@ class _AnsweringBackend(PyTorchBackend):
     def sample(
         self, observation: Observation, noise: Tensor, num_steps: int, *, conditioning: Conditionings = None
     ) -> Sample:
+        assert len(self.places) == len(noise), "a call of the model for each call of the policy"
         episodes, numbers = zip(*self.places, strict=True)
         asked = Asked(observation.to(self.device), noise.to(self.device), num_steps, episodes, numbers)
         return Sample(self._answer(asked).cpu(), {})

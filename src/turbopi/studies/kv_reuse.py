@@ -40,6 +40,7 @@ from turbopi.studies.study import Setup, Study, Tell
 
 NOTHING = 1.5  # θ above any cosine: nothing is ever reused
 STEPS = 5
+MOST_REMEMBERED = 128  # episodes: more than run at a time; one takes some 50 MB of a model of full size
 # Milliseconds of stages and of the whole call: `fused` bf16, pi05_libero, two cameras, 48 tokens, ten steps, H200
 # (benchmarks/results/h200_2026-11-24_pi05_libero/results.json)
 CALL_MS = {"vision": 1.186, "prefix": 3.475, "denoise": 2.614, "total": 7.450}
@@ -99,7 +100,7 @@ class Reusing:
     reuse: Reuse
     roll: int = 0
     compare: bool = True
-    memory: dict[Hashable, Memory] = field(default_factory=dict)  # by episode
+    memory: dict[Hashable, Memory] = field(default_factory=dict)  # by episode, in the order of their last calls
     shares: list[float] = field(default_factory=list)  # of each episode's call: image tokens that are reused
     errors: list[tuple[float, float]] = field(default_factory=list)
 
@@ -194,7 +195,11 @@ class Reusing:
         embs = padded(torch.where(stale, before.embs, embedded.embs), 1)
         k, v = padded(cache.k, 3), padded(cache.v, 3)
         for row, episode in enumerate(episodes):
-            self.memory[episode] = Memory(hidden[row], embs[row], k[:, row], v[:, row])
+            self.memory.pop(episode, None)  # the last one is the latest
+            rows = hidden[row], embs[row], k[:, row], v[:, row]
+            self.memory[episode] = Memory(*(one.clone() for one in rows))  # not a view, which keeps the whole batch
+        for episode in list(self.memory)[: -max(MOST_REMEMBERED, len(episodes))]:
+            del self.memory[episode]
 
     @property
     def error(self) -> float:

@@ -51,6 +51,8 @@ def reused(folder: Path) -> tuple[float, float] | None:
     for line in whole_lines(folder / FILE):
         task, state, number, share = json.loads(line)
         shares[task, state] = [*shares.get((task, state), [])[:number], share]
+    if not shares:
+        return None
     every = np.concatenate(list(shares.values()))
     return float(every.mean()), float((every == 1).mean())
 

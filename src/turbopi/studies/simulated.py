@@ -116,8 +116,8 @@ class Variants:
     neutral    the plain policy asked for in the study's way: four episodes must end as the plain policy's, `exact`:
                after the same commands
     broken     a cell that must lose twenty points, if the study has one
-    measured   what else a cell, by its name and folder, tells, by the column's name; the first is the plot's x where
-               variants have none
+    measured   {column: number} of what else a cell's folder tells, by the cell's name and folder; the first is the
+               plot's x where variants have none
     """
 
     name: str
@@ -210,13 +210,16 @@ class Variants:
         )
 
     def controls(self, folder: Path, cells: Sequence[SimulatorCell], small: bool) -> list[Control]:
-        """Of what is in the folder; one that wasn't run has failed."""
+        """Of what is in the folder. Without the neutral policy's episodes that control has failed; without the broken
+        cell there is none of it.
+        """
         how = "alike after the same commands" if self.exact else "alike"
         claim = f"Asked for in this study's way, the plain policy's first episodes end {how}, one request at a time."
         ours, plains = (finished(one) for one in self._control(folder))
         if ours is None or plains is None:
             controls = [Control(claim, False, f"Not run: `--way {CONTROL}`.")]
         else:
+            _check_pair(plains, ours)
             pairs = [(ours.episodes[key], plains.episodes[key]) for key in plains.episodes]
             same = [(a.status, *self._way(a)) == (b.status, *self._way(b)) for a, b in pairs]
             ends = ", ".join(f"{b.status} after {b.steps}" for _, b in pairs)

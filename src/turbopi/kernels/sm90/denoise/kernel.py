@@ -274,7 +274,9 @@ def _beside_each_other(shifted: Tensor) -> Tensor:
 
 
 def _room_to_keep(config: ModelConfig, suffix: int, device: torch.device) -> tuple[KeptStep, dict[str, Tensor]]:
-    """And what a launch of one step reads or writes beside it: no guidance, and x_t behind the step, for nobody."""
+    """Where a launch keeps what a way back needs, and what else it takes: gains of 0, as it doesn't guide, and room for
+    the step's x_t, which nobody reads.
+    """
     g = config.expert
 
     def room(*shape: int) -> Tensor:

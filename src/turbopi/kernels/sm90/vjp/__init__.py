@@ -1,1 +1,1 @@
-"""Products on the expert's way back for up to 64 tokens, for compute capability 9.0: see across.cu."""
+"""Products on the expert's way back for up to 16 tokens, for compute capability 9.0: see across.cu."""

@@ -1,6 +1,6 @@
 """The three products on the expert's way back whose operand comes from one kernel: across.cu's sizes and launch.
 
-Twins: `kernels.backward`. For sizes and numbers of tokens that it doesn't cover Triton's kernels (portable/vjp).
+Twins: `kernels.backward`. Sizes and numbers of tokens that across.cu doesn't cover: Triton's kernels (portable/vjp).
 """
 
 from dataclasses import dataclass, replace
@@ -65,7 +65,7 @@ class Cut:
 
 @cache
 def cut(mode: Mode, tokens: int, inner: int, columns: int) -> Cut | None:
-    """The narrowest blocks of which there are at most BLOCKS, else the widest; None: not covered."""
+    """The narrowest blocks of which there are at most BLOCKS, else the widest; None: across.cu doesn't cover it."""
     depth = tiles.split_of(inner) if mode == "parts" else inner
     if tokens > MOST_TOKENS or depth % (32 * WARPS):
         return None
