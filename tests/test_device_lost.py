@@ -203,7 +203,7 @@ def test_the_denoising_kernel_says_why_it_trapped(policy: UnifiedPolicy) -> None
             return "blocks of the denoising kernel waited for seconds: layer 3 for queries"
 
     fused: Any = FusedBackend.__new__(FusedBackend)
-    fused._denoisers, fused._pair_denoisers = {(10, 10, 1024): Kernel()}, {}
+    fused._denoisers, fused._pair_denoisers, fused._keepers = {(10, 10, 1024): Kernel()}, {}, {}
     with pytest.raises(DeviceLost) as explained:
         fused._explain(RuntimeError("CUDA error: unspecified launch failure"))
     assert isinstance(policy.backend, Failing)

@@ -185,6 +185,7 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
     backend._weights = pack(backend.config, state, backend._quantized)
     assert {layer.qkv.numbers for layer in backend._weights.vlm} == {torch.int8}  # type: ignore[union-attr]
     backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers, backend._refused = {}, PLAIN, {}, {}, {}
+    backend._keepers = {}
     backend._packed_expert = None
     backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
     backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
@@ -203,7 +204,7 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
     everything = {name: dataclasses.replace(site, kept=None) for name, site in calibration.sites.items()}
     calibration = dataclasses.replace(calibration, sites=everything)
     backend._quantization, backend._plan = calibration, calibration.plan(golden_model("pi05").config, "fp8")
-    backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers = {}, PLAIN, {}, {}
+    backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers, backend._keepers = {}, PLAIN, {}, {}, {}
     backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
     backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
     backend._refused = {
@@ -233,7 +234,7 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
 def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     backend, tried = FusedBackend.__new__(FusedBackend), []
     backend.config, backend.device = golden_model("pi05").config, CPU
-    backend._denoisers, backend._refused = {}, {}
+    backend._denoisers, backend._keepers, backend._refused = {}, {}, {}
     backend._packed_expert = None
     monkeypatch.setattr(backend, "_keep_expert_on", lambda device: None)
 

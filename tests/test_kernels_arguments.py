@@ -59,12 +59,21 @@ def test_the_denoising_kernel_names_no_wait_that_is_not_declared_and_declares_no
     assert len(set(denoise.WAITS.values())) == len(denoise.WAITS)
 
 
-@pytest.mark.parametrize("by_token", [False, True])
+@pytest.mark.parametrize(
+    ("by_token", "keep", "args"),
+    [(False, False, denoise.ARGS), (True, False, denoise.ARGS_BY_TOKEN), (True, True, denoise.ARGS_KEEPING)],
+)
 @pytest.mark.parametrize("suffix", [10, 50])
-def test_the_denoising_kernels_struct_has_what_its_source_reads(suffix: int, by_token: bool) -> None:
-    read = set(re.findall(r"\ba(?:rgs)?\.([a-z_]\w+)", denoise.source(suffix, False, by_token)))
-    declared = {one.name for one in (denoise.ARGS_BY_TOKEN if by_token else denoise.ARGS).fields}
+def test_the_denoising_kernels_struct_has_what_its_source_reads(
+    suffix: int, by_token: bool, keep: bool, args: Struct
+) -> None:
+    source = denoise.source(suffix, False, by_token, keep=keep)
+    if not keep:  # as the preprocessor does
+        source = re.sub(r"#ifdef TP_KEEP\n.*?#endif", "", re.sub(r"\bKEEP\(.*\)", "", source), flags=re.DOTALL)
+    read = set(re.findall(r"\ba(?:rgs)?\.([a-z_]\w+)", source))
+    declared = {one.name for one in args.fields}
     assert read <= declared, read - declared
+    assert ("keys_ready" in read) == keep
 
 
 # ---- products: a fake takes the launch, and each value must be what its name says

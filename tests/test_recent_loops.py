@@ -116,7 +116,8 @@ class Fused(FusedBackend):
     def __init__(self) -> None:
         self.config, self.device = golden_model("pi05").config, torch.device("cpu")
         self._graphs, self._calls, self._tables, self._loops = {}, {}, {}, {}
-        self._denoisers, self._pair_denoisers, self._refused, self._packed_expert = {}, {}, {}, None
+        self._denoisers, self._pair_denoisers, self._keepers, self._refused = {}, {}, {}, {}
+        self._packed_expert = None
         self._recent = RecentLoops(self._forget)
         self._batches = SimpleNamespace(forget=lambda loop: None)  # type: ignore[assignment]
         self.expert_on = "device"

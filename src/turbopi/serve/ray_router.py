@@ -3,6 +3,7 @@
 import asyncio
 import random
 import time
+from contextlib import suppress
 from typing import Any
 
 from ray.serve.request_router import RequestRouter
@@ -39,7 +40,8 @@ class FewestRequests(RequestRouter):  # type: ignore[misc]  # Ray's types aren't
         client, loop = _client(pending_request), asyncio.get_running_loop()
 
         def answered(_: Any) -> None:
-            loop.call_soon_threadsafe(self._homes.answered, client, replica_id, time.monotonic())
+            with suppress(RuntimeError):  # the loop has ended, as the server has
+                loop.call_soon_threadsafe(self._homes.answered, client, replica_id, time.monotonic())
 
         if client is not None:
             result.add_done_callback(answered)
