@@ -26,10 +26,10 @@ from turbopi.studies.report import (
     Panel,
     Plot,
     Report,
-    Series,
     compared,
     paired_cell,
     rate_cells,
+    rate_series,
 )
 from turbopi.studies.rollouts import POST, Played, ToyPolicy, open_policy, play, sampled, seeds_of
 from turbopi.studies.spread import UNIFORM, Spread, spread, spread_plot, spread_table
@@ -268,10 +268,7 @@ def _plot(cells: Sequence[DistilledCell]) -> Plot:
             own = [cell for cell in cells if (cell.policy, cell.weights) == (policy, weights)]
             own.sort(key=lambda cell: cell.steps)
             if own:
-                ends = [cell.rate.wilson95 for cell in own]
-                rates = [100 * (cell.rate.rate or 0.0) for cell in own]
-                low, high = [100 * a for a, _ in ends], [100 * b for _, b in ends]
-                series.append(Series(weights, [float(cell.steps) for cell in own], rates, low, high))
+                series.append(rate_series(weights, [float(cell.steps) for cell in own], [cell.rate for cell in own]))
         panels.append(
             Panel(f"{policy}: success", "Euler steps", "%, Wilson's 95 %", series, True, ticks=[1.0, 2.0, 10.0])
         )

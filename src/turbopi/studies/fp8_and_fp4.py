@@ -45,7 +45,18 @@ from turbopi.studies.fp4_products import (
     savings,
 )
 from turbopi.studies.problems import libero_batches
-from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
+from turbopi.studies.report import (
+    PERCENT,
+    Cell,
+    Control,
+    Grid,
+    Panel,
+    Plot,
+    Report,
+    paired_cell,
+    rate_cells,
+    rate_series,
+)
 from turbopi.studies.rollouts import ToyPolicy, met, open_policy, play, sampled
 from turbopi.studies.study import Setup, Study, Tell
 from turbopi.studies.weights import WEIGHTS, studied_checkpoint
@@ -347,18 +358,10 @@ def _plot(found: Mapping[str, Mapping[str, FormatError]], successes: Sequence[Fo
     for policy in dict.fromkeys(one.policy for one in successes):
         own = [one for one in successes if one.policy == policy and one.format in found[policy]]
         own.sort(key=lambda one: found[policy][one.format].relative_rms)
-        ends = [one.rate.wilson95 for one in own]
-        series.append(
-            Series(
-                policy,
-                [found[policy][one.format].relative_rms for one in own],
-                [100 * (one.rate.rate or 0.0) for one in own],
-                [100 * low for low, _ in ends],
-                [100 * high for _, high in ends],
-            )
-        )
+        errors = [found[policy][one.format].relative_rms for one in own]
+        series.append(rate_series(policy, errors, [one.rate for one in own]))
     title = "Success by the error of the actions"
-    panel = Panel(title, "relative rms error", "%, with Wilson's interval, 95 %", series, log_x=True)
+    panel = Panel(title, "relative rms error", PERCENT, series, log_x=True)
     return Plot("fp8_and_fp4", [panel])
 
 

@@ -34,7 +34,18 @@ from turbopi.model.prefix import camera_slots
 from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.reading import plain_document
-from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
+from turbopi.studies.report import (
+    PERCENT,
+    Cell,
+    Control,
+    Grid,
+    Panel,
+    Plot,
+    Report,
+    paired_cell,
+    rate_cells,
+    rate_series,
+)
 from turbopi.studies.rollouts import Call, Played, ToyPolicy, open_policy, play, sampled
 from turbopi.studies.study import Setup, Study, Tell
 
@@ -389,16 +400,9 @@ def _plot(found: Sequence[ReuseCell]) -> Plot:
             for what in ("full", "camera", "patch", "every")
         }
         series = [
-            Series(
-                what,
-                [100 * c.reused for c in own],
-                [100 * (c.rate.rate or 0.0) for c in own],
-                [100 * c.rate.wilson95[0] for c in own],
-                [100 * c.rate.wilson95[1] for c in own],
-            )
-            for what, own in kinds.items()
+            rate_series(what, [100 * c.reused for c in own], [c.rate for c in own]) for what, own in kinds.items()
         ]
-        panels.append(Panel(f"{policy}: success", "image tokens reused, %", "%, with Wilson's interval, 95 %", series))
+        panels.append(Panel(f"{policy}: success", "image tokens reused, %", PERCENT, series))
     return Plot("kv_reuse", panels)
 
 

@@ -23,6 +23,7 @@ from turbopi.reading import plain_document
 from turbopi.studies.differences import errors_of
 from turbopi.studies.problems import one_problem
 from turbopi.studies.report import (
+    PERCENT,
     Cell,
     Control,
     Grid,
@@ -33,6 +34,7 @@ from turbopi.studies.report import (
     compared,
     paired_cell,
     rate_cells,
+    rate_series,
 )
 from turbopi.studies.rollouts import Call, Played, ToyPolicy, open_policy, play, sampled
 from turbopi.studies.study import Setup, Study, Tell
@@ -251,11 +253,9 @@ def _success(cells: Sequence[MaskCell]) -> Panel:
     series = []
     for policy in dict.fromkeys(cell.policy for cell in cells):
         rates = [cell.rate for cell in cells if cell.policy == policy]
-        places, success = [float(i + 1) for i in range(len(rates))], [100 * (rate.rate or 0.0) for rate in rates]
-        low, high = ([100 * rate.wilson95[end] for rate in rates] for end in (0, 1))
-        series.append(Series(policy, places, success, low, high))
+        series.append(rate_series(policy, [float(i + 1) for i in range(len(rates))], rates))
     ticks = series[0].x
-    return Panel("Success", "cache, in the table's order", "%, with Wilson's interval, 95 %", series, ticks=ticks)
+    return Panel("Success", "cache, in the table's order", PERCENT, series, ticks=ticks)
 
 
 CLAIMED = "The suffix needs no mask: with one, ten steps had a cosine of −0.18, without it 0.995."

@@ -21,7 +21,18 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.evaluate.statistics import PairedDocument, RateDocument
 from turbopi.policy import UnifiedPolicy
 from turbopi.reading import plain_document
-from turbopi.studies.report import Cell, Control, Grid, Panel, Plot, Report, Series, paired_cell, rate_cells
+from turbopi.studies.report import (
+    PERCENT,
+    Cell,
+    Control,
+    Grid,
+    Panel,
+    Plot,
+    Report,
+    paired_cell,
+    rate_cells,
+    rate_series,
+)
 from turbopi.studies.rollouts import (
     CHASE,
     REPLAN,
@@ -281,12 +292,9 @@ def _plot(cells: Sequence[TimingCell]) -> Plot:
     series = []
     for how in dict.fromkeys(cell.how for cell in cells):
         own = [cell for cell in cells if cell.how == how]
-        ends = [cell.rate.wilson95 for cell in own]
-        rates = [100 * (cell.rate.rate or 0.0) for cell in own]
-        low, high = [100 * a for a, _ in ends], [100 * b for _, b in ends]
-        series.append(Series(how, [cell.age for cell in own], rates, low, high))
+        series.append(rate_series(how, [cell.age for cell in own], [cell.rate for cell in own]))
     title, x = "Success by the age of what is acted on", "mean age of the observation behind an action, control steps"
-    return Plot("pipelining", [Panel(title, x, "%, with Wilson's interval, 95 %", series)])
+    return Plot("pipelining", [Panel(title, x, PERCENT, series)])
 
 
 STUDY = Study("pipelining", "What does encoding the next observation beside this one's denoising give?", CLAIMED, run)

@@ -21,6 +21,7 @@ from turbopi.reading import plain_document
 from turbopi.wording import significant
 
 JSON, MARKDOWN = "report.json", "report.md"
+PERCENT = "%, with Wilson's interval, 95 %"  # what axis of `rate_series` says
 MARGIN = 0.05  # a cell is as good as the baseline if it is worse by less than this, with 95 % confidence
 _DPI = 110
 _MARKERS = "osD^vPX*<>"
@@ -101,6 +102,12 @@ def rate_cells(rate: RateDocument) -> list[Cell]:
     low, high = (100 * end for end in rate.wilson95)
     percent = "-" if rate.rate is None else f"{100 * rate.rate:.1f} [{low:.1f}, {high:.1f}]"
     return [f"{rate.successes} of {rate.trials}", percent]
+
+
+def rate_series(label: str, x: Sequence[float], rates: Sequence[RateDocument]) -> Series:
+    """A line of success in percent over x, with Wilson's intervals, 95 %."""
+    low, high = ([100 * rate.wilson95[end] for rate in rates] for end in (0, 1))
+    return Series(label, list(x), [100 * (rate.rate or 0.0) for rate in rates], low, high)
 
 
 def paired_cell(paired: PairedDocument) -> Cell:

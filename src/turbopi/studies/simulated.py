@@ -30,16 +30,17 @@ from turbopi.sim import SimSettings, Simulator, create
 from turbopi.studies.answering import Answering, AnsweringPolicy
 from turbopi.studies.report import (
     MARGIN,
+    PERCENT,
     Cell,
     Control,
     Grid,
     Panel,
     Plot,
     Report,
-    Series,
     compared,
     paired_cell,
     rate_cells,
+    rate_series,
 )
 from turbopi.studies.study import Setup, Study
 
@@ -246,11 +247,8 @@ class Variants:
         series = []
         for name, own in points.items():
             own.sort(key=lambda point: point[0])
-            rates = [cell.rate for _, cell in own]
-            low, high = ([100 * rate.wilson95[end] for rate in rates] for end in (0, 1))
-            series.append(Series(name, [x for x, _ in own], [100 * (rate.rate or 0.0) for rate in rates], low, high))
-        label = "%, with Wilson's interval, 95 %"
-        return Plot(self.name, [Panel("Success", self.x_label, label, series, ticks=self.ticks)])
+            series.append(rate_series(name, [x for x, _ in own], [cell.rate for _, cell in own]))
+        return Plot(self.name, [Panel("Success", self.x_label, PERCENT, series, ticks=self.ticks)])
 
 
 # --- running ----------------------------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ from turbopi.studies.report import (
     compared,
     paired_cell,
     rate_cells,
+    rate_series,
 )
 from turbopi.studies.rollouts import POST, Call, Played, ToyPolicy, met, open_policy, play, seeds_of
 from turbopi.studies.solvers import BASELINE, Learned, Way, grid_times, ways
@@ -332,16 +333,7 @@ def _panel(policy: str, cells: Sequence[SuccessCell]) -> Panel:
         ("Euler, warm", "euler", "uniform", True),
     ):
         own = [c for c in cells if c.warm == warm and ((c.solver, c.grid) == (solver, grid) or c.evaluations == 1)]
-        ends = [c.rate.wilson95 for c in own]
-        series.append(
-            Series(
-                label,
-                [float(c.evaluations) for c in own],
-                [100 * (c.rate.rate or 0.0) for c in own],
-                [100 * low for low, _ in ends],
-                [100 * high for _, high in ends],
-            )
-        )
+        series.append(rate_series(label, [float(c.evaluations) for c in own], [c.rate for c in own]))
     ticks = [float(n) for n in solvers.EVALUATIONS]
     return Panel(
         f"{policy}: success", "evaluations of the action expert", "%, Wilson's 95 %", series, True, ticks=ticks
