@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from turbopi.engine import graph
-from turbopi.engine.graph import CAPTURING, Graph
+from turbopi.engine.graph import CAPTURING, HEAD, Graph
 from turbopi.model import exact
 
 
@@ -29,7 +29,7 @@ class FakeCuda:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.captures: list[dict[str, Any]] = []
-        event = SimpleNamespace(record=lambda stream: None)
+        event = SimpleNamespace(record=lambda stream: None, elapsed_time=lambda end: 1.0)
         monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: SimpleNamespace(replay=lambda: DONE.append("launched")))
         monkeypatch.setattr(torch.cuda, "current_stream", lambda device: FakeStream(device=device))
         monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
@@ -61,6 +61,24 @@ def test_a_replay_is_waited_for_and_a_launch_is_not(monkeypatch: pytest.MonkeyPa
     assert DONE == ["launched"]
     graph.replay()
     assert DONE == ["launched", "launched", "waited"], "actions are read when replay returns"
+
+
+def test_the_head_of_a_sequence_is_a_graph_of_its_own_and_launched_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    cuda = FakeCuda(monkeypatch)
+    order: list[str] = []
+
+    def run(mark: Any) -> None:
+        order.append(f"head, captured by {len(cuda.captures)}")
+        mark(HEAD)
+        order.append(f"rest, captured by {len(cuda.captures)}")
+        mark("vision")
+
+    graph = capture(run)
+    assert order[4:] == ["head, captured by 1", "rest, captured by 2"], "twice to compile, then captured"
+    assert "head" not in graph.stage_ms(), "it ends no stage"
+    DONE.clear()
+    graph.launch(lambda: DONE.append("given"))
+    assert DONE == ["given", "launched", "launched"]
 
 
 def test_no_garbage_is_collected_within_a_capture(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ ON_GPU = torch.cuda.is_available()
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.kernels import plain  # noqa: E402
-from turbopi.kernels.portable import activations, attention, embedding, norms, rope  # noqa: E402
+from turbopi.kernels.portable import activations, attention, embedding, norms, rope, transfer  # noqa: E402
 from turbopi.kernels.portable import products as portable_products  # noqa: E402
 from turbopi.kernels.portable.ops import EmbedPatches  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention_hopper  # noqa: E402
@@ -416,3 +416,22 @@ def test_linear_gelu_is_tanhs(m: int, n: int, k: int) -> None:
     x, weight, bias = random(m, k, outliers=True), random(n, k), random(n)
     exact = plain.gelu(plain.linear(x.float(), weight.float(), bias.float()))
     assert_as_good(portable_products.linear_gelu(x, weight, bias), plain.gelu(plain.linear(x, weight, bias)), exact)
+
+
+@pytest.mark.parametrize("shape", [(2, 28, 28, 3), (10, 32), (1,)])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_a_transfer_brings_all_and_nothing_else(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    """On a GPU from pinned memory of the host and back to it."""
+    if dtype == torch.uint8 and len(shape) < 4:
+        pytest.skip("not whole words")
+    host = torch.randint(0, 256, shape).to(dtype)
+    host = host.pin_memory() if ON_GPU else host
+    on_device = torch.zeros(2, *shape, dtype=dtype, device=DEVICE)
+    back = torch.zeros(shape, dtype=dtype, pin_memory=ON_GPU)
+    twin = torch.zeros_like(on_device)
+    transfer.transfer(host, on_device[0])
+    plain.transfer(host, twin[0])
+    transfer.transfer(on_device[0], back)
+    if ON_GPU:
+        torch.cuda.synchronize()
+    assert torch.equal(on_device, twin) and torch.equal(back, host)

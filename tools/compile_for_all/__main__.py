@@ -36,9 +36,8 @@ def main() -> int:
     given = parser.parse_args()
     os.environ.pop("TRITON_INTERPRET", None)
     from compile_for_all.compiling import compile_target, versions
-    from compile_for_all.document import CompiledForAll
+    from compile_for_all.document import CompiledForAll, written
     from compile_for_all.targets import TARGETS
-    from turbopi.reading import plain_document
 
     numbers = None if given.targets is None else given.targets.split(",")
     wanted = [target for target in TARGETS if numbers is None or str(target.number) in numbers]
@@ -49,10 +48,7 @@ def main() -> int:
         rows = [row for job in jobs for row in job.result()]
     show(rows, Console(width=WIDTH))
     if given.json is not None:
-        document = CompiledForAll(date.today().isoformat(), versions(), rows)
-        import json
-
-        given.json.write_text(json.dumps(plain_document(document), indent=1) + "\n")
+        given.json.write_text(written(CompiledForAll(date.today().isoformat(), versions(), rows)))
     return 1 if any(row.problem for row in rows) else 0
 
 

@@ -20,6 +20,7 @@ from turbopi.kernels.portable import (
     resize,
     rope,
     rounding,
+    transfer,
 )
 from turbopi.kernels.portable.attention_tiles import Attention, AttentionTile
 from turbopi.kernels.portable.attention_tiles import candidates as attention_candidates
@@ -223,6 +224,7 @@ def _rest() -> Calls:
     return [
         rope_split,
         *(partial(pictures, dtype) for dtype in pixels),
+        lambda: transfer.transfer(of(2, 224, 224, 3, dtype=torch.uint8), of(2, 224, 224, 3, dtype=torch.uint8)),
         *(partial(lambda dtype: embedding.patch_rows(of(2, 224, 224, 3, dtype=dtype), 14), dtype) for dtype in pixels),
         lambda: embedding.odd_rows(of(2, 224, 224, 3, dtype=torch.uint8), 14),
         lambda: embedding.add_position(of(ROWS, 1152, dtype=F32), of(256, 1152, dtype=F32), BF16),

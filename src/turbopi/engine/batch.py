@@ -102,7 +102,7 @@ class PackedPrefix:
         buffers, inputs = self._buffers, self._inputs
         config, weights, ops = buffers.config, buffers.weights, buffers.ops
         batched = ops.batch or PLAIN_BATCH
-        self._flat.copy_(self._host, non_blocking=True)
+        ops.transfer(self._host, self._flat)
         buffers.segments.copy_(inputs["segments"])
         batched.embed_rows(inputs["source"], buffers.pictures.embs, weights.embed_tokens, self._embs)
         rope = (buffers.rope[0][inputs["positions"]], buffers.rope[1][inputs["positions"]])
@@ -178,16 +178,16 @@ class BatchLoop:
                 self._arrays["noise"][row] = one.started(noise[row])
 
     def run(self, *_: Any) -> None:
-        self._flat.copy_(self._host, non_blocking=True)
+        buffers, transfer = self._buffers, self._buffers.ops.transfer
+        transfer(self._host, self._flat)
         if self._asked is not None:
             self._asked.upload()
-        buffers = self._buffers
         if isinstance(self._by, Weights):
             self._run_operations(self._by)
         else:
             cache, starts = buffers.cache, buffers.segments[0]
             self._by.launch_pair(self._noise, cache.k, cache.v, starts, self.x_t, self.v_t)
-        self.actions.copy_(self.x_t[-1], non_blocking=True)
+        transfer(self.x_t[-1], self.actions)
 
     def _run_operations(self, weights: Weights) -> None:
         lengths = self._buffers.segments[1, :-1].long()

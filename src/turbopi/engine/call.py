@@ -2,8 +2,8 @@
 
 `StaticCall.run` is that sequence of kernels on fixed buffers; on a GPU it is captured in two parts and replayed:
 `Pictures.run`, which needs nothing but pictures and so starts while the host still tokenises, and `StaticCall.answer`.
-Pictures come before the first part, as cameras differ in their sizes; the second's inputs travel in one copy out of one
-pinned buffer, and actions come back in one.
+Inputs of either travel out of one pinned buffer, and actions come back into one; pictures of other sizes than the
+model's are copied before the first part.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from turbopi.engine import forward
 from turbopi.engine.backward import Expert, jacobian_step, jacobian_velocity, way_back
 from turbopi.engine.conditioned import Conditioned
 from turbopi.engine.flat import allocate
-from turbopi.engine.graph import Mark
+from turbopi.engine.graph import HEAD, Mark
 from turbopi.engine.recent_loops import Loop
 from turbopi.engine.resize import Resizer
 from turbopi.engine.weights import Weights
@@ -132,9 +132,10 @@ class Pictures:
         return not all(self._fits(picture) for picture in pictures)
 
     def upload(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> None:
-        """Valid pictures from the host, in place of those of the call before, without waiting.
+        """Valid pictures, in place of those of the call before, to where `run` or `run_resized` takes them from.
 
-        Each is as `images`, or uint8[h, w, 3]: then the device resizes it, or the host if the device can't.
+        Each is as `images`, or uint8[h, w, 3]: then the device resizes it, or the host if the device can't. Nothing is
+        waited for.
         """
         if resize is not None and self.ops.resize_pictures is None:
             side = self._array.shape[1]
@@ -145,24 +146,29 @@ class Pictures:
                 if self._fits(picture):
                     self._array[camera] = picture
                     self.images[camera].copy_(self.host[camera], non_blocking=True)
-        elif pictures:
+        else:
             for target, picture in zip(self._array, pictures, strict=True):
                 target[:] = picture
-            self.images.copy_(self.host, non_blocking=True)
 
     def _fits(self, picture: np.ndarray) -> bool:
         return picture.dtype == self._array.dtype and picture.shape == self._array.shape[1:]
 
     def run_resized(self, mark: Mark = lambda stage: None) -> None:
-        """`run`, once `images` has been made of pictures of other sizes."""
+        """Pictures of which some have other sizes, to the first rows of `embs`."""
         if self.ops.resize_pictures is not None and self.cameras:
             self.ops.resize_pictures(self._resizer.table, self.images)
-        self.run(mark)
+        self._encode(mark)
 
     def run(self, mark: Mark = lambda stage: None) -> None:
-        """`images` to the first rows of `embs`."""
+        """Pictures from the host to the first rows of `embs`."""
         if self.cameras:
-            forward.vision_tokens(self.config, self.weights, self.ops, self.images, self.embs[: self.rows])
+            self.ops.transfer(self.host, self.images)
+        self._encode(mark)
+
+    def _encode(self, mark: Mark) -> None:
+        if self.cameras:
+            out = self.embs[: self.rows]
+            forward.vision_tokens(self.config, self.weights, self.ops, self.images, out, lambda: mark(HEAD))
         mark("vision")
 
 
@@ -245,8 +251,8 @@ class StaticCall:
 
     def encode(self, mark: Mark = lambda stage: None) -> None:
         """Upload; then the pictures' rows, which are there, and the prompt to the cache's first rows."""
-        self.inputs.flat.copy_(self.host.flat, non_blocking=True)
         config, weights, ops, inputs = self.config, self.weights, self.ops, self.inputs
+        ops.transfer(self.host.flat, inputs.flat)
         slots = self.shape.prefix_slots(config)
         ops.embed_prompt(inputs.tokens, weights.embed_tokens, self.embs[self.pictures.rows :])
         rope = (self.rope[0][:slots], self.rope[1][:slots])
@@ -263,7 +269,7 @@ class StaticCall:
         else:
             inputs, by_token = self.inputs, () if self.asked is None else (self.asked.tokens,)
             self.denoiser.launch(inputs.noise, self.cache_k, self.cache_v, inputs.length, self.x_t, self.v_t, *by_token)
-        self.actions.copy_(self.x_t[-1], non_blocking=True)
+        self.ops.transfer(self.x_t[-1], self.actions)
         mark("denoise")
 
     def _denoise_by_operations(self) -> None:

@@ -24,6 +24,7 @@ from turbopi.kernels.plain import (
     residual_layer_norm,
     residual_rms_norm,
     rope_split,
+    transfer,
     vision_attention,
 )
 
@@ -82,6 +83,7 @@ def compiled() -> Ops:
     ).ops("Inductor, between cuBLAS's products")
 
     return Ops(
+        transfer=transfer,
         resize_pictures=_resize_pictures if torch.cuda.is_available() else None,
         embed_patches=embed_patches,
         embed_prompt=embed_prompt,

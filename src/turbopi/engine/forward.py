@@ -33,13 +33,27 @@ Stream = tuple[Tensor, Tensor | None, Tensor | None]  # residual stream, what is
 Attend = Callable[..., Tensor]
 Places = Callable[[int], tuple[Tensor, Tensor]]  # a layer's number -> where its keys and values go, each [tokens, K]
 
+HEAD_LAYERS = 3  # of vision: what they take is about as long as the host takes to launch the other 24
 
-def vision_tokens(config: ModelConfig, weights: Weights, ops: Ops, images: Tensor, out: Tensor) -> None:
-    """Pictures (uint8|float32)[V, 224, 224, 3] -> language-model tokens, into `out` [V * 256, D]."""
+
+def vision_tokens(
+    config: ModelConfig,
+    weights: Weights,
+    ops: Ops,
+    images: Tensor,
+    out: Tensor,
+    head_ends: Callable[[], None] = lambda: None,
+) -> None:
+    """Pictures (uint8|float32)[V, 224, 224, 3] -> language-model tokens, into `out` [V * 256, D].
+
+    `head_ends` is called behind the first layers: see `engine.graph.HEAD`.
+    """
     v, n = config.vision, images.shape[0]
     x = ops.embed_patches(images, weights.patch, weights.position, out.dtype)  # [V * 256, W]
     y = None
-    for layer in weights.vision:
+    for number, layer in enumerate(weights.vision):
+        if number == HEAD_LAYERS:
+            head_ends()
         x, normed = ops.residual_layer_norm(x, y, *layer.norm1, v.layer_norm_eps, **input_of(layer.qkv[0]))
         attended = ops.vision_attention(ops.linear(normed, *layer.qkv), n, v.num_heads, **input_of(layer.out[0]))
         x, normed = ops.residual_layer_norm(

@@ -13,14 +13,15 @@ import gc
 import itertools
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from typing import Any
 
 import torch
 
 from turbopi.model.exact import exact_float32
 
-Mark = Callable[[str], None]  # is told the end of each stage
+Mark = Callable[[str], None]  # is told the end of each stage, or `HEAD`
+HEAD = "head"  # the mark behind the kernels that are launched before the rest is
 
 CAPTURING = threading.RLock()  # of the process: policies on other devices, too
 
@@ -69,7 +70,11 @@ def collect_and_empty_cache() -> None:
 
 
 class Graph:
-    """A sequence of kernels captured once, with timing events at its start and at every mark.
+    """A sequence of kernels captured once, with timing events at its start and at the end of each stage.
+
+    To launch a kernel of a graph takes the host a microsecond and more, and the device begins when the last one is
+    launched. So a sequence may mark where its `HEAD` ends: that is a graph of its own, on which the device works while
+    the host launches the rest.
 
     after   the graph that is launched before each time this one is: its stages are this one's first, and the next one
             begins where they end, so that it has in it whatever time the device waits in between for this launch.
@@ -94,18 +99,14 @@ class Graph:
             self._start, self._events = like._start, like._events
         elif after is None:
             self._start = self._events["start"] = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
-        self._graph = torch.cuda.CUDAGraph()
+        self._parts: list[torch.cuda.CUDAGraph] = []  # in order
         with building(stream.device):
             stream.wait_stream(torch.cuda.current_stream(stream.device))
             with torch.cuda.stream(stream):
                 for _ in range(2):  # compiles and allocates whatever the kernels need, outside the capture
                     run(lambda stage: None)
             stream.synchronize()
-            with (
-                uncollected(),
-                torch.cuda.graph(self._graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
-            ):
-                run(self._mark)
+            self._capture(run, pool, stream)
 
     def launch(self, first: Callable[[], None] = lambda: None) -> None:
         """Do `first`, which may launch kernels, then run the graph's again on what their input buffers hold now.
@@ -115,7 +116,8 @@ class Graph:
         if self._start is not None:
             self._start.record(torch.cuda.current_stream(self._device))
         first()
-        self._graph.replay()
+        for part in self._parts:
+            part.replay()
 
     def replay(self) -> None:
         """`launch`, and wait for whatever the current stream has to do."""
@@ -126,6 +128,24 @@ class Graph:
         """Device time of the last replay: each mark's milliseconds since the one before. Their sum leaves none out."""
         pairs = itertools.pairwise(self._events.items())
         return {name: start.elapsed_time(end) for (_, start), (name, end) in pairs}
+
+    def _capture(self, run: Callable[[Mark], None], pool: Any, stream: torch.cuda.Stream) -> None:
+        with uncollected(), ExitStack() as capturing:
+
+            def begin() -> None:
+                self._parts.append(torch.cuda.CUDAGraph())
+                options: dict[str, Any] = {"pool": pool, "stream": stream, "capture_error_mode": "thread_local"}
+                capturing.enter_context(torch.cuda.graph(self._parts[-1], **options))
+
+            def mark(stage: str) -> None:
+                if stage == HEAD:
+                    capturing.close()
+                    begin()
+                else:
+                    self._mark(stage)
+
+            begin()
+            run(mark)
 
     def _mark(self, stage: str) -> None:
         if stage not in self._events:

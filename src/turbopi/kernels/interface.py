@@ -72,6 +72,7 @@ class Ops:
     read; what they hand over is a matter between them.
     """
 
+    transfer: Callable[[Tensor, Tensor], None]  # between the device and pinned memory of the host
     embed_patches: Callable[..., Tensor]
     embed_prompt: Callable[..., None]
     residual_rms_norm: Callable[..., tuple[Tensor, Tensor]]

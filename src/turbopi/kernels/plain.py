@@ -22,6 +22,11 @@ from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
 from turbopi.quantization.int8 import to_int8
 
 
+def transfer(source: Tensor, to: Tensor) -> None:
+    """`to` becomes `source`, of the same shape and dtype. One may be pinned memory of the host; nothing waits."""
+    to.copy_(source, non_blocking=True)
+
+
 def resize_picture(picture: Tensor, out: Tensor, rows: Taps, columns: Taps, top: int, left: int, low: float) -> None:
     """Picture uint8[h, w, 3] into `out` [S, S, 3], from row `top` and column `left` on; around it is padding.
 
@@ -236,6 +241,7 @@ def matmul_f32(a: Tensor, b: Tensor) -> Tensor:
 
 
 PLAIN = Ops(
+    transfer=transfer,
     embed_patches=embed_patches,
     embed_prompt=embed_prompt,
     residual_rms_norm=residual_rms_norm,

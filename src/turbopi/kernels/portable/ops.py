@@ -10,7 +10,7 @@ from torch import Tensor
 
 from turbopi.kernels import plain
 from turbopi.kernels.interface import Ops
-from turbopi.kernels.portable import attention, batch, embedding, norms, products, resize, rope
+from turbopi.kernels.portable import attention, batch, embedding, norms, products, resize, rope, transfer
 from turbopi.kernels.portable.vjp import ops as vjp
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, TileTable
 from turbopi.quantization.fp8 import E4M3
@@ -19,6 +19,7 @@ from turbopi.quantization.fp8 import E4M3
 def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
     """With these measured tiles."""
     return Ops(
+        transfer=transfer.transfer,
         embed_patches=EmbedPatches(),
         embed_prompt=embedding.embed_prompt,
         residual_rms_norm=norms.residual_rms_norm,
@@ -43,7 +44,7 @@ def portable_ops(tiles: TileTable = NO_TILES) -> Ops:
             "suffix attention": "cuBLAS and Triton's softmax",
             "the expert with a way back": vjp.ORIGIN,
             "LayerNorm": "Triton",
-            "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding, pictures' sizes": "Triton",
+            "other norms, GeGLU of the suffix, RoPE, patches, prompt embedding, pictures' sizes, transfers": "Triton",
         },
     )
 
