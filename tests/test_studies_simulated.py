@@ -47,6 +47,15 @@ def test_cells_in_a_simulator_are_kept_and_continued_and_the_report_needs_nothin
     assert len(found.not_run) == 4 and "ab2, uniform, 2" in "".join(found.not_run)
     (panel,) = found.plots[0].panels
     assert {one.label: one.x for one in panel.series} == {"euler": [1.0, 10.0], "exponential": [2.0]}
+    assert "run on CPU. " in found.method
+    file = tmp_path / "episodes" / "exponential_uniform_2" / "results.json"
+    elsewhere = json.loads(file.read_text())
+    elsewhere["policy"]["about"]["device_name"] = "another"
+    file.write_text(json.dumps(elsewhere))
+    result = turbopi(*report_only)
+    assert "not finite" not in result.output, "the plain policy isn't compared with itself"
+    found = read_document(tmp_path / "steps_libero" / report.JSON, Report)
+    assert "run on CPU (plain; euler, uniform, 1), another (exponential, uniform, 2). " in found.method
 
 
 def test_cells_of_other_episodes_or_cut_short_are_not_compared(tmp_path: Path) -> None:

@@ -212,5 +212,5 @@ def _table(grid: "Grid") -> Table:
     for column in grid.columns:
         table.add_column(column)
     for row in grid.rows:
-        table.add_row(*(cell_text(cell) or "not finite" for cell in row))
+        table.add_row(*("not finite" if cell is None else cell_text(cell) for cell in row))
     return table

@@ -181,6 +181,7 @@ class Variants:
         if plain is None:
             raise ConfigError(f"{folder / PLAIN} holds no finished run; run {self.name} with --way {PLAIN}")
         cells, solved, missing = [], {PLAIN: _solved(plain)}, []
+        ran_on: dict[str, list[str]] = {}  # cells by device
         for cell in (self.plain, *self.cells):
             place = folder / slug(cell.name)
             results = finished(place)
@@ -189,13 +190,14 @@ class Variants:
                 continue
             _check_pair(plain, results)
             solved[cell.name] = _solved(results)
+            ran_on.setdefault(str(results.policy.about.get("device_name")), []).append(cell.name)
             cells.append(_cell(cell.name, solved[PLAIN], solved[cell.name], self.measured(cell.name, place)))
-        count, first = len(solved[PLAIN]), plain.policy.about
+        count = len(solved[PLAIN])
         return setup.report(
             self.study,
             method=(
                 f"`turbopi eval {plain.protocol['simulator']}`'s episodes: {plain.suite}, {count} of them, the same "
-                f"ones with the same noise in every cell, run on {first.get('device_name')}. {self.method} "
+                f"ones with the same noise in every cell, run on {_devices_told(ran_on)}. {self.method} "
                 f"Differences are against the plain policy: the float32 reference, ten Euler steps."
             ),
             controls=self.controls(folder, cells, setup.small),
@@ -361,6 +363,13 @@ def _cell(
 ) -> SimulatorCell:
     paired = Paired.of([(plain[key], solved[key]) for key in plain])
     return SimulatorCell(way, Rate(sum(solved.values()), len(solved)).document, paired.document, dict(measured))
+
+
+def _devices_told(ran_on: Mapping[str, Sequence[str]]) -> str:
+    """Of cells by device; where there are several, which cells each has run."""
+    if len(ran_on) == 1:
+        return next(iter(ran_on))
+    return ", ".join(f"{device} ({'; '.join(names)})" for device, names in ran_on.items())
 
 
 def _table(cells: Sequence[SimulatorCell]) -> Grid:
