@@ -174,6 +174,10 @@ class Batching(SeekingPolicy):
         self.warmups.append(arguments)
         return 1.5
 
+    def infer_batch(self, observations: Any, seed: Any, **told: Any) -> list[dict[str, Any]]:
+        model_actions = {"model_actions": np.zeros((HORIZON, 32), np.float32)} if told else {}
+        return [result | model_actions for result in super().infer_batch(observations, seed)]
+
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[Batching]:
@@ -244,11 +248,11 @@ def test_each_way_is_warmed_up_before_it_runs(made: list[Batching], tmp_path: Pa
 
 
 def test_only_what_is_left_to_run_is_warmed_up(made: list[Batching], tmp_path: Path) -> None:
-    command = f"eval reacher {QUICK} --tasks 0 --workers 2 --out {tmp_path / 'run'} --json"
-    for trials, expected in ((2, [{}, {"batches": [2]}]), (2, [{}]), (3, [{}])):
+    command = f"eval reacher {QUICK} --tasks 0 --workers 2 --execution rtc --out {tmp_path / 'run'} --json"
+    for trials, expected in ((2, [{"batches": [2], "real_time": "rtc"}]), (2, []), (3, [{"real_time": "rtc"}])):
         result = turbopi(*command.split(), "--trials", trials)
         assert json.loads(result.stdout)["episodes"] == trials, result.output
-        assert made[-1].warmups == expected
+        assert made[-1].warmups == [{}, *expected]
 
 
 @pytest.mark.usefixtures("most")
