@@ -42,8 +42,8 @@ class SeekingPolicy:
             chunks[0][2, 1] = np.nan
         return [{"actions": chunk, "policy_timing": {"infer_ms": 2.0}} for chunk in chunks]
 
-    def warmup(self) -> None:
-        pass
+    def warmup(self, **arguments: Any) -> float:
+        return 0.0
 
     def infer(self, observation: dict[str, Any]) -> dict[str, Any]:
         return self.infer_batch([observation], [0])[0]

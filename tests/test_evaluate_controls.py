@@ -30,6 +30,9 @@ class Recorder:
         self.asked += list(observations)
         return [Answer(np.zeros((10, 7)), None) for _ in observations]
 
+    def warm_up(self, most: int, mode: Any, tell: Any) -> None:
+        self.asked.append((most, mode))
+
     def close(self) -> None:
         pass
 
@@ -61,6 +64,12 @@ def test_a_controlled_run_is_another_policy_than_the_same_without() -> None:
     controlled = Controlled(source, "prompt", TASKS, KEYS)
     assert controlled.identity != source.identity
     assert "prompt of another task" in controlled.label
+
+
+def test_the_policy_behind_a_control_is_warmed_up() -> None:
+    source = Recorder()
+    Controlled(source, "prompt", TASKS, KEYS).warm_up(4, "rtc", print)
+    assert source.asked == [(4, "rtc")]
 
 
 def test_an_unknown_prompt_passes_as_it_is() -> None:

@@ -171,12 +171,12 @@ def test_ways_that_tell_the_model_ask_the_policy_for_it() -> None:
         def __init__(self) -> None:
             self.metadata: dict[str, Any] = {}
 
-        def infer(self, observation: Any, seed: int, **arguments: Any) -> dict[str, Any]:
+        def infer_batch(self, observations: Any, seed: Any, **arguments: Any) -> list[dict[str, Any]]:
             asked.append(arguments)
-            return {"actions": np.zeros((10, 7)), "model_actions": np.ones((10, 32), np.float32)}
+            return [{"actions": np.zeros((10, 7)), "model_actions": np.ones((10, 32), np.float32)}]
 
     (answer,) = LocalPolicy(Policy()).infer([{}], [3], [{"previous": None, "model_actions": True}])
-    assert asked == [{"previous": None, "model_actions": True}]
+    assert asked == [{"previous": [None], "model_actions": [True]}]
     assert answer.for_next["model_actions"].shape == (10, 32)
 
 

@@ -428,9 +428,9 @@ def test_a_way_that_the_policy_is_too_slow_for_ends_the_run_with_the_reason(tmp_
             super().__init__(horizon=5)
             self.metadata["real_time"] = {"modes": ["rtc"]}
 
-        def infer(self, observation: Any, **arguments: Any) -> Any:
-            result = super().infer(observation)
-            return result | {"model_actions": result["actions"].astype(np.float32)}
+        def infer_batch(self, observations: Any, seed: Any, **arguments: Any) -> Any:
+            results = super().infer_batch(observations, seed)
+            return [result | {"model_actions": result["actions"].astype(np.float32)} for result in results]
 
     with pytest.raises(ConfigError, match=r"--execution rtc can't be run in real time: one call takes .* lower"):
         run(tmp_path, Joins(), states=(0,), replan=5, execution="rtc", control_hz=20.0)

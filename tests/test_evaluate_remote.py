@@ -1,6 +1,6 @@
 """Joined chunks from a policy server: the same episodes as in this process, and refusals that say what to do."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from turbopi.errors import ConfigError
 from turbopi.evaluate.checks import check_way
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.sources import Answer, LocalPolicy, PolicyRefused, RemotePolicy
+from turbopi.running_chunk import JoinMode
 from turbopi.shipped import CHASE_POLICY
 
 RTC = ("rtc", "rtc_identity", "rtc_trained")
@@ -39,6 +40,9 @@ class Noting:
         found = self._source.infer(observations, seeds, arguments)
         self.answers += found
         return found
+
+    def warm_up(self, most: int, mode: JoinMode | None, tell: Callable[[str], None]) -> None:
+        self._source.warm_up(most, mode, tell)
 
     def close(self) -> None:
         self._source.close()

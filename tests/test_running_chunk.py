@@ -39,12 +39,20 @@ def conditioning(chunk: RunningChunk, options: RealTime = TRAINED) -> Conditioni
     return done.conditioning(done.left_over, 4, H, "accumulated")
 
 
+def trained_policy(engine: type[OnCpu] | None = None) -> UnifiedPolicy:
+    """Trained with simulated delays. With an engine without its graphs it runs observations together."""
+    checkpoint = random_checkpoint("pi05_tiny")
+    checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, real_time=TRAINED))
+    made = UnifiedPolicy(checkpoint, num_denoising_steps=2, precision="f32", device="cpu", backend="pytorch")
+    if engine is not None:
+        load = lambda device, precision: checkpoint.load(device, precision).state  # noqa: E731
+        made.backend = engine(made.config.model, load, device=torch.device("cpu"), precision="f32")
+    return made
+
+
 @pytest.fixture(scope="module")
 def policy() -> UnifiedPolicy:
-    checkpoint = random_checkpoint("pi05_tiny")
-    config = dataclasses.replace(checkpoint.config, real_time=TRAINED)
-    checkpoint = dataclasses.replace(checkpoint, config=config)
-    return UnifiedPolicy(checkpoint, num_denoising_steps=2, precision="f32", device="cpu", backend="pytorch")
+    return trained_policy()
 
 
 def test_guided_modes_pull_towards_the_left_over_before_h_minus_s() -> None:
@@ -295,17 +303,7 @@ def test_guidance_of_an_unused_dimension_is_the_left_overs_own(policy: UnifiedPo
 
 @pytest.fixture(scope="module")
 def engine() -> UnifiedPolicy:
-    """A policy whose backend runs observations together: the engine without its graphs."""
-    checkpoint = random_checkpoint("pi05_tiny")
-    checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, real_time=TRAINED))
-    made = UnifiedPolicy(checkpoint, num_denoising_steps=2, precision="f32", device="cpu", backend="pytorch")
-    made.backend = OnCpu(
-        made.config.model,
-        lambda device, precision: checkpoint.load(device, precision).state,
-        device=torch.device("cpu"),
-        precision="f32",
-    )
-    return made
+    return trained_policy(OnCpu)
 
 
 CHUNKS = [

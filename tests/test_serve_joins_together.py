@@ -7,17 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from test_begin import OnCpu
-from test_running_chunk import TRAINED
+from test_running_chunk import trained_policy
 from test_serve_real_time import H
 from test_serve_schedule import PAYING, SERIAL, begin, closed_loop, request, table
 from test_serve_server import client, eventually, metric, served
 from test_serve_several import HoldingJoins, answer
 from websockets.asyncio.client import ClientConnection
 
-from turbopi import UnifiedPolicy
-from turbopi.checkpoint import random_checkpoint
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.running_chunk import RunningChunk
 from turbopi.serve import PolicyServer, running
@@ -318,12 +315,7 @@ def test_sessions_are_not_waited_for_where_joining_together_does_not_pay() -> No
 @pytest.mark.usefixtures("pays")
 @pytest.mark.parametrize("mode", ["rtc", "rtc_identity", "rtc_trained"])
 def test_a_real_policys_joined_chunks_are_those_of_their_session_in_any_company(mode: str) -> None:
-    checkpoint = random_checkpoint("pi05_tiny")
-    config = checkpoint.config.__class__(**{**vars(checkpoint.config), "real_time": TRAINED})
-    checkpoint = checkpoint.__class__(**{**vars(checkpoint), "config": config})
-    policy: Any = UnifiedPolicy(checkpoint, backend="pytorch", precision="f32", device="cpu", num_denoising_steps=2)
-    load = lambda device, precision: checkpoint.load(device, precision).state  # noqa: E731
-    policy.backend = OnCpu(policy.config.model, load, device=torch.device("cpu"), precision="f32")
+    policy: Any = trained_policy(OnCpu)
     policy.warmup = lambda **_: 0.0  # it would run every prompt length, as there are no graphs
     drawn = policy._noise
     policy._noise = lambda rows, horizon, given, seed: drawn(rows, horizon, None, [0] * rows)  # the same for every row

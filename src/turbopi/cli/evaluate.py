@@ -191,11 +191,15 @@ def run_with_progress(
     max_batch: int | None = None,
     on_answer: "OnAnswer | None" = None,
 ) -> "Results":
-    """Check that the policy fits, then run with a bar, or a line an episode where nobody watches."""
+    """Check that the policy fits, warm it up, then run with a bar, or a line an episode where nobody watches.
+
+    max_batch   requests that are computed together, unless the options say; None: as many as workers
+    """
     from turbopi.evaluate.checks import check_delay, check_fit
     from turbopi.evaluate.pacing import rate_told
     from turbopi.evaluate.run import default_workers, evaluate, pending, prepare
     from turbopi.evaluate.visited import Recording
+    from turbopi.execution import way_named
 
     answer = check_fit(source, simulator, protocol.sim, protocol.image_px, protocol.replan)
     if answer.problem is None:
@@ -205,11 +209,14 @@ def run_with_progress(
     recording = None if options.record is None or not left else Recording(options.record, source)
     hooks = [hook for hook in (on_answer, recording) if hook is not None]
     workers = 1 if options.real_time else min(options.workers or default_workers(), max(1, left))
+    max_batch = options.max_batch or max_batch or workers
     hz = protocol.control_hz
     paced = "" if hz is None else f" in real time ({rate_told(hz, simulator.control_hz)})"
     output.line(f"{protocol.suite}: {len(jobs)} episodes{paced} with {source.label} into {folder}")
     if left < len(jobs):
         output.line(f"{len(jobs) - left} of them are finished already; {left} to go")
+    if left:  # a worker has one request at a time
+        source.warm_up(min(workers, max_batch), way_named(protocol.execution).mode, output.line)
 
     def answered(*request: Any) -> None:
         for hook in hooks:
@@ -224,7 +231,7 @@ def run_with_progress(
                 simulator,
                 jobs,
                 num_workers=workers,
-                max_batch=options.max_batch or max_batch or workers,
+                max_batch=max_batch,
                 videos=options.video_plan(),
                 on_episode=on_episode,
                 on_answer=answered if hooks else None,

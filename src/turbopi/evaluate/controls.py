@@ -3,13 +3,14 @@
 If it doesn't, its success doesn't come from what it was told, or from what it saw.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from turbopi.errors import ConfigError
 from turbopi.evaluate.sources import Answer, PolicySource
+from turbopi.running_chunk import JoinMode
 
 Control = Literal["prompt", "pictures"]
 CONTROLS: tuple[Control, ...] = ("prompt", "pictures")
@@ -51,6 +52,9 @@ class Controlled:
             self._seen[observation["prompt"]] = {key: observation[key] for key in self._image_keys}
         wrong = [self._wrong(observation) for observation in observations]
         return self._source.infer(wrong, seeds) if arguments is None else self._source.infer(wrong, seeds, arguments)
+
+    def warm_up(self, most: int, mode: JoinMode | None, tell: Callable[[str], None]) -> None:
+        self._source.warm_up(most, mode, tell)
 
     def close(self) -> None:
         self._source.close()

@@ -1,17 +1,21 @@
 """Where actions come from: a policy in this process, or an openpi websocket server."""
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 from typing import Protocol as Interface
 
 import numpy as np
+import torch
 
+from turbopi.arguments import MAX_BATCH
 from turbopi.errors import ActionError, ConfigError, TurboPiError
 from turbopi.execution.messages import PREFIX, message
+from turbopi.execution.queue import of_batch
 from turbopi.quantization.formats import told_by
 from turbopi.reading import is_finite, shown
+from turbopi.running_chunk import JoinMode
 from turbopi.wire import MAX_BYTES, WireError, pack, unpack
 from turbopi.wording import denoising
 
@@ -76,12 +80,18 @@ class PolicySource(Interface):
         arguments   what each request tells the policy of the running chunk (turbopi.execution). None: nothing
         """
 
+    def warm_up(self, most: int, mode: JoinMode | None, tell: Callable[[str], None]) -> None:
+        """Prepare for a run that gives up to `most` observations at once and joins chunks in this mode, if in any.
+
+        tell   is given a line before what takes long, and one after it
+        """
+
     def close(self) -> None:
         """Let go of it."""
 
 
 class LocalPolicy:
-    """A UnifiedPolicy, or whatever has its `infer_batch` and `metadata`."""
+    """A UnifiedPolicy, or whatever has its `infer_batch` and `metadata`; with `runs_batches`, its `warmup`, too."""
 
     max_batch: int | None = None
 
@@ -104,23 +114,39 @@ class LocalPolicy:
         seeds: Sequence[int],
         arguments: Sequence[Mapping[str, Any]] | None = None,
     ) -> list[Answer]:
-        if arguments is not None:
-            return [self._joined(*request) for request in zip(observations, seeds, arguments, strict=True)]
+        told = [{}] * len(observations) if arguments is None else arguments
         try:
-            results = self._policy.infer_batch(list(observations), seed=list(seeds))
+            results = self._policy.infer_batch(list(observations), seed=list(seeds), **of_batch(told))
         except ActionError as error:
             if len(observations) == 1:
                 return [Answer.unusable(str(error))]
-            pairs = zip(observations, seeds, strict=True)  # the others' actions are good
-            return [self.infer([observation], [seed])[0] for observation, seed in pairs]
-        return [_answer(result, "policy_timing") for result in results]
+            each = zip(observations, seeds, told, strict=True)  # the others' actions are good
+            return [self.infer([observation], [seed], [more])[0] for observation, seed, more in each]
+        return [replace(_answer(result, "policy_timing"), for_next=_for_next(result)) for result in results]
 
-    def _joined(self, observation: Mapping[str, object], seed: int, arguments: Mapping[str, Any]) -> Answer:
+    def warm_up(self, most: int, mode: JoinMode | None, tell: Callable[[str], None]) -> None:
+        """Only where the policy runs observations together; single ones without a running chunk are warm already."""
+        if not getattr(self._policy, "runs_batches", False):
+            return
+        arguments: dict[str, Any] = {}
+        if most > 1:  # any number of them may wait together
+            arguments["batches"] = list(range(2, min(most, MAX_BATCH) + 1))
+        if mode is not None:
+            arguments["real_time"] = mode
+        if not arguments:
+            return
+        asked = ([] if most == 1 else [f"batches of up to {most}"]) + ([] if mode is None else [f"mode {mode}"])
+        tell(f"Warming up {', '.join(asked)} …")
         try:
-            result = self._policy.infer(observation, seed=seed, **arguments)
-        except ActionError as error:
-            return Answer.unusable(str(error))
-        return replace(_answer(result, "policy_timing"), for_next=_for_next(result))
+            seconds = self._policy.warmup(**arguments)
+        except torch.OutOfMemoryError as error:
+            if most == 1:
+                raise
+            raise ConfigError(
+                f"warm-up of {', '.join(asked)} takes more than the GPU's memory: {error}. Give a smaller --max-batch, "
+                "or fewer --workers"
+            ) from error
+        tell(f"warm-up: {seconds:.2f} s")
 
     def close(self) -> None:
         self._policy = None
@@ -210,6 +236,9 @@ class RemotePolicy:
             self._one(message(observation, **more, seed=seed if self.takes_seeds else None))
             for observation, seed, more in zip(observations, seeds, told, strict=True)
         ]
+
+    def warm_up(self, most: int, mode: JoinMode | None, tell: Callable[[str], None]) -> None:
+        """Nothing: a server has warmed itself up."""
 
     def close(self) -> None:
         with contextlib.suppress(Exception):  # it may be gone already

@@ -8,7 +8,7 @@ no actions, or its way is "sync") carried out none, and enters at row 0.
 
 import copy
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -50,6 +50,19 @@ class Request:
         if not self.model_actions:
             return {}
         return {"previous": self.previous, "model_actions": True}
+
+
+def of_batch(arguments: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """What `infer_batch` is told where `infer` would be told these `Request.arguments`: a value for each observation.
+
+    Empty if none of them is told anything, so that any policy with `infer_batch` takes it.
+    """
+    if not any(arguments):
+        return {}
+    return {
+        "previous": [one.get("previous") for one in arguments],
+        "model_actions": [bool(one.get("model_actions")) for one in arguments],
+    }
 
 
 class Action(NamedTuple):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from turbopi.errors import ActionError, ConfigError, DeviceLost, ObservationError
+from turbopi.execution.queue import of_batch
 from turbopi.running_chunk import RunningChunk
 from turbopi.serve.batch_times import BatchTimes
 from turbopi.serve.metrics import Metrics
@@ -302,11 +303,7 @@ class PolicyCalls:
         self, observations: Sequence[dict[str, Any]], arguments: Sequence[Mapping[str, Any]]
     ) -> list[dict[str, Any]]:
         """`arguments` of `infer`, for each observation; what isn't asked for by any isn't said."""
-        joins: dict[str, list[Any]] = {}
-        if any(arguments):
-            joins["previous"] = [one.get("previous") for one in arguments]
-            joins["model_actions"] = [bool(one.get("model_actions")) for one in arguments]
-        results = self._policy.infer_batch(list(observations), **joins)  # type: ignore[attr-defined]
+        results = self._policy.infer_batch(list(observations), **of_batch(arguments))  # type: ignore[attr-defined]
         if not isinstance(results, list) or len(results) != len(observations):
             raise TypeError(f"infer_batch must return a list of {len(observations)} results")
         return results
