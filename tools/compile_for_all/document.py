@@ -9,11 +9,8 @@ from turbopi.errors import ConfigError
 from turbopi.reading import plain_document, read_document
 
 
-class Compiled(Struct, frozen=True, array_like=True):
-    """One kernel for one target. problem: why it isn't fit to run there; refused: why it isn't to run there.
-
-    In the file it is a list of these, as `CompiledForAll.columns` says: there are thousands.
-    """
+class Compiled(Struct, frozen=True, omit_defaults=True):
+    """One kernel for one target. problem: why it isn't fit to run there; refused: why it isn't to run there."""
 
     kernel: str
     variant: str
@@ -31,7 +28,6 @@ class CompiledForAll(Struct, frozen=True):
     date: str
     versions: dict[str, str]
     rows: list[Compiled]
-    columns: tuple[str, ...] = Compiled.__struct_fields__
 
 
 def read_compiled(file: Path) -> CompiledForAll:
@@ -40,8 +36,8 @@ def read_compiled(file: Path) -> CompiledForAll:
 
 
 def written(document: CompiledForAll) -> str:
-    """JSON with a line for each row."""
+    """JSON with a line for each row: there are thousands."""
     plain = plain_document(document)
-    rows = ",\n".join(f"  {json.dumps(row)}" for row in plain.pop("rows"))
-    head = json.dumps(plain, indent=1).removesuffix("\n}")
+    rows = ",\n".join(f"  {json.dumps(plain_document(row))}" for row in document.rows)
+    head = json.dumps({name: value for name, value in plain.items() if name != "rows"}, indent=1).removesuffix("\n}")
     return f'{head},\n "rows": [\n{rows}\n ]\n}}\n'

@@ -1,0 +1,23 @@
+"""What a host's own sockets take."""
+
+import pytest
+from load_test.loopback import WARM_UP, main, round_trips
+
+
+def test_every_counted_round_trip_is_told_and_whole_messages_travel() -> None:
+    """More bytes than a socket holds at once, either way."""
+    found = round_trips(request=3_000_001, answer=2_000_001, work_s=0.0, count=3)
+    assert len(found) == 3 and min(found) > 0 and WARM_UP > 0
+
+
+def test_the_work_isnt_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--request", "10", "--answer", "10", "--work", "50", "--count", "1"]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("1 round trips: median ") and "beside the work" in told
+
+
+@pytest.mark.parametrize("bad", [["--request", "0"], ["--work", "-1"], ["--count", "0"]])
+def test_sizes_that_cant_be_are_refused(bad: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as refused:
+        main(bad)
+    assert refused.value.code == 2 and "must be at least" in capsys.readouterr().err
