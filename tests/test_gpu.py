@@ -15,6 +15,7 @@ from test_engine import made_up, shape_of
 
 from turbopi import backends
 from turbopi.config import ImageResize, Kind
+from turbopi.engine import forward
 from turbopi.engine.call import StaticCall
 from turbopi.engine.graph import Graph
 from turbopi.engine.runner import HostRow
@@ -38,6 +39,12 @@ MODES = [  # pytorch_compile takes minutes to compile them all; gpu_check runs i
     for precision in backends.precisions(name)
     if precision in ("bf16", "f32")  # FP8 needs a calibration: test_gpu_fp8.py
 ] + [(PORTABLE, "bf16")]
+
+
+@pytest.fixture(autouse=True)
+def cut_vision(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Vision of the golden models has two layers: it is cut behind the first, as the full one is behind the third."""
+    monkeypatch.setattr(forward, "HEAD_LAYERS", 1)
 
 
 @lru_cache
@@ -171,13 +178,19 @@ def test_vision_apart_and_the_rest_equal_one_graph_of_the_whole_call(name: str) 
     def in_one(row: HostRow, noise: torch.Tensor) -> torch.Tensor:
         call = next(c for s, c in runner._calls.items() if s == shape_of(observation, noise, 3))
         if call not in whole:
-            whole[call] = Graph(call.run, runner._pool, runner._stream)
+            with pytest.MonkeyPatch.context() as patched:
+                patched.setattr(forward, "HEAD_LAYERS", None)
+                whole[call] = Graph(call.run, runner._pool, runner._stream)
+            assert len(whole[call]._parts) == 1
         call.pictures.upload(row.images)
         call.write_inputs(noise[0].numpy(), row.state, row.tokens)
         whole[call].replay()
         return call.actions.clone()
 
     horizon = checkpoint.config.model.action_horizon
+    side = runner.config.vision.image_size
+    runner.begin([np.zeros((side, side, 3), np.uint8)])
+    assert [len(graph._parts) for graph in runner._graphs.values()] == [2], "vision's head, and its rest"
     for turn in range(2):
         for seed, (cameras, tokens) in enumerate([(2, 5), (3, 40), (2, 47), (1, 16), (2, 5), (0, 17), (3, 17)]):
             observation, _ = made_up("pi05", cameras, tokens, seed)

@@ -72,7 +72,7 @@ _SPECS = (
         "cuda_graph",
         "turbopi.backends.cuda_graph",
         "CudaGraphBackend",
-        "the whole call in two CUDA graphs, PyTorch's kernels: NVIDIA GPUs from compute capability 8.0",
+        "the whole call in CUDA graphs, PyTorch's kernels: NVIDIA GPUs from compute capability 8.0",
     ),
     BackendSpec(
         "fused",

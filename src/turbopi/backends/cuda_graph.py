@@ -1,4 +1,4 @@
-"""Backend `cuda_graph`: a call is two CUDA graphs, one for pictures and one for all the rest, with stock PyTorch.
+"""Backend `cuda_graph`: a call is a `Graph` for pictures and one for all the rest, with stock PyTorch.
 
 What is captured, kept and refused: engine/runner.py; of batches: engine/batches.py.
 """

@@ -2,8 +2,8 @@
 
 `StaticCall.run` is that sequence of kernels on fixed buffers; on a GPU it is captured in two parts and replayed:
 `Pictures.run`, which needs nothing but pictures and so starts while the host still tokenises, and `StaticCall.answer`.
-Inputs of either travel out of one pinned buffer, and actions come back into one; pictures of other sizes than the
-model's are copied before the first part.
+Each begins with its inputs' way out of pinned memory, and actions go back there. Where pictures have other sizes than
+the model's, they are copied before the first part.
 """
 
 from collections.abc import Sequence
@@ -155,12 +155,13 @@ class Pictures:
 
     def run_resized(self, mark: Mark = lambda stage: None) -> None:
         """Pictures of which some have other sizes, to the first rows of `embs`."""
-        if self.ops.resize_pictures is not None and self.cameras:
+        assert self.ops.resize_pictures is not None, "else `upload` has resized them on the host: `run`"
+        if self.cameras:
             self.ops.resize_pictures(self._resizer.table, self.images)
         self._encode(mark)
 
     def run(self, mark: Mark = lambda stage: None) -> None:
-        """Pictures from the host to the first rows of `embs`."""
+        """Pictures from the host, in place of what is in `images`, to the first rows of `embs`."""
         if self.cameras:
             self.ops.transfer(self.host, self.images)
         self._encode(mark)

@@ -125,7 +125,7 @@ class Graph:
         torch.cuda.current_stream(self._device).synchronize()
 
     def stage_ms(self) -> dict[str, float]:
-        """Device time of the last replay: each mark's milliseconds since the one before. Their sum leaves none out."""
+        """Device time of the last replay: milliseconds by stage since the one before. Their sum leaves none out."""
         pairs = itertools.pairwise(self._events.items())
         return {name: start.elapsed_time(end) for (_, start), (name, end) in pairs}
 

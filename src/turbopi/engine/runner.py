@@ -1,12 +1,12 @@
 """Calls as CUDA graphs: which are captured, kept, replayed and refused.
 
-A call is two graphs. The first, vision, is for a number of valid cameras; it can start before the prompt is known. The
-second, prefix and all denoising steps, is for a bucket, which rounds the prompt's length up to a multiple of 16, too;
-inside it nothing is captured anew when pictures, prompt, state or noise change. That of a conditioned call is for its
-form and the times that its actions may have, whatever is held or pulls; that of a solver for its grid. A bucket that
-warm-up didn't capture is captured when first needed, with a log line, or refused if the runner is `strict`. Graphs of
-the denoising loops used last are kept, see recent_loops.py. Observations run one after the other here; batch_runner.py
-has them run together.
+A call is two sequences of kernels, each a `Graph`. The first, vision, is for a number of valid cameras; it can start
+before the prompt is known. The second, prefix and all denoising steps, is for a bucket, which rounds the prompt's
+length up to a multiple of 16, too; inside it nothing is captured anew when pictures, prompt, state or noise change.
+That of a conditioned call is for its form and the times that its actions may have, whatever is held or pulls; that of a
+solver for its grid. A bucket that warm-up didn't capture is captured when first needed, with a log line, or refused if
+the runner is `strict`. Graphs of the denoising loops used last are kept, see recent_loops.py. Observations run one
+after the other here; batch_runner.py has them run together.
 """
 
 import logging
