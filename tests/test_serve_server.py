@@ -452,6 +452,14 @@ def test_threads_and_the_garbage_collector_are_as_before_after_a_server() -> Non
     assert sys.getswitchinterval() == usual
     assert kept[0] > 10_000, "a full collection would look through all modules among requests"
     assert gc.get_freeze_count() < 1_000
+    gc.freeze()
+    try:
+        before = gc.get_freeze_count()
+        with pytest.raises(RuntimeError, match="seen"):
+            PolicyServer(FakePolicy(), port=0).serve_forever(on_ready=look)
+        assert gc.get_freeze_count() >= before, "what the program around has frozen stays so"
+    finally:
+        gc.unfreeze()
 
 
 # --- health, pings, metrics -------------------------------------------------------------------------------------------

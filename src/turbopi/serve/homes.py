@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
+from itertools import takewhile
 from typing import Any
 
 SOON_SECONDS = 0.05  # from an answer to the next request, of a client that asks as soon as it is answered
@@ -33,5 +34,6 @@ class Homes:
         home, when = self._answered.get(client, (None, 0.0))
         if home not in requests or now - when > SOON_SECONDS:
             return None
-        active = sum(now - answered <= ACTIVE_SECONDS for _, answered in self._answered.values())
+        latest = reversed(self._answered.values())
+        active = sum(1 for _ in takewhile(lambda one: now - one[1] <= ACTIVE_SECONDS, latest))
         return home if requests[home] * len(requests) < active else None

@@ -240,13 +240,14 @@ class PolicyServer:
                 finally:
                     stopped.cancel()
 
-        usual = sys.getswitchinterval()
+        usual, frozen = sys.getswitchinterval(), gc.get_freeze_count()
         sys.setswitchinterval(min(usual, SWITCH_SECONDS))
         try:
             asyncio.run(main())
         finally:
             sys.setswitchinterval(usual)
-            gc.unfreeze()
+            if not frozen:  # else unfreezing would undo what the program around has frozen
+                gc.unfreeze()
         if self.lost is not None:
             raise DeviceLost(self.lost)
 
