@@ -154,6 +154,8 @@ def test_the_command_says_that_it_predicts_and_fits_80_columns(monkeypatch: pyte
     assert "These are predictions: nothing was run for them." in lines
     assert any("rtx4090 bf16" in line and "cuda_graph" in line for line in lines)
     assert any(line.startswith("cuda_graph, PyTorch's kernels, as on h200: ") for line in lines)
+    starred = {line.split()[1] for line in lines if line.startswith("│") and "*" in line}
+    assert starred == {"h100", "h200"} and "* but this call was measured on that GPU" in lines
     for gpu in published_gpus().values():
         assert f"  {gpu.name}: {gpu.source}" in lines
 

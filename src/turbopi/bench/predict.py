@@ -39,7 +39,7 @@ class PredictedCall(Struct, frozen=True, kw_only=True):
 
 
 class Prediction(Struct, frozen=True, kw_only=True):
-    """One GPU in one precision on one job. Nothing in it was measured on that GPU."""
+    """One GPU in one precision on one job. Only calls whose `measured_on` is this GPU were measured on it."""
 
     gpu: GpuSpec
     precision: str

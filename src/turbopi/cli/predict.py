@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from turbopi.config import ModelConfig
 
 Axes = Mapping[str, Sequence[int]]
+MEASURED = "*"  # behind a number that isn't a prediction
 
 
 def show_predictions(
@@ -59,10 +60,16 @@ def _table(job: "Job", predictions: "Sequence[Prediction]") -> Table:
         floors = [f"{one.floor_ms[name]:.2f}" for name in (*STAGES, "total")]
         name = f"{one.gpu.key} {one.precision}"
         for call in one.calls:
-            table.add_row(name, *floors, call_text(call), call.backend)
+            told = call_text(call) + MEASURED if _is_measured(one, call) else call_text(call)
+            table.add_row(name, *floors, told, call.backend)
         if not one.calls:
             table.add_row(name, *floors, "-", "")
     return table
+
+
+def _is_measured(prediction: "Prediction", call: "PredictedCall") -> bool:
+    """Whether this very job ran on this very GPU."""
+    return (call.measured_on, call.measured_job) == (prediction.gpu.key, prediction.job)
 
 
 def call_text(call: "PredictedCall") -> str:
@@ -76,8 +83,10 @@ def _notes(predictions: "Sequence[Prediction]") -> list[str]:
     from turbopi.backends import PRECISIONS
     from turbopi.bench.measured import KERNELS
 
+    measured = any(_is_measured(one, call) for one in predictions for call in one.calls)
     lines = [
         "These are predictions: nothing was run for them.",
+        *([f"{MEASURED} but this call was measured on that GPU"] if measured else []),
         "floor: the counted work at NVIDIA's published rates",
         "call: the floor and what the backend lost beyond its floor on the GPU where it",
         "      was measured, as the same time at one end, as the same ratio at the other",
