@@ -72,9 +72,9 @@ def collect_and_empty_cache() -> None:
 class Graph:
     """A sequence of kernels captured once, with timing events at its start and at the end of each stage.
 
-    To launch a kernel of a graph takes the host a microsecond and more, and the device begins when the last one is
-    launched. So a sequence may mark where its `HEAD` ends: that is a graph of its own, on which the device works while
-    the host launches the rest.
+    On some machines the host takes more than a microsecond for each kernel of a graph, and the device begins when all
+    are launched. So a sequence may mark where its `HEAD` ends: that is a graph of its own, on which the device works
+    while the host launches the rest.
 
     after   the graph that is launched before each time this one is: its stages are this one's first, and the next one
             begins where they end, so that it has in it whatever time the device waits in between for this launch.
@@ -109,7 +109,7 @@ class Graph:
             self._capture(run, pool, stream)
 
     def launch(self, first: Callable[[], None] = lambda: None) -> None:
-        """Do `first`, which may launch kernels, then run the graph's again on what their input buffers hold now.
+        """Do `first`, which may launch kernels, then run the captured ones again on what their input buffers hold now.
 
         On the current stream, without waiting for it.
         """
@@ -125,7 +125,7 @@ class Graph:
         torch.cuda.current_stream(self._device).synchronize()
 
     def stage_ms(self) -> dict[str, float]:
-        """Device time of the last replay: milliseconds by stage since the one before. Their sum leaves none out."""
+        """Milliseconds of each stage of the last replay, from the end of the one before. Their sum leaves none out."""
         pairs = itertools.pairwise(self._events.items())
         return {name: start.elapsed_time(end) for (_, start), (name, end) in pairs}
 
