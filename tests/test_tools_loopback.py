@@ -16,6 +16,12 @@ def test_the_work_isnt_counted(capsys: pytest.CaptureFixture[str]) -> None:
     assert told.startswith("1 round trips: median ") and "beside the work" in told
 
 
+def test_another_process_that_ends_is_told_and_not_waited_for() -> None:
+    """It fails at a sleep of less than nothing."""
+    with pytest.raises(ConnectionError, match="ended after 0 round trips"):
+        round_trips(request=10, answer=10, work_s=-1.0, count=1)
+
+
 @pytest.mark.parametrize("bad", [["--request", "0"], ["--work", "-1"], ["--count", "0"]])
 def test_sizes_that_cant_be_are_refused(bad: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as refused:

@@ -10,7 +10,6 @@ faster on this host, so it stands beside the overhead that `python -m load_test`
 import argparse
 import multiprocessing
 import socket
-import statistics
 import sys
 import time
 from collections.abc import Sequence
@@ -43,21 +42,22 @@ def serve(listener: socket.socket, request: int, answer: int, work_s: float) -> 
 def round_trips(request: int, answer: int, work_s: float, count: int) -> list[float]:
     """Seconds of `count` round trips less the work, behind WARM_UP others. request, answer: bytes, at least 1."""
     found = []
-    with socket.create_server(("127.0.0.1", 0)) as listener:
+    with socket.create_server(("127.0.0.1", 0)) as listener:  # then the other process alone has it, and may end it
         context = multiprocessing.get_context("spawn")
         server = context.Process(target=serve, args=(listener, request, answer, work_s), daemon=True)
         server.start()
-        with socket.create_connection(listener.getsockname()[:2]) as connection:
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            asked, buffer = bytes(request), memoryview(bytearray(answer))
-            for i in range(WARM_UP + count):
-                start = time.perf_counter()
-                connection.sendall(asked)
-                if not _read(connection, buffer):
-                    raise ConnectionError(f"the other process ended after {i} round trips")
-                if i >= WARM_UP:
-                    found.append(time.perf_counter() - start - work_s)
-        server.join()
+        connection = socket.create_connection(listener.getsockname()[:2])
+    with connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        asked, buffer = bytes(request), memoryview(bytearray(answer))
+        for i in range(WARM_UP + count):
+            start = time.perf_counter()
+            connection.sendall(asked)
+            if not _read(connection, buffer):
+                raise ConnectionError(f"the other process ended after {i} round trips")
+            if i >= WARM_UP:
+                found.append(time.perf_counter() - start - work_s)
+    server.join()
     return found
 
 
@@ -72,9 +72,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     if min(given.request, given.answer, given.count) < 1 or given.work < 0:
         parser.error("--request, --answer and --count must be at least 1, --work at least 0")
-    found = sorted(1e3 * one for one in round_trips(given.request, given.answer, given.work / 1e3, given.count))
-    p99 = found[min(len(found) - 1, int(0.99 * len(found)))]
-    print(f"{given.count} round trips: median {statistics.median(found):.3f} ms, p99 {p99:.3f} ms beside the work")
+    from load_test.document import Spread  # not above: the other process needs nothing of it
+
+    found = Spread.of([1e3 * one for one in round_trips(given.request, given.answer, given.work / 1e3, given.count)])
+    assert found is not None, "at least one was counted"
+    print(f"{given.count} round trips: median {found.p50:.3f} ms, p99 {found.p99:.3f} ms beside the work")
     return 0
 
 
