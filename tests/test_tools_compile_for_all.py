@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from compile_for_all.allowed import ALLOWED, allowed
-from compile_for_all.document import CompiledForAll, read_compiled
+from compile_for_all.document import CompiledForAll, read_compiled, written
 from compile_for_all.targets import TARGETS, over_limit
 
 ROOT = Path(__file__).parents[1]
@@ -89,6 +89,11 @@ def test_the_checked_in_result_has_every_target_and_no_problem() -> None:
     assert {row.target for row in result.rows} == ALL
     assert [row for row in result.rows if row.problem] == []
     assert {row.kernel for row in result.rows if row.refused} == {"gemm.kernel.product, FP8"}
+
+
+def test_the_checked_in_result_is_as_it_was_written() -> None:
+    file = ROOT / "benchmarks/results/compiled_for_all.json"
+    assert written(read_compiled(file)) == file.read_text()
 
 
 @pytest.mark.parametrize(("kernel", "number"), [(kernel, number) for kernel in ALLOWED for number in ALLOWED[kernel]])

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from turbopi.errors import ConfigError
 from turbopi.reading import plain_document, read_document
@@ -37,7 +37,6 @@ def read_compiled(file: Path) -> CompiledForAll:
 
 def written(document: CompiledForAll) -> str:
     """JSON with a line for each row: there are thousands."""
-    plain = plain_document(document)
     rows = ",\n".join(f"  {json.dumps(plain_document(row))}" for row in document.rows)
-    head = json.dumps({name: value for name, value in plain.items() if name != "rows"}, indent=1).removesuffix("\n}")
-    return f'{head},\n "rows": [\n{rows}\n ]\n}}\n'
+    empty = json.dumps(plain_document(structs.replace(document, rows=[])), indent=1)
+    return empty.replace('"rows": []', f'"rows": [\n{rows}\n ]') + "\n"
