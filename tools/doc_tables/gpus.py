@@ -19,7 +19,7 @@ from turbopi import backends
 from turbopi.backends import Precision
 from turbopi.bench.gpus import GpuSpec, published_gpus
 from turbopi.bench.measured import measured_calls
-from turbopi.bench.predict import PredictedCall, predict
+from turbopi.bench.predict import Prediction, predict
 from turbopi.bench.work import Job
 from turbopi.cli.predict import call_text
 from turbopi.config import ModelConfig
@@ -160,13 +160,14 @@ def gpu_predictions() -> list[str]:
             one = by_precision.get(precision)
             cells.append("" if one is None else f"{one.floor_ms['total']:.1f}")
             if precision != "int8":
-                calls = [] if one is None else [call for call in one.calls if f"`{call.backend}`" == taken[precision]]
-                cells.append(_call(gpu, calls))
+                cells.append("" if one is None else _call(one, taken[precision]))
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
-def _call(gpu: GpuSpec, calls: list[PredictedCall]) -> str:
-    if not calls:
-        return ""
-    return call_text(calls[0]) + (" (measured)" if calls[0].measured_on == gpu.key else "")
+def _call(prediction: Prediction, taken: str) -> str:
+    """The first call of the backend that is taken; nothing if none is predicted."""
+    for call in prediction.calls:
+        if f"`{call.backend}`" == taken:
+            return call_text(call) + (" (measured)" if prediction.was_measured(call) else "")
+    return ""

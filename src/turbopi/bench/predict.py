@@ -39,13 +39,17 @@ class PredictedCall(Struct, frozen=True, kw_only=True):
 
 
 class Prediction(Struct, frozen=True, kw_only=True):
-    """One GPU in one precision on one job. Only calls whose `measured_on` is this GPU were measured on it."""
+    """One GPU in one precision on one job. Only calls that `was_measured` names were measured on that GPU."""
 
     gpu: GpuSpec
     precision: str
     job: Job
     floor_ms: dict[str, float]  # by stage, and their sum as "total", at the published rates
     calls: list[PredictedCall]  # none where no backend that runs there was measured in such a batch and model
+
+    def was_measured(self, call: PredictedCall) -> bool:
+        """Whether this very job ran on this very GPU."""
+        return (call.measured_on, call.measured_job) == (self.gpu.key, self.job)
 
 
 def predict(gpu: GpuSpec, config: ModelConfig, job: Job) -> list[Prediction]:

@@ -60,16 +60,11 @@ def _table(job: "Job", predictions: "Sequence[Prediction]") -> Table:
         floors = [f"{one.floor_ms[name]:.2f}" for name in (*STAGES, "total")]
         name = f"{one.gpu.key} {one.precision}"
         for call in one.calls:
-            told = call_text(call) + MEASURED if _is_measured(one, call) else call_text(call)
+            told = call_text(call) + (MEASURED if one.was_measured(call) else "")
             table.add_row(name, *floors, told, call.backend)
         if not one.calls:
             table.add_row(name, *floors, "-", "")
     return table
-
-
-def _is_measured(prediction: "Prediction", call: "PredictedCall") -> bool:
-    """Whether this very job ran on this very GPU."""
-    return (call.measured_on, call.measured_job) == (prediction.gpu.key, prediction.job)
 
 
 def call_text(call: "PredictedCall") -> str:
@@ -83,7 +78,7 @@ def _notes(predictions: "Sequence[Prediction]") -> list[str]:
     from turbopi.backends import PRECISIONS
     from turbopi.bench.measured import KERNELS
 
-    measured = any(_is_measured(one, call) for one in predictions for call in one.calls)
+    measured = any(one.was_measured(call) for one in predictions for call in one.calls)
     lines = [
         "These are predictions: nothing was run for them.",
         *([f"{MEASURED} but this call was measured on that GPU"] if measured else []),
