@@ -17,6 +17,8 @@ from turbopi.arguments import Denoising
 from turbopi.errors import ConfigError
 from turbopi.evaluate.statistics import Paired, Rate
 from turbopi.model.conditioning import Conditioning
+from turbopi.quantization.fp8 import Directions
+from turbopi.quantization.sites import Site
 from turbopi.reading import read_document
 from turbopi.shipped import CHASE_POLICY
 from turbopi.sim.chase import SPEED as CHASE_SPEED
@@ -345,6 +347,23 @@ def test_four_bits_are_gone_after_the_block_and_activations_are_rounded_where_th
             found[name] = float((policy.model.sample(*made[0], 2) - exact).norm())
     assert torch.equal(policy.model.sample(*made[0], 2), exact)
     assert 0 < found["NVFP4, weights alone"] != found["W4A8"] < found["NVFP4"] < found[fp8_and_fp4.WRONG]
+
+
+def test_weights_are_rounded_once_for_all_formats_that_share_the_rounding_and_only_those_are_held() -> None:
+    held = fp8_and_fp4.HeldWeights()
+    asked: list[Directions | None] = []
+    weight, site = torch.nn.Parameter(torch.ones(2, 32)), Site("expert", 0, "qkv", 32, 2)
+
+    def rounding(weight: Tensor, directions: Directions | None) -> Tensor:
+        asked.append(directions)
+        return weight.detach() * 2
+
+    first = held.rounded(weight, site, rounding, None)
+    assert held.rounded(weight, site, rounding, None) is first and len(asked) == 1
+    directions = Directions(torch.ones(32, 1), torch.ones(1), 0.1)
+    common = {site: directions}
+    assert held.rounded(weight, site, rounding, common) is not first and asked[-1] is directions
+    assert held.rounded(weight, site, rounding, None) is not first and len(asked) == 3
 
 
 def test_fewer_bits_are_read_sooner() -> None:

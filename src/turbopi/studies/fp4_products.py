@@ -64,7 +64,7 @@ def matrices(model: Pi0Model, most: int = 24) -> list[Tensor]:
     """Those of the model's sites whose inputs fit blocks of 32, from the first to the last, at most so many."""
     found = [linear.weight for site in sites(model.config) for linear in linears(model, site)]
     found = [weight for weight in found if weight.shape[1] % 32 == 0]
-    return [weight.float().cpu() for weight in found[:: -(-len(found) // most)]]
+    return [weight.float() for weight in found[:: -(-len(found) // most)]]
 
 
 def normal_matrices(count: int = 4) -> list[Tensor]:
@@ -75,7 +75,7 @@ def normal_matrices(count: int = 4) -> list[Tensor]:
 
 def product_cosines(weights: Sequence[Tensor]) -> list[ProductCosine]:
     generator = torch.Generator().manual_seed(0)
-    inputs = [torch.randn(64, weight.shape[1], generator=generator) for weight in weights]
+    inputs = [torch.randn(64, weight.shape[1], generator=generator).to(weight.device) for weight in weights]
     found = []
     for how, rounding in HOW.items():
         cosines = torch.tensor([_cosine(x @ rounding(w).T, x @ w.T) for x, w in zip(inputs, weights, strict=True)])

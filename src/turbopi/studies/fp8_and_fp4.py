@@ -113,7 +113,7 @@ def cases(model: Pi0Model, made: list[Batch], seen: list[Batch], steps: int) -> 
     def of(*parts: str, mlp: bool = False) -> dict[Site, float]:
         return {s: x for s, x in scales.items() if s.part in parts and (not mlp or s.kind in MLP_KINDS)}
 
-    four = partial(in_four_bits, model, of(*PARTS))
+    four = partial(in_four_bits, model, of(*PARTS), held=HeldWeights())
     return {
         "FP8": lambda: rounded(model, of(*PARTS)),
         "FP8, rounded for directions": lambda: rounded(model, of(*PARTS), RoundedWeights(common)),
@@ -122,12 +122,13 @@ def cases(model: Pi0Model, made: list[Batch], seen: list[Batch], steps: int) -> 
         **{f"FP8, {part}": lambda part=part: rounded(model, of(part)) for part in PARTS},  # type: ignore[misc]
         "FP8 attention, vision": lambda: attention_in_fp8("vision"),
         "FP8 attention, prefix and expert": lambda: attention_in_fp8("gemma"),
+        # those of one rounding of the weights beside each other: see HeldWeights
         "NVFP4": lambda: four(activations="nvfp4"),
         "NVFP4, weights alone": lambda: four(activations="exact"),
+        "W4A8": lambda: four(activations="fp8"),
         "NVFP4, weights of the expert alone": lambda: in_four_bits(model, of("expert"), activations="exact"),
         "NVFP4, rounded for directions": lambda: four(common, activations="nvfp4"),
         "NVFP4, weights alone, rounded for directions": lambda: four(common, activations="exact"),
-        "W4A8": lambda: four(activations="fp8"),
         "W4A8, rounded for directions": lambda: four(common, activations="fp8"),
         "W4A8 (MXFP4)": lambda: four(activations="fp8", weights=round_mxfp4),
         "W4A8 (MXFP4), rounded for directions": lambda: four(common, activations="fp8", weights=round_mxfp4),
@@ -150,27 +151,42 @@ def errors(
 
 
 RoundFor = Callable[[Tensor, Directions | None], Tensor]
+Common = Mapping[Site, Directions]
+
+
+class HeldWeights:
+    """Matrices rounded in one way, each when it is first asked for. Those of the way before are let go then: at full
+    size they are as large as the model.
+    """
+
+    def __init__(self) -> None:
+        self._way: tuple[RoundFor, Common | None] | None = None
+        self._held: dict[int, Tensor] = {}  # by the matrix' identity, which the model keeps
+
+    def rounded(self, weight: Tensor, site: Site, rounding: RoundFor, common: Common | None) -> Tensor:
+        if self._way is None or self._way[0] is not rounding or self._way[1] is not common:
+            self._way, self._held = (rounding, common), {}
+        if id(weight) not in self._held:
+            self._held[id(weight)] = rounding(weight, (common or {}).get(site))
+        return self._held[id(weight)]
 
 
 @contextmanager
 def in_four_bits(
     model: Pi0Model,
     scales: Mapping[Site, float],
-    common: Mapping[Site, Directions] | None = None,
+    common: Common | None = None,
     *,
     activations: str,
     weights: RoundFor = round_nvfp4,
+    held: HeldWeights | None = None,
 ) -> Iterator[None]:
     """For a while, these sites' products are of weights in four bits, rounded for the sites' directions, if given.
 
     activations  "exact", "nvfp4", or "fp8": E4M3 with the site's scale
+    held         weights that a context before this one has rounded in the same way
     """
-    held: dict[int, Tensor] = {}
-
-    def once(weight: Tensor, site: Site) -> Tensor:
-        if id(weight) not in held:
-            held[id(weight)] = weights(weight, (common or {}).get(site))
-        return held[id(weight)]
+    rounded_once = (held or HeldWeights()).rounded
 
     def inputs(scale: float) -> Round:
         if activations == "fp8":
@@ -178,7 +194,7 @@ def in_four_bits(
         return round_nvfp4 if activations == "nvfp4" else _same
 
     changes: list[tuple[torch.nn.Linear, Round, Round]] = [
-        (linear, inputs(scale), partial(once, site=site))
+        (linear, inputs(scale), partial(rounded_once, site=site, rounding=weights, common=common))
         for site, scale in scales.items()
         for linear in linears(model, site)
     ]
@@ -212,9 +228,11 @@ def run(setup: Setup) -> Report:
     found: dict[str, dict[str, FormatError]] = {}
     products = {NORMAL: product_cosines(normal_matrices())}
     for name, (model, made, seen) in _problems(setup).items():
-        found[name] = dict(errors(model, made, seen, setup.steps, IN_SMALL if setup.small else None))
+        found[name] = {}
+        for format_, error in errors(model, made, seen, setup.steps, IN_SMALL if setup.small else None):
+            found[name][format_] = error
+            setup.tell(f"{name}: {format_}: relative rms error {error.relative_rms:.4f}")
         products[name] = product_cosines(matrices(model))
-        setup.tell(f"{name}: {len(found[name])} formats")
     every = setup.each(partial(judge, count=setup.cell_episodes, small=setup.small), setup.toy_policies)
     found |= {name: of for name, (of, _) in zip(setup.toy_policies, every, strict=True)}
     successes = [cell for _, own in every for cell in own]
