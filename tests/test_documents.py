@@ -14,7 +14,7 @@ import turbopi
 from turbopi.bench.document import read_benchmark
 
 ROOT = Path(__file__).parents[1]
-RESULT = ROOT / "benchmarks" / "results" / "h200_2026-11-24_pi05_libero" / "results.json"
+RESULT = ROOT / "benchmarks" / "results" / "h200_2026-11-26_pi05_libero" / "results.json"
 _LINK = re.compile(r"\]\(([^()\s]+(?:\([^()\s]*\)[^()\s]*)*)\)")
 
 

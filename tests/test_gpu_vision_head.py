@@ -20,7 +20,7 @@ pytestmark = [
         reason="needs an NVIDIA GPU of compute capability 9.0",
     ),
 ]
-CALIBRATION = Path(__file__).parents[1] / "benchmarks/results/h200_2026-11-24_pi05_libero/calibrate.json"
+CALIBRATION = Path(__file__).parents[1] / "benchmarks/results/h200_2026-11-26_pi05_libero/calibrate.json"
 
 
 @pytest.mark.parametrize("precision", ["bf16", "fp8"])

@@ -25,7 +25,7 @@ from turbopi.serve.sizing import Fleet, Plan, batch_times, plan_fleet, worst_sec
 
 ROOT = Path(__file__).parents[1]
 SETTINGS = settings(max_examples=60, deadline=None)  # how long an example takes says nothing
-RESULT = ROOT / "benchmarks/results/h200_2026-11-24_pi05_libero/results.json"
+RESULT = ROOT / "benchmarks/results/h200_2026-11-26_pi05_libero/results.json"
 
 
 @st.composite

@@ -240,7 +240,7 @@ def test_a_gpu_result_that_lacks_something_is_refused_by_key(
 
 
 def test_the_checked_in_calibrations_report_reads_and_comes_out_as_it_was() -> None:
-    report = json.loads((RESULTS / "h200_2026-11-24_pi05_libero/calibrate.json").read_text())["report"]
+    report = json.loads((RESULTS / "h200_2026-11-26_pi05_libero/calibrate.json").read_text())["report"]
     read = read_report(report)
     assert json.dumps(plain_document(read)) == json.dumps(report)
     assert list(read.held_out.errors()) == [name for name in report["held_out"] if name != "worst"]

@@ -6,7 +6,7 @@ benchmarks/results/, and docs/api_reference.md from the docstrings, or check tha
 
 A table stands between two lines of a document, which name what it shows and of which files:
 
-    <!-- table: main_job h200_2026-11-24_pi05_libero/results.json -->
+    <!-- table: main_job h200_2026-11-26_pi05_libero/results.json -->
     <!-- end of table -->
 
 `tables.py` has one function for each name. The plots are those that `turbopi bench --report` draws: every folder below

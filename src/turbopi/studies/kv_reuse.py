@@ -53,7 +53,7 @@ NOTHING = 1.5  # θ above any cosine: nothing is ever reused
 STEPS = 5
 MOST_REMEMBERED = 128  # episodes: more than run at a time; one takes some 50 MB of a model of full size
 # Milliseconds of stages and of the whole call: `fused` bf16, pi05_libero, two cameras, 48 tokens, ten steps, H200
-# (benchmarks/results/h200_2026-11-24_pi05_libero/results.json)
+# (2026-11-24; the reports' speed-ups are by these)
 CALL_MS = {"vision": 1.186, "prefix": 3.475, "denoise": 2.614, "total": 7.450}
 
 

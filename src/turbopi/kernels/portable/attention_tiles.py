@@ -49,7 +49,10 @@ OTHERS: dict[Attention, tuple[AttentionTile, ...]] = {
         *(AttentionTile(128, 64, 8, 2), AttentionTile(128, 32, 8, 2), AttentionTile(32, 32, 4, 2)),
     ),
     "packed_attention": (AttentionTile(PACKED_ROWS, 32, 4, 2), AttentionTile(PACKED_ROWS, 32, 8, 3)),
-    "suffix_attention": (AttentionTile(16, 32, 4, 3), AttentionTile(16, 128, 4, 2)),
+    "suffix_attention": (
+        *(AttentionTile(16, 32, 4, 3), AttentionTile(16, 128, 4, 2)),
+        *(AttentionTile(32, 64, 8, 2), AttentionTile(64, 64, 8, 2), AttentionTile(128, 64, 8, 2)),
+    ),
 }
 
 
