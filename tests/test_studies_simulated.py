@@ -11,15 +11,17 @@ from cli_helpers import refusal, turbopi
 from turbopi import UnifiedPolicy
 from turbopi.backends.pytorch import reference_model
 from turbopi.checkpoint import open_checkpoint
+from turbopi.errors import ConfigError
 from turbopi.evaluate.results import Results
 from turbopi.observation import Observation
 from turbopi.reading import read_document
 from turbopi.shipped import CHASE_POLICY
+from turbopi.sim import Task
 from turbopi.studies import kv_reuse, kv_reuse_libero, mask, report
 from turbopi.studies.kv_reuse import Reuse, Reusing
 from turbopi.studies.report import Report
 from turbopi.studies.rollouts import CHASE, open_policy, play
-from turbopi.studies.simulated import Running, Variant, finished
+from turbopi.studies.simulated import Running, Variant, _initial_states, finished
 from turbopi.studies.study import Setup
 
 IN_CHASE = (CHASE_POLICY, "--simulator", "chase", "--small", "--device", "cpu", "--workers", "1")
@@ -91,6 +93,36 @@ def test_what_a_study_in_a_simulator_is_refused(tmp_path: Path) -> None:
     assert "--episodes-only needs --out" in refusal(turbopi(*on_libero, "--episodes-only"))
     said = refusal(turbopi(*on_libero, "--out", tmp_path, "--episodes-only", "--report-only"))
     assert "leave nothing to do" in said
+    on_toys = ("study", "steps,mask", "--random-weights", "pi05_tiny", "--small", "--device", "cpu")
+    for option, value in (("--way", "euler, uniform, 1"), ("--simulator", "chase")):
+        said = refusal(turbopi(*on_toys, option, value))
+        assert f"{option} is '{value}', and is for steps_libero, " in said and "steps, mask takes none" in said
+    assert "--episodes is 1001; a cell on chase has 1000 at most" in refusal(
+        turbopi("study", "steps_libero", "--simulator", "chase", "--episodes", "1001", "--device", "cpu")
+    )
+
+
+@pytest.mark.parametrize(
+    ("simulator", "small", "asked", "episodes", "states"),
+    [
+        *(("chase", False, None, 200, 200), ("chase", True, None, 2, 2), ("chase", True, 5, 5, 5)),
+        *(("reacher", False, None, 150, 50), ("reacher", False, 7, 9, 3)),  # three tasks of fifty initial states each
+    ],
+)
+def test_a_cell_has_as_many_episodes_as_were_asked_for(
+    simulator: str, small: bool, asked: int | None, episodes: int, states: int, tmp_path: Path
+) -> None:
+    setup = Setup(small=small, simulator=simulator, episodes=asked, folder=tmp_path)
+    jobs = Running.of(setup).jobs
+    assert len(jobs) == episodes and {job.initial_state for job in jobs} == set(range(states))
+
+
+@pytest.mark.parametrize(("asked", "states"), [(None, 20), (200, 20), (50, 5), (41, 5)])
+def test_liberos_cells_are_of_states_that_training_never_saw(asked: int | None, states: int) -> None:
+    tasks = [Task(i, "task", "do it", 50, 220) for i in range(10)]
+    assert _initial_states(Setup(episodes=asked), tasks) == range(30, 30 + states)
+    with pytest.raises(ConfigError, match="--episodes is 201; a cell on libero has 200 at most"):
+        _initial_states(Setup(episodes=201), tasks)
 
 
 def ended(variant: Variant, folder: Path) -> Results:

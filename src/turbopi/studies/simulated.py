@@ -5,6 +5,7 @@ runs of `turbopi eval`. Each cell keeps its episodes in a folder of its own, and
 report is made of the folders alone, so that cells may be run by several processes, or on other machines.
 """
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -26,7 +27,7 @@ from turbopi.evaluate.sources import LocalPolicy, PolicySource
 from turbopi.evaluate.statistics import Paired, PairedDocument, Rate, RateDocument
 from turbopi.policy import UnifiedPolicy
 from turbopi.reading import plain_document
-from turbopi.sim import SimSettings, Simulator, create
+from turbopi.sim import SimSettings, Simulator, Task, create
 from turbopi.studies.answering import Answering, AnsweringPolicy
 from turbopi.studies.report import (
     MARGIN,
@@ -48,6 +49,7 @@ PLAIN, CONTROL = "plain", "control"  # names of cells that every study here has
 UNSEEN = range(30, 50)  # LIBERO's initial states that the small policy's training never saw
 STEPS = 10  # of denoising, as the small policy was judged
 _CONTROL_EPISODES = 4
+_SMALL_EPISODES = 2  # of a cell in the small form
 _LOST = -0.2  # of the rate: what a broken variant loses at least
 _NO_VIDEOS = VideoPlan("none")
 
@@ -269,17 +271,14 @@ class Running:
 
     @classmethod
     def of(cls, setup: Setup) -> "Running":
-        """LIBERO's episodes are those of all tasks of its first suite, from the initial states UNSEEN; of other
-        simulators there are as many as a cell has.
-        """
+        """Episodes of all tasks of the simulator's first suite; in the small form of its first task."""
         if setup.folder is None:
             raise ConfigError("episodes alone are of no use without a folder: give --out")
         simulator = create(setup.simulator)
         simulator.check()
         suite, libero = simulator.suites[0], setup.simulator == "libero"
         tasks = choose_tasks(simulator, suite, [0] if setup.small else None)
-        states = UNSEEN if libero else range(setup.cell_episodes)
-        jobs = make_jobs(tasks, states[:2] if setup.small else states, None, _NO_VIDEOS)
+        jobs = make_jobs(tasks, _initial_states(setup, tasks), None, _NO_VIDEOS)
         protocol = Protocol(simulator.name, suite, SimSettings(), max_steps=40 if setup.small and libero else None)
         checkpoint = setup.checkpoint or open_checkpoint(shipped.SMALL_POLICY)
         return cls(setup, setup.folder, simulator, protocol, jobs, checkpoint)
@@ -306,6 +305,21 @@ class Running:
             broken = f"the simulator broke in {len(crashed)} episodes of {cell.name}, {crashed[0]} first"
             raise ConfigError(f"{broken}; give the command again")
         self.setup.tell(f"{folder.name}: {sum(_solved(results).values())} of {len(jobs)}")
+
+
+def _initial_states(setup: Setup, tasks: Sequence[Task]) -> Sequence[int]:
+    """The first ones of every task that together are a cell's episodes, or a few more; of LIBERO those UNSEEN.
+
+    Raises ConfigError if more episodes were asked for than there are.
+    """
+    there = UNSEEN if setup.simulator == "libero" else range(min(task.num_initial_states for task in tasks))
+    if setup.episodes is not None and setup.episodes > len(there) * len(tasks):
+        raise ConfigError(
+            f"--episodes is {setup.episodes}; a cell on {setup.simulator} has {len(there) * len(tasks)} at most: "
+            f"tasks {len(tasks)}, initial states {there[0]} to {there[-1]}"
+        )
+    episodes = _SMALL_EPISODES if setup.small and setup.episodes is None else setup.cell_episodes
+    return there[: math.ceil(episodes / len(tasks))]
 
 
 def slug(name: str) -> str:
