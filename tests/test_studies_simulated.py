@@ -1,7 +1,9 @@
 """Variants of a policy in a simulator: cells that are kept, continued, compared; studies of them; padded caches."""
 
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.pytorch import reference_model
 from turbopi.checkpoint import open_checkpoint
 from turbopi.errors import ConfigError
+from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import Results
 from turbopi.observation import Observation
 from turbopi.reading import read_document
@@ -21,7 +24,7 @@ from turbopi.studies import kv_reuse, kv_reuse_libero, mask, report
 from turbopi.studies.kv_reuse import Reuse, Reusing
 from turbopi.studies.report import Report
 from turbopi.studies.rollouts import CHASE, open_policy, play
-from turbopi.studies.simulated import Running, Variant, _initial_states, finished
+from turbopi.studies.simulated import Running, Variant, _check_pair, _initial_states, finished
 from turbopi.studies.study import Setup
 
 IN_CHASE = (CHASE_POLICY, "--simulator", "chase", "--small", "--device", "cpu", "--workers", "1")
@@ -65,7 +68,9 @@ def test_cells_of_other_episodes_or_cut_short_are_not_compared(tmp_path: Path) -
     assert turbopi(*given, "plain", "--episodes", "1").exit_code == 0
     assert turbopi(*given, "euler, uniform, 1", "--episodes", "2").exit_code == 0
     report_only = ("study", "steps_libero", "--device", "cpu", "--report-only", "--out", tmp_path)
-    assert "can't be compared: the episodes differ" in refusal(turbopi(*report_only))
+    said = refusal(turbopi(*report_only))
+    assert "can't be compared: the episodes differ: 2 and 1, of which task 0 from initial state 1 is in" in said
+    assert "is in euler_uniform_1 alone" in said
     file = tmp_path / "episodes" / "euler_uniform_1" / "results.json"
     run = json.loads(file.read_text())
     run["episodes"].pop()
@@ -73,6 +78,28 @@ def test_cells_of_other_episodes_or_cut_short_are_not_compared(tmp_path: Path) -
     turbopi(*report_only)
     found = read_document(tmp_path / "steps_libero" / report.JSON, Report)
     assert "euler, uniform, 1, cut short after 1 of 2 episodes: `--way 'euler, uniform, 1'`" in found.not_run
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "said"),
+    [
+        (("policy", "identity"), "weights", "the policy's weights differ: 'others' and '"),
+        (("protocol",), "replan", "the protocol's replan differ: 'others' and 5"),
+    ],
+)
+def test_cells_of_another_policy_or_protocol_are_not_compared(
+    part: tuple[str, ...], name: str, said: str, tmp_path: Path
+) -> None:
+    given = ("study", "steps_libero", *IN_CHASE, "--out", tmp_path, "--episodes-only", "--episodes", "1")
+    assert turbopi(*given, "--way", "plain", "--way", "euler, uniform, 1").exit_code == 0
+    plain, cell = (load_results(tmp_path / "episodes" / one) for one in ("plain", "euler_uniform_1"))
+    _check_pair(plain, cell)
+    changed: Any = cell
+    for one in part:
+        changed = getattr(changed, one)
+    changed[name] = "others"
+    with pytest.raises(ConfigError, match=re.escape(f"can't be compared: {said}")):
+        _check_pair(plain, cell)
 
 
 @pytest.mark.parametrize("name", ["kv_reuse_libero", "fp8_and_fp4_libero", "mask_libero"])

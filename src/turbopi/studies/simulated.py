@@ -26,7 +26,7 @@ from turbopi.evaluate.run import default_workers, evaluate, prepare
 from turbopi.evaluate.sources import LocalPolicy, PolicySource
 from turbopi.evaluate.statistics import Paired, PairedDocument, Rate, RateDocument
 from turbopi.policy import UnifiedPolicy
-from turbopi.reading import plain_document
+from turbopi.reading import plain_document, shown
 from turbopi.sim import SimSettings, Simulator, Task, create
 from turbopi.studies.answering import Answering, AnsweringPolicy
 from turbopi.studies.report import (
@@ -354,16 +354,24 @@ def _check_pair(plain: Results, results: Results) -> None:
 
     def decisive(of: Results) -> dict[str, object]:
         names = ("weights", "config", "backend", "precision", "robot")
-        told = {f"policy's {name}": of.policy.identity.get(name) for name in names}
-        return {"episodes": sorted(of.planned), "protocol": of.protocol, **told}
+        told: dict[str, object] = {f"policy's {name}": of.policy.identity.get(name) for name in names}
+        return told | {f"protocol's {name}": value for name, value in of.protocol.items()}
 
+    if apart := sorted(plain.planned ^ results.planned):
+        owner = plain if apart[0] in plain.planned else results
+        found = f"episodes differ: {len(results.planned)} and {len(plain.planned)}, of which task {apart[0][0]} from "
+        raise _not_comparable(results, plain, f"{found}initial state {apart[0][1]} is in {owner.folder.name} alone")
     ours, theirs = decisive(results), decisive(plain)
-    for name, value in ours.items():
-        if value != theirs[name]:
-            raise ConfigError(
-                f"{results.folder} and {plain.folder} can't be compared: the {name} differ; run one of them again "
-                "with another --out"
-            )
+    for name in ours | theirs:
+        if ours.get(name) != theirs.get(name):
+            found = f"{name} differ: {shown(ours.get(name))} and {shown(theirs.get(name))}"
+            raise _not_comparable(results, plain, found)
+
+
+def _not_comparable(results: Results, plain: Results, why: str) -> ConfigError:
+    return ConfigError(
+        f"{results.folder} and {plain.folder} can't be compared: the {why}; run one of them again with another --out"
+    )
 
 
 # --- what is told -----------------------------------------------------------------------------------------------------
