@@ -16,6 +16,7 @@ from turbopi.checkpoint import open_checkpoint
 from turbopi.errors import ConfigError
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import Results
+from turbopi.evaluate.statistics import Paired, Rate
 from turbopi.observation import Observation
 from turbopi.reading import read_document
 from turbopi.shipped import CHASE_POLICY
@@ -24,7 +25,7 @@ from turbopi.studies import kv_reuse, kv_reuse_libero, mask, report
 from turbopi.studies.kv_reuse import Reuse, Reusing
 from turbopi.studies.report import Report
 from turbopi.studies.rollouts import CHASE, open_policy, play
-from turbopi.studies.simulated import Running, Variant, _check_pair, _initial_states, finished
+from turbopi.studies.simulated import Running, SimulatorCell, Variant, _check_pair, _initial_states, finished
 from turbopi.studies.study import Setup
 
 IN_CHASE = (CHASE_POLICY, "--simulator", "chase", "--small", "--device", "cpu", "--workers", "1")
@@ -175,6 +176,19 @@ def test_reuse_is_counted_by_episode_and_a_variant_that_isnt_neutral_fails_the_c
     ended(study.plain, plain)
     (found,) = study.controls(tmp_path, [], small=True)
     assert not found.held
+
+
+@pytest.mark.parametrize(("lost", "held"), [(None, False), (10, False), (40, True)])
+def test_a_full_report_is_sound_only_with_a_broken_cell_that_fails(
+    lost: int | None, held: bool, tmp_path: Path
+) -> None:
+    study, cells = kv_reuse_libero.VARIANTS, []
+    if lost is not None:
+        paired = Paired(200 - lost, lost, 0, 0).document  # both solved, the plain policy alone
+        cells = [SimulatorCell(kv_reuse_libero.ANOTHERS, Rate(200 - lost, 200).document, paired, {})]
+    _, broken = study.controls(tmp_path, cells, small=False)
+    assert broken.held is held and broken.claim.startswith("every 2, of another episode isn't as good")
+    assert (broken.evidence == "Not run: `--way 'every 2, of another episode'`.") is (lost is None)
 
 
 @pytest.mark.parametrize("what", ["full", "camera", "patch", "every"])

@@ -118,7 +118,7 @@ class Variants:
     few        names of the small form's cells
     neutral    the plain policy asked for in the study's way: four episodes must end as the plain policy's, `exact`:
                after the same commands
-    broken     a cell that must lose twenty points, if the study has one
+    broken     a cell that must lose twenty points, if the study has one; without it no full report is sound
     measured   {column: number} of what else a cell's folder tells, by the cell's name and folder; the first is the
                plot's x where variants have none
     """
@@ -215,9 +215,7 @@ class Variants:
         )
 
     def controls(self, folder: Path, cells: Sequence[SimulatorCell], small: bool) -> list[Control]:
-        """Of what is in the folder. Without the neutral policy's episodes that control has failed; without the broken
-        cell there is none of it.
-        """
+        """Of what is in the folder. One whose episodes aren't there has failed."""
         how = "alike after the same commands" if self.exact else "alike"
         claim = f"Asked for in this study's way, the plain policy's first episodes end {how}, one request at a time."
         ours, plains = (finished(one) for one in self._control(folder))
@@ -229,11 +227,13 @@ class Variants:
             same = [(a.status, *self._way(a)) == (b.status, *self._way(b)) for a, b in pairs]
             ends = ", ".join(f"{b.status} after {b.steps}" for _, b in pairs)
             controls = [Control(claim, all(same), f"{sum(same)} of {len(same)}: {ends}.")]
-        for cell in () if small else cells:  # in the small form nobody solves anything of LIBERO
-            if cell.way == self.broken:
-                lost = cell.against_plain.difference or 0.0
-                claim = f"{cell.way} isn't as good: it loses {-100 * _LOST:.0f} points at least."
-                controls.append(Control(claim, lost <= _LOST, f"{paired_cell(cell.against_plain)} points."))
+        if self.broken is not None and not small:  # in the small form nobody solves anything of LIBERO
+            claim = f"{self.broken} isn't as good: it loses {-100 * _LOST:.0f} points at least."
+            broken = next((cell.against_plain for cell in cells if cell.way == self.broken), None)
+            if broken is None:
+                controls.append(Control(claim, False, f"Not run: `--way '{self.broken}'`."))
+            else:
+                controls.append(Control(claim, (broken.difference or 0.0) <= _LOST, f"{paired_cell(broken)} points."))
         return controls
 
     def _way(self, episode: Episode) -> tuple[object, ...]:
