@@ -224,6 +224,8 @@ def most(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         ("--workers 4 --execution rtc_trained --max-batch 1", {"real_time": "rtc_trained"}),
         ("--execution rtc_identity --real-time", {"real_time": "rtc_identity"}),
         ("--workers 4 --control prompt --tasks 0,1", {"batches": [2, 3, 4]}),
+        ("--workers 4 --seeding task --tasks 0,1", {"batches": [2]}),  # an episode of each task at a time
+        ("--workers 4 --seeding task", None),
     ],
 )
 def test_warm_up_prepares_what_the_run_may_ask_for(

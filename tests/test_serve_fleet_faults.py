@@ -187,10 +187,20 @@ def test_the_greeting_and_errors_are_the_servers(fleet: FleetProcess) -> None:
 
 
 def test_a_robot_that_asks_again_at_once_stays_at_its_replica(fleet: FleetProcess) -> None:
+    """Judged by the requests that came at once by the robot's own clock, whatever else the machine does."""
+    moves: list[bool] = []  # of each such request, whether another replica answered it than the one before
+
     with fleet.robot() as robot:
-        pids = [robot.actions()["pid"] for _ in range(41)]
-        moves = sum(before != after for before, after in itertools.pairwise(pids))
-        assert moves <= 8, f"{moves} of 40: at random it would be 20"
+
+        def asked_often() -> bool:
+            asked = [(time.monotonic(), robot.actions()["pid"], time.monotonic()) for _ in range(41)]
+            for (sent, before, _), (_, after, answered) in itertools.pairwise(asked):
+                if answered - sent < SOON_SECONDS:  # so the answer before it was younger still
+                    moves.append(before != after)
+            return len(moves) >= 40
+
+        wait_for(asked_often)
+        assert sum(moves) < len(moves) / 4, f"{sum(moves)} of {len(moves)}: at random it would be half"
         assert len(processes(robot)) == 2, "one that takes its time goes to either"
 
 

@@ -254,6 +254,16 @@ def test_a_verdict_needs_an_interval() -> None:
     assert cell(20, 0, 200) == "worse" and cell(0, 0, 200) == "as good" and cell(0, 0, 20) == "open"
 
 
+def test_reuse_that_is_a_little_worse_for_certain_is_not_named_as_good() -> None:
+    def cell(value: float, lost: int) -> kv_reuse.ReuseCell:
+        paired = Paired(10_000 - lost, lost, 0, 0).document  # both solved, the plain policy alone
+        return kv_reuse.ReuseCell("toy", "full", value, Rate(10_000 - lost, 10_000).document, paired, value, value, 0.0)
+
+    said = kv_reuse.verdict([cell(0.9, 200), cell(0.1, 0)])
+    assert "toy: 1 of 2 cells are worse than no reuse; the fastest that is as good is full, θ = 0.1 (100.0%" in said
+    assert kv_reuse.verdict([cell(0.9, 200)]).startswith("toy: 1 of 1 cells are worse than no reuse. ")
+
+
 def test_the_bimodality_of_known_distributions() -> None:
     rng = np.random.default_rng(0)
     assert bimodality(rng.normal(size=20_000)) == pytest.approx(1 / 3, abs=0.02)

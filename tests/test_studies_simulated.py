@@ -1,7 +1,9 @@
 """Variants of a policy in a simulator: cells that are kept, continued, compared; studies of them; padded caches."""
 
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,15 +13,19 @@ from cli_helpers import refusal, turbopi
 from turbopi import UnifiedPolicy
 from turbopi.backends.pytorch import reference_model
 from turbopi.checkpoint import open_checkpoint
+from turbopi.errors import ConfigError
+from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import Results
+from turbopi.evaluate.statistics import Paired, Rate
 from turbopi.observation import Observation
 from turbopi.reading import read_document
 from turbopi.shipped import CHASE_POLICY
+from turbopi.sim import Task
 from turbopi.studies import kv_reuse, kv_reuse_libero, mask, report
 from turbopi.studies.kv_reuse import Reuse, Reusing
 from turbopi.studies.report import Report
 from turbopi.studies.rollouts import CHASE, open_policy, play
-from turbopi.studies.simulated import Running, Variant, finished
+from turbopi.studies.simulated import Running, SimulatorCell, Variant, _check_pair, _initial_states, finished
 from turbopi.studies.study import Setup
 
 IN_CHASE = (CHASE_POLICY, "--simulator", "chase", "--small", "--device", "cpu", "--workers", "1")
@@ -63,7 +69,9 @@ def test_cells_of_other_episodes_or_cut_short_are_not_compared(tmp_path: Path) -
     assert turbopi(*given, "plain", "--episodes", "1").exit_code == 0
     assert turbopi(*given, "euler, uniform, 1", "--episodes", "2").exit_code == 0
     report_only = ("study", "steps_libero", "--device", "cpu", "--report-only", "--out", tmp_path)
-    assert "can't be compared: the episodes differ" in refusal(turbopi(*report_only))
+    said = refusal(turbopi(*report_only))
+    assert "can't be compared: the episodes differ: 2 and 1, of which task 0 from initial state 1 is in" in said
+    assert "is in euler_uniform_1 alone" in said
     file = tmp_path / "episodes" / "euler_uniform_1" / "results.json"
     run = json.loads(file.read_text())
     run["episodes"].pop()
@@ -71,6 +79,28 @@ def test_cells_of_other_episodes_or_cut_short_are_not_compared(tmp_path: Path) -
     turbopi(*report_only)
     found = read_document(tmp_path / "steps_libero" / report.JSON, Report)
     assert "euler, uniform, 1, cut short after 1 of 2 episodes: `--way 'euler, uniform, 1'`" in found.not_run
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "said"),
+    [
+        (("policy", "identity"), "weights", "the policy's weights differ: 'others' and '"),
+        (("protocol",), "replan", "the protocol's replan differ: 'others' and 5"),
+    ],
+)
+def test_cells_of_another_policy_or_protocol_are_not_compared(
+    part: tuple[str, ...], name: str, said: str, tmp_path: Path
+) -> None:
+    given = ("study", "steps_libero", *IN_CHASE, "--out", tmp_path, "--episodes-only", "--episodes", "1")
+    assert turbopi(*given, "--way", "plain", "--way", "euler, uniform, 1").exit_code == 0
+    plain, cell = (load_results(tmp_path / "episodes" / one) for one in ("plain", "euler_uniform_1"))
+    _check_pair(plain, cell)
+    changed: Any = cell
+    for one in part:
+        changed = getattr(changed, one)
+    changed[name] = "others"
+    with pytest.raises(ConfigError, match=re.escape(f"can't be compared: {said}")):
+        _check_pair(plain, cell)
 
 
 @pytest.mark.parametrize("name", ["kv_reuse_libero", "fp8_and_fp4_libero", "mask_libero"])
@@ -91,6 +121,36 @@ def test_what_a_study_in_a_simulator_is_refused(tmp_path: Path) -> None:
     assert "--episodes-only needs --out" in refusal(turbopi(*on_libero, "--episodes-only"))
     said = refusal(turbopi(*on_libero, "--out", tmp_path, "--episodes-only", "--report-only"))
     assert "leave nothing to do" in said
+    on_toys = ("study", "steps,mask", "--random-weights", "pi05_tiny", "--small", "--device", "cpu")
+    for option, value in (("--way", "euler, uniform, 1"), ("--simulator", "chase")):
+        said = refusal(turbopi(*on_toys, option, value))
+        assert f"{option} is '{value}', and is for steps_libero, " in said and "steps, mask takes none" in said
+    assert "--episodes is 1001; a cell on chase has 1000 at most" in refusal(
+        turbopi("study", "steps_libero", "--simulator", "chase", "--episodes", "1001", "--device", "cpu")
+    )
+
+
+@pytest.mark.parametrize(
+    ("simulator", "small", "asked", "episodes", "states"),
+    [
+        *(("chase", False, None, 200, 200), ("chase", True, None, 2, 2), ("chase", True, 5, 5, 5)),
+        *(("reacher", False, None, 150, 50), ("reacher", False, 7, 9, 3)),  # three tasks of fifty initial states each
+    ],
+)
+def test_a_cell_has_as_many_episodes_as_were_asked_for(
+    simulator: str, small: bool, asked: int | None, episodes: int, states: int, tmp_path: Path
+) -> None:
+    setup = Setup(small=small, simulator=simulator, episodes=asked, folder=tmp_path)
+    jobs = Running.of(setup).jobs
+    assert len(jobs) == episodes and {job.initial_state for job in jobs} == set(range(states))
+
+
+@pytest.mark.parametrize(("asked", "states"), [(None, 20), (200, 20), (50, 5), (41, 5)])
+def test_liberos_cells_are_of_states_that_training_never_saw(asked: int | None, states: int) -> None:
+    tasks = [Task(i, "task", "do it", 50, 220) for i in range(10)]
+    assert _initial_states(Setup(episodes=asked), tasks) == range(30, 30 + states)
+    with pytest.raises(ConfigError, match="--episodes is 201; a cell on libero has 200 at most"):
+        _initial_states(Setup(episodes=201), tasks)
 
 
 def ended(variant: Variant, folder: Path) -> Results:
@@ -116,6 +176,19 @@ def test_reuse_is_counted_by_episode_and_a_variant_that_isnt_neutral_fails_the_c
     ended(study.plain, plain)
     (found,) = study.controls(tmp_path, [], small=True)
     assert not found.held
+
+
+@pytest.mark.parametrize(("lost", "held"), [(None, False), (10, False), (40, True)])
+def test_a_full_report_is_sound_only_with_a_broken_cell_that_fails(
+    lost: int | None, held: bool, tmp_path: Path
+) -> None:
+    study, cells = kv_reuse_libero.VARIANTS, []
+    if lost is not None:
+        paired = Paired(200 - lost, lost, 0, 0).document  # both solved, the plain policy alone
+        cells = [SimulatorCell(kv_reuse_libero.ANOTHERS, Rate(200 - lost, 200).document, paired, {})]
+    _, broken = study.controls(tmp_path, cells, small=False)
+    assert broken.held is held and broken.claim.startswith("every 2, of another episode isn't as good")
+    assert (broken.evidence == "Not run: `--way 'every 2, of another episode'`.") is (lost is None)
 
 
 @pytest.mark.parametrize("what", ["full", "camera", "patch", "every"])

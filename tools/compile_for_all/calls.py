@@ -271,11 +271,11 @@ def _way_back() -> Calls:
         into, table, rows = of(1024, 32, dtype=F32), of(11, 1024, dtype=F32), of(tokens, dtype=torch.int32)
         ops.pull(chunk, chunk, one, chunk, of(tokens, 1, dtype=F32), of(32, 1024, dtype=F32), BF16)
         ops.move(of(tokens, 1024, dtype=F32), into, chunk, chunk, chunk, one, one, chunk)
-        for parts in (8, 10):
-            d = of(parts, tokens, 1024, dtype=F32)
-            ops.rms_norm_vjp(d, x, table, 1e-6, of(tokens, 1024, dtype=F32), table, rows)
-        ops.rms_norm_vjp(x, x, table, 1e-6, None, table, rows)
-        ops.rms_norm_vjp(d, x, table, 1e-6, of(tokens, 1024, dtype=F32), None, rows)
+        d_x, eight, ten = of(tokens, 1024, dtype=F32), *(of(parts, tokens, 1024, dtype=F32) for parts in (8, 10))
+        for d_normed in (eight, ten):
+            ops.rms_norm_vjp(d_normed, x, table, 1e-6, d_x, table, rows)
+        ops.rms_norm_vjp(x, x, table, 1e-6, None, table, rows)  # the last one
+        ops.rms_norm_vjp(ten, x, table, 1e-6, d_x, None, rows)  # the first one
 
     return [
         partial(layer, tokens, slots, tokens == 51)

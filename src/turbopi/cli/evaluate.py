@@ -197,7 +197,7 @@ def run_with_progress(
     """
     from turbopi.evaluate.checks import check_delay, check_fit
     from turbopi.evaluate.pacing import rate_told
-    from turbopi.evaluate.run import default_workers, evaluate, pending, prepare
+    from turbopi.evaluate.run import default_workers, evaluate, most_at_once, pending, prepare
     from turbopi.evaluate.visited import Recording
     from turbopi.execution import way_named
 
@@ -205,10 +205,11 @@ def run_with_progress(
     if answer.problem is None:
         check_delay(protocol, simulator, len(answer.actions))
     results = prepare(folder, protocol, source, simulator, jobs, restart=options.restart)
-    left = len(pending(results, jobs))
+    to_run = pending(results, jobs)
+    left = len(to_run)
     recording = None if options.record is None or not left else Recording(options.record, source)
     hooks = [hook for hook in (on_answer, recording) if hook is not None]
-    workers = 1 if options.real_time else min(options.workers or default_workers(), max(1, left))
+    workers = 1 if options.real_time else min(options.workers or default_workers(), most_at_once(protocol, to_run))
     max_batch = options.max_batch or max_batch or workers
     hz = protocol.control_hz
     paced = "" if hz is None else f" in real time ({rate_told(hz, simulator.control_hz)})"

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from turbopi.studies.study import Study
 
 MOST_EPISODES = 100_000
+LIBERO = "libero"
 
 
 @command(
@@ -57,12 +58,16 @@ def study(
     episodes: Annotated[
         int | None,
         typer.Option(
-            metavar="N", min=1, max=MOST_EPISODES, help="Of each cell in closed loop; 200, or 8 in the small form."
+            metavar="N",
+            min=1,
+            max=MOST_EPISODES,
+            help="Of each cell in closed loop: 200, or 8 in the small form; on LIBERO as many of every task, rounded "
+            "up, and 2 in the small form.",
         ),
     ] = None,
     simulator: Annotated[
         str, typer.Option(metavar="NAME", help="Of studies on LIBERO: another simulator of `turbopi eval`.")
-    ] = "libero",
+    ] = LIBERO,
     way: Annotated[
         list[str] | None,
         typer.Option(
@@ -126,6 +131,8 @@ def study(
     chosen = which.split(",")
     check_names(chosen)
     studies = [load(name) for name in chosen]
+    if not any(one.episodes for one in studies):
+        _check_for_none(chosen, way, simulator)
     if episodes_only or report_only:
         _check_parts(studies, episodes_only, report_only, out)
     policies = dict(_named(one) for one in policy or [])
@@ -176,6 +183,18 @@ def study(
         raise typer.Exit(CHECK_FAILED)
 
 
+def _check_for_none(chosen: list[str], way: list[str] | None, simulator: str) -> None:
+    """Raises ConfigError for options of studies in a simulator, where none of the chosen ones is one."""
+    for option, given in (("--way", way), ("--simulator", None if simulator == LIBERO else simulator)):
+        if given:
+            told = ", ".join(given) if isinstance(given, list) else given
+            raise ConfigError(f"{option} is {told!r}, and is for {_in_simulators()}; {', '.join(chosen)} takes none")
+
+
+def _in_simulators() -> str:
+    return ", ".join(name for name in STUDIES if name.endswith("_libero"))
+
+
 def _check_parts(studies: "list[Study]", episodes_only: bool, report_only: bool, out: Path | None) -> None:
     """Raises ConfigError where episodes can't be run apart from the report."""
     option = "--episodes-only" if episodes_only else "--report-only"
@@ -185,8 +204,7 @@ def _check_parts(studies: "list[Study]", episodes_only: bool, report_only: bool,
         raise ConfigError(f"{option} needs --out: the folder whose episodes/ has a folder for each cell")
     for one in studies:
         if one.episodes is None:
-            able = ", ".join(name for name in STUDIES if name.endswith("_libero"))
-            raise ConfigError(f"{option} is for {able}; {one.name} keeps no episodes")
+            raise ConfigError(f"{option} is for {_in_simulators()}; {one.name} keeps no episodes")
 
 
 def _named(given: str) -> tuple[str, Path]:

@@ -63,6 +63,11 @@ def pending(results: Results, jobs: Sequence[Job]) -> list[Job]:
     return [job for job in jobs if job.key not in results.episodes or not results.episodes[job.key].judged]
 
 
+def most_at_once(protocol: Protocol, jobs: Sequence[Job]) -> int:
+    """How many of these episodes can run at a time: where tasks are seeded, one of each task. At least 1."""
+    return max(1, len({job.task.index for job in jobs}) if protocol.sim.seeding == "task" else len(jobs))
+
+
 def evaluate(
     results: Results,
     protocol: Protocol,

@@ -35,6 +35,7 @@ from turbopi.model.reference import Pi0Model
 from turbopi.observation import Observation
 from turbopi.reading import plain_document
 from turbopi.studies.report import (
+    MARGIN,
     PERCENT,
     Cell,
     Control,
@@ -42,6 +43,7 @@ from turbopi.studies.report import (
     Panel,
     Plot,
     Report,
+    compared,
     paired_cell,
     rate_cells,
     rate_series,
@@ -85,6 +87,10 @@ class ReuseCell(Struct, frozen=True):
     reused: float  # share of the image tokens, of all calls until an episode is decided, that are old
     reused_calls: float  # share of the calls in which all are
     action_error: float  # rms of the chunks' difference to fresh ones, over calls that reuse, relative to those
+
+    @property
+    def verdict(self) -> str:
+        return compared(self.against_plain)
 
 
 @dataclass
@@ -360,20 +366,19 @@ def _controls(policy: ToyPolicy, episodes: Sequence[int], baseline: Played) -> l
 
 
 def verdict(found: Sequence[ReuseCell]) -> str:
-    """The largest speed-up whose success is no worse by five points, with 95 % confidence, of each policy."""
+    """Of each policy how many cells are worse, and the fastest one that is as good."""
     said = []
     for policy in dict.fromkeys(cell.policy for cell in found):
-        good = [c for c in found if c.policy == policy and c.against_plain.difference95[0] > -0.05]
-        worse = [c for c in found if c.policy == policy and c.against_plain.difference95[1] < 0]
-        best = max(good, key=lambda c: _speed(c)[1], default=None)
-        count = sum(cell.policy == policy for cell in found)
-        text = f"{policy}: {len(worse)} of {count} cells are worse than no reuse"
-        if best is not None:
-            which = Reuse(best.reuse, best.value)
+        own = [cell for cell in found if cell.policy == policy]
+        worse = sum(cell.verdict == "worse" for cell in own)
+        text = f"{policy}: {worse} of {len(own)} cells are worse than no reuse"
+        good = [cell for cell in own if cell.verdict == "as good"]
+        if good:
+            best = max(good, key=lambda cell: _speed(cell)[1])
             told = f"{best.rate.rate or 0:.1%}, {_speed(best)[1]:.2f} × by the stages' times"
-            text += f"; the fastest that is no worse is {which} ({told})"
+            text += f"; the fastest that is as good is {Reuse(best.reuse, best.value)} ({told})"
         said.append(text)
-    return f"{'. '.join(said)}. No worse: by less than 5 points, with 95 % confidence."
+    return f"{'. '.join(said)}. “As good”: not worse by {100 * MARGIN:.0f} points, with 95 % confidence."
 
 
 def _speed(cell: ReuseCell) -> tuple[float, float, float]:

@@ -5,6 +5,7 @@ runs of `turbopi eval`. Each cell keeps its episodes in a folder of its own, and
 report is made of the folders alone, so that cells may be run by several processes, or on other machines.
 """
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -25,8 +26,8 @@ from turbopi.evaluate.run import default_workers, evaluate, prepare
 from turbopi.evaluate.sources import LocalPolicy, PolicySource
 from turbopi.evaluate.statistics import Paired, PairedDocument, Rate, RateDocument
 from turbopi.policy import UnifiedPolicy
-from turbopi.reading import plain_document
-from turbopi.sim import SimSettings, Simulator, create
+from turbopi.reading import plain_document, shown
+from turbopi.sim import SimSettings, Simulator, Task, create
 from turbopi.studies.answering import Answering, AnsweringPolicy
 from turbopi.studies.report import (
     MARGIN,
@@ -48,6 +49,7 @@ PLAIN, CONTROL = "plain", "control"  # names of cells that every study here has
 UNSEEN = range(30, 50)  # LIBERO's initial states that the small policy's training never saw
 STEPS = 10  # of denoising, as the small policy was judged
 _CONTROL_EPISODES = 4
+_SMALL_EPISODES = 2  # of a cell in the small form
 _LOST = -0.2  # of the rate: what a broken variant loses at least
 _NO_VIDEOS = VideoPlan("none")
 
@@ -116,7 +118,7 @@ class Variants:
     few        names of the small form's cells
     neutral    the plain policy asked for in the study's way: four episodes must end as the plain policy's, `exact`:
                after the same commands
-    broken     a cell that must lose twenty points, if the study has one
+    broken     a cell that must lose twenty points, if the study has one; without it no full report is sound
     measured   {column: number} of what else a cell's folder tells, by the cell's name and folder; the first is the
                plot's x where variants have none
     """
@@ -213,9 +215,7 @@ class Variants:
         )
 
     def controls(self, folder: Path, cells: Sequence[SimulatorCell], small: bool) -> list[Control]:
-        """Of what is in the folder. Without the neutral policy's episodes that control has failed; without the broken
-        cell there is none of it.
-        """
+        """Of what is in the folder. One whose episodes aren't there has failed."""
         how = "alike after the same commands" if self.exact else "alike"
         claim = f"Asked for in this study's way, the plain policy's first episodes end {how}, one request at a time."
         ours, plains = (finished(one) for one in self._control(folder))
@@ -227,11 +227,13 @@ class Variants:
             same = [(a.status, *self._way(a)) == (b.status, *self._way(b)) for a, b in pairs]
             ends = ", ".join(f"{b.status} after {b.steps}" for _, b in pairs)
             controls = [Control(claim, all(same), f"{sum(same)} of {len(same)}: {ends}.")]
-        for cell in () if small else cells:  # in the small form nobody solves anything of LIBERO
-            if cell.way == self.broken:
-                lost = cell.against_plain.difference or 0.0
-                claim = f"{cell.way} isn't as good: it loses {-100 * _LOST:.0f} points at least."
-                controls.append(Control(claim, lost <= _LOST, f"{paired_cell(cell.against_plain)} points."))
+        if self.broken is not None and not small:  # in the small form nobody solves anything of LIBERO
+            claim = f"{self.broken} isn't as good: it loses {-100 * _LOST:.0f} points at least."
+            broken = next((cell.against_plain for cell in cells if cell.way == self.broken), None)
+            if broken is None:
+                controls.append(Control(claim, False, f"Not run: `--way '{self.broken}'`."))
+            else:
+                controls.append(Control(claim, (broken.difference or 0.0) <= _LOST, f"{paired_cell(broken)} points."))
         return controls
 
     def _way(self, episode: Episode) -> tuple[object, ...]:
@@ -269,17 +271,14 @@ class Running:
 
     @classmethod
     def of(cls, setup: Setup) -> "Running":
-        """LIBERO's episodes are those of all tasks of its first suite, from the initial states UNSEEN; of other
-        simulators there are as many as a cell has.
-        """
+        """Episodes of all tasks of the simulator's first suite; in the small form of its first task."""
         if setup.folder is None:
             raise ConfigError("episodes alone are of no use without a folder: give --out")
         simulator = create(setup.simulator)
         simulator.check()
         suite, libero = simulator.suites[0], setup.simulator == "libero"
         tasks = choose_tasks(simulator, suite, [0] if setup.small else None)
-        states = UNSEEN if libero else range(setup.cell_episodes)
-        jobs = make_jobs(tasks, states[:2] if setup.small else states, None, _NO_VIDEOS)
+        jobs = make_jobs(tasks, _initial_states(setup, tasks), None, _NO_VIDEOS)
         protocol = Protocol(simulator.name, suite, SimSettings(), max_steps=40 if setup.small and libero else None)
         checkpoint = setup.checkpoint or open_checkpoint(shipped.SMALL_POLICY)
         return cls(setup, setup.folder, simulator, protocol, jobs, checkpoint)
@@ -306,6 +305,21 @@ class Running:
             broken = f"the simulator broke in {len(crashed)} episodes of {cell.name}, {crashed[0]} first"
             raise ConfigError(f"{broken}; give the command again")
         self.setup.tell(f"{folder.name}: {sum(_solved(results).values())} of {len(jobs)}")
+
+
+def _initial_states(setup: Setup, tasks: Sequence[Task]) -> Sequence[int]:
+    """The first ones of every task that together are a cell's episodes, or a few more; of LIBERO those UNSEEN.
+
+    Raises ConfigError if more episodes were asked for than there are.
+    """
+    there = UNSEEN if setup.simulator == "libero" else range(min(task.num_initial_states for task in tasks))
+    if setup.episodes is not None and setup.episodes > len(there) * len(tasks):
+        raise ConfigError(
+            f"--episodes is {setup.episodes}; a cell on {setup.simulator} has {len(there) * len(tasks)} at most: "
+            f"tasks {len(tasks)}, initial states {there[0]} to {there[-1]}"
+        )
+    episodes = _SMALL_EPISODES if setup.small and setup.episodes is None else setup.cell_episodes
+    return there[: math.ceil(episodes / len(tasks))]
 
 
 def slug(name: str) -> str:
@@ -340,16 +354,24 @@ def _check_pair(plain: Results, results: Results) -> None:
 
     def decisive(of: Results) -> dict[str, object]:
         names = ("weights", "config", "backend", "precision", "robot")
-        told = {f"policy's {name}": of.policy.identity.get(name) for name in names}
-        return {"episodes": sorted(of.planned), "protocol": of.protocol, **told}
+        told: dict[str, object] = {f"policy's {name}": of.policy.identity.get(name) for name in names}
+        return told | {f"protocol's {name}": value for name, value in of.protocol.items()}
 
+    if apart := sorted(plain.planned ^ results.planned):
+        owner = plain if apart[0] in plain.planned else results
+        found = f"episodes differ: {len(results.planned)} and {len(plain.planned)}, of which task {apart[0][0]} from "
+        raise _not_comparable(results, plain, f"{found}initial state {apart[0][1]} is in {owner.folder.name} alone")
     ours, theirs = decisive(results), decisive(plain)
-    for name, value in ours.items():
-        if value != theirs[name]:
-            raise ConfigError(
-                f"{results.folder} and {plain.folder} can't be compared: the {name} differ; run one of them again "
-                "with another --out"
-            )
+    for name in ours | theirs:
+        if ours.get(name) != theirs.get(name):
+            found = f"{name} differ: {shown(ours.get(name))} and {shown(theirs.get(name))}"
+            raise _not_comparable(results, plain, found)
+
+
+def _not_comparable(results: Results, plain: Results, why: str) -> ConfigError:
+    return ConfigError(
+        f"{results.folder} and {plain.folder} can't be compared: the {why}; run one of them again with another --out"
+    )
 
 
 # --- what is told -----------------------------------------------------------------------------------------------------
