@@ -36,6 +36,14 @@ def test_addresses_are_refused_with_how_to_fetch_them(address: str, advice: str)
         assert advice in str(caught.value)
 
 
+def test_an_address_that_openpi_has_fetched_is_told_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
+    folder = tmp_path / "openpi-assets" / "checkpoints" / "pi05_droid"
+    folder.mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=f"openpi has fetched it already: give {folder}$"):
+        open_checkpoint("gs://openpi-assets/checkpoints/pi05_droid")
+
+
 def test_a_hub_name_is_recognised() -> None:
     with pytest.raises(
         CheckpointError, match=r"no folder lerobot/pi05_base.*hf download lerobot/pi05_base --local-dir"
@@ -56,6 +64,13 @@ def test_paths_that_hold_no_checkpoint_say_what_is_there(tmp_path: Path) -> None
         CheckpointError, match=f"notes.txt is a file; give the checkpoint's folder, probably {tmp_path}"
     ):
         open_checkpoint(tmp_path / "notes.txt")
+
+
+def test_one_folder_too_high_is_told_the_right_one(tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "pi05_droid" / "params").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=r"but folders that do \(pi05_droid\); give .*, such as .*/pi05_droid$"):
+        open_checkpoint(tmp_path)
 
 
 def test_a_training_run_names_its_steps(tmp_path: Path) -> None:

@@ -137,7 +137,13 @@ def test_a_file_that_is_not_what_an_option_wants_is_named(option: str, content: 
     else:
         file.write_bytes(content)
     observation = tmp_path / "observation.npz"
-    np.savez(observation, prompt="x")
+    picture = np.zeros((8, 8, 3), np.uint8)
+    seen: dict[str, Any] = {
+        "observation/image": picture,
+        "observation/wrist_image": picture,
+        "observation/state": np.zeros(8),
+    }
+    np.savez(observation, prompt="x", **seen)
     weights = ("tests/golden/checkpoints/nowhere",) if option == "--config" else TINY
     more = ("--precision", "fp8", "--backend", "emulated_fp8") if option == "--quantization" else ()
     said = one_line("infer", *weights, observation, "--no-plot", "-o", tmp_path / "a.npz", option, file, *more)

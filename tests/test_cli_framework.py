@@ -166,6 +166,8 @@ def test_messages_name_options_as_they_were_typed(tmp_path: Path) -> None:
     assert refusal(turbopi("convert", golden, tmp_path / "out", "--config", "pi06")).startswith(
         "--config pi06 is neither a preset, nor 'auto', nor a path to a .json; presets are pi05_base, "
     )
+    told = refusal(turbopi("convert", golden, tmp_path / "out", "--config", "pi05_liberoo"))
+    assert told.endswith("Did you mean pi05_libero?")
 
 
 @pytest.mark.parametrize(

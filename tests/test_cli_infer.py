@@ -194,6 +194,11 @@ def test_wrong_paths_are_told_what_infer_takes() -> None:
     assert "two kinds of weights" in refusal(turbopi("infer", "a", "b", "--random-weights", "pi05_tiny"))
 
 
+def test_paths_in_the_wrong_order_are_told_so(npz: Path, tmp_path: Path) -> None:
+    told = refusal(turbopi("infer", npz, tmp_path))
+    assert told == f"{npz} is a file, but the checkpoint's folder comes first: is it {tmp_path}?"
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -219,15 +224,40 @@ def test_bad_arguments_are_refused_before_anything_is_loaded(
     assert expected in refusal(result)
 
 
-def test_an_observation_the_robot_cannot_use_is_refused_by_name(npz: Path, tmp_path: Path) -> None:
-    with np.load(npz) as archive:
-        content = dict(archive)
-    del content["observation/wrist_image"]
-    np.savez(npz, **content)
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"observation/wrist_image": None}, "the observation has no 'observation/wrist_image'"),
+        ({"observation/state": np.zeros(7)}, "observation/state has shape (7,), expected shape (8,)"),
+        ({"observation/image": np.zeros((4, 4, 3), np.int64)}, "observation/image has dtype int64"),
+        ({"prompt": None}, "the observation has no prompt"),
+    ],
+)
+def test_an_observation_the_robot_cannot_use_is_refused_before_weights_are_loaded(
+    wrong: dict[str, Any], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(UnifiedPolicy, "__init__")
+    content = {key: value for key, value in (observation() | wrong).items() if value is not None}
+    np.savez(npz := tmp_path / "observation.npz", **content)
     result = turbopi("infer", *TINY, npz, "-o", tmp_path / "actions.npz")
     assert result.exit_code == 2
-    assert f"error: {npz}: the observation has no 'observation/wrist_image'" in result.stderr
+    assert f"error: {npz}: {told}" in result.stderr
     assert not (tmp_path / "actions.npz").exists()
+
+
+def test_a_default_prompt_stands_in_for_one_that_an_observation_lacks(tmp_path: Path) -> None:
+    content = observation()
+    del content["prompt"]
+    np.savez(npz := tmp_path / "observation.npz", **content)
+    infer(tmp_path, npz, "--no-plot", "--default-prompt", "open the drawer")
+
+
+def test_a_later_call_of_a_recording_that_is_wrong_is_named(recording: Path, tmp_path: Path) -> None:
+    content = observation() | {"observation/state": np.zeros(7)}
+    save_call(recording / "000001.npz", RecordedCall(content, {"actions": np.zeros((10, 7)), "policy_timing": {}}, 0.0))
+    result = turbopi("infer", *TINY, recording, "-o", tmp_path / "actions.npz")
+    assert result.exit_code == 2
+    assert "000001.npz: observation/state has shape (7,)" in result.stderr
 
 
 def test_noise_of_another_shape_is_refused(npz: Path, tmp_path: Path) -> None:

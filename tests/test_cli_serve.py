@@ -78,6 +78,7 @@ def test_a_client_gets_actions_and_ctrl_c_stops(tmp_path: Path) -> None:
     with serving(*options, TURBOPI_API_KEY="k3y") as (process, url, printed):
         assert printed[0] == "RANDOM WEIGHTS (pi05_tiny, seed 0): the actions mean nothing.\n"
         assert "Warming up …\n" in printed
+        assert any(re.fullmatch(r"warm-up: \d+\.\d s\n", line) for line in printed)
         with connect(url, additional_headers={"Authorization": "Api-Key k3y"}, compression=None) as client:
             metadata = unpack(client.recv(decode=False))
             assert metadata["default_prompt"] == "open the drawer"
@@ -181,7 +182,7 @@ def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
         (["--max-message-mb", "0"], "max_message_mb must be more than 0"),
         (["--record", __file__], "is a file"),
         (["--execution", "async", "--control-hz", "50"], "execution is 'async'; a server joins chunks by rtc"),
-        (["--execution", "rtc"], "needs the robots' control rate"),
+        (["--execution", "rtc"], "needs the robots' control rate, too: give control_hz (--control-hz)"),
         (["--control-hz", "0"], "control_hz must be more than 0"),
         (["--deadline-ms", "0"], "deadline_ms must be more than 0 and at most 60000"),
         (["--max-batch", "4", "--no-warmup"], "--max-batch 4 needs the warm-up, which measures batches"),

@@ -311,6 +311,16 @@ def test_the_log_says_plainly_who_came_and_left(how: str, said: str, caplog: pyt
     assert re.fullmatch(rf"127\.0\.0\.1:\d+ {said}", told[1])
 
 
+def test_the_log_says_whose_request_is_refused(caplog: pytest.LogCaptureFixture) -> None:
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with client(server) as connection:
+            host, port = connection.local_address[:2]
+            assert (await refused(connection, b"\xc1")).startswith("bad request: ")
+            assert any(line.startswith(f"{host}:{port}: bad request: ") for line in caplog.messages)
+
+    served(test)
+
+
 @pytest.mark.parametrize("how", ["close", "abort"])
 def test_a_client_that_leaves_costs_nothing(how: str) -> None:
     async def leave(connection: ClientConnection) -> None:

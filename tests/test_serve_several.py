@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import re
 import time
 from collections.abc import Iterator
@@ -478,6 +479,16 @@ def test_batches_that_do_not_pay_are_said(caplog: pytest.LogCaptureFixture, monk
     with running(BatchingFakePolicy(), max_batch=4):
         pass
     assert "--max-batch is 4, but batches of this policy take as long as their observations one by one" in caplog.text
+    assert "(ms by size: 1: 10.0, 2: 20.0, 4: 40.0)" in caplog.text
+
+
+def test_a_table_of_single_calls_alone_is_not_logged(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PolicyCalls, "_measure_size", lambda *of_a_slow_policy: False)
+    with caplog.at_level(logging.INFO, "turbopi"), running(BatchingFakePolicy()):
+        pass
+    assert "by their size" not in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,10 @@ def test_the_tutorial_runs_from_its_first_line_to_its_last(tmp_path: Path) -> No
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
     script = "set -euo pipefail\nset -m\n" + "\n".join(commands())
-    # what a reader does by hand: another environment for the client; and a port that no other test uses
-    script = script.replace("python robot_loop.py", f"{CLIENT} robot_loop.py")
+    # the client's environment that is there already, and a port that no other test uses
+    install = "python3 -m venv robot && robot/bin/pip install openpi-client typing_extensions\n"
+    assert install in script
+    script = script.replace(install, "").replace("robot/bin/python", str(CLIENT))
     script = script.replace("8000", port).replace("--record recordings", f"--record recordings --port {port}")
     script = script.replace("kill %1\nwait", "kill %1\nwait || true")
     environment = os.environ | {

@@ -40,6 +40,11 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "turbopi"
 
 
+def openpi_cache() -> Path:
+    """Where openpi keeps what it fetches: $OPENPI_DATA_HOME or ~/.cache/openpi."""
+    return Path(os.environ.get("OPENPI_DATA_HOME") or "~/.cache/openpi").expanduser()
+
+
 def write_whole(file: Path, content: Content, error: Error = OutputError, *, sync: bool = True) -> None:
     """Write a file so that it appears whole or not at all; text in UTF-8. Raises `error` if it can't be written.
 

@@ -14,6 +14,7 @@ from turbopi.checkpoint.source import listing
 from turbopi.checkpoint.torch_files import INDEX, WEIGHTS
 from turbopi.config import LIMITS
 from turbopi.errors import CheckpointError
+from turbopi.files import openpi_cache
 from turbopi.reading import Fields, read_json
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "onnx", "random"]
@@ -87,6 +88,9 @@ def _local(path: str | Path) -> Path:
     text = str(path)
     address = re.match(r"([a-z][a-z0-9+.-]*):/{1,2}(.*)", text)  # Path() turns :// into :/
     if address and address[1] in _DOWNLOAD:
+        cached = openpi_cache() / address[2].rstrip("/")
+        if address[1] == "gs" and cached.is_dir():
+            raise CheckpointError(f"{text} is an address; openpi has fetched it already: give {cached}")
         how = _DOWNLOAD[address[1]].format(address=f"{address[1]}://{address[2]}", name=address[2])
         raise CheckpointError(f"{text} is an address; Turbo-Pi reads local folders. Fetch it first, with {how}")
     folder = Path(path).expanduser()
@@ -123,6 +127,10 @@ def _nothing_here(folder: Path) -> str:
     steps = sorted((entry.name for entry in folder.iterdir() if entry.name.isdigit() and entry.is_dir()), key=int)
     if steps:
         return f"{folder} holds training steps ({', '.join(steps)}); give one of them, such as {folder / steps[-1]}"
+    below = sorted(entry for entry in folder.iterdir() if _has_safetensors(entry) or (entry / "params").is_dir())
+    if below:
+        names = listing([entry.name for entry in below])
+        return f"{folder} holds no checkpoint, but folders that do ({names}); give one of them, such as {below[0]}"
     entries = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in folder.iterdir())
     return (
         f"{folder} holds no checkpoint: expected {WEIGHTS} (openpi's PyTorch, LeRobot) or params/ (openpi's JAX), "

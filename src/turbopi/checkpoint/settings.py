@@ -40,6 +40,7 @@ except for sizes, which always come from the tensors.
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
 
@@ -88,9 +89,10 @@ def read_settings(config: ConfigSource, folder: Path) -> Settings:
         return Settings(f"preset {config}", values={"preset": config})
     if isinstance(config, str | Path) and str(config).endswith(".json"):
         return _read_file(Path(config))
+    near = get_close_matches(str(config), PRESETS, n=1)
     raise ConfigError(
         f"config={str(config)!r} is neither a preset, nor 'auto', nor a path to a .json; "
-        f"presets are {', '.join(PRESETS)}"
+        f"presets are {', '.join(PRESETS)}" + "".join(f". Did you mean {name}?" for name in near)
     )
 
 

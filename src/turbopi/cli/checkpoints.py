@@ -96,12 +96,12 @@ def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str])
     }
 
 
-def robot_pipeline(checkpoint: "Checkpoint", robot: Any) -> "Pipeline":
+def robot_pipeline(checkpoint: "Checkpoint", robot: Any, default_prompt: str | None = None) -> "Pipeline":
     """A robot held against a checkpoint, without its weights and its tokenizer."""
     from turbopi.preprocess.pipeline import Pipeline
 
     no_tokenizer: Any = None  # nothing is tokenised
-    return Pipeline(checkpoint.config, checkpoint.norm_stats, no_tokenizer, robot=robot)
+    return Pipeline(checkpoint.config, checkpoint.norm_stats, no_tokenizer, default_prompt, robot)
 
 
 def _show(info: dict[str, Any], output: Output) -> None:

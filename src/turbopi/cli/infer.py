@@ -1,7 +1,8 @@
 """`turbopi infer`."""
 
+import contextlib
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +11,7 @@ import typer
 from rich.progress import Progress
 from rich.table import Table
 
+from turbopi.cli.checkpoints import robot_pipeline
 from turbopi.cli.files import check_writable, load_noise
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command, new_console
 from turbopi.cli.options import PolicyOptions
@@ -93,10 +95,12 @@ def infer(
 
     _check_targets(Path(source), out, drawing)
     sources = _sources(Path(source), call)
-    load_observation(sources[0])  # what can't be read is better known before minutes of loading
+    first = load_observation(sources[0])
     given_noise = None if noise is None else load_noise(noise)
     opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
+    with _naming(sources[0]):  # what is wrong with it is better known before minutes of loading
+        robot_pipeline(opened, options.make_robot(), options.default_prompt).see(first, resize=False)
     policy = options.make_policy(opened, output)
     draw = _noise(policy, given_noise, seed, output)
     if warmup:
@@ -201,13 +205,20 @@ def _run(
     with Progress(console=new_console(stderr=True), disable=hidden, transient=True) as bar:
         for number, source in enumerate(bar.track(sources, description="observations")):
             observation, noise = load_observation(source), draw(number)
-            try:
+            with _naming(source):
                 result = policy.infer(observation, noise=noise)
-            except ObservationError as error:
-                raise ObservationError(f"{source}: {error}") from error
             kept = observation if number < MAX_ROWS else None
             answers.append(_Answer(kept, noise, result["actions"], result["policy_timing"]))
     return answers
+
+
+@contextlib.contextmanager
+def _naming(source: Path) -> Iterator[None]:
+    """ObservationError within names the file that is wrong."""
+    try:
+        yield
+    except ObservationError as error:
+        raise ObservationError(f"{source}: {error}") from error
 
 
 def _joined(arrays: "list[np.ndarray]") -> "np.ndarray":

@@ -115,6 +115,8 @@ class WeightOptions:
             return None, paths[0]
         if len(paths) == 2:
             self.check(paths[0])
+            if Path(paths[0]).is_file() and Path(paths[1]).is_dir():
+                raise ConfigError(f"{paths[0]} is a file, but the checkpoint's folder comes first: is it {paths[1]}?")
             return paths[0], paths[1]
         wanted = (
             f"one path, the {other} (the weights are random)"

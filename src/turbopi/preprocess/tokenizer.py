@@ -6,7 +6,6 @@ Pi0's: the newline only goes behind a task that has none (its `Pi0NewLineProcess
 """
 
 import logging
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -15,6 +14,7 @@ import numpy as np
 import sentencepiece
 
 from turbopi.errors import ObservationError, TokenizerError
+from turbopi.files import openpi_cache
 from turbopi.reading import read_bytes, shown
 
 logger = logging.getLogger(__name__)
@@ -176,14 +176,10 @@ def _in_folder(folder: Path) -> list[Path]:
     return [parent / name for parent in (folder, folder / "assets") for name in FILE_NAMES]
 
 
-def _openpi_cache() -> Path:
-    home = os.environ.get("OPENPI_DATA_HOME") or "~/.cache/openpi"
-    return Path(home).expanduser() / "big_vision" / "paligemma_tokenizer.model"
-
-
 def _places(checkpoint_dir: str | Path | None, candidates: Iterable[str | Path]) -> list[Path]:
+    cached = openpi_cache() / "big_vision" / "paligemma_tokenizer.model"
     in_checkpoint = [] if checkpoint_dir is None else _in_folder(Path(checkpoint_dir).expanduser())
-    return list(dict.fromkeys([*in_checkpoint, *map(Path, candidates), _openpi_cache()]))
+    return list(dict.fromkeys([*in_checkpoint, *map(Path, candidates), cached]))
 
 
 def _not_found(places: Sequence[Path]) -> str:

@@ -175,12 +175,13 @@ class PolicyCalls:
                 times.failed(size)
                 break
         measured = times.measured_largest
-        table = ", ".join(f"{size}: {times.seconds(size, 0.0) or 0:.4f}" for size in times.sizes)
-        logger.info("seconds in the policy by size, of %s: %s", what, table)
+        table = ", ".join(f"{size}: {(times.seconds(size, 0.0) or 0) * 1e3:.1f}" for size in times.sizes)
+        if measured > 1:
+            logger.info("%s take, by their size, in ms: %s", what, table)
         if asked_for is not None and times.best(measured, 0.0) == 1 < measured:
             logger.warning(
                 "--max-batch is %d, but %s of this policy take as long as their observations one by one, so "
-                "none are formed (seconds by size: %s)",
+                "none are formed (ms by size: %s)",
                 asked_for,
                 what,
                 table,

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import Future
 from typing import Any
@@ -34,10 +35,13 @@ def run(policy: Policy, options: ServerOptions | None = None, *, console: Consol
             f"[yellow]Anyone who can reach {escape(server.host)} can use this policy: an API key protects it "
             "(TURBOPI_API_KEY or --api-key-file).[/]"
         )
-    if hasattr(policy, "warmup"):
+    began, warms_up = time.perf_counter(), hasattr(policy, "warmup")
+    if warms_up:
         tell("Warming up …")
 
     def ready(server: PolicyServer) -> None:
+        if warms_up:
+            tell(f"warm-up: {time.perf_counter() - began:.1f} s")
         http = escape(server.url.replace("ws://", "http://"))
         tell(f"Serving at [bold]{escape(server.url)}[/]   health {http}/healthz   metrics {http}/metrics")
         if server.options.has_page:

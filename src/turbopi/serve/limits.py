@@ -1,4 +1,4 @@
-"""What a client may cost. The numbers that matter to users are in docs/serving.md; robots never come near them.
+"""What a client may cost. The numbers are in docs/dev/serving.md; robots never come near them.
 
 Two things are shared by all connections and so need a fair share for each: the event loop's time (`Credit`) and
 memory (`MemoryBudget`). Everything else is a deadline or a count, kept by connection.py and listener.py.

@@ -78,7 +78,9 @@ class ServerOptions:
                 "need nothing of it"
             )
         if self.execution is not None and self.control_hz is None:
-            raise ConfigError(f"execution {self.execution!r} needs the robots' control rate, too: control_hz")
+            raise ConfigError(
+                f"execution {self.execution!r} needs the robots' control rate, too: give control_hz (--control-hz)"
+            )
         if self.control_hz is not None and not 0 < self.control_hz <= 10_000:
             raise ConfigError(f"control_hz must be more than 0 and at most 10000, not {self.control_hz}")
         if self.execution_horizon is not None and self.execution_horizon < 1:

@@ -353,30 +353,30 @@ class PolicyServer:
     ) -> tuple[dict[str, object], Asking] | _Refusal:
         """The result to send, or what to tell the client instead. Raises _PolicyFailed and _ClientGone."""
         if self.lost is not None:
-            return self._refuse("lost", _REFUSALS["lost"].format(self.lost))
+            return self._refuse(connection, "lost", _REFUSALS["lost"].format(self.lost))
         try:
             received = await self._decode(connection, message)
             asking = self._askings.read(received, connection)
         except WireError as error:
-            return self._refuse("malformed", f"bad request: {error}")
+            return self._refuse(connection, "malformed", f"bad request: {error}")
         except ObservationError as error:
-            return self._refuse("observation", _REFUSALS["observation"].format(error))
+            return self._refuse(connection, "observation", _REFUSALS["observation"].format(error))
         outcomes = await self._infer(connection, asking, arrived)
         wrong, priority = self._askings.wrong(asking, outcomes), asking.urgency.priority
         self.metrics.asked(priority, None if wrong is None else wrong.wrong)
         if wrong is not None and wrong.wrong is not None:
             if wrong.wrong == "policy":
                 raise _PolicyFailed(wrong.text)
-            return self._refuse(wrong.wrong, _REFUSALS.get(wrong.wrong, "{}").format(wrong.text))
+            return self._refuse(connection, wrong.wrong, _REFUSALS.get(wrong.wrong, "{}").format(wrong.text))
         result = self._askings.answer(asking, outcomes)
         if previous_total is not None:
             result["server_timing"]["prev_total_ms"] = previous_total * 1e3
         return result, asking
 
-    def _refuse(self, kind: str, text: str) -> _Refusal:
+    def _refuse(self, connection: GuardedConnection, kind: str, text: str) -> _Refusal:
         self.metrics.error(kind)
         text = text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 1] + "…"
-        self._log.warning(text, kind)
+        self._log.warning(f"{peer(connection)}: {text}", kind)
         if self._live is not None:
             self._live.failed(kind, text)
         return _Refusal(kind, text)

@@ -1,4 +1,4 @@
-"""The rules a backend is held to, and the verdict on what was measured. docs/verify.md has the reasons at length."""
+"""The rules a backend is held to, and the verdict on what was measured. docs/dev/verify.md has the reasons."""
 
 from dataclasses import dataclass, field
 from typing import Literal
