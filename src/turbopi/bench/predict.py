@@ -20,6 +20,7 @@ from turbopi.bench.gpus import GpuSpec, find_gpu
 from turbopi.bench.measured import Kernels, MeasuredCall, measured_calls
 from turbopi.bench.work import Job, floor_ms, stage_work
 from turbopi.config import ModelConfig
+from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
 
 PRECISIONS = ("bf16", "fp8", "int8")
 STAGES = ("vision", "prefix", "denoise")
@@ -99,6 +100,12 @@ def predicted_call(gpu: GpuSpec, config: ModelConfig, job: Job, measured: Measur
 def runs_on(kernels: Kernels, gpu: GpuSpec) -> bool:
     """Whether kernels of that kind run on a GPU of the table at all."""
     return kernels != "hopper" or gpu.capability == (9, 0)
+
+
+def refused(gpu: GpuSpec, precision: str) -> str | None:
+    """Why a GPU of the table doesn't run a precision, in words; None if it does."""
+    why = {"fp8": fp8_refusal, "int8": int8_refusal}.get(precision)
+    return None if why is None else why(gpu.capability)
 
 
 def _full_size(config: ModelConfig) -> bool:
