@@ -105,6 +105,15 @@ def test_hoppers_kernels_are_predicted_on_hopper_alone() -> None:
         assert ("hopper" in kinds) == (gpu.compute_capability == "9.0")
 
 
+def test_a_precision_is_predicted_where_a_gpu_takes_it_and_nowhere_else() -> None:
+    taken: dict[str, dict[str, bool]] = {one.precision: {} for one in predict(find_gpu("h200"), FULL, Job())}
+    for key, gpu in published_gpus().items():
+        for one in predict(gpu, FULL, Job()):
+            taken[one.precision][key] = bool(one.calls)
+    assert all(taken["bf16"].values()) and all(taken["fp8"].values())
+    assert {key for key, there in taken["int8"].items() if there} == {"rtx3090", "a100", "orin", "orin32", "h200"}
+
+
 def test_a_batch_that_nobody_measured_has_a_floor_and_no_call() -> None:
     largest = max(one.job.batch for one in measured_calls())
     one = predict(find_gpu("h200"), FULL, Job())[0]

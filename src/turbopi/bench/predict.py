@@ -119,7 +119,8 @@ def _calls(gpu: GpuSpec, config: ModelConfig, job: Job, precision: str) -> Itera
         return
     by_backend: dict[tuple[str, str], list[MeasuredCall]] = {}
     for call in measured_calls():
-        if call.precision == precision and call.job.batch == job.batch and runs_on(call.kernels, gpu):
+        runs = runs_on(call.kernels, gpu) and (call.gpu == gpu.key or refused(gpu, precision) is None)
+        if runs and call.precision == precision and call.job.batch == job.batch:
             by_backend.setdefault((call.backend, call.kernels), []).append(call)
     for calls in by_backend.values():
         own = [call for call in calls if call.gpu == gpu.key]
