@@ -105,6 +105,15 @@ def test_hoppers_kernels_are_predicted_on_hopper_alone() -> None:
         assert ("hopper" in kinds) == (gpu.compute_capability == "9.0")
 
 
+def test_a_precision_is_predicted_where_a_gpu_takes_it_and_nowhere_else() -> None:
+    taken: dict[str, dict[str, bool]] = {one.precision: {} for one in predict(find_gpu("h200"), FULL, Job())}
+    for key, gpu in published_gpus().items():
+        for one in predict(gpu, FULL, Job()):
+            taken[one.precision][key] = bool(one.calls)
+    assert all(taken["bf16"].values()) and all(taken["fp8"].values())
+    assert {key for key, there in taken["int8"].items() if there} == {"rtx3090", "a100", "orin", "orin32", "h200"}
+
+
 def test_a_batch_that_nobody_measured_has_a_floor_and_no_call() -> None:
     largest = max(one.job.batch for one in measured_calls())
     one = predict(find_gpu("h200"), FULL, Job())[0]
@@ -126,6 +135,10 @@ def test_a_gpu_is_found_as_people_write_it(typed: str) -> None:
 def test_an_unknown_gpu_is_refused_with_the_list() -> None:
     with pytest.raises(ConfigError, match=r"'rtx9090'.* known are rtx3090, .*b200"):
         find_gpu("rtx9090")
+    with pytest.raises(ConfigError, match=r"'5090'.*; did you mean rtx5090\?"):
+        find_gpu("5090")
+    with pytest.raises(ConfigError, match="known are rtx3090"):
+        find_gpu("-")
 
 
 def test_the_packages_measured_calls_are_those_of_the_result_files(tmp_path: Path) -> None:
@@ -154,6 +167,8 @@ def test_the_command_says_that_it_predicts_and_fits_80_columns(monkeypatch: pyte
     assert "These are predictions: nothing was run for them." in lines
     assert any("rtx4090 bf16" in line and "cuda_graph" in line for line in lines)
     assert any(line.startswith("cuda_graph, PyTorch's kernels, as on h200: ") for line in lines)
+    assert "int8: refused on " in result.stdout and "int8 on rtx3090, a100, orin, orin32: nothing" in result.stdout
+    assert any("h200 fp8" in line and "portable" in line for line in lines)
     starred = {line.split()[1] for line in lines if line.startswith("│") and "*" in line}
     assert starred == {"h100", "h200"} and "* but this call was measured on that GPU" in lines
     for gpu in published_gpus().values():

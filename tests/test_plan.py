@@ -17,8 +17,11 @@ from test_serve_schedule import PAYING, SERIAL, request, simulate, table
 from turbopi.bench import batch_table
 from turbopi.bench.batch_table import published_table, slow, table_of_file
 from turbopi.bench.document import Times
+from turbopi.bench.gpus import find_gpu
 from turbopi.bench.measured import measured_calls
+from turbopi.bench.predict import predict
 from turbopi.bench.work import Job
+from turbopi.config import ModelConfig
 from turbopi.errors import ConfigError
 from turbopi.serve.schedule import Schedule
 from turbopi.serve.sizing import Fleet, Plan, batch_times, plan_fleet, worst_seconds
@@ -239,10 +242,33 @@ def test_beyond_what_was_measured_it_is_a_prediction_and_says_so() -> None:
     assert long.predicted and long.job.horizon == 100
     other = published_table("rtx4090", "bf16", 10)
     assert other.predicted and other.backend == "fused" and other.seconds[1] > 0.02
-    with pytest.raises(ConfigError, match="nothing that runs in fp8 on A100 80 GB SXM was measured"):
+    with pytest.raises(ConfigError, match=r"A100 80 GB SXM doesn't run fp8: .*; this GPU has 8\.0"):
         published_table("a100", "fp8", 10)
+    assert published_table("orin", "int8", 10).predicted, "INT8 goes by an H200 with kernels for all GPUs"
     with pytest.raises(ConfigError, match="'fp7' is neither measured"):
         published_table("h200", "fp7", 10)
+
+
+def test_without_any_measurement_there_is_no_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "turbopi.bench.predict.measured_calls",
+        lambda: tuple(call for call in measured_calls() if call.precision != "int8"),
+    )
+    with pytest.raises(ConfigError, match="nothing that runs in int8 on A100 80 GB SXM was measured"):
+        published_table("a100", "int8", 10)
+
+
+def test_a_prediction_is_of_one_backends_kernels_alone() -> None:
+    """On Hopper `fused` has two kinds: one's T(1) beside the other's T(2) would be no engine's."""
+    for gpu in ("h100", "h200"):
+        alone, two = (published_table(gpu, "bf16", 100).seconds[size] for size in (1, 2))
+        portable = [
+            call
+            for one in predict(find_gpu(gpu), ModelConfig(), Job(horizon=100))
+            for call in one.calls
+            if (one.precision, call.kernels) == ("bf16", "portable")
+        ]
+        assert alone < min(call.high_ms for call in portable) / 1e3 and alone < two < 2 * alone
 
 
 def test_measured_batches_are_taken_as_soon_as_there_are_some(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -298,9 +324,19 @@ def test_the_commands_document_is_the_plan() -> None:
 
 def test_a_prediction_is_called_one() -> None:
     said = turbopi(*ASK, "--gpu", "rtx4090")
-    assert said.exit_code == 0 and "PREDICTED, never measured there" in said.stdout
+    assert said.exit_code == 0 and "PREDICTED, not measured there" in said.stdout
     assert json.loads(turbopi(*ASK, "--gpu", "rtx4090", "--json").stdout)["predicted"] is True
     assert "PREDICTED" not in turbopi(*ASK, "--gpu", "h200").stdout
+
+
+def test_a_plan_without_times_of_batches_says_so() -> None:
+    told = "Batches of chunks of 50 weren't measured there: `turbopi bench --batch`, then --times"
+    assert told in turbopi(*ASK, "--gpu", "h200").stdout.splitlines()
+    assert told not in turbopi("plan", "--robots", "1", "--hz", "50", "--horizon", "50", "--gpu", "h200").stdout
+    assert (
+        "weren't measured"
+        not in turbopi("plan", "--robots", "8", "--hz", "9", "--horizon", "10", "--gpu", "h200").stdout
+    )
 
 
 def test_the_command_to_serve_parses_and_has_as_many_replicas() -> None:

@@ -326,7 +326,7 @@ def test_the_observations_prompt_comes_first_then_the_arguments_the_configs_and_
 def test_without_any_prompt_the_observation_is_refused() -> None:
     edges = pipeline(LIBERO)
     observation = {key: value for key, value in edges.example().items() if key != "prompt"}
-    with pytest.raises(ObservationError, match="the observation has no prompt, and the policy no default prompt"):
+    with pytest.raises(ObservationError, match=r"no prompt \(LeRobot: task\), and the policy no default"):
         edges.before(observation)
 
 

@@ -18,7 +18,7 @@ from turbopi.cli.serve_ray import check_fits, check_runs
 from turbopi.client import RealTimeClient, ServerRefused
 from turbopi.errors import ConfigError
 from turbopi.serve import PolicyServer, ray_app, running
-from turbopi.serve.fleet import FleetOptions, import_ray, reason_in
+from turbopi.serve.fleet import FleetOptions, check_known, import_ray, reason_in
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.outcome import Outcome
@@ -153,7 +153,7 @@ def test_our_client_keeps_its_connection_too() -> None:
 
 def test_without_ray_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ConfigError, match=r"needs Ray Serve, which can't be imported .*pip install 'turbopi\[ray\]'"):
+    with pytest.raises(ConfigError, match=r"needs Ray Serve, which can't be imported .* install -e '.*\[ray\]'"):
         import_ray()
     assert "needs Ray Serve" in refusal(turbopi(*TINY, "--ray", "--port", "0"))
     with pytest.raises(ConfigError, match="needs Ray Serve"):
@@ -231,6 +231,13 @@ def test_autoscaling_is_rays_own_as_json() -> None:
     for text in ("1-4", "[1, 4]"):
         with pytest.raises(ConfigError, match="autoscaling is"):
             read_autoscaling(text)
+
+
+def test_what_autoscaling_has_and_ray_has_not_is_refused() -> None:
+    pytest.importorskip("ray")
+    check_known({"min_replicas": 1, "max_replicas": 4, "upscale_delay_s": 5})
+    with pytest.raises(ConfigError, match=r"autoscaling has min_replica, which .* it has .*min_replicas"):
+        check_known({"min_replica": 1})
 
 
 def test_the_reason_is_found_in_rays_tracebacks() -> None:

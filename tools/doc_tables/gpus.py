@@ -150,7 +150,7 @@ def gpu_refusals() -> list[str]:
 
 def gpu_predictions() -> list[str]:
     """Milliseconds of the main job: floors, and calls of the backend that `auto` takes."""
-    heads = ["ms", "GB/s", "bf16 floor", "bf16 call", "FP8 floor", "FP8 call", "INT8 floor"]
+    heads = ["ms", "GB/s", "bf16 floor", "bf16 call", "FP8 floor", "FP8 call", "INT8 floor", "INT8 call"]
     lines = [f"| {' | '.join(heads)} |", "|---|" + "--:|" * (len(heads) - 1)]
     for gpu in published_gpus().values():
         taken = runs(gpu)
@@ -158,9 +158,10 @@ def gpu_predictions() -> list[str]:
         cells = [gpu.name, f"{gpu.gb_per_second:g}"]
         for precision in ("bf16", "fp8", "int8"):
             one = by_precision.get(precision)
-            cells.append("" if one is None else f"{one.floor_ms['total']:.1f}")
-            if precision != "int8":
-                cells.append("" if one is None else _call(one, taken[precision]))
+            if one is None or taken[precision] == "no":
+                cells += ["", ""]
+            else:
+                cells += [f"{one.floor_ms['total']:.1f}", _call(one, taken[precision])]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 

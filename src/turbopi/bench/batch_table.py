@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from turbopi.bench.document import Times, read_benchmark
 from turbopi.bench.gpus import find_gpu
 from turbopi.bench.measured import measured_calls
-from turbopi.bench.predict import PRECISIONS, PredictedCall, predict
+from turbopi.bench.predict import PRECISIONS, PredictedCall, predict, refused
 from turbopi.bench.work import Job
 from turbopi.config import ModelConfig
 from turbopi.errors import ConfigError
@@ -23,7 +23,7 @@ class BatchTable(Struct, frozen=True, kw_only=True):
     precision: str
     job: Job  # that was measured or predicted, of one observation
     seconds: dict[int, float]  # by observations of a batch: the 99th percentile of calls
-    predicted: bool  # nothing was measured on that GPU
+    predicted: bool  # no chunks that long were measured on that GPU
     source: str  # the file of the measurement that it is, or goes by
 
 
@@ -51,29 +51,33 @@ def published_table(gpu: str, precision: str, horizon: int) -> BatchTable:
     if any(one.job.horizon >= horizon for one in measured):
         return _table(spec.key, precision, horizon, measured)
     if precision not in PRECISIONS:
-        raise ConfigError(f"precision {precision!r} is neither measured on {spec.name} nor predicted")
+        raise ConfigError(
+            f"precision {precision!r} is neither measured on {spec.name} nor predicted; plans are for "
+            f"{', '.join(PRECISIONS)}"
+        )
+    if why := refused(spec, precision):
+        raise ConfigError(f"{spec.name} doesn't run {precision}: {why}")
     config, job = ModelConfig(), Job(horizon=horizon)
     batches = sorted({call.job.batch for call in measured_calls()})
-    found: dict[str, dict[int, PredictedCall]] = {}
+    found: dict[tuple[str, str], dict[int, PredictedCall]] = {}  # by backend and its kernels
     for batch in batches:
         for one in predict(spec, config, replace(job, batch=batch)):
             for call in one.calls if one.precision == precision else ():
-                found.setdefault(call.backend, {})[batch] = call
-    backend = min((name for name in found if 1 in found[name]), key=lambda name: found[name][1].high_ms, default=None)
-    if backend is None:
+                found.setdefault((call.backend, call.kernels), {})[batch] = call
+    best = min((calls for calls in found.values() if 1 in calls), key=lambda calls: calls[1].high_ms, default=None)
+    if best is None:
         raise ConfigError(
             f"nothing that runs in {precision} on {spec.name} was measured anywhere, so there is no prediction; "
             "measure T(B) there with `turbopi bench --batch 1,2,4,8 --report DIR`, and give --times DIR/results.json"
         )
-    calls = found[backend]
     return BatchTable(
         gpu=spec.key,
-        backend=backend,
+        backend=best[1].backend,
         precision=precision,
         job=job,
-        seconds={batch: call.high_ms / 1e3 for batch, call in calls.items()},
+        seconds={batch: call.high_ms / 1e3 for batch, call in best.items()},
         predicted=True,
-        source=calls[1].source,
+        source=best[1].source,
     )
 
 

@@ -60,8 +60,10 @@ def find_gpu(name: str) -> GpuSpec:
         typed = typed.removeprefix(word)
     known = published_gpus()
     if typed not in known:
+        meant = [key for key in known if typed and typed in key]
         raise ConfigError(
-            f"no published numbers of a GPU {shown(name)} are known here; known are {', '.join(known)}. "
-            "On the GPU itself `turbopi bench` measures"
+            f"no published numbers of a GPU {shown(name)} are known here; "
+            + (f"did you mean {' or '.join(meant)}? " if meant else f"known are {', '.join(known)}. ")
+            + "On the GPU itself `turbopi bench` measures"
         )
     return known[typed]

@@ -20,6 +20,7 @@ from turbopi.bench.gpus import GpuSpec, find_gpu
 from turbopi.bench.measured import Kernels, MeasuredCall, measured_calls
 from turbopi.bench.work import Job, floor_ms, stage_work
 from turbopi.config import ModelConfig
+from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
 
 PRECISIONS = ("bf16", "fp8", "int8")
 STAGES = ("vision", "prefix", "denoise")
@@ -101,6 +102,12 @@ def runs_on(kernels: Kernels, gpu: GpuSpec) -> bool:
     return kernels != "hopper" or gpu.capability == (9, 0)
 
 
+def refused(gpu: GpuSpec, precision: str) -> str | None:
+    """Why a GPU of the table doesn't run a precision, in words; None if it does."""
+    why = {"fp8": fp8_refusal, "int8": int8_refusal}.get(precision)
+    return None if why is None else why(gpu.capability)
+
+
 def _full_size(config: ModelConfig) -> bool:
     """Whether the model has the sizes of those that were measured: what a smaller one loses is another matter."""
     full = ModelConfig()
@@ -112,7 +119,8 @@ def _calls(gpu: GpuSpec, config: ModelConfig, job: Job, precision: str) -> Itera
         return
     by_backend: dict[tuple[str, str], list[MeasuredCall]] = {}
     for call in measured_calls():
-        if call.precision == precision and call.job.batch == job.batch and runs_on(call.kernels, gpu):
+        runs = runs_on(call.kernels, gpu) and (call.gpu == gpu.key or refused(gpu, precision) is None)
+        if runs and call.precision == precision and call.job.batch == job.batch:
             by_backend.setdefault((call.backend, call.kernels), []).append(call)
     for calls in by_backend.values():
         own = [call for call in calls if call.gpu == gpu.key]

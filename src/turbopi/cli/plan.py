@@ -37,7 +37,10 @@ def plan(
     ] = None,
     times: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Instead: T(B) of your GPU, from `turbopi bench --batch 1,2,4,8 --report`."),
+        typer.Option(
+            metavar="FILE",
+            help="Instead: T(B) of your GPU: results.json of `turbopi bench --batch 1,2,4,8 --report DIR`.",
+        ),
     ] = None,
     precision: Annotated[str, typer.Option(metavar="NAME", help="Such as bf16, fp8.")] = "bf16",
     delay_steps: Annotated[
@@ -84,21 +87,27 @@ def plan(
 def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
     """The plan for people."""
     each = ", ".join(f"T({size}) {seconds * 1e3:.1f}" for size, seconds in table.seconds.items())
-    kind = "PREDICTED, never measured there" if table.predicted else "measured"
+    kind = "PREDICTED, not measured there" if table.predicted else "measured"
     serve = (
         f"turbopi serve CHECKPOINT --backend {table.backend} --precision {table.precision} --max-batch {planned.batch}"
     )
     a_second = fleet.robots * fleet.hz / fleet.steps
+    each_has = f"{planned.robots_per_gpu} robot{'s' * (planned.robots_per_gpu > 1)}"
     return [
         f"{fleet.robots} robots at {fleet.hz:g} Hz, chunks of {fleet.horizon}, a new one every {fleet.steps} steps:",
         f"  {a_second:.1f} observations a second",
         f"{table.gpu}, {table.backend} {table.precision}, {kind} ({table.job}):",
         f"  {each} ms; {table.source}",
-        f"GPUs         {planned.gpus}, at most {planned.robots_per_gpu} robots on each",
+        f"GPUs         {planned.gpus}, at most {each_has} on each",
         f"batch        {planned.batch} at most",
         f"delay        {planned.delay_steps} control steps at most "
         f"({planned.worst_seconds * 1e3:.1f} ms and {fleet.overhead_ms:g} ms overhead)",
         f"utilisation  {planned.utilisation:.0%}",
         f"run          {serve}" + (f" --ray --replicas {planned.gpus}" if planned.gpus > 1 else ""),
+        *(
+            [f"Batches of chunks of {table.job.horizon} weren't measured there: `turbopi bench --batch`, then --times"]
+            if fleet.robots > 1 and len(table.seconds) == 1
+            else []
+        ),
         *(["With Ray a call takes longer: see docs/fleet.md, and --overhead-ms"] if planned.gpus > 1 else []),
     ]

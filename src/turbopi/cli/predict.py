@@ -11,6 +11,7 @@ from turbopi.errors import ConfigError
 from turbopi.reading import plain_document
 
 if TYPE_CHECKING:
+    from turbopi.bench.gpus import GpuSpec
     from turbopi.bench.predict import PredictedCall, Prediction
     from turbopi.bench.work import Job
     from turbopi.config import ModelConfig
@@ -61,10 +62,15 @@ def _table(job: "Job", predictions: "Sequence[Prediction]") -> Table:
         name = f"{one.gpu.key} {one.precision}"
         for call in one.calls:
             told = call_text(call) + (MEASURED if one.was_measured(call) else "")
-            table.add_row(name, *floors, told, call.backend)
+            table.add_row(name, *floors, told, "portable" if _not_its_own(one.gpu, call) else call.backend)
         if not one.calls:
             table.add_row(name, *floors, "-", "")
     return table
+
+
+def _not_its_own(gpu: "GpuSpec", call: "PredictedCall") -> bool:
+    """Whether these are kernels for all GPUs where `fused` takes Hopper's."""
+    return call.kernels == "portable" and gpu.capability == (9, 0)
 
 
 def call_text(call: "PredictedCall") -> str:
@@ -77,6 +83,7 @@ def _notes(predictions: "Sequence[Prediction]") -> list[str]:
     """What the tables mean, where their numbers come from, and what can't run."""
     from turbopi.backends import PRECISIONS
     from turbopi.bench.measured import KERNELS
+    from turbopi.bench.predict import refused
 
     measured = any(one.was_measured(call) for one in predictions for call in one.calls)
     lines = [
@@ -88,13 +95,19 @@ def _notes(predictions: "Sequence[Prediction]") -> list[str]:
     ]
     calls = {(call.backend, call.kernels, call.measured_on, call.source) for one in predictions for call in one.calls}
     lines += [f"{name}, {KERNELS[kernels]}, as on {gpu}: {source}" for name, kernels, gpu, source in sorted(calls)]
+    if any(_not_its_own(one.gpu, call) for one in predictions for call in one.calls):
+        lines.append("portable: fused with TURBOPI_KERNELS=portable")
     without = [one for one in predictions if not one.calls]
     for precision in dict.fromkeys(one.precision for one in without):
-        gpus = dict.fromkeys(one.gpu.key for one in without if one.precision == precision)
+        gpus = {one.gpu.key: one.gpu for one in without if one.precision == precision}
         if precision not in PRECISIONS:
             lines.append(f"{precision}: no backend runs in it")
-        else:
-            lines.append(f"{precision} on {', '.join(gpus)}: nothing that runs there was measured on such a job")
+            continue
+        refusing = [key for key, gpu in gpus.items() if refused(gpu, precision)]
+        if refusing:
+            lines.append(f"{precision}: refused on {', '.join(refusing)}, see docs/gpus.md")
+        if others := [key for key in gpus if key not in refusing]:
+            lines.append(f"{precision} on {', '.join(others)}: nothing that runs there was measured on such a job")
     for gpu in {one.gpu.key: one.gpu for one in predictions}.values():
         rates = f"bf16 {gpu.bf16_tflops:g} TFLOP/s" + (f", FP8 {gpu.fp8_tflops:g}" if gpu.fp8_tflops else "")
         lines += [f"{gpu.key}: {gpu.gb_per_second:g} GB/s, {rates}, INT8 {gpu.int8_tops:g} TOP/s, {gpu.memory_gb:g} GB"]

@@ -232,7 +232,9 @@ class Pipeline:
     def _choose_prompt(self, sample: Incoming) -> None:
         prompt = sample.robot.prompt if sample.robot.prompt is not None else self.default_prompt
         if prompt is None:
-            raise ObservationError("the observation has no prompt, and the policy no default prompt; give one of them")
+            raise ObservationError(
+                "the observation has no prompt (LeRobot: task), and the policy no default prompt; give one of them"
+            )
         sample.prompt = read_prompt(prompt)
 
     def _normalize_state(self, sample: Incoming) -> None:

@@ -25,6 +25,7 @@ from typing import Any
 from packaging.specifiers import SpecifierSet
 
 from turbopi.errors import BackendError, BackendUnavailable, ConfigError
+from turbopi.installation import install_command
 from turbopi.serve.calls import Policy
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
@@ -103,10 +104,10 @@ def import_ray() -> tuple[Any, Any]:
         from ray import serve
     except ImportError as error:
         raise ConfigError(
-            f"a fleet needs Ray Serve, which can't be imported ({error}): pip install 'turbopi[ray]'"
+            f"a fleet needs Ray Serve, which can't be imported ({error}): {install_command('ray')}"
         ) from error
     if ray.__version__ not in RAY:
-        raise ConfigError(f"a fleet needs Ray {RAY}, but {ray.__version__} is installed: pip install 'turbopi[ray]'")
+        raise ConfigError(f"a fleet needs Ray {RAY}, but {ray.__version__} is installed: {install_command('ray')}")
     return ray, serve
 
 
@@ -167,8 +168,14 @@ def check_room(options: FleetOptions) -> None:
     for kind, each in (("GPU", 1.0 if use_gpus else 0.0), ("CPU", options.cpus)):
         have = free.get(kind, 0.0) + own * each
         if count * each > have + 1e-6:
+            fit = "replica doesn't fit" if count == 1 else "replicas don't fit"
+            if not total.get(kind):
+                raise BackendUnavailable(
+                    f"{count} {fit}: Ray's cluster has no {kind}. `turbopi doctor` says why none is seen; with "
+                    "device cpu replicas run on CPUs"
+                )
             raise BackendUnavailable(
-                f"{count} replicas of {each:g} {kind} don't fit: Ray's cluster has {total.get(kind, 0.0):g}, of which "
+                f"{count} {fit}, with {each:g} {kind} each: Ray's cluster has {total.get(kind, 0.0):g}, of which "
                 f"{have:g} are free. Ask for fewer replicas, add machines (`ray start`), or end what takes them"
             )
 
@@ -202,6 +209,7 @@ def replicas(make_policy: Callable[[], Policy], options: FleetOptions, *, warm: 
     scale: dict[str, Any] = {"num_replicas": count}
     if options.autoscaling is not None:
         scale = {"autoscaling_config": dict(options.autoscaling)}
+        check_known(options.autoscaling)
     try:
         deployment = serve.deployment(
             name=DEPLOYMENT,
@@ -218,6 +226,18 @@ def replicas(make_policy: Callable[[], Policy], options: FleetOptions, *, warm: 
     except (ValueError, TypeError) as error:
         raise ConfigError(f"Ray Serve refuses the fleet's options: {error}") from error
     return deployment.bind(make_policy, options.checkpoint, warm, options.line)
+
+
+def check_known(autoscaling: Mapping[str, Any]) -> None:
+    """Raise ConfigError for a field that Ray Serve's `autoscaling_config` hasn't: Ray Serve would ignore it."""
+    from ray.serve.config import AutoscalingConfig
+
+    known = {name for name in AutoscalingConfig.model_fields if not name.startswith("_")}
+    if unknown := sorted(set(autoscaling) - known):
+        raise ConfigError(
+            f"autoscaling has {', '.join(unknown)}, which Ray Serve's autoscaling_config hasn't; it has "
+            f"{', '.join(sorted(known))}"
+        )
 
 
 def deploy(application: Any, name: str, tell: Callable[[str], None]) -> None:

@@ -22,8 +22,9 @@ class TurboPiConfig(PreTrainedConfig):
 
     checkpoint           its folder, or its name on the Hugging Face hub (owner/name, with `pretrained_revision`)
     backend              a name from `turbopi backends`; "auto" takes the fastest one available
-    precision            "bf16", "f32", or with a calibration "fp8" or "fp8-mlp"
-    quantization         what `turbopi calibrate` wrote for this checkpoint; None: the turbopi_fp8.json in its folder
+    precision            "bf16", "f32", or with a calibration "fp8", "fp8-mlp" or "int8"
+    quantization         what `turbopi calibrate` wrote for this checkpoint; None: the turbopi_fp8.json or
+                         turbopi_int8.json in its folder
     num_inference_steps  denoising steps a chunk; None: the checkpoint's
     n_action_steps       actions of a chunk that are executed before the next one; None: the checkpoint's
     warmup               compile and capture everything when the policy is made, not during the first calls
