@@ -314,9 +314,9 @@ class GraphRunner:
             return self._capture(of.run, None)
         call = self._call(of)
         if part != "prefix" and call.denoiser is None:
-            call.denoiser = self._denoiser_of(of, call.table)
+            call.denoiser = self._denoiser_of(of, call.times.table)
         if part != "prefix" and of.loop.form == "jacobian" and call.keeper is None:
-            call.keeper = self._make_keeper(of, call.table)
+            call.keeper = self._make_keeper(of, call.times.table)
         run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
         return self._capture(run, None if part == "denoise" else self._graph(call.pictures, "vision"))
 
