@@ -185,6 +185,22 @@ def test_the_true_jacobian_goes_forward_in_a_kernel_and_back_by_operations_that_
     assert torch.equal(actions(backend), plain)
 
 
+def test_a_kernel_that_keeps_is_refused_once_for_each_loop_and_leaves_no_packed_expert(
+    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend, tried = fused(), list[TwinKernel | None]()
+
+    def make(*given: Any, **options: Any) -> TwinKernel:
+        tried.append(None)
+        return kernels(*given, **options)
+
+    monkeypatch.setattr(denoise, "DenoiseKernel", make)
+    kernels.refuse = "too small"
+    shapes = [CallShape(3, slots, Loop(2, 10, "jacobian", (1.0, 0.5, 0.0))) for slots in (16, 32)]
+    assert [backend._make_keeper(shape, backend._call(shape).times.table) for shape in shapes] == [None, None]
+    assert len(tried) == 1 and backend._packed_expert is None
+
+
 def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[TwinKernel]) -> None:
     backend = fused()
     for steps, horizon in ((3, 10), (3, 6), (2, 10), (3, 10)):
