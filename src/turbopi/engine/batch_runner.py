@@ -186,7 +186,9 @@ class BatchRunner(GraphRunner):
 
     def _costs_of(self, form: Form) -> Mapping[int, float]:
         """As `batch_costs`, in single calls of this form, which may run together."""
-        return {"plain": self.batch_costs, "jacobian": self.jacobian_costs}.get(form, self.COSTS)
+        if form == "plain":
+            return self.batch_costs
+        return self.jacobian_costs if form == "jacobian" else self.COSTS
 
     def _calls_of(self, forms: Sequence[Form]) -> list[Call]:
         """The calls that a batch of observations of these forms is split into; strict: of those that are captured."""
