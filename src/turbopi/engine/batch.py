@@ -226,6 +226,7 @@ class BatchLoop:
             tokens = batched.end_step(x, y, gate, end, *chunks)
 
     def _layers(self, weights: Weights, step: int, rope: forward.Rope, tokens: Tensor) -> forward.Stream:
+        """Suffix tokens [B * T, D] of a step through all layers of the expert."""
         buffers, config = self._buffers, self._buffers.config
         batched, heads = buffers.ops.batch or PLAIN_BATCH, config.expert.num_heads
 
