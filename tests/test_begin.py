@@ -214,6 +214,26 @@ def test_one_observation_at_a_time() -> None:
     assert torch.equal(backend.sample(observation, noise, 1).actions, actions)
 
 
+def test_one_batch_at_a_time() -> None:
+    """Else the first one's prompts would be answered by the second one's pictures."""
+    backend, made = on_cpu(), [made_up("pi05", 2, 5, seed) for seed in (0, 1)]
+    rows, noise = [HostRow.of(one, 0) for one, _ in made], np.concatenate([noise.numpy() for _, noise in made])
+    pictures, rest = [row.images for row in rows], ([row.tokens for row in rows], np.stack([r.state for r in rows]))
+    actions = backend.begin_batch(pictures).finish(*rest, noise, 1).actions
+    first, second = backend.begin_batch(pictures[::-1]), backend.begin_batch(pictures)
+    with pytest.raises(BackendError, match="begun another"):
+        first.finish(*rest, noise, 1)
+    assert torch.equal(second.finish(*rest, noise, 1).actions, actions)
+    with pytest.raises(BackendError, match="has finished this observation"):
+        second.finish(*rest, noise, 1)
+    batch, alone = backend.begin_batch(pictures), backend.begin(pictures[0])
+    with pytest.raises(BackendError, match="begun another"):
+        batch.finish(*rest, noise, 1)
+    torch.testing.assert_close(
+        alone.finish(rows[0].tokens, rows[0].state, noise[0], 1).actions[0], actions[0], rtol=0, atol=1e-4
+    )
+
+
 def test_a_begun_observation_is_over_when_the_next_ones_pictures_are_wrong() -> None:
     backend = on_cpu()
     observation, noise = made_up("pi05", 2, 5)

@@ -223,7 +223,8 @@ def in_rows(expert: Expert) -> Expert:
     assert expert.table is not None
     table = expert.table if expert.table.dim() == 4 else expert.table[:, :, None].expand(-1, -1, 10, -1)
     rows = torch.arange(10, dtype=torch.int32)
-    return dataclasses.replace(expert, table=table.flip(2).permute(2, 0, 1, 3).contiguous(), rows=rows.flip(0))
+    by_time = table.flip(2).movedim(2, 0).contiguous()  # as loops have it
+    return dataclasses.replace(expert, table=by_time.movedim(0, 2), rows=rows.flip(0))
 
 
 @pytest.mark.parametrize(

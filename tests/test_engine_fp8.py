@@ -234,7 +234,7 @@ def test_metadata_tells_which_calls_operations_denoise_and_what_the_expert_is_in
 def test_a_kernel_that_is_refused_is_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     backend, tried = FusedBackend.__new__(FusedBackend), []
     backend.config, backend.device = golden_model("pi05").config, CPU
-    backend._denoisers, backend._keepers, backend._refused = {}, {}, {}
+    backend._denoisers, backend._pair_denoisers, backend._keepers, backend._refused = {}, {}, {}, {}
     backend._packed_expert = None
     monkeypatch.setattr(backend, "_keep_expert_on", lambda device: None)
 

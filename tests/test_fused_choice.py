@@ -185,6 +185,22 @@ def test_the_true_jacobian_goes_forward_in_a_kernel_and_back_by_operations_that_
     assert torch.equal(actions(backend), plain)
 
 
+def test_a_kernel_that_keeps_is_refused_once_for_each_loop_and_leaves_no_packed_expert(
+    kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend, tried = fused(), list[TwinKernel | None]()
+
+    def make(*given: Any, **options: Any) -> TwinKernel:
+        tried.append(None)
+        return kernels(*given, **options)
+
+    monkeypatch.setattr(denoise, "DenoiseKernel", make)
+    kernels.refuse = "too small"
+    shapes = [CallShape(3, slots, Loop(2, 10, "jacobian", (1.0, 0.5, 0.0))) for slots in (16, 32)]
+    assert [backend._make_keeper(shape, backend._call(shape).times.table) for shape in shapes] == [None, None]
+    assert len(tried) == 1 and backend._packed_expert is None
+
+
 def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[TwinKernel]) -> None:
     backend = fused()
     for steps, horizon in ((3, 10), (3, 6), (2, 10), (3, 10)):
@@ -201,7 +217,7 @@ def test_a_kernel_is_made_once_for_each_loop_with_the_loops_sizes(kernels: type[
 
 def test_four_cameras_have_a_kernel_with_room_for_them(kernels: type[TwinKernel]) -> None:
     backend = fused()
-    table = backend._call(CallShape(3, 16, Loop(2, 10))).table
+    table = backend._call(CallShape(3, 16, Loop(2, 10))).times.table
     for cameras in (1, 2, 3, 4):
         assert backend._make_denoiser(CallShape(cameras, 16, Loop(2, 10)), table) is not None
     tokens, most = backend.config.vision.num_tokens, -(-backend.config.max_prompt_tokens // 16) * 16
@@ -215,7 +231,7 @@ def test_a_model_horizon_or_gpu_that_the_kernel_does_not_cover_takes_operations_
     actions(pi0)
     assert list(pi0.describe()["denoising"]) == ["operations, as it covers Pi0.5, this model is pi0"]
     backend = fused()
-    table = backend._call(CallShape(3, 16, Loop(2, 10))).table
+    table = backend._call(CallShape(3, 16, Loop(2, 10))).times.table
     assert backend._make_denoiser(CallShape(3, 16, Loop(2, denoise.MAX_SUFFIX)), table) is not None
     assert backend._make_denoiser(CallShape(3, 16, Loop(2, denoise.MAX_SUFFIX + 1)), table) is None
     monkeypatch.setattr(denoise, "unavailable", lambda device: "this GPU has 12.0")
@@ -271,7 +287,7 @@ class OnFakeGpu:
 
     def __init__(self, kernels: type[TwinKernel], monkeypatch: pytest.MonkeyPatch) -> None:
         self.backend, self.kernels = fused(), kernels
-        self.table = self.backend._call(CallShape(3, 16, Loop(2, 10))).table
+        self.table = self.backend._call(CallShape(3, 16, Loop(2, 10))).times.table
         self.backend.device = GPU
         layer: Any = GemmaLayer(**{name: Placed(GPU) for name in MATRICES}, norm1=None, norm2=None)
         self.backend._weights.expert[:] = [layer] * 3

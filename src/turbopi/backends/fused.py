@@ -80,7 +80,8 @@ class FusedBackend(CudaGraphBackend):
         self._packed_expert: Any = None  # as the denoising kernels have it
         self._denoisers: dict[tuple[Loop, int], Denoiser] = {}  # by loop and cache rows
         self._pair_denoisers: dict[tuple[Loop, int], PairDenoiser] = {}  # of two observations, for batches
-        self._keepers: dict[tuple[Loop, int], KeepingDenoiser] = {}  # forward, where the true Jacobian goes back
+        # forward, where the true Jacobian goes back; None: refused
+        self._keepers: dict[tuple[Loop, int], KeepingDenoiser | None] = {}
         self._refused: dict[tuple[Loop, int], str] = {}  # what operations denoise, and why
         super().__init__(config, load, device=device, precision=precision)
 
@@ -135,7 +136,7 @@ class FusedBackend(CudaGraphBackend):
         by_kernel = sorted({str(loop) for loop, _ in list(self._denoisers)})
         by_operations: dict[str, list[str]] = {}
         for (loop, rows), why in list(self._refused.items()):
-            kept = (loop, rows) in self._keepers
+            kept = self._keepers.get((loop, rows)) is not None
             how = "one CUDA kernel a step forward, operations back" if kept else f"operations, as {why}"
             calls = by_operations.setdefault(how, [])
             if str(loop) not in calls:
@@ -205,10 +206,14 @@ class FusedBackend(CudaGraphBackend):
                 self._refused[key] = str(e)
         if key in self._denoisers:
             return self._denoisers[key]
-        if not self._denoisers and not self._keepers:
-            self._packed_expert = None
+        self._drop_unused_expert()
         self._keep_expert_on(self.device)  # while such a graph is kept, as it points to it
         return None
+
+    def _drop_unused_expert(self) -> None:
+        """Let go of the packed matrices, 0.6 GB, if no kernel has them."""
+        if not any((*self._denoisers.values(), *self._pair_denoisers.values(), *self._keepers.values())):
+            self._packed_expert = None
 
     def _most_rows(self, shape: CallShape) -> int:
         """Of the cache's prefix, of all calls that one denoising kernel serves."""
@@ -216,7 +221,7 @@ class FusedBackend(CudaGraphBackend):
         return cameras * self.config.vision.num_tokens + bucket(self.config.max_prompt_tokens)
 
     def _make_keeper(self, shape: CallShape, table: Tensor | None) -> KeepingDenoiser | None:
-        """Hopper's denoising kernel of one step, in bfloat16."""
+        """Hopper's denoising kernel of one step, in bfloat16; None, with the reason logged, where it can't run."""
         horizon, rows = shape.loop.horizon, self._most_rows(shape)
         if table is None or not self._guides_by_kernel(horizon):
             return None
@@ -237,7 +242,8 @@ class FusedBackend(CudaGraphBackend):
                 )
             except BackendUnavailable as e:
                 logger.info("operations go forward where the true Jacobian goes back: %s", e)
-                return None
+                self._keepers[key] = None
+                self._drop_unused_expert()
         return self._keepers[key]
 
     def _guides_by_kernel(self, horizon: int) -> bool:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from turbopi.config import ModelConfig
 from turbopi.engine.conditioned import Conditioned
-from turbopi.engine.forward import Rope, project
+from turbopi.engine.forward import Rope, norm_weights, project
 from turbopi.engine.weights import Weights
 from turbopi.kernels.backward import PLAIN_BACKWARD
 from turbopi.kernels.interface import BackwardOps, KeepingDenoiser, KeptStep, Ops, State
@@ -40,13 +40,13 @@ class Expert:
     weights: Weights
     ops: Ops
     back: BackwardOps
-    table: Tensor | None  # float32[2 * layers + 1, 3, T or none, D]; None: Pi0
+    table: Tensor | None  # float32[2 * layers + 1, 3, D], by token [2 * layers + 1, 3, T, D]; None: Pi0
     length: Tensor
     cache_k: Tensor  # [layer, R, K]
     cache_v: Tensor
     rope: Rope
     hidden: Tensor | None = None  # bool[T, 1, R]: which rows a token doesn't see, of several observations' together
-    rows: Tensor | None = None  # int32[T]: rows of a table float32[U, 2 * layers + 1, 3, D]; then there is no `forward`
+    rows: Tensor | None = None  # int32[T]: of a table [2 * layers + 1, 3, U, D], as `vjp` alone takes it
 
     def forward(self, tokens: Tensor) -> tuple[Tensor, list[KeptLayer], Tensor]:
         """Suffix tokens [T, D] -> (the final norm's result float32[T, D], what each layer keeps, the last stream)."""
@@ -57,19 +57,19 @@ class Expert:
         y: Any = None
         gate: Tensor | None = None
         for i, layer in enumerate(self.weights.expert):
-            scale, shift, next_gate = self._modulation(2 * i, layer.norm1)
+            scale, shift, next_gate = norm_weights(self.table, 2 * i, layer.norm1)
             x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
             start, gate = x, next_gate
             k, v = self.cache_k[i], self.cache_v[i]
             q = back.qkv(normed, layer.qkv, *self.rope, k[slots:], v[slots:])
             attended, for_vjp = back.attention(q, k, v, *heads, **hidden_keys)
-            scale, shift, next_gate = self._modulation(2 * i + 1, layer.norm2)
+            scale, shift, next_gate = norm_weights(self.table, 2 * i + 1, layer.norm2)
             y = back.out(attended, layer.out)
             x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
             gate_up, hidden = back.gate_up(normed, layer.gate_up)
             y, gate = back.down(hidden, layer.down), next_gate
             kept.append(KeptLayer(start, for_vjp, x, gate_up))
-        scale, shift, _ = self._modulation(2 * g.depth, self.weights.expert_norm)
+        scale, shift, _ = norm_weights(self.table, 2 * g.depth, self.weights.expert_norm)
         x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, config.rms_norm_eps)
         return normed.float(), kept, x
 
@@ -87,8 +87,8 @@ class Expert:
 
         def norm(d: Tensor, x: Tensor, index: int, plain: Tensor | None, d_x: Tensor | None) -> tuple[Tensor, Any]:
             """Back through norm number `index` and the addition before it: to the stream, and to what was added."""
-            scale = self._modulation(index, plain)[0]
-            gate = None if index == 0 else self._modulation(index - 1, None)[2]
+            scale = norm_weights(self.table, index, plain)[0]
+            gate = None if index == 0 else norm_weights(self.table, index - 1, None)[2]
             rows = () if self.rows is None else (self.rows,)
             d_x, d_y = back.rms_norm_vjp(d, x, scale, eps, d_x, gate, *rows)
             if index == 0:
@@ -112,14 +112,6 @@ class Expert:
         """What attention is told of what its queries see: length, slots, heads, whether there is a state token."""
         state_token = self.config.kind == "pi0" and self.hidden is None  # else `hidden` says what it doesn't see
         return self.length, self._slots(tokens), self.config.expert.num_heads, state_token
-
-    def _modulation(self, index: int, plain: Tensor | None) -> tuple[Any, Any, Any]:
-        """Scale, shift and gate of norm number `index`; the shift and the gate may be None."""
-        if self.table is None:
-            return plain, None, None
-        of_norm = self.table[index] if self.rows is None else self.table[:, index].movedim(1, 0)
-        scale, shift, gate = of_norm.unbind(0)
-        return scale, shift, gate
 
 
 def way_back(ops: Ops, config: ModelConfig, tokens: int, *, masked: bool = False) -> BackwardOps:

@@ -21,7 +21,7 @@ from turbopi.config import ModelConfig
 from turbopi.engine import forward
 from turbopi.engine.backward import Expert, jacobian_velocity, way_back
 from turbopi.engine.call import Cache, Pictures
-from turbopi.engine.conditioned import Conditioned
+from turbopi.engine.conditioned import Conditioned, StepTimes
 from turbopi.engine.flat import allocate
 from turbopi.engine.packing import most_tiles, pack_rows
 from turbopi.engine.recent_loops import Loop
@@ -29,7 +29,7 @@ from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Ops, PairDenoiser, Segments, StepEnd
 from turbopi.kernels.plain_batch import PLAIN_BATCH, visible_to_suffix
 from turbopi.model.conditioning import Conditioning
-from turbopi.model.denoise import euler_step, step_size, time_embedding, time_grid
+from turbopi.model.denoise import euler_step, step_size
 
 PLAIN_ROW = Conditioning()  # of an observation that asks for nothing, or an empty place
 
@@ -134,15 +134,13 @@ class BatchLoop:
     ) -> None:
         assert loop.form != "solver" and (loop.form == "plain" or isinstance(by, Weights)), loop
         self._loop = loop
-        self._buffers, self._by, self._table = buffers, by, table
+        self._buffers, self._by = buffers, by
         config, device, batch = buffers.config, buffers.device, buffers.size.batch
         on_gpu = device.type == "cuda"
         self._steps, self._horizon = loop.steps, loop.horizon
         self._tokens = loop.horizon + (config.kind == "pi0")
-        plain = loop.form == "plain"
-        times = time_grid(loop.steps, config.time_grid) if plain else np.array(loop.times, np.float32)
-        self._time_embs = time_embedding(times, config.expert.width).to(device)  # Pi0's
-        self._asked = None if plain else Conditioned.allocate(config, loop, device, batch)
+        self._asked = None if loop.form == "plain" else Conditioned.allocate(config, loop, device, batch)
+        self._times = StepTimes.of(config, loop, table, self._asked, device)
         chunk = (batch, loop.horizon, config.action_dim)
         fields = {"noise": (chunk, torch.float32), "state": ((batch, config.action_dim), torch.float32)}
         self._host, host = allocate(fields, torch.device("cpu"), pinned=on_gpu)
@@ -208,14 +206,15 @@ class BatchLoop:
                     v_t = asked.pulled(step, x_t, self._velocity(weights, step, rope))
                 else:
                     expert = self._expert(weights, step, rope, *whole)
-                    v_t = jacobian_velocity(expert, asked, step, x_t, self._suffix(weights, step), self._time(step))
+                    tokens, time = self._suffix(weights, step), self._times.embedding(step)
+                    v_t = jacobian_velocity(expert, asked, step, x_t, tokens, time)
                 self.x_t[step + 1] = asked.next_x(step, x_t, v_t)
             self.v_t[step] = v_t
 
     def _run_plain_steps(self, weights: Weights, rope: forward.Rope) -> None:
         """Pi0.5's, where one operation leads from a step's last layer to the next one's tokens."""
         config, small = self._buffers.config, weights.small
-        batched, table = self._buffers.ops.batch or PLAIN_BATCH, self._table
+        batched, table = self._buffers.ops.batch or PLAIN_BATCH, self._times.table
         assert table is not None, "Pi0.5's norms are modulated"
         out, into = ((small[f"{name}.weight"], small[f"{name}.bias"]) for name in ("action_out_proj", "action_in_proj"))
         tokens = self._suffix(weights, 0)
@@ -227,6 +226,7 @@ class BatchLoop:
             tokens = batched.end_step(x, y, gate, end, *chunks)
 
     def _layers(self, weights: Weights, step: int, rope: forward.Rope, tokens: Tensor) -> forward.Stream:
+        """Suffix tokens [B * T, D] of a step through all layers of the expert."""
         buffers, config = self._buffers, self._buffers.config
         batched, heads = buffers.ops.batch or PLAIN_BATCH, config.expert.num_heads
 
@@ -236,32 +236,23 @@ class BatchLoop:
                 qkv, *rope, *prefix, *buffers.segments, heads, config.kind == "pi0", **input
             )
 
-        ops, table = batched.expert(buffers.ops), self._modulation(step)
-        return forward.expert_layers(config, weights, ops, tokens, table, attend)
+        ops = batched.expert(buffers.ops)
+        return forward.expert_layers(config, weights, ops, tokens, self._times.modulation(step), attend)
 
     def _velocity(self, weights: Weights, step: int, rope: forward.Rope) -> Tensor:
         """v_t float32[B, H, A]"""
         config, ops = self._buffers.config, self._buffers.ops
         stream = self._layers(weights, step, rope, self._suffix(weights, step))
-        out = forward.final_norm(config, weights, ops, self._modulation(step), *stream)
+        out = forward.final_norm(config, weights, ops, self._times.modulation(step), *stream)
         out = out.view(-1, self._tokens, out.shape[-1])[:, -self._horizon :]
         return forward.project(weights.small, "action_out_proj", out)
 
     def _suffix(self, weights: Weights, step: int) -> Tensor:
         """Tokens [B * T, D]"""
         config = self._buffers.config
-        tokens = forward.suffix_tokens(config, weights.small, self.x_t[step], self._time(step), self._state)
+        time = self._times.embedding(step)
+        tokens = forward.suffix_tokens(config, weights.small, self.x_t[step], time, self._state)
         return tokens.flatten(0, 1).to(weights.embed_tokens.dtype)
-
-    def _time(self, step: int) -> Tensor:
-        """The time embedding float32[D], or [B, H, D] by token."""
-        return self._time_embs[step if self._asked is None else self._asked.tokens.rows[step]]
-
-    def _modulation(self, step: int) -> Tensor | None:
-        """float32[2 * layers + 1, 3, D], or [2 * layers + 1, 3, B * H, D] by token."""
-        if self._table is None:
-            return None
-        return self._table[step] if self._asked is None else self._asked.modulation(self._table, step)
 
     def _whole_cache(self) -> tuple[Tensor, Tensor, Tensor]:
         """Keys and values of all prefixes with room for the suffixes' behind them, and what `Expert` is told is hidden.
@@ -280,6 +271,6 @@ class BatchLoop:
         return k, v, ~visible_to_suffix(starts, lengths, end - count, count, pi0)[:, None]
 
     def _expert(self, weights: Weights, step: int, rope: forward.Rope, k: Tensor, v: Tensor, hidden: Tensor) -> Expert:
-        buffers, table = self._buffers, self._modulation(step)
+        buffers, table = self._buffers, self._times.modulation(step)
         back = way_back(buffers.ops, buffers.config, self._suffix_rows, masked=True)
         return Expert(buffers.config, weights, buffers.ops, back, table, self._seen, k, v, rope, hidden)

@@ -186,7 +186,9 @@ class BatchRunner(GraphRunner):
 
     def _costs_of(self, form: Form) -> Mapping[int, float]:
         """As `batch_costs`, in single calls of this form, which may run together."""
-        return {"plain": self.batch_costs, "jacobian": self.jacobian_costs}.get(form, self.COSTS)
+        if form == "plain":
+            return self.batch_costs
+        return self.jacobian_costs if form == "jacobian" else self.COSTS
 
     def _calls_of(self, forms: Sequence[Form]) -> list[Call]:
         """The calls that a batch of observations of these forms is split into; strict: of those that are captured."""
@@ -226,23 +228,27 @@ class BatchRunner(GraphRunner):
     def _begin_call(
         self, bucket: int, pictures: Sequence[Sequence[np.ndarray]], resize: ImageResize | None, float_images: bool
     ) -> Finish:
-        """Start on the pictures of up to `bucket` observations; what is returned ends their call."""
+        """Start on the pictures of up to `bucket` observations; what is returned ends their call, as `Begun.finish`."""
         cameras = [len(one) for one in pictures]
         size = self._batches.size(bucket, cameras, float_images)
 
         def finish(
             tokens: Sequence[np.ndarray], state: np.ndarray, noise: np.ndarray, num_steps: int, asked: Asked
         ) -> Sample:
+            self._check_turn(turn)
             loop = batch_loop(asked, num_steps, noise.shape[1], self.config)
             for count, prompt in zip(cameras, tokens, strict=True):
                 self._check_tokens(count, len(prompt))
             self._recent.use(loop)
             with self._explaining():
-                return self._batches.finish(size, loop, cameras, tokens, state, noise, asked)
+                sample = self._batches.finish(size, loop, cameras, tokens, state, noise, asked)
+            self._begun = None
+            return sample
 
-        self._begun = None  # its pictures' buffers stay, but nobody gets what becomes of them
+        turn, self._begun = object(), None  # as in `begin`
         with self._explaining():
             self._batches.launch_vision(size, [picture for one in pictures for picture in one], resize)
+        self._begun = turn
         return finish
 
     def _forget(self, loop: Loop) -> None:

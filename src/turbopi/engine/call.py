@@ -16,7 +16,7 @@ from torch import Tensor
 from turbopi.config import ImageResize, ModelConfig
 from turbopi.engine import forward
 from turbopi.engine.backward import Expert, jacobian_step, jacobian_velocity, way_back
-from turbopi.engine.conditioned import Conditioned
+from turbopi.engine.conditioned import Conditioned, StepTimes
 from turbopi.engine.flat import allocate
 from turbopi.engine.graph import HEAD, Mark
 from turbopi.engine.recent_loops import Loop
@@ -24,7 +24,7 @@ from turbopi.engine.resize import Resizer
 from turbopi.engine.weights import Weights
 from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
 from turbopi.model.conditioning import Conditioning
-from turbopi.model.denoise import euler_step, time_embedding, time_grid
+from turbopi.model.denoise import euler_step
 from turbopi.preprocess.images import fitted
 
 
@@ -194,17 +194,14 @@ class StaticCall:
         assert rows <= cache.k.shape[1], f"{shape} needs {rows} cache rows, there are {cache.k.shape[1]}"
         self.cache_k, self.cache_v = cache.k[:, :rows], cache.v[:, :rows]
         self._unseen = slice(shape.prefix_slots(config), rows - suffix)
-        self.table = table
         self.denoiser: Denoiser | None = None  # in place of the operations of `denoise`
         self.keeper: KeepingDenoiser | None = None  # in place of the forward operations of guidance by the Jacobian
         self.rope = forward.rope_of_all_positions(config, rows, device)
         self.suffix_offsets = torch.arange(suffix, device=device)
         self.embs = pictures.embs[: shape.prefix_slots(config)]
-        plain = shape.loop.form == "plain"
-        times = time_grid(shape.num_steps, config.time_grid) if plain else np.array(shape.loop.times, np.float32)
-        self.time_embs = time_embedding(times, config.expert.width).to(device)  # Pi0's
         by_token = shape.loop.form in ("tokens", "jacobian")
         self.asked = Conditioned.allocate(config, shape.loop, device) if by_token else None
+        self.times = StepTimes.of(config, shape.loop, table, self.asked, device)
         self.host = Inputs.allocate(config, shape, torch.device("cpu"), pinned=on_gpu)
         self._arrays = self.host.arrays()
         self.inputs = Inputs.allocate(config, shape, device, pinned=False)
@@ -285,8 +282,9 @@ class StaticCall:
                 self.v_t[step] = self._velocity(step, rope)
                 self.x_t[step + 1] = self.shape.loop.integration.next_x(step, self.x_t, self.v_t)
                 continue
-            if self.keeper is not None and self.asked is not None:
-                expert = self._expert(self.table, rope, self.asked.tokens.rows[step])
+            if self.keeper is not None:
+                assert self.asked is not None and self.times.table is not None, "it is made for Pi0.5's guided loops"
+                expert = self._expert(self.times.table.movedim(0, 2), rope, self.asked.tokens.rows[step])
                 jacobian_step(expert, self.asked, step, self.keeper, x_t, self.v_t[step], self.x_t[step + 1])
                 continue
             if self.asked is None:
@@ -304,7 +302,7 @@ class StaticCall:
             self.weights,
             self.ops,
             self._suffix_tokens(step),
-            self._modulation(step),
+            self.times.modulation(step),
             self.inputs.length,
             self.cache_k,
             self.cache_v,
@@ -318,8 +316,8 @@ class StaticCall:
         if self.shape.loop.form == "tokens":
             return asked.pulled(step, x_t, self._velocity(step, rope))
         tokens = self._suffix_tokens(step)
-        expert = self._expert(self._modulation(step), rope)
-        return jacobian_velocity(expert, asked, step, x_t, tokens, self._time(step))
+        expert = self._expert(self.times.modulation(step), rope)
+        return jacobian_velocity(expert, asked, step, x_t, tokens, self.times.embedding(step))
 
     def _expert(self, table: Tensor | None, rope: forward.Rope, rows: Tensor | None = None) -> Expert:
         """With a way back."""
@@ -327,18 +325,8 @@ class StaticCall:
         cache = self.cache_k, self.cache_v
         return Expert(self.config, self.weights, self.ops, back, table, self.inputs.length, *cache, rope, rows=rows)
 
-    def _time(self, step: int) -> Tensor:
-        """The time embedding float32[D], or [H, D] by token."""
-        return self.time_embs[step if self.asked is None else self.asked.tokens.rows[step]]
-
-    def _modulation(self, step: int) -> Tensor | None:
-        """float32[2 * layers + 1, 3, D], or [2 * layers + 1, 3, H, D] by token."""
-        if self.table is None:
-            return None
-        return self.table[step] if self.asked is None else self.asked.modulation(self.table, step)
-
     def _suffix_tokens(self, step: int) -> Tensor:
         """The suffix [H, D] of a step: actions, and for Pi0 the state token before them and the time mixed in."""
-        x_t, time = self.x_t[step], self._time(step)
+        x_t, time = self.x_t[step], self.times.embedding(step)
         tokens = forward.suffix_tokens(self.config, self.weights.small, x_t, time, self.inputs.state)
         return tokens.to(self.weights.embed_tokens.dtype)

@@ -18,6 +18,7 @@ from turbopi.engine.recent_loops import Loop
 from turbopi.errors import ObservationError
 from turbopi.kernels.interface import TokenInputs
 from turbopi.model.conditioning import Conditioning, Form, TokenTimes
+from turbopi.model.denoise import time_embedding, time_grid
 
 MOST_TIMES = 1024  # of a loop: 2.9 MB each, on the device
 BY_ACTION = ("target", "weights")  # have no axis of steps
@@ -165,10 +166,6 @@ class Conditioned:
     def upload(self) -> None:
         self.device.copy_(self.host, non_blocking=True)
 
-    def modulation(self, table: Tensor, step: int) -> Tensor:
-        """Of every action's own time: of a table float32[U, norms, 3, D] float32[norms, 3, H or B * H, D]."""
-        return table.permute(1, 2, 0, 3).index_select(2, self.tokens.rows[step].flatten())
-
     def error(self, step: int, x_t: Tensor, v_t: Tensor) -> Tensor:
         """target − x̂, x̂ = x − t v: float32[H, A]."""
         return self.tokens.target - (x_t - self.tokens.times[step, ..., None] * v_t)
@@ -179,3 +176,37 @@ class Conditioned:
 
     def next_x(self, step: int, x_t: Tensor, v_t: Tensor) -> Tensor:
         return x_t + self.tokens.steps[step, ..., None] * v_t
+
+
+@dataclass(frozen=True)
+class StepTimes:
+    """What the expert takes of a step's time, for all N steps of a loop; of a conditioned one for its U distinct times.
+
+    table       Pi0.5's modulation, float32[N or U, 2 * layers + 1, 3, D]; None: Pi0's norms have none
+    embeddings  Pi0's, float32[N or U, D]
+    asked       which action has which of the U times in a step; None: step i has row i
+    """
+
+    table: Tensor | None
+    embeddings: Tensor
+    asked: Conditioned | None
+
+    @classmethod
+    def of(
+        cls, config: ModelConfig, loop: Loop, table: Tensor | None, asked: Conditioned | None, device: torch.device
+    ) -> "StepTimes":
+        plain = loop.form == "plain"
+        times = time_grid(loop.steps, config.time_grid) if plain else np.array(loop.times, np.float32)
+        return cls(table, time_embedding(times, config.expert.width).to(device), asked)
+
+    def embedding(self, step: int) -> Tensor:
+        """float32[D], or by token [H, D], of a batch [B, H, D]."""
+        return self.embeddings[step if self.asked is None else self.asked.tokens.rows[step]]
+
+    def modulation(self, step: int) -> Tensor | None:
+        """float32[2 * layers + 1, 3, D], or by token [2 * layers + 1, 3, H, D]; of a batch B * H in the place of H."""
+        if self.table is None:
+            return None
+        if self.asked is None:
+            return self.table[step]
+        return self.table.permute(1, 2, 0, 3).index_select(2, self.asked.tokens.rows[step].flatten())

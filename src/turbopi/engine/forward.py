@@ -131,7 +131,7 @@ def expert_output(
 def expert_layers(
     config: ModelConfig, weights: Weights, ops: Ops, tokens: Tensor, table: Tensor | None, attend: Attend
 ) -> Stream:
-    """Suffix tokens [T, D] through all layers. What attention does with the product q|k|v is `attend`'s affair."""
+    """Suffix tokens [T, D] through all layers. `attend` applies RoPE, and knows where keys and values are."""
     eps = config.rms_norm_eps
     x, y, gate = tokens, None, None
     for i, layer in enumerate(weights.expert):

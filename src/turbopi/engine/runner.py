@@ -102,7 +102,7 @@ class GraphRunner:
         self._calls: dict[CallShape, StaticCall] = {}
         self._pictures: dict[tuple[int, bool], Pictures] = {}  # by cameras, and whether they are float
         self._graphs: dict[tuple[CallShape | Pictures, str], Graph] = {}
-        self._begun: Begun | None = None  # what may be finished
+        self._begun: object = None  # what may be finished
         self._pool: Any = None
         self._stream: torch.cuda.Stream | None = None  # that graphs are captured on
         self._warming = False
@@ -262,8 +262,7 @@ class GraphRunner:
         conditioning: Conditioning | None = None,
     ) -> tuple[StaticCall, Graph]:
         """Replay a part behind vision, "prefix" or the whole "answer"."""
-        if self._begun is not begun:
-            raise BackendError(f"{self.name} has finished this observation, or begun another one since")
+        self._check_turn(begun)
         cameras = begun.cameras
         self._check_tokens(cameras, len(tokens))
         loop = self._loop(conditioning, num_steps, len(noise))
@@ -274,6 +273,11 @@ class GraphRunner:
             graph.replay()
         self._begun = None
         return call, graph
+
+    def _check_turn(self, begun: object) -> None:
+        """Raise BackendError for what was finished, or whose pictures others have taken the place of."""
+        if self._begun is not begun:
+            raise BackendError(f"{self.name} has finished this observation, or begun another one since")
 
     @contextmanager
     def _explaining(self) -> Iterator[None]:
@@ -314,9 +318,9 @@ class GraphRunner:
             return self._capture(of.run, None)
         call = self._call(of)
         if part != "prefix" and call.denoiser is None:
-            call.denoiser = self._denoiser_of(of, call.table)
+            call.denoiser = self._denoiser_of(of, call.times.table)
         if part != "prefix" and of.loop.form == "jacobian" and call.keeper is None:
-            call.keeper = self._make_keeper(of, call.table)
+            call.keeper = self._make_keeper(of, call.times.table)
         run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
         return self._capture(run, None if part == "denoise" else self._graph(call.pictures, "vision"))
 

@@ -68,8 +68,8 @@ class GemmaLayer(Generic[AnyMatrix]):
 class Ops:
     """Any of them may be exchanged for another implementation; `origin` says whose they are, for metadata.
 
-    `residual_linear` is a product that only the `y` of a residual norm reads, and such a norm's result only products
-    read; what they hand over is a matter between them.
+    `residual_linear` may return parts of its product, [parts, T, D], that are still to be added up: only a residual
+    norm may read it, as `y`. A norm's second result may have the next product's numbers: only a product may read it.
     """
 
     transfer: Callable[[Tensor, Tensor], None]  # between the device and pinned memory of the host
@@ -97,10 +97,10 @@ class Ops:
 class BackwardOps:
     """The action expert with a way back, for guidance by the true Jacobian: see `kernels.backward` for the twins.
 
-    The first five are forward, with `Ops.residual_rms_norm` between them, and keep what the way back needs. What
-    `attention` gives only `out` reads, what `attention_vjp` gives only `qkv_vjp` reads: what they hand over is a matter
-    between them. Where a product is read by a norm or its way back alone, it may be float32 parts [parts, T, D] that
-    are to be added up.
+    The first five are forward, with `Ops.residual_rms_norm` between them, and keep what the way back needs. `attention`
+    and `attention_vjp` may return sums that are unfinished: only `out` may read the first result of one, only `qkv_vjp`
+    that of the other. A product that only a norm or its way back reads may be float32 parts [parts, T, D], still to be
+    added up.
     """
 
     qkv: Callable[..., Tensor]

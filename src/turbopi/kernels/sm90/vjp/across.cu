@@ -110,7 +110,7 @@ extern "C" __global__ void __launch_bounds__(THREADS, 2)
 
   const int first = warp * SLICE;
   const byte* mine = x + ((long long)min(g, tokens - 1) * inner + part * DEPTH + first + t * 8) * 2;
-  const int to_high = g + 8 < tokens ? inner * 16 : 0;  // of tokens that don't exist others, and nobody reads their sums
+  const int to_high = g + 8 < tokens ? inner * 16 : 0;  // a missing token reads another's row; its sums are never stored
   uint4 low[AT_ONCE], high[AT_ONCE];
 #pragma unroll
   for (int i = 0; i < AT_ONCE; ++i)
