@@ -1,0 +1,87 @@
+"""Workers that die, and simulators that give what no policy takes: each costs its own episode alone."""
+
+import multiprocessing
+from collections.abc import Sequence
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluate_fakes import NO_VIDEOS, SeekingPolicy, jobs_for, run
+
+from turbopi.errors import ObservationError
+from turbopi.evaluate.plan import Protocol
+from turbopi.evaluate.results import Episode, Results
+from turbopi.evaluate.run import evaluate, prepare
+from turbopi.evaluate.schedule import TooManyCrashes
+from turbopi.evaluate.sources import LocalPolicy
+from turbopi.sim import SimSettings, create
+
+
+@pytest.fixture(autouse=True)
+def _no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("turbopi.evaluate.report.write_plots", lambda results: [])
+
+
+def kill_workers() -> None:
+    for worker in multiprocessing.active_children():
+        worker.kill()
+        worker.join()
+
+
+def statuses(results: Results) -> list[str]:
+    return [episode.status for episode in results.in_order()]
+
+
+def test_a_worker_that_is_killed_while_its_request_waits_costs_its_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listened: list[Any] = []  # the connections that the schedule listens to
+    wait = connection.wait
+
+    def listening(to: list[Any], timeout: float | None = None) -> list[Any]:
+        listened[:] = to
+        return wait(to, timeout)
+
+    class Killing(SeekingPolicy):
+        """Its first call takes until the other two workers have asked, so that one of these waits in the second."""
+
+        def infer_batch(self, observations: Sequence[dict[str, Any]], seed: Sequence[int]) -> list[dict[str, Any]]:
+            if len(self.batches) == 0:
+                while len(wait(listened, 0.1)) < 2:
+                    pass
+            if len(self.batches) == 1:
+                kill_workers()
+            return super().infer_batch(observations, seed)
+
+    (tmp_path / "gather").mkdir()
+    monkeypatch.setenv("GATHER_FOLDER", str(tmp_path / "gather"))
+    monkeypatch.setenv("GATHER_COUNT", "3")
+    monkeypatch.setattr(connection, "wait", listening)
+    gathering = "evaluate_fakes:GatheringSimulator"
+    results = run(tmp_path / "run", Killing(), simulator=gathering, tasks=(0, 1, 2), states=(0, 1), workers=3)
+    assert sorted(statuses(results)) == ["crash"] * 3 + ["success"] * 3
+    assert all("exit code -9" in (e.message or "") for e in results.in_order() if e.status == "crash")
+    assert not results.complete
+
+
+def test_a_worker_that_dies_between_two_episodes_costs_the_next_one(tmp_path: Path) -> None:
+    source, made = LocalPolicy(SeekingPolicy()), create("reacher")
+    protocol = Protocol("reacher", made.suites[0], SimSettings(camera_px=64, wait_steps=2), image_px=64)
+    jobs = jobs_for(states=(0, 1, 2))
+    results = prepare(tmp_path, protocol, source, made, jobs, restart=False)
+
+    def kill_after_the_first(episode: Episode, results: Results) -> None:
+        if len(results.episodes) == 1:
+            kill_workers()
+
+    evaluate(
+        *(results, protocol, source, made, jobs),
+        num_workers=1,
+        max_batch=1,
+        videos=NO_VIDEOS,
+        on_episode=kill_after_the_first,
+    )
+    assert statuses(results) == ["success", "crash", "success"]
+    assert "exit code -9" in (results.in_order()[1].message or "")
