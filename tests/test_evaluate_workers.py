@@ -1,6 +1,7 @@
 """Workers that die, and simulators that give what no policy takes: each costs its own episode alone."""
 
 import multiprocessing
+import re
 from collections.abc import Sequence
 from multiprocessing import connection
 from pathlib import Path
@@ -10,13 +11,13 @@ import numpy as np
 import pytest
 from evaluate_fakes import NO_VIDEOS, SeekingPolicy, jobs_for, run
 
-from turbopi.errors import ObservationError
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.results import Episode, Results
 from turbopi.evaluate.run import evaluate, prepare
-from turbopi.evaluate.schedule import TooManyCrashes
 from turbopi.evaluate.sources import LocalPolicy
 from turbopi.sim import SimSettings, create
+from turbopi.sim.base import observation_problem
+from turbopi.sim.reacher import ReacherSimulator
 
 
 @pytest.fixture(autouse=True)
@@ -85,3 +86,47 @@ def test_a_worker_that_dies_between_two_episodes_costs_the_next_one(tmp_path: Pa
     )
     assert statuses(results) == ["success", "crash", "success"]
     assert "exit code -9" in (results.in_order()[1].message or "")
+
+
+@pytest.mark.parametrize("execution", ["sync", "real time"])
+def test_a_state_that_is_nan_is_its_episodes_crash_and_the_others_go_on(execution: str, tmp_path: Path) -> None:
+    own = {} if execution == "sync" else {"execution": "async", "control_hz": 200.0}
+    results = run(tmp_path, SeekingPolicy(), simulator="evaluate_fakes:ExplodingSimulator", states=(2, 3, 4), **own)
+    broken = results.episodes[0, 3]
+    assert [episode.status == "crash" for episode in results.in_order()] == [False, True, False]
+    assert (
+        (broken.message or "")
+        .strip()
+        .endswith("'observation/state' isn't finite: nan at [1]: the simulator has gone wrong")
+    )
+
+
+PICTURE = np.zeros((4, 4, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("observation", "why"),
+    [
+        (None, "a NoneType; it should be a dict"),
+        ({}, "no 'image'; it has nothing"),
+        ({"image": None}, "'image' is NoneType; a picture should be uint8"),
+        ({"image": PICTURE / 255}, "'image' is float64"),
+        ({"image": PICTURE[:0]}, r"'image' is uint8\[0, 4, 3\]"),
+        ({"image": PICTURE[..., :1]}, r"'image' is uint8\[4, 4, 1\]"),
+        ({"image": PICTURE[None]}, r"'image' is uint8\[1, 4, 4, 3\]"),
+        ({"image": PICTURE, "state": np.array([[0, np.inf]])}, r"'state' isn't finite: inf at \[0, 1\]"),
+        ({"image": PICTURE, "gripper": float("nan")}, "'gripper' isn't finite: nan"),
+    ],
+)
+def test_what_no_policy_can_be_sent_is_named(observation: Any, why: str) -> None:
+    assert re.search(why, observation_problem(observation, ("image",)) or "")
+
+
+def test_what_a_policy_can_be_sent_is_no_problem() -> None:
+    example = ReacherSimulator().example(SimSettings())
+    assert (
+        observation_problem(
+            {**example, "count": np.arange(3), "text": np.array(["a"])}, example.keys() & {"observation/image"}
+        )
+        is None
+    )

@@ -111,6 +111,32 @@ class Simulator(Protocol):
         """Of the libraries that decide what happens, and the renderer."""
 
 
+def observation_problem(observation: Any, image_keys: Sequence[str]) -> str | None:
+    """What of an observation no policy can be sent, whichever it is; None if nothing is wrong.
+
+    image_keys   where its pictures are, uint8[h, w, 3]
+    """
+    if not isinstance(observation, dict):
+        return f"the observation is a {type(observation).__name__}; it should be a dict of keys and values"
+    for key in image_keys:
+        if key not in observation:
+            return f"the observation has no {key!r}; it has {', '.join(map(str, observation)) or 'nothing'}"
+        picture = observation[key]
+        fits = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.size
+        if not fits or picture.ndim != 3 or picture.shape[2] != 3:
+            found = (
+                f"{picture.dtype}{list(picture.shape)}" if isinstance(picture, np.ndarray) else type(picture).__name__
+            )
+            return f"{key!r} is {found}; a picture should be uint8[h, w, 3]"
+    for key, value in observation.items():
+        numbers = np.atleast_1d(value) if isinstance(value, float | np.ndarray | np.floating) else np.zeros(0)
+        if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
+            first = np.argwhere(~np.isfinite(numbers))[0]
+            place = ", ".join(map(str, first))
+            return f"{key!r} isn't finite: {numbers[tuple(first)]} at [{place}]"
+    return None
+
+
 def full_suite_name(simulator: Simulator, suite: str) -> str:
     """`suite` as in `simulator.suites`: "spatial" for "libero_spatial" will do. Raises ConfigError if there is none."""
     for known in simulator.suites:
