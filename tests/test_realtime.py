@@ -324,7 +324,14 @@ def test_a_chunk_with_nan_is_refused_and_counted() -> None:
     assert all(np.isfinite(command.action).all() for command in loop.commands if command.action is not None)
 
 
-@pytest.mark.parametrize("result", [None, {}, [], {"actions": "no"}, {"actions": np.zeros((3, 1))}])
+class OnGpu:
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+
+@pytest.mark.parametrize(
+    "result", [None, {}, [], {"actions": "no"}, {"actions": np.zeros((3, 1))}, {"actions": OnGpu()}]
+)
 def test_an_answer_that_is_no_chunk_is_refused(result: Any) -> None:
     loop, policy = started("async", execution_horizon=4)
     loop.run(6, delay=0)

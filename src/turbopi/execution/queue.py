@@ -26,7 +26,7 @@ KEPT = 10_000  # seams and delays of one queue
 # Why a chunk was never carried out:
 #   late        "rtc_trained": more actions were carried out than it was told; it continues those that it was told
 #   used_up     all of its actions belong to the past
-#   not_finite  a number in it is NaN or infinite
+#   not_finite  a number in it is NaN, infinite or beyond float32
 #   jump        the command would move by more than `max_jump` in one step
 #   malformed   it isn't what a policy answers
 #   failed      the policy gave no chunk
@@ -277,7 +277,7 @@ class ChunkQueue:
         if self.horizon is None:
             self._learn(chunk)
         if not chunk.finite:
-            return self._drop("not_finite", "a number in it is NaN or infinite")
+            return self._drop("not_finite", "a number in it is NaN, infinite or beyond float32")
         if entry >= horizon:
             return self._drop("used_up", f"{entry} actions were carried out since its observation; it has {horizon}")
         previous = flight.request.previous
