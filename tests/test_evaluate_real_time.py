@@ -478,6 +478,7 @@ def test_a_protocol_in_real_time_has_no_simulated_delay_and_needs_a_robot_that_c
         ("--real-time --smooth-videos", "draws at every control step"),
         ("--control-hz 10", "--control-hz is the rate of --real-time"),
         ("--real-time --control-hz -1", "control_hz is -1.0; it should be above 0"),
+        ("--real-time --control-hz 0", "control_hz is 0.0; it should be above 0"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(options: str, why: str, tmp_path: Path) -> None:
