@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cli_helpers import refusal, turbopi
 from evaluate_fakes import NO_VIDEOS, SeekingPolicy, jobs_for, run
 
-from turbopi.evaluate.plan import Protocol
+from turbopi.errors import ConfigError
+from turbopi.evaluate.checks import check_fit
+from turbopi.evaluate.plan import Protocol, choose_tasks
 from turbopi.evaluate.results import Episode, Results
 from turbopi.evaluate.run import evaluate, prepare
 from turbopi.evaluate.sources import LocalPolicy
@@ -130,3 +133,47 @@ def test_what_a_policy_can_be_sent_is_no_problem() -> None:
         )
         is None
     )
+
+
+class Faulty(ReacherSimulator):
+    name = "faulty"
+
+    def check(self) -> list[str]:
+        return None  # type: ignore[return-value]
+
+    def tasks(self, suite: str) -> Any:
+        raise OSError("no such scene")
+
+    def versions(self) -> dict[str, str]:
+        raise RuntimeError("no version")
+
+    def example(self, settings: SimSettings) -> dict[str, Any]:
+        raise KeyError("camera")
+
+
+class Suiteless(ReacherSimulator):
+    suites = ()  # type: ignore[assignment]
+
+
+def test_what_a_simulator_of_ones_own_raises_is_no_fault_of_turbopi(tmp_path: Path) -> None:
+    faulty, source = Faulty(), LocalPolicy(SeekingPolicy())
+    protocol = Protocol("faulty", "reacher_colors", SimSettings())
+    told = turbopi("eval", "test_evaluate_workers:Faulty", "--random-weights", "pi05_tiny", "--out", tmp_path / "never")
+    assert "check() of the simulator faulty failed: TypeError" in refusal(told)
+    with pytest.raises(ConfigError, match=r"tasks\(\) of the simulator faulty failed: OSError: no such scene; --debug"):
+        choose_tasks(faulty, "reacher_colors", None)
+    with pytest.raises(ConfigError, match=r"versions\(\) of the simulator faulty failed: RuntimeError: no version"):
+        prepare(tmp_path / "never", protocol, source, faulty, [], restart=False)
+    with pytest.raises(ConfigError, match=r"example\(\) of the simulator faulty failed: KeyError: 'camera'"):
+        check_fit(source, faulty, protocol.sim, 64, 5)
+    with pytest.raises(ConfigError, match="'test_evaluate_workers:Suiteless' has no suites"):
+        create("test_evaluate_workers:Suiteless")
+
+
+def test_a_fault_of_a_built_in_simulator_stays_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(self: ReacherSimulator, suite: str) -> Any:
+        raise KeyError("ours")
+
+    monkeypatch.setattr(ReacherSimulator, "tasks", broken)
+    with pytest.raises(KeyError, match="ours"):
+        choose_tasks(create("reacher"), "reacher_colors", None)

@@ -161,11 +161,14 @@ class EvalOptions(PolicyOptions):
     def simulator(self, name: str, output: Output) -> "Simulator":
         """Checked, with its warnings printed."""
         from turbopi.sim import create
+        from turbopi.sim.base import faults_named
 
         if ":" in name:
             let_import_from_here()
         simulator = create(name)
-        for warning in simulator.check():
+        with faults_named(simulator, "check()"):
+            warnings = list(simulator.check())
+        for warning in warnings:
             output.line(f"warning: {warning}", "yellow")
         return simulator
 

@@ -10,6 +10,7 @@ import numpy as np
 from turbopi.errors import ConfigError
 from turbopi.execution import way_named
 from turbopi.sim import SimSettings, Simulator, Task
+from turbopi.sim.base import faults_named
 
 MAX_IMAGE_PX = 4096  # as of cameras
 MAX_CONTROL_HZ = 10_000
@@ -94,7 +95,8 @@ def noise_seed(seed: int, task: int, initial_state: int, step: int) -> int:
 
 def choose_tasks(simulator: Simulator, suite: str, wanted: Sequence[int] | None) -> list[Task]:
     """The tasks with these indices, or all. Raises ConfigError, listing what there is."""
-    tasks = {task.index: task for task in simulator.tasks(suite)}
+    with faults_named(simulator, "tasks()"):
+        tasks = {task.index: task for task in simulator.tasks(suite)}
     unknown = [index for index in wanted or () if index not in tasks]
     if unknown:
         names = "\n".join(f"  {task.index}: {task.instruction}" for task in tasks.values())

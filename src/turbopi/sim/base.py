@@ -3,7 +3,8 @@
 Modules of simulators are imported by worker processes, many at once: they import neither torch nor matplotlib.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Protocol
 
@@ -109,6 +110,19 @@ class Simulator(Protocol):
 
     def versions(self) -> dict[str, str]:
         """Of the libraries that decide what happens, and the renderer."""
+
+
+@contextmanager
+def faults_named(simulator: Simulator, part: str) -> Iterator[None]:
+    """What a simulator of the user's own raises in `part` becomes a ConfigError that names both."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, TurboPiError) or type(simulator).__module__.startswith("turbopi."):
+            raise
+        raise ConfigError(
+            f"{part} of the simulator {simulator.name} failed: {type(error).__name__}: {error}; --debug shows where"
+        ) from error
 
 
 def observation_problem(observation: Any, image_keys: Sequence[str]) -> str | None:
