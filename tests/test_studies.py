@@ -272,7 +272,11 @@ def test_what_a_study_could_not_use_is_refused_before_it_runs(
 ) -> None:
     ran: list[Setup] = []
     study = load("steps")
-    monkeypatch.setattr(steps, "STUDY", type(study)(study.name, study.question, study.claimed, ran.append))
+
+    def run(setup: Setup) -> Any:
+        ran.append(setup)
+
+    monkeypatch.setattr(steps, "STUDY", type(study)(study.name, study.question, study.claimed, run))
     result = turbopi("study", "steps", "--small", "--device", "cpu", *options)
     assert result.exit_code == 2 and why in " ".join(result.stderr.split())
     assert ran == []
