@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from turbopi.config import Schedule
+from turbopi.config import RealTime, Schedule
 from turbopi.errors import ConfigError
 from turbopi.execution.chunk import Chunk, checked_max_jump, mix, read_chunk, too_far
-from turbopi.execution.delays import DelayEstimate
+from turbopi.execution.delays import DelayEstimate, number_up_to
 from turbopi.execution.ways import Execution, way_named
 from turbopi.running_chunk import RunningChunk
 
@@ -149,10 +149,9 @@ class ChunkQueue:
         self._s = None if execution_horizon is None else _horizon(execution_horizon)
         self._trained_max = trained_max_delay
         self._max_jump = None if max_jump is None else checked_max_jump(max_jump)
-        if not 0 <= old_weight <= 1:
-            raise ConfigError(f"old_weight is {old_weight}; the running chunk's part of a mean lies between 0 and 1")
-        self._old_weight = old_weight
+        self._old_weight = number_up_to(1, "old_weight", old_weight)
         self._guidance: dict[str, Any] = {"schedule": schedule, "max_guidance_weight": max_guidance_weight}
+        RealTime(**{name: value for name, value in self._guidance.items() if value is not None})  # checks them
         self._policys_guidance = policys_guidance
         self._requests = 0
         self._running: Chunk | None = None
