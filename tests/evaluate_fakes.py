@@ -86,6 +86,21 @@ class _TroubledEnvironment(ReacherEnvironment):
             os._exit(11)
 
 
+class ExplodingSimulator(ReacherSimulator):
+    """The reacher, but from one initial state its physics explode."""
+
+    def open(self, suite: str, task: int, settings: SimSettings) -> ReacherEnvironment:
+        inner = super().open(suite, task, settings)
+        return _ExplodingEnvironment(inner.color, task, settings)
+
+
+class _ExplodingEnvironment(ReacherEnvironment):
+    def reset(self, initial_state: int) -> None:
+        super().reset(initial_state)
+        if initial_state == TroubledSimulator.RAISES:
+            self.position = np.array([self.position[0], np.nan])
+
+
 class BrokenSimulator(ReacherSimulator):
     """Can't do anything at all."""
 

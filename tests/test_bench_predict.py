@@ -190,6 +190,10 @@ def test_the_commands_document_holds_the_same_predictions() -> None:
         (["--predict", "gtx1080"], "no published numbers of a GPU 'gtx1080'"),
         (["--predict", ","], "--predict names no GPU"),
         (["--predict", "h100", "--ready", "--backends", "fused"], "leave out --backends, --ready"),
+        (
+            ["--predict", "h100", "--calls", "5", "--no-error", "--device", "cpu", "--seconds", "1"],
+            "leave out --device, --calls, --seconds, --no-error",
+        ),
         (["--predict", "h100", "--batch", "0"], "--batch has 0; expected whole numbers from 1 to 1024"),
     ],
 )

@@ -254,3 +254,14 @@ def test_the_real_time_demo_counts_what_it_played_and_says_it(tmp_path: Path) ->
 def test_episodes_of_libero_are_few(tmp_path: Path) -> None:
     result = turbopi("demo", "--episodes", 21, "--report", tmp_path)
     assert result.exit_code == 2 and "plays 20 at most" in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (("--episodes", "0"), "--real-time plays episodes, and --episodes is 0"),
+        (("--frames", "2"), "--frames is for pictures of LIBERO"),
+    ],
+)
+def test_the_real_time_demo_refuses_what_it_would_ignore(options: tuple[str, str], why: str, tmp_path: Path) -> None:
+    assert why in refusal(turbopi("demo", "--real-time", *options, "--report", tmp_path))

@@ -158,6 +158,7 @@ def test_compare_runs_each_way_with_the_same_noise(tmp_path: Path) -> None:
         (f"eval reacher {QUICK} --seeding never", "seeding is 'never'; choose episode or task"),
         (f"eval reacher {QUICK} --replan 11", "chunks have 10 actions, so it can't act 11 steps"),
         (f"eval reacher {QUICK} --replan 0", "replan is 0; it should be at least 1"),
+        (f"eval reacher {QUICK} --image-px 100000", "image_px is 100000; it should be 4096 at most"),
         ("eval reacher --port 9 --trials 1", "no policy server at ws://127.0.0.1:9"),
         ("eval reacher --port 9 --steps 1 --precision f32", "the server decides about --precision, --steps: start it"),
         ("compare nothere nothere2", "'nothere' is neither the folder of an evaluation nor a way to run"),

@@ -342,6 +342,25 @@ def test_a_policy_that_is_gone_ends_the_episode() -> None:
         setup.run(World(setup.clock))
 
 
+def test_an_episode_that_crashes_leaves_nothing_to_the_next_one() -> None:
+    setup = Setup("async", policy_s=0.12)
+
+    class Crashing(World):
+        def step(self, action: np.ndarray, look: bool) -> bool:
+            if len(self.actions) == 7:  # while the chunk of step 5's observation is computed
+                raise RuntimeError("the physics exploded")
+            return super().step(action, look)
+
+    with pytest.raises(RuntimeError, match="the physics exploded"):
+        setup.run(Crashing(setup.clock))
+    assert setup.clock.due == []  # no call is under way, whose answer would be taken for another's
+    setup.trouble = {0: EOFError("the policy's part of it")}
+    with pytest.raises(EOFError):
+        setup.run(World(setup.clock))
+    setup.trouble = {}
+    assert setup.run(World(setup.clock), steps=8).status == "failure"
+
+
 def test_a_solved_task_ends_the_episode() -> None:
     setup = Setup("async", policy_s=0.02)
     ending = setup.run(World(setup.clock, solved_at=7))
@@ -459,6 +478,7 @@ def test_a_protocol_in_real_time_has_no_simulated_delay_and_needs_a_robot_that_c
         ("--real-time --smooth-videos", "draws at every control step"),
         ("--control-hz 10", "--control-hz is the rate of --real-time"),
         ("--real-time --control-hz -1", "control_hz is -1.0; it should be above 0"),
+        ("--real-time --control-hz 0", "control_hz is 0.0; it should be above 0"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(options: str, why: str, tmp_path: Path) -> None:

@@ -209,6 +209,7 @@ def test_a_chunk_that_comes_after_its_last_action_is_dropped() -> None:
     [
         ({"actions": np.full((4, 1), np.nan)}, "not_finite", "NaN"),
         ({"actions": np.full((4, 1), np.inf)}, "not_finite", "NaN"),
+        ({"actions": np.full((4, 1), -1.7e308)}, "not_finite", "beyond float32"),
         ({}, "malformed", "NoneType"),
         ({"actions": "none"}, "malformed", "str"),
         ({"actions": np.zeros((0, 1))}, "malformed", "[0, 1]"),
@@ -243,6 +244,22 @@ def test_a_policy_that_gives_no_model_actions_is_told_so(name: str, model_action
         result["model_actions"] = model_actions
     assert queue.arrive(result) == "malformed"
     assert text in queue.last_problem
+
+
+@pytest.mark.parametrize(
+    ("anchor", "reason", "text"),
+    [
+        ("x", "malformed", '"anchor" isn\'t an array of numbers but str'),
+        ([[1.0], [2.0, 3.0]], "malformed", "but list"),
+        (np.array([0.0, np.nan]), "not_finite", "NaN"),
+    ],
+)
+def test_an_anchor_that_is_none_drops_the_chunk(anchor: Any, reason: str, text: str) -> None:
+    queue = ChunkQueue("rtc")
+    queue.observe()
+    result = {"actions": np.zeros((4, 1)), "model_actions": np.zeros((4, 2)), "anchor": anchor}
+    assert queue.arrive(result) == reason
+    assert text in queue.last_problem and queue.next_action() is None
 
 
 def test_ways_that_need_nothing_ask_nothing_of_the_policy() -> None:

@@ -355,7 +355,7 @@ def test_the_command_to_serve_parses_and_has_as_many_replicas() -> None:
     ("arguments", "said"),
     [
         ([], "give --gpu GPU, or --times FILE"),
-        (["--gpu", "h200", "--times", "x"], "give --gpu GPU, or --times FILE"),
+        (["--gpu", "h200", "--times", "x"], "--gpu h200 and --times x each name"),
         (["--times", "no/such/file.json"], "no/such/file.json"),
         (["--gpu", "orin"], "this GPU can't do it for a single robot"),
     ],

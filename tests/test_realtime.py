@@ -324,7 +324,14 @@ def test_a_chunk_with_nan_is_refused_and_counted() -> None:
     assert all(np.isfinite(command.action).all() for command in loop.commands if command.action is not None)
 
 
-@pytest.mark.parametrize("result", [None, {}, [], {"actions": "no"}, {"actions": np.zeros((3, 1))}])
+class OnGpu:
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+
+@pytest.mark.parametrize(
+    "result", [None, {}, [], {"actions": "no"}, {"actions": np.zeros((3, 1))}, {"actions": OnGpu()}]
+)
 def test_an_answer_that_is_no_chunk_is_refused(result: Any) -> None:
     loop, policy = started("async", execution_horizon=4)
     loop.run(6, delay=0)
@@ -548,6 +555,13 @@ def test_a_way_that_the_policy_does_not_offer_is_refused(execution: str) -> None
         ({"max_pause_s": 0}, "max_pause_s is 0"),
         ({"max_jump": -1}, "max_jump is -1"),
         ({"delay_percentile": 101}, "percentile is 101"),
+        ({"delay_percentile": "x"}, "percentile is 'x'; it should be a number from 0 to 100"),
+        ({"delay_window": 2.5}, "window is 2.5; it should be a whole number of delays, from 1"),
+        ({"old_weight": None}, "old_weight is None; it should be a number from 0 to 1"),
+        ({"schedule": "steep"}, "schedule is 'steep'; expected one of"),
+        ({"max_guidance_weight": float("nan")}, "max_guidance_weight is nan; expected 0 to 1e6"),
+        ({"infer_arguments": 5}, "infer_arguments is 5; it should be a mapping"),
+        ({"execution": ["rtc"]}, r"execution is \['rtc'\]; choose one of"),
         ({"policy": object()}, "object is no policy"),
     ],
 )

@@ -271,6 +271,29 @@ def test_the_bimodality_of_known_distributions() -> None:
     assert bimodality(np.where(rng.uniform(size=20_000) < 0.5, -1.0, 1.0)) > 0.98
 
 
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (("--policy", "mine=/nonexistent"), "--policy is 'mine=/nonexistent', but there is no folder /nonexistent"),
+        (("--policy", "mine=.", "--policy", "mine=/tmp"), "--policy mine was given twice, as . and /tmp"),
+        (("--out", __file__), f"can't write into {__file__}"),
+    ],
+)
+def test_what_a_study_could_not_use_is_refused_before_it_runs(
+    options: tuple[str, ...], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[Setup] = []
+    study = load("steps")
+
+    def run(setup: Setup) -> Any:
+        ran.append(setup)
+
+    monkeypatch.setattr(steps, "STUDY", type(study)(study.name, study.question, study.claimed, run))
+    result = turbopi("study", "steps", "--small", "--device", "cpu", *options)
+    assert result.exit_code == 2 and why in " ".join(result.stderr.split())
+    assert ran == []
+
+
 def test_a_study_of_checkpoints_says_what_it_lacks() -> None:
     with pytest.raises(Exception, match="the mask study needs weights"):
         load("mask").run(Setup())

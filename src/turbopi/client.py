@@ -11,7 +11,7 @@ openpi's own server, too, which offers none of the "rtc" ways.
 
 import contextlib
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import Any, NoReturn
 
@@ -94,10 +94,10 @@ class RealTimeClient:
             packed = pack(message(obs, previous, model_actions, seed))
             assert self._socket is not None
             try:
-                self._socket.send(packed)
-                reply = self._socket.recv(timeout=self._answer_s)
+                with self._dropped_on_error():  # a late answer must not be taken for the next call's
+                    self._socket.send(packed)
+                    reply = self._socket.recv(timeout=self._answer_s)
             except (OSError, TimeoutError, WebSocketException) as error:
-                self._drop()  # a late answer must not be taken for the next call's
                 raise ServerLost(
                     f"the policy server at {self.url} gave no answer within {self._answer_s:g} s"
                     if isinstance(error, TimeoutError)
@@ -144,25 +144,24 @@ class RealTimeClient:
     def _connect(self) -> dict[str, Any]:
         """Connect; the server's metadata."""
         try:
-            connecting = connect(
-                self.url,
-                additional_headers=self._headers,
-                compression=None,
-                max_size=MAX_BYTES,
-                open_timeout=self._connect_s,
-                close_timeout=1.0,  # a server that hangs says no goodbye
-                ping_interval=None,  # openpi's server answers no ping while it computes
-            )
-            self._socket = self._open.enter_context(connecting)
-            greeting = self._socket.recv(timeout=self._connect_s)
+            with self._dropped_on_error():
+                connecting = connect(
+                    self.url,
+                    additional_headers=self._headers,
+                    compression=None,
+                    max_size=MAX_BYTES,
+                    open_timeout=self._connect_s,
+                    close_timeout=1.0,  # a server that hangs says no goodbye
+                    ping_interval=None,  # openpi's server answers no ping while it computes
+                )
+                self._socket = self._open.enter_context(connecting)
+                return self._unpacked(self._socket.recv(timeout=self._connect_s))
         except (InvalidURI, ValueError) as error:
             raise ConfigError(f"{self.url} is no address of a server: {error}") from error
         except (OSError, TimeoutError, WebSocketException) as error:
-            self._drop()
             if isinstance(error, InvalidStatus) and error.response.status_code in (401, 403):
                 raise ConfigError(f"the policy server at {self.url} wants its API key: give api_key") from error
             raise ServerLost(f"no policy server at {self.url}: {_reason(error)}") from error
-        return self._unpacked(greeting)
 
     def _unpacked(self, data: str | bytes) -> dict[str, Any]:
         try:
@@ -174,6 +173,15 @@ class RealTimeClient:
         except WireError as error:
             raise ServerRefused(f"the server at {self.url} doesn't speak openpi's protocol: {error}") from error
         return unpacked
+
+    @contextlib.contextmanager
+    def _dropped_on_error(self) -> Iterator[None]:
+        """Drop the connection if anything interrupts what waits for the server: Ctrl-C, too."""
+        try:
+            yield
+        except BaseException:
+            self._drop()
+            raise
 
     def _drop(self) -> None:
         self._socket = None

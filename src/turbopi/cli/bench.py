@@ -37,6 +37,7 @@ _ONE = {"--cameras": "2", "--prompt-tokens": "48", "--horizons": "10", "--steps"
 _TABLE = _ONE | {"--cameras": "1,2,3", "--prompt-tokens": "48,200", "--horizons": "10,50", "--steps": "1,2,3,5,10"}
 
 
+CALLS, SECONDS = 100, 60.0  # unless given
 MOST_PIXELS = 8192  # of a camera's width or height
 _MOST = {
     "--cameras": len(CAMERAS),
@@ -190,7 +191,7 @@ def bench(
     calls: Annotated[
         int,
         typer.Option(metavar="N", min=1, max=MOST_CALLS, help="Calls of each measurement, after three for warm-up."),
-    ] = 100,
+    ] = CALLS,
     main_calls: Annotated[
         int | None,
         typer.Option(
@@ -202,7 +203,7 @@ def bench(
     ] = None,
     seconds: Annotated[
         float, typer.Option(metavar="S", min=0, help="A measurement ends after them, though not before 20 calls.")
-    ] = 60,
+    ] = SECONDS,
     error: Annotated[
         bool, typer.Option(help="Also the error against the float32 reference, for the main job's cameras and prompt.")
     ] = True,
@@ -238,7 +239,8 @@ def bench(
     if predict is not None:
         given = {"--backends": backends != "auto", "--beside": beside, "--precisions": precisions, "--join": join}
         given |= {"--image-size": image_size, "--main-calls": main_calls, "--ready": ready, "--profile": profile}
-        given |= {"--solver": solver, "--time-grid": time_grid}
+        given |= {"--solver": solver, "--time-grid": time_grid, "--tokenizer": tokenizer, "--device": device != "auto"}
+        given |= {"--calls": calls != CALLS, "--seconds": seconds != SECONDS, "--no-error": not error}
         given |= {"--quantization": quantization, "--robot": options.robot, "--report": report}
         numbers = {option: _axis(option, text, table) for option, text in axes.items()}
         ignored = [option for option, value in given.items() if value]

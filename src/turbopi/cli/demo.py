@@ -77,6 +77,10 @@ def demo(
     takes over when it is there, once it continues the running one. real_time.png, commands.png, real_time.json.
     """
     if real_time:
+        if episodes == 0:
+            raise ConfigError("--real-time plays episodes, and --episodes is 0: give 1 or more, or leave it out")
+        if frames is not None:
+            raise ConfigError("--frames is for pictures of LIBERO, which --real-time doesn't show: leave it out")
         from turbopi.cli.demo_real_time import show_real_time
 
         show_real_time(options, checkpoint, episodes, seed, report, Output(as_json))

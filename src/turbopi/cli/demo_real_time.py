@@ -43,7 +43,7 @@ def show_real_time(
     options.tell_if_random(opened, output)
     policy = options.make_policy(opened, output)
     policy.warmup()
-    source, count = LocalPolicy(policy), episodes or EPISODES
+    source, count = LocalPolicy(policy), EPISODES if episodes is None else episodes
     px = policy.config.model.vision.image_size
     cells = [(WAYS[0], 0), *((way, DELAY) for way in WAYS)]
     played = []

@@ -161,11 +161,14 @@ class EvalOptions(PolicyOptions):
     def simulator(self, name: str, output: Output) -> "Simulator":
         """Checked, with its warnings printed."""
         from turbopi.sim import create
+        from turbopi.sim.base import faults_named
 
         if ":" in name:
             let_import_from_here()
         simulator = create(name)
-        for warning in simulator.check():
+        with faults_named(simulator, "check()"):
+            warnings = list(simulator.check())
+        for warning in warnings:
             output.line(f"warning: {warning}", "yellow")
         return simulator
 
@@ -176,7 +179,8 @@ class EvalOptions(PolicyOptions):
 
         suite = simulator.suites[0] if self.suite is None else full_suite_name(simulator, self.suite)
         settings = SimSettings(self.seed, self.seeding, self.wait_steps, self.camera_px)  # type: ignore[arg-type]
-        hz = (self.control_hz or simulator.control_hz) if self.real_time else None
+        own = simulator.control_hz if self.control_hz is None else self.control_hz
+        hz = own if self.real_time else None
         return Protocol(name, suite, settings, self.replan, self.image_px, self.max_steps, control_hz=hz)
 
     def cells(self) -> "list[Cell]":
@@ -193,7 +197,8 @@ class EvalOptions(PolicyOptions):
         ways = [name.strip() for name in self.execution.split(",")]
         if self.real_time:
             return make_cells(ways, [None], horizons)
-        return make_cells(ways, parse_numbers("--delay-steps", self.delay_steps or "0"), horizons)
+        delays = [0] if self.delay_steps is None else parse_numbers("--delay-steps", self.delay_steps)
+        return make_cells(ways, delays, horizons)
 
     def of_delay(self) -> list[str]:
         """The options under "Under delay" that are given."""

@@ -67,7 +67,9 @@ def plan(
     from turbopi.bench.batch_table import published_table, table_of_file
     from turbopi.serve.sizing import Fleet, plan_fleet
 
-    if (gpu is None) == (times is None):
+    if gpu is not None and times is not None:
+        raise ConfigError(f"--gpu {gpu} and --times {times} each name the times of a policy: give one of them")
+    if gpu is None and times is None:
         raise ConfigError("give --gpu GPU, or --times FILE with what was measured on yours")
     fleet = Fleet(robots, hz, horizon, execution_horizon, delay_steps, overhead_ms)
     if times is not None:

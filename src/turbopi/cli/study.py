@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from turbopi.cli.files import check_folder
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
 from turbopi.config import LIMITS
@@ -128,14 +129,16 @@ def study(
     Ends with exit code 1 if a control failed: then the verdict means nothing.
     """
     output = Output(as_json)
-    chosen = which.split(",")
+    chosen = list(dict.fromkeys(which.split(",")))
     check_names(chosen)
+    if out is not None:
+        check_folder(out)
     studies = [load(name) for name in chosen]
     if not any(one.episodes for one in studies):
         _check_for_none(chosen, way, simulator)
     if episodes_only or report_only:
         _check_parts(studies, episodes_only, report_only, out)
-    policies = dict(_named(one) for one in policy or [])
+    policies = _policies(policy or [])
     from turbopi import backends
     from turbopi.cli.build import given_observations
     from turbopi.reading import plain_document
@@ -207,11 +210,19 @@ def _check_parts(studies: "list[Study]", episodes_only: bool, report_only: bool,
             raise ConfigError(f"{option} is for {_in_simulators()}; {one.name} keeps no episodes")
 
 
-def _named(given: str) -> tuple[str, Path]:
-    name, _, folder = given.partition("=")
-    if not name or not folder:
-        raise ConfigError(f"--policy is {given!r}; expected NAME=FOLDER, such as two_ways=work/two_ways/checkpoint")
-    return name, Path(folder)
+def _policies(given: list[str]) -> dict[str, Path]:
+    """Each NAME=FOLDER. Raises ConfigError now, not when a study comes to it."""
+    policies: dict[str, Path] = {}
+    for one in given:
+        name, _, folder = one.partition("=")
+        if not name or not folder:
+            raise ConfigError(f"--policy is {one!r}; expected NAME=FOLDER, such as two_ways=work/two_ways/checkpoint")
+        if name in policies:
+            raise ConfigError(f"--policy {name} was given twice, as {policies[name]} and {folder}: give it once")
+        if not Path(folder).is_dir():
+            raise ConfigError(f"--policy is {one!r}, but there is no folder {folder}")
+        policies[name] = Path(folder)
+    return policies
 
 
 def _show(report: "Report", output: Output) -> None:

@@ -6,6 +6,7 @@ from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
 from turbopi.execution import way_named
 from turbopi.reading import shown
 from turbopi.sim import SimSettings, Simulator
+from turbopi.sim.base import faults_named, observation_problem
 
 _FREE = "--execution sync, async and ensemble need nothing of the policy"
 
@@ -14,7 +15,11 @@ def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings,
     """Ask once, with an example. Raises ConfigError for a policy that can't act in this simulator."""
     from turbopi.preprocess.images import resize_with_pad
 
-    example = simulator.example(settings)
+    with faults_named(simulator, "example()"):
+        example = simulator.example(settings)
+    problem = observation_problem(example, simulator.image_keys)
+    if problem is not None:
+        raise ConfigError(f"the example of an observation that {simulator.name} gives can't be used: {problem}")
     example |= {key: resize_with_pad(example[key], image_px, image_px) for key in simulator.image_keys}
     robot = f"use one for the robot {simulator.robot}, such as config pi05_{simulator.robot}"
     try:

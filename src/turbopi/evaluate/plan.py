@@ -10,7 +10,9 @@ import numpy as np
 from turbopi.errors import ConfigError
 from turbopi.execution import way_named
 from turbopi.sim import SimSettings, Simulator, Task
+from turbopi.sim.base import faults_named
 
+MAX_IMAGE_PX = 4096  # as of cameras
 MAX_CONTROL_HZ = 10_000
 VideoChoice = Literal["sample", "all", "none"]
 
@@ -49,6 +51,8 @@ class Protocol:
         for name, value in (("replan", self.replan), ("image_px", self.image_px), ("max_steps", self.max_steps)):
             if value is not None and value < 1:
                 raise ConfigError(f"{name} is {value}; it should be at least 1")
+        if self.image_px > MAX_IMAGE_PX:
+            raise ConfigError(f"image_px is {self.image_px}; it should be {MAX_IMAGE_PX} at most")
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,8 @@ def noise_seed(seed: int, task: int, initial_state: int, step: int) -> int:
 
 def choose_tasks(simulator: Simulator, suite: str, wanted: Sequence[int] | None) -> list[Task]:
     """The tasks with these indices, or all. Raises ConfigError, listing what there is."""
-    tasks = {task.index: task for task in simulator.tasks(suite)}
+    with faults_named(simulator, "tasks()"):
+        tasks = {task.index: task for task in simulator.tasks(suite)}
     unknown = [index for index in wanted or () if index not in tasks]
     if unknown:
         names = "\n".join(f"  {task.index}: {task.instruction}" for task in tasks.values())

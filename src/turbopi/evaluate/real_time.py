@@ -96,25 +96,27 @@ class RealTimeLoop:
         commands, reel = Commands(), Reel(film, smooth=False)
         step, status, standing, seen = 0, "failure", 0, True
         self._pacer.begin()
-        while step < max_steps:
-            self._pacer.wait()
-            self._policy.check()
-            pictures = self._look(environment, step, reel, image_keys) if seen else []
-            command = self._executor.next_action()
-            if command.takes_over:
-                if len(commands.values) > standing:  # it takes over from another chunk
-                    commands.seams.append(step)
-                if pictures:
-                    reel.picture(step, pictures)
-            commands.values.append(self._values(command, commands, reel, first))
-            standing += command.kind != "fresh"
-            step += 1
-            seen = self._executor.wants_observation
-            if environment.step(commands.values[-1], look=seen):
-                status = "success"
-                break
-        seconds = self._pacer.seconds
-        self._inference.begin(lambda: None).result()  # the call that is under way, if there is one, has ended
+        try:
+            while step < max_steps:
+                self._pacer.wait()
+                self._policy.check()
+                pictures = self._look(environment, step, reel, image_keys) if seen else []
+                command = self._executor.next_action()
+                if command.takes_over:
+                    if len(commands.values) > standing:  # it takes over from another chunk
+                        commands.seams.append(step)
+                    if pictures:
+                        reel.picture(step, pictures)
+                commands.values.append(self._values(command, commands, reel, first))
+                standing += command.kind != "fresh"
+                step += 1
+                seen = self._executor.wants_observation
+                if environment.step(commands.values[-1], look=seen):
+                    status = "success"
+                    break
+            seconds = self._pacer.seconds
+        finally:  # also of an episode that crashes: an answer that comes later would be taken for the next one's
+            self._inference.begin(lambda: None).result()  # the call that is under way, if there is one, has ended
         self._policy.check()
         if film is not None:
             for number, chunk in self._policy.chunks.items():
@@ -176,12 +178,12 @@ class _Policy:
     def __init__(self, ask: Ask, offered: Mapping[str, Any], clock: Callable[[], float]) -> None:
         self.metadata = {"real_time": dict(offered)} if offered else {}
         self._ask, self._clock = ask, clock
-        self._lost: BaseException | None = None
         self.begin_episode(0)
 
     def begin_episode(self, number: int) -> None:
         """`number`: of the chunk that will be asked for next."""
         self._next = number
+        self._lost: BaseException | None = None
         self.latency_ms: list[float] = []
         self.chunks: dict[int, np.ndarray] = {}  # as they were answered
 

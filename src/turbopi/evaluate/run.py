@@ -24,6 +24,7 @@ from turbopi.files import alone_in
 from turbopi.provenance import provenance
 from turbopi.reading import plain_document
 from turbopi.sim import Simulator
+from turbopi.sim.base import faults_named
 
 # Is told of every episode as it ends, with the results so far
 OnEpisode = Callable[[Episode, Results], None]
@@ -47,7 +48,9 @@ def prepare(
         with _alone(folder):  # `evaluate` needs to be; who can't be should know before it is prepared
             pass
     policy = PolicyTold(source.label, source.identity, source.about)
-    versions = {"simulator": simulator.versions(), **plain_document(provenance(torch.device("cpu")))}
+    with faults_named(simulator, "versions()"):
+        own = simulator.versions()
+    versions = {"simulator": own, **plain_document(provenance(torch.device("cpu")))}
     results = Results(folder, protocol_json(protocol), policy, [job.task for job in jobs], versions, {})
     if restart:
         check_is_run(folder)

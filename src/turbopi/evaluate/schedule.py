@@ -176,6 +176,7 @@ class Scheduler:
         seconds = time.monotonic() - worker.started
         worker.kill()
         self._workers.remove(worker)
+        self._requests = [request for request in self._requests if request.worker is not worker]
         self._end(worker, "crash", 0, seconds, why)
         self._running.pop(worker)
         fresh = WorkerHandle(self._setup)

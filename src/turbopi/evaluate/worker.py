@@ -12,6 +12,7 @@ from turbopi.evaluate.frames import Frame
 from turbopi.evaluate.plan import Job
 from turbopi.evaluate.real_time import RealTimeLoop
 from turbopi.sim import Environment, SimSettings
+from turbopi.sim.base import observation_problem
 
 
 class Worker:
@@ -98,6 +99,9 @@ class Worker:
         return self.environment
 
     def _ask(self, step: int | None, observation: dict[str, object], arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        problem = observation_problem(observation, self.simulator.image_keys)
+        if problem is not None:
+            raise BadObservation(f"{problem}: the simulator has gone wrong")
         self.connection.send(("observation", step, observation, arguments))
         answer = self.connection.recv()
         if answer[0] == "stop":
@@ -106,6 +110,10 @@ class Worker:
             raise NoActions(answer[1])
         result: Mapping[str, Any] = answer[1]
         return result
+
+
+class BadObservation(Exception):
+    """The simulator gives what no policy can be sent."""
 
 
 class Stopped(Exception):

@@ -38,7 +38,8 @@ class WorkerHandle:
     def begin(self, job: Job) -> None:
         self.job, self.task = job, job.task.index
         self.started = self.heard = time.monotonic()
-        self.connection.send(("episode", job))
+        with contextlib.suppress(OSError):  # it died meanwhile; that is the next thing to `receive` from it
+            self.connection.send(("episode", job))
 
     def receive(self) -> tuple[Any, ...]:
         """The next message; ("died", exit code) if the process is gone."""

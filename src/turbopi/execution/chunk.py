@@ -7,17 +7,20 @@ import numpy as np
 
 from turbopi.errors import ConfigError
 
+_MOST = float(np.finfo(np.float32).max)
+
 
 class Chunk(NamedTuple):
     number: int  # of its request
     actions: np.ndarray  # float64[H, d], in the robot's units
     model_actions: np.ndarray | None  # float32[H, A]
-    anchor: np.ndarray | None
+    anchor: np.ndarray | None  # float64, of relative actions
 
     @property
     def finite(self) -> bool:
-        model_actions = self.model_actions
-        return bool(np.isfinite(self.actions).all() and (model_actions is None or np.isfinite(model_actions).all()))
+        """Whether every number is one, in float32, too: beyond it differences and means overflow."""
+        parts = (self.actions, self.model_actions, self.anchor)
+        return all(bool((np.abs(part) <= _MOST).all()) for part in parts if part is not None)
 
 
 def read_chunk(
@@ -43,8 +46,12 @@ def read_chunk(
     model_actions = numbers(result["model_actions"], np.float32)
     if model_actions is None or model_actions.ndim != 2 or len(model_actions) != len(actions):
         return f'"model_actions" isn\'t float32 [{len(actions)}, A] but {_shape(result["model_actions"])}'
-    anchor = result.get("anchor")
-    return Chunk(number, actions, model_actions, None if anchor is None else np.array(anchor))
+    anchor = None
+    if result.get("anchor") is not None:
+        anchor = numbers(result["anchor"], np.float64)
+        if anchor is None:
+            return f'"anchor" isn\'t an array of numbers but {_shape(result["anchor"])}'
+    return Chunk(number, actions, model_actions, anchor)
 
 
 def too_far(actions: np.ndarray, last: np.ndarray | None, most: np.ndarray) -> str | None:
@@ -78,7 +85,7 @@ def numbers(value: object, dtype: type[np.floating[Any]]) -> np.ndarray | None:
     """`value` as an array of its own, if it is numbers."""
     try:
         array = np.asarray(value)
-    except ValueError:  # lists of different lengths
+    except (ValueError, TypeError, RuntimeError, OverflowError):  # lists of different lengths, a tensor on a GPU
         return None
     with np.errstate(over="ignore"):  # an infinity is found later
         return array.astype(dtype) if array.dtype.kind in "fiu" else None

@@ -16,12 +16,10 @@ class DelayEstimate:
     """
 
     def __init__(self, initial: int = 0, *, percentile: float = 95.0, window: int = 50) -> None:
-        if not 0 <= percentile <= 100:
-            raise ConfigError(f"the delays' percentile is {percentile}; it should lie between 0 and 100")
-        if window < 1:
-            raise ConfigError(f"the delays' window is {window}; it should hold 1 delay or more")
-        self._measured: deque[int] = deque(maxlen=window)
-        self._percentile = percentile
+        if isinstance(window, bool) or not isinstance(window, int | np.integer) or window < 1:
+            raise ConfigError(f"the delays' window is {window!r}; it should be a whole number of delays, from 1")
+        self._measured: deque[int] = deque(maxlen=int(window))
+        self._percentile = number_up_to(100, "the delays' percentile", percentile)
         self._initial = _checked(initial)
 
     def begin(self, steps: int) -> None:
@@ -37,6 +35,14 @@ class DelayEstimate:
         if not self._measured:
             return self._initial
         return int(np.percentile(self._measured, self._percentile, method="higher"))
+
+
+def number_up_to(most: float, name: str, value: object) -> float:
+    """Raises ConfigError for what is no number from 0 to `most`."""
+    number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not number or not 0 <= value <= most:  # type: ignore[operator]
+        raise ConfigError(f"{name} is {value!r}; it should be a number from 0 to {most:g}")
+    return float(value)  # type: ignore[arg-type]
 
 
 def _checked(steps: int) -> int:

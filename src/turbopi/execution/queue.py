@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from turbopi.config import Schedule
+from turbopi.config import RealTime, Schedule
 from turbopi.errors import ConfigError
 from turbopi.execution.chunk import Chunk, checked_max_jump, mix, read_chunk, too_far
-from turbopi.execution.delays import DelayEstimate
+from turbopi.execution.delays import DelayEstimate, number_up_to
 from turbopi.execution.ways import Execution, way_named
 from turbopi.running_chunk import RunningChunk
 
@@ -26,7 +26,7 @@ KEPT = 10_000  # seams and delays of one queue
 # Why a chunk was never carried out:
 #   late        "rtc_trained": more actions were carried out than it was told; it continues those that it was told
 #   used_up     all of its actions belong to the past
-#   not_finite  a number in it is NaN or infinite
+#   not_finite  a number in it is NaN, infinite or beyond float32
 #   jump        the command would move by more than `max_jump` in one step
 #   malformed   it isn't what a policy answers
 #   failed      the policy gave no chunk
@@ -149,10 +149,9 @@ class ChunkQueue:
         self._s = None if execution_horizon is None else _horizon(execution_horizon)
         self._trained_max = trained_max_delay
         self._max_jump = None if max_jump is None else checked_max_jump(max_jump)
-        if not 0 <= old_weight <= 1:
-            raise ConfigError(f"old_weight is {old_weight}; the running chunk's part of a mean lies between 0 and 1")
-        self._old_weight = old_weight
+        self._old_weight = number_up_to(1, "old_weight", old_weight)
         self._guidance: dict[str, Any] = {"schedule": schedule, "max_guidance_weight": max_guidance_weight}
+        RealTime(**{name: value for name, value in self._guidance.items() if value is not None})  # checks them
         self._policys_guidance = policys_guidance
         self._requests = 0
         self._running: Chunk | None = None
@@ -277,7 +276,7 @@ class ChunkQueue:
         if self.horizon is None:
             self._learn(chunk)
         if not chunk.finite:
-            return self._drop("not_finite", "a number in it is NaN or infinite")
+            return self._drop("not_finite", "a number in it is NaN, infinite or beyond float32")
         if entry >= horizon:
             return self._drop("used_up", f"{entry} actions were carried out since its observation; it has {horizon}")
         previous = flight.request.previous

@@ -40,6 +40,6 @@ assert tuple(WAYS) == get_args(Execution)
 
 def way_named(name: str) -> Way:
     """Raises ConfigError for a name that isn't one."""
-    if name not in WAYS:
+    if not isinstance(name, str) or name not in WAYS:
         raise ConfigError(f"execution is {name!r}; choose one of {', '.join(WAYS)}")
     return WAYS[name]

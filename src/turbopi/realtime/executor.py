@@ -93,6 +93,8 @@ class RealTimeExecutor:
         self._policy = policy
         self._offered = check_policy(policy, self._way)
         self._server_joins = server_joins(self._offered) and self._way.mode is None
+        if infer_arguments is not None and not isinstance(infer_arguments, Mapping):
+            raise ConfigError(f"infer_arguments is {infer_arguments!r}; it should be a mapping, such as num_steps to 5")
         self._arguments = dict(infer_arguments or {})
         self._clock = clock
         self._delays = DelayEstimate(percentile=delay_percentile, window=delay_window)

@@ -34,5 +34,7 @@ def create(name: str) -> Simulator:
     missing = [part for part in _PARTS if not hasattr(made, part)]
     if missing:
         raise ConfigError(f"{name!r} is no simulator: it has no {', '.join(missing)}; see turbopi.sim.base.Simulator")
+    if not made.suites:
+        raise ConfigError(f"{name!r} has no suites: it should have the name of one suite of tasks or more")
     simulator: Simulator = made
     return simulator

@@ -3,7 +3,8 @@
 Modules of simulators are imported by worker processes, many at once: they import neither torch nor matplotlib.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Protocol
 
@@ -109,6 +110,45 @@ class Simulator(Protocol):
 
     def versions(self) -> dict[str, str]:
         """Of the libraries that decide what happens, and the renderer."""
+
+
+@contextmanager
+def faults_named(simulator: Simulator, part: str) -> Iterator[None]:
+    """What a simulator of the user's own raises in `part` becomes a ConfigError that names both."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, TurboPiError) or type(simulator).__module__.startswith("turbopi."):
+            raise
+        raise ConfigError(
+            f"{part} of the simulator {simulator.name} failed: {type(error).__name__}: {error}; --debug shows where"
+        ) from error
+
+
+def observation_problem(observation: Any, image_keys: Sequence[str]) -> str | None:
+    """What of an observation no policy can be sent, whichever it is; None if nothing is wrong.
+
+    image_keys   where its pictures are, uint8[h, w, 3]
+    """
+    if not isinstance(observation, dict):
+        return f"the observation is a {type(observation).__name__}; it should be a dict of keys and values"
+    for key in image_keys:
+        if key not in observation:
+            return f"the observation has no {key!r}; it has {', '.join(map(str, observation)) or 'nothing'}"
+        picture = observation[key]
+        fits = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.size
+        if not fits or picture.ndim != 3 or picture.shape[2] != 3:
+            found = (
+                f"{picture.dtype}{list(picture.shape)}" if isinstance(picture, np.ndarray) else type(picture).__name__
+            )
+            return f"{key!r} is {found}; a picture should be uint8[h, w, 3]"
+    for key, value in observation.items():
+        numbers = np.atleast_1d(value) if isinstance(value, float | np.ndarray | np.floating) else np.zeros(0)
+        if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
+            first = np.argwhere(~np.isfinite(numbers))[0]
+            place = ", ".join(map(str, first))
+            return f"{key!r} isn't finite: {numbers[tuple(first)]} at [{place}]"
+    return None
 
 
 def full_suite_name(simulator: Simulator, suite: str) -> str:
