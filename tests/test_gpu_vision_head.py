@@ -30,9 +30,7 @@ def test_vision_in_two_graphs_gives_what_it_gives_in_one(precision: Precision, m
     if precision == "fp8":
         quantization = Quantization.load(CALIBRATION)
         checkpoint.__dict__["_fingerprint"] = quantization.fingerprint  # to hash all weights takes a minute
-    policy = UnifiedPolicy(
-        checkpoint, backend="fused", precision=precision, device="cuda:0", quantization=quantization
-    )  # fmt: skip
+    policy = UnifiedPolicy(checkpoint, backend="fused", precision=precision, device="cuda:0", quantization=quantization)
     runner: Any = policy.backend
     pictures = list(np.random.default_rng(0).integers(0, 256, (2, 224, 224, 3), dtype=np.uint8))
     found = []
