@@ -143,6 +143,24 @@ def joins(document: BenchDocument) -> list[str]:
     return _table(["", "a chunk is", "whole call, ms", "× plain", "denoise", "error"], rows, numbers_from=2)
 
 
+def batches(document: BenchDocument) -> list[str]:
+    """`fused`: several observations in one call (`turbopi bench --batch`), by horizon."""
+    rows = []
+    for horizon in sorted({one.job.horizon for one in document.results}):
+        for size in sorted({one.job.batch for one in document.results}):
+            row = [str(horizon), str(size)]
+            for precision in ("bf16", "fp8"):
+                found = _result(document, "fused", precision, horizon=horizon, batch=size)
+                if found is None:
+                    row += ["", "", ""]
+                    continue
+                rate = 1000 * size / found.milliseconds["total"].p50
+                row += [_ms(found), f"{rate:.0f}", f"{found.times_floor:.1f}"]
+            rows.append(row)
+    head = ["H", "observations", "bf16: ms", "a second", "× floor", "FP8: ms", "a second", "× floor"]
+    return _table(head, rows, numbers_from=0)
+
+
 def lines_over_steps(document: BenchDocument) -> list[str]:
     """What a denoising step adds to a call: two cameras and the main job's prompt."""
     main = document.main_job
@@ -324,7 +342,7 @@ def _read_marks(file: Path) -> list[MarkedVariant]:
 
 
 _OF_BENCHMARKS = (
-    *(headline, main_job, whole_calls, image_sizes, lines_over_steps, joins),
+    *(headline, main_job, whole_calls, image_sizes, lines_over_steps, joins, batches),
     *(errors, ready, kernels, machine),
 )
 TABLES = {
