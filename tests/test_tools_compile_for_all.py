@@ -106,4 +106,4 @@ def test_what_may_spill_is_what_does(kernel: str, number: int) -> None:
 
 
 def test_what_is_not_named_may_not_spill() -> None:
-    assert allowed("attention.vision", 90) == allowed("batch.suffix", 80) == 0
+    assert allowed("attention.vision", 90) == allowed("batch.packed", 80) == 0
