@@ -53,7 +53,6 @@ def machine(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Iterator[Callable[
 
     monkeypatch.setattr(fused, "compile_cubin", compile_cubin)
     monkeypatch.setattr(fused, "DependentKernel", kernel)
-    monkeypatch.setattr(fused, "result_dtype", lambda x, inverse: torch.bfloat16 if inverse is None else E4M3)
     monkeypatch.setattr(instructions, "wgmma", emulate.wgmma)
     monkeypatch.setattr(instructions, "tensor_map", emulate.tensor_map)
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())

@@ -46,7 +46,7 @@ __device__ __forceinline__ u64 core_operand(u32 address, int along, int down) {
 __device__ __forceinline__ void arrive_consumers(int barrier, int threads) {
     asm volatile("bar.arrive %0, %1;" ::"r"(barrier), "r"(threads) : "memory");
 }
-__device__ __forceinline__ void show_to_async() { asm volatile("fence.proxy.async;" ::: "memory"); }
+__device__ __forceinline__ void show_to_async() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
 // `bytes` of this CTA's shared memory into that of one of the cluster, whose barrier counts them
 __device__ __forceinline__ void copy_to_cta(u32 to, u32 from, u32 bytes, u32 bar) {
     asm volatile("cp.async.bulk.shared::cluster.shared::cta.mbarrier::complete_tx::bytes [%0], [%1], %2, [%3];"

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
-from turbopi.kernels.dependent_launch import result_dtype
 from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.sm90 import instructions
@@ -122,7 +121,7 @@ def projected_attention(
     assert a.dtype == matrix.dtype == (E4M3 if fp8 else torch.bfloat16) and a.is_contiguous() and matrix.is_contiguous()
     assert (bias is not None) == fp8 and (bias is None or bias.dtype == torch.bfloat16)
     assert exchange.flags.shape[0] >= images * heads
-    out = torch.empty(rows, width, dtype=result_dtype(torch.empty(0, dtype=torch.bfloat16, device=a.device), inverse), device=a.device)
+    out = torch.empty(rows, width, dtype=torch.bfloat16 if inverse is None else E4M3, device=a.device)
     kernel = _kernel(cut, fp8, inverse is not None, sums.count, a.device)
     blocks = CTAS * images * heads
     share = 0 if ahead is None else ahead.numel() * ahead.element_size() // blocks // 16 * 16
