@@ -100,10 +100,10 @@ inline std::vector<Thread> threads;
 inline Thread* now;
 inline ucontext_t scheduler;
 inline Dim grid;
-inline int cta_threads, cluster, clusters_at_once = 1, ranks;  // ranks: blocks that run at once
+inline int cta_threads, ranks;
 inline std::vector<std::unique_ptr<char[]>> memory;  // of each rank
 inline std::map<unsigned, MBarrier> mbarriers;
-inline std::map<int, Barrier> barriers;  // by rank and number; a cluster's: below 0
+inline std::map<int, Barrier> barriers;  // by rank and number; cluster's: -1
 inline std::vector<Warp> warps;
 inline std::vector<Copy> copies;
 inline std::mt19937 random;
@@ -113,10 +113,6 @@ inline std::function<void()> kernel;
 
 inline char* at(unsigned address) { return memory.at(address >> PLACE).get() + (address & ((1u << PLACE) - 1)); }
 inline char* shared() { return memory[now->rank].get(); }
-inline int first_of_cluster() { return now->rank / cluster * cluster; }
-inline unsigned in_cluster(unsigned address, int rank) {  // an address of this block as one of the cluster's has it
-    return (address & ((1u << PLACE) - 1)) | (first_of_cluster() + rank) << PLACE;
-}
 inline void wait_until(const std::function<bool()>& over) {
     do swapcontext(&now->context, &scheduler);  // also who needn't wait lets others go first
     while (!over());
@@ -233,18 +229,7 @@ inline std::string row_of(const Thread* warpgroup, int row, int next) {
     return bytes;
 }
 inline Thread* warpgroup() { return now - now->index.x % 128; }
-// 8 numbers of 16 bits of an operand's column that lies across its rows of 16 bytes (PTX: MN-major, not swizzled): bits 16
-// to 29 say how far the next 8 rows are, 32 to 45 how far the next 8 columns.
-inline std::string column_of(uint64_t operand, int column, int next) {
-    auto units = [&](int from) { return unsigned(operand >> from & 0x3fff) * 16; };
-    if (operand >> 62) throw std::runtime_error("an operand across that is swizzled");
-    std::string bytes;
-    for (int row = 0; row < 8; ++row)
-        bytes.append(at((units(0) + column / 8 * units(32) + next * units(16) + row * 16 + column % 8 * 2) |
-                        now->rank << PLACE), 2);
-    return bytes;
-}
-template <int COLUMNS, bool FP8, bool ACROSS>
+template <int COLUMNS, bool FP8>
 void multiply(const Thread& thread, const Pending& p) {
     const int warp = thread.index.x / 32 % 4, lane = thread.index.x % 32;
     for (int i = 0; i < COLUMNS / 2; ++i) {
@@ -253,8 +238,7 @@ void multiply(const Thread& thread, const Pending& p) {
         for (int next = 0; next < 2; ++next) {
             const std::string held = p.a.in_registers ? row_of(warpgroup(), row, next) : "";
             const char* const a = p.a.in_registers ? held.data() : row_of(p.a.place, row, next);
-            const std::string gathered = ACROSS ? column_of(p.b, column, next) : "";
-            const char* const b = ACROSS ? gathered.data() : row_of(p.b, column, next);
+            const char* const b = row_of(p.b, column, next);
             for (int k = 0; k < (FP8 ? 16 : 8); ++k) sum += number(a, k, FP8) * number(b, k, FP8);
         }
         p.sums[i] = sum;
@@ -268,9 +252,9 @@ inline void finish(int groups) {  // of this warpgroup, whose threads have all c
     }
     for (Thread* t = first; t < first + 128; ++t) t->done = max(t->done, groups);
 }
-template <int COLUMNS, bool FP8, bool ACROSS>
+template <int COLUMNS, bool FP8>
 void product(float* sums, OperandA a, uint64_t b, bool keep) {
-    now->pending.push_back({sums, a, b, keep, now->committed, multiply<COLUMNS, FP8, ACROSS>});
+    now->pending.push_back({sums, a, b, keep, now->committed, multiply<COLUMNS, FP8>});
 }
 inline void await(int left) {
     const int groups = now->committed - left;
@@ -301,7 +285,7 @@ inline void run_thread() {
     now->ended = true, ++moved;
     swapcontext(&now->context, &scheduler);
 }
-inline void run_blocks(int first) {
+inline void run_cluster(int first) {
     memory.clear(), mbarriers.clear(), barriers.clear(), copies.clear(), fault.clear();
     for (int rank = 0; rank < ranks; ++rank) {
         memory.emplace_back(new char[SHARED]);
@@ -407,7 +391,7 @@ inline void ptx_mbarrier_init(unsigned bar, unsigned count) { machine::mbarriers
 inline void ptx_mbarrier_expect(unsigned bar, unsigned bytes) { machine::arrive(bar, bytes); }
 inline void ptx_mbarrier_arrive(unsigned bar, int times = 1) { machine::arrive(bar, 0, times); }
 inline void ptx_mbarrier_arrive_remote(unsigned bar, unsigned cta) {
-    machine::arrive(machine::in_cluster(bar, cta));
+    machine::arrive((bar & ((1u << machine::PLACE) - 1)) | cta << machine::PLACE);
 }
 inline void ptx_mbarrier_wait(unsigned bar, unsigned parity) {
     machine::wait_until([&] { return machine::barrier(bar).phase != parity; });
@@ -416,16 +400,10 @@ inline void ptx_mbarrier_test(unsigned& over, unsigned bar, unsigned parity) {
     swapcontext(&machine::now->context, &machine::scheduler);
     over = machine::barrier(bar).phase != parity;
 }
-inline void ptx_cluster_sync() {
-    machine::meet(machine::barriers[-1 - machine::first_of_cluster()], machine::cluster * machine::cta_threads);
-}
+inline void ptx_cluster_sync() { machine::meet(machine::barriers[-1], machine::ranks * machine::cta_threads); }
 inline void ptx_bar_sync(int number, int count) { machine::meet(machine::barriers[machine::now->rank * 16 + number], count); }
-inline void ptx_bar_arrive(int number, int count) {
-    machine::Barrier& b = machine::barriers[machine::now->rank * 16 + number];
-    if (++b.arrived == count) b.arrived = 0, ++b.uses, ++machine::moved;
-}
 inline void ptx_mapa(unsigned& there, unsigned address, int rank) {
-    there = machine::in_cluster(address, rank);
+    there = (address & ((1u << machine::PLACE) - 1)) | rank << machine::PLACE;
 }
 template <typename Number>
 void st_async(unsigned to, const std::vector<Number>& all, unsigned bar) {
@@ -436,8 +414,6 @@ inline void ptx_st_async(unsigned to, float x, float y, float z, float w, unsign
 inline void ptx_st_async(unsigned to, unsigned x, unsigned y, unsigned bar) { st_async<unsigned>(to, {x, y}, bar); }
 inline void ptx_st_async(unsigned to, unsigned x, unsigned bar) { st_async<unsigned>(to, {x}, bar); }
 inline void ptx_rcp(float& y, float x) { y = 1 / x; }
-inline void ptx_ex2(float& y, float x) { y = std::exp2(x); }
-inline void ptx_trap() { throw std::runtime_error("trap"); }
 inline void ptx_tanh(float& y, float x) { y = std::tanh(x); }
 inline void ptx_wgmma_commit() { machine::commit(); }
 inline void ptx_wgmma_wait(int left) { machine::await(left); }
@@ -537,19 +513,10 @@ inline void ptx_copy_bytes(unsigned to, const void* from, unsigned bytes, unsign
     c.to = to, c.bar = bar, c.bytes.assign((const char*)from, bytes);
     machine::copies.push_back(c);
 }
-inline void ptx_copy_bytes(unsigned to, const void* from, unsigned bytes, unsigned bar) {
-    ptx_copy_bytes(to, from, bytes, bar, 0);
-}
-inline void ptx_copy_to_cta(unsigned to, unsigned from, unsigned bytes, unsigned bar) {
-    ptx_copy_bytes(to, machine::at(from), bytes, bar, 0);
-}
-inline void ptx_copy_out(void* to, unsigned from, unsigned bytes) { memcpy(to, machine::at(from), bytes); }
-inline unsigned atomicAdd(unsigned* to, unsigned what) { return ++machine::moved, *to += what, *to - what; }
-inline unsigned atomicExch(unsigned* to, unsigned what) { return ++machine::moved, std::swap(*to, what), what; }
 template <typename Map>
 void ptx_copy_2d(unsigned to, const Map* map, int x, int y, unsigned bar, unsigned mask = 0) {
     machine::Copy c;
     memcpy(&c.map, map, sizeof c.map);
-    c.to = to, c.bar = bar, c.at[0] = x, c.at[1] = y, c.at[2] = 0, c.mask = mask ? mask << machine::first_of_cluster() : 1u << machine::now->rank;
+    c.to = to, c.bar = bar, c.at[0] = x, c.at[1] = y, c.at[2] = 0, c.mask = mask ? mask : 1u << machine::now->rank;
     machine::copies.push_back(c);
 }

@@ -59,22 +59,6 @@ __device__ __forceinline__ void send(u32 to, float4 v, u32 bar) {
 __device__ __forceinline__ u64 operand(u32 address) {
     return ((u64)(address & 0x3ffff) >> 4) | (1ull << 16) | (64ull << 32) | (1ull << 62);
 }
-// Its lower half, which counts in 16 bytes.
-__device__ __forceinline__ u32 lower_half(u32 address) { return (u32)operand(address); }
-__device__ __forceinline__ u64 operand_of(u32 lower) { return lower | (operand(0) & 0xffffffff00000000ull); }
-// A block of a matrix, into the CTAs of `mask`, at the same place in each
-template <bool MULTICAST>
-__device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int row, u32 bar, u32 mask) {
-    if (MULTICAST)
-        asm volatile(
-            "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster"
-            " [%0], [%1, {%2, %3}], [%4], %5;"
-            ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar), "h"((u16)mask) : "memory");
-    else
-        asm volatile(
-            "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3}], [%4];"
-            ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar) : "memory");
-}
 
 // Values that the compiler is to make here, and once: else it makes addresses anew for each load, after a wait.
 template <typename T>

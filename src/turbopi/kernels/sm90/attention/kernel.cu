@@ -16,15 +16,25 @@
 //
 // A CTA has 64 rows of q, a producer warp and TP_WGS consumer warpgroups, which take tiles of TP_KEYS keys in turn: one
 // multiplies while another weighs. In the end each gets the others' sums of a share of the columns.
+//
+// Numbers are kept as wgmma leaves them: a lane holds columns 2 (lane % 4) and the next one of each block of 8, in rows
+// lane / 4 and lane / 4 + 8 of its warp's 16.
 
 constexpr int WGS = TP_WGS, KEYS = TP_KEYS, STAGES = TP_STAGES, DIM = TP_DIM, SHARING = TP_SHARING;
-constexpr bool WHOLE = TP_WHOLE, PACKED = TP_PACKED;
+constexpr bool OUT_FP8 = TP_OUT_FP8, WHOLE = TP_WHOLE, PACKED = TP_PACKED;
+#if TP_OUT_FP8
+typedef unsigned char Element;
+#else
+typedef u16 Element;
+#endif
 constexpr int PANELS = (DIM + 63) / 64;  // of 64 columns, 128 bytes: as much as a swizzle spans
 constexpr int ROW_BYTES = 128, Q_PANEL = 64 * ROW_BYTES, KEY_PANEL = KEYS * ROW_BYTES;
 constexpr int Q_BYTES = PANELS * Q_PANEL, STAGE_BYTES = PANELS * KEY_PANEL;
-constexpr int BLOCKS = DIM / 8, DEPTH = (DIM + 15) / 16, THREADS = 128 * WGS;
+constexpr int BLOCKS = DIM / 8, FOURS = (BLOCKS + 3) / 4, DEPTH = (DIM + 15) / 16, THREADS = 128 * WGS;
 static_assert(STAGES >= 2 * WGS, "a warpgroup would wait for a slot that it holds");
 constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : 232, PRODUCER_REGISTERS = 40;
+// which warpgroup ends up with a block of 8 columns; blocks go in fours, as that many leave together
+__device__ constexpr int owner(int block) { return block / 4 * WGS / FOURS; }
 
 // Generated: mma_logits(float (&)[KEYS / 2], u64, u64, int keep), mma_values(float (&)[DIM / 2], u32 * 4, u64, int keep),
 // and the kernel's parameters.
@@ -46,6 +56,20 @@ __device__ __forceinline__ void load_into_all(u32 to, const TensorMap* map, int 
 __device__ __forceinline__ u64 operand_across(u32 address) {
     return ((u64)(address & 0x3ffff) >> 4) | ((u64)(KEY_PANEL >> 4) << 16) | (64ull << 32) | (1ull << 62);
 }
+__device__ __forceinline__ float power_of_two(float x) {
+    float y;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+}
+__device__ __forceinline__ float largest_of_quad(float x) {
+    x = fmaxf(x, __shfl_xor_sync(~0u, x, 1));
+    return fmaxf(x, __shfl_xor_sync(~0u, x, 2));
+}
+
+__device__ __forceinline__ void sync_consumers(int barrier, int threads) {
+    asm volatile("bar.sync %0, %1;" ::"r"(barrier), "r"(threads) : "memory");
+}
+
 extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), 1)
 attention(ATTENTION_PARAMETERS) {
     extern __shared__ char raw[];
@@ -148,7 +172,26 @@ attention(ATTENTION_PARAMETERS) {
                     if (i / 4 * 8 + lane % 4 * 2 + i % 2 >= left) logits[i] = none;
             }
             float shrink[2];
-            weigh_rows(logits, scale, top, total, shrink, weights);
+#pragma unroll
+            for (int half = 0; half < 2; ++half) {
+                float best = top[half];
+#pragma unroll
+                for (int i = 0; i < KEYS / 2; ++i)
+                    if (i / 2 % 2 == half) best = fmaxf(best, logits[i]);
+                best = largest_of_quad(best);
+                shrink[half] = power_of_two((top[half] - best) * scale);
+                top[half] = best;
+                total[half] *= shrink[half];
+            }
+#pragma unroll
+            for (int i = 0; i < KEYS / 2; i += 2) {
+                const int half = i / 2 % 2;
+                const float offset = top[half] * scale;
+                const float x = power_of_two(fmaf(logits[i], scale, -offset));
+                const float y = power_of_two(fmaf(logits[i + 1], scale, -offset));
+                total[half] += x + y;
+                weights[i / 2] = pack(x, y);
+            }
             if (!WHOLE) {
 #pragma unroll
                 for (int i = 0; i < DIM / 2; ++i) sums[i] *= shrink[i / 2 % 2];
@@ -195,15 +238,79 @@ attention(ATTENTION_PARAMETERS) {
         for (int half = 0; half < 2; ++half) total[half] = sum_of_quad(total[half]);
 
 #if TP_WGS == 2
-        static_assert(2 * RECEIVED<BLOCKS> <= Q_BYTES + STAGES * STAGE_BYTES, "no room for the other's sums");
-        join_rows(sums, top, total, scale, raw + (base - shared_address(raw)), warpgroup, own);
+        // the other's sums of this warpgroup's columns, by block and thread; behind them its tops and totals
+        constexpr int MOST = (FOURS + 1) / 2 * 4 * 2048, SHARE = MOST + 2048;
+        static_assert(2 * SHARE <= Q_BYTES + STAGES * STAGE_BYTES, "no room for the other's sums");
+        char* const shared = raw + (base - shared_address(raw));
+        sync_consumers(1, THREADS);  // nobody reads tiles any more
+#pragma unroll
+        for (int to = 0; to < 2; ++to) {
+            if (to == warpgroup) continue;
+            float4* const there = (float4*)(shared + to * SHARE) + own;
+            int count = 0;
+#pragma unroll
+            for (int j = 0; j < BLOCKS; ++j)
+                if (owner(j) == to)
+                    there[128 * count++] = make_float4(sums[4 * j], sums[4 * j + 1], sums[4 * j + 2], sums[4 * j + 3]);
+            there[MOST / 16] = make_float4(top[0], top[1], total[0], total[1]);
+        }
+        sync_consumers(1, THREADS);
+        const float4* const received = (const float4*)(shared + warpgroup * SHARE) + own;
+        const float4 other = received[MOST / 16];
+        float mine[2], theirs[2];
+#pragma unroll
+        for (int half = 0; half < 2; ++half) {  // 2^-inf is 0: who had no keys counts for nothing
+            const float other_top = half ? other.y : other.x, best = fmaxf(top[half], other_top);
+            mine[half] = power_of_two((top[half] - best) * scale);
+            theirs[half] = power_of_two((other_top - best) * scale);
+            total[half] = total[half] * mine[half] + (half ? other.w : other.z) * theirs[half];
+        }
+#pragma unroll
+        for (int who = 0; who < 2; ++who) {
+            if (who != warpgroup) continue;
+            int count = 0;
+#pragma unroll
+            for (int j = 0; j < BLOCKS; ++j) {
+                if (owner(j) != who) continue;
+                const float4 x = received[128 * count++];
+                sums[4 * j] = sums[4 * j] * mine[0] + x.x * theirs[0];
+                sums[4 * j + 1] = sums[4 * j + 1] * mine[0] + x.y * theirs[0];
+                sums[4 * j + 2] = sums[4 * j + 2] * mine[1] + x.z * theirs[1];
+                sums[4 * j + 3] = sums[4 * j + 3] * mine[1] + x.w * theirs[1];
+            }
+        }
 #endif
 
-        const int first_row = row + warp * 16 + lane / 4;
-        store_rows(
-            sums, total, inverse, WGS, warpgroup, lane,
-            [&](int half) { return out + ((size_t)(group * rows + first_row + half * 8) * heads + head) * DIM; },
-            [&](int half) { return first_row + half * 8 < end_of_rows; });
+#pragma unroll
+        for (int half = 0; half < 2; ++half) {
+            const int at = row + warp * 16 + lane / 4 + half * 8;
+            Element* const to = out + ((size_t)(group * rows + at) * heads + head) * DIM;
+            const float factor = (OUT_FP8 ? inverse : 1.0f) / total[half];
+            auto value = [&](int j) -> u32 {
+                const float x = sums[4 * j + 2 * half] * factor, y = sums[4 * j + 2 * half + 1] * factor;
+                return OUT_FP8 ? pack_e4m3(x, y) : pack(x, y);
+            };
+#pragma unroll
+            for (int j = 0; j + 3 < BLOCKS; j += 4) {
+                if (owner(j) != warpgroup) continue;
+                const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
+                if (at < end_of_rows) {
+                    Element* const here = to + (j + lane % 4) * 8;
+                    if (OUT_FP8) *(uint2*)here = make_uint2(v.x | v.y << 16, v.z | v.w << 16);
+                    else *(uint4*)here = v;
+                }
+            }
+#pragma unroll
+            for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
+                if (owner(j) != warpgroup) continue;
+                const u32 v = value(j);
+                if (at < end_of_rows) {
+                    Element* const here = to + j * 8 + lane % 4 * 2;
+                    if (OUT_FP8) *(u16*)here = (u16)v;
+                    else *(u32*)here = v;
+                }
+            }
+        }
     }
     if (SHARING > 1) cluster_sync();  // what this CTA loads for the others may still be on its way
 }

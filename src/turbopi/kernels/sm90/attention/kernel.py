@@ -182,9 +182,7 @@ def source(tile: AttentionTile) -> str:
     logits = instructions.wgmma("mma_logits", tile.keys)
     values = instructions.wgmma("mma_values", tile.dim, from_registers=True, across=True)
     parameters = f"#define ATTENTION_PARAMETERS {PARAMETERS.declarations}"
-    return instructions.source(
-        "attention/rows.cu", "attention/kernel.cu", generated=f"{logits}\n{values}\n{parameters}\n"
-    )
+    return instructions.source("attention/kernel.cu", generated=f"{logits}\n{values}\n{parameters}\n")
 
 
 @cache

@@ -58,6 +58,19 @@ constexpr bool BIASED = !FP8 && !TP_NORMED && (EPILOGUE == 1 || EPILOGUE == 2 ||
 constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
 constexpr int PRODUCER_REGISTERS = WGS == 1 ? 40 : WGS == 2 ? 40 : 24;
 
+// into the CTAs of `mask`, at the same place in each
+template <bool MULTICAST>
+__device__ __forceinline__ void load(u32 to, const TensorMap* map, int k, int row, u32 bar, u32 mask) {
+    if (MULTICAST)
+        asm volatile(
+            "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster"
+            " [%0], [%1, {%2, %3}], [%4], %5;"
+            ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar), "h"((u16)mask) : "memory");
+    else
+        asm volatile(
+            "cp.async.bulk.tensor.2d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3}], [%4];"
+            ::"r"(to), "l"(map), "r"(k), "r"(row), "r"(bar) : "memory");
+}
 // Generated: mma(float (&sums)[BN / 2], u64 a, u64 b, int keep), and the kernel's parameters.
 
 __device__ __forceinline__ float tanh_of_gelu(float x) {  // off by 2^-11 at most: less than rounding is
@@ -67,6 +80,10 @@ __device__ __forceinline__ float tanh_of_gelu(float x) {  // off by 2^-11 at mos
 }
 __device__ __forceinline__ float gelu(float x) { return fmaf(0.5f * x, tanh_of_gelu(x), 0.5f * x); }
 __device__ __forceinline__ float twice_gelu(float x) { return fmaf(x, tanh_of_gelu(x), x); }
+// The descriptor of instructions.cu's `operand`, of its lower half, which counts in 16 bytes.
+__device__ __forceinline__ u32 lower_half(u32 address) { return (u32)operand(address); }
+__device__ __forceinline__ u64 operand_of(u32 lower) { return lower | (operand(0) & 0xffffffff00000000ull); }
+
 __device__ __forceinline__ float wide(u16 x) { return __uint_as_float((u32)x << 16); }
 __device__ __forceinline__ float wide(float x) { return x; }
 // A tile's scales and biases by column of `w`. Each thread of a warpgroup fetches some of them long before they are
