@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from turbopi.bench.document import Result, read_benchmark
 from turbopi.bench.gpus import find_gpu, published_gpus
 from turbopi.bench.measured import measured_calls
-from turbopi.bench.predict import PRECISIONS, STAGES, predict, predicted_call, published_floors, runs_on
+from turbopi.bench.predict import MOST_TOKENS, PRECISIONS, STAGES, predict, predicted_call, published_floors, runs_on
 from turbopi.bench.work import Job, stage_work
 from turbopi.config import ModelConfig, preset
 from turbopi.errors import ConfigError
@@ -66,6 +66,26 @@ def test_on_the_measured_gpu_and_job_the_prediction_is_the_measurement() -> None
         call = predicted_call(find_gpu(one.gpu), FULL, one.job, one)
         took = one.milliseconds["total"].p50
         assert call.low_ms == pytest.approx(took) and call.high_ms == pytest.approx(took)
+
+
+def test_chunks_beyond_the_denoising_kernel_may_take_longer_in_proportion() -> None:
+    pytest.importorskip("triton", reason="Triton isn't installed")
+    from turbopi.kernels.portable.denoise import kernel as portable
+    from turbopi.kernels.sm90.denoise import kernel as hopper
+
+    assert MOST_TOKENS == {"hopper": hopper.MAX_SUFFIX, "portable": portable.MAX_SUFFIX}
+    wanted = Job(horizon=50)
+    (measured,) = (
+        one
+        for one in measured_calls()
+        if (one.gpu, one.kernels, one.precision, one.job) == ("h200", "hopper", "bf16", wanted)
+    )
+    took = {name: times.p50 for name, times in measured.milliseconds.items()}
+    longest, longer = (
+        predicted_call(find_gpu("h200"), FULL, replace(wanted, horizon=horizon), measured) for horizon in (56, 100)
+    )
+    assert longest.high_ms == pytest.approx(took["total"], rel=0.01)
+    assert longer.high_ms == pytest.approx(took["total"] + took["denoise"] * 44 / 56, rel=0.01)
 
 
 def test_where_a_gpu_was_measured_itself_no_other_ones_calls_are_taken() -> None:
