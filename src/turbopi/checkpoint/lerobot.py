@@ -7,7 +7,6 @@ the processors' steps may be in lerobot_pipeline.py.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -95,7 +94,7 @@ class LeRobotFolder:
                 time_grid="accumulated" if summed else "multiplied",
             ),
             robot="lerobot",
-            normalization=Normalization("identity", "identity"),  # until the next line
+            normalization=self.normalization,
             robot_options=self._robot_options(),
             discrete_state_input=self.kind == "pi05",
             image_resize="lerobot_0.4" if old else "lerobot",
@@ -106,8 +105,6 @@ class LeRobotFolder:
             ),
             real_time=self._real_time(),
         )
-        if "normalization" not in settings.values:
-            described = replace(described, normalization=self._normalization())
         config = with_values(described, settings)
         if config.robot == described.robot:
             self._check_actions(config.normalization)
@@ -215,9 +212,11 @@ class LeRobotFolder:
 
     # -- scaling -------------------------------------------------------------------------------------------------------
 
-    def _normalization(self) -> Normalization:
-        """The processors' modes; config.json must agree."""
-        return Normalization(
+    @property
+    def normalization(self) -> Normalization:
+        """A turbopi.json's, or the processors' modes: CheckpointError unless config.json agrees with them."""
+        chosen: Normalization | None = self.settings.values.get("normalization")
+        return chosen or Normalization(
             self._mode(PREPROCESSOR, NORMALIZER, "STATE"), self._mode(POSTPROCESSOR, UNNORMALIZER, "ACTION")
         )
 

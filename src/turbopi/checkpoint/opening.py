@@ -1,10 +1,10 @@
 """Opening a checkpoint: find it, read its description, check its tensors, and settle its configuration."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from turbopi.checkpoint.base import Checkpoint, describe_weights
+from turbopi.checkpoint.base import Checkpoint, describe_weights, norm_stats_info
 from turbopi.checkpoint.lerobot import LeRobotFolder
 from turbopi.checkpoint.locate import Location, locate, recorded_config, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
@@ -73,26 +73,35 @@ def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[
         return open_checkpoint(path, config).info()
     except ConfigError as error:
         location = locate(path)
-        source = open_weights(location, _base_only(config, location))
+        settings = _without_policy(config, location)
+        source = open_weights(location, settings)
         return {
             **describe_weights(source),
             "path": str(location.folder),
             "random_weights": False,
             "kind": detect_kind(source, location.weights),
             "assets": asset_ids(location.assets),
+            **(_lerobot_statistics(location, settings) if location.format == "lerobot" else {}),
             **recorded_config(location),
             "tokenizers": [str(file) for file in tokenizer_candidates(location.folder)],
             "config_error": str(error),
         }
 
 
-def _base_only(config: ConfigSource, location: Location) -> Settings:
-    """Of `config`, what an adapter can't be read without."""
+def _without_policy(config: ConfigSource, location: Location) -> Settings:
+    """Of `config`, what weights and statistics are read by: an adapter's base, and LeRobot's modes if it has others."""
     try:
-        values = read_settings(config, location.folder).values if location.adapter else {}
+        values = read_settings(config, location.folder).values
     except ConfigError:
         values = {}
-    return Settings("none", values={key: values[key] for key in ("base_model",) if key in values})
+    needed = {"base_model": location.adapter, "normalization": location.format == "lerobot"}
+    return Settings("none", values={key: values[key] for key in needed if needed[key] and key in values})
+
+
+def _lerobot_statistics(location: Location, settings: Settings) -> dict[str, Any]:
+    """As `Checkpoint.info` has them. LeRobot keeps them in the processors' files, not below assets/."""
+    folder = LeRobotFolder(location.folder, settings)
+    return {"normalization": asdict(folder.normalization), "norm_stats": norm_stats_info(folder.stats)}
 
 
 def open_weights(location: Location, settings: Settings) -> WeightSource:
