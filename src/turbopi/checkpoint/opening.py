@@ -6,17 +6,17 @@ from typing import Any
 
 from turbopi.checkpoint.base import Checkpoint, describe_weights, norm_stats_info
 from turbopi.checkpoint.lerobot import LeRobotFolder
-from turbopi.checkpoint.locate import Location, locate, recorded_config, tokenizer_candidates
+from turbopi.checkpoint.locate import Location, Recorded, locate, recorded_config, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import PeftSource, base_model
 from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
-from turbopi.checkpoint.sizes import detect_kind, model_sizes
+from turbopi.checkpoint.sizes import VARIANTS, detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
 from turbopi.checkpoint.torch_files import TorchSource
-from turbopi.config import PolicyConfig
+from turbopi.config import ModelConfig, PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
 from turbopi.model.reference import parameter_shapes
 
@@ -40,16 +40,12 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
     policy = policy_config(
         settings,
         kind,
-        horizon=recorded.get("action_horizon"),
+        horizon=recorded.numbers.get("action_horizon"),
         assets=asset_ids(location.assets),
         where=location.folder,
     )
     policy = _with_sizes(policy, source, settings, location)
-    if recorded.get("action_dim", policy.model.action_dim) != policy.model.action_dim:
-        raise CheckpointError(
-            f"{location.folder}: config.json has action_dim {recorded['action_dim']}, but the weights have "
-            f"{policy.model.action_dim}; one of the files belongs to another checkpoint"
-        )
+    _check_recorded(recorded, policy.model, location.folder)
     stats, asset_id = find_norm_stats(location.assets, policy.asset_id, policy.normalization)
     return Checkpoint(
         path=location.folder,
@@ -61,6 +57,23 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
         expected_sha256=settings.weights_sha256,
         tokenizer_candidates=tuple(tokenizer_candidates(location.folder)),
     )
+
+
+def _check_recorded(recorded: Recorded, model: ModelConfig, folder: Path) -> None:
+    """CheckpointError if openpi's config.json is about other weights. A size's name that openpi hasn't is a fork's."""
+    other = "one of the files belongs to another checkpoint"
+    if (dim := recorded.numbers.get("action_dim", model.action_dim)) != model.action_dim:
+        raise CheckpointError(
+            f"{folder}: config.json has action_dim {dim}, but the weights have {model.action_dim}; {other}"
+        )
+    for key, ours in (("paligemma_variant", model.vlm), ("action_expert_variant", model.expert)):
+        name = recorded.variants.get(key, "")
+        known = VARIANTS.get(name.removesuffix("_lora"), ours)
+        if known != ours:
+            raise CheckpointError(
+                f"{folder}: config.json has {key} {name}, which is {known.width} wide with {known.depth} layers and an "
+                f"MLP of {known.mlp_dim}, but the weights have {ours.width}, {ours.depth} and {ours.mlp_dim}; {other}"
+            )
 
 
 def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[str, Any]:
@@ -82,7 +95,7 @@ def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[
             "kind": detect_kind(source, location.weights),
             "assets": asset_ids(location.assets),
             **(_lerobot_statistics(location, settings) if location.format == "lerobot" else {}),
-            **recorded_config(location),
+            **recorded_config(location).numbers,
             "tokenizers": [str(file) for file in tokenizer_candidates(location.folder)],
             "config_error": str(error),
         }
