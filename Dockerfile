@@ -23,8 +23,10 @@ RUN case "$DEVICE" in \
       cpu) pip install $CPU_TORCH ;; \
       *) echo "DEVICE is '$DEVICE'; expected cuda or cpu" >&2; exit 1 ;; \
     esac
+# of pyproject.toml's extras, with commas between them: ray for fleets, view, …
+ARG EXTRAS=""
 COPY src ./src
-RUN pip install . \
+RUN pip install ".${EXTRAS:+[$EXTRAS]}" \
     && ln -s "$(python -c 'from turbopi.shipped import SMALL_POLICY; print(SMALL_POLICY)')" /small_policy \
     && useradd --create-home --uid 1000 robot \
     && install --directory --owner robot /home/robot/.cache

@@ -10,7 +10,7 @@ from checkpoint_helpers import GOLDEN, LIBERO, jax_copy, read_tree, torch_copy, 
 
 from turbopi.checkpoint import open_checkpoint
 from turbopi.checkpoint.settings import parse_values
-from turbopi.config import PRESETS, GemmaConfig, ModelConfig, Normalization, VisionConfig
+from turbopi.config import PRESETS, GemmaConfig, ModelConfig, Normalization, RealTime, VisionConfig
 from turbopi.errors import CheckpointError, ConfigError
 
 PI05, PI0 = GOLDEN / "pi05" / "jax", GOLDEN / "pi0" / "jax"
@@ -211,6 +211,63 @@ def test_a_config_json_of_another_checkpoint_is_refused(tmp_path: Path) -> None:
     write_json(folder / "config.json", {"action_horizon": "10"})
     with pytest.raises(CheckpointError, match="action_horizon is '10'; expected a whole number"):
         open_checkpoint(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"precision": "fp64"}, "precision is 'fp64'; expected one of bfloat16, float32, float16"),
+        ({"precision": 16}, "precision is 16; expected one of"),
+        ({"paligemma_variant": 2}, "paligemma_variant is 2; expected a text"),
+        ({"action_expert_variant": " "}, "action_expert_variant is ' '; expected a text"),
+        (
+            {"paligemma_variant": "gemma_2b"},
+            "paligemma_variant gemma_2b, which is 2048 wide with 18 layers",
+        ),
+        ({"action_expert_variant": "gemma_300m_lora"}, "gemma_300m_lora, which is 1024 wide .* another checkpoint"),
+    ],
+)
+def test_a_config_json_that_no_converter_writes_beside_these_weights_is_refused(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    folder = torch_copy(tmp_path / "c")
+    recorded = json.loads((folder / "config.json").read_text())
+    write_json(folder / "config.json", recorded | change)
+    with pytest.raises(CheckpointError, match=message):
+        open_checkpoint(folder)
+
+
+def test_a_config_json_may_name_a_forks_sizes_and_leave_things_out(tmp_path: Path) -> None:
+    folder = torch_copy(tmp_path / "c")
+    for content in ({"paligemma_variant": "gemma_2b_of_mine", "precision": None}, {"precision": "float16"}, {}):
+        write_json(folder / "config.json", content)
+        assert open_checkpoint(folder).config.model.action_horizon == 10
+
+
+@pytest.mark.parametrize(
+    ("real_time", "horizon", "message"),
+    [
+        ({"execution_horizon": 17}, 16, "execution_horizon = 17, but a chunk has 16 actions; expected at most 16"),
+        ({"trained_max_delay": 16}, 16, "trained_max_delay = 16, but a chunk has 16 actions; expected at most 15"),
+        ({"execution_horizon": 16, "trained_max_delay": 15}, 16, None),
+    ],
+)
+def test_real_time_options_fit_the_chunk(
+    tmp_path: Path, real_time: dict[str, Any], horizon: int, message: str | None
+) -> None:
+    """A joined call would cut them in silence."""
+    folder = torch_copy(tmp_path / "c")
+    settings = {"preset": "pi05_libero", "vision_heads": 4, "action_horizon": horizon, "real_time": real_time}
+    write_json(folder / "turbopi.json", settings)
+    own = PRESETS["pi05_libero"].with_model(action_horizon=horizon)
+    own = dataclasses.replace(own, real_time=RealTime(**real_time))
+    if message is None:
+        assert open_checkpoint(folder).config.real_time == RealTime(15, 16)
+        return
+    with pytest.raises(ConfigError, match=f"turbopi.json: real_time has {message}"):
+        open_checkpoint(folder)
+    with pytest.raises(ConfigError, match=f"PolicyConfig pi05_libero: real_time has {message}"):
+        open_checkpoint(folder, own)
 
 
 def test_one_of_several_assets_must_be_chosen(tmp_path: Path) -> None:

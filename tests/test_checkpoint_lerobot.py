@@ -10,7 +10,7 @@ from checkpoint_helpers import GOLDEN, edit_json, edit_tensors, lerobot_copy, le
 from safetensors.torch import load_file
 
 from turbopi.checkpoint import inspect_checkpoint, open_checkpoint
-from turbopi.config import PRESETS, GemmaConfig, Normalization, VisionConfig
+from turbopi.config import PRESETS, GemmaConfig, Normalization, RealTime, VisionConfig
 from turbopi.errors import CheckpointError, ConfigError, ObservationError
 from turbopi.robots import create_robot
 
@@ -111,6 +111,19 @@ def test_turbopi_json_puts_single_differences_over_the_description(tmp_path: Pat
     assert config.model.time_grid == "multiplied"
 
 
+def test_lerobots_mask_ends_where_it_did_in_a_chunk_of_another_length(tmp_path: Path) -> None:
+    """And of the delays that training simulated, those count that leave an action to compute."""
+    folder = lerobot_copy(
+        tmp_path / "c", rtc_config={"enabled": True, "execution_horizon": 3}, rtc_training_max_delay=6
+    )
+    for horizon, expected in ((12, RealTime(6, 9, "linear", 10.0)), (5, RealTime(4, 2, "linear", 10.0))):
+        write_json(folder / "turbopi.json", {"action_horizon": horizon})
+        assert open_checkpoint(folder).config.real_time == expected
+    write_json(folder / "turbopi.json", {"action_horizon": 5, "real_time": {"trained_max_delay": 6}})
+    with pytest.raises(ConfigError, match="trained_max_delay = 6, but a chunk has 5 actions; expected at most 4"):
+        open_checkpoint(folder)
+
+
 def test_a_preset_does_not_fit_a_lerobot_folder(tmp_path: Path) -> None:
     folder = lerobot_copy(tmp_path / "c")
     with pytest.raises(ConfigError, match='describes itself, so preset pi05_libero doesn\'t fit: use config="auto"'):
@@ -126,6 +139,9 @@ def test_a_preset_does_not_fit_a_lerobot_folder(tmp_path: Path) -> None:
         ({"type": ["pi0"]}, r"of type \['pi0'\]"),
         ({"image_resolution": [448, 448]}, r"image_resolution = \[448, 448\], which Turbo-Pi doesn't compute"),
         ({"min_period": 0.001}, "min_period = 0.001"),
+        ({"dtype": "float8"}, "dtype is 'float8'; expected one of bfloat16, float32"),
+        ({"paligemma_variant": "gemma_9b"}, "paligemma_variant is 'gemma_9b'; expected one of gemma_300m, gemma_2b"),
+        ({"action_expert_variant": 300}, "action_expert_variant is 300; expected one of gemma_300m, gemma_2b"),
         ({"max_period": 8.0}, "max_period = 8.0"),
         ({"chunk_size": None}, "chunk_size is None; expected a whole number from 1"),
         ({"chunk_size": "50"}, "chunk_size is '50'; expected a whole number"),

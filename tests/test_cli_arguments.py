@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from cli_helpers import turbopi
 
+from turbopi.cli.files import check_folder
+from turbopi.errors import ConfigError
+
 TINY = ("--random-weights", "pi05_tiny")
 PLAN = ("plan", "--hz", "50", "--horizon", "50")
 NOWHERE = ("--observations", "there/is/no/such/recording")  # refused late: what is refused first is another thing
@@ -121,11 +124,27 @@ def test_a_file_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytes
 def test_a_folder_that_may_not_be_written_is_refused_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def refused(*arguments: Any) -> None:
+        raise PermissionError(13, "Permission denied")
+
     real = os.access
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK and real(path, mode))
+    monkeypatch.setattr(os, "mkdir", refused)
     assert "isn't writable" in one_line("calibrate", *TINY, "--out", tmp_path / "fp8.json")
-    assert "isn't writable" in one_line("serve", *TINY, "--port", 0, "--record", tmp_path)
-    assert "isn't writable" in one_line("demo", *TINY, "--report", tmp_path)
+    assert f"{tmp_path} isn't writable (Permission" in one_line("serve", *TINY, "--port", 0, "--record", tmp_path)
+    assert f"{tmp_path} isn't writable (Permission" in one_line("demo", *TINY, "--report", tmp_path / "a" / "b")
+
+
+def test_a_folder_is_tried_and_not_only_asked_about(tmp_path: Path) -> None:
+    """Permissions let root write into /proc, where nothing can be made; a name may be too long for the disk."""
+    for name in ("/proc/x", "/proc", tmp_path / ("x" * 300)):
+        with pytest.raises(ConfigError, match=f"can't write into {name}: .* isn't writable"):
+            check_folder(Path(name))
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "kept").touch()
+    check_folder(tmp_path / "new" / "below")
+    check_folder(tmp_path / "there")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["kept", "there"]
 
 
 @pytest.mark.parametrize("option", ["--config", "--robot", "--tokenizer", "--quantization", "--noise"])

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from checkpoint_helpers import GOLDEN
 from cli_helpers import refusal, text_of, turbopi
+from lerobot_golden import GOLDEN as GOLDEN_LEROBOT
+from lerobot_golden import GoldenCase
 
 from turbopi.checkpoint import open_checkpoint, random_checkpoint
 from turbopi.shipped import FRAMES, load_frames
@@ -27,7 +29,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     result = turbopi("convert", "--random-weights", "pi05_tiny", folder, "--weights-seed", 4)
     assert result.exit_code == 0, result.output
     assert "RANDOM WEIGHTS (pi05_tiny, seed 4): the actions mean nothing." in result.stdout
-    assert f"random -> {folder}: 0.012 GB in bf16" in result.stdout
+    assert f"random -> {folder}: 11.66 MB in bf16" in result.stdout
     return folder
 
 
@@ -46,7 +48,7 @@ def test_inspect_shows_what_the_folder_holds(tiny: Path) -> None:
         "of the state quantile; 8 dimensions of mean, std, q01, q99",
         "of the actions quantile; 7 dimensions",
         "sizes: vlm width 192, mlp dim 512, depth 6, num heads 8, num kv heads 1, head dim 32",
-        "weights 235 tensors, 0.011 GB, stored as BF16",
+        "weights 235 tensors, 11.34 MB, stored as BF16",
         "vision tower (SigLIP) 1,298,048",
         "total 5,672,480",
     ):
@@ -75,6 +77,39 @@ def test_inspect_without_a_configuration_shows_the_rest_and_the_choices() -> Non
     assert "not known yet: " in result.stdout
     assert "suggest pi05_libero" in result.stdout
     assert "443,232" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("case", "state", "actions"),
+    [
+        (
+            "mean_std",
+            "lerobot_zscore; 8 dimensions of mean, std, q01",
+            "lerobot_zscore; 7 dimensions of mean, std",
+        ),
+        ("min_max_identity", "lerobot_min_max; 8 dimensions of mean, std", "identity; 7 dimensions of mean, std"),
+    ],
+)
+def test_inspect_shows_lerobots_statistics_before_the_vision_heads_are_known(
+    case: str, state: str, actions: str, tmp_path: Path
+) -> None:
+    folder = GoldenCase(GOLDEN_LEROBOT / case).assemble(tmp_path)
+    known = text_of(turbopi("inspect", folder).stdout)
+    (folder / "turbopi.json").unlink()
+    result = turbopi("inspect", folder)
+    assert result.exit_code == 0, result.output
+    shown = text_of(result.stdout)
+    assert "not known yet: " in shown and "vision_heads" in shown
+    for fact in ("statistics in the checkpoint's own files", f"of the state {state}", f"of the actions {actions}"):
+        assert fact in shown, fact
+        assert fact in known, fact
+    assert "91 tensors, 271.4 kB" in shown
+
+
+def test_inspect_takes_the_normalization_of_a_turbopi_json_that_lacks_the_vision_heads(tmp_path: Path) -> None:
+    folder = GoldenCase(GOLDEN_LEROBOT / "mean_std").assemble(tmp_path)
+    (folder / "turbopi.json").write_text(json.dumps({"normalization": "identity"}))
+    assert "of the state identity; " in text_of(turbopi("inspect", folder).stdout)
 
 
 def test_inspect_shows_the_robots_keys_whoever_names_the_robot(tiny: Path) -> None:

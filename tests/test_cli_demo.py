@@ -132,6 +132,14 @@ def test_a_report_folder_that_cannot_be_made_is_refused_before_the_work(tmp_path
     assert result.stderr == f"error: can't write into {tmp_path / 'file'}: {tmp_path / 'file'} is a file\n"
 
 
+@pytest.mark.parametrize(("options", "name"), [((), "report.json"), (("--real-time",), "real_time.json")])
+def test_another_commands_results_are_not_replaced(options: tuple[str, ...], name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text('{"study": "mask"}')
+    said = refusal(turbopi("demo", *options, "--report", tmp_path))
+    assert said.startswith(f"{tmp_path / name} is there and isn't a report of `turbopi demo")
+    assert (tmp_path / name).read_text() == '{"study": "mask"}'
+
+
 @pytest.mark.parametrize("preset", ["pi05_tiny", "pi05_droid", "pi05_aloha", "pi05_base"])
 def test_the_pictures_reach_every_robots_cameras(preset: str) -> None:
     frame = shipped.load_frames()[0]

@@ -190,7 +190,8 @@ def test_without_a_gpu_it_says_so() -> None:
     if torch.cuda.is_available():
         pytest.skip("there is one")
     said = refusal(turbopi("tune"))
-    assert said == "tiles are measured on an NVIDIA GPU, and there is none here; `turbopi doctor` says why"
+    needed = "--dry-run needs it, too: which tiles there are depends on the GPU"
+    assert said == f"tiles are measured on an NVIDIA GPU, and there is none here; `turbopi doctor` says why. {needed}"
 
 
 def test_a_gpu_that_fused_cannot_use_comes_with_its_reason(fake: FakeGpu, monkeypatch: pytest.MonkeyPatch) -> None:

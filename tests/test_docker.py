@@ -2,6 +2,7 @@
 
 import json
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,18 @@ def test_health_is_asked_at_the_port_that_a_server_takes(file: Path) -> None:
 def test_no_image_runs_as_root(file: Path) -> None:
     users = re.findall(r"^USER (\S+)", file.read_text(encoding="utf-8"), re.MULTILINE)
     assert users[-1] == "robot"
+
+
+def test_an_image_installs_the_extras_that_it_is_built_with() -> None:
+    """By the shell's own expansion; the document's extras are the package's."""
+    (installed,) = re.findall(r'pip install ("\..*?") ', (ROOT / "Dockerfile").read_text(encoding="utf-8"))
+    for extras, expected in (("", "."), ("ray", ".[ray]"), ("ray,view", ".[ray,view]")):
+        told = subprocess.run(["sh", "-c", f"printf %s {installed}"], env={"EXTRAS": extras}, capture_output=True)
+        assert told.stdout.decode() == expected
+    assert 'EXTRAS=""' in instructions(ROOT / "Dockerfile", "ARG")
+    named = re.findall(r"EXTRAS=([\w,]+)", (ROOT / "docs/docker.md").read_text(encoding="utf-8"))
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert named and all(re.search(rf"^{one} = \[", project, re.MULTILINE) for text in named for one in text.split(","))
 
 
 def test_the_cpu_image_takes_the_pytorch_that_the_tests_run_with() -> None:

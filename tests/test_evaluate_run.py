@@ -158,7 +158,7 @@ def test_ctrl_c_leaves_valid_results_and_no_process(tmp_path: Path) -> None:
 def test_a_run_is_not_continued_in_another_way(tmp_path: Path) -> None:
     run(tmp_path, SeekingPolicy(), states=(0,))
     with pytest.raises(
-        ConfigError, match=r"protocol\.replan = 5, but this one has 3: give another --out, or --restart"
+        ConfigError, match=r"protocol\.replan = 5, but this one has 3: give another --out, or begin again"
     ):
         run(tmp_path, SeekingPolicy(), states=(0,), replan=3)
     other = SeekingPolicy()

@@ -527,7 +527,7 @@ def test_the_command_says_what_it_wrote(command: Result) -> None:
     assert [line for line in command.stderr.splitlines() if line.startswith("exporting")] == [
         f"exporting {graph}" for graph in exporting.GRAPHS
     ]
-    assert f"openpi_torch -> {folder}: 0.00" in command.stderr
+    assert f"openpi_torch -> {folder}: 1.8" in command.stderr
     assert document["bytes"] == sum(document["files"].values())
     assert document["seconds"] > 0
     assert open_export(folder).manifest.items() <= document.items()

@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import logging
+import os
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from pathlib import Path
@@ -18,7 +20,8 @@ from turbopi.cli.serve_ray import check_fits, check_runs
 from turbopi.client import RealTimeClient, ServerRefused
 from turbopi.errors import ConfigError
 from turbopi.serve import PolicyServer, ray_app, running
-from turbopi.serve.fleet import FleetOptions, check_known, import_ray, reason_in
+from turbopi.serve.fleet import STARTED_HERE, TOKEN_LOGGER, FleetOptions, check_known, import_ray, reason_in
+from turbopi.serve.fleet import connect as connect_to_ray
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.outcome import Outcome
@@ -167,6 +170,32 @@ def test_another_version_of_ray_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "ray.serve", serve)
     with pytest.raises(ConfigError, match=r"a fleet needs Ray <3,>=2.60, but 2.9.3 is installed"):
         import_ray()
+
+
+def test_a_ray_that_is_started_here_says_nothing_of_its_token_which_stays_on(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    ray, serve, started = ModuleType("ray"), ModuleType("ray.serve"), []
+
+    def init(address: str, **options: Any) -> None:
+        if address == "auto":
+            raise ConnectionError("no cluster")
+        logger = logging.getLogger(TOKEN_LOGGER)
+        logger.warning("Token authentication is enabled for this Ray cluster. Set RAY_AUTH_MODE=disabled to opt out.")
+        logger.warning("Token authentication is disabled for this Ray cluster.")
+        started.append(os.environ.get("RAY_AUTH_MODE"))
+
+    ray.__version__, ray.serve = "2.60.0", serve  # type: ignore[attr-defined]
+    ray.init, ray.is_initialized = init, lambda: False  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setitem(sys.modules, "ray.serve", serve)
+    for name in ("RAY_ADDRESS", "RAY_AUTH_MODE"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in STARTED_HERE.items():  # `connect` sets them; so they are gone after the test
+        monkeypatch.setenv(name, value)
+    assert connect_to_ray()
+    assert started == [None], "Ray chooses itself: with a token"
+    assert caplog.messages == ["Token authentication is disabled for this Ray cluster."]
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from turbopi.studies import kv_reuse, kv_reuse_libero, mask, report
 from turbopi.studies.kv_reuse import Reuse, Reusing
 from turbopi.studies.report import Report
 from turbopi.studies.rollouts import CHASE, open_policy, play
-from turbopi.studies.simulated import Running, SimulatorCell, Variant, _check_pair, _initial_states, finished
+from turbopi.studies.simulated import PLAIN, Running, SimulatorCell, Variant, _check_pair, _initial_states, finished
 from turbopi.studies.study import Setup
 
 IN_CHASE = (CHASE_POLICY, "--simulator", "chase", "--small", "--device", "cpu", "--workers", "1")
@@ -189,6 +189,14 @@ def test_a_full_report_is_sound_only_with_a_broken_cell_that_fails(
     _, broken = study.controls(tmp_path, cells, small=False)
     assert broken.held is held and broken.claim.startswith("every 2, of another episode isn't as good")
     assert (broken.evidence == "Not run: `--way 'every 2, of another episode'`.") is (lost is None)
+
+
+def test_a_cell_that_does_not_tell_what_it_reused_has_no_place_in_the_plot() -> None:
+    study, paired = kv_reuse_libero.VARIANTS, Paired(180, 0, 20, 0).document
+    shares = {PLAIN: {}, "full 0.9": {"tokens reused, %": 40.0}, "full 0.87": {}, "patch 0.9": {}}
+    cells = [SimulatorCell(way, Rate(180, 200).document, paired, told) for way, told in shares.items()]
+    (panel,) = study._plot(cells).panels
+    assert {series.label: series.x for series in panel.series} == {PLAIN: [0], "full": [40.0]}
 
 
 @pytest.mark.parametrize("what", ["full", "camera", "patch", "every"])

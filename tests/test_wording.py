@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from turbopi.wording import significant
+from turbopi.wording import data_size, significant
 
 
 @pytest.mark.parametrize(
@@ -26,3 +26,20 @@ from turbopi.wording import significant
 )
 def test_an_error_has_three_significant_digits_however_small(value: float | None, shown: str) -> None:
     assert significant(value) == shown
+
+
+@pytest.mark.parametrize(
+    ("count", "shown"),
+    [
+        (0, "0 bytes"),
+        (999, "999 bytes"),
+        (1_000, "1.0 kB"),
+        (91_412, "91.4 kB"),
+        (11_345_678, "11.35 MB"),
+        (7_233_456_789, "7.233 GB"),
+        (999_999, "1.00 MB"),
+        (999_999_999, "1.000 GB"),
+    ],
+)
+def test_a_size_has_the_unit_that_fits(count: int, shown: str) -> None:
+    assert data_size(count) == shown

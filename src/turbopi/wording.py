@@ -19,6 +19,14 @@ def cosine(value: float | None) -> str:
     return "not finite" if value is None else f"{value:.6f}"
 
 
+def data_size(count: float) -> str:
+    """Bytes in the unit that fits, of 1000 each: "7.233 GB", "11.35 MB", "91.4 kB", "850 bytes"."""
+    for unit, size, digits in (("GB", 1e9, 3), ("MB", 1e6, 2), ("kB", 1e3, 1)):
+        if count >= 1000 and round(count / size, digits) >= 1:
+            return f"{count / size:.{digits}f} {unit}"
+    return f"{count:.0f} bytes"
+
+
 def denoising(about: Mapping[str, object]) -> str:
     """ "10 steps" of a policy's metadata, and its solver and time grid where they aren't openpi's."""
     said = f"{about.get('num_denoising_steps')} steps"

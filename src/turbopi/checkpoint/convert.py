@@ -29,6 +29,7 @@ from turbopi.checkpoint.opening import open_checkpoint
 from turbopi.checkpoint.random_weights import random_checkpoint
 from turbopi.checkpoint.settings import FILE_NAME as SETTINGS
 from turbopi.checkpoint.settings import ConfigSource, Settings, parse_values, policy_config
+from turbopi.checkpoint.sizes import VARIANTS
 from turbopi.checkpoint.source import Shape, check_finite
 from turbopi.checkpoint.torch_files import WEIGHTS
 from turbopi.config import PRESETS, GemmaConfig, ModelConfig, PolicyConfig, RealTime
@@ -39,11 +40,6 @@ from turbopi.model.reference import FloatPrecision
 _DTYPES: dict[FloatPrecision, tuple[str, torch.dtype]] = {
     "bf16": ("BF16", torch.bfloat16),
     "f32": ("F32", torch.float32),
-}
-_VARIANTS = {  # openpi's names of sizes: width, MLP
-    "gemma_2b": GemmaConfig(width=2048, mlp_dim=16384),
-    "gemma_300m": GemmaConfig(width=1024, mlp_dim=4096),
-    "dummy": GemmaConfig(width=64, mlp_dim=128, depth=4, head_dim=16),
 }
 
 
@@ -172,7 +168,7 @@ def _openpi_config(model: ModelConfig, precision: FloatPrecision) -> dict[str, o
 
 
 def _variant(sizes: GemmaConfig) -> str:
-    return next((name for name, known in _VARIANTS.items() if known == sizes), "custom")
+    return next((name for name, known in VARIANTS.items() if known == sizes), "custom")
 
 
 def _settings(config: PolicyConfig, asset_id: str) -> tuple[dict[str, object], Path | None]:

@@ -7,7 +7,6 @@ the processors' steps may be in lerobot_pipeline.py.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -41,6 +40,12 @@ _MODES: dict[str, NormMode] = {
 _SCHEDULES: dict[str, Schedule] = {"EXP": "exponential", "LINEAR": "linear", "ONES": "ones", "ZEROS": "zeros"}
 _EPS = 1e-8
 _FEATURE_TYPES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
+_VARIANTS = ("gemma_300m", "gemma_2b")
+_CHOICES = {  # values that LeRobot refuses others of; sizes and stored dtypes are the tensors'
+    "paligemma_variant": _VARIANTS,
+    "action_expert_variant": _VARIANTS,
+    "dtype": ("bfloat16", "float32"),
+}
 # values of config.json that change what the model computes, and the only ones that Turbo-Pi computes
 _FIXED = {
     "image_resolution": ([224, 224], "224 x 224 pictures"),
@@ -90,12 +95,12 @@ class LeRobotFolder:
             name=f"lerobot_{self.kind}",
             model=ModelConfig(
                 kind=self.kind,
-                action_horizon=self.config.integer("chunk_size", 1, LIMITS["action_horizon"], default=50),
+                action_horizon=self._chunk_size,
                 max_prompt_tokens=self.pipelines.max_tokens,
                 time_grid="accumulated" if summed else "multiplied",
             ),
             robot="lerobot",
-            normalization=Normalization("identity", "identity"),  # until the next line
+            normalization=self.normalization,
             robot_options=self._robot_options(),
             discrete_state_input=self.kind == "pi05",
             image_resize="lerobot_0.4" if old else "lerobot",
@@ -106,8 +111,6 @@ class LeRobotFolder:
             ),
             real_time=self._real_time(),
         )
-        if "normalization" not in settings.values:
-            described = replace(described, normalization=self._normalization())
         config = with_values(described, settings)
         if config.robot == described.robot:
             self._check_actions(config.normalization)
@@ -178,6 +181,9 @@ class LeRobotFolder:
                 f"{self.file} has max_state_dim = {state} and max_action_dim = {action}; Turbo-Pi's Pi0 has one width "
                 "for both"
             )
+        for key, choices in _CHOICES.items():
+            if self.config.values.get(key) is not None:
+                self.config.choice(key, choices)
         for key, (expected, meaning) in _FIXED.items():
             value = self.config.values.get(key, expected)
             if value != expected:
@@ -185,6 +191,10 @@ class LeRobotFolder:
                     f"{self.file} has {key} = {shown(value)}, which Turbo-Pi doesn't compute; it does {meaning}"
                 )
         return cast(Kind, kind)
+
+    @property
+    def _chunk_size(self) -> int:
+        return self.config.integer("chunk_size", 1, LIMITS["action_horizon"], default=50)
 
     # -- real-time execution -------------------------------------------------------------------------------------------
 
@@ -202,9 +212,10 @@ class LeRobotFolder:
         A mask as long as the chunk or longer says nothing: it ends where the left-over does.
         """
         trained = self.config.integer("rtc_training_max_delay", 0, LIMITS["action_horizon"] - 1, default=0)
+        horizon = self.settings.values.get("action_horizon", self._chunk_size)
+        trained = min(trained, horizon - 1)  # a longer delay leaves nothing of a chunk to compute
         if (rtc := self._rtc_config) is None:
             return RealTime(trained_max_delay=trained)
-        horizon = self.config.integer("chunk_size", 1, LIMITS["action_horizon"], default=50)
         end = rtc.integer("execution_horizon", 1, LIMITS["action_horizon"], default=10)
         return RealTime(
             trained_max_delay=trained,
@@ -215,9 +226,11 @@ class LeRobotFolder:
 
     # -- scaling -------------------------------------------------------------------------------------------------------
 
-    def _normalization(self) -> Normalization:
-        """The processors' modes; config.json must agree."""
-        return Normalization(
+    @property
+    def normalization(self) -> Normalization:
+        """A turbopi.json's, or the processors' modes: CheckpointError unless config.json agrees with them."""
+        chosen: Normalization | None = self.settings.values.get("normalization")
+        return chosen or Normalization(
             self._mode(PREPROCESSOR, NORMALIZER, "STATE"), self._mode(POSTPROCESSOR, UNNORMALIZER, "ACTION")
         )
 

@@ -18,6 +18,7 @@ from turbopi.files import openpi_cache
 from turbopi.reading import Fields, read_json
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot", "onnx", "random"]
+PRECISIONS = ("bfloat16", "float32", "float16")  # of openpi's converter
 
 _DOWNLOAD = {
     "gs": "gsutil -m cp -r {address} DIR (or openpi's own openpi.shared.download)",
@@ -71,17 +72,27 @@ def tokenizer_candidates(folder: Path) -> list[Path]:
     return [file for pattern in patterns for file in sorted(folder.glob(pattern)) if file.is_file()]
 
 
-def recorded_config(location: Location) -> dict[str, int]:
-    """action_dim and action_horizon of the config.json that openpi's converter writes, where it has them."""
+@dataclass(frozen=True)
+class Recorded:
+    """What the config.json says that openpi's converter writes, where it has it."""
+
+    numbers: dict[str, int]  # action_dim, action_horizon
+    variants: dict[str, str]  # paligemma_variant, action_expert_variant: openpi's names of sizes, or a fork's
+
+
+def recorded_config(location: Location) -> Recorded:
+    """openpi's config.json. CheckpointError for values that no converter writes; openpi itself reads none of them."""
     file = location.folder / "config.json"
     if location.format != "openpi_torch" or not file.is_file():
-        return {}
-    fields = Fields(read_json(file), file)
-    return {
-        key: fields.integer(key, 1, LIMITS[key])
-        for key in ("action_dim", "action_horizon")
-        if fields.values.get(key) is not None
-    }
+        return Recorded({}, {})
+    content = read_json(file)
+    fields = Fields({key: value for key, value in content.items() if value is not None}, file)
+    fields.choice("precision", PRECISIONS, default=PRECISIONS[0])
+    sizes = [key for key in ("action_dim", "action_horizon") if key in fields.values]
+    variants = [key for key in ("paligemma_variant", "action_expert_variant") if key in fields.values]
+    return Recorded(
+        {key: fields.integer(key, 1, LIMITS[key]) for key in sizes}, {key: fields.text(key) for key in variants}
+    )
 
 
 def _local(path: str | Path) -> Path:

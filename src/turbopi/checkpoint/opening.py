@@ -1,22 +1,22 @@
 """Opening a checkpoint: find it, read its description, check its tensors, and settle its configuration."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from turbopi.checkpoint.base import Checkpoint, describe_weights
+from turbopi.checkpoint.base import Checkpoint, describe_weights, norm_stats_info
 from turbopi.checkpoint.lerobot import LeRobotFolder
-from turbopi.checkpoint.locate import Location, locate, recorded_config, tokenizer_candidates
+from turbopi.checkpoint.locate import Location, Recorded, locate, recorded_config, tokenizer_candidates
 from turbopi.checkpoint.norm_stats import asset_ids, find_norm_stats
 from turbopi.checkpoint.onnx_folder import GraphSource, open_export
 from turbopi.checkpoint.openpi_jax import JaxSource
 from turbopi.checkpoint.peft_adapter import CONFIG as ADAPTER
 from turbopi.checkpoint.peft_adapter import PeftSource, base_model
 from turbopi.checkpoint.settings import ConfigSource, Settings, policy_config, read_settings
-from turbopi.checkpoint.sizes import detect_kind, model_sizes
+from turbopi.checkpoint.sizes import VARIANTS, detect_kind, model_sizes
 from turbopi.checkpoint.source import WeightSource, check_tensors
 from turbopi.checkpoint.torch_files import TorchSource
-from turbopi.config import PolicyConfig
+from turbopi.config import ModelConfig, PolicyConfig
 from turbopi.errors import CheckpointError, ConfigError
 from turbopi.model.reference import parameter_shapes
 
@@ -40,16 +40,12 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
     policy = policy_config(
         settings,
         kind,
-        horizon=recorded.get("action_horizon"),
+        horizon=recorded.numbers.get("action_horizon"),
         assets=asset_ids(location.assets),
         where=location.folder,
     )
     policy = _with_sizes(policy, source, settings, location)
-    if recorded.get("action_dim", policy.model.action_dim) != policy.model.action_dim:
-        raise CheckpointError(
-            f"{location.folder}: config.json has action_dim {recorded['action_dim']}, but the weights have "
-            f"{policy.model.action_dim}; one of the files belongs to another checkpoint"
-        )
+    _check_recorded(recorded, policy.model, location.folder)
     stats, asset_id = find_norm_stats(location.assets, policy.asset_id, policy.normalization)
     return Checkpoint(
         path=location.folder,
@@ -63,6 +59,23 @@ def open_checkpoint(path: str | Path, config: ConfigSource = "auto") -> Checkpoi
     )
 
 
+def _check_recorded(recorded: Recorded, model: ModelConfig, folder: Path) -> None:
+    """CheckpointError if openpi's config.json is about other weights. A size's name that openpi hasn't is a fork's."""
+    other = "one of the files belongs to another checkpoint"
+    if (dim := recorded.numbers.get("action_dim", model.action_dim)) != model.action_dim:
+        raise CheckpointError(
+            f"{folder}: config.json has action_dim {dim}, but the weights have {model.action_dim}; {other}"
+        )
+    for key, ours in (("paligemma_variant", model.vlm), ("action_expert_variant", model.expert)):
+        name = recorded.variants.get(key, "")
+        known = VARIANTS.get(name.removesuffix("_lora"), ours)
+        if known != ours:
+            raise CheckpointError(
+                f"{folder}: config.json has {key} {name}, which is {known.width} wide with {known.depth} layers and an "
+                f"MLP of {known.mlp_dim}, but the weights have {ours.width}, {ours.depth} and {ours.mlp_dim}; {other}"
+            )
+
+
 def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[str, Any]:
     """`open_checkpoint(path, config).info()`; if only its configuration can't be settled, what is known without it.
 
@@ -73,26 +86,35 @@ def inspect_checkpoint(path: str | Path, config: ConfigSource = "auto") -> dict[
         return open_checkpoint(path, config).info()
     except ConfigError as error:
         location = locate(path)
-        source = open_weights(location, _base_only(config, location))
+        settings = _without_policy(config, location)
+        source = open_weights(location, settings)
         return {
             **describe_weights(source),
             "path": str(location.folder),
             "random_weights": False,
             "kind": detect_kind(source, location.weights),
             "assets": asset_ids(location.assets),
-            **recorded_config(location),
+            **(_lerobot_statistics(location, settings) if location.format == "lerobot" else {}),
+            **recorded_config(location).numbers,
             "tokenizers": [str(file) for file in tokenizer_candidates(location.folder)],
             "config_error": str(error),
         }
 
 
-def _base_only(config: ConfigSource, location: Location) -> Settings:
-    """Of `config`, what an adapter can't be read without."""
+def _without_policy(config: ConfigSource, location: Location) -> Settings:
+    """Of `config`, what weights and statistics are read by: an adapter's base, and LeRobot's modes if it has others."""
     try:
-        values = read_settings(config, location.folder).values if location.adapter else {}
+        values = read_settings(config, location.folder).values
     except ConfigError:
         values = {}
-    return Settings("none", values={key: values[key] for key in ("base_model",) if key in values})
+    needed = {"base_model": location.adapter, "normalization": location.format == "lerobot"}
+    return Settings("none", values={key: values[key] for key in needed if needed[key] and key in values})
+
+
+def _lerobot_statistics(location: Location, settings: Settings) -> dict[str, Any]:
+    """As `Checkpoint.info` has them. LeRobot keeps them in the processors' files, not below assets/."""
+    folder = LeRobotFolder(location.folder, settings)
+    return {"normalization": asdict(folder.normalization), "norm_stats": norm_stats_info(folder.stats)}
 
 
 def open_weights(location: Location, settings: Settings) -> WeightSource:

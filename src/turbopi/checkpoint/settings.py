@@ -23,7 +23,8 @@ itself.
     num_denoising_steps   1 to 1000, unless whoever runs it says otherwise; else LeRobot's num_inference_steps, or 10
     solver, solver_grid   of a call, unless whoever runs it says otherwise: as UnifiedPolicy's `solver` and `time_grid`
     real_time             object of trained_max_delay (delays that training simulated, control steps),
-                          execution_horizon, schedule, max_guidance_weight: see turbopi.config.RealTime
+                          execution_horizon, schedule, max_guidance_weight: see turbopi.config.RealTime. The delay is
+                          below the action horizon, the execution horizon at most as long
     vision_heads          attention heads of a vision tower of a non-standard width
     lora_alpha            number, or {"vlm": number, "expert": number}: see openpi_lora.py
     lora_rslora           true if adapters were trained rank-stabilised
@@ -81,6 +82,7 @@ class Settings:
 def read_settings(config: ConfigSource, folder: Path) -> Settings:
     """Parse `config=` for the checkpoint in `folder`. Raises ConfigError for whatever can't be right about it."""
     if isinstance(config, PolicyConfig):
+        check_real_time(config, f"PolicyConfig {config.name}")
         return Settings(f"PolicyConfig {config.name}", policy=config)
     if isinstance(config, str) and config == "auto":
         file = folder / FILE_NAME
@@ -144,9 +146,23 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
     config = replace(config, **{key: values[key] for key in fields if key in values})
     model = {key: values[key] for key in ("action_horizon", "max_prompt_tokens", "time_grid") if key in values}
     config = config.with_model(**model)
+    check_real_time(config, settings.source)
     if config.model.kind == "pi0" and config.discrete_state_input:
         raise ConfigError(f"{settings.source}: discrete_state_input is true, but Pi0 reads its state as a number token")
     return config
+
+
+def check_real_time(config: PolicyConfig, source: str) -> None:
+    """ConfigError for control steps that no chunk has: calls would cut them in silence, or never reach them."""
+    horizon, options = config.model.action_horizon, config.real_time
+    for name, value, most in (
+        ("execution_horizon", options.execution_horizon, horizon),
+        ("trained_max_delay", options.trained_max_delay, horizon - 1),
+    ):
+        if value is not None and value > most:
+            raise ConfigError(
+                f"{source}: real_time has {name} = {value}, but a chunk has {horizon} actions; expected at most {most}"
+            )
 
 
 def _check_kind(config: PolicyConfig, kind: Kind, source: str, where: Path) -> None:

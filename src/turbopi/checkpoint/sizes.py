@@ -9,6 +9,11 @@ from turbopi.config import LIMITS, GemmaConfig, Kind, ModelConfig, VisionConfig
 from turbopi.errors import CheckpointError, ConfigError
 from turbopi.reading import shown
 
+VARIANTS = {  # openpi's names of sizes
+    "gemma_2b": GemmaConfig(width=2048, mlp_dim=16384),
+    "gemma_300m": GemmaConfig(width=1024, mlp_dim=4096),
+    "dummy": GemmaConfig(width=64, mlp_dim=128, depth=4, head_dim=16),
+}
 _STANDARD_VISION = VisionConfig()  # So400m: 1152 wide, 16 heads
 
 # What sizes are read from. A checkpoint without one of these gets a message about it rather than about sizes.

@@ -16,7 +16,7 @@ from turbopi.cli.options import CheckpointArgument, RobotOptions
 from turbopi.cli.typed import as_typed
 from turbopi.errors import ConfigError
 from turbopi.files import write_whole
-from turbopi.wording import denoising
+from turbopi.wording import data_size, denoising
 
 if TYPE_CHECKING:
     from turbopi.checkpoint import Checkpoint
@@ -29,6 +29,7 @@ PART_NAMES = {
     "expert": "action expert",
     "action_time": "action, state and time projections",
 }
+OWN_FILES = "in the checkpoint's own files"  # LeRobot's statistics
 
 
 @command(
@@ -129,7 +130,6 @@ def _show(info: dict[str, Any], output: Output) -> None:
 def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
     facts = [("format", info["format"]), ("model", info["kind"])]
     if "robot" in info:
-        normalization = info["normalization"]
         facts += [
             ("configuration", f"{info['name']}, from {info['config_source']}"),
             ("robot", info["robot"]),
@@ -137,17 +137,19 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
             ("action horizon", f"{info['action_horizon']}, denoising in {denoising(info)}"),
             ("prompt", f"at most {info['max_prompt_tokens']} tokens, {_state_input(info)}"),
             ("statistics", _statistics_source(info)),
-            ("  of the state", _statistics(info["norm_stats"]["state"], normalization["state"])),
-            ("  of the actions", _statistics(info["norm_stats"]["actions"], normalization["actions"])),
+            *_features(info),
             *((f"sizes: {name}", _sizes(sizes)) for name, sizes in info["sizes"].items() if isinstance(sizes, dict)),
             ("vocabulary", f"{info['sizes']['vocab_size']:,}"),
             ("action dimensions", str(info["sizes"]["action_dim"])),
         ]
     else:
-        facts.append(("statistics", ", ".join(info["assets"]) or "none"))
+        if "norm_stats" in info:
+            facts += [("statistics", OWN_FILES), *_features(info)]
+        else:
+            facts.append(("statistics", ", ".join(info["assets"]) or "none"))
         facts += [(key.replace("_", " "), str(info[key])) for key in ("action_horizon", "action_dim") if key in info]
     facts += [
-        ("weights", f"{info['tensors']} tensors, {info['stored_bytes'] / 1e9:.3f} GB, {_dtypes(info)}"),
+        ("weights", f"{info['tensors']} tensors, {data_size(info['stored_bytes'])}, {_dtypes(info)}"),
         ("tokenizer", ", ".join(info["tokenizers"]) or "none in the folder"),
     ]
     return [*facts, ("SHA-256", info["sha256"])] if "sha256" in info else facts
@@ -156,13 +158,18 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
 def _statistics_source(info: dict[str, Any]) -> str:
     if info["random_weights"]:
         return "made up: values of about 1"
-    return f"asset {info['asset_id']}" if info["asset_id"] else "in the checkpoint's own files"
+    return f"asset {info['asset_id']}" if info["asset_id"] else OWN_FILES
 
 
 def _state_input(info: dict[str, Any]) -> str:
     if info["kind"] == "pi0":
         return "the state is a token of its own"
     return "the state in it" if info["discrete_state_input"] else "without the state"
+
+
+def _features(info: dict[str, Any]) -> list[tuple[str, str]]:
+    stats, modes = info["norm_stats"], info["normalization"]
+    return [(f"  of the {name}", _statistics(stats[name], modes[name])) for name in ("state", "actions")]
 
 
 def _statistics(stats: dict[str, Any] | None, mode: str) -> str:
@@ -226,7 +233,7 @@ def convert(
     seconds = time.perf_counter() - started
     tokenizer = complete_random(folder, options.weights_seed or 0) if opened.format == "random" else None
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    output.line(f"{opened.format} -> {folder}: {size / 1e9:.3f} GB in {precision}, {seconds:.1f} s")
+    output.line(f"{opened.format} -> {folder}: {data_size(size)} in {precision}, {seconds:.1f} s")
     output.line(f"Look at it with `turbopi inspect {folder}`.")
     output.document(
         {"folder": folder, "precision": precision, "bytes": size, "seconds": seconds, "tokenizer": tokenizer}

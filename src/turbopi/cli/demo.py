@@ -8,7 +8,7 @@ import typer
 from rich.progress import Progress
 from rich.table import Table
 
-from turbopi.cli.files import check_folder
+from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console, plain
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.timings import STAGES, timing_columns
@@ -92,6 +92,7 @@ def demo(
 
         checkpoint = str(SMALL_POLICY)
     check_folder(report)  # what can't be written, or played, is better known before the work
+    check_replaces(report / "report.json", "frames", "a report of `turbopi demo`")
     if episodes:
         from turbopi.sim import create
 

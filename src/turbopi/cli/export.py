@@ -10,6 +10,7 @@ from turbopi.cli.checkpoints import complete_random
 from turbopi.cli.framework import CheckpointThen, JsonFlag, Output, command
 from turbopi.cli.options import EngineCalibration, ScaleMethod, WeightOptions
 from turbopi.errors import BackendUnavailable, ConfigError
+from turbopi.wording import data_size
 
 FORMATS = ("onnx",)
 PRECISIONS = ("f32", "fp8")
@@ -99,6 +100,6 @@ def export(
     if checkpoint.format == "random":
         complete_random(written.folder, options.weights_seed or 0)
     seconds = time.perf_counter() - started
-    output.line(f"{checkpoint.format} -> {written.folder}: {written.bytes / 1e9:.3f} GB, {precision}, {seconds:.1f} s")
+    output.line(f"{checkpoint.format} -> {written.folder}: {data_size(written.bytes)}, {precision}, {seconds:.1f} s")
     output.line(f"Try it with `turbopi infer {written.folder} OBSERVATION`.")
     output.document({"folder": written.folder, "bytes": written.bytes, "seconds": seconds, **written.manifest})

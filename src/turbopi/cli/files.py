@@ -2,7 +2,9 @@
 
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from turbopi.errors import ConfigError, ObservationError
@@ -14,12 +16,28 @@ if TYPE_CHECKING:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise ConfigError now for a folder that couldn't be made or written to later, after all the work."""
-    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    """Raise ConfigError now for a folder that couldn't be made or written to later, after all the work.
+
+    The folder is made, written to and removed again: permissions alone don't tell, least of all to root.
+    """
+    target = folder.absolute()
+    existing = next(path for path in (target, *target.parents) if os.path.exists(path))
     if not existing.is_dir():
         raise ConfigError(f"can't write into {folder}: {existing} is a file")
-    if not os.access(existing, os.W_OK):
-        raise ConfigError(f"can't write into {folder}: {existing} isn't writable")
+    made: list[Path] = []
+    try:
+        for path in reversed((target, *target.parents)):
+            if not os.path.exists(path):
+                path.mkdir()
+                made.append(path)
+        with TemporaryDirectory(prefix=".turbopi-", dir=target):
+            pass
+    except OSError as error:
+        raise ConfigError(f"can't write into {folder}: {existing} isn't writable ({error.strerror})") from error
+    finally:
+        for path in reversed(made):
+            with suppress(OSError):  # somebody has put something there meanwhile
+                path.rmdir()
 
 
 def check_writable(file: Path) -> None:

@@ -61,7 +61,9 @@ def tune(
         Path | None, typer.Option(metavar="FILE", help="Write here instead of the cache, where engines look.")
     ] = None,
     noisy: Annotated[bool, typer.Option("--noisy", help="Measure although other programs use the GPU.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be measured.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what would be measured, on the GPU that is here.")
+    ] = False,
     device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cuda or cuda:N.")] = "auto",
     as_json: JsonFlag = False,
 ) -> None:
@@ -142,7 +144,8 @@ def usable_device(device: str) -> "torch.device":
     reason = backends.availability("fused", resolved)
     if resolved.type != "cuda":
         raise BackendUnavailable(
-            "tiles are measured on an NVIDIA GPU, and there is none here; `turbopi doctor` says why"
+            "tiles are measured on an NVIDIA GPU, and there is none here; `turbopi doctor` says why. --dry-run needs "
+            "it, too: which tiles there are depends on the GPU"
         )
     if reason is not None:
         raise BackendUnavailable(f"tiles are those of backend fused, which can't run here: {reason}")

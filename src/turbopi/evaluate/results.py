@@ -173,7 +173,8 @@ class Results:
             if mine.get(name) != theirs.get(name):
                 raise ConfigError(
                     f"{self.folder} holds a run with {name} = {theirs.get(name)!r}, but this one has "
-                    f"{mine.get(name)!r}: give another --out, or --restart to begin again"
+                    f"{mine.get(name)!r}: give another --out, or begin again (of `turbopi eval` with --restart, of a "
+                    "study by deleting that folder)"
                 )
         self.episodes = dict(earlier.episodes)
         self.planned |= earlier.planned

@@ -18,7 +18,8 @@ import asyncio
 import logging
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,6 +47,8 @@ STARTED_HERE = {  # of a Ray that is started here
     "RAY_USAGE_STATS_ENABLED": "0",  # it reports to nobody
     "RAY_worker_niceness": "0",  # Ray's own 15 would let every other program on the machine go before the robots
 }
+TOKEN_LOGGER = "ray._private.authentication.authentication_token_setup"
+TOKEN_TOLD = "Token authentication is enabled"  # what begins the three lines that it says at every start
 QUIET = {"log_level": "WARNING", "enable_access_log": False}  # a line for each request would cost more than it tells
 OBJECT_STORE_BYTES = 256 * 2**20  # of a Ray that is started here: observations don't go through it
 
@@ -135,8 +138,28 @@ def connect() -> bool:
             ) from error
     except (RuntimeError, ValueError) as error:  # other versions of Ray or Python there, an address that is none
         raise ConfigError(f"Ray's cluster can't be joined: {error}") from error
-    ray.init(address="local", include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, **quiet)
+    with _silent_about_its_token():
+        ray.init(address="local", include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, **quiet)
     return True
+
+
+@contextmanager
+def _silent_about_its_token() -> Iterator[None]:
+    """Leave out what Ray says when it has turned token authentication on, as it does for every Ray that it starts.
+
+    The token stays on. Ray's own setting for silence, RAY_AUTH_MODE=token, would have to be in the environment before
+    Ray is imported, and then clusters without a token could no longer be joined.
+    """
+    logger = logging.getLogger(TOKEN_LOGGER)
+    logger.addFilter(_isnt_about_its_token)
+    try:
+        yield
+    finally:
+        logger.removeFilter(_isnt_about_its_token)
+
+
+def _isnt_about_its_token(record: logging.LogRecord) -> bool:
+    return not record.getMessage().startswith(TOKEN_TOLD)
 
 
 def disconnect() -> None:

@@ -14,7 +14,7 @@ from turbopi.evaluate.sources import PolicySource
 from turbopi.files import append_line, whole_lines
 from turbopi.studies.answering import Asked
 from turbopi.studies.kv_reuse import CLAIMED, NOTHING, Reuse, Reusing, speed_ups
-from turbopi.studies.simulated import Given, Variant, Variants
+from turbopi.studies.simulated import PLAIN, Given, Variant, Variants, open_plain
 
 FILE = "reused.jsonl"  # in a cell's folder: [task, initial state, call, share of image tokens that it reused]
 ANOTHERS = "every 2, of another episode"
@@ -89,6 +89,7 @@ VARIANTS = Variants(
     ),
     would_change="Pictures that stand still for long while the policy needs no answer; a policy that reads the state.",
     x_label="image tokens reused, %",
+    plain=Variant(PLAIN, open_plain, x=0),
     measured=_measured,
 )
 STUDY = VARIANTS.study

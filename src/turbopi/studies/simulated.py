@@ -85,7 +85,7 @@ class Variant:
 
     open    gives the policy for as long as its episodes run
     series  the line of the plot that it belongs to; None: one of its own
-    x       its place in the plot; None: what the study's `measured` says
+    x       its place in the plot; None: what the study's `measured` says, or without that its place in the table
     """
 
     name: str
@@ -120,7 +120,7 @@ class Variants:
                after the same commands
     broken     a cell that must lose twenty points, if the study has one; without it no full report is sound
     measured   {column: number} of what else a cell's folder tells, by the cell's name and folder; the first is the
-               plot's x where variants have none
+               plot's x where variants have none, and a cell whose folder tells nothing isn't in the plot
     """
 
     name: str
@@ -134,7 +134,7 @@ class Variants:
     would_change: str
     x_label: str
     broken: str | None = None
-    measured: Callable[[str, Path], Mapping[str, float]] = lambda name, folder: {}
+    measured: Callable[[str, Path], Mapping[str, float]] | None = None
     plain: Variant = Variant(PLAIN, open_plain)
     ticks: list[float] | None = None
 
@@ -193,7 +193,8 @@ class Variants:
             _check_pair(plain, results)
             solved[cell.name] = _solved(results)
             ran_on.setdefault(str(results.policy.about.get("device_name")), []).append(cell.name)
-            cells.append(_cell(cell.name, solved[PLAIN], solved[cell.name], self.measured(cell.name, place)))
+            told = {} if self.measured is None else self.measured(cell.name, place)
+            cells.append(_cell(cell.name, solved[PLAIN], solved[cell.name], told))
         count = len(solved[PLAIN])
         return setup.report(
             self.study,
@@ -241,12 +242,16 @@ class Variants:
         return (episode.steps, episode.motion) if self.exact else ()
 
     def _plot(self, cells: Sequence[SimulatorCell]) -> Plot:
-        """Success by x, which is a cell's place in the table where nothing else says."""
+        """Success by x, see `Variant.x`. A cell that should have a measured x and has none is left out."""
         variants = {cell.name: cell for cell in (self.plain, *self.cells)}
         points: dict[str, list[tuple[float, SimulatorCell]]] = {}
         for place, cell in enumerate(cells):
             variant = variants[cell.way]
-            x = next(iter(cell.measured.values()), float(place)) if variant.x is None else variant.x
+            x = variant.x
+            if x is None:
+                x = float(place) if self.measured is None else next(iter(cell.measured.values()), None)
+            if x is None:
+                continue
             points.setdefault(variant.series or cell.way, []).append((x, cell))
         series = []
         for name, own in points.items():
