@@ -136,7 +136,7 @@ def test_what_a_server_is_to_join_reaches_it(monkeypatch: Any) -> None:
 def test_a_mode_that_the_checkpoint_was_not_trained_for_is_one_line() -> None:
     result = turbopi("serve", *TINY, "--port", 0, "--execution", "rtc_trained", "--control-hz", 50)
     assert result.exit_code == 2
-    assert "execution is 'rtc_trained', which this policy can't: it offers ['rtc', " in result.stderr
+    assert "--execution rtc_trained was asked for, which this policy can't: it offers ['rtc', " in result.stderr
 
 
 def test_strict_reaches_the_policy_and_needs_a_warm_up(monkeypatch: Any) -> None:
@@ -179,12 +179,13 @@ def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
     ("options", "message"),
     [
         (["--api-key", "a b"], "the API key must be printable ASCII without spaces"),
-        (["--max-message-mb", "0"], "max_message_mb must be more than 0"),
+        (["--max-message-mb", "0"], "--max-message-mb 0 should be more than 0 and finite"),
         (["--record", __file__], "is a file"),
-        (["--execution", "async", "--control-hz", "50"], "execution is 'async'; a server joins chunks by rtc"),
-        (["--execution", "rtc"], "needs the robots' control rate, too: give control_hz (--control-hz)"),
-        (["--control-hz", "0"], "control_hz must be more than 0"),
-        (["--deadline-ms", "0"], "deadline_ms must be more than 0 and at most 60000"),
+        (["--execution", "async", "--control-hz", "50"], "--execution async isn't a server's: it joins chunks by rtc"),
+        (["--execution", "rtc"], "--execution rtc needs the robots' control rate, too: give --control-hz"),
+        (["--control-hz", "0"], "--control-hz 0 should be more than 0"),
+        (["--deadline-ms", "0"], "--deadline-ms 0 should be more than 0 and at most 60000"),
+        (["--allowed-hosts", "http://robot.lab"], "--allowed-hosts has 'http://robot.lab', which is no name"),
         (["--max-batch", "4", "--no-warmup"], "--max-batch 4 needs the warm-up, which measures batches"),
     ],
 )
@@ -214,7 +215,7 @@ def test_a_host_that_is_not_this_machine_is_refused() -> None:
 @pytest.mark.parametrize(
     ("option", "value", "expected"),
     [
-        ("--max-message-mb", "0", "max_message_mb must be more than 0"),
+        ("--max-message-mb", "0", "--max-message-mb 0 should be more than 0"),
         ("--api-key", "two words", "the API key must be printable ASCII without spaces"),
     ],
 )

@@ -204,7 +204,7 @@ def test_a_policy_that_joins_nothing_says_so() -> None:
     with pytest.raises(ObservationError, match="joins no chunks"):
         server.plan(message({"place": 0}, seed=3), "c")
     assert server.metadata == {}
-    with pytest.raises(ConfigError, match="execution is 'rtc', which this policy can't: it offers none"):
+    with pytest.raises(ConfigError, match="execution='rtc' was asked for, which this policy can't: it offers none"):
         real_time(policy, execution="rtc", control_hz=50)
 
 
@@ -360,11 +360,11 @@ def test_a_server_joins_by_the_ways_there_are() -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"execution": "async", "control_hz": 50}, "execution is 'async'; a server joins chunks by rtc"),
+        ({"execution": "async", "control_hz": 50}, "execution='async' isn't a server's: it joins chunks by rtc"),
         ({"execution": "rtc"}, "needs the robots' control rate"),
-        ({"control_hz": 0}, "control_hz must be more than 0"),
-        ({"execution_horizon": 0}, "execution_horizon must be 1 or more"),
-        ({"delay_steps": -1}, "delay_steps must be 0 or more"),
+        ({"control_hz": 0}, "control_hz=0 should be more than 0"),
+        ({"execution_horizon": 0}, "execution_horizon=0 should be 1 or more"),
+        ({"delay_steps": -1}, "delay_steps=-1 should be 0 or more"),
     ],
 )
 def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], text: str) -> None:

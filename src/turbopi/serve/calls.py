@@ -387,15 +387,15 @@ def _largest(policy: Policy, pipelined: bool, options: ServerOptions) -> int:
     if execution is not None and execution not in getattr(policy, "batch_modes", ()):
         if asked_for is not None and asked_for > 1:
             raise ConfigError(
-                f"max_batch is {asked_for}, but this policy runs requests that join a chunk one by one, and with "
-                f"execution {execution!r} all do: leave one of them out"
+                f"max_batch={asked_for} was asked for, but this policy runs requests that join a chunk one by one, and "
+                f"with execution={execution!r} all do: leave one of them out"
             )
         return 1
     if not pipelined and not lacking:
         return AUTO_LARGEST if asked_for is None else asked_for
     if asked_for is not None and asked_for > 1:
         why = "is pipelined, and takes one observation at a time" if pipelined else f"has no {' and no '.join(lacking)}"
-        raise ConfigError(f"max_batch is {asked_for}, but this policy {why}: leave it out")
+        raise ConfigError(f"max_batch={asked_for} was asked for, but this policy {why}: leave it out")
     return 1
 
 

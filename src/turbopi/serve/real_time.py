@@ -82,7 +82,7 @@ class RealTime:
         self._of_connections: dict[Hashable, _Session] = {}
         if options.execution is not None and options.execution not in self._modes:
             what = f"it offers {self._modes}" if self._modes else "it offers none"
-            raise ConfigError(f"execution is {options.execution!r}, which this policy can't: {what}")
+            raise ConfigError(f"execution={options.execution!r} was asked for, which this policy can't: {what}")
         metrics.watch_sessions(lambda: len(self._named) + len(self._of_connections))
 
     @property
