@@ -169,7 +169,7 @@ def test_messages_name_options_as_they_were_typed(tmp_path: Path) -> None:
         "--config pi06 is neither a preset, nor 'auto', nor a path to a .json; presets are pi05_base, "
     )
     told = refusal(turbopi("convert", golden, tmp_path / "out", "--config", "pi05_liberoo"))
-    assert told.endswith("Did you mean pi05_libero?")
+    assert "; did you mean pi05_libero? Presets are pi05_base, " in told
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from turbopi.wording import significant
+from turbopi.wording import did_you_mean, significant
 
 
 @pytest.mark.parametrize(
@@ -26,3 +26,19 @@ from turbopi.wording import significant
 )
 def test_an_error_has_three_significant_digits_however_small(value: float | None, shown: str) -> None:
     assert significant(value) == shown
+
+
+@pytest.mark.parametrize(
+    ("typed", "question"),
+    [
+        ("actoin_horizon", "did you mean action_horizon?"),
+        ("horizon", "did you mean action_horizon or execution_horizon?"),
+        ("action_horizon_of_chunks", "did you mean action_horizon?"),
+        ("o", ""),  # all contain it
+        ("robto", "did you mean robot?"),
+        ("qqq", ""),
+        ("", ""),
+    ],
+)
+def test_what_was_probably_meant_is_asked(typed: str, question: str) -> None:
+    assert did_you_mean(typed, ["action_horizon", "execution_horizon", "robot", "robot_options"]) == question

@@ -1,7 +1,8 @@
 """How numbers are written for people, in one way everywhere."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 
 
 def significant(value: float | None) -> str:
@@ -17,6 +18,18 @@ def significant(value: float | None) -> str:
 def cosine(value: float | None) -> str:
     """With six decimals, as those near 1 are of interest. None is "not finite"."""
     return "not finite" if value is None else f"{value:.6f}"
+
+
+def did_you_mean(typed: str, known: Iterable[str]) -> str:
+    """A question with the known names that were probably meant: "did you mean a or b?"; "" if there are none.
+
+    Those that contain what was typed, unless there are more than three; else the one that is spelt most alike.
+    """
+    names = list(known)
+    meant = [name for name in names if typed and typed in name]
+    if not 1 <= len(meant) <= 3:
+        meant = get_close_matches(typed, names, n=1)
+    return f"did you mean {' or '.join(meant)}?" if meant else ""
 
 
 def denoising(about: Mapping[str, object]) -> str:
