@@ -90,8 +90,9 @@ def evaluate_command(
         _refuse_policy_options(options)
     else:
         options.check(checkpoint)
-    if options.out is not None:
-        check_folder(options.out)
+    for written in (options.out or DEFAULT_OUT, options.record):
+        if written is not None:
+            check_folder(written)
     chosen = options.simulator(simulator, output)
     protocol = options.protocol(chosen, simulator)
     jobs = options.jobs(chosen, protocol.suite)

@@ -2,6 +2,8 @@
 
 import os
 import sys
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,11 +17,25 @@ if TYPE_CHECKING:
 
 def check_folder(folder: Path) -> None:
     """Raise ConfigError now for a folder that couldn't be made or written to later, after all the work."""
-    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    places = (folder.absolute(), *folder.absolute().parents)
+    existing = next(path for path in places if os.path.exists(path))
     if not existing.is_dir():
         raise ConfigError(f"can't write into {folder}: {existing} is a file")
-    if not os.access(existing, os.W_OK):
-        raise ConfigError(f"can't write into {folder}: {existing} isn't writable")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _probe(folder)
+    except OSError as error:
+        why = "isn't writable" if existing == places[0] else "takes no such folder"
+        raise ConfigError(f"can't write into {folder}: {existing} {why} ({error.strerror})") from error
+    finally:
+        for made in places[: places.index(existing)]:  # by this check alone
+            with suppress(OSError):
+                made.rmdir()
+
+
+def _probe(folder: Path) -> None:
+    """Make something in a folder, and remove it. Raises OSError; `os.access` allows root what a filesystem doesn't."""
+    os.rmdir(tempfile.mkdtemp(prefix=".turbopi-", dir=folder))
 
 
 def check_writable(file: Path) -> None:
@@ -28,9 +44,15 @@ def check_writable(file: Path) -> None:
         raise ConfigError(f"{file} is a folder; give a file's name")
     if not file.absolute().parent.is_dir():
         raise ConfigError(f"can't write {file}: there is no folder {file.absolute().parent}")
-    for path in (file.absolute().parent, file):
-        if path.exists() and not os.access(path, os.W_OK):
-            raise ConfigError(f"can't write {file}: {path} isn't writable")
+    if file.exists() and not os.access(file, os.W_OK):
+        raise ConfigError(f"can't write {file}: it isn't writable")
+    target = Path(os.path.realpath(file))
+    if target.exists() and not target.is_file():
+        return  # /dev/null or a pipe, which is written to as it is
+    try:
+        _probe(target.parent)
+    except OSError as error:
+        raise ConfigError(f"can't write {file}: {target.parent} isn't writable ({error.strerror})") from error
 
 
 def check_replaces(file: Path, key: str, what: str) -> None:
