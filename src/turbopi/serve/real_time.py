@@ -63,7 +63,7 @@ class RealTime:
 
     waits  whether a request of the session of that name still waits for its turn: then a newer one replaces it
 
-    Raises ConfigError if the policy doesn't offer the options' `execution`.
+    Raises ConfigError as `check_execution`.
     """
 
     def __init__(
@@ -80,9 +80,7 @@ class RealTime:
         self._options, self._metrics, self._clock, self._waits = options, metrics, clock, waits
         self._named: OrderedDict[Hashable, _Session] = OrderedDict()  # the one used last at the end
         self._of_connections: dict[Hashable, _Session] = {}
-        if options.execution is not None and options.execution not in self._modes:
-            what = f"it offers {self._modes}" if self._modes else "it offers none"
-            raise ConfigError(f"execution={options.execution!r} was asked for, which this policy can't: {what}")
+        check_execution(options, self._offered, metadata.get("action_horizon"))
         metrics.watch_sessions(lambda: len(self._named) + len(self._of_connections))
 
     @property
@@ -309,6 +307,27 @@ class RealTime:
                     )
                 return s
         return max(1, horizon // 2)
+
+
+def check_execution(options: ServerOptions, offered: Mapping[str, Any], horizon: int | None) -> None:
+    """Raise ConfigError if a policy can't do what the options ask for.
+
+    offered  its metadata's "real_time"
+    horizon  actions of its chunks; None: it doesn't say
+    """
+    execution, modes, s = options.execution, list(offered.get("modes", ())), options.execution_horizon
+    if execution is not None and execution not in modes:
+        what = f"it offers {modes}" if modes else "it offers none"
+        if execution == "rtc_trained" and modes:
+            what += (
+                ". That mode is for checkpoints that were trained with simulated delays; if this one was, put "
+                '{"real_time": {"trained_max_delay": …}} into a turbopi.json'
+            )
+        raise ConfigError(f"execution={execution!r} was asked for, which this policy can't: {what}")
+    if s is not None and horizon is not None and s > horizon:
+        raise ConfigError(
+            f"execution_horizon={s} was asked for, but this policy's chunks have {horizon} actions: give at most that"
+        )
 
 
 def _seed(asked: Asked) -> dict[str, Any]:
