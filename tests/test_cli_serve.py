@@ -26,6 +26,7 @@ from turbopi.checkpoint import random_checkpoint
 from turbopi.cli.framework import Output
 from turbopi.cli.offers import offers_of
 from turbopi.cli.options import PolicyOptions
+from turbopi.cli.ports import why_not_free
 from turbopi.errors import ConfigError
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
@@ -265,6 +266,19 @@ def test_a_taken_port_is_refused_before_weights_are_loaded() -> None:
         message = refusal(turbopi("serve", *TINY, "--port", port))
     assert message.startswith(f"can't listen on 127.0.0.1:{port}: ")
     assert message.endswith("Choose another --host or --port")
+
+
+def test_a_port_that_is_taken_on_one_address_of_several_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def both(*_: Any, **__: Any) -> list[Any]:
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, port)) for address in ("127.0.0.2", "127.0.0.1")]
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        monkeypatch.setattr(socket, "getaddrinfo", both)
+        assert why_not_free("two", port) == "Address already in use"
+    assert why_not_free("two", port) is None
 
 
 def test_a_host_that_is_not_this_machine_is_refused() -> None:

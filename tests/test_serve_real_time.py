@@ -1,6 +1,7 @@
 """Real-time execution over the wire: what clients may ask, sessions, and a server that survives all of it."""
 
 import asyncio
+import io
 import json
 import os
 import platform
@@ -14,6 +15,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from rich.console import Console
 from serve_fakes import FakePolicy, http_get
 from websockets.sync.client import connect
 
@@ -25,7 +27,7 @@ from turbopi.execution.messages import KEYS, message, read_message
 from turbopi.realtime import RealTimeExecutor
 from turbopi.recordings import iter_recording
 from turbopi.running_chunk import JoinMode, RunningChunk
-from turbopi.serve import PolicyServer, ServerOptions, running
+from turbopi.serve import PolicyServer, ServerOptions, run, running
 from turbopi.serve import real_time as sessions_module
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import JOINING
@@ -370,6 +372,30 @@ def test_a_server_joins_by_the_ways_there_are() -> None:
 def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         ServerOptions(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, ("by rtc:", "50 actions a second (--control-hz), 5 of 10 before", "delay is measured here")),
+        ({"execution": "rtc_trained", "delay_steps": 3}, ("by rtc_trained:", "the delay is 3 control steps.")),
+        ({"execution_horizon": 6, "control_hz": 12.5}, ("12.5 actions a second", "6 of 10 before")),
+    ],
+)
+def test_a_server_says_how_it_joins_in_one_line(options: dict[str, Any], words: tuple[str, ...]) -> None:
+    policy, console = Joins(), Console(file=io.StringIO(), width=60)
+    policy.metadata["action_horizon"] = H
+
+    def serve_forever(self: PolicyServer, ready: Any, stopping: Any) -> None:
+        ready(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PolicyServer, "serve_forever", serve_forever)
+        run(policy, **{"execution": "rtc", "control_hz": 50, **options}, console=console)
+        run(policy, console=console)
+    lines = [line for line in console.file.getvalue().splitlines() if line.startswith("Joins")]  # type: ignore[attr-defined]
+    assert len(lines) == 1 and all(word in lines[0] for word in words), lines
+    assert lines[0].endswith("A request's turbopi/step, turbopi/delay and turbopi/execution_horizon come first")
 
 
 # --- through a socket -------------------------------------------------------------------------------------------------
