@@ -116,6 +116,8 @@ def test_a_running_chunk_comes_through_a_message_as_it_was() -> None:
 
 
 LEFT = np.zeros((4, A), np.float32)
+LARGE = np.zeros((4, A))
+LARGE[2, 1] = 1
 
 
 @pytest.mark.parametrize(
@@ -146,7 +148,14 @@ LEFT = np.zeros((4, A), np.float32)
         ({"previous": LEFT[0], "mode": "rtc", "delay": 1}, r"turbopi/previous has shape \[3\]"),
         ({"previous": LEFT[:0], "mode": "rtc", "delay": 1}, r"shape \[0, 3\]"),
         ({"previous": [1.0], "mode": "rtc", "delay": 1}, "turbopi/previous is list"),
-        ({"previous": LEFT + np.nan, "mode": "rtc", "delay": 1}, "aren't finite"),
+        (
+            {"previous": LEFT + np.nan, "mode": "rtc", "delay": 1},
+            r"previous has nan at \[0, 0\]; all should be finite in",
+        ),
+        ({"previous": LARGE * 1e39, "mode": "rtc", "delay": 1}, r"previous has 1e\+39 at \[2, 1\]; .* in float32"),
+        ({"previous": LARGE * 1e20, "mode": "rtc", "delay": 1}, r"previous has 1e\+20 at \[2, 1\], whose square isn't"),
+        ({"previous": LARGE * -1e20, "mode": "rtc", "delay": 1}, r"previous has -1e\+20 at \[2, 1\], whose square"),
+        ({"previous": LEFT, "mode": "rtc", "delay": 1, "anchor": np.array([1, np.inf])}, r"anchor has inf at \[1\]"),
         ({"previous": LEFT, "mode": "rtc", "delay": 1, "session": "a"}, "either the client keeps"),
         ({"anchor": np.zeros(2)}, "turbopi/anchor came without turbopi/previous"),
     ],
@@ -446,6 +455,20 @@ def test_the_server_survives_every_refusal(served: tuple[PolicyServer, Joins]) -
         if sample.name == "turbopi_errors_total"
     }
     assert status == 200 and errors["observation"] == len(bad)
+
+
+def test_actions_that_are_not_finite_are_told_with_the_left_over_that_was_joined(
+    served: tuple[PolicyServer, Joins],
+) -> None:
+    server, _ = served
+    joined = {"turbopi/previous": LARGE * 1e18, "turbopi/mode": "rtc", "turbopi/delay": 1}
+    with connect(server.url, compression=None) as socket:
+        socket.recv()
+        for asked in (joined, {}):
+            socket.send(pack({"place": 0, "bad": True, **asked}))
+            reply = socket.recv(30)
+            assert isinstance(reply, str) and reply.startswith("bad actions: the actions hold nan at [0, 0]")
+            assert ("turbopi/previous has values up to 1e+18" in reply) == bool(asked)
 
 
 def test_a_recording_of_joined_calls_is_read_back(tmp_path: Path) -> None:
