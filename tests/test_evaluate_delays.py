@@ -184,7 +184,7 @@ def test_ways_that_tell_the_model_ask_the_policy_for_it() -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ("--execution never", "execution is 'never'; choose one of sync, async"),
+        ("--execution never", "--execution never is no way to run; choose one of sync, async"),
         ("--delay-steps x", "--delay-steps is 'x'"),
         ("--delay-steps=", "--delay-steps is ''"),
         ("--execution-horizon 4 --replan 6", "say the same; give one of them"),
