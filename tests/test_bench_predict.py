@@ -153,7 +153,7 @@ def test_a_gpu_is_found_as_people_write_it(typed: str) -> None:
 
 
 def test_an_unknown_gpu_is_refused_with_the_list() -> None:
-    with pytest.raises(ConfigError, match=r"'rtx9090'.* known are rtx3090, .*b200"):
+    with pytest.raises(ConfigError, match=r"'rtx9090'.*; did you mean rtx5090\? Known are rtx3090, .*b200"):
         find_gpu("rtx9090")
     with pytest.raises(ConfigError, match=r"'5090'.*; did you mean rtx5090\?"):
         find_gpu("5090")

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,10 @@ from turbopi.checkpoint import open_checkpoint
 from turbopi.cli import app
 from turbopi.cli.framework import Output, plain, with_errors_told
 from turbopi.cli.progress import with_stages
-from turbopi.cli.typed import OPTIONS, as_typed
+from turbopi.cli.typed import OF_POLICIES, OF_SERVERS, as_typed
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.policy import UnifiedPolicy
+from turbopi.serve import ServerOptions
 
 COMMANDS = (
     *(
@@ -167,7 +169,7 @@ def test_messages_name_options_as_they_were_typed(tmp_path: Path) -> None:
         "--config pi06 is neither a preset, nor 'auto', nor a path to a .json; presets are pi05_base, "
     )
     told = refusal(turbopi("convert", golden, tmp_path / "out", "--config", "pi05_liberoo"))
-    assert told.endswith("Did you mean pi05_libero?")
+    assert "; did you mean pi05_libero? Presets are pi05_base, " in told
 
 
 @pytest.mark.parametrize(
@@ -179,6 +181,19 @@ def test_messages_name_options_as_they_were_typed(tmp_path: Path) -> None:
         ("Or pass its path as tokenizer=, or put", "Or pass its path as --tokenizer, or put"),
         ("try it with backend='fused'", "try it with --backend fused"),
         ("give num_denoising_steps=", "give --steps"),
+        ("queue_limit=-1 should be 0 or more", "--queue-limit -1 should be 0 or more"),
+        ("max_batch=2.5, or record_dir=", "--max-batch 2.5, or --record"),
+        ("as in deadline_ms=nan.", "as in --deadline-ms nan."),
+        ("CUDA graphs need a GPU; use backend 'pytorch'", "CUDA graphs need a GPU; use --backend pytorch"),
+        (
+            "backend 'onnx' can't; take solver 'euler' and time grid 'uniform', or backend 'fused' or 'pytorch'",
+            "backend 'onnx' can't; take --solver euler and --time-grid uniform, or --backend fused or pytorch",
+        ),
+        (
+            "take precision 'bf16', or to judge FP8 without such a GPU backend 'emulated_fp8'",
+            "take --precision bf16, or to judge FP8 without such a GPU --backend emulated_fp8",
+        ),
+        ("take the GPU's; backend 'fused' has none", "take the GPU's; backend 'fused' has none"),
         ("runs/config=a.json isn't there", "runs/config=a.json isn't there"),
         ("my_config= is nothing of ours", "my_config= is nothing of ours"),
     ],
@@ -189,9 +204,13 @@ def test_only_arguments_are_worded_as_options(said: str, shown: str) -> None:
 
 def test_every_argument_of_the_policy_is_an_option_of_the_policy_commands() -> None:
     arguments = set(inspect.signature(UnifiedPolicy.__init__).parameters) - {"self", "checkpoint_dir", "progress"}
-    assert set(OPTIONS) == arguments
-    shown = turbopi("serve", "--help").stdout
-    assert all(option in text_of(shown) for option in OPTIONS.values())
+    assert set(OF_POLICIES) == arguments
+
+
+def test_every_option_of_a_server_is_worded_as_it_is_typed() -> None:
+    assert set(OF_SERVERS) == {field.name for field in fields(ServerOptions)} | {"autoscaling"}
+    shown = text_of(turbopi("serve", "--help").stdout)
+    assert not [option for option in (*OF_POLICIES.values(), *OF_SERVERS.values()) if option not in shown]
 
 
 def test_an_unknown_preset_lists_the_choices() -> None:

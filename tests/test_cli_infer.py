@@ -260,7 +260,10 @@ def test_a_later_call_of_a_recording_that_is_wrong_is_named(recording: Path, tmp
     assert "000001.npz: observation/state has shape (7,)" in result.stderr
 
 
-def test_noise_of_another_shape_is_refused(npz: Path, tmp_path: Path) -> None:
+def test_noise_of_another_shape_is_refused_before_weights_are_loaded(
+    npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(UnifiedPolicy, "__init__")
     np.save(tmp_path / "noise.npy", np.zeros((9, 32), np.float32))
     result = turbopi("infer", *TINY, npz, "--noise", tmp_path / "noise.npy", "-o", tmp_path / "actions.npz")
     assert result.exit_code == 2

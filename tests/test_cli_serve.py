@@ -3,11 +3,11 @@
 import json
 import os
 import re
-import select
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,7 +21,13 @@ import pytest
 from cli_helpers import refusal, turbopi
 from websockets.sync.client import connect
 
+from turbopi import backends
 from turbopi.checkpoint import random_checkpoint
+from turbopi.cli.framework import Output
+from turbopi.cli.offers import offers_of
+from turbopi.cli.options import PolicyOptions
+from turbopi.cli.ports import why_not_free
+from turbopi.errors import ConfigError
 from turbopi.observation import Observation
 from turbopi.policy import UnifiedPolicy
 from turbopi.recordings import iter_recording
@@ -52,19 +58,17 @@ def serving(*options: str, **environment: str) -> Iterator[tuple["subprocess.Pop
 
 
 def wait_for_url(process: "subprocess.Popen[str]", printed: list[str]) -> str:
-    assert process.stdout is not None
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
-        readable, _, _ = select.select([process.stdout], [], [], 1)
-        if readable:
-            line = process.stdout.readline()
-            if not line:
-                assert process.stderr is not None
-                raise AssertionError(f"the server ended: {printed} {process.stderr.read()}")
+    assert process.stdout is not None and process.stderr is not None
+    too_late = threading.Timer(120, process.kill)  # select() wouldn't see a line that readline() has read ahead
+    too_late.start()
+    try:
+        for line in process.stdout:
             printed.append(line)
             if found := re.search(r"Serving at (ws://\S+)", line):
                 return found[1]
-    raise AssertionError(f"no server after 120 s: {printed}")
+    finally:
+        too_late.cancel()
+    raise AssertionError(f"the server ended, or didn't serve in 120 s: {printed} {process.stderr.read()}")
 
 
 def test_a_client_gets_actions_and_ctrl_c_stops(tmp_path: Path) -> None:
@@ -133,10 +137,66 @@ def test_what_a_server_is_to_join_reaches_it(monkeypatch: Any) -> None:
     assert "model_actions" in answer
 
 
-def test_a_mode_that_the_checkpoint_was_not_trained_for_is_one_line() -> None:
-    result = turbopi("serve", *TINY, "--port", 0, "--execution", "rtc_trained", "--control-hz", 50)
-    assert result.exit_code == 2
-    assert "execution is 'rtc_trained', which this policy can't: it offers ['rtc', " in result.stderr
+RTC = ["--execution", "rtc", "--control-hz", "50"]
+CANNOT = "was asked for, which this policy can't: it offers"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["--execution", "rtc_trained", "--control-hz", "50"],
+            f"--execution rtc_trained {CANNOT} ['rtc', 'rtc_identity']. That mode is for checkpoints that were trained",
+        ),
+        ([*RTC, "--solver", "heun", "--steps", "6"], f"--execution rtc {CANNOT} none"),
+        (
+            [*RTC, "--max-batch", "4", "--backend", "pytorch"],
+            "--max-batch 4 was asked for, but this policy runs requests",
+        ),
+        (
+            [*RTC, "--execution-horizon", "11"],
+            "--execution-horizon 11 was asked for, but this policy's chunks have 10 ",
+        ),
+    ],
+)
+def test_what_the_policy_cannot_do_is_refused_before_its_weights_are_loaded(
+    options: list[str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(PolicyOptions, "make_policy")
+    assert message in refusal(turbopi("serve", *TINY, "--device", "cpu", "--port", 0, *options))
+
+
+@pytest.mark.parametrize("settings", [{}, {"real_time": {"trained_max_delay": 2}}, {"solver": "heun"}], ids=repr)
+@pytest.mark.parametrize("backend", ["auto", "pytorch"])
+def test_what_a_policy_offers_is_known_before_its_weights_are_loaded(
+    settings: dict[str, Any], backend: str, tmp_path: Path
+) -> None:
+    config = tmp_path / "mine.json"
+    config.write_text(json.dumps({"preset": "pi05_tiny", **settings}))
+    options = PolicyOptions(random_weights="pi05_tiny", config=str(config), backend=backend, device="cpu")
+    offers, policy = offers_of(options, options.open(None)), options.make_policy(options.open(None), Output())
+    assert offers.real_time == policy.metadata["real_time"]
+    assert (offers.pipelined, offers.batch_modes) == (policy.pipelined, policy.batch_modes)
+    assert ("rtc_trained" in offers.real_time["modes"]) == ("real_time" in settings)
+
+
+def test_what_backends_for_gpus_offer_is_known_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backends, "check", lambda *_: None)
+    found = {
+        name: offers_of(options, options.open(None))
+        for name in ("fused", "cuda_graph", "tensorrt", "tensorrt_pipelined")
+        if (options := PolicyOptions(random_weights="pi05_tiny", backend=name, device="cpu"))
+    }
+    modes = ("rtc", "rtc_identity")
+    assert {name: one.batch_modes for name, one in found.items() if one.batch_modes} == {
+        "fused": modes,
+        "cuda_graph": modes,
+    }
+    assert [name for name, one in found.items() if one.pipelined] == ["tensorrt_pipelined"]
+    assert [name for name, one in found.items() if one.real_time["modes"]] == ["fused", "cuda_graph"]
+    heun = PolicyOptions(random_weights="pi05_tiny", backend="tensorrt", device="cpu", solver="heun")
+    with pytest.raises(ConfigError, match="takes Euler's steps on the uniform grid alone"):
+        offers_of(heun, heun.open(None))
 
 
 def test_strict_reaches_the_policy_and_needs_a_warm_up(monkeypatch: Any) -> None:
@@ -179,12 +239,13 @@ def test_ctrl_c_while_it_warms_up_stops_it_before_any_client() -> None:
     ("options", "message"),
     [
         (["--api-key", "a b"], "the API key must be printable ASCII without spaces"),
-        (["--max-message-mb", "0"], "max_message_mb must be more than 0"),
+        (["--max-message-mb", "0"], "--max-message-mb 0 should be more than 0 and finite"),
         (["--record", __file__], "is a file"),
-        (["--execution", "async", "--control-hz", "50"], "execution is 'async'; a server joins chunks by rtc"),
-        (["--execution", "rtc"], "needs the robots' control rate, too: give control_hz (--control-hz)"),
-        (["--control-hz", "0"], "control_hz must be more than 0"),
-        (["--deadline-ms", "0"], "deadline_ms must be more than 0 and at most 60000"),
+        (["--execution", "async", "--control-hz", "50"], "--execution async isn't a server's: it joins chunks by rtc"),
+        (["--execution", "rtc"], "--execution rtc needs the robots' control rate, too: give --control-hz"),
+        (["--control-hz", "0"], "--control-hz 0 should be more than 0"),
+        (["--deadline-ms", "0"], "--deadline-ms 0 should be more than 0 and at most 60000"),
+        (["--allowed-hosts", "http://robot.lab"], "--allowed-hosts has 'http://robot.lab', which is no name"),
         (["--max-batch", "4", "--no-warmup"], "--max-batch 4 needs the warm-up, which measures batches"),
     ],
 )
@@ -207,6 +268,19 @@ def test_a_taken_port_is_refused_before_weights_are_loaded() -> None:
     assert message.endswith("Choose another --host or --port")
 
 
+def test_a_port_that_is_taken_on_one_address_of_several_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def both(*_: Any, **__: Any) -> list[Any]:
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, port)) for address in ("127.0.0.2", "127.0.0.1")]
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        monkeypatch.setattr(socket, "getaddrinfo", both)
+        assert why_not_free("two", port) == "Address already in use"
+    assert why_not_free("two", port) is None
+
+
 def test_a_host_that_is_not_this_machine_is_refused() -> None:
     assert "can't listen on 192.0.2.1:8000: " in refusal(turbopi("serve", *TINY, "--host", "192.0.2.1"))
 
@@ -214,7 +288,7 @@ def test_a_host_that_is_not_this_machine_is_refused() -> None:
 @pytest.mark.parametrize(
     ("option", "value", "expected"),
     [
-        ("--max-message-mb", "0", "max_message_mb must be more than 0"),
+        ("--max-message-mb", "0", "--max-message-mb 0 should be more than 0"),
         ("--api-key", "two words", "the API key must be printable ASCII without spaces"),
     ],
 )

@@ -19,6 +19,7 @@ from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import protocol_json
 from turbopi.evaluate.sources import LocalPolicy
 from turbopi.execution import WAYS
+from turbopi.policy import UnifiedPolicy
 from turbopi.sim import create
 from turbopi.sim.base import Task
 
@@ -183,7 +184,7 @@ def test_ways_that_tell_the_model_ask_the_policy_for_it() -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ("--execution never", "execution is 'never'; choose one of sync, async"),
+        ("--execution never", "--execution never is no way to run; choose one of sync, async"),
         ("--delay-steps x", "--delay-steps is 'x'"),
         ("--delay-steps=", "--delay-steps is ''"),
         ("--execution-horizon 4 --replan 6", "say the same; give one of them"),
@@ -191,6 +192,21 @@ def test_ways_that_tell_the_model_ask_the_policy_for_it() -> None:
 )
 def test_bad_ways_are_refused(options: str, why: str, tmp_path: Path) -> None:
     assert why in refused(f"eval reacher --random-weights pi05_tiny {options}", "--out", tmp_path / "never")
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ("--execution async,rtc_trained", "--execution rtc_trained isn't offered by this policy, which offers"),
+        ("--execution async --delay-steps 0,9", "a delay of 9 control steps doesn't fit --execution async"),
+        ("--replan 11", "the policy's chunks have 10 actions, so it can't act 11 steps before it is asked again"),
+    ],
+)
+def test_what_the_policy_cannot_do_is_refused_before_its_weights_are_loaded(
+    options: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(UnifiedPolicy, "__init__")
+    assert why in refused(f"eval chase --random-weights pi05_tiny {options}", "--out", tmp_path / "never")
 
 
 def test_the_command_runs_every_cell_and_compares_them(tmp_path: Path) -> None:

@@ -382,7 +382,9 @@ def test_settings_that_cannot_be_right_are_refused(options: dict[str, Any], text
 
 
 def test_an_unknown_way_is_refused_with_those_there_are() -> None:
-    with pytest.raises(ConfigError, match="execution is 'fast'; choose one of sync, async, ensemble, rtc, rtc_ident"):
+    with pytest.raises(
+        ConfigError, match="execution='fast' is no way to run; choose one of sync, async, ensemble, rtc, rtc_ident"
+    ):
         way_named("fast")
 
 

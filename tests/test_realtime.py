@@ -546,7 +546,7 @@ def test_a_way_that_the_policy_does_not_offer_is_refused(execution: str) -> None
         ({"control_hz": 0}, "control_hz is 0"),
         ({"control_hz": float("nan")}, "control_hz is nan"),
         ({"control_hz": 1e9}, "at most 10000"),
-        ({"execution": "fast"}, "execution is 'fast'"),
+        ({"execution": "fast"}, "execution='fast' is no way to run"),
         ({"execution_horizon": 0}, "execution horizon is 0"),
         ({"on_empty": "stop"}, "on_empty is 'stop'; choose one of hold, slow_down, raise"),
         ({"hold_action": "first"}, "hold_action is 'first'"),
@@ -561,7 +561,7 @@ def test_a_way_that_the_policy_does_not_offer_is_refused(execution: str) -> None
         ({"schedule": "steep"}, "schedule is 'steep'; expected one of"),
         ({"max_guidance_weight": float("nan")}, "max_guidance_weight is nan; expected 0 to 1e6"),
         ({"infer_arguments": 5}, "infer_arguments is 5; it should be a mapping"),
-        ({"execution": ["rtc"]}, r"execution is \['rtc'\]; choose one of"),
+        ({"execution": ["rtc"]}, r"execution=\['rtc'\] is no way to run; choose one of"),
         ({"policy": object()}, "object is no policy"),
     ],
 )

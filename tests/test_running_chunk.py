@@ -243,7 +243,12 @@ def test_a_left_over_keeps_its_absolute_actions_when_the_state_has_moved() -> No
     np.testing.assert_array_equal(again[:, unchanged], left_over[:, unchanged])
     joined = policy.infer(moved, seed=1, previous=RunningChunk(left_over, 2, anchor=old), model_actions=True)
     np.testing.assert_array_equal(joined["anchor"], np.asarray(pipeline.anchor(state)))
-    for anchor, message in ((old[:3], r"shape \[3\]"), (old * np.nan, "14 finite numbers")):
+    far = np.where(mask, 1e300, 0.0)
+    for anchor, message in (
+        (old[:3], r"shape \[3\]"),
+        (old * np.nan, "14 finite numbers"),
+        (far, r"moved from its anchor to the new state, isn't finite in float32 at \[0, 0\]: .* the anchor 1e\+300"),
+    ):
         with pytest.raises(ObservationError, match=message):
             policy.infer(moved, previous=RunningChunk(left_over, 2, anchor=anchor))
 

@@ -242,7 +242,7 @@ def test_a_policy_whose_batches_do_not_join_in_the_servers_mode_forms_none(mode:
     for kind in (Fewer, Silent):
         calls = PolicyServer(kind(), execution=mode, control_hz=50)._calls
         assert isinstance(calls, PolicyCalls) and calls.times.largest == calls.joining.largest == 1
-        with pytest.raises(ConfigError, match=r"max_batch is 4, but this policy runs requests that join .* one by one"):
+        with pytest.raises(ConfigError, match=r"max_batch=4 was asked for, but this policy runs .* one by one"):
             PolicyServer(kind(), execution=mode, control_hz=50, max_batch=4)
 
 

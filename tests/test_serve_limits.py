@@ -257,7 +257,7 @@ def test_who_comes_beyond_all_room_is_told_so(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_max_clients_must_be_one_or_more() -> None:
-    with pytest.raises(ConfigError, match="max_clients must be 1 or more, not 0"):
+    with pytest.raises(ConfigError, match="max_clients=0 should be 1 or more"):
         PolicyServer(FakePolicy(), max_clients=0)
 
 

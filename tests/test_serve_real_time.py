@@ -1,6 +1,7 @@
 """Real-time execution over the wire: what clients may ask, sessions, and a server that survives all of it."""
 
 import asyncio
+import io
 import json
 import os
 import platform
@@ -14,6 +15,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from rich.console import Console
 from serve_fakes import FakePolicy, http_get
 from websockets.sync.client import connect
 
@@ -25,7 +27,7 @@ from turbopi.execution.messages import KEYS, message, read_message
 from turbopi.realtime import RealTimeExecutor
 from turbopi.recordings import iter_recording
 from turbopi.running_chunk import JoinMode, RunningChunk
-from turbopi.serve import PolicyServer, ServerOptions, running
+from turbopi.serve import PolicyServer, ServerOptions, run, running
 from turbopi.serve import real_time as sessions_module
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import JOINING
@@ -114,6 +116,8 @@ def test_a_running_chunk_comes_through_a_message_as_it_was() -> None:
 
 
 LEFT = np.zeros((4, A), np.float32)
+LARGE = np.zeros((4, A))
+LARGE[2, 1] = 1
 
 
 @pytest.mark.parametrize(
@@ -144,7 +148,14 @@ LEFT = np.zeros((4, A), np.float32)
         ({"previous": LEFT[0], "mode": "rtc", "delay": 1}, r"turbopi/previous has shape \[3\]"),
         ({"previous": LEFT[:0], "mode": "rtc", "delay": 1}, r"shape \[0, 3\]"),
         ({"previous": [1.0], "mode": "rtc", "delay": 1}, "turbopi/previous is list"),
-        ({"previous": LEFT + np.nan, "mode": "rtc", "delay": 1}, "aren't finite"),
+        (
+            {"previous": LEFT + np.nan, "mode": "rtc", "delay": 1},
+            r"previous has nan at \[0, 0\]; all should be finite in",
+        ),
+        ({"previous": LARGE * 1e39, "mode": "rtc", "delay": 1}, r"previous has 1e\+39 at \[2, 1\]; .* in float32"),
+        ({"previous": LARGE * 1e20, "mode": "rtc", "delay": 1}, r"previous has 1e\+20 at \[2, 1\], whose square isn't"),
+        ({"previous": LARGE * -1e20, "mode": "rtc", "delay": 1}, r"previous has -1e\+20 at \[2, 1\], whose square"),
+        ({"previous": LEFT, "mode": "rtc", "delay": 1, "anchor": np.array([1, np.inf])}, r"anchor has inf at \[1\]"),
         ({"previous": LEFT, "mode": "rtc", "delay": 1, "session": "a"}, "either the client keeps"),
         ({"anchor": np.zeros(2)}, "turbopi/anchor came without turbopi/previous"),
     ],
@@ -204,7 +215,7 @@ def test_a_policy_that_joins_nothing_says_so() -> None:
     with pytest.raises(ObservationError, match="joins no chunks"):
         server.plan(message({"place": 0}, seed=3), "c")
     assert server.metadata == {}
-    with pytest.raises(ConfigError, match="execution is 'rtc', which this policy can't: it offers none"):
+    with pytest.raises(ConfigError, match="execution='rtc' was asked for, which this policy can't: it offers none"):
         real_time(policy, execution="rtc", control_hz=50)
 
 
@@ -360,16 +371,40 @@ def test_a_server_joins_by_the_ways_there_are() -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"execution": "async", "control_hz": 50}, "execution is 'async'; a server joins chunks by rtc"),
+        ({"execution": "async", "control_hz": 50}, "execution='async' isn't a server's: it joins chunks by rtc"),
         ({"execution": "rtc"}, "needs the robots' control rate"),
-        ({"control_hz": 0}, "control_hz must be more than 0"),
-        ({"execution_horizon": 0}, "execution_horizon must be 1 or more"),
-        ({"delay_steps": -1}, "delay_steps must be 0 or more"),
+        ({"control_hz": 0}, "control_hz=0 should be more than 0"),
+        ({"execution_horizon": 0}, "execution_horizon=0 should be 1 or more"),
+        ({"delay_steps": -1}, "delay_steps=-1 should be 0 or more"),
     ],
 )
 def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         ServerOptions(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, ("by rtc:", "50 actions a second (--control-hz), 5 of 10 before", "delay is measured here")),
+        ({"execution": "rtc_trained", "delay_steps": 3}, ("by rtc_trained:", "the delay is 3 control steps.")),
+        ({"execution_horizon": 6, "control_hz": 12.5}, ("12.5 actions a second", "6 of 10 before")),
+    ],
+)
+def test_a_server_says_how_it_joins_in_one_line(options: dict[str, Any], words: tuple[str, ...]) -> None:
+    policy, console = Joins(), Console(file=io.StringIO(), width=60)
+    policy.metadata["action_horizon"] = H
+
+    def serve_forever(self: PolicyServer, ready: Any, stopping: Any) -> None:
+        ready(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PolicyServer, "serve_forever", serve_forever)
+        run(policy, **{"execution": "rtc", "control_hz": 50, **options}, console=console)
+        run(policy, console=console)
+    lines = [line for line in console.file.getvalue().splitlines() if line.startswith("Joins")]  # type: ignore[attr-defined]
+    assert len(lines) == 1 and all(word in lines[0] for word in words), lines
+    assert lines[0].endswith("A request's turbopi/step, turbopi/delay and turbopi/execution_horizon come first")
 
 
 # --- through a socket -------------------------------------------------------------------------------------------------
@@ -420,6 +455,20 @@ def test_the_server_survives_every_refusal(served: tuple[PolicyServer, Joins]) -
         if sample.name == "turbopi_errors_total"
     }
     assert status == 200 and errors["observation"] == len(bad)
+
+
+def test_actions_that_are_not_finite_are_told_with_the_left_over_that_was_joined(
+    served: tuple[PolicyServer, Joins],
+) -> None:
+    server, _ = served
+    joined = {"turbopi/previous": LARGE * 1e18, "turbopi/mode": "rtc", "turbopi/delay": 1}
+    with connect(server.url, compression=None) as socket:
+        socket.recv()
+        for asked in (joined, {}):
+            socket.send(pack({"place": 0, "bad": True, **asked}))
+            reply = socket.recv(30)
+            assert isinstance(reply, str) and reply.startswith("bad actions: the actions hold nan at [0, 0]")
+            assert ("turbopi/previous has values up to 1e+18" in reply) == bool(asked)
 
 
 def test_a_recording_of_joined_calls_is_read_back(tmp_path: Path) -> None:

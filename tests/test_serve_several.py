@@ -494,12 +494,12 @@ def test_a_table_of_single_calls_alone_is_not_logged(
 @pytest.mark.parametrize(
     ("policy", "options", "text"),
     [
-        (FakePolicy, {"max_batch": 2}, "max_batch is 2, but this policy has no infer_batch and no example_observation"),
+        (FakePolicy, {"max_batch": 2}, "max_batch=2 was asked for, but this policy has no infer_batch and no ex"),
         (PipelinedFakePolicy, {"max_batch": 2}, "this policy is pipelined, and takes one observation at a time"),
-        (FakePolicy, {"max_batch": 0}, "max_batch must be from 1 to 64, not 0"),
-        (FakePolicy, {"max_batch": 65}, "max_batch must be from 1 to 64, not 65"),
-        (FakePolicy, {"deadline_ms": 0}, "deadline_ms must be more than 0 and at most 60000, not 0"),
-        (FakePolicy, {"deadline_ms": float("nan")}, "deadline_ms must be more than 0"),
+        (FakePolicy, {"max_batch": 0}, "max_batch=0 should be from 1 to 64"),
+        (FakePolicy, {"max_batch": 65}, "max_batch=65 should be from 1 to 64"),
+        (FakePolicy, {"deadline_ms": 0}, "deadline_ms=0 should be more than 0 and at most 60000"),
+        (FakePolicy, {"deadline_ms": float("nan")}, "deadline_ms=nan should be more than 0"),
         (
             Joins,
             {"max_batch": 2, "execution": "rtc", "control_hz": 50},

@@ -241,7 +241,7 @@ def test_observations_made_by_hand_are_verified_too_evenly_spread(tmp_path: Path
         (["--backend", "emulated_fp8", "--precision", "fp8"], "precision 'fp8' needs a calibration"),
         (["--backend", "emulated_fp8", "--precision", "fp8", "--quantization", "none.json"], "no file none.json"),
         (["--precision", "f32", "--quantization", "none.json"], "precision 'f32' takes no calibration"),
-        (["--precision", "fp8"], "fp8 needs an NVIDIA GPU of compute capability 8.9 or newer; take precision 'bf16'"),
+        (["--precision", "fp8"], "fp8 needs an NVIDIA GPU of compute capability 8.9 or newer; take --precision bf16"),
     ],
 )
 def test_calibrations_are_looked_at_before_anything_runs(

@@ -1,10 +1,10 @@
-"""Numbers as people read them."""
+"""Numbers and names as people read them."""
 
 import math
 
 import pytest
 
-from turbopi.wording import data_size, significant
+from turbopi.wording import data_size, did_you_mean, significant
 
 
 @pytest.mark.parametrize(
@@ -43,3 +43,19 @@ def test_an_error_has_three_significant_digits_however_small(value: float | None
 )
 def test_a_size_has_the_unit_that_fits(count: int, shown: str) -> None:
     assert data_size(count) == shown
+
+
+@pytest.mark.parametrize(
+    ("typed", "question"),
+    [
+        ("actoin_horizon", "did you mean action_horizon?"),
+        ("horizon", "did you mean action_horizon or execution_horizon?"),
+        ("action_horizon_of_chunks", "did you mean action_horizon?"),
+        ("o", ""),  # all contain it
+        ("robto", "did you mean robot?"),
+        ("qqq", ""),
+        ("", ""),
+    ],
+)
+def test_what_was_probably_meant_is_asked(typed: str, question: str) -> None:
+    assert did_you_mean(typed, ["action_horizon", "execution_horizon", "robot", "robot_options"]) == question

@@ -1,7 +1,8 @@
-"""How numbers are written for people, in one way everywhere."""
+"""How numbers and names are written for people, in one way everywhere."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 
 
 def significant(value: float | None) -> str:
@@ -25,6 +26,18 @@ def data_size(count: float) -> str:
         if count >= 1000 and round(count / size, digits) >= 1:
             return f"{count / size:.{digits}f} {unit}"
     return f"{count:.0f} bytes"
+
+
+def did_you_mean(typed: str, known: Iterable[str]) -> str:
+    """A question with the known names that were probably meant: "did you mean a or b?"; "" if there are none.
+
+    Those that contain what was typed, unless there are more than three; else the one that is spelt most alike.
+    """
+    names = list(known)
+    meant = [name for name in names if typed and typed in name]
+    if not 1 <= len(meant) <= 3:
+        meant = get_close_matches(typed, names, n=1)
+    return f"did you mean {' or '.join(meant)}?" if meant else ""
 
 
 def denoising(about: Mapping[str, object]) -> str:

@@ -14,6 +14,7 @@ from msgspec import Meta, Struct
 
 from turbopi.errors import ConfigError
 from turbopi.reading import read_document, shown
+from turbopi.wording import did_you_mean
 
 FILE = Path(__file__).parents[1] / "data" / "gpus.json"
 _Positive = Annotated[float, Meta(gt=0)]
@@ -60,10 +61,10 @@ def find_gpu(name: str) -> GpuSpec:
         typed = typed.removeprefix(word)
     known = published_gpus()
     if typed not in known:
-        meant = [key for key in known if typed and typed in key]
+        meant = did_you_mean(typed, known)
         raise ConfigError(
             f"no published numbers of a GPU {shown(name)} are known here; "
-            + (f"did you mean {' or '.join(meant)}? " if meant else f"known are {', '.join(known)}. ")
-            + "On the GPU itself `turbopi bench` measures"
+            + (f"{meant} Known are " if meant else "known are ")
+            + f"{', '.join(known)}. On the GPU itself `turbopi bench` measures"
         )
     return known[typed]

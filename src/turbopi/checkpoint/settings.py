@@ -41,7 +41,6 @@ except for sizes, which always come from the tensors.
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
 
@@ -50,6 +49,7 @@ from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, Polic
 from turbopi.errors import ConfigError
 from turbopi.model.solvers import GRIDS, SOLVERS, checked_grid
 from turbopi.reading import is_finite, is_integer, read_json, shown
+from turbopi.wording import did_you_mean
 
 FILE_NAME = "turbopi.json"
 ABOUT_WEIGHTS = {"lora_alpha", "lora_rslora", "base_model", "weights_sha256", "lerobot_semantics"}  # keys of a .json
@@ -91,10 +91,11 @@ def read_settings(config: ConfigSource, folder: Path) -> Settings:
         return Settings(f"preset {config}", values={"preset": config})
     if isinstance(config, str | Path) and str(config).endswith(".json"):
         return _read_file(Path(config))
-    near = get_close_matches(str(config), PRESETS, n=1)
+    near = did_you_mean(str(config), PRESETS)
     raise ConfigError(
         f"config={str(config)!r} is neither a preset, nor 'auto', nor a path to a .json; "
-        f"presets are {', '.join(PRESETS)}" + "".join(f". Did you mean {name}?" for name in near)
+        + (f"{near} Presets are " if near else "presets are ")
+        + ", ".join(PRESETS)
     )
 
 
@@ -206,7 +207,8 @@ def parse_values(values: Mapping[str, object], where: str) -> dict[str, Any]:
     """Check a settings object and bring it into PolicyConfig's types. ConfigError names the key and what it may be."""
     unknown = [key for key in values if key not in _SCHEMA]
     if unknown:
-        raise ConfigError(f"{where}: unknown keys {', '.join(map(shown, unknown[:5]))}; known are {', '.join(_SCHEMA)}")
+        asked = [shown(key) + (f" ({meant})" if (meant := did_you_mean(key, _SCHEMA)) else "") for key in unknown[:5]]
+        raise ConfigError(f"{where}: unknown keys {', '.join(asked)}; known are {', '.join(_SCHEMA)}")
     parsed = {}
     for key, value in values.items():
         expected, parse = _SCHEMA[key]

@@ -15,11 +15,13 @@ from turbopi.cli.api_key import ApiKey, ApiKeyFile, chosen_key
 from turbopi.cli.evaluate_options import EvalOptions
 from turbopi.cli.files import check_folder
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
+from turbopi.cli.offers import offers_of
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.errors import ConfigError
 from turbopi.reading import plain_document
 
 if TYPE_CHECKING:
+    from turbopi.checkpoint import Checkpoint
     from turbopi.evaluate.delays import Cell
     from turbopi.evaluate.plan import Job, Protocol
     from turbopi.evaluate.results import Episode, Results
@@ -90,8 +92,9 @@ def evaluate_command(
         _refuse_policy_options(options)
     else:
         options.check(checkpoint)
-    if options.out is not None:
-        check_folder(options.out)
+    for written in (options.out or DEFAULT_OUT, options.record):
+        if written is not None:
+            check_folder(written)
     chosen = options.simulator(simulator, output)
     protocol = options.protocol(chosen, simulator)
     jobs = options.jobs(chosen, protocol.suite)
@@ -104,7 +107,9 @@ def evaluate_command(
     if remote:
         source: PolicySource = RemotePolicy(host or "127.0.0.1", port, chosen_key(api_key, api_key_file))
     else:
-        source = options.local_policy(checkpoint, output)
+        source = options.local_policy(
+            checkpoint, output, lambda opened: _check_cells(options, opened, cells, protocol, chosen)
+        )
     try:
         for cell in cells:
             check_way(source, cell.protocol(protocol))
@@ -126,6 +131,20 @@ def evaluate_command(
         source.close()
     if not complete:
         raise typer.Exit(CHECK_FAILED)
+
+
+def _check_cells(
+    options: EvalOptions, opened: "Checkpoint", cells: "list[Cell]", protocol: "Protocol", simulator: "Simulator"
+) -> None:
+    """Raise ConfigError for what the policy won't be able to do, before its weights are loaded."""
+    from turbopi.evaluate.checks import check_delay, check_horizon, check_offered
+
+    offered, horizon = offers_of(options, opened).real_time, opened.config.model.action_horizon
+    for cell in cells:
+        own = cell.protocol(protocol)
+        check_offered(offered, None, own)
+        check_horizon(horizon, own.replan)
+        check_delay(own, simulator, horizon)
 
 
 def _run_cells(

@@ -12,6 +12,9 @@ from turbopi.cli.options import PolicyOptions
 from turbopi.errors import ConfigError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from turbopi.checkpoint import Checkpoint
     from turbopi.evaluate.delays import Cell
     from turbopi.evaluate.plan import Job, Protocol, VideoPlan
     from turbopi.evaluate.sources import PolicySource
@@ -238,12 +241,15 @@ class EvalOptions(PolicyOptions):
         states = None if self.initial_states is None else parse_numbers("--initial-states", self.initial_states)
         return make_jobs(choose_tasks(simulator, suite, wanted), states, self.trials, self.video_plan())
 
-    def local_policy(self, checkpoint: str | None, output: Output) -> "PolicySource":
-        """The policy in this process, warmed up."""
+    def local_policy(
+        self, checkpoint: str | None, output: Output, check: "Callable[[Checkpoint], None]" = lambda opened: None
+    ) -> "PolicySource":
+        """The policy in this process, warmed up. `check` is called before its weights are loaded."""
         from turbopi.evaluate.sources import LocalPolicy
         from turbopi.shipped import with_libero_stats
 
         opened = with_libero_stats(self.open(checkpoint))
+        check(opened)
         self.tell_if_random(opened, output)
         policy = self.make_policy(opened, output)
         policy.warmup()

@@ -2,9 +2,9 @@
 
 import os
 import sys
+import tempfile
 from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from turbopi.errors import ConfigError, ObservationError
@@ -16,28 +16,26 @@ if TYPE_CHECKING:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise ConfigError now for a folder that couldn't be made or written to later, after all the work.
-
-    The folder is made, written to and removed again: permissions alone don't tell, least of all to root.
-    """
-    target = folder.absolute()
-    existing = next(path for path in (target, *target.parents) if os.path.exists(path))
+    """Raise ConfigError now for a folder that couldn't be made or written to later, after all the work."""
+    places = (folder.absolute(), *folder.absolute().parents)
+    existing = next(path for path in places if os.path.exists(path))
     if not existing.is_dir():
         raise ConfigError(f"can't write into {folder}: {existing} is a file")
-    made: list[Path] = []
     try:
-        for path in reversed((target, *target.parents)):
-            if not os.path.exists(path):
-                path.mkdir()
-                made.append(path)
-        with TemporaryDirectory(prefix=".turbopi-", dir=target):
-            pass
+        folder.mkdir(parents=True, exist_ok=True)
+        _probe(folder)
     except OSError as error:
-        raise ConfigError(f"can't write into {folder}: {existing} isn't writable ({error.strerror})") from error
+        why = "isn't writable" if existing == places[0] else "takes no such folder"
+        raise ConfigError(f"can't write into {folder}: {existing} {why} ({error.strerror})") from error
     finally:
-        for path in reversed(made):
-            with suppress(OSError):  # somebody has put something there meanwhile
-                path.rmdir()
+        for made in places[: places.index(existing)]:  # by this check alone
+            with suppress(OSError):
+                made.rmdir()
+
+
+def _probe(folder: Path) -> None:
+    """Make something in a folder, and remove it. Raises OSError; `os.access` allows root what a filesystem doesn't."""
+    os.rmdir(tempfile.mkdtemp(prefix=".turbopi-", dir=folder))
 
 
 def check_writable(file: Path) -> None:
@@ -46,9 +44,15 @@ def check_writable(file: Path) -> None:
         raise ConfigError(f"{file} is a folder; give a file's name")
     if not file.absolute().parent.is_dir():
         raise ConfigError(f"can't write {file}: there is no folder {file.absolute().parent}")
-    for path in (file.absolute().parent, file):
-        if path.exists() and not os.access(path, os.W_OK):
-            raise ConfigError(f"can't write {file}: {path} isn't writable")
+    if file.exists() and not os.access(file, os.W_OK):
+        raise ConfigError(f"can't write {file}: it isn't writable")
+    target = Path(os.path.realpath(file))
+    if target.exists() and not target.is_file():
+        return  # /dev/null or a pipe, which is written to as it is
+    try:
+        _probe(target.parent)
+    except OSError as error:
+        raise ConfigError(f"can't write {file}: {target.parent} isn't writable ({error.strerror})") from error
 
 
 def check_replaces(file: Path, key: str, what: str) -> None:

@@ -22,6 +22,7 @@ from turbopi.files import write_whole
 if TYPE_CHECKING:
     import numpy as np
 
+    from turbopi.config import ModelConfig
     from turbopi.policy import UnifiedPolicy
 
 PLOT_SUFFIXES = (".png", ".pdf", ".svg")
@@ -91,6 +92,7 @@ def infer(
         raise ConfigError("--plot and --no-plot were both given; give one of them")
     check_writable(out)
     drawing = None if no_plot else plot or out.with_suffix(".png")
+    from turbopi.arguments import checked_noise
     from turbopi.recordings import load_observation
 
     _check_targets(Path(source), out, drawing)
@@ -101,8 +103,11 @@ def infer(
     options.tell_if_random(opened, output)
     with _naming(sources[0]):  # what is wrong with it is better known before minutes of loading
         robot_pipeline(opened, options.make_robot(), options.default_prompt).see(first, resize=False)
+    model = opened.config.model
+    if given_noise is not None:  # now: it is no observation's fault
+        checked_noise([given_noise], (1, model.action_horizon, model.action_dim))
     policy = options.make_policy(opened, output)
-    draw = _noise(policy, given_noise, seed, output)
+    draw = _noise(model, given_noise, seed, output)
     if warmup:
         if policy.backend.name == "pytorch_compile":
             output.line("warm-up: compiling, which takes a minute or more")
@@ -177,17 +182,14 @@ def _sources(path: Path, call: int | None) -> list[Path]:
 
 
 def _noise(
-    policy: "UnifiedPolicy", given: "np.ndarray | None", seed: int | None, output: Output
+    model: "ModelConfig", given: "np.ndarray | None", seed: int | None, output: Output
 ) -> Callable[[int], "np.ndarray"]:
     """Call i -> float32[H, action_dim]: the given noise for all, or what UnifiedPolicy draws for seed + i."""
     import numpy as np
 
-    from turbopi.arguments import checked_noise
-
-    shape = (policy.config.model.action_horizon, policy.config.model.action_dim)
     if given is not None:
-        checked_noise([given], (1, *shape))  # now: it is no observation's fault
         return lambda number: given
+    shape = (model.action_horizon, model.action_dim)
     first = secrets.randbelow(2**31) if seed is None else seed
     if seed is None:
         output.line(f"noise: seed {first} (--seed {first} gives these actions again)")

@@ -10,6 +10,7 @@ import typer
 from turbopi.cli.api_key import ApiKey, chosen_key
 from turbopi.cli.files import check_folder
 from turbopi.cli.framework import Output, command, log_to_stderr
+from turbopi.cli.offers import check_server
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.serve_ray import Autoscaling, FleetName, FleetWishes, Gpus, Ray, Replicas, Update, serve_fleet
@@ -197,6 +198,7 @@ def serve(
         serve_fleet(wishes, options, checkpoint, wanted, output, warmup=warmup, strict=strict, before_serving=_log_all)
         return
     opened = options.open(checkpoint)
+    check_server(wanted, options, opened)
     options.tell_if_random(opened, output)
     policy = options.make_policy(opened, output, strict=strict)
 

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from turbopi.cli.framework import Output
+from turbopi.cli.offers import check_server
 from turbopi.cli.options import PolicyOptions
 from turbopi.errors import ConfigError
 from turbopi.serve.options import ServerOptions
@@ -138,6 +139,8 @@ def serve_fleet(
     fleet.import_ray()
     options = wishes.options(policy, checkpoint, server)
     opened = policy.open(checkpoint)  # what is wrong with it shows here, not in a replica's log
+    anywhere = replace(policy, backend="pytorch", precision=None, device="cpu")  # replicas may run on other devices
+    check_server(replace(server, max_batch=None), anywhere, opened)
     policy.tell_if_random(opened, output)
     make = partial(make_policy, _for_workers(policy), _absolute(checkpoint), strict)
     with _cluster(output.console) as ours:

@@ -3,7 +3,7 @@
 import re
 
 # arguments of the Python interface whose messages reach the command line, and the options that they come from
-OPTIONS = {
+OF_POLICIES = {
     "config": "--config",
     "robot": "--robot",
     "backend": "--backend",
@@ -17,14 +17,44 @@ OPTIONS = {
     "default_prompt": "--default-prompt",
     "strict": "--strict",
 }
-_ARGUMENT = re.compile(rf"""(?<![\w/.-])({"|".join(OPTIONS)})=(?:(['"])(.*?)\2)?""")  # config=, config='auto'
+OF_SERVERS = {
+    "host": "--host",
+    "port": "--port",
+    "api_key": "--api-key",
+    "max_message_mb": "--max-message-mb",
+    "queue_limit": "--queue-limit",
+    "max_batch": "--max-batch",
+    "deadline_ms": "--deadline-ms",
+    "record_dir": "--record",
+    "allowed_hosts": "--allowed-hosts",
+    "max_clients": "--max-clients",
+    "page": "--page",
+    "execution": "--execution",
+    "control_hz": "--control-hz",
+    "execution_horizon": "--execution-horizon",
+    "delay_steps": "--delay-steps",
+    "autoscaling": "--autoscaling",
+}
+OPTIONS = {**OF_POLICIES, **OF_SERVERS}
+_ARGUMENT = re.compile(  # config=, config='auto', queue_limit=-1
+    rf"""(?<![\w/.-])({"|".join(OPTIONS)})=(?:(['"])(.*?)\2|([^\s,;:()'"]+(?<!\.)))?"""
+)
+_ADVICE = re.compile(r"\b(?:use|take) [^;:]*")  # use backend 'pytorch' or 'onnx'
+_ADVISED = re.compile(r"\b(backend|precision|solver|time grid) ('\w+'(?:(?:, | or )'\w+')*)")
 
 
 def as_typed(message: str) -> str:
-    """`message` with each `name=`, or `name='value'`, as the option that stands for it on the command line."""
+    """`message` with arguments as the options that stand for them on the command line.
+
+    An argument is `name=`, `name='value'` or `name=1.5`; or in advice, after "use" or "take", `backend 'value'`.
+    """
 
     def option(match: re.Match[str]) -> str:
-        value = match[3]
+        value = match[3] if match[4] is None else match[4]
         return OPTIONS[match[1]] if value is None else f"{OPTIONS[match[1]]} {value or repr(value)}"
 
-    return _ARGUMENT.sub(option, message)
+    def advised(match: re.Match[str]) -> str:
+        return f"{OPTIONS[match[1].replace(' ', '_')]} {match[2].replace(chr(39), '')}"
+
+    message = _ARGUMENT.sub(option, message)
+    return _ADVICE.sub(lambda advice: _ADVISED.sub(advised, advice[0]), message)

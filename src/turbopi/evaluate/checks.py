@@ -1,5 +1,8 @@
 """Whether a policy, a simulator and a protocol fit, asked before the first episode."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.evaluate.plan import Protocol
 from turbopi.evaluate.sources import Answer, PolicyRefused, PolicySource
@@ -33,12 +36,17 @@ def check_fit(source: PolicySource, simulator: Simulator, settings: SimSettings,
         raise ConfigError(
             f"the policy's actions have {width} numbers, but {simulator.name} needs {simulator.action_dim}; {robot}"
         )
+    check_horizon(horizon, replan)
+    return answer
+
+
+def check_horizon(horizon: int, replan: int) -> None:
+    """Raise ConfigError for chunks that end before the policy is asked again."""
     if horizon < replan:
         raise ConfigError(
             f"the policy's chunks have {horizon} actions, so it can't act {replan} steps before it is asked again: "
             f"give --replan {horizon} or less"
         )
-    return answer
 
 
 def actions_needed(protocol: Protocol) -> int:
@@ -71,8 +79,16 @@ def check_delay(protocol: Protocol, simulator: Simulator, horizon: int) -> None:
 
 def check_way(source: PolicySource, protocol: Protocol) -> None:
     """Raise ConfigError if the policy doesn't offer the protocol's way to run, or not at that delay."""
+    check_offered(source.real_time, source.about.get("server"), protocol)
+
+
+def check_offered(told: Mapping[str, Any], where: object, protocol: Protocol) -> None:
+    """`check_way` of a policy that isn't there yet.
+
+    told   what its metadata says under "real_time"
+    where  the address of its server; None: it runs in this process
+    """
     way = way_named(protocol.execution)
-    told, where = source.real_time, source.about.get("server")
     who = "this policy" if where is None else f"the policy server at {where}"
     if way.mode is None:
         if told.get("execution") is not None and protocol.control_hz is None:  # the executor tells it what it must know

@@ -18,6 +18,7 @@ from turbopi.running_chunk import JoinMode, RunningChunk
 PREFIX = "turbopi/"
 MAX_SESSION = 64  # characters
 MAX_STEP = 2**53
+MAX_ACTION = float(np.sqrt(np.finfo(np.float32).max))  # of a normalised one: the model's norms square it in float32
 MAX_SEED = 2**64 - 1
 SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch")  # serve/urgency.py reads them
 KEYS = (
@@ -114,6 +115,11 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
                 f"{PREFIX}previous has shape {list(left_over.shape)}; it should be float32 [K, action_dim], the "
                 'rows of "model_actions" that are left when the observation is taken'
             )
+        if (too_large := np.abs(left_over) > MAX_ACTION).any():
+            raise ObservationError(
+                f"{_first(left_over, too_large, 'previous')}, whose square isn't finite in float32, in which the model "
+                'computes. It should be rows of "model_actions", which are normalised: most are from -1 to 1'
+            )
         if mode is None or delay is None:
             missing = "mode" if mode is None else "delay"
             raise ObservationError(f"{PREFIX}previous came without {PREFIX}{missing}: give both mode and delay")
@@ -188,6 +194,12 @@ def _numbers(given: Mapping[str, Any], key: str, dtype: type[np.floating[Any]] =
         raise ObservationError(f"{PREFIX}{key} is {type(value).__name__}; it should be an array of numbers")
     with np.errstate(over="ignore"):
         array = value.astype(dtype)
-    if not np.isfinite(array).all():
-        raise ObservationError(f"{PREFIX}{key} has values that aren't finite")
+    if not (finite := np.isfinite(array)).all():
+        raise ObservationError(f"{_first(value, ~finite, key)}; all should be finite in {np.dtype(dtype)}")
     return array
+
+
+def _first(values: np.ndarray, wrong: np.ndarray, key: str) -> str:
+    """What is said of the first wrong one of an array."""
+    place = tuple(int(axis) for axis in np.argwhere(wrong)[0])
+    return f"{PREFIX}{key} has {float(values[place]):.3g} at {list(place)}"

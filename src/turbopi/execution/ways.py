@@ -41,5 +41,5 @@ assert tuple(WAYS) == get_args(Execution)
 def way_named(name: str) -> Way:
     """Raises ConfigError for a name that isn't one."""
     if not isinstance(name, str) or name not in WAYS:
-        raise ConfigError(f"execution is {name!r}; choose one of {', '.join(WAYS)}")
+        raise ConfigError(f"execution={name!r} is no way to run; choose one of {', '.join(WAYS)}")
     return WAYS[name]

@@ -191,7 +191,7 @@ class Pipeline:
         anchor  of the state that they are relative to; `state` is the new one, as `before` returned it. Absolute
                 actions are returned as they are
 
-        Raises ObservationError for an anchor of another shape, or one that isn't finite.
+        Raises ObservationError for an anchor of another shape, or one that isn't finite, and if the result isn't.
         """
         mask, new = self.robot.delta_mask, self.anchor(state)
         if mask is None or new is None:
@@ -202,7 +202,16 @@ class Pipeline:
                 f"the anchor has shape {list(old.shape)} and dtype {old.dtype}; it should be {len(new)} finite "
                 'numbers, what came with the left-over under "anchor"'
             )
-        return reanchored(left_over, old.astype(np.float64), new, mask, self.action_scale)
+        with np.errstate(over="ignore", invalid="ignore"):  # refused below
+            moved = reanchored(left_over, old.astype(np.float64), new, mask, self.action_scale)
+        if not (finite := np.isfinite(moved)).all():
+            row, column = (int(axis) for axis in np.argwhere(~finite)[0])
+            raise ObservationError(
+                f"the left-over, moved from its anchor to the new state, isn't finite in float32 at [{row}, {column}]: "
+                f"there it is {left_over[row, column]:.3g}, normalised, the anchor {old[column]:.3g} and the new state "
+                f"{new[column]:.3g}. Give the anchor that came with the left-over"
+            )
+        return moved
 
     def example(self, seed: int = 0) -> dict[str, Any]:
         """A random valid observation in the robot's own keys; the same for the same seed."""

@@ -90,6 +90,11 @@ class Askings:
             if outcome.wrong in ("observation", "actions") and asking.rows is not None:
                 text = f"row {number} of {asking.rows} (from 0): {outcome.text}"
                 return Outcome(outcome.seconds, wrong=outcome.wrong, text=text)
+            if outcome.wrong == "actions" and (previous := asking.plan.asked.previous) is not None:
+                largest = float(abs(previous.left_over).max())
+                text = f"{outcome.text}. This request's {PREFIX}previous has values up to {largest:.3g}, and most "
+                text += "normalised actions are from -1 to 1: if they are far off, look there first"
+                return Outcome(outcome.seconds, wrong=outcome.wrong, text=text)
             if outcome.wrong is not None:
                 return outcome
         return None

@@ -107,7 +107,10 @@ class PolicyCalls:
         self._on_lost = on_lost
         self._asked_for, self._execution = options.max_batch, options.execution
         self._numbers = itertools.count()  # of runs
-        self.times = BatchTimes(_largest(policy, self._pipelined, options))
+        lacking = [name for name in ("infer_batch", "example_observation") if not hasattr(policy, name)]
+        batch_modes = getattr(policy, "batch_modes", ())
+        largest = largest_batch(options, pipelined=self._pipelined, batch_modes=batch_modes, lacking=lacking)
+        self.times = BatchTimes(largest)
         self.joining = BatchTimes(self.times.largest if options.execution is not None else 1)
         turns = BatchTimes() if self._pipelined else None
         schedule = Schedule(options.queue_limit, self.times, turns, self.joining)
@@ -380,22 +383,27 @@ def _sizes(times: BatchTimes) -> list[int]:
     return [*(2**power for power in range(largest.bit_length()) if 2**power < largest), largest]
 
 
-def _largest(policy: Policy, pipelined: bool, options: ServerOptions) -> int:
-    """Observations of a batch, at most, as far as measuring allows. Raises ConfigError."""
+def largest_batch(
+    options: ServerOptions, *, pipelined: bool, batch_modes: Sequence[str], lacking: Sequence[str] = ()
+) -> int:
+    """Observations of a batch, at most, as far as measuring allows. Raises ConfigError.
+
+    pipelined, batch_modes  the policy's
+    lacking                 what it would need for batches, and hasn't
+    """
     asked_for, execution = options.max_batch, options.execution
-    lacking = [name for name in ("infer_batch", "example_observation") if not hasattr(policy, name)]
-    if execution is not None and execution not in getattr(policy, "batch_modes", ()):
+    if execution is not None and execution not in batch_modes:
         if asked_for is not None and asked_for > 1:
             raise ConfigError(
-                f"max_batch is {asked_for}, but this policy runs requests that join a chunk one by one, and with "
-                f"execution {execution!r} all do: leave one of them out"
+                f"max_batch={asked_for} was asked for, but this policy runs requests that join a chunk one by one, and "
+                f"with execution={execution!r} all do: leave one of them out"
             )
         return 1
     if not pipelined and not lacking:
         return AUTO_LARGEST if asked_for is None else asked_for
     if asked_for is not None and asked_for > 1:
         why = "is pipelined, and takes one observation at a time" if pipelined else f"has no {' and no '.join(lacking)}"
-        raise ConfigError(f"max_batch is {asked_for}, but this policy {why}: leave it out")
+        raise ConfigError(f"max_batch={asked_for} was asked for, but this policy {why}: leave it out")
     return 1
 
 

@@ -258,7 +258,7 @@ def check_known(autoscaling: Mapping[str, Any]) -> None:
     known = {name for name in AutoscalingConfig.model_fields if not name.startswith("_")}
     if unknown := sorted(set(autoscaling) - known):
         raise ConfigError(
-            f"autoscaling has {', '.join(unknown)}, which Ray Serve's autoscaling_config hasn't; it has "
+            f"autoscaling= has {', '.join(unknown)}, which Ray Serve's autoscaling_config hasn't; it has "
             f"{', '.join(sorted(known))}"
         )
 

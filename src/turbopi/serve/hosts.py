@@ -30,7 +30,8 @@ class AllowedHosts:
         for name in more:
             if not name or any(character in name for character in "/@:[] \t\n") or not name.isprintable():
                 raise ConfigError(
-                    f"allowed host {name!r} is no name; give names such as robot.lab, without http:// and without port"
+                    f"allowed_hosts= has {name!r}, which is no name; give names such as robot.lab, without http:// and "
+                    "without port"
                 )
         self._named = {_plain(name) for name in more}
         self._any = "*" in self._named

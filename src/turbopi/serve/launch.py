@@ -46,6 +46,8 @@ def run(policy: Policy, options: ServerOptions | None = None, *, console: Consol
         tell(f"Serving at [bold]{escape(server.url)}[/]   health {http}/healthz   metrics {http}/metrics")
         if server.options.has_page:
             tell(f"Page {http}/")
+        if server.joins is not None:
+            tell(escape(server.joins))
         if server.recording is not None:
             tell(f"Recording to {escape(str(server.recording))}")
         tell("Ctrl-C stops.")

@@ -59,34 +59,30 @@ class ServerOptions:
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
-            raise ConfigError(f"port must be between 0 and 65535, not {self.port}")
+            raise ConfigError(f"port={self.port} should be from 0 to 65535")
         if not 0 < self.max_message_mb < math.inf:
-            raise ConfigError(f"max_message_mb must be more than 0 and finite, not {self.max_message_mb}")
+            raise ConfigError(f"max_message_mb={self.max_message_mb:g} should be more than 0 and finite")
         if self.queue_limit < 0:
-            raise ConfigError(f"queue_limit must be 0 or more, not {self.queue_limit}")
+            raise ConfigError(f"queue_limit={self.queue_limit} should be 0 or more")
         if self.max_batch is not None and not 1 <= self.max_batch <= MAX_BATCH:
-            raise ConfigError(f"max_batch must be from 1 to {MAX_BATCH}, not {self.max_batch}")
+            raise ConfigError(f"max_batch={self.max_batch} should be from 1 to {MAX_BATCH}")
         if not 0 < self.deadline_ms <= MAX_DEADLINE_MS:
-            raise ConfigError(
-                f"deadline_ms must be more than 0 and at most {MAX_DEADLINE_MS:g}, not {self.deadline_ms:g}"
-            )
+            raise ConfigError(f"deadline_ms={self.deadline_ms:g} should be more than 0 and at most {MAX_DEADLINE_MS:g}")
         if self.max_clients < 1:
-            raise ConfigError(f"max_clients must be 1 or more, not {self.max_clients}")
+            raise ConfigError(f"max_clients={self.max_clients} should be 1 or more")
         if self.execution is not None and self.execution not in JOINING:
             raise ConfigError(
-                f"execution is {self.execution!r}; a server joins chunks by {', '.join(JOINING)}. Other ways to run "
-                "need nothing of it"
+                f"execution={self.execution!r} isn't a server's: it joins chunks by {', '.join(JOINING)}. Other "
+                "ways to run need nothing of it"
             )
         if self.execution is not None and self.control_hz is None:
-            raise ConfigError(
-                f"execution {self.execution!r} needs the robots' control rate, too: give control_hz (--control-hz)"
-            )
+            raise ConfigError(f"execution={self.execution!r} needs the robots' control rate, too: give control_hz=")
         if self.control_hz is not None and not 0 < self.control_hz <= 10_000:
-            raise ConfigError(f"control_hz must be more than 0 and at most 10000, not {self.control_hz}")
+            raise ConfigError(f"control_hz={self.control_hz:g} should be more than 0 and at most 10000")
         if self.execution_horizon is not None and self.execution_horizon < 1:
-            raise ConfigError(f"execution_horizon must be 1 or more, not {self.execution_horizon}")
+            raise ConfigError(f"execution_horizon={self.execution_horizon} should be 1 or more")
         if self.delay_steps is not None and self.delay_steps < 0:
-            raise ConfigError(f"delay_steps must be 0 or more, not {self.delay_steps}")
+            raise ConfigError(f"delay_steps={self.delay_steps} should be 0 or more")
         check_key(self.api_key)
         AllowedHosts(self.host, self.allowed_hosts)
 

@@ -121,7 +121,8 @@ class Arguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     def server(self) -> ServerOptions:
         """Of the server behind Ray's proxy: on loopback, with a port of its own, without a page."""
         if self.max_message_mb > PROXY_MB:
-            raise ConfigError(f"max_message_mb is {self.max_message_mb:g}, but Ray Serve's proxy takes {PROXY_MB:g} MB")
+            asked = f"max_message_mb={self.max_message_mb:g} was asked for"
+            raise ConfigError(f"{asked}, but Ray Serve's proxy takes {PROXY_MB:g} MB")
         return ServerOptions(
             port=0,
             api_key=None if self.api_key_file is None else key_in(Path(self.api_key_file)),
@@ -179,7 +180,9 @@ def gpus_for(device: str) -> bool | None:
     if device in ("cuda", "cpu"):
         return device == "cuda"
     if device != "auto":
-        raise ConfigError(f"device is {device!r}, but in a fleet Ray gives each replica its GPU: cuda, cpu or auto")
+        raise ConfigError(
+            f"device={device!r} was asked for, but in a fleet Ray gives each replica its GPU: cuda, cpu or auto"
+        )
     return None
 
 
@@ -190,10 +193,10 @@ def read_autoscaling(value: Mapping[str, Any] | str | None) -> Mapping[str, Any]
             value = json.loads(value)
         except ValueError as error:
             raise ConfigError(
-                f'autoscaling is JSON such as {{"min_replicas": 1, "max_replicas": 4}}: {error}'
+                f'autoscaling= takes JSON such as {{"min_replicas": 1, "max_replicas": 4}}: {error}'
             ) from error
         if not isinstance(value, dict):
-            raise ConfigError(f"autoscaling is a JSON object, not {value!r}")
+            raise ConfigError(f"autoscaling= takes a JSON object, not {value!r}")
     return value
 
 

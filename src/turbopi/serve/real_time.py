@@ -63,7 +63,7 @@ class RealTime:
 
     waits  whether a request of the session of that name still waits for its turn: then a newer one replaces it
 
-    Raises ConfigError if the policy doesn't offer the options' `execution`.
+    Raises ConfigError as `check_execution`.
     """
 
     def __init__(
@@ -80,9 +80,8 @@ class RealTime:
         self._options, self._metrics, self._clock, self._waits = options, metrics, clock, waits
         self._named: OrderedDict[Hashable, _Session] = OrderedDict()  # the one used last at the end
         self._of_connections: dict[Hashable, _Session] = {}
-        if options.execution is not None and options.execution not in self._modes:
-            what = f"it offers {self._modes}" if self._modes else "it offers none"
-            raise ConfigError(f"execution is {options.execution!r}, which this policy can't: {what}")
+        self._horizon: int | None = metadata.get("action_horizon")
+        check_execution(options, self._offered, self._horizon)
         metrics.watch_sessions(lambda: len(self._named) + len(self._of_connections))
 
     @property
@@ -99,6 +98,23 @@ class RealTime:
                 "sessions": {"most": MAX_SESSIONS, "idle_seconds": IDLE_SECONDS},
             }
         }
+
+    @property
+    def told(self) -> str | None:
+        """How this server joins the chunks of clients that don't say how, on one line; None if it doesn't."""
+        options, horizon = self._options, self._horizon
+        if options.execution is None:
+            return None
+        carried_out = options.execution_horizon or (None if horizon is None else default_execution_horizon(horizon))
+        of_chunk = "half of a chunk" if carried_out is None else f"{carried_out} of {horizon or 'a chunk'}"
+        delay = f"{options.delay_steps} control steps"
+        if options.delay_steps is None:
+            delay = "measured here, without the network (or --delay-steps)"
+        return (
+            f"Joins each client's chunks by {options.execution}: robots carry out {options.control_hz:g} actions a "
+            f"second (--control-hz), {of_chunk} before the next chunk takes over; the delay is {delay}. "
+            f"A request's {PREFIX}step, {PREFIX}delay and {PREFIX}execution_horizon come first"
+        )
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
@@ -308,7 +324,33 @@ class RealTime:
                         f"{PREFIX}execution_horizon from 1 to {horizon}"
                     )
                 return s
-        return max(1, horizon // 2)
+        return default_execution_horizon(horizon)
+
+
+def default_execution_horizon(horizon: int) -> int:
+    """s, control steps, of chunks of `horizon` actions: half."""
+    return max(1, horizon // 2)
+
+
+def check_execution(options: ServerOptions, offered: Mapping[str, Any], horizon: int | None) -> None:
+    """Raise ConfigError if a policy can't do what the options ask for.
+
+    offered  its metadata's "real_time"
+    horizon  actions of its chunks; None: it doesn't say
+    """
+    execution, modes, s = options.execution, list(offered.get("modes", ())), options.execution_horizon
+    if execution is not None and execution not in modes:
+        what = f"it offers {modes}" if modes else "it offers none"
+        if execution == "rtc_trained" and modes:
+            what += (
+                ". That mode is for checkpoints that were trained with simulated delays; if this one was, put "
+                '{"real_time": {"trained_max_delay": …}} into a turbopi.json'
+            )
+        raise ConfigError(f"execution={execution!r} was asked for, which this policy can't: {what}")
+    if s is not None and horizon is not None and s > horizon:
+        raise ConfigError(
+            f"execution_horizon={s} was asked for, but this policy's chunks have {horizon} actions: give at most that"
+        )
 
 
 def _seed(asked: Asked) -> dict[str, Any]:

@@ -147,6 +147,11 @@ class PolicyServer:
         """The folder that this run's recording goes to; None if nothing is recorded."""
         return None if self._recorder is None else self._recorder.folder
 
+    @property
+    def joins(self) -> str | None:
+        """How it joins the chunks of clients that don't say how, on one line; None if it doesn't."""
+        return self._real_time.told
+
     async def start(self) -> None:
         """Take the port, warm the policy up on its thread, start recording, then let clients in.
 
