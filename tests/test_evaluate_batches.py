@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -189,6 +190,8 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[Batching]:
         return policies[-1]
 
     monkeypatch.setattr(PolicyOptions, "make_policy", make)
+    offered = SimpleNamespace(real_time=Batching().metadata["real_time"])  # not the checkpoint's
+    monkeypatch.setattr("turbopi.cli.evaluate.offers_of", lambda *_: offered)
     return policies
 
 

@@ -262,6 +262,7 @@ def test_autoscaling_is_rays_own_as_json() -> None:
             read_autoscaling(text)
 
 
+@pytest.mark.filterwarnings("default")  # Ray's own
 def test_what_autoscaling_has_and_ray_has_not_is_refused() -> None:
     pytest.importorskip("ray")
     check_known({"min_replicas": 1, "max_replicas": 4, "upscale_delay_s": 5})
