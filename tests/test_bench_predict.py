@@ -1,6 +1,8 @@
 """Predictions for GPUs that aren't here: from published numbers, labelled, and near what was measured where it was."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,16 @@ from msgspec.structs import replace
 from turbopi.bench.document import Result, read_benchmark
 from turbopi.bench.gpus import find_gpu, published_gpus
 from turbopi.bench.measured import measured_calls
-from turbopi.bench.predict import MOST_TOKENS, PRECISIONS, STAGES, predict, predicted_call, published_floors, runs_on
+from turbopi.bench.predict import (
+    MOST_TOKENS,
+    PRECISIONS,
+    STAGES,
+    predict,
+    predicted_call,
+    published_floors,
+    refused,
+    runs_on,
+)
 from turbopi.bench.work import Job, stage_work
 from turbopi.config import ModelConfig, preset
 from turbopi.errors import ConfigError
@@ -86,6 +97,27 @@ def test_chunks_beyond_the_denoising_kernel_may_take_longer_in_proportion() -> N
     )
     assert longest.high_ms == pytest.approx(took["total"], rel=0.01)
     assert longer.high_ms == pytest.approx(took["total"] + took["denoise"] * 44 / 56, rel=0.01)
+
+
+def test_what_a_gpu_refuses_is_what_the_kernels_refuse() -> None:
+    pytest.importorskip("triton", reason="Triton isn't installed")
+    from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
+
+    for gpu in published_gpus().values():
+        assert refused(gpu, "bf16") is None
+        assert refused(gpu, "fp8") == fp8_refusal(gpu.capability)
+        assert refused(gpu, "int8") == int8_refusal(gpu.capability)
+
+
+def test_predictions_and_plans_need_no_triton() -> None:
+    """As in an installation for CPUs."""
+    code = (
+        "import sys; sys.modules['triton'] = None\n"
+        "from turbopi.bench.batch_table import published_table\n"
+        "print(published_table('orin', 'int8', 10).predicted)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "True", done.stderr
 
 
 def test_where_a_gpu_was_measured_itself_no_other_ones_calls_are_taken() -> None:

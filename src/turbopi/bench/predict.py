@@ -23,7 +23,6 @@ from turbopi.bench.gpus import GpuSpec, find_gpu
 from turbopi.bench.measured import Kernels, MeasuredCall, measured_calls
 from turbopi.bench.work import Job, floor_ms, stage_work
 from turbopi.config import ModelConfig
-from turbopi.kernels.portable.gemm.tiles import fp8_refusal, int8_refusal
 
 PRECISIONS = ("bf16", "fp8", "int8")
 STAGES = ("vision", "prefix", "denoise")
@@ -112,9 +111,16 @@ def runs_on(kernels: Kernels, gpu: GpuSpec) -> bool:
 
 
 def refused(gpu: GpuSpec, precision: str) -> str | None:
-    """Why a GPU of the table doesn't run a precision, in words; None if it does."""
-    why = {"fp8": fp8_refusal, "int8": int8_refusal}.get(precision)
-    return None if why is None else why(gpu.capability)
+    """Why a GPU of the table doesn't run a precision, in the kernels' words; None if it does.
+
+    Not asked of the kernels themselves: they need Triton, and predictions are for machines without it, too.
+    """
+    has_fp8, has = gpu.fp8_tflops is not None, f"this GPU has {gpu.compute_capability}"
+    if precision == "fp8" and not has_fp8:
+        return f"tensor cores multiply E4M3 from compute capability 8.9 on; {has}"
+    if precision == "int8" and has_fp8:
+        return f"INT8 is for GPUs without FP8, up to compute capability 8.7; {has}"
+    return None
 
 
 def _full_size(config: ModelConfig) -> bool:
