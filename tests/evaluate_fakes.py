@@ -2,9 +2,10 @@
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from multiprocessing import connection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from turbopi.evaluate.run import evaluate, prepare
 from turbopi.evaluate.sources import LocalPolicy, PolicySource
 from turbopi.sim import SimSettings, SimulatorUnavailable, create
 from turbopi.sim.reacher import SPEED, ReacherEnvironment, ReacherSimulator
+
+if TYPE_CHECKING:
+    import pytest
 
 NO_VIDEOS = VideoPlan("none")
 HORIZON = 10
@@ -158,3 +162,22 @@ def run(
     jobs = jobs_for(simulator, tasks, states, videos)
     results = prepare(folder, chosen, source, made, jobs, restart=restart)
     return evaluate(results, chosen, source, made, jobs, num_workers=workers, max_batch=max_batch, videos=videos)
+
+
+def gathering(monkeypatch: "pytest.MonkeyPatch", folder: Path, workers: int) -> Callable[[], int]:
+    """Has GatheringSimulator begin when so many workers are there, which meet in `folder`.
+
+    What is returned waits up to 0.1 s, and says how many workers have something for the schedule.
+    """
+    listened: list[Any] = []  # the connections that the schedule listens to
+    wait = connection.wait
+
+    def listening(to: list[Any], timeout: float | None = None) -> list[Any]:
+        listened[:] = to
+        return wait(to, timeout)
+
+    folder.mkdir()
+    monkeypatch.setenv("GATHER_FOLDER", str(folder))
+    monkeypatch.setenv("GATHER_COUNT", str(workers))
+    monkeypatch.setattr(connection, "wait", listening)
+    return lambda: len(wait(listened, 0.1))

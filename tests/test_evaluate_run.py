@@ -6,14 +6,13 @@ import json
 import multiprocessing
 import os
 import threading
-from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
 import evaluate_fakes
 import numpy as np
 import pytest
-from evaluate_fakes import NO_VIDEOS, SeekingPolicy, TroubledSimulator, jobs_for, run
+from evaluate_fakes import NO_VIDEOS, SeekingPolicy, TroubledSimulator, gathering, jobs_for, run
 
 from turbopi.errors import ActionError, ConfigError, OutputError, TurboPiError
 from turbopi.evaluate.plan import VideoPlan, noise_seed
@@ -47,30 +46,21 @@ def test_a_policy_that_sees_solves_every_episode(tmp_path: Path) -> None:
 
 
 def test_workers_requests_are_batched_which_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    workers: list[Any] = []  # the connections that the schedule listens to
-    wait = connection.wait
-
-    def listening(to: list[Any], timeout: float | None = None) -> list[Any]:
-        workers[:] = to
-        return wait(to, timeout)
+    asking = gathering(monkeypatch, tmp_path / "gather", 3)
 
     class Slow(SeekingPolicy):
         """While it is at the first request, if that came alone, those of the other two workers come in."""
 
         def infer_batch(self, observations: Any, seed: Any) -> Any:
-            while not self.batches and len(observations) == 1 and len(wait(workers, 0.1)) < 2:
+            while not self.batches and len(observations) == 1 and asking() < 2:
                 pass
             return super().infer_batch(observations, seed)
 
     alone, batched = SeekingPolicy(), Slow()
     first = run(tmp_path / "one", alone, tasks=(0, 1, 2), states=(0, 1))
     assert set(alone.batches) == {1}
-    (tmp_path / "gather").mkdir()
-    monkeypatch.setenv("GATHER_FOLDER", str(tmp_path / "gather"))
-    monkeypatch.setenv("GATHER_COUNT", "3")
-    monkeypatch.setattr(connection, "wait", listening)
-    gathering = "evaluate_fakes:GatheringSimulator"
-    second = run(tmp_path / "two", batched, simulator=gathering, tasks=(0, 1, 2), states=(0, 1), workers=3, max_batch=2)
+    simulator = "evaluate_fakes:GatheringSimulator"
+    second = run(tmp_path / "two", batched, simulator=simulator, tasks=(0, 1, 2), states=(0, 1), workers=3, max_batch=2)
     assert max(batched.batches[:2]) == max(batched.batches) == 2
     assert outcomes(second) == outcomes(first)
     assert sorted(batched.seeds) == sorted(alone.seeds)

@@ -3,14 +3,13 @@
 import multiprocessing
 import re
 from collections.abc import Sequence
-from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from cli_helpers import refusal, turbopi
-from evaluate_fakes import NO_VIDEOS, SeekingPolicy, jobs_for, run
+from evaluate_fakes import NO_VIDEOS, SeekingPolicy, gathering, jobs_for, run
 
 from turbopi.errors import ConfigError
 from turbopi.evaluate.checks import check_fit
@@ -41,30 +40,27 @@ def statuses(results: Results) -> list[str]:
 def test_a_worker_that_is_killed_while_its_request_waits_costs_its_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    listened: list[Any] = []  # the connections that the schedule listens to
-    wait = connection.wait
-
-    def listening(to: list[Any], timeout: float | None = None) -> list[Any]:
-        listened[:] = to
-        return wait(to, timeout)
+    asking = gathering(monkeypatch, tmp_path / "gather", 3)
 
     class Killing(SeekingPolicy):
         """Its first call takes until the other two workers have asked, so that one of these waits in the second."""
 
         def infer_batch(self, observations: Sequence[dict[str, Any]], seed: Sequence[int]) -> list[dict[str, Any]]:
             if len(self.batches) == 0:
-                while len(wait(listened, 0.1)) < 2:
+                while asking() < 2:
                     pass
             if len(self.batches) == 1:
                 kill_workers()
             return super().infer_batch(observations, seed)
 
-    (tmp_path / "gather").mkdir()
-    monkeypatch.setenv("GATHER_FOLDER", str(tmp_path / "gather"))
-    monkeypatch.setenv("GATHER_COUNT", "3")
-    monkeypatch.setattr(connection, "wait", listening)
-    gathering = "evaluate_fakes:GatheringSimulator"
-    results = run(tmp_path / "run", Killing(), simulator=gathering, tasks=(0, 1, 2), states=(0, 1), workers=3)
+    results = run(
+        tmp_path / "run",
+        Killing(),
+        simulator="evaluate_fakes:GatheringSimulator",
+        tasks=(0, 1, 2),
+        states=(0, 1),
+        workers=3,
+    )
     assert sorted(statuses(results)) == ["crash"] * 3 + ["success"] * 3
     assert all("exit code -9" in (e.message or "") for e in results.in_order() if e.status == "crash")
     assert not results.complete

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from turbopi.wording import data_size, did_you_mean, significant
+from turbopi.wording import data_size, did_you_mean, names_known, significant
 
 
 @pytest.mark.parametrize(
@@ -59,3 +59,8 @@ def test_a_size_has_the_unit_that_fits(count: int, shown: str) -> None:
 )
 def test_what_was_probably_meant_is_asked(typed: str, question: str) -> None:
     assert did_you_mean(typed, ["action_horizon", "execution_horizon", "robot", "robot_options"]) == question
+
+
+def test_known_names_come_behind_what_was_probably_meant() -> None:
+    assert names_known("robto", "keys are", ["robot", "prompt"]) == "did you mean robot? Keys are robot, prompt"
+    assert names_known("qqq", "keys are", ["robot", "prompt"]) == "keys are robot, prompt"

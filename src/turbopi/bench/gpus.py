@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 
 from turbopi.errors import ConfigError
 from turbopi.reading import read_document, shown
-from turbopi.wording import did_you_mean
+from turbopi.wording import names_known
 
 FILE = Path(__file__).parents[1] / "data" / "gpus.json"
 _Positive = Annotated[float, Meta(gt=0)]
@@ -61,10 +61,8 @@ def find_gpu(name: str) -> GpuSpec:
         typed = typed.removeprefix(word)
     known = published_gpus()
     if typed not in known:
-        meant = did_you_mean(typed, known)
         raise ConfigError(
-            f"no published numbers of a GPU {shown(name)} are known here; "
-            + (f"{meant} Known are " if meant else "known are ")
-            + f"{', '.join(known)}. On the GPU itself `turbopi bench` measures"
+            f"no published numbers of a GPU {shown(name)} are known here; {names_known(typed, 'known are', known)}. "
+            "On the GPU itself `turbopi bench` measures"
         )
     return known[typed]

@@ -49,7 +49,7 @@ from turbopi.config import LIMITS, PRESETS, Kind, Normalization, NormMode, Polic
 from turbopi.errors import ConfigError
 from turbopi.model.solvers import GRIDS, SOLVERS, checked_grid
 from turbopi.reading import is_finite, is_integer, read_json, shown
-from turbopi.wording import did_you_mean
+from turbopi.wording import did_you_mean, names_known
 
 FILE_NAME = "turbopi.json"
 ABOUT_WEIGHTS = {"lora_alpha", "lora_rslora", "base_model", "weights_sha256", "lerobot_semantics"}  # keys of a .json
@@ -91,11 +91,9 @@ def read_settings(config: ConfigSource, folder: Path) -> Settings:
         return Settings(f"preset {config}", values={"preset": config})
     if isinstance(config, str | Path) and str(config).endswith(".json"):
         return _read_file(Path(config))
-    near = did_you_mean(str(config), PRESETS)
     raise ConfigError(
         f"config={str(config)!r} is neither a preset, nor 'auto', nor a path to a .json; "
-        + (f"{near} Presets are " if near else "presets are ")
-        + ", ".join(PRESETS)
+        + names_known(str(config), "presets are", PRESETS)
     )
 
 

@@ -10,9 +10,8 @@ import numpy as np
 from turbopi.errors import ConfigError
 from turbopi.execution import way_named
 from turbopi.sim import SimSettings, Simulator, Task
-from turbopi.sim.base import faults_named
+from turbopi.sim.base import MAX_PX, faults_named
 
-MAX_IMAGE_PX = 4096  # as of cameras
 MAX_CONTROL_HZ = 10_000
 VideoChoice = Literal["sample", "all", "none"]
 
@@ -51,8 +50,8 @@ class Protocol:
         for name, value in (("replan", self.replan), ("image_px", self.image_px), ("max_steps", self.max_steps)):
             if value is not None and value < 1:
                 raise ConfigError(f"{name} is {value}; it should be at least 1")
-        if self.image_px > MAX_IMAGE_PX:
-            raise ConfigError(f"image_px is {self.image_px}; it should be {MAX_IMAGE_PX} at most")
+        if self.image_px > MAX_PX:
+            raise ConfigError(f"image_px is {self.image_px}; it should be {MAX_PX} at most")
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ class SimulatorUnavailable(TurboPiError):
     """A simulator can't run on this machine; the message says why and what to do."""
 
 
+MAX_PX = 4096  # of a picture's width and height
 _Count = Annotated[int, Meta(ge=0, le=10**9)]
 
 
@@ -50,7 +51,7 @@ class SimSettings:
     def __post_init__(self) -> None:
         if self.seeding not in ("episode", "task"):
             raise ConfigError(f"seeding is {self.seeding!r}; choose episode or task")
-        for name, least, most in (("seed", 0, 2**32 - 1), ("wait_steps", 0, 1000), ("camera_px", 16, 4096)):
+        for name, least, most in (("seed", 0, 2**32 - 1), ("wait_steps", 0, 1000), ("camera_px", 16, MAX_PX)):
             value = getattr(self, name)
             if not least <= value <= most:
                 raise ConfigError(f"{name} is {value}; it should be from {least} to {most}")
