@@ -71,6 +71,8 @@ def test_packed_rows(observations: list[tuple[int, int]], spare: int, empty: int
         seen += pictures
     assert packed.tiles.shape == (most_tiles(rows, batch, heads), 4)
     queries = np.zeros(rows * heads, int)  # each row of queries is in one tile, and sees its own segment
+    begins = [int(first) for first, end, _, _ in packed.tiles[::2] if first < end]
+    assert {start * heads for start, length in packed.segments.T if length} <= set(begins), "a block may take two"
     for first, end, key, keys in packed.tiles:
         for query in range(first, min(first + TILE, end)):
             queries[query] += 1

@@ -4,6 +4,7 @@ In float32 through Triton's interpreter, or on a GPU in bfloat16: see test_kerne
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from turbopi.kernels.interface import Segments, StepEnd  # noqa: E402
 from turbopi.kernels.portable import batch as portable_batch  # noqa: E402
 from turbopi.kernels.portable import batch_steps, norms  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention  # noqa: E402
+from turbopi.kernels.sm90.attention import suffix  # noqa: E402
+from turbopi.kernels.sm90.attention.suffix_tile import KEYS, RANKS, SuffixTile  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32
@@ -92,23 +95,48 @@ def check_packed(attend: Callable[..., Tensor], lengths: list[int], spare: int, 
 @pytest.mark.parametrize("blocks", [1, 1000])
 @pytest.mark.parametrize("lengths", [[300, 0, 5], [64, 129]])
 def test_suffix_attention(lengths: list[int], blocks: int, state_token: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With keys in one block or split over several; NaN beyond an observation's rows never counts."""
+    """With keys in one block or split over several."""
     monkeypatch.setattr(portable_batch, "BLOCKS_AT_ONCE", blocks)
-    segments, _ = packed(lengths, 0, len(lengths))
-    batch, tokens = len(lengths), 3
-    prefix_k, prefix_v = random(sum(lengths) + 400, DIM), random(sum(lengths) + 400, DIM, seed=1)
+    check_suffix(portable_batch.suffix_attention, lengths, 3, state_token, HEADS, DIM)
+
+
+@on_hopper
+@pytest.mark.parametrize("state_token", [False, True])
+@pytest.mark.parametrize("tokens", [3, 10, 51])
+@pytest.mark.parametrize(("heads", "dim"), [(4, 64), (8, 256)])
+@pytest.mark.parametrize("lengths", [[300, 0, 5], [64, 129], [560, 547, 816, 1] * 4])
+def test_suffix_attention_on_hopper(lengths: list[int], heads: int, dim: int, tokens: int, state_token: bool) -> None:
+    check_suffix(suffix.suffix_attention, lengths, tokens, state_token, heads, dim)
+
+
+@on_hopper
+@pytest.mark.parametrize("ranks", RANKS)
+@pytest.mark.parametrize("keys", KEYS)
+def test_suffix_attention_on_hopper_in_clusters_of_any_size(ranks: int, keys: int) -> None:
+    tile = SuffixTile(256, 80, ranks, keys)
+    check_suffix(partial(suffix.suffix_attention, tile=tile), [560, 0, 547], 10, False, 8, 256)
+
+
+def check_suffix(
+    attend: Callable[..., Tensor], lengths: list[int], tokens: int, state_token: bool, heads: int, dim: int
+) -> None:
+    """As the twin, and as each observation alone; the same again; NaN beyond an observation's rows never counts."""
+    sizes = torch.tensor([*lengths, 0], dtype=torch.int32)
+    starts, sizes, batch = (sizes.cumsum(0) - sizes).int().to(DEVICE), sizes.to(DEVICE), len(lengths)
+    prefix_k, prefix_v = random(sum(lengths) + 400, dim), random(sum(lengths) + 400, dim, seed=1)
     prefix_k[sum(lengths) :] = prefix_v[sum(lengths) :] = torch.nan
-    qkv, turn = random(batch * tokens, (HEADS + 2) * DIM, seed=2), angles(batch * tokens)
-    given = (qkv, *turn, prefix_k, prefix_v, segments.starts, segments.lengths, HEADS, state_token)
-    ours = portable_batch.suffix_attention(*given)
+    qkv, turn = random(batch * tokens, (heads + 2) * dim, seed=2), angles(batch * tokens, dim)
+    given = (qkv, *turn, prefix_k, prefix_v, starts, sizes, heads, state_token)
+    ours = attend(*given)
     torch.testing.assert_close(ours, plain_batch.suffix_attention(*given), atol=TOLERANCE, rtol=TOLERANCE)
-    k, v = torch.empty(batch * tokens, DIM, device=DEVICE, dtype=DTYPE), qkv[:, -DIM:]
+    assert torch.equal(attend(*given), ours)
+    k, v = torch.empty(batch * tokens, dim, device=DEVICE, dtype=DTYPE), qkv[:, -dim:]
     q = plain.rope_split(qkv, *turn, k, torch.empty_like(k))
     at = 0
     for row, length in enumerate(lengths):
         own, mine = slice(at, at + length), slice(row * tokens, (row + 1) * tokens)
         keys, values = (torch.cat((x[own], y[mine])).float() for x, y in ((prefix_k, k), (prefix_v, v)))
-        logits = q.view(-1, HEADS, DIM)[mine].float() @ keys.T * DIM**-0.5  # [T, n, keys]
+        logits = q.view(-1, heads, dim)[mine].float() @ keys.T * dim**-0.5  # [T, n, keys]
         if state_token:
             logits[0, :, length + 1 :] = -torch.inf
         torch.testing.assert_close(
@@ -117,9 +145,9 @@ def test_suffix_attention(lengths: list[int], blocks: int, state_token: bool, mo
         at += length
 
 
-def angles(tokens: int) -> tuple[Tensor, Tensor]:
+def angles(tokens: int, dim: int) -> tuple[Tensor, Tensor]:
     """Cosines and sines float32[tokens, K/2]: other ones for each token, so that a row's neighbour's show."""
-    turned = torch.rand(tokens, DIM // 2, generator=torch.Generator().manual_seed(9)).to(DEVICE) * 6
+    turned = torch.rand(tokens, dim // 2, generator=torch.Generator().manual_seed(9)).to(DEVICE) * 6
     return turned.cos(), turned.sin()
 
 

@@ -3,21 +3,19 @@
 The launch is the production code's; g++ stands for NVRTC and tests/emulator/machine.h for a cluster of Hopper.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from emulator import emulate
+from emulator.emulate import Machine
 from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.kernels import plain
 from turbopi.kernels.portable.quantize import quantize
-from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.gemm import bf16, fp8
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Epilogue, Sums, Tile
 from turbopi.quantization.fp8 import E4M3, to_e4m3
@@ -34,35 +32,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def machine(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Iterator[Callable[[int], None]]:
-    """`machine(seed)`: launches go to a machine that takes turns in that order and has room for two clusters, so that
-    each has several tiles; where sums are gathered, for as many as are needed.
-    """
-    order = 0
-    takes: dict[bytes, dict[str, int]] = {}
-
-    def compile_cubin(source: str, arch: str, defines: dict[str, int]) -> bytes:
-        takes[source.encode()] = defines
-        return source.encode()
-
-    def kernel(cubin: bytes, name: str, parameters: Any, *, shared_bytes: int, threads: int, cluster: int) -> Any:
-        library = emulate.compiled(cubin.decode(), name, parameters, takes[cubin], folder)
-        at_once = 99 if takes[cubin]["TP_GATHER"] else 2
-        return emulate.EmulatedKernel(library, parameters, threads, cluster, at_once, order)
-
-    def seeded(seed: int) -> None:
-        nonlocal order
-        order = seed
-        for module in (bf16, fp8):
-            module._kernel.cache_clear()
-
-    monkeypatch.setattr(bf16, "compile_cubin", compile_cubin)
-    monkeypatch.setattr(bf16, "DependentKernel", kernel)
-    monkeypatch.setattr(instructions, "wgmma", emulate.wgmma)
-    monkeypatch.setattr(instructions, "tensor_map", emulate.tensor_map)
-    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
-    yield seeded
-    seeded(0)
+def machine(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Iterator[Machine]:
+    """Room for two clusters, so that each has several tiles; where sums are gathered, for as many as are needed."""
+    made = Machine((bf16, fp8), folder, monkeypatch, lambda defines: 99 if defines["TP_GATHER"] else 2)
+    yield made
+    made(0)
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
@@ -91,7 +65,7 @@ BF16_TILES = [  # a ring of 3 is used again and again; clusters of either kind; 
 
 @pytest.mark.parametrize(("epilogue", "tile"), BF16_TILES)
 def test_a_product_in_bf16_is_right_in_whatever_order_its_threads_go(
-    machine: Callable[[int], None], epilogue: Epilogue, tile: Tile
+    machine: Machine, epilogue: Epilogue, tile: Tile
 ) -> None:
     m, n, k = 136, 40, 504
     x, weight = random(m, k), random(2 * n if epilogue == "geglu" else n, k, seed=1) / k**0.5
@@ -120,7 +94,7 @@ def test_a_product_in_bf16_is_right_in_whatever_order_its_threads_go(
     ],
 )
 def test_a_product_in_fp8_is_right_in_whatever_order_its_threads_go(
-    machine: Callable[[int], None], epilogue: Epilogue, tile: Tile, inverse: float | None
+    machine: Machine, epilogue: Epilogue, tile: Tile, inverse: float | None
 ) -> None:
     m, n, k = 72, 40, 1008
     weight = quantize(random(2 * n if epilogue == "geglu" else n, k, seed=1) / k**0.5, 0.01)
@@ -136,7 +110,7 @@ def test_a_product_in_fp8_is_right_in_whatever_order_its_threads_go(
 
 
 def test_an_fp8_product_leaves_a_copy_that_is_normed_with_the_norms_scale_and_shift(
-    machine: Callable[[int], None],
+    machine: Machine,
 ) -> None:
     m, n, k = 72, 40, 256
     tile = Tile(1, 24, ring=3)

@@ -196,6 +196,24 @@ def test_vision_attention_on_hopper(
 
 
 @on_hopper
+@pytest.mark.parametrize(("keys", "warpgroups", "queries"), [(64, 1, 1), (64, 2, 2), (128, 2, 1), (64, 4, 2)])
+@pytest.mark.parametrize(("heads", "head_dim"), [(4, 16), (16, 72), (2, 24)])
+@pytest.mark.parametrize(("images", "tokens"), [(1, 256), (16, 256), (2, 50), (40, 116)])
+def test_wide_vision_attention_on_hopper(
+    heads: int, head_dim: int, images: int, tokens: int, keys: int, warpgroups: int, queries: int
+) -> None:
+    """From fewer units of rows than multiprocessors to several for each."""
+    qkv = random(images * tokens, 3 * heads * head_dim)
+    qkv[:, ::17] *= 8
+    poison_allocator()
+    tile = attention_hopper.AttentionTile(head_dim, keys, warpgroups, wide=True, queries=queries)
+    ours = attention_hopper.vision_attention(qkv, images, heads, tile=tile)
+    assert_as_good(ours, plain.vision_attention(qkv, images, heads), plain.vision_attention(qkv.float(), images, heads))
+    for _ in range(5):
+        assert torch.equal(attention_hopper.vision_attention(qkv, images, heads, tile=tile), ours)
+
+
+@on_hopper
 @pytest.mark.parametrize("warpgroups", [0, 1, 2])
 @pytest.mark.parametrize(("heads", "head_dim"), [(8, 16), (8, 32), (8, 256), (4, 48)])
 @pytest.mark.parametrize(

@@ -17,8 +17,11 @@ from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton isn't installed")
 
+from turbopi.errors import BackendUnavailable
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
+from turbopi.kernels.sm90.attention import suffix
+from turbopi.kernels.sm90.attention.suffix_tile import SuffixTile
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise.packing import RANKS, PackedExpert, Tables
 from turbopi.kernels.sm90.gemm import bf16 as gemm
@@ -188,9 +191,12 @@ def test_what_is_fetched_ahead_is_shared_out_and_never_reaches_beyond_the_matrix
 # ---- attention
 
 
-@pytest.mark.parametrize(("images", "tokens", "heads", "dim"), [(3, 256, 16, 72), (2, 50, 2, 24), (1, 128, 8, 256)])
-def test_visions_attention_has_a_block_for_each_64_queries_of_a_head_of_a_picture(
-    images: int, tokens: int, heads: int, dim: int, maps: None, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("images", "tokens", "heads", "dim", "rows"),
+    [(2, 256, 16, 72, 64), (3, 256, 16, 72, 128), (8, 256, 16, 72, 256), (8, 256, 16, 128, 128), (2, 50, 2, 24, 64)],
+)
+def test_visions_attention_has_a_unit_for_so_many_queries_of_a_head_of_a_picture(
+    images: int, tokens: int, heads: int, dim: int, rows: int, maps: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kernel, tiles = Launched(1), list[attention_hopper.AttentionTile]()
 
@@ -199,16 +205,59 @@ def test_visions_attention_has_a_block_for_each_64_queries_of_a_head_of_a_pictur
         return kernel
 
     monkeypatch.setattr(attention_hopper, "_kernel", compiled)
+    monkeypatch.setattr(attention_hopper, "_multiprocessors", lambda device: 132)
     attention_hopper.vision_attention(on_meta(images * tokens, 3 * heads * dim), images, heads)
     given, (tile,) = kernel.given, tiles
-    assert kernel.blocks == images * heads * given["tiles"] and kernel.blocks % tile.sharing == 0
-    assert (given["tiles"] - 1) * 64 < tokens <= given["tiles"] * 64
+    assert tile.rows == rows and tile.wide == (rows > 64) and tile.stages >= 2
+    assert given["units"] == images * heads * given["tiles"] and kernel.blocks % tile.sharing == 0
+    assert kernel.blocks == (min(given["units"], 132) if tile.wide else given["units"]), "a wide one has several units"
+    assert (given["tiles"] - 1) * rows < tokens <= given["tiles"] * rows
     assert (given["rows"], given["keys"], given["heads"], given["length"]) == (tokens, tokens, heads, None)
     assert (given["k_first"], given["v_first"]) == (heads, 2 * heads), "q, k and v lie side by side"
-    for name, rows in (("map_q", 64), ("map_k", tile.keys // tile.sharing), ("map_v", tile.keys // tile.sharing)):
+    for name, box in (("map_q", 64), ("map_k", tile.keys // tile.sharing), ("map_v", tile.keys // tile.sharing)):
         assert given[name].sizes == (dim, 3 * heads, images * tokens)
-        assert given[name].strides == (dim, 3 * heads * dim) and given[name].box == (64, 1, rows)
+        assert given[name].strides == (dim, 3 * heads * dim) and given[name].box == (64, 1, box)
     assert given["scale"] == pytest.approx(dim**-0.5 / np.log(2))
+
+
+@pytest.mark.parametrize(
+    ("batch", "tokens", "tile"),
+    [
+        (8, 10, SuffixTile(256, 80, 8, 80)),
+        (16, 10, SuffixTile(256, 80, 4, 80)),  # of clusters of eight there is no room for sixteen
+        (8, 50, SuffixTile(256, 104, 2, 64)),
+        (64, 50, SuffixTile(256, 104, 1, 64)),
+        (8, 1, SuffixTile(256, 8, 8, 80)),
+    ],
+)
+def test_a_suffixs_clusters_are_as_large_as_all_of_them_fit(
+    batch: int, tokens: int, tile: SuffixTile, maps: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: dict[SuffixTile, Launched] = {}
+
+    def compiled(one: SuffixTile, *rest: Any) -> Launched:
+        return made.setdefault(one, Launched(one.ranks))
+
+    monkeypatch.setattr(suffix, "_kernel", compiled)
+    heads, dim, prefix = 8, 256, 560 * batch
+    qkv, angles = on_meta(batch * tokens, (heads + 2) * dim), on_meta(batch * tokens, dim // 2, dtype=torch.float32)
+    cache, segments = on_meta(prefix, dim), on_meta(batch + 1, dtype=torch.int32)
+    suffix.suffix_attention(qkv, angles, angles, cache, cache, segments, segments, heads)
+    kernel = made[tile]
+    assert kernel.blocks == batch * kernel.given["tiles"] * tile.ranks
+    assert (kernel.given["tiles"] - 1) * tile.rows < tokens * heads <= kernel.given["tiles"] * tile.rows
+    assert kernel.given["map_k"].sizes == (dim, 1, prefix) and kernel.given["map_k"].box == (64, 1, tile.keys)
+    assert tile.stages >= 2 and {one.name for one in suffix.PARAMETERS.all} == kernel.given.keys()
+
+
+def test_where_no_cluster_of_eight_fits_smaller_ones_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    def compiled(one: SuffixTile, *rest: Any) -> Launched:
+        if one.ranks > 2:
+            raise BackendUnavailable("no room for one")
+        return Launched(one.ranks)
+
+    monkeypatch.setattr(suffix, "_kernel", compiled)
+    assert suffix.chosen_tile(256, 80, 16, 570, False, torch.device("meta")).ranks == 2
 
 
 # ---- the denoising kernel: what its launch is given, read back as the GPU reads it

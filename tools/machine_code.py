@@ -15,6 +15,8 @@ from turbopi.config import preset
 from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.sm90.attention import kernel as attention
+from turbopi.kernels.sm90.attention import suffix
+from turbopi.kernels.sm90.attention.suffix_tile import SuffixTile
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise.packing import Arrangement
 from turbopi.kernels.sm90.gemm import bf16, fp8
@@ -64,8 +66,13 @@ def _product_fp8(tile: Tile, epilogue: Epilogue, inner: int, copied: int, out_fp
     return nvrtc.compile_cubin(bf16.source(tile.columns, takes, fp8=True), ARCH, sizes, folder=folder)
 
 
-def _attention(tile: attention.AttentionTile, whole: bool, folder: Path | None) -> bytes:
-    return nvrtc.compile_cubin(attention.source(tile), ARCH, attention.constants(tile, False, whole), folder=folder)
+def _attention(tile: attention.AttentionTile, whole: bool, folder: Path | None, *, packed: bool = False) -> bytes:
+    sizes = attention.constants(tile, False, whole, packed)
+    return nvrtc.compile_cubin(attention.source(tile), ARCH, sizes, folder=folder)
+
+
+def _suffixes(tile: SuffixTile, in_fp8: bool, folder: Path | None) -> bytes:
+    return nvrtc.compile_cubin(suffix.source(tile), ARCH, suffix.constants(tile, in_fp8), folder=folder)
 
 
 SHAPES: dict[str, Callable[[Path | None], bytes]] = {
@@ -92,6 +99,11 @@ SHAPES: dict[str, Callable[[Path | None], bytes]] = {
     "product that leaves a copy, fp8": partial(_product_fp8, Tile(1, 80, cluster_m=2), "bias", 1152, 15, False),
     "vision's attention": partial(_attention, attention.AttentionTile(72, 128, sharing=2), True),
     "prefix's attention": partial(_attention, attention.AttentionTile(256, 64), False),
+    "vision's attention in batches": partial(
+        _attention, attention.AttentionTile(72, 64, 4, wide=True, queries=2), False
+    ),
+    "prefixes' attention": partial(_attention, attention.AttentionTile(256, 80, wide=True), False, packed=True),
+    "suffixes' attention, fp8": partial(_suffixes, SuffixTile(256, 80, 4, 80), True),
 }
 
 

@@ -1,7 +1,7 @@
 """Our kernels' CUDA C++, compiled by g++ for machine.h's cluster and launched in the GPU's place.
 
-Only what gemm's source and the denoising kernel's products need is there: an instruction that machine.h doesn't know is
-an error when it is translated, or where only a part of a source is to run, when it does.
+Only what the sources of gemm and attention and the denoising kernel's products need is there: an instruction that
+machine.h doesn't know is an error when it is translated, or where only a part of a source is to run, when it does.
 Slow (a product of 64 x 16 x 64 takes milliseconds) and not exact to the tensor cores' order of summation.
 """
 
@@ -10,12 +10,17 @@ import hashlib
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
+import torch
+
 from turbopi.kernels.arguments import TENSOR_MAP, Parameters
+from turbopi.kernels.sm90 import instructions
 
 COMPILER = shutil.which("g++")
 MACHINE = Path(__file__).with_name("machine.h")
@@ -36,6 +41,7 @@ INSTRUCTIONS = (
     *(("st.relaxed.gpu.global.u32", "put"), ("cp.async.cg.shared.global", "copy_16")),
     ("m8n8.x4.trans.shared.b16", "ldmatrix_transposed"),
     *(("cp.async.bulk.tensor.2d", "copy_2d"), ("complete_tx::bytes.L2::cache_hint", "copy_bytes")),
+    *(("cp.async.bulk.tensor.3d", "copy_3d"), ("ex2.approx", "ex2"), ("st.shared.v4.u32", "store_four")),
 )
 # No effect on what is computed here: kernels run one by one, registers are plenty, and copies are seen at once.
 IGNORED = ("griddepcontrol", "setmaxnreg", "prefetch", "createpolicy", "fence")
@@ -99,13 +105,11 @@ def _operands(text: str) -> list[str]:
 
 def wgmma(name: str, columns: int, *, numbers: str = "bf16", from_registers: bool = False, across: bool = False) -> str:
     """In place of `instructions.wgmma`."""
-    if across:
-        raise NotImplementedError("machine.h multiplies operands by rows")
-    fp8 = str(numbers == "e4m3").lower()
+    forms = ", ".join(str(form).lower() for form in (numbers == "e4m3", across))
     takes, a = ("u32 a0, u32 a1, u32 a2, u32 a3", "{a0, a1, a2, a3}") if from_registers else ("u64 a", "a")
     return (
         f"inline void {name}(float (&sums)[{columns // 2}], {takes}, u64 b, int keep) "
-        f"{{ machine::product<{columns}, {fp8}>(sums, {a}, b, keep); }}"
+        f"{{ machine::product<{columns}, {forms}>(sums, {a}, b, keep); }}"
     )
 
 
@@ -186,3 +190,40 @@ class EmulatedKernel:
         run.restype = ctypes.c_char_p
         if (why := run(blocks, self.threads, self.cluster, self.seed, pointers)) is not None:
             raise RuntimeError(why.decode())
+
+
+class Machine:
+    """Launches of modules that make kernels, or keep them in a cache `_kernel`, go to machine.h."""
+
+    def __init__(
+        self,
+        modules: Sequence[Any],
+        folder: Path,
+        patch: pytest.MonkeyPatch,
+        at_once: Callable[[dict[str, int]], int] = lambda defines: 2,
+    ) -> None:
+        """folder: for compiled kernels. at_once: how many clusters there is room for, by a kernel's constants."""
+        self._modules, self._seed = modules, 0
+        defined: dict[str, dict[str, int]] = {}
+
+        def compile_cubin(source: str, arch: str, defines: dict[str, int]) -> bytes:
+            defined[source] = defines
+            return source.encode()
+
+        def kernel(cubin: bytes, name: str, takes: Parameters, *, shared_bytes: int, threads: int, cluster: int) -> Any:
+            defines = defined[cubin.decode()]
+            library = compiled(cubin.decode(), name, takes, defines, folder)
+            return EmulatedKernel(library, takes, threads, cluster, at_once(defines), self._seed)
+
+        for module in (one for one in modules if hasattr(one, "compile_cubin")):
+            patch.setattr(module, "compile_cubin", compile_cubin)
+            patch.setattr(module, "DependentKernel", kernel)
+        patch.setattr(instructions, "wgmma", wgmma)
+        patch.setattr(instructions, "tensor_map", tensor_map)
+        patch.setattr(torch.cuda, "device", lambda device: nullcontext())
+
+    def __call__(self, seed: int) -> None:
+        """From now on it takes turns in the order of that seed."""
+        self._seed = seed
+        for module in self._modules:
+            module._kernel.cache_clear()

@@ -34,9 +34,11 @@ struct float4 { float x, y, z, w; };
 struct uint2 { unsigned x, y; };
 struct ushort2 { unsigned short x, y; };
 struct uint4 { unsigned x, y, z, w; };
+struct int4 { int x, y, z, w; };
 inline float2 make_float2(float x, float y) { return {x, y}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
 inline uint2 make_uint2(unsigned x, unsigned y) { return {x, y}; }
+inline int4 make_int4(int x, int y, int z, int w) { return {x, y, z, w}; }
 inline uint4 make_uint4(unsigned x, unsigned y, unsigned z, unsigned w) { return {x, y, z, w}; }
 template <typename T> T max(T a, T b) { return a < b ? b : a; }
 template <typename T> T min(T a, T b) { return b < a ? b : a; }
@@ -228,8 +230,14 @@ inline std::string row_of(const Thread* warpgroup, int row, int next) {
         bytes.append((const char*)&warpgroup[row / 16 * 32 + lane].pending.front().a.registers[next * 2 + row / 8 % 2], 4);
     return bytes;
 }
+// One number of an operand whose 16 rows are the product's depth: columns in panels of 64, bits 16 to 29 how far apart.
+inline const char* across(uint64_t operand, int row, int column) {
+    auto units = [&](int from) { return unsigned(operand >> from & 0x3fff) * 16; };
+    const unsigned start = units(0) + row / 8 * units(32) + column / 64 * units(16);
+    return at(swizzled(start + row % 8 * 128 + column % 64 * 2) | now->rank << PLACE);
+}
 inline Thread* warpgroup() { return now - now->index.x % 128; }
-template <int COLUMNS, bool FP8>
+template <int COLUMNS, bool FP8, bool ACROSS>
 void multiply(const Thread& thread, const Pending& p) {
     const int warp = thread.index.x / 32 % 4, lane = thread.index.x % 32;
     for (int i = 0; i < COLUMNS / 2; ++i) {
@@ -238,8 +246,9 @@ void multiply(const Thread& thread, const Pending& p) {
         for (int next = 0; next < 2; ++next) {
             const std::string held = p.a.in_registers ? row_of(warpgroup(), row, next) : "";
             const char* const a = p.a.in_registers ? held.data() : row_of(p.a.place, row, next);
-            const char* const b = row_of(p.b, column, next);
-            for (int k = 0; k < (FP8 ? 16 : 8); ++k) sum += number(a, k, FP8) * number(b, k, FP8);
+            const char* const b = ACROSS ? nullptr : row_of(p.b, column, next);
+            for (int k = 0; k < (FP8 ? 16 : 8); ++k)
+                sum += number(a, k, FP8) * (ACROSS ? bf16(across(p.b, next * 8 + k, column)) : number(b, k, FP8));
         }
         p.sums[i] = sum;
     }
@@ -252,9 +261,9 @@ inline void finish(int groups) {  // of this warpgroup, whose threads have all c
     }
     for (Thread* t = first; t < first + 128; ++t) t->done = max(t->done, groups);
 }
-template <int COLUMNS, bool FP8>
+template <int COLUMNS, bool FP8, bool ACROSS = false>
 void product(float* sums, OperandA a, uint64_t b, bool keep) {
-    now->pending.push_back({sums, a, b, keep, now->committed, multiply<COLUMNS, FP8>});
+    now->pending.push_back({sums, a, b, keep, now->committed, multiply<COLUMNS, FP8, ACROSS>});
 }
 inline void await(int left) {
     const int groups = now->committed - left;
@@ -415,6 +424,12 @@ inline void ptx_st_async(unsigned to, unsigned x, unsigned y, unsigned bar) { st
 inline void ptx_st_async(unsigned to, unsigned x, unsigned bar) { st_async<unsigned>(to, {x}, bar); }
 inline void ptx_rcp(float& y, float x) { y = 1 / x; }
 inline void ptx_tanh(float& y, float x) { y = std::tanh(x); }
+inline void ptx_ex2(float& y, float x) { y = std::exp2(x); }
+inline void ptx_store_four(unsigned to, unsigned x, unsigned y, unsigned z, unsigned w) {
+    const unsigned all[4] = {x, y, z, w};
+    memcpy(machine::at(to), all, 16);
+}
+inline void ptx_store_four(unsigned to, unsigned v) { ptx_store_four(to, v, v, v, v); }
 inline void ptx_wgmma_commit() { machine::commit(); }
 inline void ptx_wgmma_wait(int left) { machine::await(left); }
 inline void ptx_cvt_bf16x2(unsigned& both, float high, float low) {
@@ -514,9 +529,13 @@ inline void ptx_copy_bytes(unsigned to, const void* from, unsigned bytes, unsign
     machine::copies.push_back(c);
 }
 template <typename Map>
-void ptx_copy_2d(unsigned to, const Map* map, int x, int y, unsigned bar, unsigned mask = 0) {
+void ptx_copy_3d(unsigned to, const Map* map, int x, int y, int z, unsigned bar, unsigned mask = 0) {
     machine::Copy c;
     memcpy(&c.map, map, sizeof c.map);
-    c.to = to, c.bar = bar, c.at[0] = x, c.at[1] = y, c.at[2] = 0, c.mask = mask ? mask : 1u << machine::now->rank;
+    c.to = to, c.bar = bar, c.at[0] = x, c.at[1] = y, c.at[2] = z, c.mask = mask ? mask : 1u << machine::now->rank;
     machine::copies.push_back(c);
+}
+template <typename Map>
+void ptx_copy_2d(unsigned to, const Map* map, int x, int y, unsigned bar, unsigned mask = 0) {
+    ptx_copy_3d(to, map, x, y, 0, bar, mask);
 }

@@ -52,10 +52,10 @@ class FusedBackend(CudaGraphBackend):
     """As `cuda_graph`, in bfloat16 or, as a calibration says, partly in FP8 or INT8: `describe()` says what runs."""
 
     name: ClassVar[str] = "fused"
-    # measured on an H200 with two cameras in bfloat16: benchmarks/results/h200_2026-11-24_batches.json, of 2 see
-    # docs/dev/log.md; in FP8 four take 3.4, eight 5.3, sixteen 9.9
-    COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.2, 8: 5.4, 16: 10.6}
-    COSTS_WITH_PAIRS: ClassVar[Mapping[int, float]] = {**COSTS, 2: 1.75}
+    # measured on an H200 with two cameras in bfloat16: benchmarks/results/h200_2026-11-27_attention, of 2 without the
+    # kernel for pairs docs/dev/log.md; in FP8 two take 1.6, four 2.7, eight 4.6, sixteen 8.7
+    COSTS: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 2.9, 8: 5.15, 16: 10.1}
+    COSTS_WITH_PAIRS: ClassVar[Mapping[int, float]] = {**COSTS, 2: 1.65}
     # where one guided call alone goes forward in the denoising kernel; of two estimated
     JACOBIAN_COSTS_BESIDE_KERNEL: ClassVar[Mapping[int, float]] = {1: 1, 2: 2.2, 4: 3.3, 8: 5.2}
     _tiles = Tiles(NO_TILES, BY_MODEL)  # measured ones, as they were when this backend was made

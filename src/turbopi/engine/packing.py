@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-TILE = 64  # query rows that a block of packed attention has; rows of all heads of a token follow each other
+TILE = 64  # query rows of a tile of packed attention; rows of all heads of a token follow each other
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Packed:
 
 def most_tiles(rows: int, batch: int, heads: int) -> int:
     """How many tiles so many rows can take, however they are shared out."""
-    return -(-rows * heads // TILE) + batch + 1
+    return 2 * (rows * heads // (2 * TILE) + batch + 1)
 
 
 def pack_rows(
@@ -63,7 +63,7 @@ def _tiles(segments: np.ndarray, rows: int, heads: int) -> np.ndarray:
         firsts = np.arange(start * heads, (start + length) * heads, TILE)
         here = tiles[at : at + len(firsts)]
         here[:, 0], here[:, 1], here[:, 2], here[:, 3] = firsts, (start + length) * heads, start, length
-        at += len(firsts)
+        at += len(firsts) + len(firsts) % 2
     return tiles
 
 

@@ -128,8 +128,9 @@ class Segments:
 
     starts: Tensor  # int32[B + 1]  first row of each; the last one is the padding's
     lengths: Tensor  # int32[B + 1]  rows of each, perhaps none
-    # int32[tiles, 4]  query rows of packed attention that are one block's: the first one, where its segment ends, and
-    # that segment's first key and number of keys. Blocks take 64 rows; a tile that ends where it begins is none.
+    # int32[tiles, 4]  tiles of 64 query rows of packed attention: the first one, where its segment ends, and that
+    # segment's first key and number of keys. A tile that ends where it begins is none. Each segment begins with an even
+    # tile, so that a block may take two.
     tiles: Tensor
 
 

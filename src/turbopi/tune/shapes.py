@@ -9,6 +9,7 @@ from typing import Literal
 
 from turbopi.config import ModelConfig
 from turbopi.engine.runner import BUCKET, bucket
+from turbopi.kernels.sm90.attention.suffix_tile import takes
 from turbopi.kernels.tile_table import Kernels, Numbers, TileKey, whole_64
 
 Precision = Literal["bf16", "fp8"]
@@ -154,7 +155,8 @@ def _expert(
     yield replace(usual, name="expert qkv")
     attention = replace(usual, kernels="portable", operation="suffix_attention", numbers="bf16", out_fp8=fp8)
     prefix = call.cameras * config.vision.num_tokens + call.prompt_tokens
-    yield replace(attention, name="expert attention", columns=g.num_heads, inner=g.head_dim, prefix_rows=prefix)
+    if kernels == "portable" or not takes(g.head_dim, rows * g.num_heads):
+        yield replace(attention, name="expert attention", columns=g.num_heads, inner=g.head_dim, prefix_rows=prefix)
     yield replace(usual, name="expert out", operation="parts", columns=width, inner=heads, norm_behind="rms")
     yield replace(usual, name="expert gate, up", operation="geglu", columns=g.mlp_dim, out_fp8=fp8)
     yield replace(usual, name="expert down", operation="parts", columns=width, inner=g.mlp_dim, norm_behind="rms")

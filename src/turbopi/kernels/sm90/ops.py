@@ -14,6 +14,7 @@ from turbopi.kernels.portable import batch as portable_batch
 from turbopi.kernels.portable.ops import attend as attend_portably
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90.attention import kernel as attention
+from turbopi.kernels.sm90.attention import suffix, suffix_tile
 from turbopi.kernels.sm90.gemm import products
 from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
@@ -50,7 +51,9 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
         batch=replace(
             batch,
             packed_attention=partial(packed_attention, tiles=tiles),
-            origin="CUDA for prefixes, Triton for suffixes",
+            suffix_attention=partial(suffix_attention, tiles=tiles),
+            origin=f"CUDA; Triton for suffixes of fewer than {suffix_tile.LEAST_QUERIES} queries, or where head_dim "
+            "isn't 64, 128, 192 or 256",
         ),
         origin={**portable.origin, **origin},
     )
@@ -96,3 +99,22 @@ def vision_attention(
     if attention.takes(qkv.shape[1] // 3 // heads):
         return attention.vision_attention(qkv, images, heads, inverse)
     return portable_attention.vision_attention(qkv, images, heads, inverse, tiles=tiles)
+
+
+def suffix_attention(
+    qkv: Tensor,
+    cos: Tensor,
+    sin: Tensor,
+    prefix_k: Tensor,
+    prefix_v: Tensor,
+    starts: Tensor,
+    lengths: Tensor,
+    heads: int,
+    state_token: bool = False,
+    inverse: float | None = None,
+    tiles: TileTable = NO_TILES,
+) -> Tensor:
+    given = (qkv, cos, sin, prefix_k, prefix_v, starts, lengths, heads, state_token, inverse)
+    if suffix_tile.takes(prefix_k.shape[1], len(qkv) * heads):
+        return suffix.suffix_attention(*given)
+    return portable_batch.suffix_attention(*given, tiles=tiles)

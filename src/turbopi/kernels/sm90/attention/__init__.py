@@ -1,1 +1,1 @@
-"""Attention of vision and prefix by wgmma and TMA."""
+"""Attention of vision, prefixes and suffixes by wgmma and TMA."""

@@ -1,4 +1,7 @@
-"""Attention without materialised logits through wgmma and TMA, for compute capability 9.0: see kernel.cu.
+"""Attention without materialised logits through wgmma and TMA, for compute capability 9.0.
+
+Two kernels: narrow.cu has 64 rows of queries a CTA, whose warpgroups take tiles of keys in turn; that is soonest where
+there are fewer CTAs than multiprocessors. wide.cu has 64 rows for each warpgroup and loads keys less often.
 
 Twins: `vision_attention` of `kernels.plain`, its `attention` without a suffix, and `packed_attention` of
 `kernels.plain_batch`. The kernels for all other GPUs, and for heads that this one doesn't take, are in
@@ -24,7 +27,7 @@ PARAMETERS = Parameters(
         *(Parameter(TENSOR_MAP, f"map_{name}") for name in "qkv"),
         Parameter("Element*", "out"),  # bfloat16 or E4M3: kernel.cu
         Parameter("const long long*", "length"),
-        *(Parameter("int", name) for name in ("rows", "keys", "heads", "k_first", "v_first", "tiles")),
+        *(Parameter("int", name) for name in ("rows", "keys", "heads", "k_first", "v_first", "tiles", "units")),
         Parameter("float", "scale"),
         Parameter("float", "inverse"),
         Parameter("const int4*", "segments", "packed rows: see `kernels.interface.Segments`"),
@@ -32,20 +35,37 @@ PARAMETERS = Parameters(
 )
 
 
+ENOUGH_UNITS = 0.7  # wide ones, by multiprocessor: then they are sooner (docs/dev/log.md, "Attention of batches")
+MOST_OF_FOUR = 72  # columns for which four wide warpgroups have registers
+
+
 @dataclass(frozen=True)
 class AttentionTile:
-    """How attention is cut: 64 query rows a CTA, `keys` keys at a time for each of one or two warpgroups."""
+    """How attention is cut: `keys` keys at a time for each of some warpgroups."""
 
     dim: int  # columns of a head
     keys: int
     warpgroups: int = 2
     sharing: int = 1  # CTAs in a cluster, which load keys and values together
+    wide: bool = False  # each warpgroup has rows of its own: wide.cu
+    queries: int = 1  # units of rows whose queries have room in a CTA; wide ones alone
+
+    @property
+    def rows(self) -> int:
+        """Of queries in a CTA."""
+        return 64 * self.warpgroups if self.wide else 64
+
+    @property
+    def threads(self) -> int:
+        """Of a CTA: the consumers' and the producer's."""
+        return 128 * (self.warpgroups + 1)
 
     @property
     def stages(self) -> int:
         """Tiles of keys or values in flight: as many as fit, beside the queries, 1 KB of alignment and the barriers."""
         panels = -(-self.dim // 64)
-        return min(12, (SHARED_BYTES - 2048 - 64 * panels * 128) // (self.keys * panels * 128))
+        beside = 2048 + self.queries * self.rows * panels * 128
+        return min(12, (SHARED_BYTES - beside) // (self.keys * panels * 128))
 
     def holds(self, keys: int) -> bool:
         """Whether shared memory takes so many keys and values at once."""
@@ -80,13 +100,19 @@ def prefix_attention(
 
 
 def packed_attention(
-    q: Tensor, k: Tensor, v: Tensor, segments: Segments, heads: int, inverse: float | None = None
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    segments: Segments,
+    heads: int,
+    inverse: float | None = None,
+    tile: AttentionTile | None = None,
 ) -> Tensor:
     """Each row of q [R * n, K] over the keys of its own segment: k, v [R, K] -> [R, n * K]; `inverse` as above."""
     assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
     rows, dim = q.shape
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
-    tile = AttentionTile(dim, keys=64)
+    tile = tile or AttentionTile(dim, keys=80, wide=True)
     _launch(tile, (q, k, v), (1, 1, 1), (0, 0, 0), out, None, rows, k.shape[0], 1, inverse, segments.tiles)
     return out
 
@@ -102,12 +128,18 @@ def vision_attention(
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     tokens, dim = rows // images, width // heads
     out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse))
-    places, tile = (3 * heads,) * 3, tile or _vision_tile(tokens, dim)
+    tile = tile or _vision_tile(tokens, dim, images * heads, _multiprocessors(qkv.device))
+    places = (3 * heads,) * 3
     _launch(tile, (qkv,) * 3, places, (0, heads, 2 * heads), out, None, tokens, tokens, images * heads, inverse)
     return out
 
 
-def _vision_tile(tokens: int, dim: int) -> AttentionTile:
+def _vision_tile(tokens: int, dim: int, groups: int, sms: int) -> AttentionTile:
+    for warpgroups in (4, 2):
+        tile = AttentionTile(dim, 64, warpgroups, wide=True, queries=2 if dim <= 128 else 1)
+        fits = warpgroups == 2 or dim <= MOST_OF_FOUR
+        if fits and groups * -(-tokens // tile.rows) >= ENOUGH_UNITS * sms:
+            return tile
     tile = AttentionTile(dim, keys=128 if dim <= 128 else 64)
     pair = replace(tile, sharing=2)
     return pair if -(-tokens // 64) % 2 == 0 and pair.holds(tokens) else tile
@@ -142,8 +174,9 @@ def _launch(
         )
         for matrix, width, box in zip(matrices, heads, boxes, strict=True)
     ]
-    tiles = -(-rows // 64) if segments is None else len(segments)
+    tiles = -(-rows // tile.rows) if segments is None else len(segments) * 64 // tile.rows
     assert tile.sharing == 1 or (tiles % tile.sharing == 0 and tile.holds(keys)), "who shares never waits for a slot"
+    units = tiles * groups
     whole = length is None and not packed and keys == tile.keys * tile.warpgroups
     kernel = _kernel(tile, inverse is not None, whole, packed, out.device)
     given = {
@@ -156,11 +189,12 @@ def _launch(
         "k_first": first[1],
         "v_first": first[2],
         "tiles": tiles,
+        "units": units,
         "scale": tile.dim**-0.5 * LOG2_E,
         "inverse": 1.0 if inverse is None else inverse,
         "segments": None if segments is None else segments.data_ptr(),
     }
-    kernel.launch_dependent(tiles * groups, given)
+    kernel.launch_dependent(min(units, kernel.max_clusters) if tile.wide else units, given)
 
 
 def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False, packed: bool = False) -> dict[str, int]:
@@ -172,24 +206,30 @@ def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False, packed: b
         "TP_STAGES": tile.stages,
         "TP_OUT_FP8": int(out_fp8),
         "TP_SHARING": tile.sharing,
+        "TP_QUERIES": tile.queries,
         "TP_WHOLE": int(whole),
         "TP_PACKED": int(packed),
     }
 
 
 def source(tile: AttentionTile) -> str:
-    """kernel.cu with the instructions for a tile."""
+    """The kernel with the instructions for a tile."""
     logits = instructions.wgmma("mma_logits", tile.keys)
     values = instructions.wgmma("mma_values", tile.dim, from_registers=True, across=True)
     parameters = f"#define ATTENTION_PARAMETERS {PARAMETERS.declarations}"
-    return instructions.source("attention/kernel.cu", generated=f"{logits}\n{values}\n{parameters}\n")
+    files = [f"attention/{name}.cu" for name in ("common", "wide" if tile.wide else "narrow")]
+    return instructions.source(*files, generated=f"{logits}\n{values}\n{parameters}\n")
+
+
+@cache
+def _multiprocessors(device: torch.device) -> int:
+    return torch.cuda.get_device_properties(device).multi_processor_count
 
 
 @cache
 def _kernel(tile: AttentionTile, out_fp8: bool, whole: bool, packed: bool, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8, whole, packed))
-        threads = 128 * (tile.warpgroups + 1)
         return DependentKernel(
-            cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=threads, cluster=tile.sharing
+            cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=tile.threads, cluster=tile.sharing
         )

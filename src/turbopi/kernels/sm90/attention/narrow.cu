@@ -1,6 +1,6 @@
 // out = softmax(scale * q @ k^T) @ v in bfloat16 with float32 logits and sums, over the first `length` keys: TMA feeds
-// shared memory, wgmma multiplies. For compute capability 9.0. kernel.py sets the TP_ constants and writes
-// `mma_logits` and `mma_values` for the tile's widths.
+// shared memory, wgmma multiplies. For compute capability 9.0, where there are fewer CTAs than multiprocessors; wide.cu
+// has more rows. kernel.py sets the TP_ constants.
 //
 // q, k and v are columns of matrices [rows, heads, TP_DIM] (possibly of one and the same): heads of q begin at column
 // block 0, those of k at `k_first`, of v at `v_first`. In every one of gridDim.x / tiles groups, a head of a picture or
@@ -9,65 +9,25 @@
 // TP_SHARING CTAs of one group form a cluster: each loads a share of every tile of keys and values into all of them.
 // All tiles must have room then, as nobody waits for the others to free a slot.
 //
-// TP_PACKED: rows of several groups follow each other, and `segments` says of each CTA's rows which keys they see: see
-// `kernels.interface.Segments`.
-//
 // TP_WHOLE: there are KEYS keys for each warpgroup and no length, so that nothing is decided while it runs.
 //
 // A CTA has 64 rows of q, a producer warp and TP_WGS consumer warpgroups, which take tiles of TP_KEYS keys in turn: one
 // multiplies while another weighs. In the end each gets the others' sums of a share of the columns.
-//
-// Numbers are kept as wgmma leaves them: a lane holds columns 2 (lane % 4) and the next one of each block of 8, in rows
-// lane / 4 and lane / 4 + 8 of its warp's 16.
 
-constexpr int WGS = TP_WGS, KEYS = TP_KEYS, STAGES = TP_STAGES, DIM = TP_DIM, SHARING = TP_SHARING;
-constexpr bool OUT_FP8 = TP_OUT_FP8, WHOLE = TP_WHOLE, PACKED = TP_PACKED;
-#if TP_OUT_FP8
-typedef unsigned char Element;
-#else
-typedef u16 Element;
-#endif
-constexpr int PANELS = (DIM + 63) / 64;  // of 64 columns, 128 bytes: as much as a swizzle spans
-constexpr int ROW_BYTES = 128, Q_PANEL = 64 * ROW_BYTES, KEY_PANEL = KEYS * ROW_BYTES;
-constexpr int Q_BYTES = PANELS * Q_PANEL, STAGE_BYTES = PANELS * KEY_PANEL;
-constexpr int BLOCKS = DIM / 8, FOURS = (BLOCKS + 3) / 4, DEPTH = (DIM + 15) / 16, THREADS = 128 * WGS;
+constexpr int SHARING = TP_SHARING;
+constexpr bool WHOLE = TP_WHOLE;
+constexpr int Q_PANEL = 64 * ROW_BYTES, Q_BYTES = PANELS * Q_PANEL, FOURS = (BLOCKS + 3) / 4;
 static_assert(STAGES >= 2 * WGS, "a warpgroup would wait for a slot that it holds");
 constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : 232, PRODUCER_REGISTERS = 40;
 // which warpgroup ends up with a block of 8 columns; blocks go in fours, as that many leave together
 __device__ constexpr int owner(int block) { return block / 4 * WGS / FOURS; }
 
-// Generated: mma_logits(float (&)[KEYS / 2], u64, u64, int keep), mma_values(float (&)[DIM / 2], u32 * 4, u64, int keep),
-// and the kernel's parameters.
-
-// 64 columns of 64 or KEYS rows of one head
-__device__ __forceinline__ void load(u32 to, const TensorMap* map, int column, int head, int row, u32 bar) {
-    asm volatile(
-        "cp.async.bulk.tensor.3d.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1, {%2, %3, %4}], [%5];"
-        ::"r"(to), "l"(map), "r"(column), "r"(head), "r"(row), "r"(bar) : "memory");
-}
 // into all CTAs of the cluster, at the same place in each
 __device__ __forceinline__ void load_into_all(u32 to, const TensorMap* map, int column, int head, int row, u32 bar) {
     asm volatile(
         "cp.async.bulk.tensor.3d.shared::cluster.global.mbarrier::complete_tx::bytes.multicast::cluster"
         " [%0], [%1, {%2, %3, %4}], [%5], %6;"
         ::"r"(to), "l"(map), "r"(column), "r"(head), "r"(row), "r"(bar), "h"((u16)((1 << SHARING) - 1)) : "memory");
-}
-// rows of 128 bytes, swizzled, columns of the product along the row; panels of 64 of them lie KEY_PANEL bytes apart
-__device__ __forceinline__ u64 operand_across(u32 address) {
-    return ((u64)(address & 0x3ffff) >> 4) | ((u64)(KEY_PANEL >> 4) << 16) | (64ull << 32) | (1ull << 62);
-}
-__device__ __forceinline__ float power_of_two(float x) {
-    float y;
-    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
-    return y;
-}
-__device__ __forceinline__ float largest_of_quad(float x) {
-    x = fmaxf(x, __shfl_xor_sync(~0u, x, 1));
-    return fmaxf(x, __shfl_xor_sync(~0u, x, 2));
-}
-
-__device__ __forceinline__ void sync_consumers(int barrier, int threads) {
-    asm volatile("bar.sync %0, %1;" ::"r"(barrier), "r"(threads) : "memory");
 }
 
 extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), 1)
@@ -93,9 +53,7 @@ attention(ATTENTION_PARAMETERS) {
     if (!WHOLE) asm volatile("griddepcontrol.wait;" ::: "memory");
 
     const int series = quotient(blockIdx.x, tiles), group = quotient(series, heads), head = series - group * heads;
-    const int4 segment = PACKED ? segments[blockIdx.x] : make_int4((blockIdx.x - series * tiles) * 64, rows, 0, 0);
-    const int row = segment.x, end_of_rows = segment.y;  // in its group
-    if (PACKED && row >= end_of_rows) return;
+    const int row = (blockIdx.x - series * tiles) * 64;  // in its group
 
     // Tiles pass through the ring in rounds: one of keys for each warpgroup, then their values. Each warpgroup's first
     // keys, up to `early`, are loaded and multiplied before the length is known.
@@ -109,7 +67,7 @@ attention(ATTENTION_PARAMETERS) {
                 const u32 s = place % STAGES;
                 if (place >= STAGES) barrier_wait(empty + 8 * s, (place / STAGES + 1) & 1);
                 barrier_expect(full + 8 * s, STAGE_BYTES);
-                const int part = blockIdx.x % SHARING, from = group * keys + segment.z + tile * KEYS + part * (KEYS / SHARING);
+                const int part = blockIdx.x % SHARING, from = group * keys + tile * KEYS + part * (KEYS / SHARING);
                 for (int p = 0; p < PANELS; ++p) {
                     const u32 to = ring + s * STAGE_BYTES + p * KEY_PANEL + part * (KEY_PANEL / SHARING);
                     if (SHARING > 1) load_into_all(to, map, 64 * p, first + head, from, full + 8 * s);
@@ -121,7 +79,7 @@ attention(ATTENTION_PARAMETERS) {
             for (int p = 0; p < PANELS; ++p)
                 load(base + p * Q_PANEL, &map_q, 64 * p, head, group * rows + row, q_full);
             for (int tile = 0; tile < early; ++tile) load_tile(&map_k, k_first, tile, place_of_keys(tile));
-            const int valid = WHOLE ? WGS * KEYS : PACKED ? segment.w : length ? (int)*length : keys;
+            const int valid = WHOLE ? WGS * KEYS : length ? (int)*length : keys;
         const int last = (valid + KEYS - 1) / KEYS;
 #pragma unroll 1
             for (int round = 0; round < last; round += WGS) {
@@ -135,7 +93,7 @@ attention(ATTENTION_PARAMETERS) {
     } else {
         asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
         const int lane = threadIdx.x % 32, own = threadIdx.x % 128, warp = own / 32;
-        const int valid = WHOLE ? WGS * KEYS : PACKED ? segment.w : length ? (int)*length : keys;
+        const int valid = WHOLE ? WGS * KEYS : length ? (int)*length : keys;
         const int last = (valid + KEYS - 1) / KEYS;
         const float none = __uint_as_float(0xff800000);  // -inf
         float logits[KEYS / 2], sums[DIM / 2] = {};      // of the values, by weight
@@ -148,20 +106,6 @@ attention(ATTENTION_PARAMETERS) {
         };
         auto release = [&](int place) {
             if (own == 0) barrier_arrive(empty + 8 * (place % STAGES));
-        };
-        auto multiply_keys = [&](u32 tile) {
-#pragma unroll
-            for (int k = 0; k < DEPTH; ++k)
-                mma_logits(logits, operand(base + k / 4 * Q_PANEL + k % 4 * 32),
-                           operand(tile + k / 4 * KEY_PANEL + k % 4 * 32), k > 0);
-            commit_products();
-        };
-        auto multiply_values = [&](u32 values) {
-#pragma unroll
-            for (int k = 0; k < KEYS / 16; ++k)
-                mma_values(sums, weights[4 * k], weights[4 * k + 1], weights[4 * k + 2], weights[4 * k + 3],
-                           operand_across(values + k * 16 * ROW_BYTES), 1);
-            commit_products();
         };
         // the tile's logits become weights, the sums follow the new top; values beyond the length become 0
         auto weigh = [&](int tile, u32 values) {
@@ -212,7 +156,7 @@ attention(ATTENTION_PARAMETERS) {
         if (WHOLE || tile < early) {  // also where the length ends before it: its place is used again in the end
             const u32 first = await_tile(place);
             begin_products();
-            multiply_keys(first);
+            multiply_keys<Q_PANEL>(logits, base, first);
             await_products<0>();
             release(place);
         }
@@ -222,8 +166,8 @@ attention(ATTENTION_PARAMETERS) {
                 weigh(tile, values);
                 const u32 next = await_tile(place + 2 * WGS);
                 begin_products();
-                multiply_values(values);
-                multiply_keys(next);
+                multiply_values(sums, weights, values);
+                multiply_keys<Q_PANEL>(logits, base, next);
                 await_products<0>();
                 release(place + WGS);
                 release(place + 2 * WGS);
@@ -231,7 +175,7 @@ attention(ATTENTION_PARAMETERS) {
             const u32 values = await_tile(place + WGS);
             weigh(tile, values);
             begin_products();
-            multiply_values(values);
+            multiply_values(sums, weights, values);
             await_products<0>();
         }
 #pragma unroll
@@ -281,36 +225,9 @@ attention(ATTENTION_PARAMETERS) {
         }
 #endif
 
-#pragma unroll
-        for (int half = 0; half < 2; ++half) {
-            const int at = row + warp * 16 + lane / 4 + half * 8;
-            Element* const to = out + ((size_t)(group * rows + at) * heads + head) * DIM;
-            const float factor = (OUT_FP8 ? inverse : 1.0f) / total[half];
-            auto value = [&](int j) -> u32 {
-                const float x = sums[4 * j + 2 * half] * factor, y = sums[4 * j + 2 * half + 1] * factor;
-                return OUT_FP8 ? pack_e4m3(x, y) : pack(x, y);
-            };
-#pragma unroll
-            for (int j = 0; j + 3 < BLOCKS; j += 4) {
-                if (owner(j) != warpgroup) continue;
-                const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
-                if (at < end_of_rows) {
-                    Element* const here = to + (j + lane % 4) * 8;
-                    if (OUT_FP8) *(uint2*)here = make_uint2(v.x | v.y << 16, v.z | v.w << 16);
-                    else *(uint4*)here = v;
-                }
-            }
-#pragma unroll
-            for (int j = BLOCKS / 4 * 4; j < BLOCKS; ++j) {
-                if (owner(j) != warpgroup) continue;
-                const u32 v = value(j);
-                if (at < end_of_rows) {
-                    Element* const here = to + j * 8 + lane % 4 * 2;
-                    if (OUT_FP8) *(u16*)here = (u16)v;
-                    else *(u32*)here = v;
-                }
-            }
-        }
+        const int at = row + warp * 16;
+        store_rows(sums, total, inverse, out + ((size_t)(group * rows + at) * heads + head) * DIM, (size_t)heads * DIM,
+                   rows - at, [&](int block) { return owner(block) == warpgroup; });
     }
     if (SHARING > 1) cluster_sync();  // what this CTA loads for the others may still be on its way
 }

@@ -1,0 +1,228 @@
+// Attention of a batch's suffixes: the tokens of an observation over its prefix's keys and each other's. suffix.py sets the
+// TP_ constants.
+//
+// qkv [batch * tokens, (heads + 2) * DIM] are queries, key and value of each token, to which RoPE comes here; a row is a
+// head of a token. TP_ROWS rows of one observation belong to a cluster of TP_RANKS CTAs, each of which attends with all
+// of them to its share of the keys: of the prefix's, which TMA brings before the kernel in front has ended, and behind
+// them of the suffix's own. Then each rank gets from all ranks what they have of its DIM / TP_RANKS columns, every row
+// over its total and in bfloat16, with the row's largest logit and total, and adds them up.
+
+constexpr int ROWS = TP_ROWS, RANKS = TP_RANKS, COLUMNS = DIM / RANKS, HALF = DIM / 2;
+constexpr int Q_PANEL = ROWS * ROW_BYTES, Q_BYTES = PANELS * Q_PANEL;  // a warpgroup may read beyond them: rows of nobody
+constexpr int MAIL_BYTES = RANKS * ROWS * COLUMNS * 2, ENDS_BYTES = RANKS * ROWS * 8;
+constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : 232, PRODUCER_REGISTERS = 40;
+static_assert(ROWS % 8 == 0 && ROWS <= 64 * WGS && DIM % 64 == 0 && COLUMNS % 8 == 0 && STAGES >= 2, "sizes");
+
+// An operand's 16 bytes of row `row` from column `column` on; its panels of 64 columns lie `panel` bytes apart.
+__device__ __forceinline__ u32 place_of(u32 operand, int panel, int row, int column) {
+    return operand + column / 64 * panel + row * ROW_BYTES + ((column % 64 / 8) ^ (row % 8)) * 16;
+}
+__device__ __forceinline__ void put(u32 to, uint4 v) {
+    asm volatile("st.shared.v4.u32 [%0], {%1, %2, %3, %4};" ::"r"(to), "r"(v.x), "r"(v.y), "r"(v.z), "r"(v.w) : "memory");
+}
+__device__ __forceinline__ void send_end(u32 to, float top, float total, u32 bar) {
+    asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v2.b32 [%0], {%1, %2}, [%3];"
+                 ::"r"(to), "r"(__float_as_uint(top)), "r"(__float_as_uint(total)), "r"(bar) : "memory");
+}
+// Columns 8 c to 8 c + 7 of a head and those HALF further, with their angles: loaded, and after RoPE in an operand's row.
+struct Turn {
+    uint4 low, high;
+    float4 cosines[2], sines[2];
+
+    __device__ __forceinline__ void load(const u16* head, const float* cos, const float* sin, int c) {
+        low = *(const uint4*)(head + 8 * c), high = *(const uint4*)(head + HALF + 8 * c);
+#pragma unroll
+        for (int i = 0; i < 2; ++i)
+            cosines[i] = *(const float4*)(cos + 8 * c + 4 * i), sines[i] = *(const float4*)(sin + 8 * c + 4 * i);
+    }
+    __device__ __forceinline__ void put_turned(u32 operand, int panel, int row, int c) const {
+        const u32 a[4] = {low.x, low.y, low.z, low.w}, b[4] = {high.x, high.y, high.z, high.w};
+        u32 first[4], second[4];
+#pragma unroll
+        for (int i = 0; i < 4; ++i) {
+            const float4 cs = cosines[i / 2], sn = sines[i / 2];
+            const float c0 = i % 2 ? cs.z : cs.x, c1 = i % 2 ? cs.w : cs.y, s0 = i % 2 ? sn.z : sn.x, s1 = i % 2 ? sn.w : sn.y;
+            const float x0 = bf16_low(a[i]), x1 = bf16_high(a[i]), y0 = bf16_low(b[i]), y1 = bf16_high(b[i]);
+            first[i] = pack(x0 * c0 - y0 * s0, x1 * c1 - y1 * s1);
+            second[i] = pack(y0 * c0 + x0 * s0, y1 * c1 + x1 * s1);
+        }
+        put(place_of(operand, panel, row, 8 * c), make_uint4(first[0], first[1], first[2], first[3]));
+        put(place_of(operand, panel, row, HALF + 8 * c), make_uint4(second[0], second[1], second[2], second[3]));
+    }
+};
+
+extern "C" __global__ void __launch_bounds__(THREADS + 128, 1)
+attention(SUFFIX_PARAMETERS) {
+    extern __shared__ char raw[];
+    const u32 base = (shared_address(raw) + 1023) / 1024 * 1024, ring = base + Q_BYTES, mail = ring + STAGES * STAGE_BYTES;
+    const u32 ends = mail + MAIL_BYTES, mail_full = ends + ENDS_BYTES, full = mail_full + 8, empty = full + 8 * STAGES;
+    const int warpgroup = __shfl_sync(~0u, threadIdx.x / 128, 0);  // the same for all, as the compiler now sees
+    const int rank = blockIdx.x % RANKS, unit = blockIdx.x / RANKS, batch = unit / tiles;
+    const int first_row = (unit - batch * tiles) * ROWS, count = min(ROWS, tokens * heads - first_row);
+
+    if (threadIdx.x == 0) {
+        barrier_init(mail_full, 1);
+        for (int s = 0; s < STAGES; ++s) barrier_init(full + 8 * s, 1), barrier_init(empty + 8 * s, WGS);
+        asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
+        barrier_expect(mail_full, RANKS * count * (2 * COLUMNS + 8));
+    }
+    cluster_sync();
+    asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
+
+    // its share of the keys: those from `length` on are the suffix's
+    const int begin = starts[batch], length = lengths[batch], share = (length + tokens + RANKS - 1) / RANKS;
+    const int from = min(rank * share, length + tokens), valid = min(share, length + tokens - from);
+    const int last = (valid + KEYS - 1) / KEYS;
+
+    // Tiles pass through the ring in pairs: keys, then their values.
+    if (warpgroup == WGS) {
+        asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
+        if (threadIdx.x == THREADS) {
+#pragma unroll 1
+            for (int place = 0; place < 2 * last; ++place) {
+                const u32 s = place % STAGES;
+                if (place >= STAGES) barrier_wait(empty + 8 * s, (place / STAGES + 1) & 1);
+                barrier_expect(full + 8 * s, STAGE_BYTES);
+                for (int p = 0; p < PANELS; ++p)
+                    load(ring + s * STAGE_BYTES + p * KEY_PANEL, place % 2 ? &map_v : &map_k, 64 * p, 0,
+                         begin + from + place / 2 * KEYS, full + 8 * s);
+            }
+        }
+        return;
+    }
+
+    asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
+    const int own = threadIdx.x % 128, warp = own / 32, lane = own % 32, width = (heads + 2) * DIM;
+    asm volatile("griddepcontrol.wait;" ::: "memory");
+    const u16* const of_batch = qkv + (size_t)batch * tokens * width;
+    const float *const cosines = cos + batch * tokens * HALF, *const sines = sin + batch * tokens * HALF;
+    constexpr int CHUNKS = HALF / 8, AT_ONCE = 5;  // loads of so many chunks are on their way together
+#pragma unroll
+    for (int first = 0; first < (ROWS * CHUNKS + THREADS - 1) / THREADS; first += AT_ONCE) {
+        Turn turns[AT_ONCE];
+#pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k) {
+            const int i = (first + k) * THREADS + threadIdx.x, row = i / CHUNKS, token = quotient(first_row + row, heads);
+            if (row < count)
+                turns[k].load(of_batch + (size_t)token * width + (first_row + row - token * heads) * DIM,
+                              cosines + token * HALF, sines + token * HALF, i % CHUNKS);
+        }
+#pragma unroll
+        for (int k = 0; k < AT_ONCE; ++k) {
+            const int i = (first + k) * THREADS + threadIdx.x;
+            if (i / CHUNKS < count) turns[k].put_turned(base, Q_PANEL, i / CHUNKS, i % CHUNKS);
+        }
+    }
+
+    auto await_tile = [&](int place) {
+        barrier_wait(full + 8 * (place % STAGES), (place / STAGES) & 1);
+        return ring + place % STAGES * STAGE_BYTES;
+    };
+    auto release = [&](int place) {
+        if (own == 0) barrier_arrive(empty + 8 * (place % STAGES));
+    };
+    // Waits for a tile, puts the suffix's keys and values into it and clears what nobody sees. Whether anything was stored.
+    auto complete = [&](int tile) {
+        const u32 keys = await_tile(2 * tile), values = await_tile(2 * tile + 1);
+        const int here = from + tile * KEYS, seen = min(KEYS, valid - tile * KEYS);
+        const int first = max(here, length) - here, found = max(0, seen - first);  // the suffix's: those from `first` on
+        const u16* const tokens_of = of_batch + (size_t)(here + first - length) * width + heads * DIM;
+        for (int i = threadIdx.x; i < found * CHUNKS; i += THREADS) {
+            const int token = here + first - length + i / CHUNKS;
+            Turn turn;
+            turn.load(tokens_of + (size_t)(i / CHUNKS) * width, cosines + token * HALF, sines + token * HALF, i % CHUNKS);
+            turn.put_turned(keys, KEY_PANEL, first + i / CHUNKS, i % CHUNKS);
+        }
+        for (int i = threadIdx.x; i < found * (DIM / 8); i += THREADS) {
+            const int row = i / (DIM / 8), column = i % (DIM / 8) * 8;
+            put(place_of(values, KEY_PANEL, first + row, column),
+                *(const uint4*)(tokens_of + (size_t)row * width + DIM + column));
+        }
+        if (seen < KEYS) clear_rows(values, seen, THREADS);
+        return found > 0 || seen < KEYS;
+    };
+    if (last > 0) complete(0);
+    show_to_products(1, THREADS);
+
+    float logits[KEYS / 2], sums[DIM / 2] = {};
+    u32 weights[KEYS / 4];
+    Softmax softmax{scale};
+    const u32 queries = base + 64 * ROW_BYTES * warpgroup;
+    for (int tile = 0; tile < last; ++tile) {  // few: nothing is gained by weighing one while another multiplies
+        if (tile > 0 && complete(tile)) show_to_products(1, THREADS);
+        const u32 keys = await_tile(2 * tile), values = await_tile(2 * tile + 1);
+        begin_products();
+        multiply_keys<Q_PANEL>(logits, queries, keys);
+        await_products<0>();
+        settle(logits);
+        release(2 * tile);
+        const int left = valid - tile * KEYS;
+        if (left < KEYS) hide(logits, left);
+        if (state_token && first_row + 64 * warpgroup < heads) {  // whose rows see no other key of the suffix
+            const int seen = length + 1 - from - tile * KEYS;
+#pragma unroll
+            for (int i = 0; i < KEYS / 2; ++i) {
+                const int row = first_row + 64 * warpgroup + 16 * warp + lane / 4 + i / 2 % 2 * 8;
+                if (row < heads && i / 4 * 8 + lane % 4 * 2 + i % 2 >= seen) logits[i] = NONE;
+            }
+        }
+        shrink_sums(sums, softmax.weigh(logits));
+        round_weights(logits, weights);
+        begin_products();
+        multiply_values(sums, weights, values);
+        await_products<0>();
+        settle(sums);
+        release(2 * tile + 1);
+    }
+    softmax.end();
+
+#pragma unroll
+    for (int half = 0; half < 2; ++half) {
+        const int row = 64 * warpgroup + 16 * warp + lane / 4 + 8 * half;
+        const float total = softmax.total[half], factor = total > 0 ? 1 / total : total;
+        auto value = [&](int j) { return pack(sums[4 * j + 2 * half] * factor, sums[4 * j + 2 * half + 1] * factor); };
+#pragma unroll
+        for (int j = 0; j < BLOCKS; j += 4) {
+            const uint4 v = transpose_quad(value(j), value(j + 1), value(j + 2), value(j + 3), lane);
+            const int column = (j + lane % 4) * 8, to = column / COLUMNS;
+            if (row < count)
+                send(at_rank(mail + ((rank * ROWS + row) * COLUMNS + column % COLUMNS) * 2, to),
+                     make_float4(__uint_as_float(v.x), __uint_as_float(v.y), __uint_as_float(v.z), __uint_as_float(v.w)),
+                     at_rank(mail_full, to));
+        }
+        for (int to = lane % 4; to < RANKS; to += 4)
+            if (row < count)
+                send_end(at_rank(ends + (rank * ROWS + row) * 8, to), softmax.top[half] * scale, total, at_rank(mail_full, to));
+    }
+    barrier_wait(mail_full, 0);
+    for (int i = threadIdx.x; i < count * (COLUMNS / 8); i += THREADS) {
+        const int row = i / (COLUMNS / 8), column = i % (COLUMNS / 8) * 8;
+        const char* const received = raw + (mail - shared_address(raw));
+        const float2* const end = (const float2*)(received + MAIL_BYTES) + row;
+        float best = end[0].x, whole = 0, result[8] = {};
+#pragma unroll
+        for (int r = 1; r < RANKS; ++r) best = fmaxf(best, end[r * ROWS].x);
+#pragma unroll
+        for (int r = 0; r < RANKS; ++r) {
+            const float part = power_of_two(end[r * ROWS].x - best) * end[r * ROWS].y;  // 2^-inf is 0: no keys there
+            const uint4 v = *(const uint4*)(received + ((r * ROWS + row) * COLUMNS + column) * 2);
+            const u32 pairs[4] = {v.x, v.y, v.z, v.w};
+            whole += part;
+#pragma unroll
+            for (int k = 0; k < 4; ++k) {
+                result[2 * k] += part * bf16_low(pairs[k]);
+                result[2 * k + 1] += part * bf16_high(pairs[k]);
+            }
+        }
+        const float factor = (OUT_FP8 ? inverse : 1.0f) / whole;
+        Element* const to = out + ((size_t)batch * tokens * heads + first_row + row) * DIM + rank * COLUMNS + column;
+        u32 pairs[4];
+#pragma unroll
+        for (int k = 0; k < 4; ++k) {
+            const float x = result[2 * k] * factor, y = result[2 * k + 1] * factor;
+            pairs[k] = OUT_FP8 ? pack_e4m3(x, y) : pack(x, y);
+        }
+        if (OUT_FP8) *(uint2*)to = make_uint2(pairs[0] | pairs[1] << 16, pairs[2] | pairs[3] << 16);
+        else *(uint4*)to = make_uint4(pairs[0], pairs[1], pairs[2], pairs[3]);
+    }
+}

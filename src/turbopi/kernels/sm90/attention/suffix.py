@@ -1,0 +1,129 @@
+"""Attention of a batch's suffixes in clusters, for compute capability 9.0: see suffix.cu.
+
+Twin: `kernels.plain_batch.suffix_attention`. The kernel for all other GPUs, and for what this one doesn't take, is in
+kernels/portable/batch.py.
+"""
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from turbopi.errors import BackendUnavailable
+from turbopi.kernels.arguments import TENSOR_MAP, Parameter, Parameters
+from turbopi.kernels.dependent_launch import result_dtype
+from turbopi.kernels.nvrtc import compile_cubin
+from turbopi.kernels.portable.attention import LOG2_E
+from turbopi.kernels.sm90 import instructions
+from turbopi.kernels.sm90.attention.suffix_tile import KEYS, MOST_ROWS, RANKS, SuffixTile
+from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
+
+PARAMETERS = Parameters(
+    (
+        *(Parameter(TENSOR_MAP, f"map_{name}") for name in "kv"),
+        Parameter("const u16*", "qkv"),
+        *(Parameter("const float*", name) for name in ("cos", "sin")),
+        *(Parameter("const int*", name) for name in ("starts", "lengths")),
+        Parameter("Element*", "out"),  # bfloat16 or E4M3: common.cu
+        *(Parameter("int", name) for name in ("tokens", "heads", "tiles", "state_token")),
+        *(Parameter("float", name) for name in ("scale", "inverse")),
+    )
+)
+
+
+def suffix_attention(
+    qkv: Tensor,
+    cos: Tensor,
+    sin: Tensor,
+    prefix_k: Tensor,
+    prefix_v: Tensor,
+    starts: Tensor,
+    lengths: Tensor,
+    heads: int,
+    state_token: bool = False,
+    inverse: float | None = None,
+    *,
+    tile: SuffixTile | None = None,
+) -> Tensor:
+    """See `kernels.plain_batch.suffix_attention`. All contiguous. With `inverse` the result leaves as E4M3.
+
+    The prefix's keys and values and the segments must have been written before the kernel in front of this one began.
+    """
+    given = {"qkv": qkv, "cos": cos, "sin": sin, "starts": starts, "lengths": lengths}
+    assert all(one.is_contiguous() for one in (*given.values(), prefix_k, prefix_v)), "rows are read as they lie"
+    assert all(one.dtype == torch.bfloat16 for one in (qkv, prefix_k, prefix_v))
+    batch, count, dim = len(starts) - 1, len(qkv), prefix_k.shape[1]
+    tokens = count // batch
+    assert qkv.shape[1] == (heads + 2) * dim and cos.shape == sin.shape == (count, dim // 2)
+    rows, in_fp8 = tokens * heads, inverse is not None  # of queries of an observation
+    tile = tile or chosen_tile(dim, rows, batch, len(prefix_k) // batch + tokens, in_fp8, qkv.device)
+    tiles, out = -(-rows // tile.rows), qkv.new_empty(count, heads * dim, dtype=result_dtype(qkv, inverse))
+    maps = {
+        name: instructions.tensor_map(one.data_ptr(), (dim, 1, len(one)), (dim, dim), (64, 1, tile.keys))
+        for name, one in (("map_k", prefix_k), ("map_v", prefix_v))
+    }
+    _kernel(tile, in_fp8, qkv.device).launch_dependent(
+        batch * tiles * tile.ranks,
+        {
+            **maps,
+            **{name: one.data_ptr() for name, one in {**given, "out": out}.items()},
+            "tokens": tokens,
+            "heads": heads,
+            "tiles": tiles,
+            "state_token": int(state_token),
+            "scale": dim**-0.5 * LOG2_E,
+            "inverse": 1.0 if inverse is None else inverse,
+        },
+    )
+    return out
+
+
+def chosen_tile(dim: int, rows: int, batch: int, keys: int, in_fp8: bool, device: torch.device) -> SuffixTile:
+    """The largest clusters of which the device holds all at once, and tiles of keys that are filled best.
+
+    keys  of one observation, about
+    """
+    tiles = -(-rows // MOST_ROWS)
+    of_cluster = -(-rows // tiles // 8) * 8
+    for ranks in RANKS:
+        share = -(-keys // ranks)
+        size = min(KEYS, key=lambda one: -(-share // one) * one)
+        tile = SuffixTile(dim, of_cluster, ranks, size)
+        try:
+            if _kernel(tile, in_fp8, device).max_clusters >= batch * tiles:
+                break
+        except BackendUnavailable:  # no room for one cluster, as under MIG
+            if ranks == RANKS[-1]:
+                raise
+    return tile
+
+
+def constants(tile: SuffixTile, out_fp8: bool) -> dict[str, int]:
+    """What suffix.cu is compiled with."""
+    return {
+        "TP_DIM": tile.dim,
+        "TP_WGS": tile.warpgroups,
+        "TP_KEYS": tile.keys,
+        "TP_STAGES": tile.stages,
+        "TP_OUT_FP8": int(out_fp8),
+        "TP_ROWS": tile.rows,
+        "TP_RANKS": tile.ranks,
+    }
+
+
+def source(tile: SuffixTile) -> str:
+    """suffix.cu with the instructions for a tile."""
+    logits = instructions.wgmma("mma_logits", tile.keys)
+    values = instructions.wgmma("mma_values", tile.dim, from_registers=True, across=True)
+    parameters = f"#define SUFFIX_PARAMETERS {PARAMETERS.declarations}"
+    files = [f"attention/{name}.cu" for name in ("common", "suffix")]
+    return instructions.source(*files, generated=f"{logits}\n{values}\n{parameters}\n")
+
+
+@cache
+def _kernel(tile: SuffixTile, out_fp8: bool, device: torch.device) -> DependentKernel:
+    with torch.cuda.device(device):
+        cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8))
+        return DependentKernel(
+            cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=tile.threads, cluster=tile.ranks
+        )

@@ -1,0 +1,149 @@
+// Attention as narrow.cu has it, for many rows: each of TP_WGS consumer warpgroups has 64 rows of q of its own, and all of
+// them take every tile of keys and of values. A CTA goes from one `unit` of 64 * TP_WGS rows to the next, while the
+// producer loads what comes then; TP_QUERIES units' q have room.
+//
+// A warpgroup weighs a tile's logits while its values of the tile before are multiplied, and asks for logits ahead of
+// values, so that the tensor cores have work meanwhile.
+//
+// TP_PACKED: `segments` says of every second 64 rows which keys they see, and those behind them, too: see
+// `kernels.interface.Segments`.
+
+constexpr bool PACKED = TP_PACKED;
+constexpr int ROWS = 64 * WGS, QUERIES = TP_QUERIES;
+constexpr int Q_PANEL = 64 * ROW_BYTES, Q_BYTES = PANELS * Q_PANEL;  // of a warpgroup
+static_assert(STAGES >= 2, "a tile of keys and one of values");
+static_assert(!PACKED || WGS == 2, "packed rows come in pairs of 64");
+// What a multiprocessor's registers are, by warpgroup, when the producer has given away what it doesn't need
+constexpr int PRODUCER_REGISTERS = WGS == 4 ? 24 : 40, CONSUMER_REGISTERS = WGS == 4 ? 112 : WGS == 1 ? 240 : 232;
+
+struct Unit {
+    int group, head, row, end_of_rows, first_key, keys;  // rows and keys in the group
+};
+
+extern "C" __global__ void __launch_bounds__(THREADS + 128, 1)
+attention(ATTENTION_PARAMETERS) {
+    extern __shared__ char raw[];
+    const u32 base = (shared_address(raw) + 1023) / 1024 * 1024, ring = base + QUERIES * WGS * Q_BYTES;
+    const u32 full = ring + STAGES * STAGE_BYTES, empty = full + 8 * STAGES;
+    const u32 q_full = empty + 8 * STAGES, q_empty = q_full + 8 * QUERIES;
+    const int warpgroup = __shfl_sync(~0u, threadIdx.x / 128, 0);  // the same for all, as the compiler now sees
+
+    if (threadIdx.x == THREADS) {
+        asm volatile("prefetch.tensormap [%0];\nprefetch.tensormap [%1];\nprefetch.tensormap [%2];"
+                     ::"l"(&map_q), "l"(&map_k), "l"(&map_v));
+    }
+    if (threadIdx.x == 0) {
+        for (int s = 0; s < STAGES; ++s) barrier_init(full + 8 * s, 1), barrier_init(empty + 8 * s, WGS);
+        for (int s = 0; s < QUERIES; ++s) barrier_init(q_full + 8 * s, 1), barrier_init(q_empty + 8 * s, WGS);
+        asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
+    }
+    __syncthreads();
+    asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
+    asm volatile("griddepcontrol.wait;" ::: "memory");
+
+    auto unit_of = [&](int number) {
+        const int series = quotient(number, tiles), group = quotient(series, heads), head = series - group * heads;
+        if (!PACKED) return Unit{group, head, (number - series * tiles) * ROWS, rows, 0, keys};
+        const int4 segment = segments[2 * number];
+        return Unit{group, head, segment.x, segment.y, segment.z, segment.w};
+    };
+
+    // Tiles pass through the ring in pairs: keys, then their values.
+    if (warpgroup == WGS) {
+        asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
+        if (threadIdx.x != THREADS) return;
+        u32 place = 0, turn = 0;
+#pragma unroll 1
+        for (int number = blockIdx.x; number < units; number += gridDim.x) {
+            const Unit unit = unit_of(number);
+            if (unit.row >= unit.end_of_rows) continue;
+            const u32 slot = turn % QUERIES;
+            if (turn >= QUERIES) barrier_wait(q_empty + 8 * slot, (turn / QUERIES + 1) & 1);
+            barrier_expect(q_full + 8 * slot, WGS * Q_BYTES);
+            for (int w = 0; w < WGS; ++w)
+                for (int p = 0; p < PANELS; ++p)
+                    load(base + (slot * WGS + w) * Q_BYTES + p * Q_PANEL, &map_q, 64 * p, unit.head,
+                         unit.group * rows + unit.row + 64 * w, q_full + 8 * slot);
+            ++turn;
+#pragma unroll 1
+            for (int from = 0; from < unit.keys; from += KEYS)
+#pragma unroll 1
+                for (int values = 0; values < 2; ++values, ++place) {
+                    const u32 s = place % STAGES;
+                    if (place >= STAGES) barrier_wait(empty + 8 * s, (place / STAGES + 1) & 1);
+                    barrier_expect(full + 8 * s, STAGE_BYTES);
+                    for (int p = 0; p < PANELS; ++p)
+                        load(ring + s * STAGE_BYTES + p * KEY_PANEL, values ? &map_v : &map_k, 64 * p,
+                             (values ? v_first : k_first) + unit.head, unit.group * keys + unit.first_key + from,
+                             full + 8 * s);
+                }
+        }
+        return;
+    }
+
+    asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
+    const int own = threadIdx.x % 128, warp = own / 32;
+    u32 place = 0, turn = 0;
+    auto await_tile = [&](u32 place) {
+        barrier_wait(full + 8 * (place % STAGES), (place / STAGES) & 1);
+        return ring + place % STAGES * STAGE_BYTES;
+    };
+    auto release = [&](u32 place) {
+        if (own == 0) barrier_arrive(empty + 8 * (place % STAGES));
+    };
+#pragma unroll 1
+    for (int number = blockIdx.x; number < units; number += gridDim.x) {
+        const Unit unit = unit_of(number);
+        if (unit.row >= unit.end_of_rows) continue;
+        const u32 slot = turn % QUERIES, queries = base + (slot * WGS + warpgroup) * Q_BYTES;
+        float logits[KEYS / 2], sums[DIM / 2] = {};
+        u32 weights[KEYS / 4];
+        Softmax softmax{scale};
+
+        barrier_wait(q_full + 8 * slot, (turn / QUERIES) & 1);
+        const u32 first = await_tile(place);
+        begin_products();
+        multiply_keys<Q_PANEL>(logits, queries, first);
+        await_products<0>();
+        settle(logits);
+        release(place);
+        int left = unit.keys;  // keys from this tile on
+        if (left < KEYS) hide(logits, left);
+        softmax.weigh(logits);
+        round_weights(logits, weights);
+#pragma unroll 1
+        for (; left > KEYS; left -= KEYS, place += 2) {
+            const u32 keys = await_tile(place + 2), values = await_tile(place + 1);
+            begin_products();
+            multiply_keys<Q_PANEL>(logits, queries, keys);
+            multiply_values(sums, weights, values);
+            await_products<1>();
+            settle(logits);
+            release(place + 2);
+            if (left < 2 * KEYS) hide(logits, left - KEYS);
+            const float2 shrink = softmax.weigh(logits);
+            await_products<0>();
+            settle(sums);
+            release(place + 1);
+            round_weights(logits, weights);
+            shrink_sums(sums, shrink);
+        }
+        if (own == 0) barrier_arrive(q_empty + 8 * slot);
+        const u32 values = await_tile(place + 1);
+        if (left < KEYS) {
+            clear_rows(values, left, THREADS);
+            show_to_products(1, THREADS);
+        }
+        begin_products();
+        multiply_values(sums, weights, values);
+        await_products<0>();
+        settle(sums);
+        release(place + 1);
+        place += 2;
+        ++turn;
+        softmax.end();
+        const int at = unit.row + 64 * warpgroup + 16 * warp;
+        store_rows(sums, softmax.total, inverse, out + ((size_t)(unit.group * rows + at) * heads + unit.head) * DIM,
+                   (size_t)heads * DIM, unit.end_of_rows - at, [](int) { return true; });
+    }
+}
