@@ -25,16 +25,15 @@ from turbopi.engine.packing import pack_rows, split
 from turbopi.model.conditioning import Form
 
 # Milliseconds of vision, prefix and denoising of a call for so many observations of two pictures, and what `fused`
-# splits other numbers by. benchmarks/results/h100_2026-11-24_batches.json, device times; of two observations the
-# denoising is that of h200_2026-11-24_pairs.json, scaled as two single calls' are.
+# splits other numbers by: benchmarks/results/h100_2026-11-27_batches/batches.json.
 GPUS: dict[str, tuple[dict[int, tuple[float, float, float]], dict[int, float]]] = {
     "h100_bf16": (
-        {1: (1.29, 3.45, 3.0), 2: (2.6, 6.92, 3.95), 4: (4.46, 12.99, 7.03), 8: (8.64, 23.85, 7.91)},
-        {1: 1, 2: 1.75, 4: 3.2, 8: 5.4},
+        {1: (1.27, 3.4, 3.0), 2: (2.38, 6.67, 3.55), 4: (3.79, 12.76, 5.73), 8: (7.37, 23.83, 6.95)},
+        {1: 1, 2: 1.65, 4: 2.9, 8: 5.15},
     ),
     "h100_fp8": (
-        {1: (1.06, 2.08, 2.01), 2: (2.11, 4.16, 2.89), 4: (3.52, 8.29, 5.79), 8: (6.52, 14.34, 6.51)},
-        {1: 1, 2: 1.75, 4: 3.2, 8: 5.4},
+        {1: (1.0, 2.07, 2.01), 2: (1.77, 3.94, 2.82), 4: (2.83, 7.06, 4.6), 8: (5.34, 13.76, 5.22)},
+        {1: 1, 2: 1.65, 4: 2.9, 8: 5.15},
     ),
     "none": ({1: (0.0, 0.0, 0.0)}, {1: 1}),
 }
