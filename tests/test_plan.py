@@ -322,6 +322,17 @@ def test_the_commands_document_is_the_plan() -> None:
     assert document["predicted"] is False and document["times"]["source"] == times.source
 
 
+@pytest.mark.parametrize("gpu", ["h100", "h200"])
+@pytest.mark.parametrize("precision", ["bf16", "fp8"])
+def test_a_table_names_the_files_of_all_its_times(gpu: str, precision: str) -> None:
+    table = published_table(gpu, precision, 50)
+    named = [call for call in measured_calls() if call.source in table.source.split(", ")]
+    for batch, seconds in table.seconds.items():
+        job = replace(table.job, batch=batch)
+        of_it = [call for call in named if (call.gpu, call.precision, call.job) == (gpu, precision, job)]
+        assert seconds in {slow(call.milliseconds["total"]) for call in of_it}, batch
+
+
 def test_a_prediction_is_called_one() -> None:
     said = turbopi(*ASK, "--gpu", "rtx4090")
     assert said.exit_code == 0 and "PREDICTED, not measured there" in said.stdout

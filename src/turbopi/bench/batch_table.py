@@ -24,7 +24,7 @@ class BatchTable(Struct, frozen=True, kw_only=True):
     job: Job  # that was measured or predicted, of one observation
     seconds: dict[int, float]  # by observations of a batch: the 99th percentile of calls
     predicted: bool  # no chunks that long were measured on that GPU
-    source: str  # the file of the measurement that it is, or goes by
+    source: str  # the files of the measurements that it is, or the one that it goes by
 
 
 class _Timed(Struct, frozen=True):
@@ -121,13 +121,14 @@ def _table(gpu: str, precision: str, horizon: int, timed: Sequence[_Timed]) -> B
         for one in timed
         if (one.backend, one.kernels) == (best.backend, best.kernels) and replace(one.job, batch=1) == best.job
     ]
+    # of several measurements the soonest, which are sorted last
+    chosen = {one.job.batch: one for one in sorted(same, key=lambda one: (one.job.batch, -one.seconds))}
     return BatchTable(
         gpu=gpu,
         backend=best.backend,
         precision=precision,
         job=best.job,
-        # of several measurements the soonest, which are sorted last
-        seconds={one.job.batch: one.seconds for one in sorted(same, key=lambda one: (one.job.batch, -one.seconds))},
+        seconds={batch: one.seconds for batch, one in chosen.items()},
         predicted=False,
-        source=best.source,
+        source=", ".join(dict.fromkeys(one.source for one in chosen.values())),
     )

@@ -99,7 +99,8 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
         f"{fleet.robots} robots at {fleet.hz:g} Hz, chunks of {fleet.horizon}, a new one every {fleet.steps} steps:",
         f"  {a_second:.1f} observations a second",
         f"{table.gpu}, {table.backend} {table.precision}, {kind} ({table.job}):",
-        f"  {each} ms; {table.source}",
+        f"  {each} ms",
+        f"  {table.source}",
         f"GPUs         {planned.gpus}, at most {each_has} on each",
         f"batch        {planned.batch} at most",
         f"delay        {planned.delay_steps} control steps at most "
