@@ -22,7 +22,7 @@ from turbopi.kernels.sm90.attention.suffix_tile import SuffixTile
 from turbopi.quantization.fp8 import E4M3
 
 pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
-SEEDS = (0, 1, 2)
+SEEDS = (0, 1, 5)  # of the order in which threads go; with 1 and 5 products read at once, with 5 a CTA stands still
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,5 @@
 // What the attention kernels share: sizes of a tile, its operands, weights of logits, results on their way out.
-// kernel.py sets the TP_ constants and writes `mma_logits(float (&)[KEYS / 2], u64, u64, int keep)` and
+// kernel.py or suffix.py sets the TP_ constants and writes `mma_logits(float (&)[KEYS / 2], u64, u64, int keep)` and
 // `mma_values(float (&)[DIM / 2], u32 * 4, u64, int keep)`.
 //
 // Numbers are kept as wgmma leaves them: a lane holds columns 2 (lane % 4) and the next one of each block of 8, in rows
@@ -124,8 +124,8 @@ struct Softmax {
     }
 };
 
-// Weights as wgmma's operand in registers wants them. While a product is on its way ptxas takes no operand that is made: it
-// would let every product wait for the one before.
+// Weights as wgmma's operand in registers wants them. Only when no product is on its way: otherwise ptxas makes each one
+// wait for the one before.
 __device__ __forceinline__ void round_weights(const float (&logits)[KEYS / 2], u32 (&weights)[KEYS / 4]) {
 #pragma unroll
     for (int i = 0; i < KEYS / 4; ++i) weights[i] = pack(logits[2 * i], logits[2 * i + 1]);

@@ -25,7 +25,7 @@ from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
 PARAMETERS = Parameters(
     (
         *(Parameter(TENSOR_MAP, f"map_{name}") for name in "qkv"),
-        Parameter("Element*", "out"),  # bfloat16 or E4M3: kernel.cu
+        Parameter("Element*", "out"),  # bfloat16 or E4M3: common.cu
         Parameter("const long long*", "length"),
         *(Parameter("int", name) for name in ("rows", "keys", "heads", "k_first", "v_first", "tiles", "units")),
         Parameter("float", "scale"),
@@ -198,7 +198,7 @@ def _launch(
 
 
 def constants(tile: AttentionTile, out_fp8: bool, whole: bool = False, packed: bool = False) -> dict[str, int]:
-    """What kernel.cu is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
+    """What the kernel is compiled with; `whole`: for the keys that its warpgroups take at once, all seen."""
     return {
         "TP_DIM": tile.dim,
         "TP_WGS": tile.warpgroups,

@@ -5,15 +5,15 @@
 // A warpgroup weighs a tile's logits while its values of the tile before are multiplied, and asks for logits ahead of
 // values, so that the tensor cores have work meanwhile.
 //
-// TP_PACKED: `segments` says of every second 64 rows which keys they see, and those behind them, too: see
-// `kernels.interface.Segments`.
+// TP_PACKED: entries of `segments` are for 64 rows; a unit goes by its first, even one, whose segment is the next one's,
+// too: see `kernels.interface.Segments`.
 
 constexpr bool PACKED = TP_PACKED;
 constexpr int ROWS = 64 * WGS, QUERIES = TP_QUERIES;
 constexpr int Q_PANEL = 64 * ROW_BYTES, Q_BYTES = PANELS * Q_PANEL;  // of a warpgroup
 static_assert(STAGES >= 2, "a tile of keys and one of values");
 static_assert(!PACKED || WGS == 2, "packed rows come in pairs of 64");
-// What a multiprocessor's registers are, by warpgroup, when the producer has given away what it doesn't need
+// Registers of a thread, when the producer has given away what it doesn't need
 constexpr int PRODUCER_REGISTERS = WGS == 4 ? 24 : 40, CONSUMER_REGISTERS = WGS == 4 ? 112 : WGS == 1 ? 240 : 232;
 
 struct Unit {
