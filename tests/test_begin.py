@@ -15,6 +15,7 @@ from turbopi import UnifiedPolicy
 from turbopi.backends.cuda_graph import CudaGraphBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import Kind
+from turbopi.engine.graph import HEAD
 from turbopi.engine.runner import HostRow
 from turbopi.errors import BackendError, ObservationError
 from turbopi.kernels.interface import Ops
@@ -35,11 +36,20 @@ class Ran:
         if at_once:  # as a capture does
             run(lambda stage: None)
 
-    def launch(self, first: Callable[[], None] = lambda: None) -> None:
+    def launch(self, *before: Callable[[], None]) -> None:
+        left = iter(before)
+
+        def mark(stage: str) -> None:
+            if stage == HEAD:
+                next(left, lambda: None)()
+            else:
+                self._stages.append(stage)
+
         self._stages.clear()
         self._tell(self._name)
-        first()
-        self._run(self._stages.append)
+        mark(HEAD)
+        self._run(mark)
+        assert next(left, None) is None, "each is done before a graph of its own"
 
     replay = launch
 

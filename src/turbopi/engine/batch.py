@@ -155,6 +155,7 @@ class BatchLoop:
         self._whole_rows = -(-(buffers.rows + self._suffix_rows) // 16) * 16  # of `_whole_cache`; as `cache_rows`
         self._seen = torch.tensor([self._whole_rows - self._suffix_rows], device=device)  # all: `hidden` has what isn't
         self.actions = torch.empty(chunk, pin_memory=on_gpu)
+        self.actions_array = self.actions.numpy()
 
     def write(
         self, noise: np.ndarray, state: np.ndarray, conditionings: Sequence[Conditioning | None] | None = None

@@ -84,14 +84,18 @@ class Batches:
         self._loop_graph(size, loop)
 
     def launch_vision(self, size: BatchSize, pictures: Sequence[np.ndarray], resize: ImageResize | None) -> None:
-        """Send the pictures of all observations and start on them, without waiting."""
+        """Send the pictures of all observations, part by part, and start on each part when it is sent, without waiting.
+
+        A wrong picture of a later part raises when the earlier ones have been launched. Nothing comes of these.
+        """
         buffers = self._pictures_of(size)
-        blank = np.zeros(tuple(buffers.images.shape[1:]), np.float32 if size.float_images else np.uint8)
-        given = [*pictures, *(blank for _ in range(size.pictures - len(pictures)))]
-        resized = resize is not None and self._ops.resize_pictures is not None and buffers.resizes(given)
-        graph = self._vision_graph(size, resized)
+        if (missing := size.pictures - len(pictures)) > 0:
+            blank = np.zeros(tuple(buffers.images.shape[1:]), np.float32 if size.float_images else np.uint8)
+            pictures = [*pictures, *[blank] * missing]
+        resized = buffers.resizes(pictures, resize)
+        graph, uploads = self._vision_graph(size, resized), buffers.uploads(pictures, resize, resized)
         self._mark(0)
-        graph.launch(lambda: buffers.upload(given, resize))
+        graph.launch(*uploads)
         self._mark(1)
 
     def finish(
@@ -117,7 +121,7 @@ class Batches:
         if self._marks:
             self._marks[-1].synchronize()
         times = [start.elapsed_time(end) for start, end in itertools.pairwise(self._marks)]
-        return Sample(run.actions[: len(noise)].clone(), dict(zip(STAGES, times, strict=False)))
+        return Sample(torch.from_numpy(run.actions_array[: len(noise)].copy()), dict(zip(STAGES, times, strict=False)))
 
     def trace(self, size: BatchSize, loop: Loop, row: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What the last call left of one observation: keys and values [layer, length, K], x_t and v_t [N.., H, A]."""

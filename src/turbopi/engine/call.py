@@ -3,11 +3,13 @@
 `StaticCall.run` is that sequence of kernels on fixed buffers; on a GPU it is captured in two parts and replayed:
 `Pictures.run`, which needs nothing but pictures and so starts while the host still tokenises, and `StaticCall.answer`.
 Each begins with its inputs' way out of pinned memory, and actions go back there. Where pictures have other sizes than
-the model's, they are copied before the first part.
+the model's, they are copied before the first part. Of many pictures, a batch's, vision begins with some of them while
+the host still copies the others: see `Pictures.uploads`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -26,6 +28,10 @@ from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
 from turbopi.model.conditioning import Conditioning
 from turbopi.model.denoise import euler_step
 from turbopi.preprocess.images import fitted
+
+# Pictures that are sent together: while the device works on the head of some, the host copies the next ones, which it
+# takes 26 us for each (224 x 224, uint8).
+PART = 8
 
 
 @dataclass(frozen=True)
@@ -104,6 +110,42 @@ class Cache:
         return cls(*(torch.full(size, torch.nan, device=device, dtype=dtype) for _ in range(2)))
 
 
+class Part:
+    """Pictures of a call that are sent together: their places in pinned memory, and on the device."""
+
+    def __init__(self, host: Tensor, images: Tensor) -> None:
+        self.host, self.images, self.resizer = host, images, Resizer(images)
+        self._array = host.numpy()
+
+    def fits(self, picture: np.ndarray) -> bool:
+        """Whether it has the size and dtype of `images`."""
+        return picture.dtype == self._array.dtype and picture.shape == self._array.shape[1:]
+
+    def write(self, pictures: Sequence[np.ndarray]) -> None:
+        """Pictures as `images` to where `transferred` takes them from."""
+        for target, picture in zip(self._array, pictures, strict=True):
+            target[:] = picture
+
+    def send(self, pictures: Sequence[np.ndarray], resize: ImageResize) -> None:
+        """Pictures as `images`, or uint8[h, w, 3], to where `resized` takes them from."""
+        self.resizer.upload([None if self.fits(one) else one for one in pictures], resize)
+        for camera, picture in enumerate(pictures):
+            if self.fits(picture):
+                self._array[camera] = picture
+                self.images[camera].copy_(self.host[camera], non_blocking=True)
+
+    def transferred(self, ops: Ops) -> Tensor:
+        """`images`, by a kernel, from what `write` has written."""
+        ops.transfer(self.host, self.images)
+        return self.images
+
+    def resized(self, ops: Ops) -> Tensor:
+        """`images`, by a kernel, from what `send` has sent."""
+        assert ops.resize_pictures is not None, "else the host has resized them: `transferred`"
+        ops.resize_pictures(self.resizer.table, self.images)
+        return self.images
+
+
 class Pictures:
     """The vision stage of every call with so many pictures, whatever its prompt.
 
@@ -120,56 +162,63 @@ class Pictures:
         self.cameras, self.float_images, self.rows = cameras, float_images, cameras * config.vision.num_tokens
         table, side = weights.embed_tokens, config.vision.image_size
         dims, dtype = (cameras, side, side, 3), torch.float32 if float_images else torch.uint8
-        self.host = torch.zeros(dims, dtype=dtype, pin_memory=table.is_cuda)
-        self._array = self.host.numpy()
+        host = torch.zeros(dims, dtype=dtype, pin_memory=table.is_cuda)
         self.images = torch.zeros(dims, dtype=dtype, device=table.device)
-        self._resizer = Resizer(self.images)
+        self._places = [slice(first, min(first + PART, cameras)) for first in range(0, cameras, PART)]
+        self._parts = [Part(host[place], self.images[place]) for place in self._places]
         size = (self.rows + prompt_slots, config.vlm.width)
         self.embs = torch.full(size, torch.nan, device=table.device, dtype=table.dtype)  # as in `Cache`
 
-    def resizes(self, pictures: Sequence[np.ndarray]) -> bool:
-        """Whether `run_resized` is needed: some picture hasn't the size and dtype of `images`."""
-        return not all(self._fits(picture) for picture in pictures)
+    def resizes(self, pictures: Sequence[np.ndarray], resize: ImageResize | None) -> bool:
+        """Whether `run_resized` is needed: some picture hasn't the size and dtype of `images`, and the device may
+        resize it.
+        """
+        if resize is None or self.ops.resize_pictures is None:
+            return False
+        return not all(self._parts[0].fits(one) for one in pictures)
 
     def upload(self, pictures: Sequence[np.ndarray], resize: ImageResize | None = None) -> None:
         """Valid pictures, in place of those of the call before, to where `run` or `run_resized` takes them from.
 
         Each is as `images`, or uint8[h, w, 3]: then the device resizes it, or the host if the device can't. Nothing is
-        waited for.
+        waited for. A picture that is wrong raises; those before it may have been sent, and the next call's take the
+        place of them all.
         """
-        if resize is not None and self.ops.resize_pictures is None:
-            side = self._array.shape[1]
-            pictures = [one if self._fits(one) else fitted(one, side, resize) for one in pictures]
-        if resize is not None and self.resizes(pictures):
-            self._resizer.upload([None if self._fits(one) else one for one in pictures], resize)
-            for camera, picture in enumerate(pictures):
-                if self._fits(picture):
-                    self._array[camera] = picture
-                    self.images[camera].copy_(self.host[camera], non_blocking=True)
-        else:
-            for target, picture in zip(self._array, pictures, strict=True):
-                target[:] = picture
+        for upload in self.uploads(pictures, resize, self.resizes(pictures, resize)):
+            upload()
 
-    def _fits(self, picture: np.ndarray) -> bool:
-        return picture.dtype == self._array.dtype and picture.shape == self._array.shape[1:]
+    def uploads(
+        self, pictures: Sequence[np.ndarray], resize: ImageResize | None, resized: bool
+    ) -> list[Callable[[], None]]:
+        """`upload` in steps, one for each head of `run` or, `resized`, `run_resized`, to be done before it: see
+        `Graph.launch`.
+        """
+        assert len(pictures) <= self.cameras, f"{len(pictures)} pictures, there is room for {self.cameras}"
+
+        def upload(part: Part, place: slice) -> None:
+            these = pictures[place]
+            if resize is None:
+                part.write(these)
+            elif resized:
+                part.send(these, resize)
+            else:
+                side = self.config.vision.image_size
+                part.write([one if part.fits(one) else fitted(one, side, resize) for one in these])
+
+        return [partial(upload, part, place) for part, place in zip(self._parts, self._places, strict=True)]
 
     def run_resized(self, mark: Mark = lambda stage: None) -> None:
         """Pictures of which some have other sizes, to the first rows of `embs`."""
-        assert self.ops.resize_pictures is not None, "else `upload` has resized them on the host: `run`"
-        if self.cameras:
-            self.ops.resize_pictures(self._resizer.table, self.images)
-        self._encode(mark)
+        self._encode([partial(part.resized, self.ops) for part in self._parts], mark)
 
     def run(self, mark: Mark = lambda stage: None) -> None:
         """Pictures from the host, in place of what is in `images`, to the first rows of `embs`."""
-        if self.cameras:
-            self.ops.transfer(self.host, self.images)
-        self._encode(mark)
+        self._encode([partial(part.transferred, self.ops) for part in self._parts], mark)
 
-    def _encode(self, mark: Mark) -> None:
-        if self.cameras:
+    def _encode(self, parts: Sequence[Callable[[], Tensor]], mark: Mark) -> None:
+        if parts:
             out = self.embs[: self.rows]
-            forward.vision_tokens(self.config, self.weights, self.ops, self.images, out, lambda: mark(HEAD))
+            forward.vision_tokens(self.config, self.weights, self.ops, parts, out, lambda: mark(HEAD))
         mark("vision")
 
 

@@ -21,7 +21,7 @@ import torch
 from turbopi.model.exact import exact_float32
 
 Mark = Callable[[str], None]  # is told the end of each stage, or `HEAD`
-HEAD = "head"  # the mark behind the kernels that are launched before the rest is
+HEAD = "head"  # the mark behind kernels that are launched before those that follow are
 
 CAPTURING = threading.RLock()  # of the process: policies on other devices, too
 
@@ -74,7 +74,8 @@ class Graph:
 
     On some machines the host takes more than a microsecond for each kernel of a graph, and the device begins when all
     are launched. So a sequence may mark where its `HEAD` ends: that is a graph of its own, on which the device works
-    while the host launches the rest.
+    while the host launches the rest. There may be several heads, one behind the other: then the host can copy what the
+    next one reads while the device works on the one before.
 
     after   the graph that is launched before each time this one is: its stages are this one's first, and the next one
             begins where they end, so that it has in it whatever time the device waits in between for this launch.
@@ -108,15 +109,20 @@ class Graph:
             stream.synchronize()
             self._capture(run, pool, stream)
 
-    def launch(self, first: Callable[[], None] = lambda: None) -> None:
-        """Do `first`, which may launch kernels, then run the captured ones again on what their input buffers hold now.
+    def launch(self, *before: Callable[[], None]) -> None:
+        """Run the captured kernels again on what their input buffers hold now.
+
+        before  the first is done before the first graph is launched, the second before the one behind the first `HEAD`,
+                and so on. Each may launch kernels. If one raises, no graph from its own on is launched
 
         On the current stream, without waiting for it.
         """
+        assert len(before) <= len(self._parts), f"{len(before)} things to do before {len(self._parts)} graphs"
         if self._start is not None:
             self._start.record(torch.cuda.current_stream(self._device))
-        first()
-        for part in self._parts:
+        for part, first in itertools.zip_longest(self._parts, before):
+            if first is not None:
+                first()
             part.replay()
 
     def replay(self) -> None:

@@ -173,9 +173,9 @@ class GraphRunner:
         buffers = self._pictures_of(begun.cameras, begun.float_images)
         self._begun = None  # one given up may still be read from the buffers, but nobody gets what becomes of it
         with self._explaining():
-            resized = resize is not None and self._ops.resize_pictures is not None and buffers.resizes(pictures)
+            resized = buffers.resizes(pictures, resize)
             vision = self._graph(buffers, RESIZED if resized else "vision")
-            vision.launch(lambda: buffers.upload(pictures, resize))
+            vision.launch(*buffers.uploads(pictures, resize, resized))
         self._begun = begun
         return begun
 
