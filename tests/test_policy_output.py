@@ -99,7 +99,7 @@ def test_waiting_for_ones_turn_is_in_no_other_time(
     pipeline = whole.pipeline
     first = "see" if kind == "begin" else "before"
     monkeypatch.setattr(pipeline, first, clock.passes(0.5, getattr(pipeline, first)))
-    monkeypatch.setattr(pipeline, "after", clock.passes(0.25, pipeline.after))
+    monkeypatch.setattr(pipeline, "after_all", clock.passes(0.25, pipeline.after_all))
 
     class Lock:
         __enter__ = clock.passes(2.0)  # until others have had their turn

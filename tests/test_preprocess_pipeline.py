@@ -217,6 +217,22 @@ def test_the_models_actions_and_the_state_are_left_alone() -> None:
     np.testing.assert_array_equal(edges.after(chunk, state)["actions"], first)
 
 
+@pytest.mark.parametrize("name", ["pi05_libero", "pi05_droid", "pi05_aloha", "pi05_base", "pi0_libero", "pi0_aloha"])
+def test_chunks_of_a_batch_leave_as_they_do_one_by_one(name: str) -> None:
+    """To the last bit, and without the batch's memory, which a backend may write to again."""
+    config = preset(name)
+    widths = {"libero": (8, 7), "droid": (8, 8), "aloha": (14, 14), "plain": (32, 32)}[config.robot]
+    edges = pipeline(config, *widths)
+    states = [edges.before(edges.example(seed))[1] for seed in range(3)]
+    chunks = np.random.default_rng(0).normal(size=(3, config.model.action_horizon, 32)).astype(np.float32)
+    together = edges.after_all(chunks, states)
+    for row, result in enumerate(together):
+        alone = edges.after(chunks[row], states[row])["actions"]
+        np.testing.assert_array_equal(result["actions"], alone, strict=True)
+        assert not np.shares_memory(result["actions"], chunks)
+        assert not any(np.shares_memory(result["actions"], other["actions"]) for other in together[:row])
+
+
 def test_relative_actions_are_added_to_the_unnormalised_state() -> None:
     config = PolicyConfig("base", ModelConfig(), "plain")
     edges = pipeline(config, 7, 7, robot=Relative())

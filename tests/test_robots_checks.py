@@ -1,6 +1,7 @@
 """Robots that don't fit: found when the policy is made, or, at the latest, before the robot gets anything."""
 
 import dataclasses
+import itertools
 import json
 import sys
 from collections.abc import Mapping
@@ -103,6 +104,28 @@ def test_outputs_that_change_their_shape_later_never_reach_the_robot() -> None:
     assert edges.after(chunk, state)["actions"].shape == (10, 6)
     with pytest.raises(ActionError, match=r"robot odd: `outputs` gave actions of shape \[10, 32\], expected \[10, 6\]"):
         edges.after(chunk, state)
+
+
+def _raise(error: Exception) -> np.ndarray:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda a: a, r"robot odd: `outputs` gave actions of shape \[10, 32\], expected \[10, 6\]"),
+        (lambda a: a[:, :6] * np.nan, "un-normalised, robot odd gets .*60 of 60 .* row 0, column 0"),
+        (lambda a: _raise(ActionError("out of reach")), "out of reach$"),
+    ],
+)
+def test_what_a_robot_does_wrong_in_a_batch_is_said_with_the_observations_number(wrong: Any, message: str) -> None:
+    edges, chunks, states = pipeline(Arm()), np.zeros((4, 10, 32), np.float32), [np.zeros(32)] * 4
+    calls = itertools.count()
+    edges.robot = robot_giving(lambda a: wrong(a) if next(calls) >= 2 else a[:, :6])
+    with pytest.raises(ActionError, match=rf"^observation 2 of 4 \(from 0\): {message}"):
+        edges.after_all(chunks, states)
+    with pytest.raises(ActionError, match=f"^{message}"):
+        edges.after(chunks[2], states[2])
 
 
 def test_a_dry_run_does_not_warn_of_what_middling_actions_do() -> None:

@@ -65,6 +65,7 @@ class Joining:
     ) -> None:
         self._config, self._model, self._pipeline, self._backend = config, config.model, pipeline, backend
         self._integration = integration
+        self._known: tuple[object, backends.Conditions | None] = (None, None)  # see `_forms`
         if integration is not None:
             try:
                 self._check_form("solver")
@@ -76,7 +77,7 @@ class Joining:
         """What `RunningChunk`s may ask of this policy."""
         if self._integration is not None and not self._integration.is_euler:
             return ()  # see `Conditioning`
-        able = backends.forms(self._backend())
+        able = self._forms()
         trained = self._config.real_time.trained_max_delay > 0
         return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
 
@@ -92,11 +93,11 @@ class Joining:
 
         Raises ObservationError; of several observations it names the row.
         """
-        plain, rows = self._checked(None, None, steps, horizon, integration), []
+        rows = [self._checked(None, None, steps, horizon, integration)] * len(conditionings)
         for i, (conditioning, chunk) in enumerate(zip(conditionings, previous, strict=True)):
-            with row_named(i, len(conditionings)):
-                joins = conditioning is not None or chunk is not None
-                rows.append(self._checked(conditioning, chunk, steps, horizon, integration) if joins else plain)
+            if conditioning is not None or chunk is not None:
+                with row_named(i, len(conditionings)):
+                    rows[i] = self._checked(conditioning, chunk, steps, horizon, integration)
         return Joins(rows, steps, horizon, integration)
 
     def _checked(
@@ -131,9 +132,10 @@ class Joining:
         {} for an ordinary call, else "conditioning": one for all observations, or a list with one for each.
         """
         rows: list[Conditioning | None] = []
-        for i, ((conditioning, chunk), state) in enumerate(zip(joins.rows, states, strict=True)):
-            with row_named(i, len(states)):
-                one = conditioning if chunk is None else self._of_chunk(chunk, state, joins)
+        for i, ((one, chunk), state) in enumerate(zip(joins.rows, states, strict=True)):
+            if chunk is not None:
+                with row_named(i, len(states)):
+                    one = self._of_chunk(chunk, state, joins)
             rows.append(None if one is None or one.form == "plain" else one)
         if all(one is rows[0] for one in rows):
             return {} if rows[0] is None else {"conditioning": rows[0]}
@@ -186,9 +188,16 @@ class Joining:
             asked.append((steps, horizon, one))
         return asked
 
+    def _forms(self) -> tuple[Form, ...]:
+        """`backends.forms` of the backend; whether it is `Conditions` is found out once, not for every row."""
+        backend, known = self._backend(), self._known
+        if known[0] is not backend:
+            known = self._known = backend, backend if isinstance(backend, backends.Conditions) else None
+        return () if known[1] is None else known[1].forms
+
     def _check_form(self, form: Form) -> None:
-        backend = self._backend()
-        if form != "plain" and form not in backends.forms(backend):
+        if form != "plain" and form not in self._forms():
+            backend = self._backend()
             what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
             if form == "solver":
                 raise ObservationError(

@@ -245,10 +245,11 @@ class UnifiedPolicy:
         rows, steps, actions = len(observations), denoising.steps, self._horizon(horizon)
         joins = self._joining.checked(conditionings, previous, steps, actions, denoising.integration)
         ran = self._call.run(observations, joins, lambda: self._noise(rows, actions, noise, seed))
-        results = self._results(ran.sample, ran.states)
+        chunks = ran.sample.actions.numpy()
+        results = self._pipeline.after_all(chunks, ran.states)
         for row, result in enumerate(results):
             if model_actions[row]:
-                result["model_actions"] = ran.sample.actions[row].numpy().copy()
+                result["model_actions"] = chunks[row].copy()
                 if (anchor := self._pipeline.anchor(ran.states[row])) is not None:
                     result["anchor"] = anchor
         timing = ran.sample.timing(start, ran.asked, ran.infer_start, ran.infer_end, time.perf_counter())
@@ -296,7 +297,7 @@ class UnifiedPolicy:
                     self._guard.examine(error)
                     raise
                 infer_end = time.perf_counter()
-                result = self._results(sample, [state])[0]
+                result = self._pipeline.after_all(sample.actions.numpy(), [state])[0]
                 infer_start = asked + sample.queue_ms / 1e3
                 timing = sample.timing(start, asked, infer_start, infer_end, time.perf_counter())
                 answer.set_result(result | {"policy_timing": timing})
@@ -446,18 +447,6 @@ class UnifiedPolicy:
             **self._loading,
             **self._pipeline.metadata,
         }
-
-    def _results(self, sample: backends.Sample, states: Sequence[np.ndarray]) -> list[dict[str, Any]]:
-        """The robot's actions of each row. An ActionError names the row, if there are several."""
-        chunks, results = sample.actions.numpy(), []
-        for row, (chunk, state) in enumerate(zip(chunks, states, strict=True)):
-            try:
-                results.append(self._pipeline.after(chunk, state))
-            except ActionError as error:
-                if len(states) == 1:
-                    raise
-                raise ActionError(f"observation {row} of {len(states)} (from 0): {error}") from None
-        return results
 
     def _horizon(self, horizon: int | None) -> int:
         """A call's. Raises ObservationError."""

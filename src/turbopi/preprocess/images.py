@@ -14,7 +14,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import torch
@@ -152,6 +152,7 @@ def resize_unit_into(image: np.ndarray, out: np.ndarray, *, low: float = 0.0) ->
         out[..., channel] = planes[channel] * np.float32(2) - np.float32(1)
 
 
+@lru_cache(maxsize=16)  # the same few in every call
 def placement(shape: tuple[int, ...], target: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of a `target`-sized frame that a picture of `shape` fills, its aspect ratio kept.
 

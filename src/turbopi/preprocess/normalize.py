@@ -34,6 +34,7 @@ class Normalizer:
         if not NEEDS[mode]:
             return
         self._a, self._b = self._statistics(stats)
+        self._span = self._divisor()
         self.width = len(self._a)
 
     def _statistics(self, stats: FeatureStats | None) -> tuple[np.ndarray, np.ndarray]:
@@ -50,6 +51,21 @@ class Normalizer:
             raise ConfigError(f"{self.feature} statistics {names[0]} {a.shape} and {names[1]} {b.shape} don't match")
         return (a.astype(np.float32), b.astype(np.float32)) if self.is_lerobot else (a, b)
 
+    def _divisor(self) -> np.ndarray:
+        """What `normalize` divides by."""
+        a, b = self._a, self._b
+        with np.errstate(over="ignore"):  # absurd statistics
+            match self.mode:
+                case "quantile":
+                    return np.asarray(b - a + _OPENPI_EPS)
+                case "zscore":
+                    return np.asarray(b + _OPENPI_EPS)
+                case "lerobot_zscore":
+                    return np.asarray(b + np.float32(_LEROBOT_EPS))
+                case _:  # lerobot_quantile, lerobot_min_max
+                    span = b - a
+                    return np.where(span == 0, np.float32(_LEROBOT_EPS), span)
+
     @property
     def is_lerobot(self) -> bool:
         """Whether it computes in float32, as LeRobot does."""
@@ -62,17 +78,17 @@ class Normalizer:
         d = x.shape[-1]
         if d > self.width or (self.is_lerobot and d != self.width):
             raise ObservationError(f"{self.feature} has {d} values, but the checkpoint's statistics cover {self.width}")
-        a, b = self._a[:d], self._b[:d]
+        a, span = self._a[:d], self._span[:d]
         with np.errstate(over="ignore"):  # absurd inputs become inf, which the pipeline refuses
             match self.mode:
                 case "quantile":
-                    return np.asarray((x - a) / (b - a + _OPENPI_EPS) * 2.0 - 1.0)
+                    return np.asarray((x - a) / span * 2.0 - 1.0)
                 case "zscore":
-                    return np.asarray((x - a) / (b + _OPENPI_EPS))
+                    return np.asarray((x - a) / span)
                 case "lerobot_zscore":
-                    return np.asarray((x.astype(np.float32) - a) / (b + np.float32(_LEROBOT_EPS)), np.float64)
+                    return np.asarray((x.astype(np.float32) - a) / span, np.float64)
                 case _:  # lerobot_quantile, lerobot_min_max
-                    return np.asarray(2.0 * (x.astype(np.float32) - a) / _nonzero(b - a) - 1.0, np.float64)
+                    return np.asarray(2.0 * (x.astype(np.float32) - a) / span - 1.0, np.float64)
 
     def says_something_past(self, width: int) -> bool:
         """Whether the statistics past the first `width` values are more than padding: not all 0."""
@@ -98,24 +114,18 @@ class Normalizer:
         return out
 
     def _unscaled(self, x: np.ndarray) -> np.ndarray:
-        a, b = self._a, self._b
+        a, b, span = self._a, self._b, self._span
         if self.is_lerobot:
             x = x.astype(np.float32)
         match self.mode:
-            case "quantile":
-                return np.asarray((x + 1.0) / 2.0 * (b - a + _OPENPI_EPS) + a)
+            case "quantile" | "lerobot_min_max":
+                return np.asarray((x + 1.0) / 2.0 * span + a)
             case "zscore":
-                return np.asarray(x * (b + _OPENPI_EPS) + a)
+                return np.asarray(x * span + a)
             case "lerobot_quantile":
-                return np.asarray((x + 1.0) * _nonzero(b - a) / 2.0 + a)
-            case "lerobot_min_max":
-                return np.asarray((x + 1.0) / 2.0 * _nonzero(b - a) + a)
+                return np.asarray((x + 1.0) * span / 2.0 + a)
             case _:  # lerobot_zscore: the epsilon is in the forward direction only
                 return np.asarray(x * b + a)
-
-
-def _nonzero(span: np.ndarray) -> np.ndarray:
-    return np.where(span == 0, np.float32(_LEROBOT_EPS), span)
 
 
 def pad_last(x: np.ndarray, width: int) -> np.ndarray:

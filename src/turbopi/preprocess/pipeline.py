@@ -6,7 +6,7 @@ un-normalised: openpi un-normalises what it has normalised, LeRobot has kept wha
 """
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,9 +27,11 @@ from turbopi.preprocess.robot_checks import (
 )
 from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.robots import Robot, RobotInputs, robot_for
-from turbopi.robots.base import read_prompt, read_state
-from turbopi.robots.pictures import check_hwc, to_uint8
+from turbopi.robots.base import all_finite, read_prompt, read_state
+from turbopi.robots.pictures import check_hwc, is_rgb8, to_uint8
 from turbopi.robots.plain import Plain
+
+_CAMERAS = frozenset(CAMERAS)
 
 
 @dataclass
@@ -57,11 +59,11 @@ class Incoming:
 
 
 @dataclass
-class _Result:
-    """One action chunk on its way out."""
+class _Outgoing:
+    """A call's action chunks on their way out, all at once: eight take twice as long as one."""
 
-    actions: np.ndarray  # [H, d]
-    state: np.ndarray  # [s], s from action_dim
+    actions: np.ndarray  # [B, H, d]
+    states: Sequence[np.ndarray]  # of each [s], s from action_dim
 
 
 class Pipeline:
@@ -106,7 +108,7 @@ class Pipeline:
             self._pad_state,
             self._keep_raw_state,
         )
-        self.after_model: tuple[Callable[[_Result], None], ...] = (
+        self.after_model: tuple[Callable[[_Outgoing], None], ...] = (
             self._unnormalize,
             self._make_absolute,
             self._write_actions,
@@ -153,27 +155,39 @@ class Pipeline:
         Raises ActionError if any of the model's numbers, also of dimensions that the robot doesn't have, or any of the
         robot's is NaN or infinite, and if the robot's `outputs` gives another shape.
         """
-        assert model_actions.shape[1:] == (self.config.model.action_dim,), model_actions.shape
-        if not np.isfinite(model_actions).all():
-            raise ActionError(
-                f"{_first_not_finite(model_actions, 'the model computed')}. Look at the checkpoint's weights "
-                "(`turbopi inspect`) and, in FP8, at its calibration: `turbopi verify` compares this backend with the "
-                "float32 reference"
+        return self.after_all(model_actions[None], [state])[0]
+
+    def after_all(self, model_actions: np.ndarray, states: Sequence[np.ndarray]) -> list[dict[str, Any]]:
+        """`after` of each observation of a batch: its chunks are float32[B, H, action_dim].
+
+        An ActionError names the first row that is wrong, if there are several.
+        """
+        assert model_actions.shape[::2] == (len(states), self.config.model.action_dim), model_actions.shape
+        if not all_finite(model_actions):
+            raise _not_finite(
+                model_actions,
+                "the model computed",
+                ". Look at the checkpoint's weights (`turbopi inspect`) and, in FP8, at its calibration: `turbopi "
+                "verify` compares this backend with the float32 reference",
             )
-        result = _Result(model_actions, state)
+        out = _Outgoing(model_actions, states)
         with np.errstate(over="ignore", invalid="ignore"):  # refused below
             for step in self.after_model:
-                step(result)
-            actions = np.array(result.actions, np.float64)
-        if not np.isfinite(actions).all():
-            raise ActionError(
-                f"{_first_not_finite(actions, f'un-normalised, robot {self.robot.name} gets')}, though the model's "
-                "numbers are finite. Look at the checkpoint's statistics of actions, and of the state if actions are "
-                "relative to it, and at the robot's `outputs`"
+                step(out)
+        if not all_finite(out.actions):
+            raise _not_finite(
+                out.actions,
+                f"un-normalised, robot {self.robot.name} gets",
+                ", though the model's numbers are finite. Look at the checkpoint's statistics of actions, and of the "
+                "state if actions are relative to it, and at the robot's `outputs`",
             )
         keys = getattr(self.robot, "action_keys", None)
-        named = {} if keys is None else {"named_actions": dict(zip(keys, np.ascontiguousarray(actions.T), strict=True))}
-        return {"actions": actions, **named}
+        if keys is None:
+            return [{"actions": actions} for actions in out.actions]
+        return [
+            {"actions": actions, "named_actions": dict(zip(keys, np.ascontiguousarray(actions.T), strict=True))}
+            for actions in out.actions
+        ]
 
     def anchor(self, state: np.ndarray) -> np.ndarray | None:
         """What `after` adds to relative actions, float64[len(delta_mask)] in their units; None for absolute ones.
@@ -182,8 +196,11 @@ class Pipeline:
         """
         if self.robot.delta_mask is None:
             return None
-        full = state if self._adds_raw_state else self.state_scale.unnormalize(state)
-        return np.array(full[: len(self.robot.delta_mask)], np.float64)
+        return np.array(self._in_units(state)[: len(self.robot.delta_mask)], np.float64)
+
+    def _in_units(self, state: np.ndarray) -> np.ndarray:
+        """The state that relative actions are added to, from the one that `before` returned."""
+        return state if self._adds_raw_state else self.state_scale.unnormalize(state)
 
     def reanchored(self, left_over: np.ndarray, anchor: np.ndarray | None, state: np.ndarray) -> np.ndarray:
         """Relative actions float32[K, action_dim], normalised, as seen from another state: the same absolute ones.
@@ -254,8 +271,8 @@ class Pipeline:
 
     def _resize_images(self, sample: Incoming) -> None:
         pictures, present = sample.robot.images, sample.robot.image_mask
-        final = sample.robot.in_order or not set(pictures) <= set(CAMERAS)
-        cameras = list(pictures) if final else list(CAMERAS)
+        final = sample.robot.in_order or not _CAMERAS.issuperset(pictures)
+        cameras = tuple(pictures) if final else CAMERAS
         valid = [present.get(camera, camera in pictures) for camera in cameras]
         sample.image_mask = np.array(valid, np.bool_)
         checked = [self._check_picture(pictures.get(camera), camera) for camera in itertools.compress(cameras, valid)]
@@ -265,9 +282,13 @@ class Pipeline:
         else:  # the device resizes bytes
             for picture in checked:
                 placement(picture.shape, (size, size))  # refuses one that is too narrow before anything starts
-            sample.pictures = [one if one.dtype == np.uint8 else fitted(one, size, resize) for one in checked]
+            if RESIZES[resize].float_images:
+                checked = [one if one.dtype == np.uint8 else fitted(one, size, resize) for one in checked]
+            sample.pictures = checked
 
     def _check_picture(self, picture: object, camera: str) -> np.ndarray:
+        if is_rgb8(picture):
+            return picture
         picture = check_hwc(picture, camera)
         return picture if RESIZES[self.config.image_resize].float_images else to_uint8(picture, camera)
 
@@ -288,7 +309,7 @@ class Pipeline:
         with np.errstate(over="ignore"):
             state = sample.state.astype(np.float32)
         sample.model_state = state[:width]
-        if not np.isfinite(state).all():
+        if not all_finite(state):
             at = int(np.flatnonzero(~np.isfinite(state))[0])
             raise ObservationError(f"state value {at} is {sample.state[at]:g} once normalised, too large for the model")
 
@@ -304,21 +325,32 @@ class Pipeline:
 
     # After the model
 
-    def _unnormalize(self, result: _Result) -> None:
-        result.actions = self.action_scale.unnormalize(result.actions)
+    def _unnormalize(self, out: _Outgoing) -> None:
+        steps = out.actions.reshape(-1, out.actions.shape[-1])  # [B * H, d]
+        out.actions = self.action_scale.unnormalize(steps).reshape(out.actions.shape)
 
-    def _make_absolute(self, result: _Result) -> None:
-        if self._adds_raw_state:
-            actions, state = result.actions.astype(np.float32), result.state.astype(np.float32)
-            result.actions = absolute_actions(actions, state, self.robot.delta_mask or ())
-        elif self.robot.delta_mask is not None:
-            state = self.state_scale.unnormalize(result.state)  # what `anchor` says, too
-            result.actions = absolute_actions(result.actions, state, self.robot.delta_mask)
+    def _make_absolute(self, out: _Outgoing) -> None:
+        mask = self.robot.delta_mask
+        if mask is None:
+            return
+        states = np.stack([self._in_units(state)[: len(mask)] for state in out.states])
+        if self._adds_raw_state:  # in float32, as LeRobot
+            out.actions, states = out.actions.astype(np.float32), states.astype(np.float32)
+        out.actions = absolute_actions(out.actions, states, mask)
 
-    def _write_actions(self, result: _Result) -> None:
-        expected = (len(result.actions), self._action_width)
-        result.actions = self.robot.outputs(result.actions)
-        check_shape(self.robot, result.actions, expected)
+    def _write_actions(self, out: _Outgoing) -> None:
+        rows, horizon, _ = out.actions.shape
+        written = np.empty((rows, horizon, self._action_width))
+        for row, actions in enumerate(out.actions):
+            try:
+                given = self.robot.outputs(actions)
+                check_shape(self.robot, given, written.shape[1:])
+            except ActionError as error:
+                if rows == 1:
+                    raise
+                raise ActionError(_of_row(row, rows, str(error))) from None
+            written[row] = given
+        out.actions = written
 
     def _dry_run(self) -> int:
         """How many actions a step the robot gets. Raises ConfigError if `outputs` isn't what it should be."""
@@ -356,12 +388,22 @@ class Pipeline:
                 )
 
 
-def _first_not_finite(actions: np.ndarray, who: str) -> str:
-    """What an ActionError says of actions [H, d] that aren't all finite."""
+def _not_finite(batch: np.ndarray, who: str, advice: str) -> ActionError:
+    """The error of actions [B, H, d] that aren't all finite: it is of the first observation that has such numbers."""
+    row = int(np.argwhere(~np.isfinite(batch))[0, 0])
+    actions = batch[row]
     places = np.argwhere(~np.isfinite(actions))
-    first = tuple(int(axis) for axis in places[0])
-    where = f"row {first[0]}, column {first[1]}" if len(first) == 2 else f"place {list(first)}"
-    return (
-        f"{who} actions that no robot may be given: {len(places)} of {actions.size} numbers aren't finite, the first "
-        f"one, {actions[first]}, in {where} (both from 0)"
+    step, column = map(int, places[0])
+    return ActionError(
+        _of_row(
+            row,
+            len(batch),
+            f"{who} actions that no robot may be given: {len(places)} of {actions.size} numbers aren't finite, the "
+            f"first one, {actions[step, column]}, in row {step}, column {column} (both from 0){advice}",
+        )
     )
+
+
+def _of_row(row: int, rows: int, message: str) -> str:
+    """What is wrong with an observation; if it is one of several, with its number."""
+    return message if rows == 1 else f"observation {row} of {rows} (from 0): {message}"
