@@ -1,8 +1,12 @@
 """The source of Hopper's attention, run on a CPU thread by thread: see test_kernels_emulated.py."""
 
+import re
+import subprocess
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
+import machine_code
 import numpy as np
 import pytest
 import torch
@@ -13,7 +17,8 @@ from torch import Tensor
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from turbopi.engine.packing import pack_rows
-from turbopi.kernels import plain, plain_batch
+from turbopi.errors import BackendUnavailable
+from turbopi.kernels import nvrtc, plain, plain_batch
 from turbopi.kernels.interface import Segments
 from turbopi.kernels.sm90.attention import kernel as attention
 from turbopi.kernels.sm90.attention import suffix
@@ -67,6 +72,25 @@ def test_vision(machine: Machine, tile: AttentionTile, tokens: int) -> None:
         assert_close(attention.vision_attention(qkv, images, heads, tile=tile), exact)
 
 
+@pytest.mark.parametrize(
+    ("tile", "length"), [(AttentionTile(24, 16), 1), (AttentionTile(24, 16), 70), (AttentionTile(24, 32, 1), 80)]
+)
+def test_prefix(machine: Machine, tile: AttentionTile, length: int) -> None:
+    """NaN beyond the length never counts; a query's shows in its own row alone."""
+    heads, slots = 2, 80
+    q, k, v = random(slots * heads, tile.dim), random(slots, tile.dim, seed=1), random(slots, tile.dim, seed=2)
+    k[:, ::7] *= 8
+    on_device = torch.tensor([length])
+    exact = plain.attention(q.float(), k.float(), v.float(), on_device, slots, heads).view_as(q)
+    k[length:], v[length:], q[3, 5] = torch.nan, torch.nan, torch.nan
+    others = [row for row in range(len(q)) if row != 3]
+    for seed in SEEDS:
+        machine(seed)
+        ours = attention.prefix_attention(q, k, v, on_device, heads, tile=tile).view_as(q)
+        assert_close(ours[others], exact[others])
+        assert ours[3].isnan().all()
+
+
 def test_packed(machine: Machine) -> None:
     """Observations of which one ends in the middle of a pair of tiles, and NaN that others must not see."""
     tile, heads, lengths, spare = AttentionTile(24, 16, wide=True), 4, [33, 3, 20], 5
@@ -94,6 +118,7 @@ def test_packed(machine: Machine) -> None:
         (SuffixTile(64, 40, 4, 16), [60, 7], 10),  # ranks without keys
         (SuffixTile(64, 72, 1, 16), [33], 18),  # two warpgroups
         (SuffixTile(128, 24, 2, 32), [50], 11),  # two clusters an observation, the second one not full
+        (SuffixTile(192, 24, 8, 16), [150], 6),  # 24 columns a rank
     ],
 )
 def test_suffix(machine: Machine, tile: SuffixTile, lengths: list[int], tokens: int, state_token: bool) -> None:
@@ -117,6 +142,36 @@ def test_suffix(machine: Machine, tile: SuffixTile, lengths: list[int], tokens: 
             assert_close(ours[2 * tokens :], exact[2 * tokens :])
 
 
+def test_nan_in_a_token_shows_in_its_row_alone(machine: Machine) -> None:
+    heads, tokens, tile = 4, 10, SuffixTile(64, 40, 4, 16)
+    qkv, cache = random(tokens, (heads + 2) * tile.dim), random(90, tile.dim, seed=1)
+    qkv[2, tile.dim + 5] = torch.nan  # of its second head's query
+    angles = torch.ones(tokens, tile.dim // 2)
+    starts, sizes = torch.tensor([0, 90], dtype=torch.int32), torch.tensor([90, 0], dtype=torch.int32)
+    for seed in SEEDS:
+        machine(seed)
+        ours = suffix.suffix_attention(qkv, angles, angles, cache, cache, starts, sizes, heads, tile=tile)
+        assert torch.equal(ours.view(-1, tile.dim).isnan().any(1).nonzero(), torch.tensor([[2 * heads + 1]]))
+        assert ours.view(-1, tile.dim)[2 * heads + 1].isnan().all()
+
+
+def test_where_no_cluster_fits_it_is_asked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def no_room(*given: object, cluster: int, **rest: object) -> None:
+        asked.append(cluster)
+        raise BackendUnavailable("no room for one")
+
+    monkeypatch.setattr(suffix, "compile_cubin", lambda *given: b"")
+    monkeypatch.setattr(suffix, "DependentKernel", no_room)
+    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+    for _ in range(2):
+        with pytest.raises(BackendUnavailable, match="no room for one"):
+            suffix.chosen_tile(64, 40, 3, 100, False, torch.device("meta"))
+    suffix._kernel_or_why_not.cache_clear()
+    assert asked == [8, 4, 2, 1]
+
+
 def test_what_leaves_in_fp8_is_scaled(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (attention, suffix):
         monkeypatch.setattr(module, "result_dtype", lambda x, inverse: E4M3)  # as on a GPU
@@ -134,3 +189,19 @@ def test_what_leaves_in_fp8_is_scaled(machine: Machine, monkeypatch: pytest.Monk
     ours = suffix.suffix_attention(*given, inverse=30.0, tile=SuffixTile(64, 40, 2, 32))
     assert ours.dtype == E4M3
     torch.testing.assert_close(ours.float(), 30 * plain_batch.suffix_attention(*given).float(), atol=0.1, rtol=0.07)
+
+
+@pytest.mark.skipif(machine_code.compiler() is None, reason="no NVRTC here")
+def test_weights_are_made_while_values_are_multiplied(folder: Path) -> None:
+    """In wide.cu's machine code for two warpgroups: where ptxas waits for values first, nothing hides the weights."""
+    import triton
+
+    tile = AttentionTile(256, 80, wide=True)
+    made = nvrtc.compile_cubin(attention.source(tile), "sm_90a", attention.constants(tile, False), folder=folder)
+    file = folder / "wide.cubin"
+    file.write_bytes(made)
+    command = [triton.knobs.nvidia.cuobjdump.path, "-sass", file]
+    code = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    logits_there, values_there = (rf"WARPGROUP\.DEPBAR\.LE gsb0, 0x{left}" for left in (1, 0))
+    between = re.search(f"{logits_there}(.*?){values_there}", code, re.DOTALL)
+    assert between is not None and between[1].count("MUFU.EX2") >= tile.keys // 2

@@ -24,6 +24,7 @@ from turbopi.kernels.portable import batch_steps, norms  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention  # noqa: E402
 from turbopi.kernels.sm90.attention import suffix  # noqa: E402
 from turbopi.kernels.sm90.attention.suffix_tile import KEYS, RANKS, SuffixTile  # noqa: E402
+from turbopi.quantization.fp8 import E4M3  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
 DTYPE = torch.bfloat16 if ON_GPU else torch.float32
@@ -74,6 +75,27 @@ def test_packed_attention_on_hopper(lengths: list[int], spare: int, batch: int) 
     check_packed(attention.packed_attention, lengths, spare, batch)
 
 
+@on_hopper
+@pytest.mark.parametrize("inverse", [None, 55.0])
+def test_packed_attention_on_hopper_of_heads_of_256(inverse: float | None) -> None:
+    """NaN in the padding's rows, which lie in the last observation's last tile of keys, never counts."""
+    dim, rows = 256, 473
+    segments, _ = packed([300, 3, 170], 7, 4)
+    q, k, v = random(480 * HEADS, dim), random(480, dim, seed=1), random(480, dim, seed=2)
+    twin = plain_batch.packed_attention(q, k, v, segments, HEADS)[:rows].float()
+    k[rows:], v[rows:] = torch.nan, torch.nan
+    ours = attention.packed_attention(q, k, v, segments, HEADS, inverse).float()
+    assert bool(ours[rows:].isnan().all())
+    if inverse is None:
+        torch.testing.assert_close(ours[:rows], twin, atol=TOLERANCE, rtol=TOLERANCE)
+    else:
+        assert_rounded_to_e4m3(ours[:rows] / inverse, twin)
+
+
+def assert_rounded_to_e4m3(ours: Tensor, twin: Tensor) -> None:
+    assert float((ours - twin).norm() / twin.norm()) < 0.035
+
+
 def check_packed(attend: Callable[..., Tensor], lengths: list[int], spare: int, batch: int) -> None:
     segments, _ = packed(lengths, spare, batch)
     rows = sum(lengths) + spare
@@ -115,6 +137,25 @@ def test_suffix_attention_on_hopper(lengths: list[int], heads: int, dim: int, to
 def test_suffix_attention_on_hopper_in_clusters_of_any_size(ranks: int, keys: int) -> None:
     tile = SuffixTile(256, 80, ranks, keys)
     check_suffix(partial(suffix.suffix_attention, tile=tile), [560, 0, 547], 10, False, 8, 256)
+
+
+@on_hopper
+@pytest.mark.parametrize("state_token", [False, True])
+@pytest.mark.parametrize("dim", [128, 192])
+def test_suffix_attention_on_hopper_of_other_heads(dim: int, state_token: bool) -> None:
+    check_suffix(suffix.suffix_attention, [300, 0, 129], 10, state_token, 4, dim)
+
+
+@on_hopper
+@pytest.mark.parametrize("dim", [64, 192, 256])
+def test_suffix_attention_on_hopper_leaves_in_e4m3(dim: int) -> None:
+    heads, tokens, sizes = 8, 10, torch.tensor([300, 0, 129, 0], dtype=torch.int32)
+    starts, sizes = (sizes.cumsum(0) - sizes).int().to(DEVICE), sizes.to(DEVICE)
+    qkv, cache = random(3 * tokens, (heads + 2) * dim), random(429, dim, seed=1)
+    given = (qkv, *angles(3 * tokens, dim), cache, cache, starts, sizes, heads)
+    ours = suffix.suffix_attention(*given, inverse=55.0)
+    assert ours.dtype == E4M3
+    assert_rounded_to_e4m3(ours.float() / 55, plain_batch.suffix_attention(*given).float())
 
 
 def check_suffix(

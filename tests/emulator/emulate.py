@@ -225,5 +225,5 @@ class Machine:
     def __call__(self, seed: int) -> None:
         """From now on it takes turns in the order of that seed."""
         self._seed = seed
-        for module in self._modules:
-            module._kernel.cache_clear()
+        for cached in (one for module in self._modules for one in vars(module).values() if hasattr(one, "cache_clear")):
+            cached.cache_clear()

@@ -1,4 +1,5 @@
-// What the attention kernels share: sizes of a tile, its operands, weights of logits, results on their way out.
+// What the attention kernels share: sizes of a tile, the ring that tiles pass through, their operands, weights of logits,
+// results on their way out.
 // kernel.py or suffix.py sets the TP_ constants and writes `mma_logits(float (&)[KEYS / 2], u64, u64, int keep)` and
 // `mma_values(float (&)[DIM / 2], u32 * 4, u64, int keep)`.
 //
@@ -15,6 +16,11 @@ typedef u16 Element;
 constexpr int PANELS = (DIM + 63) / 64;  // of 64 columns, 128 bytes: as much as a swizzle spans
 constexpr int ROW_BYTES = 128, KEY_PANEL = KEYS * ROW_BYTES, STAGE_BYTES = PANELS * KEY_PANEL;
 constexpr int BLOCKS = DIM / 8, DEPTH = (DIM + 15) / 16, THREADS = 128 * WGS;
+static_assert(DIM % 8 == 0 && 16 <= DIM && DIM <= 256, "columns that a product may have");
+static_assert(KEYS % 16 == 0 && 16 <= KEYS && KEYS <= 256, "a product with values is 16 keys deep");
+// Registers of a thread, when the producer has given away what it doesn't need
+constexpr int PRODUCER_REGISTERS = WGS == 4 ? 24 : 40, CONSUMER_REGISTERS = WGS == 4 ? 112 : WGS == 1 ? 240 : 232;
+static_assert(WGS == 1 || WGS == 2 || WGS == 4, "setmaxnreg waits for registers that a multiprocessor hasn't");
 
 #define NONE __uint_as_float(0xff800000)  // -inf
 
@@ -40,6 +46,38 @@ __device__ __forceinline__ float largest_of_quad(float x) {
 __device__ __forceinline__ void sync_consumers(int barrier, int threads) {
     asm volatile("bar.sync %0, %1;" ::"r"(barrier), "r"(threads) : "memory");
 }
+
+// Tiles pass through STAGES slots of shared memory, each at its `place` in the order of all. Behind the slots are their
+// barriers: a tile is there; all its readers, which are warpgroups, have released it.
+struct Ring {
+    static constexpr int BYTES = STAGES * (STAGE_BYTES + 16);
+    u32 slots;
+
+    __device__ __forceinline__ u32 slot(u32 place) const { return slots + place % STAGES * STAGE_BYTES; }
+    __device__ __forceinline__ u32 full(u32 place) const { return slots + STAGES * STAGE_BYTES + place % STAGES * 8; }
+    __device__ __forceinline__ u32 empty(u32 place) const { return full(place) + STAGES * 8; }
+
+    __device__ __forceinline__ void init(int readers) const {
+        for (int s = 0; s < STAGES; ++s) barrier_init(full(s), 1), barrier_init(empty(s), readers);
+    }
+    // For the producer: waits until the slot is free. What it loads there next is to tell `full`.
+    __device__ __forceinline__ void claim(u32 place) const {
+        if (place >= STAGES) barrier_wait(empty(place), (place / STAGES + 1) & 1);
+        barrier_expect(full(place), STAGE_BYTES);
+    }
+    __device__ __forceinline__ void load_tile(u32 place, const TensorMap* map, int head, int row) const {
+        claim(place);
+        for (int p = 0; p < PANELS; ++p) load(slot(place) + p * KEY_PANEL, map, 64 * p, head, row, full(place));
+    }
+    // For readers
+    __device__ __forceinline__ u32 await(u32 place) const {
+        barrier_wait(full(place), (place / STAGES) & 1);
+        return slot(place);
+    }
+    __device__ __forceinline__ void release(u32 place) const {
+        if (threadIdx.x % 128 == 0) barrier_arrive(empty(place));
+    }
+};
 
 // The products of a tile, as a group: of 64 queries, whose panels lie Q_PANEL bytes apart, with keys, and of their weights
 // with values.
@@ -86,33 +124,34 @@ __device__ __forceinline__ void settle(float (&registers)[COUNT]) {
     for (int i = 0; i < COUNT; ++i) asm volatile("" : "+f"(registers[i])::"memory");
 }
 
-// Of a lane's two rows, over tiles of keys: the largest logit so far and the sum of weights. The sums of values are
-// relative to it.
+#define LOWEST __uint_as_float(0xff7fffff)  // of float32: a row's top before it sees a key; -inf - -inf would be NaN
+
+// Of a lane's two rows, over tiles of keys: the largest logit so far, in powers of two, and the sum of weights. The sums of
+// values are relative to it. The largest weight is 1, which bfloat16 has: a top that lags behind is less exact.
 struct Softmax {
     float scale;  // of logits, in powers of two
-    float top[2] = {NONE, NONE}, total[2] = {};
+    float top[2] = {LOWEST, LOWEST}, total[2] = {};
 
     // A tile's logits become weights. Sums of values that were made before are to be shrunk by what comes back, so that
     // they are relative to the new top: `shrink_sums`.
     __device__ __forceinline__ float2 weigh(float (&logits)[KEYS / 2]) {
-        float shrink[2], offset[2];
+        float shrink[2];
 #pragma unroll
         for (int half = 0; half < 2; ++half) {
-            float best = top[half];
+            float best = NONE;
 #pragma unroll
             for (int i = 0; i < KEYS / 2; ++i)
                 if (i / 2 % 2 == half) best = fmaxf(best, logits[i]);
-            best = largest_of_quad(best);
-            offset[half] = best == NONE ? 0 : best * scale;  // of a row that has seen no key yet
-            shrink[half] = power_of_two(fmaf(top[half], scale, -offset[half]));
-            top[half] = best;
+            const float before = top[half];
+            top[half] = fmaxf(before, largest_of_quad(best) * scale);
+            shrink[half] = power_of_two(before - top[half]);  // exactly 1 where the top stays
             total[half] *= shrink[half];
         }
 #pragma unroll
         for (int i = 0; i < KEYS / 2; i += 2) {
             const int half = i / 2 % 2;
-            logits[i] = power_of_two(fmaf(logits[i], scale, -offset[half]));
-            logits[i + 1] = power_of_two(fmaf(logits[i + 1], scale, -offset[half]));
+            logits[i] = power_of_two(fmaf(logits[i], scale, -top[half]));
+            logits[i + 1] = power_of_two(fmaf(logits[i + 1], scale, -top[half]));
             total[half] += logits[i] + logits[i + 1];
         }
         return make_float2(shrink[0], shrink[1]);
@@ -131,10 +170,11 @@ __device__ __forceinline__ void round_weights(const float (&logits)[KEYS / 2], u
     for (int i = 0; i < KEYS / 4; ++i) weights[i] = pack(logits[2 * i], logits[2 * i + 1]);
 }
 __device__ __forceinline__ void shrink_sums(float (&sums)[DIM / 2], float2 by) {
-    if (!__any_sync(~0u, by.x != 1 || by.y != 1)) return;
 #pragma unroll
     for (int i = 0; i < DIM / 2; ++i) sums[i] *= i / 2 % 2 ? by.y : by.x;
 }
+// Whether any row of the warp has a new top. NaN, too, is to reach the sums.
+__device__ __forceinline__ bool any_shrinks(float2 by) { return __any_sync(~0u, by.x != 1 || by.y != 1); }
 
 // Rows' sums of values in the columns of blocks that are `mine`, over their totals, to `out`, which points to the first of
 // the warp's 16 rows; `pitch` numbers from row to row. Rows from `there` on aren't written.

@@ -92,6 +92,7 @@ def prefix_attention(
     and contiguous.
     """
     assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
+    assert length.dtype == torch.int64 and length.numel() == 1
     rows, dim = q.shape
     tile = tile or AttentionTile(dim, keys=64)
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
@@ -110,6 +111,7 @@ def packed_attention(
 ) -> Tensor:
     """Each row of q [R * n, K] over the keys of its own segment: k, v [R, K] -> [R, n * K]; `inverse` as above."""
     assert all(t.is_contiguous() and t.dtype == torch.bfloat16 for t in (q, k, v))
+    assert segments.tiles.is_contiguous() and segments.tiles.dtype == torch.int32 and segments.tiles.shape[1] == 4
     rows, dim = q.shape
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse))
     tile = tile or AttentionTile(dim, keys=80, wide=True)

@@ -18,7 +18,8 @@ constexpr int SHARING = TP_SHARING;
 constexpr bool WHOLE = TP_WHOLE;
 constexpr int Q_PANEL = 64 * ROW_BYTES, Q_BYTES = PANELS * Q_PANEL, FOURS = (BLOCKS + 3) / 4;
 static_assert(STAGES >= 2 * WGS, "a warpgroup would wait for a slot that it holds");
-constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : 232, PRODUCER_REGISTERS = 40;
+static_assert(WGS <= 2, "in the end each gets the sums of one other");
+static_assert(KEYS % (8 * SHARING) == 0 && SHARING <= 8, "a swizzle's rows are one CTA's share, or several");
 // which warpgroup ends up with a block of 8 columns; blocks go in fours, as that many leave together
 __device__ constexpr int owner(int block) { return block / 4 * WGS / FOURS; }
 
@@ -33,8 +34,9 @@ __device__ __forceinline__ void load_into_all(u32 to, const TensorMap* map, int 
 extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), 1)
 attention(ATTENTION_PARAMETERS) {
     extern __shared__ char raw[];
-    const u32 base = (shared_address(raw) + 1023) / 1024 * 1024, ring = base + Q_BYTES;
-    const u32 q_full = ring + STAGES * STAGE_BYTES, full = q_full + 8, empty = full + 8 * STAGES;
+    const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
+    const Ring ring{base + Q_BYTES};
+    const u32 q_full = ring.slots + Ring::BYTES;
     const int warpgroup = __shfl_sync(~0u, threadIdx.x / 128, 0);  // the same for all, as the compiler now sees
 
     if (threadIdx.x == THREADS) {
@@ -43,7 +45,7 @@ attention(ATTENTION_PARAMETERS) {
     }
     if (threadIdx.x == 0) {
         barrier_init(q_full, 1);
-        for (int s = 0; s < STAGES; ++s) barrier_init(full + 8 * s, 1), barrier_init(empty + 8 * s, 1);
+        ring.init(1);
         asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
     }
     if (SHARING > 1) cluster_sync();
@@ -64,15 +66,12 @@ attention(ATTENTION_PARAMETERS) {
         asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
         if (threadIdx.x == THREADS) {
             auto load_tile = [&](const TensorMap* map, int first, int tile, int place) {
-                const u32 s = place % STAGES;
-                if (place >= STAGES) barrier_wait(empty + 8 * s, (place / STAGES + 1) & 1);
-                barrier_expect(full + 8 * s, STAGE_BYTES);
+                if (SHARING == 1) return ring.load_tile(place, map, first + head, group * keys + tile * KEYS);
+                ring.claim(place);
                 const int part = blockIdx.x % SHARING, from = group * keys + tile * KEYS + part * (KEYS / SHARING);
-                for (int p = 0; p < PANELS; ++p) {
-                    const u32 to = ring + s * STAGE_BYTES + p * KEY_PANEL + part * (KEY_PANEL / SHARING);
-                    if (SHARING > 1) load_into_all(to, map, 64 * p, first + head, from, full + 8 * s);
-                    else load(to, map, 64 * p, first + head, from, full + 8 * s);
-                }
+                for (int p = 0; p < PANELS; ++p)
+                    load_into_all(ring.slot(place) + p * KEY_PANEL + part * (KEY_PANEL / SHARING), map, 64 * p,
+                                  first + head, from, ring.full(place));
             };
             if (WHOLE) asm volatile("griddepcontrol.wait;" ::: "memory");
             barrier_expect(q_full, Q_BYTES);
@@ -80,7 +79,7 @@ attention(ATTENTION_PARAMETERS) {
                 load(base + p * Q_PANEL, &map_q, 64 * p, head, group * rows + row, q_full);
             for (int tile = 0; tile < early; ++tile) load_tile(&map_k, k_first, tile, place_of_keys(tile));
             const int valid = WHOLE ? WGS * KEYS : length ? (int)*length : keys;
-        const int last = (valid + KEYS - 1) / KEYS;
+            const int last = (valid + KEYS - 1) / KEYS;
 #pragma unroll 1
             for (int round = 0; round < last; round += WGS) {
                 const int end = min(round + WGS, last);
@@ -92,62 +91,26 @@ attention(ATTENTION_PARAMETERS) {
         }
     } else {
         asm volatile("setmaxnreg.inc.sync.aligned.u32 %0;" ::"n"(CONSUMER_REGISTERS));
-        const int lane = threadIdx.x % 32, own = threadIdx.x % 128, warp = own / 32;
+        const int own = threadIdx.x % 128, warp = own / 32;
         const int valid = WHOLE ? WGS * KEYS : length ? (int)*length : keys;
         const int last = (valid + KEYS - 1) / KEYS;
-        const float none = __uint_as_float(0xff800000);  // -inf
-        float logits[KEYS / 2], sums[DIM / 2] = {};      // of the values, by weight
-        float top[2] = {none, none}, total[2] = {};
-        u32 weights[KEYS / 4];  // as wgmma's operand in registers wants them
+        float logits[KEYS / 2], sums[DIM / 2] = {};  // of the values, by weight
+        u32 weights[KEYS / 4];
+        Softmax softmax{scale};
         auto await_tile = [&](int place) {
             if (WHOLE) __builtin_assume(place < STAGES);
-            barrier_wait(full + 8 * (place % STAGES), (place / STAGES) & 1);
-            return ring + place % STAGES * STAGE_BYTES;
-        };
-        auto release = [&](int place) {
-            if (own == 0) barrier_arrive(empty + 8 * (place % STAGES));
+            return ring.await(place);
         };
         // the tile's logits become weights, the sums follow the new top; values beyond the length become 0
         auto weigh = [&](int tile, u32 values) {
             const int left = valid - tile * KEYS;
+            if (!WHOLE && left < KEYS) hide(logits, left);
+            const float2 shrink = softmax.weigh(logits);
+            round_weights(logits, weights);
+            if (!WHOLE) shrink_sums(sums, shrink);  // hidden behind the powers of two: no vote
             if (!WHOLE && left < KEYS) {
-#pragma unroll
-                for (int i = 0; i < KEYS / 2; ++i)
-                    if (i / 4 * 8 + lane % 4 * 2 + i % 2 >= left) logits[i] = none;
-            }
-            float shrink[2];
-#pragma unroll
-            for (int half = 0; half < 2; ++half) {
-                float best = top[half];
-#pragma unroll
-                for (int i = 0; i < KEYS / 2; ++i)
-                    if (i / 2 % 2 == half) best = fmaxf(best, logits[i]);
-                best = largest_of_quad(best);
-                shrink[half] = power_of_two((top[half] - best) * scale);
-                top[half] = best;
-                total[half] *= shrink[half];
-            }
-#pragma unroll
-            for (int i = 0; i < KEYS / 2; i += 2) {
-                const int half = i / 2 % 2;
-                const float offset = top[half] * scale;
-                const float x = power_of_two(fmaf(logits[i], scale, -offset));
-                const float y = power_of_two(fmaf(logits[i + 1], scale, -offset));
-                total[half] += x + y;
-                weights[i / 2] = pack(x, y);
-            }
-            if (!WHOLE) {
-#pragma unroll
-                for (int i = 0; i < DIM / 2; ++i) sums[i] *= shrink[i / 2 % 2];
-            }
-            if (!WHOLE && left < KEYS) {  // 0 * NaN would be NaN
-                const int first = left * (ROW_BYTES / 16), count = KEY_PANEL / 16 - first;
-                for (int i = own; i < PANELS * count; i += 128) {
-                    const u32 at = values + i / count * KEY_PANEL + (first + i % count) * 16;
-                    asm volatile("st.shared.v4.u32 [%0], {%1, %1, %1, %1};" ::"r"(at), "r"(0) : "memory");
-                }
-                asm volatile("fence.proxy.async.shared::cta;" ::: "memory");
-                sync_consumers(2 + warpgroup, 128);
+                clear_rows(values, left, 128);
+                show_to_products(2 + warpgroup, 128);
             }
         };
 
@@ -158,7 +121,7 @@ attention(ATTENTION_PARAMETERS) {
             begin_products();
             multiply_keys<Q_PANEL>(logits, base, first);
             await_products<0>();
-            release(place);
+            ring.release(place);
         }
         if (WHOLE || tile < last) {
             for (; !WHOLE && tile + WGS < last; tile += WGS, place += 2 * WGS) {
@@ -169,8 +132,8 @@ attention(ATTENTION_PARAMETERS) {
                 multiply_values(sums, weights, values);
                 multiply_keys<Q_PANEL>(logits, base, next);
                 await_products<0>();
-                release(place + WGS);
-                release(place + 2 * WGS);
+                ring.release(place + WGS);
+                ring.release(place + 2 * WGS);
             }
             const u32 values = await_tile(place + WGS);
             weigh(tile, values);
@@ -178,8 +141,7 @@ attention(ATTENTION_PARAMETERS) {
             multiply_values(sums, weights, values);
             await_products<0>();
         }
-#pragma unroll
-        for (int half = 0; half < 2; ++half) total[half] = sum_of_quad(total[half]);
+        softmax.end();
 
 #if TP_WGS == 2
         // the other's sums of this warpgroup's columns, by block and thread; behind them its tops and totals
@@ -196,18 +158,18 @@ attention(ATTENTION_PARAMETERS) {
             for (int j = 0; j < BLOCKS; ++j)
                 if (owner(j) == to)
                     there[128 * count++] = make_float4(sums[4 * j], sums[4 * j + 1], sums[4 * j + 2], sums[4 * j + 3]);
-            there[MOST / 16] = make_float4(top[0], top[1], total[0], total[1]);
+            there[MOST / 16] = make_float4(softmax.top[0], softmax.top[1], softmax.total[0], softmax.total[1]);
         }
         sync_consumers(1, THREADS);
         const float4* const received = (const float4*)(shared + warpgroup * SHARE) + own;
         const float4 other = received[MOST / 16];
         float mine[2], theirs[2];
 #pragma unroll
-        for (int half = 0; half < 2; ++half) {  // 2^-inf is 0: who had no keys counts for nothing
-            const float other_top = half ? other.y : other.x, best = fmaxf(top[half], other_top);
-            mine[half] = power_of_two((top[half] - best) * scale);
-            theirs[half] = power_of_two((other_top - best) * scale);
-            total[half] = total[half] * mine[half] + (half ? other.w : other.z) * theirs[half];
+        for (int half = 0; half < 2; ++half) {  // who had no keys counts for nothing: its top is LOWEST
+            const float top = softmax.top[half], other_top = half ? other.y : other.x, best = fmaxf(top, other_top);
+            mine[half] = power_of_two(top - best);
+            theirs[half] = power_of_two(other_top - best);
+            softmax.total[half] = softmax.total[half] * mine[half] + (half ? other.w : other.z) * theirs[half];
         }
 #pragma unroll
         for (int who = 0; who < 2; ++who) {
@@ -226,7 +188,7 @@ attention(ATTENTION_PARAMETERS) {
 #endif
 
         const int at = row + warp * 16;
-        store_rows(sums, total, inverse, out + ((size_t)(group * rows + at) * heads + head) * DIM, (size_t)heads * DIM,
+        store_rows(sums, softmax.total, inverse, out + ((size_t)(group * rows + at) * heads + head) * DIM, (size_t)heads * DIM,
                    rows - at, [&](int block) { return owner(block) == warpgroup; });
     }
     if (SHARING > 1) cluster_sync();  // what this CTA loads for the others may still be on its way

@@ -10,8 +10,9 @@
 constexpr int ROWS = TP_ROWS, RANKS = TP_RANKS, COLUMNS = DIM / RANKS, HALF = DIM / 2;
 constexpr int Q_PANEL = ROWS * ROW_BYTES, Q_BYTES = PANELS * Q_PANEL;  // a warpgroup may read beyond them: rows of nobody
 constexpr int MAIL_BYTES = RANKS * ROWS * COLUMNS * 2, ENDS_BYTES = RANKS * ROWS * 8;
-constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : 232, PRODUCER_REGISTERS = 40;
-static_assert(ROWS % 8 == 0 && ROWS <= 64 * WGS && DIM % 64 == 0 && COLUMNS % 8 == 0 && STAGES >= 2, "sizes");
+static_assert(WGS <= 2 && ROWS % 8 == 0 && 64 * (WGS - 1) < ROWS && ROWS <= 64 * WGS, "rows of so many warpgroups");
+static_assert(DIM % 64 == 0 && COLUMNS % 8 == 0 && RANKS <= 8, "16 bytes of a row go to one rank");
+static_assert(STAGES >= 2, "a tile of keys and one of values");
 
 // An operand's 16 bytes of row `row` from column `column` on; its panels of 64 columns lie `panel` bytes apart.
 __device__ __forceinline__ u32 place_of(u32 operand, int panel, int row, int column) {
@@ -54,15 +55,16 @@ struct Turn {
 extern "C" __global__ void __launch_bounds__(THREADS + 128, 1)
 attention(SUFFIX_PARAMETERS) {
     extern __shared__ char raw[];
-    const u32 base = (shared_address(raw) + 1023) / 1024 * 1024, ring = base + Q_BYTES, mail = ring + STAGES * STAGE_BYTES;
-    const u32 ends = mail + MAIL_BYTES, mail_full = ends + ENDS_BYTES, full = mail_full + 8, empty = full + 8 * STAGES;
+    const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;
+    const Ring ring{base + Q_BYTES};
+    const u32 mail = ring.slots + Ring::BYTES, ends = mail + MAIL_BYTES, mail_full = ends + ENDS_BYTES;
     const int warpgroup = __shfl_sync(~0u, threadIdx.x / 128, 0);  // the same for all, as the compiler now sees
     const int rank = blockIdx.x % RANKS, unit = blockIdx.x / RANKS, batch = unit / tiles;
     const int first_row = (unit - batch * tiles) * ROWS, count = min(ROWS, tokens * heads - first_row);
 
     if (threadIdx.x == 0) {
         barrier_init(mail_full, 1);
-        for (int s = 0; s < STAGES; ++s) barrier_init(full + 8 * s, 1), barrier_init(empty + 8 * s, WGS);
+        ring.init(WGS);
         asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
         barrier_expect(mail_full, RANKS * count * (2 * COLUMNS + 8));
     }
@@ -79,14 +81,8 @@ attention(SUFFIX_PARAMETERS) {
         asm volatile("setmaxnreg.dec.sync.aligned.u32 %0;" ::"n"(PRODUCER_REGISTERS));
         if (threadIdx.x == THREADS) {
 #pragma unroll 1
-            for (int place = 0; place < 2 * last; ++place) {
-                const u32 s = place % STAGES;
-                if (place >= STAGES) barrier_wait(empty + 8 * s, (place / STAGES + 1) & 1);
-                barrier_expect(full + 8 * s, STAGE_BYTES);
-                for (int p = 0; p < PANELS; ++p)
-                    load(ring + s * STAGE_BYTES + p * KEY_PANEL, place % 2 ? &map_v : &map_k, 64 * p, 0,
-                         begin + from + place / 2 * KEYS, full + 8 * s);
-            }
+            for (int place = 0; place < 2 * last; ++place)
+                ring.load_tile(place, place % 2 ? &map_v : &map_k, 0, begin + from + place / 2 * KEYS);
         }
         return;
     }
@@ -114,16 +110,9 @@ attention(SUFFIX_PARAMETERS) {
         }
     }
 
-    auto await_tile = [&](int place) {
-        barrier_wait(full + 8 * (place % STAGES), (place / STAGES) & 1);
-        return ring + place % STAGES * STAGE_BYTES;
-    };
-    auto release = [&](int place) {
-        if (own == 0) barrier_arrive(empty + 8 * (place % STAGES));
-    };
     // Waits for a tile, puts the suffix's keys and values into it and clears what nobody sees. Whether anything was stored.
     auto complete = [&](int tile) {
-        const u32 keys = await_tile(2 * tile), values = await_tile(2 * tile + 1);
+        const u32 keys = ring.await(2 * tile), values = ring.await(2 * tile + 1);
         const int here = from + tile * KEYS, seen = min(KEYS, valid - tile * KEYS);
         const int first = max(here, length) - here, found = max(0, seen - first);  // the suffix's: those from `first` on
         const u16* const tokens_of = of_batch + (size_t)(here + first - length) * width + heads * DIM;
@@ -150,12 +139,12 @@ attention(SUFFIX_PARAMETERS) {
     const u32 queries = base + 64 * ROW_BYTES * warpgroup;
     for (int tile = 0; tile < last; ++tile) {  // few: nothing is gained by weighing one while another multiplies
         if (tile > 0 && complete(tile)) show_to_products(1, THREADS);
-        const u32 keys = await_tile(2 * tile), values = await_tile(2 * tile + 1);
+        const u32 keys = ring.await(2 * tile), values = ring.await(2 * tile + 1);
         begin_products();
         multiply_keys<Q_PANEL>(logits, queries, keys);
         await_products<0>();
         settle(logits);
-        release(2 * tile);
+        ring.release(2 * tile);
         const int left = valid - tile * KEYS;
         if (left < KEYS) hide(logits, left);
         if (state_token && first_row + 64 * warpgroup < heads) {  // whose rows see no other key of the suffix
@@ -166,13 +155,14 @@ attention(SUFFIX_PARAMETERS) {
                 if (row < heads && i / 4 * 8 + lane % 4 * 2 + i % 2 >= seen) logits[i] = NONE;
             }
         }
-        shrink_sums(sums, softmax.weigh(logits));
+        const float2 shrink = softmax.weigh(logits);
+        if (tile > 0 && any_shrinks(shrink)) shrink_sums(sums, shrink);
         round_weights(logits, weights);
         begin_products();
         multiply_values(sums, weights, values);
         await_products<0>();
         settle(sums);
-        release(2 * tile + 1);
+        ring.release(2 * tile + 1);
     }
     softmax.end();
 
@@ -192,7 +182,7 @@ attention(SUFFIX_PARAMETERS) {
         }
         for (int to = lane % 4; to < RANKS; to += 4)
             if (row < count)
-                send_end(at_rank(ends + (rank * ROWS + row) * 8, to), softmax.top[half] * scale, total, at_rank(mail_full, to));
+                send_end(at_rank(ends + (rank * ROWS + row) * 8, to), softmax.top[half], total, at_rank(mail_full, to));
     }
     barrier_wait(mail_full, 0);
     for (int i = threadIdx.x; i < count * (COLUMNS / 8); i += THREADS) {
@@ -204,7 +194,7 @@ attention(SUFFIX_PARAMETERS) {
         for (int r = 1; r < RANKS; ++r) best = fmaxf(best, end[r * ROWS].x);
 #pragma unroll
         for (int r = 0; r < RANKS; ++r) {
-            const float part = power_of_two(end[r * ROWS].x - best) * end[r * ROWS].y;  // 2^-inf is 0: no keys there
+            const float part = power_of_two(end[r * ROWS].x - best) * end[r * ROWS].y;  // 0 of a rank without keys
             const uint4 v = *(const uint4*)(received + ((r * ROWS + row) * COLUMNS + column) * 2);
             const u32 pairs[4] = {v.x, v.y, v.z, v.w};
             whole += part;

@@ -52,9 +52,11 @@ def suffix_attention(
     given = {"qkv": qkv, "cos": cos, "sin": sin, "starts": starts, "lengths": lengths}
     assert all(one.is_contiguous() for one in (*given.values(), prefix_k, prefix_v)), "rows are read as they lie"
     assert all(one.dtype == torch.bfloat16 for one in (qkv, prefix_k, prefix_v))
+    assert cos.dtype == sin.dtype == torch.float32 and starts.dtype == lengths.dtype == torch.int32
     batch, count, dim = len(starts) - 1, len(qkv), prefix_k.shape[1]
     tokens = count // batch
     assert qkv.shape[1] == (heads + 2) * dim and cos.shape == sin.shape == (count, dim // 2)
+    assert starts.shape == lengths.shape and prefix_k.shape == prefix_v.shape
     rows, in_fp8 = tokens * heads, inverse is not None  # of queries of an observation
     tile = tile or chosen_tile(dim, rows, batch, len(prefix_k) // batch + tokens, in_fp8, qkv.device)
     tiles, out = -(-rows // tile.rows), qkv.new_empty(count, heads * dim, dtype=result_dtype(qkv, inverse))
@@ -120,10 +122,21 @@ def source(tile: SuffixTile) -> str:
     return instructions.source(*files, generated=f"{logits}\n{values}\n{parameters}\n")
 
 
-@cache
 def _kernel(tile: SuffixTile, out_fp8: bool, device: torch.device) -> DependentKernel:
+    made = _kernel_or_why_not(tile, out_fp8, device)
+    if isinstance(made, BackendUnavailable):
+        raise made.with_traceback(None)
+    return made
+
+
+@cache
+def _kernel_or_why_not(tile: SuffixTile, out_fp8: bool, device: torch.device) -> DependentKernel | BackendUnavailable:
+    """`chosen_tile` asks again for each layer: where no cluster of a size fits, it is loaded once to find that out."""
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8))
-        return DependentKernel(
-            cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=tile.threads, cluster=tile.ranks
-        )
+        try:
+            return DependentKernel(
+                cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=tile.threads, cluster=tile.ranks
+            )
+        except BackendUnavailable as why:
+            return why
