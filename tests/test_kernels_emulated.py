@@ -60,6 +60,9 @@ BF16_TILES = [  # a ring of 3 is used again and again; clusters of either kind; 
     ("partial", Tile(1, 16, splits=2, ring=3)),
     ("parts", Tile(1, 16, splits=2, ring=3)),
     ("geglu", Tile(1, 32, ring=3, overlap=True)),
+    ("plain", Tile(1, 24, ring=3, overlap=True)),
+    ("bias", Tile(1, 16, ring=3, overlap=True)),
+    ("gelu", Tile(1, 32, cluster_m=2, ring=3, overlap=True)),
 ]
 
 
@@ -91,6 +94,8 @@ def test_a_product_in_bf16_is_right_in_whatever_order_its_threads_go(
         ("plain", Tile(1, 16, ring=3), None),
         ("gelu", Tile(1, 32, ring=3), 20.0),
         ("geglu", Tile(1, 64, ring=3), None),
+        ("plain", Tile(1, 24, ring=3, overlap=True), None),
+        ("gelu", Tile(1, 16, ring=3, overlap=True), 20.0),
     ],
 )
 def test_a_product_in_fp8_is_right_in_whatever_order_its_threads_go(

@@ -197,14 +197,18 @@ def test_products(m: int, n: int, k: int, epilogue: Epilogue, tile: Tile, out_fp
 
 @on_hopper
 @pytest.mark.parametrize("tile", [Tile(3, 128), Tile(2, 176, cluster_n=2), Tile(1, 96)])
+@pytest.mark.parametrize("epilogue", ["plain", "bias", "gelu", "geglu"])
 @pytest.mark.parametrize(("m", "n", "k"), [(560, 16384, 2048), (203, 4304, 1152), (1, 16, 992)])
-def test_geglu_during_the_next_tiles_products_is_the_same(m: int, n: int, k: int, tile: Tile) -> None:
-    x, matrix = operands(m, 2 * n, k)
+def test_an_epilogue_during_the_next_tiles_products_is_the_same(
+    m: int, n: int, k: int, epilogue: Epilogue, tile: Tile
+) -> None:
+    x, matrix = operands(m, 2 * n if epilogue == "geglu" else n, k)
+    bias = random(n) if epilogue in ("bias", "gelu") else None
     tiles = tile, replace(tile, overlap=True)
     for inverse in (None, 30.0):
-        one, other = (gemm_fp8.matmul_fp8(x, matrix, t, "geglu", inverse=inverse).float() for t in tiles)
+        one, other = (gemm_fp8.matmul_fp8(x, matrix, t, epilogue, bias, inverse=inverse).float() for t in tiles)
         assert torch.equal(one, other)
-    one, other = (matmul(x.to(DTYPE), matrix.data.to(DTYPE), t, "geglu") for t in tiles)
+    one, other = (matmul(x.to(DTYPE), matrix.data.to(DTYPE), t, epilogue, bias) for t in tiles)
     assert torch.equal(one, other)
 
 

@@ -17,6 +17,7 @@ if torch.cuda.is_available():
 
 from turbopi.config import preset
 from turbopi.kernels import plain
+from turbopi.kernels.portable import norms
 from turbopi.kernels.sm90.gemm import bf16, fp8
 from turbopi.kernels.sm90.gemm.bf16 import Folded, Tile
 from turbopi.kernels.sm90.gemm.fp8 import FoldedFp8
@@ -50,6 +51,13 @@ def float32(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(GpuBench, "random", random)
 
 
+@pytest.fixture
+def plain_norms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The interpreter has no E4M3 either."""
+    monkeypatch.setattr(norms, "residual_layer_norm", plain.residual_layer_norm)
+    monkeypatch.setattr(norms, "residual_rms_norm", plain.residual_rms_norm)
+
+
 def product(operation: str, numbers: Any = "fp8", **more: Any) -> Operation:
     return Operation("prefix qkv", "portable", operation, numbers, 40, 32, 64, 17, **more)
 
@@ -68,6 +76,51 @@ SMALL = {"rows": 32, "columns": 64, "warps": 4, "stages": 6, "splits": 1}
 def test_portable_products_are_right_by_their_own_measure(one: Operation) -> None:
     bench = portable.bench(one, CPU)
     assert bench.error(SMALL) <= bench.bound < 0.05
+
+
+@pytest.mark.usefixtures("float32", "plain_norms")
+@pytest.mark.parametrize("norm", ["layer", "rms"])
+@pytest.mark.parametrize("numbers", ["bf16", "fp8"])
+def test_a_norm_in_front_runs_before_each_product_which_takes_its_result(
+    norm: Any, numbers: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = product("geglu", numbers, norm_in_front=norm)
+    bench = portable.bench(one, CPU)
+    assert bench.error(SMALL) <= bench.bound < 0.05
+    assert in_a_call(bench, SMALL, "product", portable, monkeypatch) == ["norm", "product of it"]
+
+
+@pytest.mark.usefixtures("float32", "plain_norms")
+def test_a_norm_behind_runs_after_each_product(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = portable.bench(product("parts", norm_behind="rms"), CPU)
+    assert in_a_call(bench, SMALL, "product", portable, monkeypatch) == ["product", "norm"]
+
+
+def in_a_call(bench: GpuBench, knobs: Knobs, name: str, module: Any, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is launched where this is timed; `name` is the product's, in that module."""
+    launched: list[str] = []
+    made: list[Tensor] = []
+
+    def norm(kernel: Any) -> Any:
+        def run(*given: Any) -> Any:
+            launched.append("norm")
+            result = kernel(*given)
+            made.append(result[1])
+            return result
+
+        return run
+
+    def product(x: Tensor, *given: Any, **more: Any) -> Any:
+        launched.append("product of it" if made and x is made[-1] else "product")
+        return multiplied(x, *given, **more)
+
+    multiplied = getattr(module, name)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, name, product)
+        for kernel in ("residual_layer_norm", "residual_rms_norm"):
+            patch.setattr(norms, kernel, norm(getattr(norms, kernel)))
+        bench.in_call(knobs, 1)
+    return launched
 
 
 @pytest.mark.usefixtures("float32")
@@ -204,19 +257,30 @@ def smaller(one: Operation) -> Operation:
     return replace(one, rows=64, columns=one.columns if square else min(one.columns, 1152), inner=min(one.inner, 1152))
 
 
-@pytest.mark.usefixtures("twins")
+@pytest.mark.usefixtures("twins", "plain_norms")
 @pytest.mark.parametrize("precision", ["bf16", "fp8"])
-def test_hoppers_products_are_given_what_makes_their_forms_right(precision: str) -> None:
+def test_hoppers_products_are_given_what_makes_their_forms_right(
+    precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen = set()
     for one in (*hoppers(precision), *hoppers(precision, 4)):
-        form = (one.operation, one.numbers, one.normed, one.norm_behind)
+        form = (one.operation, one.numbers, one.normed, one.norm_in_front, one.norm_behind)
         if form not in seen:
             seen.add(form)
             bench = hopper.Product(smaller(one), CPU)
             for knobs in chosen(hopper.candidates(one, SMS)):
                 error = bench.error(knobs)
                 assert error <= bench.bound < 0.08, (form, knobs, error, bench.bound)
+                kernel = "matmul_fp8" if one.numbers == "fp8" else "matmul"
+                launched = in_a_call(bench, knobs, kernel, hopper, monkeypatch)
+                assert launched == around(one), (form, launched)
     assert len(seen) >= 9
+
+
+def around(one: Operation) -> list[str]:
+    """What a call launches for it."""
+    first = ["norm", "product of it"] if one.norm_in_front else ["product"]
+    return first + (["norm"] if one.norm_behind and one.operation != "residual" else [])
 
 
 def chosen(candidates: Sequence[Knobs]) -> list[Knobs]:
@@ -249,9 +313,10 @@ def test_every_candidate_of_hoppers_can_be_laid_out(precision: str, batch: int) 
 
 
 def test_the_towers_products_are_measured_in_the_form_that_they_run_in() -> None:
-    forms = {one.name: (one.operation, one.normed) for one in hoppers("bf16")}
-    assert forms["vision qkv"] == ("bias", True) and forms["vision out"] == ("residual", False)
-    several = {one.name: (one.operation, one.normed) for one in hoppers("bf16", 4)}
-    assert several["vision qkv"] == ("bias", False) and several["vision out"] == ("partial", False)
+    forms = {one.name: (one.operation, one.normed, one.norm_in_front) for one in hoppers("bf16")}
+    assert forms["vision qkv"] == ("bias", True, None) and forms["vision out"] == ("residual", False, None)
+    several = {one.name: (one.operation, one.normed, one.norm_in_front) for one in hoppers("bf16", 4)}
+    assert several["vision qkv"] == ("bias", False, "layer") and several["vision out"] == ("partial", False, None)
+    assert several["expert qkv"] == ("plain", False, "rms")
     few = [hopper.resolved(one, SMS - 1) for one in operations(FULL, Call(2, 48), "bf16", "hopper")]
     assert {one.operation for one in few if one.name == "vision fc2"} == {"partial"}

@@ -1,7 +1,6 @@
 """The tuner on a GPU: small operations of every kind, really compiled, checked and timed."""
 
 from dataclasses import replace
-from typing import Literal
 
 import pytest
 import torch
@@ -17,7 +16,7 @@ from turbopi.tune import hopper, portable
 from turbopi.tune.gpu import steadiness
 from turbopi.tune.plan import bench_maker
 from turbopi.tune.race import Raced, race
-from turbopi.tune.shapes import Call, Operation, Precision, operations
+from turbopi.tune.shapes import Call, Norm, Operation, Precision, operations
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")]
 DEVICE = torch.device("cuda", 0)
@@ -57,18 +56,18 @@ def test_portable_attention(kind: str, out_fp8: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("operation", "numbers", "norm"),
+    ("operation", "numbers", "in_front", "behind"),
     [
-        *(("geglu", "bf16", None), ("plain", "fp8", None), ("gelu", "fp8", None), ("geglu", "fp8", None)),
-        *(("parts", "fp8", "rms"), ("parts", "fp8", "layer")),
+        *(("geglu", "bf16", "rms", None), ("geglu", "fp8", "rms", None), ("plain", "fp8", None, None)),
+        *(("gelu", "fp8", "layer", None), ("parts", "fp8", None, "rms"), ("parts", "fp8", None, "layer")),
     ],
 )
-def test_portable_products(operation: str, numbers: Numbers, norm: Literal["rms", "layer"] | None) -> None:
+def test_portable_products(operation: str, numbers: Numbers, in_front: Norm | None, behind: Norm | None) -> None:
     if numbers == "fp8" and fp8_refusal(torch.cuda.get_device_capability(DEVICE)):
         pytest.skip("has no FP8")
-    out_fp8, bias = numbers == "fp8" and operation in ("gelu", "geglu"), norm == "layer" or operation == "gelu"
+    out_fp8, bias = numbers == "fp8" and operation in ("gelu", "geglu"), "layer" in (in_front, behind)
     usual = Operation(operation, "portable", operation, numbers, 500, 1024, 1152, 1, bias=bias, out_fp8=out_fp8)
-    assert check(replace(usual, norm_behind=norm)) > 1
+    assert check(replace(usual, norm_in_front=in_front, norm_behind=behind)) > 1
 
 
 @on_hopper

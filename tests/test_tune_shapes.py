@@ -29,12 +29,22 @@ FULL = preset("pi05_libero").model
 
 
 def recording(ran: Ran) -> Ops:
-    """Plain operations that count their sizes: (operation, rows, columns, inner)."""
+    """Plain operations that count their sizes: (operation, rows, columns, inner). Products of a norm count as such."""
+    last: list[tuple[str, Tensor]] = [("", torch.empty(0))]  # the norm that ran last, and its result
+
+    def norm(name: str, twin: Any) -> Any:
+        def run(*given: Any, **more: Any) -> tuple[Tensor, Tensor]:
+            x, normed = twin(*given, **more)
+            last[0] = name, normed
+            return x, normed
+
+        return run
 
     def product(name: str, twin: Any) -> Any:
         def run(x: Tensor, weight: Tensor, *rest: Any, **more: Any) -> Tensor:
-            halves = 2 if name == "geglu" else 1
-            ran[name, x.shape[0], weight.shape[0] // halves, weight.shape[1]] += 1
+            rows, columns = x.shape[0], weight.shape[0] // (2 if name == "geglu" else 1)
+            in_front = last[0][0] if x is last[0][1] else None
+            ran[named(name, in_front), rows, columns, weight.shape[1]] += 1
             return twin(x, weight, *rest, **more)
 
         return run
@@ -57,6 +67,8 @@ def recording(ran: Ran) -> Ops:
 
     return replace(
         PLAIN,
+        residual_layer_norm=norm("layer", PLAIN.residual_layer_norm),
+        residual_rms_norm=norm("rms", PLAIN.residual_rms_norm),
         linear=product("plain", PLAIN.linear),
         residual_linear=product("parts", PLAIN.residual_linear),
         linear_gelu=product("gelu", PLAIN.linear_gelu),
@@ -67,11 +79,15 @@ def recording(ran: Ran) -> Ops:
     )
 
 
+def named(operation: str, norm_in_front: str | None) -> str:
+    return operation if norm_in_front is None else f"{operation} of a norm: {norm_in_front}"
+
+
 def counted(kind: Kind, call: Call, monkeypatch: pytest.MonkeyPatch) -> Ran:
     monkeypatch.setattr(shapes, "_has_choice", lambda one: True)
     config, ran = golden_model(kind).config, Ran()
     for one in operations(config, call, "fp8", "portable", steps=STEPS, horizon=HORIZON):
-        ran[one.operation, one.rows, one.columns, one.inner] += one.uses
+        ran[named(one.operation, one.norm_in_front), one.rows, one.columns, one.inner] += one.uses
     return ran
 
 

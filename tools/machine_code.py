@@ -96,6 +96,8 @@ SHAPES: dict[str, Callable[[Path | None], bytes]] = {
     ),
     "prefix's GeGLU, bf16": partial(_product, Tile(3, 128, 1, 2, overlap=True), "geglu", False),
     "prefix's GeGLU, fp8": partial(_product_fp8, Tile(3, 128, cluster_n=2, overlap=True), "geglu", 2048, 0, True),
+    "vision's qkv in batches, bf16": partial(_product, Tile(2, 176, 2, overlap=True), "bias", False),
+    "vision's fc1 in batches, fp8": partial(_product_fp8, Tile(2, 184, overlap=True), "gelu", 1152, 0, True),
     "product that leaves a copy, fp8": partial(_product_fp8, Tile(1, 80, cluster_m=2), "bias", 1152, 15, False),
     "vision's attention": partial(_attention, attention.AttentionTile(72, 128, sharing=2), True),
     "prefix's attention": partial(_attention, attention.AttentionTile(256, 64), False),

@@ -43,9 +43,9 @@ class GpuBench(ABC):
     def run(self, knobs: Knobs, copy: int, out: Tensor | None = None) -> Tensor:
         """The operation in these tiles, on one of the copies; into `out` where the operation takes one."""
 
-    def behind(self, result: Tensor) -> object:
-        """What reads the result, where its form (parts) makes that slower or faster."""
-        return result
+    def in_call(self, knobs: Knobs, copy: int) -> object:
+        """What is timed: the operation with the kernels that a call runs around it, where they matter to its tiles."""
+        return self.run(knobs, copy)
 
     def out_for(self, knobs: Knobs) -> Tensor | None:
         """Memory for a result, all NaN; None: the operation allocates its own."""
@@ -89,7 +89,7 @@ class GpuBench(ABC):
         return wide / INVERSE if self.operation.out_fp8 else wide
 
     def timer(self, knobs: Knobs) -> Round:
-        """A CUDA graph of the operation over all copies."""
+        """A CUDA graph of the operation, as `in_call` runs it, over all copies."""
         calls = math.ceil(CALLS / self.copies) * self.copies
         with self._guard:
             if self._pool is None:
@@ -98,7 +98,7 @@ class GpuBench(ABC):
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph, pool=self._pool):
                 for call in range(calls):
-                    self.behind(self.run(knobs, call % self.copies))
+                    self.in_call(knobs, call % self.copies)
             once = replayed(graph, 1, self.device)
             replays = max(1, min(MOST_REPLAYS, math.ceil(ROUND_MICROSECONDS / max(once, 1.0))))
 

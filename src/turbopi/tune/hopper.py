@@ -39,13 +39,14 @@ INPUT_SCALE = 0.02
 
 
 def resolved(one: Wanted, sms: int) -> Wanted:
-    """As the tower runs it: into the residual stream, and behind a norm, where its sizes have that."""
+    """As the tower runs it: into the residual stream, and with the norm in front folded, where its sizes have that."""
     if one.kernels != "hopper" or not one.name.startswith(("vision", "projector")):
         return one
     if one.operation == "residual":
         return one if sms >= GATHERING_SMS and usual_choice(one, sms) is not None else replace(one, operation="partial")
     before = replace(one, operation="residual", columns=one.inner)  # as the tower's product that leaves the stream
-    return replace(one, normed=one.normed and sms >= GATHERING_SMS and usual_choice(before, sms) is not None)
+    folded = one.norm_in_front == "layer" and sms >= GATHERING_SMS and usual_choice(before, sms) is not None
+    return replace(one, normed=True, norm_in_front=None) if folded else one
 
 
 def usual_choice(one: Wanted, sms: int) -> Chosen:
@@ -62,7 +63,7 @@ def candidates(one: Wanted, sms: int) -> list[Knobs]:
     sizes, usual = (one.rows, one.columns, one.inner), usual_choice(one, sms)
     found = hopper_candidates.candidates(operation, one.numbers == "fp8", *sizes, sms, usual)
     if one.normed:  # a norm is multiplied whole
-        found = [cut for cut in found if not isinstance(cut, Tile) or cut.splits == 1]
+        found = [cut for cut in found if not isinstance(cut, Tile) or (cut.splits == 1 and not cut.overlap)]
     return [to_knobs(cut) for cut in found]
 
 
@@ -72,18 +73,16 @@ class Product(ProductBench):
     def __init__(self, operation: Wanted, device: torch.device) -> None:
         super().__init__(operation, device, INPUT_SCALE)
         one, first = operation, self.weights[0]
-        if self.stream is not None:
-            self.stream_sums = sums_of(self.stream)
-            self.for_copy = self.norm[0].float() * COPY_SCALE, self.norm[1].float() * COPY_SCALE
-        self.raw = self.random(one.rows, one.inner)  # what a norm stands before
+        if (norm := self.norm_behind) is not None:
+            self.stream_sums = sums_of(norm.stream)
+            self.for_copy = norm.scale.float() * COPY_SCALE, norm.shift.float() * COPY_SCALE
         if one.normed:
-            self._norm_in_front(first)
+            self._fold_norm(first)
         else:
-            self.x = to_e4m3(self.raw, first.inverse) if isinstance(first, ScaledMatrix) else self.raw
             self.exact, twin = self._products(self.x.float() if not self.fp8 else self.x, self.x, first)
             self.twin_error = relative(self.whole(twin), self.exact)
 
-    def _norm_in_front(self, first: Matrix) -> None:
+    def _fold_norm(self, first: Matrix) -> None:
         """The norm's weights, the sums of the rows that it is made of, and matrices that take it."""
         one, assert_bias = self.operation, self.bias
         assert assert_bias is not None, "the tower's products have biases"
@@ -126,25 +125,26 @@ class Product(ProductBench):
         )
         exact = activated(one.operation, sums)
         if one.operation == "residual":
-            assert self.stream is not None
-            exact = exact + self.stream.float()
+            assert self.norm_behind is not None
+            exact = exact + self.norm_behind.stream.float()
         return exact, plain.as_input(exact, torch.bfloat16, self.inverse) if self.fp8 else self.twin(x, weight)
 
     def twin(self, x: Tensor, weight: Matrix) -> Tensor:
         result = super().twin(x, weight)
-        return result + self.stream if self.operation.operation == "residual" and self.stream is not None else result
+        norm = self.norm_behind
+        return result + norm.stream if self.operation.operation == "residual" and norm is not None else result
 
-    def run(self, knobs: Knobs, copy: int, out: Tensor | None = None) -> Tensor:
-        cut = from_knobs(knobs)
+    def run(self, knobs: Knobs, copy: int, out: Tensor | None = None, x: Tensor | None = None) -> Tensor:
+        cut, x = from_knobs(knobs), self.x if x is None else x
         if not isinstance(cut, Tile):
-            return self._by_library(cut, copy)
+            return self._by_library(cut, copy, x)
         one, weight = self.operation, self.weights[copy]
         operation: Operation = one.operation  # type: ignore[assignment]
         epilogue = hopper_candidates.epilogue_of(operation)
         if epilogue in SPLIT and (cut.splits == 1 or cut.gather) and (self.fp8 or epilogue == "partial"):
             epilogue = "bias"
         if one.operation == "residual":
-            return self._into_stream(cut, copy, out)
+            return self._into_stream(cut, copy, out, x)
         ahead = self._ahead(copy)
         if one.normed and self.fp8:
             folded = self.folded_fp8[copy]
@@ -157,14 +157,15 @@ class Product(ProductBench):
                 matmul(self.raw, given, cut, epilogue, out=out, sums=self.sums, eps=EPS, ahead=ahead), self.inverse
             )
         if isinstance(weight, ScaledMatrix):
-            return matmul_fp8(self.x, weight, cut, epilogue, self.bias, out, self.inverse, ahead=ahead)
-        return as_input(matmul(self.x, weight, cut, epilogue, self.bias, out, ahead=ahead), self.inverse)
+            return matmul_fp8(x, weight, cut, epilogue, self.bias, out, self.inverse, ahead=ahead)
+        return as_input(matmul(x, weight, cut, epilogue, self.bias, out, ahead=ahead), self.inverse)
 
-    def _into_stream(self, tile: Tile, copy: int, out: Tensor | None) -> Tensor:
-        one, weight, stream = self.operation, self.weights[copy], self.stream
-        assert stream is not None
+    def _into_stream(self, tile: Tile, copy: int, out: Tensor | None, x: Tensor) -> Tensor:
+        one, weight = self.operation, self.weights[copy]
+        assert self.norm_behind is not None
+        stream = self.norm_behind.stream
         sums = Sums.allocate(tile, one.rows, one.columns, self.device)
-        ahead, x, bias = self._ahead(copy), self.x, self.bias
+        ahead, bias = self._ahead(copy), self.bias
         if not isinstance(weight, ScaledMatrix):
             return matmul(x, weight, tile, "bias", bias, out, residual=stream, sums_out=sums, ahead=ahead)
         plain_sums = Sums.allocate(tile, one.rows, one.columns, self.device)
@@ -172,9 +173,10 @@ class Product(ProductBench):
         left = Copy(room, self.stream_sums, *self.for_copy, EPS, plain_sums)
         return matmul_fp8(x, weight, tile, "bias", bias, out, residual=stream, sums_out=sums, copy=left, ahead=ahead)
 
-    def _by_library(self, parts: int | None, copy: int) -> Tensor:
+    def _by_library(self, parts: int | None, copy: int, x: Tensor) -> Tensor:
         one, weight, bias = self.operation, self.weights[copy], self.bias
-        x = norms.residual_layer_norm(self.raw, None, *self.front, EPS)[1] if one.normed else self.x
+        if one.normed:
+            x = norms.residual_layer_norm(self.raw, None, *self.front, EPS)[1]
         if parts is not None:
             assert isinstance(weight, Tensor)
             return parts_at_once(x, weight, parts)

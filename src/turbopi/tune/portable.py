@@ -17,7 +17,7 @@ from turbopi.kernels.portable.attention_tiles import candidates as attention_can
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
 from turbopi.kernels.tile_table import LIBRARY, Knobs
-from turbopi.quantization.fp8 import E4M3, ScaledMatrix, to_e4m3
+from turbopi.quantization.fp8 import E4M3, ScaledMatrix
 from turbopi.tune.gpu import INVERSE, GpuBench, poisoned, relative
 from turbopi.tune.product_bench import ProductBench, activated
 from turbopi.tune.shapes import Operation
@@ -63,19 +63,18 @@ class Product(ProductBench):
 
     def __init__(self, operation: Operation, device: torch.device) -> None:
         super().__init__(operation, device, INPUT_SCALE)
-        x, first = self.random(operation.rows, operation.inner), self.weights[0]
-        self.x = to_e4m3(x, first.inverse) if isinstance(first, ScaledMatrix) else x
-        sums = first.product(self.x, self.bias) if isinstance(first, ScaledMatrix) else x.float() @ first.float().T
+        first, x = self.weights[0], self.x
+        sums = first.product(x, self.bias) if isinstance(first, ScaledMatrix) else x.float() @ first.float().T
         self.exact = activated(operation.operation, sums)
-        self.twin_error = relative(self.whole(self.twin(self.x, first)), self.exact)
+        self.twin_error = relative(self.whole(self.twin(x, first)), self.exact)
 
-    def run(self, knobs: Knobs, copy: int, out: Tensor | None = None) -> Tensor:
-        weight = self.weights[copy]
+    def run(self, knobs: Knobs, copy: int, out: Tensor | None = None, x: Tensor | None = None) -> Tensor:
+        weight, x = self.weights[copy], self.x if x is None else x
         if LIBRARY in knobs:
             assert isinstance(weight, Tensor) and self.operation.operation == "geglu"
-            return activations.geglu(F.linear(self.x, weight), self.inverse)
+            return activations.geglu(F.linear(x, weight), self.inverse)
         epilogue: tiles.Epilogue = self.operation.operation  # type: ignore[assignment]
-        return product(self.x, weight, epilogue, self.bias, out, self.inverse, tiles.Tile(**knobs))
+        return product(x, weight, epilogue, self.bias, out, self.inverse, tiles.Tile(**knobs))
 
     def out_for(self, knobs: Knobs) -> Tensor | None:
         if LIBRARY in knobs:

@@ -1,6 +1,12 @@
-"""What benches of products share, portable and Hopper's: weights that take turns, their twin, the norm behind them."""
+"""What benches of products share, portable and Hopper's: weights that take turns, their twin, the norms around them.
 
-from dataclasses import replace
+A norm that is a kernel of its own is timed with the product, in front or behind, so microseconds include it:
+  - behind, it adds up a product's parts, so their number makes it slower or faster;
+  - in front, it keeps a product from starting while the one before still runs, as two products in a row would.
+"""
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -8,17 +14,33 @@ from torch import Tensor
 from turbopi.kernels import plain
 from turbopi.kernels.portable import norms
 from turbopi.kernels.portable.quantize import quantize
-from turbopi.quantization.fp8 import Matrix, ScaledMatrix
+from turbopi.kernels.tile_table import Knobs
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix, to_e4m3
 from turbopi.tune.gpu import INVERSE, GpuBench, cold_copies
-from turbopi.tune.shapes import Operation
+from turbopi.tune.shapes import Norm, Operation
 
 EPS = 1e-6
 
 
-class ProductBench(GpuBench):
-    """x @ weightᵀ with its epilogue, and the norm that adds parts up. A subclass makes x, `exact` and `twin_error`."""
+@dataclass(frozen=True)
+class StreamNorm:
+    """The norm of stream + y by the kernel that a call runs."""
 
-    x: Tensor
+    kind: Norm
+    stream: Tensor  # bfloat16[rows, width]
+    scale: Tensor  # [width]
+    shift: Tensor  # [width], of a LayerNorm
+    inverse: float | None  # of a result in E4M3
+
+    def __call__(self, y: Tensor) -> Tensor:
+        """y: [rows, width], or a product's parts of it."""
+        if self.kind == "layer":
+            return norms.residual_layer_norm(self.stream, y, self.scale, self.shift, EPS, self.inverse)[1]
+        return norms.residual_rms_norm(self.stream, y, None, self.scale, None, EPS, self.inverse)[1]
+
+
+class ProductBench(GpuBench):
+    """x @ weightᵀ with its epilogue, and the norms around it. A subclass makes `exact` and `twin_error`."""
 
     def __init__(self, operation: Operation, device: torch.device, input_scale: float) -> None:
         """input_scale: of E4M3 inputs."""
@@ -28,12 +50,32 @@ class ProductBench(GpuBench):
         weight = self.random(rows, one.inner) / one.inner**0.5
         self.bias = self.random(one.columns) if one.bias else None
         self.inverse = INVERSE if one.out_fp8 else None
-        self.stream = self.random(one.rows, one.columns) if one.norm_behind else None
-        self.scale = torch.ones(one.columns, device=device)
-        self.norm = self.random(one.columns), self.random(one.columns)
         first: Matrix = quantize(weight, input_scale) if self.fp8 else weight
         self.copies = cold_copies(weight.numel() * (1 if self.fp8 else 2), device)
         self.weights = [first, *(_clone(first) for _ in range(self.copies - 1))]
+        inverse = first.inverse if isinstance(first, ScaledMatrix) else None
+        self.norm_in_front = self._norm(one.norm_in_front, one.inner, inverse)
+        self.norm_behind = self._norm(one.norm_behind, one.columns, INVERSE if self.fp8 else None)
+        self.raw = self.random(one.rows, one.inner)  # what the norm in front adds to its stream; without one, the input
+        self.x = self.raw if inverse is None else to_e4m3(self.raw, inverse)
+        self.x = self.in_front()
+
+    @abstractmethod
+    def run(self, knobs: Knobs, copy: int, out: Tensor | None = None, x: Tensor | None = None) -> Tensor:
+        """x: what is multiplied, instead of the bench's own."""
+
+    def in_call(self, knobs: Knobs, copy: int) -> object:
+        return self.behind(self.run(knobs, copy, x=self.in_front()))
+
+    def in_front(self) -> Tensor:
+        """The input, made by the norm in front if there is one."""
+        return self.x if self.norm_in_front is None else self.norm_in_front(self.raw)
+
+    def behind(self, result: Tensor) -> Tensor:
+        """What the norm behind makes of the result; "residual" has added the stream itself."""
+        if self.norm_behind is None or self.operation.operation == "residual":
+            return result
+        return self.norm_behind(result)
 
     def twin(self, x: Tensor, weight: Matrix) -> Tensor:
         """The plain operation."""
@@ -43,13 +85,13 @@ class ProductBench(GpuBench):
             return plain.linear_gelu(x, weight, self.bias, self.inverse)
         return plain.linear(x, weight, self.bias)
 
-    def behind(self, result: Tensor) -> object:
-        one, inverse = self.operation, INVERSE if self.fp8 else None
-        if self.stream is None or one.operation == "residual":  # which has added the stream itself
-            return result
-        if one.norm_behind == "layer":
-            return norms.residual_layer_norm(self.stream, result, *self.norm, EPS, inverse)
-        return norms.residual_rms_norm(self.stream, result, None, self.scale, None, EPS, inverse)
+    def _norm(self, kind: Norm | None, width: int, inverse: float | None) -> StreamNorm | None:
+        if kind is None:
+            return None
+        scale, shift = self.random(width), self.random(width)
+        if kind == "rms":
+            scale = scale.float()  # as the engine has it
+        return StreamNorm(kind, self.random(self.operation.rows, width), scale, shift, inverse)
 
 
 def activated(operation: str, sums: Tensor) -> Tensor:

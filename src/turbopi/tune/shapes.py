@@ -3,16 +3,20 @@
 Kept apart from kernels and GPUs. Shapes as in engine/forward.py: D width, F hidden width of an MLP, K head_dim.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from turbopi.config import ModelConfig
+from turbopi.engine.call import PART
+from turbopi.engine.forward import HEAD_LAYERS, row_chunks
 from turbopi.engine.runner import BUCKET, bucket
 from turbopi.kernels.sm90.attention.suffix_tile import takes
 from turbopi.kernels.tile_table import Kernels, Numbers, TileKey, whole_64
 
 Precision = Literal["bf16", "fp8"]
+Norm = Literal["layer", "rms"]
 
 
 @dataclass(frozen=True)
@@ -37,8 +41,9 @@ class Operation:
     out_fp8    whether its result leaves in E4M3
     images     of vision's attention
     batch, prefix_rows  of attention in a batch: observations, and rows of each one's prefix
-    norm_behind  adds the result to the residual stream
-    normed     whether a LayerNorm stands in front of it
+    norm_in_front  a kernel of its own, which makes the input from the residual stream
+    norm_behind    likewise; adds the result to the residual stream
+    normed     whether the product itself takes the LayerNorm of its input: see `tune.hopper.resolved`
     """
 
     name: str
@@ -54,7 +59,8 @@ class Operation:
     images: int = 0
     batch: int = 1
     prefix_rows: int = 0
-    norm_behind: Literal["layer", "rms"] | None = None
+    norm_in_front: Norm | None = None
+    norm_behind: Norm | None = None
     normed: bool = False
 
     @property
@@ -112,37 +118,52 @@ def _has_choice(one: Operation) -> bool:
 
 
 def _vision(config: ModelConfig, call: Call, precision: Precision, kernels: Kernels) -> Iterator[Operation]:
-    v, fp8, images = config.vision, precision == "fp8", call.cameras * call.batch
-    rows = images * v.num_tokens
-    if not rows:
-        return
-    hopper = kernels == "hopper"
+    v, fp8, hopper = config.vision, precision == "fp8", kernels == "hopper"
     linear, residual = ("bias", "residual") if hopper else ("plain", "parts")
-    usual = Operation("", kernels, linear, precision, rows, v.width, v.width, v.depth, bias=True)
-    yield replace(usual, name="vision qkv", columns=3 * v.width, normed=True)
-    attention = Operation("vision attention", "portable", "vision_attention", "bf16", rows, v.num_heads, v.head_dim, 0)
-    if not hopper:
-        yield replace(attention, uses=v.depth, images=images, out_fp8=fp8)
-    yield replace(usual, name="vision out", operation=residual, norm_behind="layer")
-    yield replace(usual, name="vision fc1", operation="gelu", columns=v.mlp_dim, out_fp8=fp8, normed=True)
-    yield replace(usual, name="vision fc2", operation=residual, inner=v.mlp_dim, norm_behind="layer")
-    yield replace(usual, name="projector", numbers="bf16", columns=config.vlm.width, uses=1, normed=True)
+    for images, layers in _picture_parts(config, call.cameras * call.batch):
+        rows = images * v.num_tokens
+        usual = Operation("", kernels, linear, precision, rows, v.width, v.width, layers, bias=True)
+        yield replace(usual, name="vision qkv", columns=3 * v.width, norm_in_front="layer")
+        if not hopper:
+            attention = replace(usual, operation="vision_attention", numbers="bf16", bias=False, images=images)
+            yield replace(attention, name="vision attention", columns=v.num_heads, inner=v.head_dim, out_fp8=fp8)
+        yield replace(usual, name="vision out", operation=residual, norm_behind="layer")
+        fc1 = replace(usual, name="vision fc1", operation="gelu", columns=v.mlp_dim, out_fp8=fp8)
+        yield replace(fc1, norm_in_front="layer")
+        yield replace(usual, name="vision fc2", operation=residual, inner=v.mlp_dim, norm_behind="layer")
+        if images == call.cameras * call.batch:
+            projector = replace(usual, name="projector", numbers="bf16", columns=config.vlm.width, uses=1)
+            yield replace(projector, norm_in_front="layer")
+
+
+def _picture_parts(config: ModelConfig, images: int) -> Iterator[tuple[int, int]]:
+    """(how many pictures, layers that run over so many): see `engine.forward.vision_tokens`."""
+    if 0 < images <= PART:
+        yield images, config.vision.depth
+    elif images:
+        yield images, config.vision.depth - HEAD_LAYERS
+        yield PART, images // PART * HEAD_LAYERS
+        if images % PART:
+            yield images % PART, HEAD_LAYERS
 
 
 def _prefix(config: ModelConfig, call: Call, precision: Precision, kernels: Kernels) -> Iterator[Operation]:
     g, fp8 = config.vlm, precision == "fp8"
     rows = call.batch * (call.cameras * config.vision.num_tokens + call.prompt_tokens)
     heads, width = g.num_heads * g.head_dim, g.width
-    usual = Operation("", kernels, "plain", precision, rows, heads + 2 * g.head_dim, width, g.depth - 1)
-    yield replace(usual, name="prefix qkv")
-    yield replace(usual, name="prefix last k, v", columns=2 * g.head_dim, uses=1)
     if kernels == "portable":
-        kind = "prefix_attention" if call.batch == 1 else "packed_attention"
-        attention = replace(usual, operation=kind, numbers="bf16", columns=g.num_heads, inner=g.head_dim)
-        yield replace(attention, name="prefix attention", batch=call.batch, out_fp8=fp8)
-    yield replace(usual, name="prefix out", operation="parts", columns=width, inner=heads, norm_behind="rms")
-    yield replace(usual, name="prefix gate, up", operation="geglu", columns=g.mlp_dim, out_fp8=fp8)
-    yield replace(usual, name="prefix down", operation="parts", columns=width, inner=g.mlp_dim, norm_behind="rms")
+        kind, uses = "prefix_attention" if call.batch == 1 else "packed_attention", g.depth - 1
+        attention = Operation("prefix attention", kernels, kind, "bf16", rows, g.num_heads, g.head_dim, uses)
+        yield replace(attention, batch=call.batch, out_fp8=fp8)
+    for size, count in Counter(chunk.stop - chunk.start for chunk in row_chunks(rows)).items():
+        uses = (g.depth - 1) * count
+        usual = Operation("", kernels, "plain", precision, size, heads + 2 * g.head_dim, width, uses)
+        normed = replace(usual, norm_in_front="rms")
+        yield replace(normed, name="prefix qkv")
+        yield replace(normed, name="prefix last k, v", columns=2 * g.head_dim, uses=count)
+        yield replace(usual, name="prefix out", operation="parts", columns=width, inner=heads, norm_behind="rms")
+        yield replace(normed, name="prefix gate, up", operation="geglu", columns=g.mlp_dim, out_fp8=fp8)
+        yield replace(usual, name="prefix down", operation="parts", columns=width, inner=g.mlp_dim, norm_behind="rms")
 
 
 def _expert(
@@ -152,11 +173,12 @@ def _expert(
     g, fp8, rows = config.expert, precision == "fp8", call.batch * tokens
     heads, width, uses = g.num_heads * g.head_dim, g.width, g.depth * steps
     usual = Operation("", kernels, "plain", precision, rows, heads + 2 * g.head_dim, width, uses, batch=call.batch)
-    yield replace(usual, name="expert qkv")
+    normed = replace(usual, norm_in_front="rms")
+    yield replace(normed, name="expert qkv")
     attention = replace(usual, kernels="portable", operation="suffix_attention", numbers="bf16", out_fp8=fp8)
     prefix = call.cameras * config.vision.num_tokens + call.prompt_tokens
     if kernels == "portable" or not takes(g.head_dim, rows * g.num_heads):
         yield replace(attention, name="expert attention", columns=g.num_heads, inner=g.head_dim, prefix_rows=prefix)
     yield replace(usual, name="expert out", operation="parts", columns=width, inner=heads, norm_behind="rms")
-    yield replace(usual, name="expert gate, up", operation="geglu", columns=g.mlp_dim, out_fp8=fp8)
+    yield replace(normed, name="expert gate, up", operation="geglu", columns=g.mlp_dim, out_fp8=fp8)
     yield replace(usual, name="expert down", operation="parts", columns=width, inner=g.mlp_dim, norm_behind="rms")

@@ -31,7 +31,7 @@
 // in the copy already, and the bias goes apart.
 //
 // `ahead`: what this kernel's last loads are followed by into L2, the next one's weights, `ahead_bytes` a CTA.
-// TP_OVERLAP: see geglu.cu.
+// TP_OVERLAP: see overlap.cu.
 
 constexpr int WGS = TP_WGS, BN = TP_BN, STAGES = TP_STAGES, CM = TP_CM, CN = TP_CN, SPLITS = TP_SPLITS;
 constexpr bool GATHER = TP_GATHER;
@@ -101,6 +101,13 @@ struct Factors {
             const bool inside = c < BN && col < N;
             scale[i] = inside ? scales[part * N + col] : 0.0f;
             bias[i] = inside && with_bias ? biases[col] : Bias();
+        }
+    }
+    __device__ __forceinline__ void fetch_biases(const Bias* biases, int n, int N) {  // of bfloat16, which isn't scaled
+#pragma unroll
+        for (int i = 0; i < OWN; ++i) {
+            const int c = threadIdx.x % 128 + 128 * i;
+            scale[i] = 0.0f, bias[i] = biases && c < BN && n + c < N ? biases[n + c] : Bias();
         }
     }
     __device__ __forceinline__ void scale_up(float by) {  // GeGLU's up columns

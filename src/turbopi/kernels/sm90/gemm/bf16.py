@@ -33,7 +33,7 @@ class Tile:
     cluster_m: int = 1  # CTAs that share rows of the weight
     cluster_n: int = 1  # CTAs that share rows of a
     splits: int = 1
-    overlap: bool = False  # GeGLU of a tile goes on during the next one's products
+    overlap: bool = False  # what follows a tile's sums goes on during the next one's products
     ring: int = 16  # most steps on their way: of more, the first come late
     gather: bool = False  # the splits' sums are added up in a cluster; else the epilogue is "partial" or "parts"
 
@@ -46,8 +46,12 @@ class Tile:
         return self.cluster_m * self.cluster_n * (self.splits if self.gather else 1)
 
     def takes(self, epilogue: Epilogue, steps: int) -> bool:
-        """Whether there are steps for the pieces in which GeGLU goes on between them."""
-        return not self.overlap or (epilogue == "geglu" and steps > -(-self.columns // 64) * 2)
+        """Whether there are steps for the pieces in which an overlapped epilogue goes on between them."""
+        if not self.overlap:
+            return True
+        if epilogue == "geglu":
+            return steps > -(-self.columns // 64) * 2
+        return epilogue in ("plain", "bias", "gelu") and steps > -(-self.columns // 32)
 
     def stages(self, *, factors: int, lines: bool = False) -> int:
         """As many as fit beside 1 KB of alignment, barriers, pairs of `factors` a column and warpgroup, and sums.
@@ -179,6 +183,7 @@ def layout(
 ) -> tuple[int, tuple[int, int]]:
     """(columns of the result in a tile, how many clusters' tiles it takes along M and along N)"""
     assert residual is None or (epilogue == "bias" and residual.is_contiguous() and sums_out is not None)
+    assert residual is None or not tile.overlap, "the stream is added behind the sums"
     assert tile.splits <= steps and tile.takes(epilogue, steps), f"{steps} steps are too few for {tile}"
     assert not tile.gather or epilogue != "geglu", "sums are gathered after that"
     parts = tile.cluster_m * (2 if epilogue == "geglu" else 1)
@@ -281,7 +286,8 @@ def constants(
     tile: Tile, epilogue: Epilogue, residual: bool = False, normed: int = 0, copied: int = 0
 ) -> dict[str, int]:
     """What kernel.cu is compiled with."""
-    return tile_constants(tile, epilogue, residual, factors=normed > 0) | {
+    factors = normed > 0 or (tile.overlap and epilogue in ("bias", "gelu"))  # biases lie in shared memory then
+    return tile_constants(tile, epilogue, residual, factors=factors) | {
         "TP_NORMED": normed,
         "TP_COPY": copied,
         **BF16,
@@ -321,10 +327,10 @@ def build(takes: Parameters, sizes: dict[str, int], tile: Tile, device: torch.de
 
 
 def source(columns: int, takes: Parameters, *, fp8: bool) -> str:
-    """base.cu, geglu.cu and kernel.cu with the instruction for tiles of that many columns."""
+    """base.cu, overlap.cu and kernel.cu with the instruction for tiles of that many columns."""
     mma = instructions.wgmma("mma", columns, numbers="e4m3" if fp8 else "bf16")
     generated = f"{mma}\n#define GEMM_PARAMETERS {takes.declarations}\n"
-    return instructions.source("gemm/base.cu", "gemm/geglu.cu", "gemm/kernel.cu", generated=generated)
+    return instructions.source("gemm/base.cu", "gemm/overlap.cu", "gemm/kernel.cu", generated=generated)
 
 
 def matrix_map(address: int, rows: int, width: int, box_rows: int, fp8: bool = False) -> Any:

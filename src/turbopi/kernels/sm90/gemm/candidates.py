@@ -8,7 +8,8 @@ from turbopi.kernels.sm90.gemm.bf16 import SPLIT, Epilogue, Tile
 from turbopi.kernels.sm90.gemm.products import Chosen, Operation
 
 CHEAPEST, WITH_KIN = 10, 5  # tiles by the cost model; of so many also clusters and shorter rings
-MOST_SUMS, MOST_OVERLAPPED = 192 * 192, 192 * 128  # numbers of a tile, and of one whose GeGLU overlaps
+OVERLAPPED = 8  # tiles, the cheapest, whose epilogue overlaps; GeGLU's come with the kin
+MOST_SUMS, MOST_OVERLAPPED = 192 * 192, 192 * 128  # numbers of a tile, and of one whose epilogue overlaps
 MOST_CLUSTER = 8
 LEAST_STAGES = 3
 SHORT_RING = 5
@@ -35,10 +36,14 @@ def possible(tile: Tile, operation: Operation, in_fp8: bool, k: int) -> bool:
         return False
     if tile.rows * tile.columns > (MOST_OVERLAPPED if tile.overlap else MOST_SUMS):
         return False
-    if in_fp8 and steps > fp8.UNPROMOTED_STEPS * tile.splits and not fp8.promotion(tile, k):
+    promoted = fp8.promotion(tile, k) if in_fp8 else 0
+    if in_fp8 and steps > fp8.UNPROMOTED_STEPS * tile.splits and not promoted:
+        return False
+    if tile.overlap and (operation == "residual" or promoted or tile.splits > 1):
         return False
     stages = tile.stages(factors=2 if in_fp8 else 1, lines=operation == "parts")
-    return tile.takes(epilogue_of(operation), steps) and stages >= LEAST_STAGES
+    made_whole = whole and (operation == "partial" or (operation == "parts" and in_fp8))
+    return tile.takes("bias" if made_whole else epilogue_of(operation), steps) and stages >= LEAST_STAGES
 
 
 def candidates(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int, usual: Chosen) -> list[Chosen]:
@@ -59,7 +64,16 @@ def _tiles(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int)
 
     cheapest = sorted(plain, key=price)[:CHEAPEST]
     kin = [other for tile in cheapest[:WITH_KIN] for other in _kin(tile, operation, m, n)]
-    return cheapest + [tile for tile in kin if possible(tile, operation, in_fp8, k)]
+    overlapped = [] if operation == "geglu" else _overlapped(plain, m, n, sms)
+    overlapped = sorted((tile for tile in overlapped if possible(tile, operation, in_fp8, k)), key=price)[:OVERLAPPED]
+    in_pairs = [replace(tile, cluster_m=2) for tile in overlapped[: OVERLAPPED // 2]]
+    more = (*kin, *overlapped, *in_pairs)
+    return cheapest + [tile for tile in more if possible(tile, operation, in_fp8, k)]
+
+
+def _overlapped(plain: list[Tile], m: int, n: int, sms: int) -> list[Tile]:
+    """Those of which a CTA has several."""
+    return [replace(tile, overlap=True) for tile in plain if -(-m // tile.rows) * -(-n // tile.columns) > sms]
 
 
 def _plain(operation: Operation, m: int) -> list[Tile]:

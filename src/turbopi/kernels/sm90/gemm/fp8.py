@@ -107,6 +107,7 @@ def matmul_fp8(
         out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)
     assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
     promote = promotion(tile, k) if promote is None else promote
+    assert not (promote and tile.overlap), "no registers are left for sums that are promoted"
     normed = 0 if sums is None else sums.count
     copied = copied_parts(copy, m, n)
     kernel = _kernel(tile, epilogue, inverse is not None, promote, residual is not None, normed, copied, a.device)

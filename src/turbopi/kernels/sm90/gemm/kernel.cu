@@ -112,9 +112,10 @@ gemm(GEMM_PARAMETERS) {
         };
         auto tile_at = [&](int unit) { return tile_of(unit, m_groups, n_groups, k_blocks, rank); };
         auto end = [&] { await_products<0>(), release(last); };
-        geglu_tiles(step, end, tile_at, first, units, stride, k_blocks, (Element*)out, M, N, group
+        overlapped_tiles(step, end, tile_at, first, units, stride, k_blocks, (Element*)out, (const u16*)bias, M, N, group,
+                         behind_barriers + group * BN
 #if TP_FP8
-                    , scale, inverse, behind_barriers + group * BN
+                         , scale, inverse
 #endif
         );
 #else

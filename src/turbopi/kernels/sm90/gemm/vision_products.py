@@ -1,6 +1,6 @@
 """The vision tower's products with the LayerNorms and the residual stream between them, for compute capability 9.0."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -139,6 +139,7 @@ class VisionProducts:
             or bias is None
             or (tile := bf16_tile(self._tiles, epilogue, x.x, weight)) is None
             or tile.splits > 1
+            or tile.overlap
         ):
             return None
         key = weight.data_ptr()
@@ -174,6 +175,7 @@ class VisionProducts:
         rows, (columns, inner) = x.copy.shape[0], weight.shape
         tile = chosen_fp8(self._tiles, epilogue, rows, columns, inner, num_sms(x.copy.device))
         assert tile is not None and tile.splits == 1, "a norm is multiplied whole"
+        tile = replace(tile, overlap=False)
         ahead = self._next(weight)
         return matmul_fp8(x.copy, self._folded_fp8[key], tile, epilogue, bias, out, inverse, sums=x.sums, ahead=ahead)
 

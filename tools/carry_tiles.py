@@ -1,0 +1,137 @@
+"""Keeps measured tiles whose machine code a change of the kernels' source has left as it was.
+
+    PYTHONPATH=src:tools python -m carry_tiles REVISION [--check]
+
+The files in src/turbopi/data/tiles say with which source their tiles were measured, and of another none is used. But
+most changes leave most kernels alone. This compiles each tile of Hopper's products as it is at REVISION, whose source
+the files name, and as it is here. A tile of the same machine code in all its forms is kept under today's source; one of
+another is taken out and named: `turbopi tune --only-missing` measures it again. A GPU isn't needed, NVRTC is.
+With --check the files stay as they are; exit code 1 if a tile would be taken out.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from msgspec.structs import replace
+from rich.console import Console
+
+from turbopi.backends.tuned_tiles import PACKAGE, SHIPPED, SOURCES, TileFile, TunedTile, fingerprint, write_tile_file
+from turbopi.errors import ConfigError
+from turbopi.kernels import nvrtc
+from turbopi.kernels.sm90.gemm import bf16, fp8
+from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
+from turbopi.kernels.sm90.gemm.products import from_knobs
+from turbopi.reading import read_document
+from turbopi.source_code import code_of
+
+ARCH = "sm_90a"
+PARTS = 12  # of the sums of a row: any number gives a kernel of that form
+ROOT = PACKAGE.parents[1]
+
+
+def forms(one: TunedTile, tile: Tile) -> Iterator[tuple[str, dict[str, int]]]:
+    """The source and the constants of each kernel that the engine may launch for an operation with its tile."""
+    operation: Any = one.operation
+    epilogue: Epilogue = "bias" if operation == "residual" else operation
+    if (tile.splits == 1 or tile.gather) and (
+        operation == "partial" or (operation == "parts" and one.numbers == "fp8")
+    ):
+        epilogue = "bias"
+    residual = operation == "residual"
+    normed = (0, PARTS) if operation in ("bias", "gelu") and tile.splits == 1 and not tile.overlap else (0,)
+    for parts in normed:
+        if one.numbers == "bf16":
+            takes = bf16.parameters(fp8=False, residual=residual, normed=parts > 0, copied=False)
+            yield bf16.source(tile.columns, takes, fp8=False), bf16.constants(tile, epilogue, residual, parts)
+            continue
+        for out_fp8 in (False, True) if operation in ("gelu", "geglu") else (False,):
+            for copied in (0, PARTS) if residual else (0,):
+                takes = bf16.parameters(fp8=True, residual=residual, normed=parts > 0, copied=copied > 0)
+                promote = fp8.promotion(tile, one.inner)
+                constants = fp8.constants(tile, epilogue, out_fp8, promote, residual, parts, copied)
+                yield bf16.source(tile.columns, takes, fp8=True), constants
+
+
+def machine_code(one: TunedTile) -> str:
+    """A hash of the machine code of all forms; of the library's tiles, which have none here, the same for all."""
+    tile, digest = from_knobs(one.tile), hashlib.sha256()
+    if isinstance(tile, Tile):
+        for source, constants in forms(one, tile):
+            digest.update(nvrtc.compile_cubin(source, ARCH, constants))
+    return digest.hexdigest()[:16]
+
+
+def compiled(tiles: list[TunedTile]) -> dict[str, str]:
+    """{a tile's key: its machine code} of Hopper's products."""
+    products = [one for one in tiles if one.kernels == "hopper"]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return {str(one.key): code for one, code in zip(products, pool.map(machine_code, products), strict=True)}
+
+
+def other_sources(package: Path) -> dict[str, str]:
+    """The code that measured times depend on besides the products' own, by file."""
+    files = (file for glob in SOURCES["hopper"] if "sm90" not in glob for file in package.glob(glob))
+    return {file.relative_to(package).as_posix(): code_of(file) for file in files}
+
+
+def carried(document: TileFile, before: dict[str, str], now: dict[str, str]) -> tuple[TileFile, list[TunedTile]]:
+    """The document under today's source, and the tiles that it has no more."""
+    gone = [one for one in document.tiles if str(one.key) in now and before[str(one.key)] != now[str(one.key)]]
+    kept = [one for one in document.tiles if one not in gone]
+    return replace(document, tiles=kept, fingerprints=document.fingerprints | {"hopper": fingerprint("hopper")}), gone
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("revision", help="whose source the tiles were measured with, as git names it")
+    parser.add_argument("--check", action="store_true", help="change no file")
+    parser.add_argument("--codes", type=Path, help=argparse.SUPPRESS)  # of this file's tiles, for the other revision
+    arguments = parser.parse_args()
+    if arguments.codes is not None:
+        document = read_document(arguments.codes, TileFile, ConfigError)
+        print(json.dumps({"fingerprint": fingerprint("hopper"), "codes": compiled(document.tiles)}))
+        return 0
+    console, failed = Console(soft_wrap=True), False
+    with tempfile.TemporaryDirectory() as folder:
+        archive = subprocess.run(
+            ["git", "archive", arguments.revision, "src"], cwd=ROOT, check=True, capture_output=True
+        )
+        subprocess.run(["tar", "x", "-C", folder], input=archive.stdout, check=True)
+        old = Path(folder, "src")
+        if other_sources(old / "turbopi") != other_sources(PACKAGE):
+            console.print("norms, activations or the library's products have changed, too: measure again")
+            return 1
+        paths = os.pathsep.join((str(old), str(Path(__file__).parent)))
+        for file in sorted(SHIPPED.glob("*.json")):
+            command = [sys.executable, "-m", "carry_tiles", arguments.revision, "--codes", str(file)]
+            answer = subprocess.run(
+                command, env=os.environ | {"PYTHONPATH": paths}, check=True, stdout=subprocess.PIPE, text=True
+            )
+            before = json.loads(answer.stdout)
+            document = read_document(file, TileFile, ConfigError)
+            if document.fingerprints.get("hopper") != before["fingerprint"]:
+                console.print(f"{file.name}: its tiles were measured with another source than {arguments.revision}'s")
+                failed = True
+                continue
+            new, gone = carried(document, before["codes"], compiled(document.tiles))
+            for one in gone:
+                console.print(f"{file.name}: {one.name}, {one.rows} rows, {one.numbers} has other machine code")
+            console.print(f"{file.name}: {len(new.tiles)} tiles kept, {len(gone)} taken out")
+            if arguments.check:
+                failed |= bool(gone)
+            else:
+                write_tile_file(new, file)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
