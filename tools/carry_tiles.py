@@ -4,20 +4,24 @@
 
 The files in src/turbopi/data/tiles say with which source their tiles were measured, and of another none is used. But
 most changes leave most kernels alone. This compiles each tile of Hopper's products as it is at REVISION, whose source
-the files name, and as it is here. A tile of the same machine code in all its forms is kept under today's source; one of
-another is taken out and named: `turbopi tune --only-missing` measures it again. A GPU isn't needed, NVRTC is.
+the files name, and as it is here. A tile of the same machine code in all its forms, launched in the same way, is kept
+under today's source; another is taken out and named: `turbopi tune --only-missing` measures it again. A GPU isn't
+needed, NVRTC is. Of new candidates it knows nothing: take the rows out for which there are some.
 With --check the files stay as they are; exit code 1 if a tile would be taken out.
 """
 
 import argparse
 import hashlib
+import itertools
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace as replace_tile
 from pathlib import Path
 from typing import Any
 
@@ -40,31 +44,37 @@ ROOT = PACKAGE.parents[1]
 
 def forms(one: TunedTile, tile: Tile) -> Iterator[tuple[str, dict[str, int]]]:
     """The source and the constants of each kernel that the engine may launch for an operation with its tile."""
-    operation: Any = one.operation
-    epilogue: Epilogue = "bias" if operation == "residual" else operation
-    if (tile.splits == 1 or tile.gather) and (
-        operation == "partial" or (operation == "parts" and one.numbers == "fp8")
-    ):
-        epilogue = "bias"
-    residual = operation == "residual"
-    normed = (0, PARTS) if operation in ("bias", "gelu") and tile.splits == 1 and not tile.overlap else (0,)
-    for parts in normed:
-        if one.numbers == "bf16":
-            takes = bf16.parameters(fp8=False, residual=residual, normed=parts > 0, copied=False)
-            yield bf16.source(tile.columns, takes, fp8=False), bf16.constants(tile, epilogue, residual, parts)
+    in_fp8, epilogue, residual = one.numbers == "fp8", epilogue_of(one, tile), one.operation == "residual"
+    copies = (0, PARTS) if residual else (0,)
+    norms = (0, PARTS) if one.operation in ("bias", "gelu") and tile.splits == 1 else (0,)
+    for parts, copied in itertools.product(norms, copies):
+        of_norm = replace_tile(tile, overlap=False) if parts else tile
+        takes = bf16.parameters(fp8=in_fp8, residual=residual, normed=parts > 0, copied=copied > 0)
+        source = bf16.source(tile.columns, takes, fp8=in_fp8)
+        if not in_fp8:
+            yield source, bf16.constants(of_norm, epilogue, residual, parts, copied)
             continue
-        for out_fp8 in (False, True) if operation in ("gelu", "geglu") else (False,):
-            for copied in (0, PARTS) if residual else (0,):
-                takes = bf16.parameters(fp8=True, residual=residual, normed=parts > 0, copied=copied > 0)
-                promote = fp8.promotion(tile, one.inner)
-                constants = fp8.constants(tile, epilogue, out_fp8, promote, residual, parts, copied)
-                yield bf16.source(tile.columns, takes, fp8=True), constants
+        promote = fp8.promotion(of_norm, one.inner)
+        for out_fp8 in (False, True) if one.operation in ("gelu", "geglu") else (False,):
+            yield source, fp8.constants(of_norm, epilogue, out_fp8, promote, residual, parts, copied)
+
+
+def epilogue_of(one: TunedTile, tile: Tile) -> Epilogue:
+    operation: Any = one.operation
+    whole = tile.splits == 1 or tile.gather
+    made_whole = operation == "partial" or (operation == "parts" and one.numbers == "fp8")
+    return "bias" if operation == "residual" or (whole and made_whole) else operation
 
 
 def machine_code(one: TunedTile) -> str:
-    """A hash of the machine code of all forms; of the library's tiles, which have none here, the same for all."""
+    """A hash of the machine code of all forms and of how they are launched; of the library's tiles, which have none
+    here, the same for all.
+    """
     tile, digest = from_knobs(one.tile), hashlib.sha256()
     if isinstance(tile, Tile):
+        depth = fp8.DEPTH if one.numbers == "fp8" else bf16.DEPTH
+        launched = bf16.layout(tile, epilogue_of(one, tile), one.rows, one.columns, -(-one.inner // depth), None, None)
+        digest.update(repr((launched, bf16.clusters(tile, math.prod(launched[1]), 1 << 20))).encode())
         for source, constants in forms(one, tile):
             digest.update(nvrtc.compile_cubin(source, ARCH, constants))
     return digest.hexdigest()[:16]

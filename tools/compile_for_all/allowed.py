@@ -7,7 +7,7 @@ result. All of them are written and read a few times a phase or a tile, not in t
 ALLOWED: dict[str, dict[int, int]] = {
     # Timed on an H200 as it is: docs/dev/log.md
     "sm90: denoising": {90: 64},
-    # Once a tile, around the pieces of its epilogue. The tuner found it sooner than tiles that don't spill
+    # Once a tile, around the pieces of its epilogue. The tuner measured it faster than tiles that don't spill
     "sm90: vision's qkv in batches": {90: 16},
     # Before the loop that multiplies, and behind it: two blocks shall fit a multiprocessor
     "sm90: way back": {90: 16},

@@ -21,7 +21,7 @@ import torch
 from turbopi.model.exact import exact_float32
 
 Mark = Callable[[str], None]  # is told the end of each stage, or `HEAD`
-HEAD = "head"  # the mark behind kernels that are launched before those that follow are
+HEAD = "head"  # the mark that cuts a sequence: what is before it is a graph of its own, launched first
 
 CAPTURING = threading.RLock()  # of the process: policies on other devices, too
 

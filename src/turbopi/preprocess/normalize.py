@@ -52,7 +52,7 @@ class Normalizer:
         return (a.astype(np.float32), b.astype(np.float32)) if self.is_lerobot else (a, b)
 
     def _divisor(self) -> np.ndarray:
-        """What `normalize` divides by."""
+        """What `normalize` divides by, and `unnormalize` multiplies by, but in lerobot_zscore."""
         a, b = self._a, self._b
         with np.errstate(over="ignore"):  # absurd statistics
             match self.mode:

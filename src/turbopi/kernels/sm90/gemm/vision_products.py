@@ -175,7 +175,7 @@ class VisionProducts:
         rows, (columns, inner) = x.copy.shape[0], weight.shape
         tile = chosen_fp8(self._tiles, epilogue, rows, columns, inner, num_sms(x.copy.device))
         assert tile is not None and tile.splits == 1, "a norm is multiplied whole"
-        tile = replace(tile, overlap=False)
+        tile = replace(tile, overlap=False)  # what follows such a product's sums needs more registers than that leaves
         ahead = self._next(weight)
         return matmul_fp8(x.copy, self._folded_fp8[key], tile, epilogue, bias, out, inverse, sums=x.sums, ahead=ahead)
 
