@@ -143,8 +143,10 @@ def test_peak_memory_is_the_weights_and_at_most_a_gigabyte_of_full_size(
     tiny = str(golden / "checkpoints" / "pi05" / "jax")
     result = subprocess.run(
         [sys.executable, "-c", MEASURE, str(folders[layout]), precision, config, tiny],
-        # glibc keeps freed blocks below 32 MB for reuse: nothing beside a full model, but a third of this one
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "MALLOC_MMAP_THRESHOLD_": str(2**20)},
+        # glibc keeps freed blocks below 32 MB for reuse, and for each thread that was scheduled some of its own:
+        # nothing beside a full model, but a third of this one
+        env=os.environ
+        | {"PYTHONPATH": os.pathsep.join(sys.path), "MALLOC_MMAP_THRESHOLD_": str(2**20), "MALLOC_ARENA_MAX": "1"},
         capture_output=True,
         text=True,
     )
