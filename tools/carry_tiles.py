@@ -23,19 +23,18 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace as replace_tile
 from pathlib import Path
-from typing import Any
 
 from msgspec.structs import replace
-from rich.console import Console
 
 from turbopi.backends.tuned_tiles import PACKAGE, SHIPPED, SOURCES, TileFile, TunedTile, fingerprint, write_tile_file
 from turbopi.errors import ConfigError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.sm90.gemm import bf16, fp8
-from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
+from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.products import from_knobs
 from turbopi.reading import read_document
 from turbopi.source_code import code_of
+from turbopi.tune.hopper import epilogue_with
 
 ARCH = "sm_90a"
 PARTS = 12  # of the sums of a row: any number gives a kernel of that form
@@ -44,7 +43,8 @@ ROOT = PACKAGE.parents[1]
 
 def forms(one: TunedTile, tile: Tile) -> Iterator[tuple[str, dict[str, int]]]:
     """The source and the constants of each kernel that the engine may launch for an operation with its tile."""
-    in_fp8, epilogue, residual = one.numbers == "fp8", epilogue_of(one, tile), one.operation == "residual"
+    in_fp8, residual = one.numbers == "fp8", one.operation == "residual"
+    epilogue = epilogue_with(one.operation, tile, in_fp8)
     copies = (0, PARTS) if residual else (0,)
     norms = (0, PARTS) if one.operation in ("bias", "gelu") and tile.splits == 1 else (0,)
     for parts, copied in itertools.product(norms, copies):
@@ -59,21 +59,16 @@ def forms(one: TunedTile, tile: Tile) -> Iterator[tuple[str, dict[str, int]]]:
             yield source, fp8.constants(of_norm, epilogue, out_fp8, promote, residual, parts, copied)
 
 
-def epilogue_of(one: TunedTile, tile: Tile) -> Epilogue:
-    operation: Any = one.operation
-    whole = tile.splits == 1 or tile.gather
-    made_whole = operation == "partial" or (operation == "parts" and one.numbers == "fp8")
-    return "bias" if operation == "residual" or (whole and made_whole) else operation
-
-
 def machine_code(one: TunedTile) -> str:
     """A hash of the machine code of all forms and of how they are launched; of the library's tiles, which have none
     here, the same for all.
     """
     tile, digest = from_knobs(one.tile), hashlib.sha256()
     if isinstance(tile, Tile):
-        depth = fp8.DEPTH if one.numbers == "fp8" else bf16.DEPTH
-        launched = bf16.layout(tile, epilogue_of(one, tile), one.rows, one.columns, -(-one.inner // depth), None, None)
+        in_fp8 = one.numbers == "fp8"
+        steps = -(-one.inner // (fp8.DEPTH if in_fp8 else bf16.DEPTH))
+        epilogue = epilogue_with(one.operation, tile, in_fp8)
+        launched = bf16.layout(tile, epilogue, one.rows, one.columns, steps, None, None)
         digest.update(repr((launched, bf16.clusters(tile, math.prod(launched[1]), 1 << 20))).encode())
         for source, constants in forms(one, tile):
             digest.update(nvrtc.compile_cubin(source, ARCH, constants))
@@ -110,37 +105,37 @@ def main() -> int:
         document = read_document(arguments.codes, TileFile, ConfigError)
         print(json.dumps({"fingerprint": fingerprint("hopper"), "codes": compiled(document.tiles)}))
         return 0
-    console, failed = Console(soft_wrap=True), False
     with tempfile.TemporaryDirectory() as folder:
-        archive = subprocess.run(
-            ["git", "archive", arguments.revision, "src"], cwd=ROOT, check=True, capture_output=True
-        )
-        subprocess.run(["tar", "x", "-C", folder], input=archive.stdout, check=True)
-        old = Path(folder, "src")
+        old = source_at(arguments.revision, Path(folder))
         if other_sources(old / "turbopi") != other_sources(PACKAGE):
-            console.print("norms, activations or the library's products have changed, too: measure again")
+            print("norms, activations or the library's products have changed, too: measure again")
             return 1
-        paths = os.pathsep.join((str(old), str(Path(__file__).parent)))
-        for file in sorted(SHIPPED.glob("*.json")):
-            command = [sys.executable, "-m", "carry_tiles", arguments.revision, "--codes", str(file)]
-            answer = subprocess.run(
-                command, env=os.environ | {"PYTHONPATH": paths}, check=True, stdout=subprocess.PIPE, text=True
-            )
-            before = json.loads(answer.stdout)
-            document = read_document(file, TileFile, ConfigError)
-            if document.fingerprints.get("hopper") != before["fingerprint"]:
-                console.print(f"{file.name}: its tiles were measured with another source than {arguments.revision}'s")
-                failed = True
-                continue
-            new, gone = carried(document, before["codes"], compiled(document.tiles))
-            for one in gone:
-                console.print(f"{file.name}: {one.name}, {one.rows} rows, {one.numbers} has other machine code")
-            console.print(f"{file.name}: {len(new.tiles)} tiles kept, {len(gone)} taken out")
-            if arguments.check:
-                failed |= bool(gone)
-            else:
-                write_tile_file(new, file)
-    return int(failed)
+        return max(carry(file, old, arguments.revision, arguments.check) for file in sorted(SHIPPED.glob("*.json")))
+
+
+def source_at(revision: str, folder: Path) -> Path:
+    """Unpacks a revision's src there."""
+    archive = subprocess.run(["git", "archive", revision, "src"], cwd=ROOT, check=True, stdout=subprocess.PIPE)
+    subprocess.run(["tar", "x", "-C", folder], input=archive.stdout, check=True)
+    return folder / "src"
+
+
+def carry(file: Path, old: Path, revision: str, check: bool) -> int:
+    """One file, measured with the source in `old`. Returns the exit code."""
+    command = [sys.executable, "-m", "carry_tiles", revision, "--codes", str(file)]
+    paths = os.pathsep.join((str(old), str(Path(__file__).parent)))
+    answer = subprocess.run(command, env=os.environ | {"PYTHONPATH": paths}, check=True, stdout=subprocess.PIPE)
+    before, document = json.loads(answer.stdout), read_document(file, TileFile, ConfigError)
+    if document.fingerprints.get("hopper") != before["fingerprint"]:
+        print(f"{file.name}: its tiles were measured with another source than {revision}'s")
+        return 1
+    new, gone = carried(document, before["codes"], compiled(document.tiles))
+    for one in gone:
+        print(f"{file.name}: {one.name}, {one.rows} rows, {one.numbers} has other machine code")
+    print(f"{file.name}: {len(new.tiles)} tiles kept, {len(gone)} taken out")
+    if not check:
+        write_tile_file(new, file)
+    return int(check and bool(gone))
 
 
 if __name__ == "__main__":

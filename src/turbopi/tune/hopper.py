@@ -14,7 +14,7 @@ from turbopi.kernels import plain
 from turbopi.kernels.portable import norms
 from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
 from turbopi.kernels.sm90.gemm import candidates as hopper_candidates
-from turbopi.kernels.sm90.gemm.bf16 import SPLIT, Copy, Folded, Sums, Tile, matmul
+from turbopi.kernels.sm90.gemm.bf16 import SPLIT, Copy, Epilogue, Folded, Sums, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, matmul_fp8
 from turbopi.kernels.sm90.gemm.products import (
     Chosen,
@@ -65,6 +65,13 @@ def candidates(one: Wanted, sms: int) -> list[Knobs]:
     if one.normed:  # a norm is multiplied whole
         found = [cut for cut in found if not isinstance(cut, Tile) or (cut.splits == 1 and not cut.overlap)]
     return [to_knobs(cut) for cut in found]
+
+
+def epilogue_with(operation: str, tile: Tile, in_fp8: bool) -> Epilogue:
+    """What the kernel is compiled with: where nothing stays split, "partial" and E4M3's "parts" are "bias"."""
+    epilogue = hopper_candidates.epilogue_of(operation)  # type: ignore[arg-type]
+    whole = tile.splits == 1 or tile.gather
+    return "bias" if whole and epilogue in SPLIT and (in_fp8 or epilogue == "partial") else epilogue
 
 
 class Product(ProductBench):
@@ -139,10 +146,7 @@ class Product(ProductBench):
         if not isinstance(cut, Tile):
             return self._by_library(cut, copy, x)
         one, weight = self.operation, self.weights[copy]
-        operation: Operation = one.operation  # type: ignore[assignment]
-        epilogue = hopper_candidates.epilogue_of(operation)
-        if epilogue in SPLIT and (cut.splits == 1 or cut.gather) and (self.fp8 or epilogue == "partial"):
-            epilogue = "bias"
+        epilogue = epilogue_with(one.operation, cut, self.fp8)
         if one.operation == "residual":
             return self._into_stream(cut, copy, out, x)
         ahead = self._ahead(copy)
