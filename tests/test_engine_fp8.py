@@ -12,10 +12,12 @@ from torch import Tensor
 
 from turbopi.backends.fused import FusedBackend
 from turbopi.calibrate.statistics import collect
+from turbopi.engine import forward
+from turbopi.engine import weights as engine_weights
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.emulate import RoundedWeights, rounded
 from turbopi.engine.recent_loops import Loop, RecentLoops
-from turbopi.engine.weights import modulation, pack
+from turbopi.engine.weights import Weights, modulation, pack
 from turbopi.errors import BackendUnavailable
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.portable.denoise.packing import PackedExpert
@@ -90,6 +92,50 @@ def test_a_part_in_fp8_beside_one_in_full() -> None:
     ours, _ = engine_actions({str(site): scale for site, scale in scales.items()}, case.observation, case.noise)
     exact = model.sample(case.observation, case.noise, STEPS)[0]
     assert relative(ours, emulated) < 0.25 * relative(emulated, exact)
+
+
+@pytest.mark.parametrize("format", FORMATS.values(), ids=FORMATS)
+def test_hidden_columns_of_vision_fill_whole_lines_of_memory(format: Format, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The zeros behind them change no number, and matrices that aren't rounded have none."""
+    whole, narrow = pack_with_hidden(112, ("fc1", "fc2"), format), pack_with_hidden(112, ("fc2",), format)
+    monkeypatch.setattr(engine_weights, "_in_whole_lines", lambda *both: both)
+    as_it_was = pack_with_hidden(112, ("fc1", "fc2"), format)
+    for layer, before in zip(whole.vision, as_it_was.vision, strict=True):
+        (fc1, bias), (fc2, last_bias) = layer.fc1, layer.fc2
+        assert fc1.shape == (128, 64) and fc2.shape == (64, 128) and bias.shape == (128,)
+        assert before.fc1[0].shape == (112, 64) and torch.equal(last_bias, before.fc2[1])
+        assert torch.equal(cast(ScaledMatrix, fc1).dequantized()[112:], torch.zeros(16, 64))
+    for weights in (narrow, as_it_was):
+        assert all(layer.fc2[0].shape == (64, 112) for layer in weights.vision)
+    assert torch.equal(vision_of(whole), vision_of(as_it_was))
+
+
+def pack_with_hidden(hidden: int, rounded_kinds: tuple[str, ...], format: Format) -> Weights:
+    """The golden model's, its vision cut to so many hidden columns, of which these matrices are rounded."""
+    model = golden_model("pi05")
+    config = dataclasses.replace(model.config, vision=dataclasses.replace(model.config.vision, mlp_dim=hidden))
+    state = dict(model.state_dict())
+    for name in state:
+        if name.endswith("fc2.weight"):
+            state[name] = state[name][:, :hidden].contiguous()
+        elif ".fc1." in name:
+            state[name] = state[name][:hidden]
+
+    def make(place: str, matrix: Tensor) -> Matrix:
+        chosen = place.startswith("vision") and place.endswith(rounded_kinds)
+        return quantize(matrix, 0.02, format=format) if chosen else matrix
+
+    return pack(config, state, make)
+
+
+def vision_of(weights: Weights) -> Tensor:
+    """Tokens [256, D] of a made-up picture."""
+    config = golden_model("pi05").config
+    generator = torch.Generator().manual_seed(0)
+    picture = torch.randint(0, 256, (1, 224, 224, 3), generator=generator, dtype=torch.uint8)
+    out = torch.empty(config.vision.num_tokens, config.vlm.width)
+    forward.vision_tokens(config, weights, PLAIN, [lambda: picture], out)
+    return out
 
 
 def test_nothing_rounded_changes_nothing() -> None:

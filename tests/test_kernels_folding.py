@@ -15,7 +15,7 @@ from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Folded, Sums, Tile, clusters, matmul
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, best_tile, matmul_fp8
-from turbopi.quantization.fp8 import E4M3, E4M3_MAX, ScaledMatrix, to_e4m3
+from turbopi.quantization.fp8 import E4M3, E4M3_MAX, ScaledMatrix, to_e4m3, whole_lines
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 EPS = 1e-6
@@ -78,8 +78,8 @@ def test_a_tile_is_gathered_at_once_or_not_at_all() -> None:
 
 
 def test_smaller_gpus_gather_nothing() -> None:
-    assert best_tile(512, WIDTH, HIDDEN, "partial", GATHERING_SMS).gather
-    assert not best_tile(512, WIDTH, HIDDEN, "partial", GATHERING_SMS - 1).gather
+    assert best_tile(512, WIDTH, whole_lines(HIDDEN), "partial", GATHERING_SMS).gather
+    assert not best_tile(512, WIDTH, whole_lines(HIDDEN), "partial", GATHERING_SMS - 1).gather
 
 
 @on_hopper

@@ -57,7 +57,7 @@ def chosen() -> Iterator[tuple[Tile, int, int, int, Epilogue, bool]]:
         yield tile, 560, 16384, 2048, "geglu", False
     for m in (1, 11, 203, 816, 976):
         yield gemm_fp8.best_tile(m, 2048, 16384, "parts", H200_SMS), m, 2048, 16384, "parts", True
-        yield gemm_fp8.best_tile(m, 4304, 1152, "gelu", H200_SMS), m, 4304, 1152, "gelu", True
+        yield gemm_fp8.best_tile(m, 4352, 1152, "gelu", H200_SMS), m, 4352, 1152, "gelu", True
         yield gemm_fp8.best_tile(m, 16384, 2048, "geglu", H200_SMS), m, 16384, 2048, "geglu", True
 
 
@@ -66,7 +66,7 @@ def test_another_tile_is_chosen_only_on_purpose() -> None:
     tables = tiles.VISION_TILES, tiles.PARTS_TILES, tiles.FEW_TILES, tiles.FEW_GEGLU_TILES, tiles.GEGLU_TILES
     of_the_stream = tiles.RESIDUAL_TILES, tiles.RESIDUAL_TILES_FP8, tiles.TILES_FP8
     shapes = (
-        *((3456, 1152), (1152, 1152), (4304, 1152), (1152, 4304), (2048, 1152)),
+        *((3456, 1152), (1152, 1152), (4352, 1152), (1152, 4352), (2048, 1152)),
         *((2560, 2048), (2048, 2048), (16384, 2048), (2048, 16384), (512, 2048)),
     )
     rows, epilogues = (1, *range(64, 1025, 64), 1000), ("plain", "bias", "gelu", "geglu", "partial", "parts")
@@ -75,7 +75,7 @@ def test_another_tile_is_chosen_only_on_purpose() -> None:
         for m, (n, k), epilogue, sms in itertools.product(rows, shapes, epilogues, (66, H200_SMS))
     ]
     choices = "\n".join([repr((*tables, *of_the_stream)), *estimated])
-    assert hashlib.sha256(choices.encode()).hexdigest()[:16] == "8cb0797cadbb780c"
+    assert hashlib.sha256(choices.encode()).hexdigest()[:16] == "815b89c884eda7ef"
 
 
 CHOSEN = sorted(set(chosen()), key=str)

@@ -31,10 +31,10 @@ from turbopi.errors import ConfigError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.sm90.gemm import bf16, fp8
 from turbopi.kernels.sm90.gemm.bf16 import Tile
+from turbopi.kernels.sm90.gemm.candidates import epilogue_with
 from turbopi.kernels.sm90.gemm.products import from_knobs
 from turbopi.reading import read_document
 from turbopi.source_code import code_of
-from turbopi.tune.hopper import epilogue_with
 
 ARCH = "sm_90a"
 PARTS = 12  # of the sums of a row: any number gives a kernel of that form

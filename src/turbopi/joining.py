@@ -6,8 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from turbopi import backends
-from turbopi.backends import Backend
+from turbopi.backends.abilities import Held
 from turbopi.config import ModelConfig, PolicyConfig
 from turbopi.engine.conditioned import batch_form
 from turbopi.errors import ConfigError, ObservationError
@@ -51,7 +50,7 @@ class Joins:
 
 
 class Joining:
-    """Of one policy; `backend` tells the one that it holds, `integration` how it denoises unless a call says otherwise.
+    """Of one policy; `held` tells its backend, `integration` how it denoises unless a call says otherwise.
 
     Raises ConfigError for an integration that the backend doesn't have.
     """
@@ -60,12 +59,11 @@ class Joining:
         self,
         config: PolicyConfig,
         pipeline: Pipeline,
-        backend: Callable[[], Backend],
+        held: Held,
         integration: Integration | None = None,
     ) -> None:
-        self._config, self._model, self._pipeline, self._backend = config, config.model, pipeline, backend
+        self._config, self._model, self._pipeline, self._held = config, config.model, pipeline, held
         self._integration = integration
-        self._known: tuple[object, backends.Conditions | None] = (None, None)  # see `_forms`
         if integration is not None:
             try:
                 self._check_form("solver")
@@ -189,15 +187,13 @@ class Joining:
         return asked
 
     def _forms(self) -> tuple[Form, ...]:
-        """`backends.forms` of the backend; whether it is `Conditions` is found out once, not for every row."""
-        backend, known = self._backend(), self._known
-        if known[0] is not backend:
-            known = self._known = backend, backend if isinstance(backend, backends.Conditions) else None
-        return () if known[1] is None else known[1].forms
+        """`backends.forms` of the backend."""
+        conditions = self._held().conditions
+        return () if conditions is None else conditions.forms
 
     def _check_form(self, form: Form) -> None:
         if form != "plain" and form not in self._forms():
-            backend = self._backend()
+            backend = self._held().backend
             what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
             if form == "solver":
                 raise ObservationError(

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from turbopi import backends
-from turbopi.backends import Backend
+from turbopi.backends.abilities import Held
 from turbopi.backends.lost import Guard
 from turbopi.joining import Joining, Joins
 from turbopi.observation import Observation
@@ -31,21 +31,11 @@ class Ran:
     infer_end: float
 
 
-class _Held:
-    """The backend that a policy holds, and what it can do. Found out once: `isinstance` of a protocol takes 10 us."""
-
-    def __init__(self, backend: Backend) -> None:
-        self.backend = backend
-        self.begins = backend if isinstance(backend, backends.Begins) else None
-        self.runs_batches = backend if isinstance(backend, backends.RunsBatches) else None
-
-
 class ModelCall:
-    """Of one policy. One call at a time: others wait for `lock`. `backend` tells the one that the policy holds."""
+    """Of one policy, by the backend that it holds. One call at a time: others wait for `lock`."""
 
-    def __init__(self, pipeline: Pipeline, joining: Joining, backend: Callable[[], Backend], guard: Guard) -> None:
-        self._pipeline, self._joining, self._backend, self._guard = pipeline, joining, backend, guard
-        self._held = _Held(backend())
+    def __init__(self, pipeline: Pipeline, joining: Joining, held: Held, guard: Guard) -> None:
+        self._pipeline, self._joining, self._held, self._guard = pipeline, joining, held, guard
         self.lock = threading.Lock()
 
     def run(
@@ -55,20 +45,18 @@ class ModelCall:
         noise: Callable[[], np.ndarray],  # float32[B, H, action_dim], called when all else is known to be right
     ) -> Ran:
         """Raises ObservationError for what can't be used, DeviceLost when the GPU fails for good."""
-        backend, held = self._backend(), self._held
-        if held.backend is not backend:
-            held = self._held = _Held(backend)
-        if len(observations) == 1 and held.begins is not None:
-            return self._begin(held.begins, observations[0], joins, noise)
-        if held.runs_batches is not None:
-            return self._begin_batch(held.runs_batches, observations, joins, noise)
+        able = self._held()
+        if len(observations) == 1 and able.begins is not None:
+            return self._begin(able.begins, observations[0], joins, noise)
+        if able.runs_batches is not None:
+            return self._begin_batch(able.runs_batches, observations, joins, noise)
         prepared = [self._pipeline.before(obs) for obs in observations]
         inputs, states = Observation.stack([one for one, _ in prepared]), [state for _, state in prepared]
         x_1, arguments = torch.from_numpy(noise()), self._joining.arguments(joins, states)
         asked = time.perf_counter()
         with self.lock, self._guard:
             infer_start = time.perf_counter()
-            sample = backend.sample(inputs, x_1, joins.steps, **arguments)
+            sample = able.backend.sample(inputs, x_1, joins.steps, **arguments)
             return Ran(sample, states, asked, infer_start, time.perf_counter())
 
     def _begin(

@@ -37,9 +37,9 @@ ROWS, PREFIX, SUFFIX = 512, 560, 50
 PRODUCTS: tuple[tuple[str, tiles.Epilogue, int, int, int, bool, bool], ...] = (
     ("vision's qkv", "plain", ROWS, 3456, 1152, True, False),
     ("vision's out", "parts", ROWS, 1152, 1152, True, False),
-    ("vision's fc1", "gelu", ROWS, 4304, 1152, True, True),
-    ("vision's fc1 before bf16", "gelu", ROWS, 4304, 1152, True, False),
-    ("vision's fc2", "parts", ROWS, 1152, 4304, True, False),
+    ("vision's fc1", "gelu", ROWS, 4352, 1152, True, True),
+    ("vision's fc1 before bf16", "gelu", ROWS, 4352, 1152, True, False),
+    ("vision's fc2", "parts", ROWS, 1152, 4352, True, False),
     ("projector", "plain", ROWS, 2048, 1152, True, False),
     ("prefix's qkv", "plain", PREFIX, 2560, 2048, False, False),
     ("prefix's out", "parts", PREFIX, 2048, 2048, False, False),

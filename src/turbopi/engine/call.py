@@ -34,6 +34,11 @@ from turbopi.preprocess.images import fitted
 PART = 8
 
 
+def places_of_parts(pictures: int) -> list[slice]:
+    """Which of so many pictures are sent together."""
+    return [slice(first, min(first + PART, pictures)) for first in range(0, pictures, PART)]
+
+
 @dataclass(frozen=True)
 class CallShape:
     """What a captured call is fixed to."""
@@ -164,7 +169,7 @@ class Pictures:
         dims, dtype = (cameras, side, side, 3), torch.float32 if float_images else torch.uint8
         host = torch.zeros(dims, dtype=dtype, pin_memory=table.is_cuda)
         self.images = torch.zeros(dims, dtype=dtype, device=table.device)
-        self._places = [slice(first, min(first + PART, cameras)) for first in range(0, cameras, PART)]
+        self._places = places_of_parts(cameras)
         self._parts = [Part(host[place], self.images[place]) for place in self._places]
         size = (self.rows + prompt_slots, config.vlm.width)
         self.embs = torch.full(size, torch.nan, device=table.device, dtype=table.dtype)  # as in `Cache`

@@ -18,7 +18,7 @@ from turbopi.engine.graph import empty_cache
 from turbopi.engine.room import GATE_UP, QKV, is_conditioning, join
 from turbopi.kernels.interface import Affine, AffineMatrix, AnyMatrix, GemmaLayer, State, VisionLayer
 from turbopi.model.denoise import time_embedding, time_grid
-from turbopi.quantization.fp8 import Matrix
+from turbopi.quantization.fp8 import Matrix, ScaledMatrix, whole_lines
 
 MakeMatrix = Callable[[str, Tensor], Matrix]  # by its place, such as "vision.3.fc1" or "prefix.0.qkv"
 
@@ -110,6 +110,7 @@ def _vision_layers(config: ModelConfig, take: _Tensors, make: MakeMatrix) -> Ite
             weight, bias = take.affine(f"{prefix}.{name}")
             return make(f"vision.{i}.{kind}", weight), bias
 
+        fc1, fc2 = _in_whole_lines(matrix("fc1", "mlp.fc1"), matrix("fc2", "mlp.fc2"))
         yield VisionLayer(
             norm1=take.affine(f"{prefix}.layer_norm1"),
             qkv=(
@@ -118,9 +119,24 @@ def _vision_layers(config: ModelConfig, take: _Tensors, make: MakeMatrix) -> Ite
             ),
             out=matrix("out", "self_attn.out_proj"),
             norm2=take.affine(f"{prefix}.layer_norm2"),
-            fc1=matrix("fc1", "mlp.fc1"),
-            fc2=matrix("fc2", "mlp.fc2"),
+            fc1=fc1,
+            fc2=fc2,
         )
+
+
+def _in_whole_lines(fc1: AffineMatrix, fc2: AffineMatrix) -> tuple[AffineMatrix, AffineMatrix]:
+    """Both as they are, or in eight bits with hidden columns of zeros up to whole lines of memory.
+
+    Of SigLIP's 4,304 every other row begins inside a line: fc2 takes 1.05 to 1.4 times as long. GELU of 0 is 0, and 0
+    adds nothing.
+    """
+    (first, bias), (second, last_bias) = fc1, fc2
+    if not (isinstance(first, ScaledMatrix) and isinstance(second, ScaledMatrix)):
+        return fc1, fc2
+    (hidden, inner), columns = first.shape, second.shape[0]
+    if (wide := whole_lines(hidden)) == hidden:
+        return fc1, fc2
+    return (first.padded(wide, inner), F.pad(bias, (0, wide - hidden))), (second.padded(columns, wide), last_bias)
 
 
 def _gemma_layers(

@@ -16,6 +16,7 @@ from torch import Tensor
 E4M3 = torch.float8_e4m3fn
 E4M3_MAX = 448.0
 ALIGNMENT = 16  # inner sizes and widths must be multiples of it: tensor cores and their loads take 16 bytes at once
+LINE = 128  # bytes of a line of a GPU's memory: of a row that begins inside one, as many bytes take two loads
 
 
 def to_e4m3(x: Tensor, inverse: float | Tensor) -> Tensor:
@@ -73,6 +74,13 @@ class ScaledMatrix:
     def __getitem__(self, rows: slice) -> "ScaledMatrix":
         return replace(self, data=self.data[rows], scale=self.scale[rows])
 
+    def padded(self, rows: int, columns: int) -> "ScaledMatrix":
+        """With zeros behind its rows and columns, up to so many."""
+        data, scale = self.data.new_zeros(rows, columns), self.scale.new_ones(rows)
+        data[: self.shape[0], : self.shape[1]] = self.data
+        scale[: self.shape[0]] = self.scale
+        return replace(self, data=data, scale=scale)
+
     def product(self, x: Tensor, bias: Tensor | None = None) -> Tensor:
         """float32[tokens, out]: x [tokens, in] of the same numbers times this, as it is meant; slow."""
         exact = torch.float64 if self.numbers == torch.int8 else torch.float32  # int32 is exact, too
@@ -85,6 +93,11 @@ class ScaledMatrix:
 
 
 Matrix = Tensor | ScaledMatrix
+
+
+def whole_lines(columns: int) -> int:
+    """So many numbers of eight bits, and what is missing to whole lines of memory."""
+    return -(-columns // LINE) * LINE
 
 
 def input_of(matrix: Matrix) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from turbopi.kernels import plain
 from turbopi.kernels.portable import norms
 from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
 from turbopi.kernels.sm90.gemm import candidates as hopper_candidates
-from turbopi.kernels.sm90.gemm.bf16 import SPLIT, Copy, Epilogue, Folded, Sums, Tile, matmul
+from turbopi.kernels.sm90.gemm.bf16 import Copy, Folded, Sums, Tile, matmul
+from turbopi.kernels.sm90.gemm.candidates import epilogue_with
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, matmul_fp8
 from turbopi.kernels.sm90.gemm.products import (
     Chosen,
@@ -65,13 +66,6 @@ def candidates(one: Wanted, sms: int) -> list[Knobs]:
     if one.normed:  # a norm is multiplied whole
         found = [cut for cut in found if not isinstance(cut, Tile) or (cut.splits == 1 and not cut.overlap)]
     return [to_knobs(cut) for cut in found]
-
-
-def epilogue_with(operation: str, tile: Tile, in_fp8: bool) -> Epilogue:
-    """What the kernel is compiled with: where nothing stays split, "partial" and E4M3's "parts" are "bias"."""
-    epilogue = hopper_candidates.epilogue_of(operation)  # type: ignore[arg-type]
-    whole = tile.splits == 1 or tile.gather
-    return "bias" if whole and epilogue in SPLIT and (in_fp8 or epilogue == "partial") else epilogue
 
 
 class Product(ProductBench):

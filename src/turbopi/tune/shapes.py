@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from turbopi.config import ModelConfig
-from turbopi.engine.call import PART
+from turbopi.engine.call import places_of_parts
 from turbopi.engine.forward import HEAD_LAYERS, row_chunks
 from turbopi.engine.runner import BUCKET, bucket
 from turbopi.kernels.sm90.attention.suffix_tile import takes
 from turbopi.kernels.tile_table import Kernels, Numbers, TileKey, whole_64
+from turbopi.quantization.fp8 import whole_lines
 
 Precision = Literal["bf16", "fp8"]
 Norm = Literal["layer", "rms"]
@@ -120,6 +121,7 @@ def _has_choice(one: Operation) -> bool:
 def _vision(config: ModelConfig, call: Call, precision: Precision, kernels: Kernels) -> Iterator[Operation]:
     v, fp8, hopper = config.vision, precision == "fp8", kernels == "hopper"
     linear, residual = ("bias", "residual") if hopper else ("plain", "parts")
+    hidden = v.mlp_dim if precision == "bf16" else whole_lines(v.mlp_dim)  # see `engine.weights`
     for images, layers in _picture_parts(config, call.cameras * call.batch):
         rows = images * v.num_tokens
         usual = Operation("", kernels, linear, precision, rows, v.width, v.width, layers, bias=True)
@@ -128,9 +130,9 @@ def _vision(config: ModelConfig, call: Call, precision: Precision, kernels: Kern
             attention = replace(usual, operation="vision_attention", numbers="bf16", bias=False, images=images)
             yield replace(attention, name="vision attention", columns=v.num_heads, inner=v.head_dim, out_fp8=fp8)
         yield replace(usual, name="vision out", operation=residual, norm_behind="layer")
-        fc1 = replace(usual, name="vision fc1", operation="gelu", columns=v.mlp_dim, out_fp8=fp8)
+        fc1 = replace(usual, name="vision fc1", operation="gelu", columns=hidden, out_fp8=fp8)
         yield replace(fc1, norm_in_front="layer")
-        yield replace(usual, name="vision fc2", operation=residual, inner=v.mlp_dim, norm_behind="layer")
+        yield replace(usual, name="vision fc2", operation=residual, inner=hidden, norm_behind="layer")
         if images == call.cameras * call.batch:
             projector = replace(usual, name="projector", numbers="bf16", columns=config.vlm.width, uses=1)
             yield replace(projector, norm_in_front="layer")
@@ -138,13 +140,13 @@ def _vision(config: ModelConfig, call: Call, precision: Precision, kernels: Kern
 
 def _picture_parts(config: ModelConfig, images: int) -> Iterator[tuple[int, int]]:
     """(how many pictures, layers that run over so many): see `engine.forward.vision_tokens`."""
-    if 0 < images <= PART:
+    parts = Counter(place.stop - place.start for place in places_of_parts(images))
+    if parts.total() == 1:
         yield images, config.vision.depth
-    elif images:
+    elif parts:
         yield images, config.vision.depth - HEAD_LAYERS
-        yield PART, images // PART * HEAD_LAYERS
-        if images % PART:
-            yield images % PART, HEAD_LAYERS
+        for size, count in parts.items():
+            yield size, count * HEAD_LAYERS
 
 
 def _prefix(config: ModelConfig, call: Call, precision: Precision, kernels: Kernels) -> Iterator[Operation]:

@@ -151,7 +151,8 @@ def _suffix_kernel(
     """BLOCK_M rows of one observation's queries over every SPLITS-th tile of its prefix; the last split has its suffix.
 
     A row is a head of a token. RoPE comes to queries and to the suffix's keys as they are loaded. With one split the
-    result goes to `out`, else sums to `parts` and (top, total) to `weights`, by split and row.
+    result goes to `out`, else the split's own result to `parts` and the logarithm (base 2) of its weight to `weights`,
+    by split and row.
     """
     DIM: tl.constexpr = 2 * HALF
     batch, split = tl.program_id(1), tl.program_id(2)
@@ -208,9 +209,10 @@ def _suffix_kernel(
         tl.store(out + m[:, None] * DIM + d[None, :], (acc / total[:, None]).to(out.dtype.element_ty), inside)
     else:
         place = split.to(tl.int64) * tl.num_programs(1) * rows + m
-        tl.store(parts + place[:, None] * DIM + d[None, :], acc, inside)
-        tl.store(weights + place * 2, top, own < rows)
-        tl.store(weights + place * 2 + 1, total, own < rows)
+        some = total > 0  # else the split had no keys: its sums are 0, and its weight is 2^-inf
+        result = acc / tl.where(some, total, 1.0)[:, None]
+        tl.store(parts + place[:, None] * DIM + d[None, :], result.to(parts.dtype.element_ty), inside)
+        tl.store(weights + place, tl.where(some, top + tl.log2(total), -float("inf")), own < rows)
 
 
 @triton.jit
@@ -225,16 +227,15 @@ def _combine_kernel(
     place = split * count + row
     launch_dependents(PDL)
     wait_for_producer(PDL)
-    top = tl.load(weights + place * 2, split < SPLITS, -float("inf"))
-    total = tl.load(weights + place * 2 + 1, split < SPLITS, 0.0)
-    sums = tl.load(
+    weight = tl.load(weights + place, split < SPLITS, -float("inf"))
+    results = tl.load(
         parts + place.to(tl.int64)[:, None] * DIM + d[None, :], (split < SPLITS)[:, None] & (d < DIM)[None, :], 0.0
     )
-    factor = tl.exp2(top - tl.max(top, 0))  # 2^-inf is 0: who had no keys counts for nothing
-    whole = tl.sum(factor * total, 0)
+    share = tl.exp2(weight - tl.max(weight, 0))  # 2^-inf is 0: who had no keys counts for nothing
+    whole = tl.sum(share, 0)
     if SCALED:
         whole /= inverse
-    result = tl.sum(sums * factor[:, None], 0) / whole
+    result = tl.sum(results.to(tl.float32) * share[:, None], 0) / whole
     tl.store(out + row * DIM + d, result.to(out.dtype.element_ty), d < DIM)
 
 
@@ -267,8 +268,8 @@ def suffix_attention(
     along = triton.cdiv(rows, tile.rows)
     splits = suffix_splits(along * batch, len(prefix_k) // batch, tile.keys)
     out = qkv.new_empty(count, heads * dim, dtype=result_dtype(qkv, inverse))
-    parts = torch.empty(splits, batch * rows, dim, device=qkv.device) if splits > 1 else out
-    weights = torch.empty(splits, batch * rows, 2, device=qkv.device) if splits > 1 else out
+    parts = qkv.new_empty(splits, batch * rows, dim) if splits > 1 else out
+    weights = torch.empty(splits, batch * rows, device=qkv.device) if splits > 1 else out
     sizes = {"BLOCK_D": triton.next_power_of_2(dim), "SPLITS": splits, "SCALED": inverse is not None}
     _suffix_kernel[(along, batch, splits)](
         *given, out, parts, weights, rows, count // batch, heads, dim**-0.5 * LOG2_E, inverse or 1.0,

@@ -17,8 +17,15 @@ LIBRARY_PARTS = (2, 4)  # parts of the inner axis that cuBLAS multiplies at once
 
 
 def epilogue_of(operation: Operation) -> Epilogue:
-    """What the kernel is compiled with; "partial" and "residual" of a whole sum are "bias"."""
+    """What the cost model knows an operation by."""
     return "bias" if operation == "residual" else operation
+
+
+def epilogue_with(operation: str, tile: Tile, in_fp8: bool) -> Epilogue:
+    """What the kernel is compiled with: where nothing stays split, "partial" and E4M3's "parts" are "bias"."""
+    epilogue = epilogue_of(operation)  # type: ignore[arg-type]
+    whole = tile.splits == 1 or tile.gather
+    return "bias" if whole and epilogue in SPLIT and (in_fp8 or epilogue == "partial") else epilogue
 
 
 def possible(tile: Tile, operation: Operation, in_fp8: bool, k: int) -> bool:
@@ -42,8 +49,7 @@ def possible(tile: Tile, operation: Operation, in_fp8: bool, k: int) -> bool:
     if tile.overlap and (operation == "residual" or promoted or tile.splits > 1):
         return False
     stages = tile.stages(factors=2 if in_fp8 else 1, lines=operation == "parts")
-    made_whole = whole and (operation == "partial" or (operation == "parts" and in_fp8))
-    return tile.takes("bias" if made_whole else epilogue_of(operation), steps) and stages >= LEAST_STAGES
+    return tile.takes(epilogue_with(operation, tile, in_fp8), steps) and stages >= LEAST_STAGES
 
 
 def candidates(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int, usual: Chosen) -> list[Chosen]:

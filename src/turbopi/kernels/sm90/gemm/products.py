@@ -73,14 +73,21 @@ def bf16_tile(tiles: TileTable, operation: Operation, x: Tensor, weight: Tensor)
 
 
 def tuned_linear(
-    x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | None = None, *, tiles: TileTable = NO_TILES
+    x: Tensor,
+    weight: Matrix,
+    bias: Tensor | None = None,
+    out: Tensor | None = None,
+    ahead: Tensor | None = None,
+    *,
+    tiles: TileTable = NO_TILES,
 ) -> Tensor:
+    epilogue: Epilogue = "plain" if bias is None else "bias"
     if isinstance(weight, ScaledMatrix):
-        return _fp8(x, weight, "plain" if bias is None else "bias", bias, out, tiles=tiles)
-    tile = bf16_tile(tiles, "plain" if bias is None else "bias", x, weight)
+        return _fp8(x, weight, epilogue, bias, out, ahead=ahead, tiles=tiles)
+    tile = bf16_tile(tiles, epilogue, x, weight)
     if tile is None:
         return linear(x, weight, bias, out)
-    return matmul(x, weight, tile, "plain" if bias is None else "bias", bias, out)
+    return matmul(x, weight, tile, epilogue, bias, out, ahead=ahead)
 
 
 def tuned_residual_linear(

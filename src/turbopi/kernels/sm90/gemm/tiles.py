@@ -4,6 +4,7 @@ Other sizes: in FP8 `fp8.best_tile` estimates, in bfloat16 cuBLAS multiplies, Ge
 """
 
 from turbopi.kernels.sm90.gemm.bf16 import Tile
+from turbopi.quantization.fp8 import whole_lines
 
 # SigLIP So400m's products that beat cuBLAS on an H200, by [rows, out, in]: the tiles fill its SMs just once.
 VISION_TILES = {
@@ -34,7 +35,7 @@ RESIDUAL_TILES = {
     (768, 1152, 1152): Tile(2, 64),
     (768, 1152, 4304): Tile(2, 144, cluster_m=2, cluster_n=2, splits=2, gather=True),
 }
-RESIDUAL_TILES_FP8 = RESIDUAL_TILES | {
+RESIDUAL_TILES_FP8 = {(rows, out, whole_lines(inner)): tile for (rows, out, inner), tile in RESIDUAL_TILES.items()} | {
     (512, 1152, 1152): Tile(1, 80, cluster_m=2),
     (768, 1152, 1152): Tile(1, 128, ring=5),
 }
@@ -72,13 +73,13 @@ GEGLU_TILES = (Tile(3, 128, 1, 2, overlap=True), Tile(3, 192), Tile(2, 256), Til
 # kernels are compiled for all the prompt lengths.
 TILES_FP8 = {
     (256, 3456, 1152): Tile(1, 112, cluster_m=2),
-    (256, 4304, 1152): Tile(2, 72),
+    (256, 4352, 1152): Tile(2, 72),
     (512, 3456, 1152): Tile(2, 112, cluster_m=2),
     (512, 1152, 1152): Tile(1, 96),
-    (512, 4304, 1152): Tile(2, 136, ring=5),
+    (512, 4352, 1152): Tile(2, 136, ring=5),
     (768, 3456, 1152): Tile(2, 160, cluster_m=2),
-    (768, 4304, 1152): Tile(3, 136),
-    (512, 1152, 4304): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
+    (768, 4352, 1152): Tile(3, 136),
+    (512, 1152, 4352): Tile(2, 96, cluster_m=2, cluster_n=2, splits=2, gather=True),
     (320, 2560, 2048): Tile(1, 112),
     (576, 2560, 2048): Tile(3, 64),
     (576, 2048, 2048): Tile(1, 160),

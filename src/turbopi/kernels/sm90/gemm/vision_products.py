@@ -76,7 +76,8 @@ class VisionProducts:
             else:
                 tile = bf16_tile(self._tiles, "residual", x, weight)
         if tile is None or bias is None:
-            return tuned_residual_linear(x, weight, bias, tiles=self._tiles)
+            ahead = None if bias is None else self._next(weight)
+            return tuned_residual_linear(x, weight, bias, ahead, tiles=self._tiles)
         return Product(x, weight, bias, tile)
 
     def residual_layer_norm(
@@ -118,7 +119,10 @@ class VisionProducts:
             if (made := self._normed(x, weight, bias, "bias", out)) is not None:
                 return made
             x = x.made()
-        return tuned_linear(x, weight, bias, out, tiles=self._tiles)
+        ahead = None if bias is None else self._next(weight)
+        if out is not None:  # as in `_normed`
+            ahead = None
+        return tuned_linear(x, weight, bias, out, ahead, tiles=self._tiles)
 
     def linear_gelu(
         self, x: Tensor | Normed | NormedCopy, weight: Matrix, bias: Tensor, inverse: float | None = None
