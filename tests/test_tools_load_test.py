@@ -307,12 +307,14 @@ def test_a_closed_loop_counts_what_was_answered_and_its_document_comes_out_as_it
 
 def test_the_robot_is_the_one_that_the_server_names() -> None:
     policy = Counting()
-    policy.metadata = {**policy.metadata, "robot": "libero", "numbers": np.arange(2), "none": float("nan")}
+    told = {"robot": "libero", "numbers": np.arange(2), "none": float("nan"), "tokenizer": "/home/ada/sp.model"}
+    policy.metadata = {**policy.metadata, **told}
     quick = {**QUICK, "robot": None}
     with running(policy) as server:
         document = run(Wanted(url=server.url, arrivals="fixed", rate=2.0, **quick), [])  # type: ignore[arg-type]
     assert document.load.robot == "libero" and document.answered == 2
     assert document.server["numbers"] == [0, 1] and document.server["none"] is None
+    assert document.server["tokenizer"] == "sp.model"
 
 
 def test_without_a_robot_or_a_server_it_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:

@@ -185,7 +185,7 @@ def run(wanted: Wanted, command: Sequence[str]) -> LoadDocument:
         provenance=where,
         command=list(command),
         load=load,
-        server=_plain(server),
+        server=_without_folders(_plain(server)),
         clients=clients,
         **fields,  # type: ignore[arg-type]
     )
@@ -218,6 +218,12 @@ def _device(url: str, server: Mapping[str, Any]) -> torch.device:
     device = str(server.get("device", "cpu"))
     here = url.partition("//")[2].rpartition(":")[0] in LOOPBACK
     return torch.device(device if here and device.startswith("cuda") and torch.cuda.is_available() else "cpu")
+
+
+def _without_folders(server: dict[str, Any]) -> dict[str, Any]:
+    """Its tokenizer by its file's name: where that lies on the server's machine is nobody else's business."""
+    tokenizer = server.get("tokenizer")
+    return server | {"tokenizer": Path(tokenizer).name} if isinstance(tokenizer, str) else server
 
 
 def _plain(value: Any) -> Any:
