@@ -107,7 +107,7 @@ def test_hidden_columns_of_vision_fill_whole_lines_of_memory(format: Format, mon
         assert torch.equal(cast(ScaledMatrix, fc1).dequantized()[112:], torch.zeros(16, 64))
     for weights in (narrow, as_it_was):
         assert all(layer.fc2[0].shape == (64, 112) for layer in weights.vision)
-    assert torch.equal(vision_of(whole), vision_of(as_it_was))
+    assert relative(vision_of(whole), vision_of(as_it_was)) < 1e-3  # a sum's last bit may round a number another way
 
 
 def pack_with_hidden(hidden: int, rounded_kinds: tuple[str, ...], format: Format) -> Weights:

@@ -20,6 +20,7 @@ from turbopi.engine.weights import modulation, pack
 from turbopi.kernels.interface import Ops, Segments
 from turbopi.kernels.plain import PLAIN
 from turbopi.kernels.plain_batch import PLAIN_BATCH
+from turbopi.kernels.tile_table import Kernels
 from turbopi.tune import shapes
 from turbopi.tune.shapes import Call, calls, distinct, operations
 
@@ -123,6 +124,18 @@ def test_a_batchs_operations(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> Non
     prefix.run()
     loop.run()
     assert ran == counted(kind, Call(cameras, slots, batch), monkeypatch)
+
+
+@pytest.mark.parametrize("kernels", ["hopper", "portable"])
+def test_vision_in_eight_bits_has_hidden_columns_in_whole_lines(kernels: Kernels) -> None:
+    """As `engine.weights` packs them."""
+    hidden = {}
+    precisions: tuple[shapes.Precision, ...] = ("bf16", "fp8")
+    for precision in precisions:
+        found = {one.name: one for one in shapes.operations(FULL, Call(2, 48), precision, kernels)}
+        if precision == "fp8" or kernels == "hopper":  # else the library's
+            hidden[precision] = found["vision fc1"].columns, found["vision fc2"].inner
+    assert hidden.pop("fp8") == (4352, 4352) and set(hidden.values()) <= {(4304, 4304)}
 
 
 def test_on_hopper_the_same_products_have_its_names() -> None:

@@ -252,7 +252,8 @@ def test_hoppers_products_take_measured_tiles_before_their_own_tables() -> None:
     assert products.chosen(NO_TILES, "residual", *shape) == hopper_tiles.RESIDUAL_TILES[shape] != tile
     assert products.chosen(table, "residual", *shape) == tile
     assert products.chosen_fp8(table, "residual", *shape, 132) == tile
-    assert products.chosen_fp8(NO_TILES, "residual", 2048, 1152, 4304, 132) is None
+    assert products.chosen_fp8(NO_TILES, "residual", 2048, 1152, 4352, 132) is None
+    assert products.chosen_fp8(NO_TILES, "residual", 512, 1152, 4352, 132) is not None
     by_library = TileTable({TileKey("hopper", "bias", "bf16", 512, 3456, 1152): {LIBRARY: 1}})
     assert products.chosen(by_library, "bias", 512, 3456, 1152) is None
     in_parts = TileTable({TileKey("hopper", "parts", "bf16", 576, 2048, 16384): {LIBRARY: 4}})

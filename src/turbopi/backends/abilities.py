@@ -16,7 +16,7 @@ class Abilities:
 
 
 class Held:
-    """The abilities of the backend that someone holds; `backend` tells it, and may tell another one next time."""
+    """The abilities of the backend that someone holds now: `backend` returns it, and later perhaps another one."""
 
     def __init__(self, backend: Callable[[], Backend]) -> None:
         self._backend, self._found = backend, Abilities(backend())

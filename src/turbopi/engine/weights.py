@@ -125,10 +125,10 @@ def _vision_layers(config: ModelConfig, take: _Tensors, make: MakeMatrix) -> Ite
 
 
 def _in_whole_lines(fc1: AffineMatrix, fc2: AffineMatrix) -> tuple[AffineMatrix, AffineMatrix]:
-    """Both as they are, or in eight bits with hidden columns of zeros up to whole lines of memory.
+    """Both as they are; if both are in eight bits, with hidden columns of zeros up to whole lines of memory.
 
-    Of SigLIP's 4,304 seven rows of eight begin inside a line: fc2 takes 1.05 to 1.4 times as long. GELU of 0 is 0, and
-    0 adds nothing.
+    With SigLIP's 4,304 hidden columns seven rows of fc2 in eight begin inside a line, and fc2 takes 1.05 to 1.4 times
+    as long. GELU of 0 is 0, and 0 adds nothing.
     """
     (first, bias), (second, last_bias) = fc1, fc2
     if not (isinstance(first, ScaledMatrix) and isinstance(second, ScaledMatrix)):

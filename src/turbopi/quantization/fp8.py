@@ -16,7 +16,7 @@ from torch import Tensor
 E4M3 = torch.float8_e4m3fn
 E4M3_MAX = 448.0
 ALIGNMENT = 16  # inner sizes and widths must be multiples of it: tensor cores and their loads take 16 bytes at once
-LINE = 128  # bytes of a line of a GPU's memory: of a row that begins inside one, as many bytes take two loads
+LINE = 128  # bytes of a line of a GPU's memory: where a row begins inside one, loading 128 of its bytes takes two lines
 
 
 def to_e4m3(x: Tensor, inverse: float | Tensor) -> Tensor:
@@ -75,7 +75,7 @@ class ScaledMatrix:
         return replace(self, data=self.data[rows], scale=self.scale[rows])
 
     def padded(self, rows: int, columns: int) -> "ScaledMatrix":
-        """With zeros behind its rows and columns, up to so many."""
+        """Padded with zeros to [rows, columns]; the scales of new rows are 1."""
         data, scale = self.data.new_zeros(rows, columns), self.scale.new_ones(rows)
         data[: self.shape[0], : self.shape[1]] = self.data
         scale[: self.shape[0]] = self.scale
@@ -96,7 +96,7 @@ Matrix = Tensor | ScaledMatrix
 
 
 def whole_lines(columns: int) -> int:
-    """So many numbers of eight bits, and what is missing to whole lines of memory."""
+    """`columns` of eight bits, rounded up to whole lines of memory."""
     return -(-columns // LINE) * LINE
 
 

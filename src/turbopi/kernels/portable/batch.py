@@ -1,7 +1,7 @@
 """Rows of several observations together: embedding them, and attention that keeps them apart.
 
 Twins: `kernels.plain_batch`. Logits, softmax and sums are float32; probabilities are rounded to the values' dtype for
-their product, as in the twins.
+their product, as in the twins. Where keys are split over blocks, each split's result is rounded to the queries' dtype.
 """
 
 from functools import partial
