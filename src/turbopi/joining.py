@@ -75,7 +75,7 @@ class Joining:
         """What `RunningChunk`s may ask of this policy."""
         if self._integration is not None and not self._integration.is_euler:
             return ()  # see `Conditioning`
-        able = self._forms()
+        able = self._held().forms
         trained = self._config.real_time.trained_max_delay > 0
         return tuple(mode for mode, form in FORMS.items() if form in able and (mode != "rtc_trained" or trained))
 
@@ -186,13 +186,8 @@ class Joining:
             asked.append((steps, horizon, one))
         return asked
 
-    def _forms(self) -> tuple[Form, ...]:
-        """`backends.forms` of the backend."""
-        conditions = self._held().conditions
-        return () if conditions is None else conditions.forms
-
     def _check_form(self, form: Form) -> None:
-        if form != "plain" and form not in self._forms():
+        if form != "plain" and form not in self._held().forms:
             backend = self._held().backend
             what = "guidance by the true Jacobian" if form == "jacobian" else "times, held actions or guidance by token"
             if form == "solver":

@@ -24,7 +24,6 @@ from turbopi.backends.base import (
 from turbopi.config import ModelConfig
 from turbopi.engine.graph import preparing
 from turbopi.errors import BackendUnavailable, ConfigError
-from turbopi.model.conditioning import Form
 from turbopi.quantization.calibration_file import Quantization
 from turbopi.quantization.plan import TIERS, format_of
 
@@ -43,7 +42,6 @@ __all__ = [
     "availability",
     "choose",
     "create",
-    "forms",
     "resolve_device",
 ]
 
@@ -219,11 +217,6 @@ def create(
     more = {} if quantization is None else {"quantization": quantization}
     with preparing(device):
         return _backend_class(name)(config, load, device=device, precision=precision, **more)
-
-
-def forms(backend: Backend) -> tuple[Form, ...]:
-    """What a backend's denoising loop can be asked for beside openpi's."""
-    return backend.forms if isinstance(backend, Conditions) else ()
 
 
 def precisions(name: str) -> tuple[Precision, ...]:

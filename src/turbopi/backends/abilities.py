@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from turbopi.backends.base import Backend, Begins, Conditions, RunsBatches
+from turbopi.model.conditioning import Form
 
 
 class Abilities:
@@ -13,6 +14,11 @@ class Abilities:
         self.begins = backend if isinstance(backend, Begins) else None
         self.runs_batches = backend if isinstance(backend, RunsBatches) else None
         self.conditions = backend if isinstance(backend, Conditions) else None
+
+    @property
+    def forms(self) -> tuple[Form, ...]:
+        """What the denoising loop can be asked for beside openpi's."""
+        return () if self.conditions is None else self.conditions.forms
 
 
 class Held:
