@@ -23,7 +23,7 @@ from turbopi.kernels.interface import Segments
 from turbopi.kernels.sm90.attention import kernel as attention
 from turbopi.kernels.sm90.attention import suffix
 from turbopi.kernels.sm90.attention.kernel import AttentionTile
-from turbopi.kernels.sm90.attention.suffix_tile import SuffixTile
+from turbopi.kernels.sm90.attention.suffix_tile import FewTile, SuffixTile
 from turbopi.quantization.fp8 import E4M3
 
 pytestmark = pytest.mark.skipif(emulate.COMPILER is None, reason="no g++ here")
@@ -119,9 +119,17 @@ def test_packed(machine: Machine) -> None:
         (SuffixTile(64, 72, 1, 16), [33], 18),  # two warpgroups
         (SuffixTile(128, 24, 2, 32), [50], 11),  # two clusters an observation, the second one not full
         (SuffixTile(192, 24, 8, 16), [150], 6),  # 24 columns a rank
+        (FewTile(64, 40, 2, 80, 2), [40, 0, 5], 10),
+        (FewTile(64, 40, 4, 80, 2), [330, 7], 10),  # two tiles of keys a rank
+        (FewTile(64, 40, 8, 80, 4), [6], 10),  # ranks without keys; warpgroups without columns
+        (FewTile(128, 24, 2, 64, 4), [50], 11),  # two clusters an observation, the second one not full
+        (FewTile(192, 72, 2, 80, 4), [50], 18),  # two blocks of rows
+        (FewTile(256, 40, 6, 80, 2), [150], 20),  # of the suffix's keys more than are loaded beside queries
     ],
 )
-def test_suffix(machine: Machine, tile: SuffixTile, lengths: list[int], tokens: int, state_token: bool) -> None:
+def test_suffix(
+    machine: Machine, tile: SuffixTile | FewTile, lengths: list[int], tokens: int, state_token: bool
+) -> None:
     """NaN beyond an observation's rows, and in another observation's, never counts."""
     heads, batch, rows = 4, len(lengths), sum(lengths)
     qkv = random(batch * tokens, (heads + 2) * tile.dim)
@@ -142,8 +150,9 @@ def test_suffix(machine: Machine, tile: SuffixTile, lengths: list[int], tokens: 
             assert_close(ours[2 * tokens :], exact[2 * tokens :])
 
 
-def test_nan_in_a_token_shows_in_its_row_alone(machine: Machine) -> None:
-    heads, tokens, tile = 4, 10, SuffixTile(64, 40, 4, 16)
+@pytest.mark.parametrize("tile", [SuffixTile(64, 40, 4, 16), FewTile(64, 40, 4, 48, 2)])
+def test_nan_in_a_token_shows_in_its_row_alone(machine: Machine, tile: SuffixTile | FewTile) -> None:
+    heads, tokens = 4, 10
     qkv, cache = random(tokens, (heads + 2) * tile.dim), random(90, tile.dim, seed=1)
     qkv[2, tile.dim + 5] = torch.nan  # of its second head's query
     angles = torch.ones(tokens, tile.dim // 2)
@@ -166,10 +175,11 @@ def test_where_no_cluster_fits_it_is_asked_once(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(suffix, "DependentKernel", no_room)
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
     for _ in range(2):
+        tile = suffix.chosen_tile(64, 40, 3, 100, False, torch.device("meta"))
         with pytest.raises(BackendUnavailable, match="no room for one"):
-            suffix.chosen_tile(64, 40, 3, 100, False, torch.device("meta"))
+            suffix._kernel(tile, False, torch.device("meta"))
     suffix._kernel_or_why_not.cache_clear()
-    assert asked == [8, 4, 2, 1]
+    assert asked == [8, 6, 8, 6, 8, 4, 2, 1], "of two warpgroups, of four, of suffix.cu"
 
 
 def test_what_leaves_in_fp8_is_scaled(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,9 +196,10 @@ def test_what_leaves_in_fp8_is_scaled(machine: Machine, monkeypatch: pytest.Monk
     angles = torch.rand(tokens, 32, generator=torch.Generator().manual_seed(3))
     starts, sizes = torch.tensor([0, length], dtype=torch.int32), torch.tensor([length, 0], dtype=torch.int32)
     given = (qkv, angles.cos(), angles.sin(), cache, cache, starts, sizes, heads)
-    ours = suffix.suffix_attention(*given, inverse=30.0, tile=SuffixTile(64, 40, 2, 32))
-    assert ours.dtype == E4M3
-    torch.testing.assert_close(ours.float(), 30 * plain_batch.suffix_attention(*given).float(), atol=0.1, rtol=0.07)
+    for tile in (SuffixTile(64, 40, 2, 32), FewTile(64, 40, 2, 48, 2)):
+        ours = suffix.suffix_attention(*given, inverse=30.0, tile=tile)
+        assert ours.dtype == E4M3
+        torch.testing.assert_close(ours.float(), 30 * plain_batch.suffix_attention(*given).float(), atol=0.1, rtol=0.07)
 
 
 @pytest.mark.skipif(machine_code.compiler() is None, reason="no NVRTC here")

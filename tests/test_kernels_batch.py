@@ -3,6 +3,7 @@
 In float32 through Triton's interpreter, or on a GPU in bfloat16: see test_kernels_ops.py.
 """
 
+import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -23,7 +24,7 @@ from turbopi.kernels.portable import batch as portable_batch  # noqa: E402
 from turbopi.kernels.portable import batch_steps, norms  # noqa: E402
 from turbopi.kernels.sm90.attention import kernel as attention  # noqa: E402
 from turbopi.kernels.sm90.attention import suffix  # noqa: E402
-from turbopi.kernels.sm90.attention.suffix_tile import KEYS, RANKS, SuffixTile  # noqa: E402
+from turbopi.kernels.sm90.attention.suffix_tile import KEYS, RANKS, FewTile, SuffixTile  # noqa: E402
 from turbopi.quantization.fp8 import E4M3  # noqa: E402
 
 DEVICE = torch.device("cuda" if ON_GPU else "cpu")
@@ -132,11 +133,25 @@ def test_suffix_attention_on_hopper(lengths: list[int], heads: int, dim: int, to
 
 
 @on_hopper
-@pytest.mark.parametrize("ranks", RANKS)
-@pytest.mark.parametrize("keys", KEYS)
-def test_suffix_attention_on_hopper_in_clusters_of_any_size(ranks: int, keys: int) -> None:
-    tile = SuffixTile(256, 80, ranks, keys)
-    check_suffix(partial(suffix.suffix_attention, tile=tile), [560, 0, 547], 10, False, 8, 256)
+@pytest.mark.parametrize("state_token", [False, True])
+@pytest.mark.parametrize(
+    "tile",
+    [
+        *(SuffixTile(256, 80, ranks, keys) for ranks, keys in itertools.product(RANKS, KEYS)),
+        *(FewTile(256, 40, ranks, keys, 2) for ranks, keys in ((8, 80), (6, 96), (6, 64), (6, 144), (1, 80))),
+        *(FewTile(256, 80, ranks, keys, 4) for ranks, keys in ((8, 80), (6, 96), (6, 144), (3, 96))),
+    ],
+    ids=str,
+)
+def test_suffix_attention_on_hopper_in_clusters_of_any_size(tile: SuffixTile | FewTile, state_token: bool) -> None:
+    check_suffix(partial(suffix.suffix_attention, tile=tile), [560, 0, 547], 10, state_token, 8, 256)
+
+
+@on_hopper
+@pytest.mark.parametrize("dim", [64, 128, 192])
+def test_suffix_attention_of_many_queries_on_hopper_of_other_heads(dim: int) -> None:
+    tile = SuffixTile(dim, 104, 2, 64)
+    check_suffix(partial(suffix.suffix_attention, tile=tile), [300, 0, 129], 51, True, 8, dim)
 
 
 @on_hopper
@@ -166,7 +181,7 @@ def check_suffix(
     starts, sizes, batch = (sizes.cumsum(0) - sizes).int().to(DEVICE), sizes.to(DEVICE), len(lengths)
     prefix_k, prefix_v = random(sum(lengths) + 400, dim), random(sum(lengths) + 400, dim, seed=1)
     prefix_k[sum(lengths) :] = prefix_v[sum(lengths) :] = torch.nan
-    qkv, turn = random(batch * tokens, (heads + 2) * dim, seed=2), angles(batch * tokens, dim)
+    turn, qkv = angles(batch * tokens, dim), random(batch * tokens, (heads + 2) * dim, seed=2)
     given = (qkv, *turn, prefix_k, prefix_v, starts, sizes, heads, state_token)
     ours = attend(*given)
     torch.testing.assert_close(ours, plain_batch.suffix_attention(*given), atol=TOLERANCE, rtol=TOLERANCE)

@@ -20,8 +20,8 @@ pytest.importorskip("triton", reason="Triton isn't installed")
 from turbopi.errors import BackendUnavailable
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.attention import kernel as attention_hopper
-from turbopi.kernels.sm90.attention import suffix
-from turbopi.kernels.sm90.attention.suffix_tile import SuffixTile
+from turbopi.kernels.sm90.attention import suffix, suffix_tile
+from turbopi.kernels.sm90.attention.suffix_tile import FewTile, SuffixTile
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise.packing import RANKS, PackedExpert, Tables
 from turbopi.kernels.sm90.gemm import bf16 as gemm
@@ -86,7 +86,7 @@ class Launched:
     """Stands for a compiled kernel on an H200; keeps what it was launched with."""
 
     def __init__(self, cluster: int) -> None:
-        self.max_clusters = {1: 132, 2: 66, 4: 30, 8: 15}[cluster]
+        self.max_clusters = {1: 132, 2: 66, 4: 30, 6: 17, 8: 15}[cluster]
         self.blocks = 0
         self.given: dict[str, Any] = {}
 
@@ -96,6 +96,11 @@ class Launched:
 
 def on_meta(*shape: int, dtype: torch.dtype = torch.bfloat16) -> Tensor:
     return torch.empty(*shape, dtype=dtype, device="meta")
+
+
+@pytest.fixture(autouse=True)
+def h200(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instructions, "multiprocessors", lambda device: H200_SMS)
 
 
 @pytest.fixture
@@ -171,7 +176,36 @@ def test_loads_fill_a_tile_and_its_stages_fit_into_shared_memory(
     factors = 8 * tile.warpgroups * tile.columns if fp8 else 0
     lines = tile.warpgroups * 4 * 16 * 128 if epilogue == "parts" else 0
     assert sizes["TP_STAGES"] >= 3
-    assert 1024 + stages + barriers + factors + lines <= instructions.SHARED_BYTES == 227 * 1024
+    assert 1024 + stages + barriers + factors + lines <= sizes["TP_SHARED_BYTES"] <= instructions.SHARED_BYTES
+    assert instructions.SHARED_BYTES == 227 * 1024
+
+
+def test_one_tile_of_few_steps_leaves_the_rest_of_shared_memory_to_the_next_kernel() -> None:
+    """Rows of a batch's suffixes, and twice as many tiles; what needs all registers keeps its ring."""
+    tile = Tile(1, 64, splits=4)
+    alone = gemm.fitted(tile, (2, 16), 16, GPU)
+    assert alone == dataclasses.replace(tile, ring=4) and gemm.fitted(tile, (4, 16), 16, GPU) == tile
+    assert gemm.fitted(Tile(2, 64), (1, 16), 4, GPU) == Tile(2, 64), "no CTA fits beside two warpgroups' registers"
+    gathered = Tile(1, 64, splits=4, gather=True)
+    assert gemm.fitted(gathered, (1, 4), 16, GPU) == gathered, "sums are gathered where operands were"
+    needed = [gemm_fp8.constants(one, "parts", False, 0)["TP_SHARED_BYTES"] for one in (tile, alone)]
+    assert needed[1] < needed[0] <= instructions.SHARED_BYTES
+    assert (
+        gemm.constants(tile, "parts")["TP_LEAVES_ROOM"] == 1
+        and gemm.constants(Tile(2, 64), "parts")["TP_LEAVES_ROOM"] == 0
+    )
+    assert gemm_fp8.constants(tile, "bias", False, 4, residual=True)["TP_LEAVES_ROOM"] == 0, (
+        "sums twice beside a stream"
+    )
+
+
+def test_a_halved_tile_fits_a_multiprocessor_twice() -> None:
+    for columns, lines in ((72, False), (128, True)):
+        tile = Tile(1, columns).halved(factors=1, lines=lines)
+        bytes_of = [
+            one.shared_bytes(factors=1, lines=lines) for one in (tile, dataclasses.replace(tile, ring=tile.ring + 1))
+        ]
+        assert bytes_of[0] <= gemm.HALF_SHARED_BYTES < bytes_of[1]
 
 
 def test_what_is_fetched_ahead_is_shared_out_and_never_reaches_beyond_the_matrix(
@@ -205,7 +239,6 @@ def test_visions_attention_has_a_unit_for_so_many_queries_of_a_head_of_a_picture
         return kernel
 
     monkeypatch.setattr(attention_hopper, "_kernel", compiled)
-    monkeypatch.setattr(attention_hopper, "_multiprocessors", lambda device: 132)
     attention_hopper.vision_attention(on_meta(images * tokens, 3 * heads * dim), images, heads)
     given, (tile,) = kernel.given, tiles
     assert tile.rows == rows and tile.wide == (rows > 64) and tile.stages >= 2
@@ -223,22 +256,24 @@ def test_visions_attention_has_a_unit_for_so_many_queries_of_a_head_of_a_picture
 @pytest.mark.parametrize(
     ("batch", "tokens", "tile"),
     [
-        (8, 10, SuffixTile(256, 80, 8, 80)),
-        (16, 10, SuffixTile(256, 80, 4, 80)),  # of clusters of eight there is no room for sixteen
+        (1, 1, FewTile(256, 8, 8, 80, 2)),
+        (4, 10, FewTile(256, 40, 8, 80, 2)),
+        (8, 10, FewTile(256, 40, 6, 96, 2)),  # of clusters of eight there is no room for sixteen
+        (16, 10, FewTile(256, 80, 6, 96, 4)),
+        (4, 50, FewTile(256, 104, 6, 112, 4)),
         (8, 50, SuffixTile(256, 104, 2, 64)),
         (64, 50, SuffixTile(256, 104, 1, 64)),
-        (8, 1, SuffixTile(256, 8, 8, 80)),
     ],
 )
 def test_a_suffixs_clusters_are_as_large_as_all_of_them_fit(
-    batch: int, tokens: int, tile: SuffixTile, maps: None, monkeypatch: pytest.MonkeyPatch
+    batch: int, tokens: int, tile: SuffixTile | FewTile, maps: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made: dict[SuffixTile, Launched] = {}
+    made: dict[SuffixTile | FewTile, Launched] = {}
 
-    def compiled(one: SuffixTile, *rest: Any) -> Launched:
+    def compiled(one: SuffixTile | FewTile, *rest: Any) -> Launched:
         return made.setdefault(one, Launched(one.ranks))
 
-    monkeypatch.setattr(suffix, "_kernel", compiled)
+    monkeypatch.setattr(suffix, "_kernel_or_why_not", compiled)
     heads, dim, prefix = 8, 256, 560 * batch
     qkv, angles = on_meta(batch * tokens, (heads + 2) * dim), on_meta(batch * tokens, dim // 2, dtype=torch.float32)
     cache, segments = on_meta(prefix, dim), on_meta(batch + 1, dtype=torch.int32)
@@ -248,16 +283,28 @@ def test_a_suffixs_clusters_are_as_large_as_all_of_them_fit(
     assert (kernel.given["tiles"] - 1) * tile.rows < tokens * heads <= kernel.given["tiles"] * tile.rows
     assert kernel.given["map_k"].sizes == (dim, 1, prefix) and kernel.given["map_k"].box == (64, 1, tile.keys)
     assert tile.stages >= 2 and {one.name for one in suffix.PARAMETERS.all} == kernel.given.keys()
+    assert tile.shared_bytes <= instructions.SHARED_BYTES
 
 
 def test_where_no_cluster_of_eight_fits_smaller_ones_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    def compiled(one: SuffixTile, *rest: Any) -> Launched:
-        if one.ranks > 2:
-            raise BackendUnavailable("no room for one")
-        return Launched(one.ranks)
+    def compiled(one: SuffixTile | FewTile, *rest: Any) -> Launched | BackendUnavailable:
+        return BackendUnavailable("no room for one") if one.ranks > 2 else Launched(one.ranks)
 
-    monkeypatch.setattr(suffix, "_kernel", compiled)
+    monkeypatch.setattr(suffix, "_kernel_or_why_not", compiled)
     assert suffix.chosen_tile(256, 80, 16, 570, False, torch.device("meta")).ranks == 2
+
+
+@pytest.mark.parametrize("dim", [64, 128, 192, 256])
+def test_every_suffix_has_tiles_that_fit(dim: int) -> None:
+    """Whatever its rows, its prefix and the batch: the last one has clusters of one CTA."""
+    for rows, batch, keys in itertools.product((8, 40, 80, 104, 128, 136, 408), (1, 4, 16), (1, 57, 570, 978, 3000)):
+        tiles = [tile for tile, _ in suffix_tile.tiles(dim, rows, batch, keys)]
+        assert tiles[-1].ranks == 1
+        for tile in tiles:
+            assert tile.shared_bytes <= instructions.SHARED_BYTES and tile.rows % 8 == 0 and tile.stages >= 2
+            if isinstance(tile, FewTile):
+                assert tile.keys % 16 == 0 and tile.sent_rows <= tile.keys, "what is sent lies where keys were"
+                assert tile.members * tile.part >= tile.keys and tile.members * tile.columns >= dim
 
 
 # ---- the denoising kernel: what its launch is given, read back as the GPU reads it

@@ -58,7 +58,7 @@ def told(tower: Tower, monkeypatch: pytest.MonkeyPatch) -> Told:
 
     for name in ("tuned_linear", "tuned_residual_linear", "tuned_linear_gelu"):
         monkeypatch.setattr(vision_products, name, product)
-    monkeypatch.setattr(vision_products, "num_sms", lambda device: 132)
+    monkeypatch.setattr(vision_products, "multiprocessors", lambda device: 132)
     return told
 
 

@@ -16,7 +16,7 @@ from turbopi.errors import BackendError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.sm90.attention import kernel as attention
 from turbopi.kernels.sm90.attention import suffix
-from turbopi.kernels.sm90.attention.suffix_tile import SuffixTile
+from turbopi.kernels.sm90.attention.suffix_tile import FewTile, SuffixTile
 from turbopi.kernels.sm90.denoise import kernel as denoise
 from turbopi.kernels.sm90.denoise.packing import Arrangement
 from turbopi.kernels.sm90.gemm import bf16, fp8
@@ -71,7 +71,7 @@ def _attention(tile: attention.AttentionTile, whole: bool, folder: Path | None, 
     return nvrtc.compile_cubin(attention.source(tile), ARCH, sizes, folder=folder)
 
 
-def _suffixes(tile: SuffixTile, in_fp8: bool, folder: Path | None) -> bytes:
+def _suffixes(tile: SuffixTile | FewTile, in_fp8: bool, folder: Path | None) -> bytes:
     return nvrtc.compile_cubin(suffix.source(tile), ARCH, suffix.constants(tile, in_fp8), folder=folder)
 
 
@@ -106,6 +106,8 @@ SHAPES: dict[str, Callable[[Path | None], bytes]] = {
     ),
     "prefixes' attention": partial(_attention, attention.AttentionTile(256, 80, wide=True), False, packed=True),
     "suffixes' attention, fp8": partial(_suffixes, SuffixTile(256, 80, 4, 80), True),
+    "suffixes' attention in few clusters, fp8": partial(_suffixes, FewTile(256, 40, 6, 96, 2), True),
+    "suffixes' attention in few clusters, bf16": partial(_suffixes, FewTile(256, 80, 6, 96, 4), False),
 }
 
 

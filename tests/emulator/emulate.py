@@ -30,7 +30,9 @@ INSTRUCTIONS = (
     *(("mbarrier.init", "mbarrier_init"), ("mbarrier.arrive.expect_tx", "mbarrier_expect")),
     *(("mbarrier.arrive.shared::cluster", "mbarrier_arrive_remote"), ("mbarrier.arrive", "mbarrier_arrive")),
     *(("mbarrier.try_wait.parity", "mbarrier_wait"), ("mbarrier.test_wait.parity", "mbarrier_test")),
-    *(("barrier.cluster.arrive", "cluster_sync"), ("bar.sync", "bar_sync"), ("mapa.", "mapa")),
+    *(("mapa.", "mapa"), ("bar.sync", "bar_sync")),
+    *(("cluster.arrive.relaxed;\\nbarrier.cluster.wait", "cluster_sync"), ("cluster.arrive.relaxed", "cluster_arrive")),
+    *(("cluster.arrive", "cluster_sync"), ("cluster.wait", "cluster_wait")),
     *(("st.async", "st_async"), ("rcp.approx", "rcp"), ("tanh.approx", "tanh")),
     *(("wgmma.commit_group", "wgmma_commit"), ("wgmma.wait_group", "wgmma_wait")),
     *(("fma.rn.bf16x2", "fma_bf16x2"), ("cvt.rn.f16x2.e4m3x2", "cvt_e4m3_halves"), ("cvt.rn.bf16x2", "cvt_bf16x2")),
@@ -42,6 +44,7 @@ INSTRUCTIONS = (
     ("m8n8.x4.trans.shared.b16", "ldmatrix_transposed"),
     *(("cp.async.bulk.tensor.2d", "copy_2d"), ("complete_tx::bytes.L2::cache_hint", "copy_bytes")),
     *(("cp.async.bulk.tensor.3d", "copy_3d"), ("ex2.approx", "ex2"), ("st.shared.v4.u32", "store_four")),
+    ("st.shared.u32", "store_one"),
 )
 # No effect on what is computed here: kernels run one by one, registers are plenty, and copies are seen at once.
 IGNORED = ("griddepcontrol", "setmaxnreg", "prefetch", "createpolicy", "fence")
@@ -220,6 +223,7 @@ class Machine:
             patch.setattr(module, "DependentKernel", kernel)
         patch.setattr(instructions, "wgmma", wgmma)
         patch.setattr(instructions, "tensor_map", tensor_map)
+        patch.setattr(instructions, "multiprocessors", lambda device: 2)
         patch.setattr(torch.cuda, "device", lambda device: nullcontext())
 
     def __call__(self, seed: int) -> None:

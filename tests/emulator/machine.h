@@ -88,6 +88,7 @@ struct Thread {
     std::unique_ptr<char[]> stack;
     Dim index, block;
     int rank, shuffles = 0, committed = 0, done = 0;  // groups of products
+    unsigned cluster_use = 0;  // of the cluster's barrier that it arrived at
     std::vector<Pending> pending;
     bool ended = false;
 };
@@ -120,9 +121,13 @@ inline void wait_until(const std::function<bool()>& over) {
     while (!over());
     ++moved;
 }
-inline void meet(Barrier& b, int count) {
+inline unsigned arrive_at(Barrier& b, int count) {  // which use of the barrier that was
     const unsigned use = b.uses;
     if (++b.arrived == count) b.arrived = 0, ++b.uses, ++moved;
+    return use;
+}
+inline void meet(Barrier& b, int count) {
+    const unsigned use = arrive_at(b, count);
     wait_until([&] { return b.uses != use; });
 }
 
@@ -410,6 +415,12 @@ inline void ptx_mbarrier_test(unsigned& over, unsigned bar, unsigned parity) {
     over = machine::barrier(bar).phase != parity;
 }
 inline void ptx_cluster_sync() { machine::meet(machine::barriers[-1], machine::ranks * machine::cta_threads); }
+inline void ptx_cluster_arrive() {
+    machine::now->cluster_use = machine::arrive_at(machine::barriers[-1], machine::ranks * machine::cta_threads);
+}
+inline void ptx_cluster_wait() {
+    machine::wait_until([use = machine::now->cluster_use] { return machine::barriers[-1].uses != use; });
+}
 inline void ptx_bar_sync(int number, int count) { machine::meet(machine::barriers[machine::now->rank * 16 + number], count); }
 inline void ptx_mapa(unsigned& there, unsigned address, int rank) {
     there = (address & ((1u << machine::PLACE) - 1)) | rank << machine::PLACE;
@@ -430,6 +441,7 @@ inline void ptx_store_four(unsigned to, unsigned x, unsigned y, unsigned z, unsi
     memcpy(machine::at(to), all, 16);
 }
 inline void ptx_store_four(unsigned to, unsigned v) { ptx_store_four(to, v, v, v, v); }
+inline void ptx_store_one(unsigned to, unsigned v) { memcpy(machine::at(to), &v, 4); }
 inline void ptx_wgmma_commit() { machine::commit(); }
 inline void ptx_wgmma_wait(int left) { machine::await(left); }
 inline void ptx_cvt_bf16x2(unsigned& both, float high, float low) {

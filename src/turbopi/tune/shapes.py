@@ -179,7 +179,7 @@ def _expert(
     yield replace(normed, name="expert qkv")
     attention = replace(usual, kernels="portable", operation="suffix_attention", numbers="bf16", out_fp8=fp8)
     prefix = call.cameras * config.vision.num_tokens + call.prompt_tokens
-    if kernels == "portable" or not takes(g.head_dim, rows * g.num_heads):
+    if kernels == "portable" or not takes(g.head_dim):
         yield replace(attention, name="expert attention", columns=g.num_heads, inner=g.head_dim, prefix_rows=prefix)
     yield replace(usual, name="expert out", operation="parts", columns=width, inner=heads, norm_behind="rms")
     yield replace(normed, name="expert gate, up", operation="geglu", columns=g.mlp_dim, out_fp8=fp8)

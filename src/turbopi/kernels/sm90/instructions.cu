@@ -40,6 +40,12 @@ __device__ __forceinline__ bool barrier_over(u32 bar, u32 parity) {
 __device__ __forceinline__ void cluster_sync() {
     asm volatile("barrier.cluster.arrive.relaxed;\nbarrier.cluster.wait;" ::: "memory");
 }
+__device__ __forceinline__ void cluster_arrive() {  // the first half of `cluster_sync`
+    asm volatile("barrier.cluster.arrive.relaxed;" ::: "memory");
+}
+__device__ __forceinline__ void cluster_wait() {  // the second
+    asm volatile("barrier.cluster.wait;" ::: "memory");
+}
 __device__ __forceinline__ void cluster_exchange() {  // what was stored before it in others' memory is there after it
     asm volatile("barrier.cluster.arrive.release;\nbarrier.cluster.wait.acquire;" ::: "memory");
 }

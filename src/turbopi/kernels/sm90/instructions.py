@@ -60,6 +60,11 @@ class DependentKernel(Kernel):
         return config
 
 
+@lru_cache
+def multiprocessors(device: torch.device) -> int:
+    return torch.cuda.get_device_properties(device).multi_processor_count
+
+
 def source(*names: str, generated: str, folder: Path | None = None) -> str:
     """A kernel's source: instructions.cu, what is `generated` (instructions, parameters), and those files."""
     here = folder or files("turbopi.kernels.sm90")

@@ -13,6 +13,7 @@ from turbopi.kernels.portable import attention as portable_attention
 from turbopi.kernels.portable import batch as portable_batch
 from turbopi.kernels.portable.ops import attend as attend_portably
 from turbopi.kernels.portable.ops import portable_ops
+from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.attention import kernel as attention
 from turbopi.kernels.sm90.attention import suffix, suffix_tile
 from turbopi.kernels.sm90.gemm import products
@@ -36,7 +37,7 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
         "the expert with a way back": vjp.ORIGIN,
         "vision and prefix attention": "CUDA; Triton where head_dim isn't a multiple of 8 from 16 to 256",
     }
-    if products.num_sms(device) >= GATHERING_SMS:
+    if instructions.multiprocessors(device) >= GATHERING_SMS:
         origin["LayerNorm"] = f"most in the products around them for {_rows(RESIDUAL_TILES)} rows, else Triton"
     return replace(
         portable,
@@ -52,8 +53,7 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
             batch,
             packed_attention=partial(packed_attention, tiles=tiles),
             suffix_attention=partial(suffix_attention, tiles=tiles),
-            origin=f"CUDA; Triton for suffixes of fewer than {suffix_tile.LEAST_QUERIES} queries, or where head_dim "
-            "isn't 64, 128, 192 or 256",
+            origin="CUDA; Triton for suffixes where head_dim isn't 64, 128, 192 or 256",
         ),
         origin={**portable.origin, **origin},
     )
@@ -115,6 +115,6 @@ def suffix_attention(
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     given = (qkv, cos, sin, prefix_k, prefix_v, starts, lengths, heads, state_token, inverse)
-    if suffix_tile.takes(prefix_k.shape[1], len(qkv) * heads):
+    if suffix_tile.takes(prefix_k.shape[1]):
         return suffix.suffix_attention(*given)
     return portable_batch.suffix_attention(*given, tiles=tiles)

@@ -130,7 +130,7 @@ def vision_attention(
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     tokens, dim = rows // images, width // heads
     out = qkv.new_empty(rows, width, dtype=result_dtype(qkv, inverse))
-    tile = tile or _vision_tile(tokens, dim, images * heads, _multiprocessors(qkv.device))
+    tile = tile or _vision_tile(tokens, dim, images * heads, instructions.multiprocessors(qkv.device))
     places = (3 * heads,) * 3
     _launch(tile, (qkv,) * 3, places, (0, heads, 2 * heads), out, None, tokens, tokens, images * heads, inverse)
     return out
@@ -221,11 +221,6 @@ def source(tile: AttentionTile) -> str:
     parameters = f"#define ATTENTION_PARAMETERS {PARAMETERS.declarations}"
     files = [f"attention/{name}.cu" for name in ("common", "wide" if tile.wide else "narrow")]
     return instructions.source(*files, generated=f"{logits}\n{values}\n{parameters}\n")
-
-
-@cache
-def _multiprocessors(device: torch.device) -> int:
-    return torch.cuda.get_device_properties(device).multi_processor_count
 
 
 @cache

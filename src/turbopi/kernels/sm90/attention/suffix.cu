@@ -7,50 +7,12 @@
 // them of the suffix's own. Then each rank gets from all ranks what they have of its DIM / TP_RANKS columns, every row
 // over its total and in bfloat16, with the row's largest logit and total, and adds them up.
 
-constexpr int ROWS = TP_ROWS, RANKS = TP_RANKS, COLUMNS = DIM / RANKS, HALF = DIM / 2;
+constexpr int COLUMNS = DIM / RANKS;
 constexpr int Q_PANEL = ROWS * ROW_BYTES, Q_BYTES = PANELS * Q_PANEL;  // a warpgroup may read beyond them: rows of nobody
 constexpr int MAIL_BYTES = RANKS * ROWS * COLUMNS * 2, ENDS_BYTES = RANKS * ROWS * 8;
 static_assert(WGS <= 2 && ROWS % 8 == 0 && 64 * (WGS - 1) < ROWS && ROWS <= 64 * WGS, "rows of so many warpgroups");
 static_assert(DIM % 64 == 0 && COLUMNS % 8 == 0 && RANKS <= 8, "16 bytes of a row go to one rank");
 static_assert(STAGES >= 2, "a tile of keys and one of values");
-
-// An operand's 16 bytes of row `row` from column `column` on; its panels of 64 columns lie `panel` bytes apart.
-__device__ __forceinline__ u32 place_of(u32 operand, int panel, int row, int column) {
-    return operand + column / 64 * panel + row * ROW_BYTES + ((column % 64 / 8) ^ (row % 8)) * 16;
-}
-__device__ __forceinline__ void put(u32 to, uint4 v) {
-    asm volatile("st.shared.v4.u32 [%0], {%1, %2, %3, %4};" ::"r"(to), "r"(v.x), "r"(v.y), "r"(v.z), "r"(v.w) : "memory");
-}
-__device__ __forceinline__ void send_end(u32 to, float top, float total, u32 bar) {
-    asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v2.b32 [%0], {%1, %2}, [%3];"
-                 ::"r"(to), "r"(__float_as_uint(top)), "r"(__float_as_uint(total)), "r"(bar) : "memory");
-}
-// Columns 8 c to 8 c + 7 of a head and those HALF further, with their angles: loaded, and after RoPE in an operand's row.
-struct Turn {
-    uint4 low, high;
-    float4 cosines[2], sines[2];
-
-    __device__ __forceinline__ void load(const u16* head, const float* cos, const float* sin, int c) {
-        low = *(const uint4*)(head + 8 * c), high = *(const uint4*)(head + HALF + 8 * c);
-#pragma unroll
-        for (int i = 0; i < 2; ++i)
-            cosines[i] = *(const float4*)(cos + 8 * c + 4 * i), sines[i] = *(const float4*)(sin + 8 * c + 4 * i);
-    }
-    __device__ __forceinline__ void put_turned(u32 operand, int panel, int row, int c) const {
-        const u32 a[4] = {low.x, low.y, low.z, low.w}, b[4] = {high.x, high.y, high.z, high.w};
-        u32 first[4], second[4];
-#pragma unroll
-        for (int i = 0; i < 4; ++i) {
-            const float4 cs = cosines[i / 2], sn = sines[i / 2];
-            const float c0 = i % 2 ? cs.z : cs.x, c1 = i % 2 ? cs.w : cs.y, s0 = i % 2 ? sn.z : sn.x, s1 = i % 2 ? sn.w : sn.y;
-            const float x0 = bf16_low(a[i]), x1 = bf16_high(a[i]), y0 = bf16_low(b[i]), y1 = bf16_high(b[i]);
-            first[i] = pack(x0 * c0 - y0 * s0, x1 * c1 - y1 * s1);
-            second[i] = pack(y0 * c0 + x0 * s0, y1 * c1 + x1 * s1);
-        }
-        put(place_of(operand, panel, row, 8 * c), make_uint4(first[0], first[1], first[2], first[3]));
-        put(place_of(operand, panel, row, HALF + 8 * c), make_uint4(second[0], second[1], second[2], second[3]));
-    }
-};
 
 extern "C" __global__ void __launch_bounds__(THREADS + 128, 1)
 attention(SUFFIX_PARAMETERS) {
@@ -92,16 +54,17 @@ attention(SUFFIX_PARAMETERS) {
     asm volatile("griddepcontrol.wait;" ::: "memory");
     const u16* const of_batch = qkv + (size_t)batch * tokens * width;
     const float *const cosines = cos + batch * tokens * HALF, *const sines = sin + batch * tokens * HALF;
-    constexpr int CHUNKS = HALF / 8, AT_ONCE = 5;  // loads of so many chunks are on their way together
+    constexpr int AT_ONCE = 5;  // loads of so many chunks are on their way together
 #pragma unroll
     for (int first = 0; first < (ROWS * CHUNKS + THREADS - 1) / THREADS; first += AT_ONCE) {
         Turn turns[AT_ONCE];
 #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) {
             const int i = (first + k) * THREADS + threadIdx.x, row = i / CHUNKS, token = quotient(first_row + row, heads);
-            if (row < count)
-                turns[k].load(of_batch + (size_t)token * width + (first_row + row - token * heads) * DIM,
-                              cosines + token * HALF, sines + token * HALF, i % CHUNKS);
+            if (row < count) {
+                turns[k].load(of_batch + (size_t)token * width + (first_row + row - token * heads) * DIM, i % CHUNKS);
+                turns[k].load_angles(cosines + token * HALF, sines + token * HALF, i % CHUNKS);
+            }
         }
 #pragma unroll
         for (int k = 0; k < AT_ONCE; ++k) {
@@ -119,7 +82,8 @@ attention(SUFFIX_PARAMETERS) {
         for (int i = threadIdx.x; i < found * CHUNKS; i += THREADS) {
             const int token = here + first - length + i / CHUNKS;
             Turn turn;
-            turn.load(tokens_of + (size_t)(i / CHUNKS) * width, cosines + token * HALF, sines + token * HALF, i % CHUNKS);
+            turn.load(tokens_of + (size_t)(i / CHUNKS) * width, i % CHUNKS);
+            turn.load_angles(cosines + token * HALF, sines + token * HALF, i % CHUNKS);
             turn.put_turned(keys, KEY_PANEL, first + i / CHUNKS, i % CHUNKS);
         }
         for (int i = threadIdx.x; i < found * (DIM / 8); i += THREADS) {
@@ -169,7 +133,7 @@ attention(SUFFIX_PARAMETERS) {
 #pragma unroll
     for (int half = 0; half < 2; ++half) {
         const int row = 64 * warpgroup + 16 * warp + lane / 4 + 8 * half;
-        const float total = softmax.total[half], factor = total > 0 ? 1 / total : total;
+        const float total = softmax.total[half], factor = total > 0 ? inverse_of(total) : total;
         auto value = [&](int j) { return pack(sums[4 * j + 2 * half] * factor, sums[4 * j + 2 * half + 1] * factor); };
 #pragma unroll
         for (int j = 0; j < BLOCKS; j += 4) {
@@ -185,34 +149,11 @@ attention(SUFFIX_PARAMETERS) {
                 send_end(at_rank(ends + (rank * ROWS + row) * 8, to), softmax.top[half], total, at_rank(mail_full, to));
     }
     barrier_wait(mail_full, 0);
+    const char* const received = raw + (mail - shared_address(raw));
     for (int i = threadIdx.x; i < count * (COLUMNS / 8); i += THREADS) {
         const int row = i / (COLUMNS / 8), column = i % (COLUMNS / 8) * 8;
-        const char* const received = raw + (mail - shared_address(raw));
-        const float2* const end = (const float2*)(received + MAIL_BYTES) + row;
-        float best = end[0].x, whole = 0, result[8] = {};
-#pragma unroll
-        for (int r = 1; r < RANKS; ++r) best = fmaxf(best, end[r * ROWS].x);
-#pragma unroll
-        for (int r = 0; r < RANKS; ++r) {
-            const float part = power_of_two(end[r * ROWS].x - best) * end[r * ROWS].y;  // 0 of a rank without keys
-            const uint4 v = *(const uint4*)(received + ((r * ROWS + row) * COLUMNS + column) * 2);
-            const u32 pairs[4] = {v.x, v.y, v.z, v.w};
-            whole += part;
-#pragma unroll
-            for (int k = 0; k < 4; ++k) {
-                result[2 * k] += part * bf16_low(pairs[k]);
-                result[2 * k + 1] += part * bf16_high(pairs[k]);
-            }
-        }
-        const float factor = (OUT_FP8 ? inverse : 1.0f) / whole;
-        Element* const to = out + ((size_t)batch * tokens * heads + first_row + row) * DIM + rank * COLUMNS + column;
-        u32 pairs[4];
-#pragma unroll
-        for (int k = 0; k < 4; ++k) {
-            const float x = result[2 * k] * factor, y = result[2 * k + 1] * factor;
-            pairs[k] = OUT_FP8 ? pack_e4m3(x, y) : pack(x, y);
-        }
-        if (OUT_FP8) *(uint2*)to = make_uint2(pairs[0] | pairs[1] << 16, pairs[2] | pairs[3] << 16);
-        else *(uint4*)to = make_uint4(pairs[0], pairs[1], pairs[2], pairs[3]);
+        add_ranks(out + ((size_t)batch * tokens * heads + first_row + row) * DIM + rank * COLUMNS + column,
+                  received + (row * COLUMNS + column) * 2, ROWS * COLUMNS * 2, (const float2*)(received + MAIL_BYTES) + row,
+                  ROWS, inverse);
     }
 }

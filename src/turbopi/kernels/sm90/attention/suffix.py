@@ -1,6 +1,6 @@
-"""Attention of a batch's suffixes in clusters, for compute capability 9.0: see suffix.cu.
+"""Attention of a batch's suffixes in clusters, for compute capability 9.0: see suffix.cu and suffix_few.cu.
 
-Twin: `kernels.plain_batch.suffix_attention`. The kernel for all other GPUs, and for what this one doesn't take, is in
+Twin: `kernels.plain_batch.suffix_attention`. The kernel for all other GPUs, and for what these don't take, is in
 kernels/portable/batch.py.
 """
 
@@ -15,8 +15,8 @@ from turbopi.kernels.dependent_launch import result_dtype
 from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.sm90 import instructions
-from turbopi.kernels.sm90.attention.suffix_tile import KEYS, MOST_ROWS, RANKS, SuffixTile
-from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
+from turbopi.kernels.sm90.attention.suffix_tile import FewTile, Tile, tiles
+from turbopi.kernels.sm90.instructions import DependentKernel
 
 PARAMETERS = Parameters(
     (
@@ -43,7 +43,7 @@ def suffix_attention(
     state_token: bool = False,
     inverse: float | None = None,
     *,
-    tile: SuffixTile | None = None,
+    tile: Tile | None = None,
 ) -> Tensor:
     """See `kernels.plain_batch.suffix_attention`. All contiguous. With `inverse` the result leaves as E4M3.
 
@@ -59,19 +59,19 @@ def suffix_attention(
     assert starts.shape == lengths.shape and prefix_k.shape == prefix_v.shape
     rows, in_fp8 = tokens * heads, inverse is not None  # of queries of an observation
     tile = tile or chosen_tile(dim, rows, batch, len(prefix_k) // batch + tokens, in_fp8, qkv.device)
-    tiles, out = -(-rows // tile.rows), qkv.new_empty(count, heads * dim, dtype=result_dtype(qkv, inverse))
+    per_batch, out = -(-rows // tile.rows), qkv.new_empty(count, heads * dim, dtype=result_dtype(qkv, inverse))
     maps = {
         name: instructions.tensor_map(one.data_ptr(), (dim, 1, len(one)), (dim, dim), (64, 1, tile.keys))
         for name, one in (("map_k", prefix_k), ("map_v", prefix_v))
     }
     _kernel(tile, in_fp8, qkv.device).launch_dependent(
-        batch * tiles * tile.ranks,
+        batch * per_batch * tile.ranks,
         {
             **maps,
             **{name: one.data_ptr() for name, one in {**given, "out": out}.items()},
             "tokens": tokens,
             "heads": heads,
-            "tiles": tiles,
+            "tiles": per_batch,
             "state_token": int(state_token),
             "scale": dim**-0.5 * LOG2_E,
             "inverse": 1.0 if inverse is None else inverse,
@@ -80,29 +80,22 @@ def suffix_attention(
     return out
 
 
-def chosen_tile(dim: int, rows: int, batch: int, keys: int, in_fp8: bool, device: torch.device) -> SuffixTile:
-    """The largest clusters of which the device holds all at once, and tiles of keys that are filled best.
+def chosen_tile(dim: int, rows: int, batch: int, keys: int, in_fp8: bool, device: torch.device) -> Tile:
+    """The first of whose clusters the device holds all at once, else the one of smallest clusters.
 
-    keys  of one observation, about
+    Arguments as in `suffix_tile.tiles`.
     """
-    tiles = -(-rows // MOST_ROWS)
-    of_cluster = -(-rows // tiles // 8) * 8
-    for ranks in RANKS:
-        share = -(-keys // ranks)
-        size = min(KEYS, key=lambda one: -(-share // one) * one)
-        tile = SuffixTile(dim, of_cluster, ranks, size)
-        try:
-            if _kernel(tile, in_fp8, device).max_clusters >= batch * tiles:
-                break
-        except BackendUnavailable:  # no room for one cluster, as under MIG
-            if ranks == RANKS[-1]:
-                raise
+    for tile, clusters in tiles(dim, rows, batch, keys):
+        kernel = _kernel_or_why_not(tile, in_fp8, device)
+        if not isinstance(kernel, BackendUnavailable) and kernel.max_clusters >= clusters:
+            break
     return tile
 
 
-def constants(tile: SuffixTile, out_fp8: bool) -> dict[str, int]:
-    """What suffix.cu is compiled with."""
-    return {
+def constants(tile: Tile, out_fp8: bool) -> dict[str, int]:
+    """What the kernel is compiled with."""
+    own = {"TP_PART": tile.part, "TP_COLUMNS": tile.columns} if isinstance(tile, FewTile) else {}
+    return own | {
         "TP_DIM": tile.dim,
         "TP_WGS": tile.warpgroups,
         "TP_KEYS": tile.keys,
@@ -113,16 +106,23 @@ def constants(tile: SuffixTile, out_fp8: bool) -> dict[str, int]:
     }
 
 
-def source(tile: SuffixTile) -> str:
-    """suffix.cu with the instructions for a tile."""
-    logits = instructions.wgmma("mma_logits", tile.keys)
-    values = instructions.wgmma("mma_values", tile.dim, from_registers=True, across=True)
+def source(tile: Tile) -> str:
+    """The kernel with the instructions for a tile."""
+    functions = [
+        instructions.wgmma("mma_logits", tile.keys),
+        instructions.wgmma("mma_values", tile.dim, from_registers=True, across=True),
+    ]
+    if isinstance(tile, FewTile):
+        functions += [
+            instructions.wgmma("mma_part", tile.part),
+            instructions.wgmma("mma_columns", tile.columns, across=True),
+        ]
     parameters = f"#define SUFFIX_PARAMETERS {PARAMETERS.declarations}"
-    files = [f"attention/{name}.cu" for name in ("common", "suffix")]
-    return instructions.source(*files, generated=f"{logits}\n{values}\n{parameters}\n")
+    files = [f"attention/{name}.cu" for name in ("common", "suffix_common", tile.source)]
+    return instructions.source(*files, generated="\n".join((*functions, parameters, "")))
 
 
-def _kernel(tile: SuffixTile, out_fp8: bool, device: torch.device) -> DependentKernel:
+def _kernel(tile: Tile, out_fp8: bool, device: torch.device) -> DependentKernel:
     made = _kernel_or_why_not(tile, out_fp8, device)
     if isinstance(made, BackendUnavailable):
         raise made.with_traceback(None)
@@ -130,13 +130,13 @@ def _kernel(tile: SuffixTile, out_fp8: bool, device: torch.device) -> DependentK
 
 
 @cache
-def _kernel_or_why_not(tile: SuffixTile, out_fp8: bool, device: torch.device) -> DependentKernel | BackendUnavailable:
+def _kernel_or_why_not(tile: Tile, out_fp8: bool, device: torch.device) -> DependentKernel | BackendUnavailable:
     """`chosen_tile` asks again for each layer: where no cluster of a size fits, it is loaded once to find that out."""
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile), "sm_90a", constants(tile, out_fp8))
         try:
             return DependentKernel(
-                cubin, "attention", PARAMETERS, shared_bytes=SHARED_BYTES, threads=tile.threads, cluster=tile.ranks
+                cubin, "attention", PARAMETERS, shared_bytes=tile.shared_bytes, threads=tile.threads, cluster=tile.ranks
             )
         except BackendUnavailable as why:
             return why

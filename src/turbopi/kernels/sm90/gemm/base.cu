@@ -55,7 +55,9 @@ constexpr bool PACED = STAGE_BYTES >= 28 * 1024;
 constexpr int LEAD = 2;
 constexpr u32 PACE = 250;
 constexpr bool BIASED = !FP8 && !TP_NORMED && (EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4);  // E4M3: see Factors
-constexpr int CONSUMER_REGISTERS = WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
+// TP_LEAVES_ROOM: a CTA has half of a multiprocessor's registers, so that one of the next kernel may start beside it.
+static_assert(!TP_LEAVES_ROOM || WGS == 1, "more warpgroups need more registers");
+constexpr int CONSUMER_REGISTERS = TP_LEAVES_ROOM ? 208 : WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
 constexpr int PRODUCER_REGISTERS = WGS == 1 ? 40 : WGS == 2 ? 40 : 24;
 
 // into the CTAs of `mask`, at the same place in each
@@ -134,6 +136,7 @@ __device__ constexpr int owner(int block) { return block / TOGETHER * SPLITS / G
 constexpr int FROM_ONE = (GROUPS + SPLITS - 1) / SPLITS * TOGETHER * 128 * WGS * 16;
 constexpr bool APART = TP_APART;
 constexpr int RECEIVED_BYTES = APART ? (SPLITS - 1) * FROM_ONE : 0;
+static_assert(1024 + STAGES * (STAGE_BYTES + 16) + RECEIVED_BYTES + 16 <= TP_SHARED_BYTES, "what a CTA is given");
 static_assert(!GATHER || APART || (SPLITS - 1) * FROM_ONE <= STAGES * STAGE_BYTES, "no room for the others' sums");
 
 // Adds up, for the blocks of 8 columns that are this part's, the sums of all parts of a tile, which come with `bar`.

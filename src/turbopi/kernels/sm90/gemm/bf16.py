@@ -4,7 +4,7 @@ Twins: `linear`, `linear_gelu`, `linear_geglu` of `kernels.plain`; "partial" and
 are added up, which the norms in `norms.py` do.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, 
 SPLIT = ("partial", "parts")
 DEPTH = 64  # of a step along the inner axis
 STEP_BYTES = 128  # the same, in either precision
+HALF_SHARED_BYTES = 113 * 1024  # of one of two CTAs on a multiprocessor
 BF16 = {"TP_FP8": 0, "TP_OUT_FP8": 0, "TP_PROMOTE": 0}  # fp8.py has the others
 
 
@@ -58,12 +59,31 @@ class Tile:
 
         With `lines` also beside the rows of 128 bytes in which "parts" leave.
         """
-        taken = self.apart(factors=factors) * self._received + 64 * self.warpgroups * STEP_BYTES * lines
+        taken = self.apart(factors=factors) * self._received + self.rows * STEP_BYTES * lines
         return min(self.ring, (self._room(factors) - taken) // self._stage_bytes)
 
     def apart(self, *, factors: int) -> bool:
         """Whether there is room beside the stages for what a part of the inner axis gets of the others' sums."""
         return self.gather and self._room(factors) - self._received >= 6 * self._stage_bytes
+
+    def shared_bytes(self, *, factors: int, lines: bool) -> int:
+        """Of a CTA; arguments as of `stages`."""
+        beside = SHARED_BYTES - self._room(factors) + self.rows * STEP_BYTES * lines
+        apart = self.apart(factors=factors) * self._received
+        return beside + apart + self.stages(factors=factors, lines=lines) * self._stage_bytes
+
+    @property
+    def leaves_room(self) -> bool:
+        """Whether half of a multiprocessor's registers are enough: then the next kernel's CTAs may start beside."""
+        return self.warpgroups == 1 and self.columns <= 128 and not self.overlap
+
+    def halved(self, *, factors: int, lines: bool) -> "Tile":
+        """With a ring so short that two CTAs fit a multiprocessor."""
+        least = (
+            self.shared_bytes(factors=factors, lines=lines)
+            - self.stages(factors=factors, lines=lines) * self._stage_bytes
+        )
+        return replace(self, ring=max(1, (HALF_SHARED_BYTES - least) // self._stage_bytes))
 
     @property
     def _stage_bytes(self) -> int:
@@ -158,6 +178,7 @@ def matmul(
     assert a.dtype == weight.dtype == torch.bfloat16 and a.is_contiguous() and weight.is_contiguous()
     assert k % 8 == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
     columns, groups = layout(tile, epilogue, m, n, -(-k // DEPTH), residual, sums_out)
+    tile = fitted(tile, groups, -(-k // DEPTH), a.device)
     if out is None:
         shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
         out = torch.empty(shape, dtype=torch.float32 if epilogue == "partial" else torch.bfloat16, device=a.device)
@@ -191,6 +212,16 @@ def layout(
     assert (tile.splits == 1 or epilogue in SPLIT) != tile.gather, "only partial sums stay split"
     columns = tile.columns // 2 if epilogue == "geglu" else tile.columns
     return columns, (-(-m // (tile.rows * tile.cluster_m)), -(-n // (columns * tile.cluster_n)))
+
+
+def fitted(tile: Tile, groups: tuple[int, int], steps: int, device: torch.device) -> Tile:
+    """What leaves room, with a ring of no more steps than a CTA has, if it has but one tile: the rest of shared memory
+    is the next kernel's.
+    """
+    units = groups[0] * groups[1] * tile.cluster_m * tile.cluster_n * tile.splits
+    if tile.gather or not tile.leaves_room or units > instructions.multiprocessors(device):
+        return tile
+    return replace(tile, ring=min(tile.ring, -(-steps // tile.splits)))
 
 
 def launch(
@@ -294,12 +325,17 @@ def constants(
     }
 
 
-def tile_constants(tile: Tile, epilogue: Epilogue, residual: bool, *, factors: int) -> dict[str, int]:
+def tile_constants(
+    tile: Tile, epilogue: Epilogue, residual: bool, *, factors: int, promoted: bool = False
+) -> dict[str, int]:
     """Of these, what doesn't depend on the precision; for `factors` see `Tile.stages`."""
+    lines = epilogue == "parts"
     return {
         "TP_WGS": tile.warpgroups,
         "TP_BN": tile.columns,
-        "TP_STAGES": tile.stages(factors=factors, lines=epilogue == "parts"),
+        "TP_STAGES": tile.stages(factors=factors, lines=lines),
+        "TP_SHARED_BYTES": tile.shared_bytes(factors=factors, lines=lines),
+        "TP_LEAVES_ROOM": int(tile.leaves_room and not (residual and promoted)),
         "TP_CM": tile.cluster_m,
         "TP_CN": tile.cluster_n,
         "TP_SPLITS": tile.splits,
@@ -322,8 +358,8 @@ def _kernel(
 def build(takes: Parameters, sizes: dict[str, int], tile: Tile, device: torch.device) -> DependentKernel:
     with torch.cuda.device(device):
         cubin = compile_cubin(source(tile.columns, takes, fp8=bool(sizes["TP_FP8"])), "sm_90a", sizes)
-        threads = 128 * (tile.warpgroups + 1)
-        return DependentKernel(cubin, "gemm", takes, shared_bytes=SHARED_BYTES, threads=threads, cluster=tile.cluster)
+        threads, shared = 128 * (tile.warpgroups + 1), sizes["TP_SHARED_BYTES"]
+        return DependentKernel(cubin, "gemm", takes, shared_bytes=shared, threads=threads, cluster=tile.cluster)
 
 
 def source(columns: int, takes: Parameters, *, fp8: bool) -> str:

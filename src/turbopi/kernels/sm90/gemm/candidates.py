@@ -9,6 +9,7 @@ from turbopi.kernels.sm90.gemm.products import Chosen, Operation
 
 CHEAPEST, WITH_KIN = 10, 5  # tiles by the cost model; of so many also clusters and shorter rings
 OVERLAPPED = 8  # tiles, the cheapest, whose epilogue overlaps; GeGLU's come with the kin
+HALVED = 4  # tiles, the cheapest, of which two fit a multiprocessor
 MOST_SUMS, MOST_OVERLAPPED = 192 * 192, 192 * 128  # numbers of a tile, and of one whose epilogue overlaps
 MOST_CLUSTER = 8
 LEAST_STAGES = 3
@@ -72,8 +73,10 @@ def _tiles(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int)
     kin = [other for tile in cheapest[:WITH_KIN] for other in _kin(tile, operation, m, n)]
     overlapped = [] if operation == "geglu" else _overlapped(plain, m, n, sms)
     overlapped = sorted((tile for tile in overlapped if possible(tile, operation, in_fp8, k)), key=price)[:OVERLAPPED]
+    factors, lines = 2 if in_fp8 else 1, operation == "parts"
+    halved = [tile.halved(factors=factors, lines=lines) for tile in sorted(plain, key=price) if tile.leaves_room]
     in_pairs = [replace(tile, cluster_m=2) for tile in overlapped[: OVERLAPPED // 2]]
-    more = (*kin, *overlapped, *in_pairs)
+    more = (*kin, *overlapped, *in_pairs, *halved[:HALVED])
     return cheapest + [tile for tile in more if possible(tile, operation, in_fp8, k)]
 
 

@@ -19,6 +19,7 @@ from turbopi.kernels.sm90.gemm.bf16 import (
     build,
     copied_parts,
     copy_arguments,
+    fitted,
     launch,
     layout,
     matrix_map,
@@ -100,13 +101,14 @@ def matmul_fp8(
     assert a.dtype == weight.data.dtype == E4M3 and a.is_contiguous() and weight.data.is_contiguous()
     assert k % ALIGNMENT == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
     columns, groups = layout(tile, epilogue, m, n, -(-k // DEPTH), residual, sums_out)
+    promote = promotion(tile, k) if promote is None else promote
+    tile = fitted(tile, groups, -(-k // DEPTH), a.device)
     partial = epilogue == "partial"
     assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu", "parts"))
     if out is None:
         shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
         out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)
     assert out.is_contiguous() and out.dtype == _result_dtype(partial, inverse)
-    promote = promotion(tile, k) if promote is None else promote
     assert not (promote and tile.overlap), "no registers are left for sums that are promoted"
     normed = 0 if sums is None else sums.count
     copied = copied_parts(copy, m, n)
@@ -142,7 +144,7 @@ def constants(
     own = {"TP_FP8": 1, "TP_OUT_FP8": int(out_fp8), "TP_PROMOTE": promote, "TP_NORMED": normed, "TP_COPY": copied}
     if out_fp8:
         own["TP_APART"] = 0  # such blocks go in fours, which may need more room than `Tile.apart` counts
-    return tile_constants(tile, epilogue, residual, factors=2 if normed else 1) | own
+    return tile_constants(tile, epilogue, residual, factors=2 if normed else 1, promoted=promote > 0) | own
 
 
 @cache

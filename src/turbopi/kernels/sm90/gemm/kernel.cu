@@ -1,6 +1,6 @@
 // The kernel; what it does, sizes and helpers are in base.cu, which comes before it.
 
-extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), 1)
+extern "C" __global__ void __launch_bounds__(128 * (WGS + 1), TP_LEAVES_ROOM ? 2 : 1)
 gemm(GEMM_PARAMETERS) {
     extern __shared__ char raw[];
     const u32 base = (shared_address(raw) + 1023) / 1024 * 1024;

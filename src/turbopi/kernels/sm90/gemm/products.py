@@ -22,6 +22,7 @@ from turbopi.kernels.sm90.gemm.tiles import (
     RESIDUAL_TILES_FP8,
     VISION_TILES,
 )
+from turbopi.kernels.sm90.instructions import multiprocessors
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, Knobs, TileTable
 from turbopi.quantization.fp8 import Matrix, ScaledMatrix, to_e4m3
 
@@ -140,7 +141,7 @@ def tuned_linear_geglu(
 ) -> Tensor:
     if isinstance(gate_up, ScaledMatrix):
         return _fp8(x, gate_up, "geglu", inverse=inverse, tiles=tiles)
-    tile = chosen_geglu(tiles, x.shape[0], gate_up.shape[0] // 2, x.shape[1], num_sms(x.device))
+    tile = chosen_geglu(tiles, x.shape[0], gate_up.shape[0] // 2, x.shape[1], multiprocessors(x.device))
     return as_input(linear_geglu(x, gate_up) if tile is None else matmul(x, gate_up, tile, "geglu"), inverse)
 
 
@@ -161,16 +162,11 @@ def _fp8(
     tiles: TileTable,
 ) -> Tensor:
     n = weight.shape[0] // 2 if epilogue == "geglu" else weight.shape[0]
-    tile = chosen_fp8(tiles, epilogue, x.shape[0], n, weight.shape[1], num_sms(x.device))
+    tile = chosen_fp8(tiles, epilogue, x.shape[0], n, weight.shape[1], multiprocessors(x.device))
     assert tile is not None, "the library has no such product"
     if epilogue in SPLIT and (tile.splits == 1 or tile.gather):
         epilogue = "bias"
     return matmul_fp8(x, weight, tile, epilogue, bias, out, inverse, ahead=ahead)
-
-
-@lru_cache
-def num_sms(device: torch.device) -> int:
-    return torch.cuda.get_device_properties(device).multi_processor_count
 
 
 def chosen_geglu(tiles: TileTable, rows: int, hidden: int, inner: int, sms: int) -> Tile | None:

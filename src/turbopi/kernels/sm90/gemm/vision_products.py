@@ -12,11 +12,11 @@ from turbopi.kernels.sm90.gemm.products import (
     as_input,
     bf16_tile,
     chosen_fp8,
-    num_sms,
     tuned_linear,
     tuned_linear_gelu,
     tuned_residual_linear,
 )
+from turbopi.kernels.sm90.instructions import multiprocessors
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix
 
@@ -69,7 +69,7 @@ class VisionProducts:
         self._last: Tensor | None = None
 
     def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
-        sms, tile = num_sms(x.device), None
+        sms, tile = multiprocessors(x.device), None
         if bias is not None and sms >= GATHERING_SMS:
             if isinstance(weight, ScaledMatrix):
                 tile = chosen_fp8(self._tiles, "residual", x.shape[0], weight.shape[0], weight.shape[1], sms)
@@ -177,7 +177,7 @@ class VisionProducts:
         if key not in self._folded_fp8:
             self._folded_fp8[key] = FoldedFp8.fold(weight, x.scale, x.shift)
         rows, (columns, inner) = x.copy.shape[0], weight.shape
-        tile = chosen_fp8(self._tiles, epilogue, rows, columns, inner, num_sms(x.copy.device))
+        tile = chosen_fp8(self._tiles, epilogue, rows, columns, inner, multiprocessors(x.copy.device))
         assert tile is not None and tile.splits == 1, "a norm is multiplied whole"
         tile = replace(tile, overlap=False)  # what follows such a product's sums needs more registers than that leaves
         ahead = self._next(weight)
