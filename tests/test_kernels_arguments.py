@@ -98,6 +98,7 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> Launched:
     for module in (gemm, gemm_fp8, attention_hopper):
         monkeypatch.setattr(module, "_kernel", lambda *args: kernel)
     monkeypatch.setattr(instructions, "tensor_map", lambda address, sizes, *rest: (address, sizes))
+    monkeypatch.setattr(instructions, "multiprocessors", lambda device: 132)
     return kernel
 
 
