@@ -97,7 +97,7 @@ FEW_RANKS = (8, 6)
 FEW_KEYS = 144  # most of a tile: with more, several tiles are loaded one after the other
 # (most rows of a cluster, warpgroups). Two leave room on a multiprocessor for the next kernel's CTAs.
 FEW_FORMS = ((64, 2), (112, 4))
-FEW_CLUSTERS = 16  # of six CTAs, one a multiprocessor: a whole Hopper has room for so many at once
+FEW_CLUSTERS = 16  # of six CTAs, one a multiprocessor: an H100 or H200 has room for so many at once, an H20 hasn't
 
 
 def takes(dim: int) -> bool:

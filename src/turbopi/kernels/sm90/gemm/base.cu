@@ -5,9 +5,9 @@
 // nonlinearity. The tensor cores keep only some 14 bits of sums of E4M3 products: after every TP_PROMOTE blocks of K
 // (0: never) they are added up in float32 registers. TP_OUT_FP8: the result leaves as E4M3, times `inverse`.
 //
-// A CTA has two producer warps and TP_WGS consumer warpgroups of 64 rows each, and walks over its tiles
-// (grid = SMs, not tiles), so the next tile's loads run during an epilogue. TP_CM x TP_CN CTAs form a cluster of
-// neighbouring tiles: those of a row share their part of `a` and those of a column theirs of `w`; each loads its share
+// A CTA has two producer warps and TP_WGS consumer warpgroups of 64 rows each, and walks over its tiles (grid = CTAs that
+// the GPU holds at once, not tiles), so the next tile's loads run during an epilogue. TP_CM x TP_CN CTAs form a cluster
+// of neighbouring tiles: those of a row share their part of `a` and those of a column theirs of `w`; each loads its share
 // of it into all of them, as reading operands from L2 would be the bottleneck.
 // Weights don't depend on the kernel before this one: one thread loads them, as far ahead as there is room, while
 // another waits for that kernel's end to load `a`.
