@@ -167,17 +167,24 @@ def run(
 def gathering(monkeypatch: "pytest.MonkeyPatch", folder: Path, workers: int) -> Callable[[], int]:
     """Has GatheringSimulator begin when so many workers are there, which meet in `folder`.
 
-    What is returned waits up to 0.1 s, and says how many workers have something for the schedule.
+    What is returned waits up to 0.1 s, and says how many workers have asked, whether the schedule has read that or not.
     """
     listened: list[Any] = []  # the connections that the schedule listens to
+    read: list[Any] = []  # those that it has read from
     wait = connection.wait
 
     def listening(to: list[Any], timeout: float | None = None) -> list[Any]:
         listened[:] = to
-        return wait(to, timeout)
+        ready = wait(to, timeout)
+        read.extend(ready)
+        return ready
+
+    def asked() -> int:
+        known = [*read, *wait(listened, 0.1)]
+        return sum(one in known for one in listened)
 
     folder.mkdir()
     monkeypatch.setenv("GATHER_FOLDER", str(folder))
     monkeypatch.setenv("GATHER_COUNT", str(workers))
     monkeypatch.setattr(connection, "wait", listening)
-    return lambda: len(wait(listened, 0.1))
+    return asked
