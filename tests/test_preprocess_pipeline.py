@@ -233,6 +233,18 @@ def test_chunks_of_a_batch_leave_as_they_do_one_by_one(name: str) -> None:
         assert not any(np.shares_memory(result["actions"], other["actions"]) for other in together[:row])
 
 
+def test_states_of_several_widths_are_added_as_each_alone() -> None:
+    """Identity takes any; only what relative actions are added to counts."""
+    config = dataclasses.replace(PLAIN, normalization=Normalization("identity", "identity"))
+    edges = pipeline(config, robot=Relative())
+    states = [edges.before({"state": np.arange(width, dtype=np.float64)})[1] for width in (7, 33, 40)]
+    assert [len(state) for state in states] == [32, 33, 40]
+    chunks = np.random.default_rng(0).normal(size=(3, 4, 32)).astype(np.float32)
+    for chunk, state, result in zip(chunks, states, edges.after_all(chunks, states), strict=True):
+        np.testing.assert_array_equal(result["actions"], edges.after(chunk, state)["actions"])
+        np.testing.assert_array_equal(result["actions"][0], chunk[0, :7] + np.append(np.arange(6.0), 0))
+
+
 def test_relative_actions_are_added_to_the_unnormalised_state() -> None:
     config = PolicyConfig("base", ModelConfig(), "plain")
     edges = pipeline(config, 7, 7, robot=Relative())

@@ -31,6 +31,7 @@ class Normalizer:
         self.width: int | None = None  # of the statistics; None: any
         if mode not in NEEDS:
             raise ConfigError(f"unknown normalisation {mode!r}; choose one of {', '.join(NEEDS)}")
+        self.is_lerobot = mode.startswith("lerobot_")  # computes in float32, as LeRobot does
         if not NEEDS[mode]:
             return
         self._a, self._b = self._statistics(stats)
@@ -65,11 +66,6 @@ class Normalizer:
                 case _:  # lerobot_quantile, lerobot_min_max
                     span = b - a
                     return np.where(span == 0, np.float32(_LEROBOT_EPS), span)
-
-    @property
-    def is_lerobot(self) -> bool:
-        """Whether it computes in float32, as LeRobot does."""
-        return self.mode.startswith("lerobot_")
 
     def normalize(self, x: np.ndarray) -> np.ndarray:
         """float[..., d] to float64[..., d]. Raises ObservationError if d is more than the statistics cover."""

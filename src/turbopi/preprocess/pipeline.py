@@ -5,7 +5,6 @@ state goes into the prompt normalised but not padded (but by LeRobot 0.4), and r
 un-normalised: openpi un-normalises what it has normalised, LeRobot has kept what came.
 """
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,7 +17,7 @@ from turbopi.errors import ActionError, ConfigError, ObservationError
 from turbopi.observation import ModelInputs
 from turbopi.preprocess.images import RESIZES, all_fitted, fitted, placement
 from turbopi.preprocess.normalize import Normalizer, pad_last
-from turbopi.preprocess.relative_actions import absolute_actions, reanchored
+from turbopi.preprocess.relative_actions import add_state, reanchored
 from turbopi.preprocess.robot_checks import (
     check_shape,
     notes_on_statistics,
@@ -39,7 +38,8 @@ class Incoming:
     """One observation on its way in: `Pipeline.see` fills the first half, `Pipeline.read` the rest.
 
     resize          False: pictures in uint8 keep their size, for a backend that resizes them
-    pictures        (uint8|float32)[224, 224, 3] of each camera that `image_mask` has; some may be the observation's own
+    pictures        (uint8|float32)[224, 224, 3] of each camera that is `valid`; some may be the observation's own
+    valid           of each camera, whether there is such a picture
     state           float64[s]  normalised, padded to action_dim at least; Pi0.5 may have a wider one, for its prompt.
                                 In the end what `Pipeline.after` needs: as it came, where LeRobot adds it to actions
     model_state     float32[action_dim]  what fits of it, as the model reads it
@@ -50,12 +50,16 @@ class Incoming:
     robot: RobotInputs = field(init=False)
     prompt: str = field(init=False)
     pictures: list[np.ndarray] = field(init=False)
-    image_mask: np.ndarray = field(init=False)
+    valid: list[bool] = field(init=False)
 
     state: np.ndarray = field(init=False)
     model_state: np.ndarray = field(init=False)
     tokens: np.ndarray = field(init=False)
     token_mask: np.ndarray = field(init=False)
+
+    @property
+    def image_mask(self) -> np.ndarray:  # bool[C]
+        return np.array(self.valid, np.bool_)
 
 
 @dataclass
@@ -96,6 +100,13 @@ class Pipeline:
         self.action_scale = Normalizer(config.normalization.actions, stats.actions, "actions")
         self._check()
         self._action_width = self._dry_run()
+        mask = self.robot.delta_mask
+        self._delta_mask = None if mask is None else np.array(mask, np.bool_)
+        # Whether actions become absolute as in LeRobot: by the state that came, in float32.
+        scaled_by_lerobot = self.state_scale.is_lerobot or self.action_scale.is_lerobot
+        self._adds_raw_state = mask is not None and scaled_by_lerobot
+        self._image_shape = (config.model.vision.image_size,) * 2
+        self._float_images = RESIZES[config.image_resize].float_images
         self.notes = notes_on_statistics(self.robot, self.state_scale, self.action_scale)
         self.before_vision: tuple[Callable[[Incoming], None], ...] = (
             self._read_observation,
@@ -122,11 +133,10 @@ class Pipeline:
         """
         one = self.see(observation)
         self.read(one)
-        size = self.config.model.vision.image_size
-        black, dtype = (-1, np.float32) if RESIZES[self.config.image_resize].float_images else (0, np.uint8)
-        images: np.ndarray = np.empty((len(one.image_mask), size, size, 3), dtype)
+        black, dtype = (-1, np.float32) if self._float_images else (0, np.uint8)
+        images: np.ndarray = np.empty((len(one.valid), *self._image_shape, 3), dtype)
         pictures = iter(one.pictures)
-        for valid, image in zip(one.image_mask, images, strict=True):
+        for valid, image in zip(one.valid, images, strict=True):
             image[:] = next(pictures) if valid else black
         return ModelInputs(images, one.image_mask, one.tokens, one.token_mask, one.model_state), one.state
 
@@ -194,9 +204,9 @@ class Pipeline:
 
         state   as `before` returned it
         """
-        if self.robot.delta_mask is None:
+        if self._delta_mask is None:
             return None
-        return np.array(self._in_units(state)[: len(self.robot.delta_mask)], np.float64)
+        return np.array(self._in_units(state)[: len(self._delta_mask)], np.float64)
 
     def _in_units(self, state: np.ndarray) -> np.ndarray:
         """The state that relative actions are added to, from the one that `before` returned."""
@@ -210,7 +220,7 @@ class Pipeline:
 
         Raises ObservationError for an anchor of another shape, or one that isn't finite, and if the result isn't.
         """
-        mask, new = self.robot.delta_mask, self.anchor(state)
+        mask, new = self._delta_mask, self.anchor(state)
         if mask is None or new is None:
             return left_over
         old = np.asarray(anchor)
@@ -273,24 +283,26 @@ class Pipeline:
         pictures, present = sample.robot.images, sample.robot.image_mask
         final = sample.robot.in_order or not _CAMERAS.issuperset(pictures)
         cameras = tuple(pictures) if final else CAMERAS
-        valid = [present.get(camera, camera in pictures) for camera in cameras]
-        sample.image_mask = np.array(valid, np.bool_)
-        checked = [self._check_picture(pictures.get(camera), camera) for camera in itertools.compress(cameras, valid)]
-        size, resize = self.config.model.vision.image_size, self.config.image_resize
+        sample.valid, checked = [], []
+        for camera in cameras:
+            valid = present.get(camera, camera in pictures)
+            sample.valid.append(valid)
+            if valid:
+                picture = pictures.get(camera)
+                checked.append(picture if is_rgb8(picture) else self._checked_picture(picture, camera))
+        shape, resize = self._image_shape, self.config.image_resize
         if sample.resize:
-            sample.pictures = all_fitted(checked, size, resize)
+            sample.pictures = all_fitted(checked, shape[0], resize)
         else:  # the device resizes bytes
             for picture in checked:
-                placement(picture.shape, (size, size))  # refuses one that is too narrow before anything starts
-            if RESIZES[resize].float_images:
-                checked = [one if one.dtype == np.uint8 else fitted(one, size, resize) for one in checked]
+                placement(picture.shape, shape)  # refuses one that is too narrow before anything starts
+            if self._float_images:
+                checked = [one if one.dtype == np.uint8 else fitted(one, shape[0], resize) for one in checked]
             sample.pictures = checked
 
-    def _check_picture(self, picture: object, camera: str) -> np.ndarray:
-        if is_rgb8(picture):
-            return picture
+    def _checked_picture(self, picture: object, camera: str) -> np.ndarray:
         picture = check_hwc(picture, camera)
-        return picture if RESIZES[self.config.image_resize].float_images else to_uint8(picture, camera)
+        return picture if self._float_images else to_uint8(picture, camera)
 
     def _tokenize(self, sample: Incoming) -> None:
         state = None
@@ -317,12 +329,6 @@ class Pipeline:
         if self._adds_raw_state:
             sample.state = pad_last(np.array(sample.robot.state, np.float64), self.config.model.action_dim)
 
-    @property
-    def _adds_raw_state(self) -> bool:
-        """Whether actions become absolute as in LeRobot: by the state that came, in float32."""
-        scaled = self.state_scale.is_lerobot or self.action_scale.is_lerobot
-        return self.robot.delta_mask is not None and scaled
-
     # After the model
 
     def _unnormalize(self, out: _Outgoing) -> None:
@@ -330,13 +336,14 @@ class Pipeline:
         out.actions = self.action_scale.unnormalize(steps).reshape(out.actions.shape)
 
     def _make_absolute(self, out: _Outgoing) -> None:
-        mask = self.robot.delta_mask
+        mask = self._delta_mask
         if mask is None:
             return
-        states = np.stack([self._in_units(state)[: len(mask)] for state in out.states])
+        used = len(mask) if self._adds_raw_state else max(len(mask), self.state_scale.width or 0)
+        states = self._in_units(np.array([state[:used] for state in out.states]))[:, : len(mask)]
         if self._adds_raw_state:  # in float32, as LeRobot
             out.actions, states = out.actions.astype(np.float32), states.astype(np.float32)
-        out.actions = absolute_actions(out.actions, states, mask)
+        add_state(out.actions, states, mask)  # in place: `_unnormalize` made them
 
     def _write_actions(self, out: _Outgoing) -> None:
         rows, horizon, _ = out.actions.shape

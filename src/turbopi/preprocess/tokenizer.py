@@ -43,7 +43,7 @@ def state_bins(state: np.ndarray) -> np.ndarray:
 
     256 equal bins over [-1, 1): below -1 gives -1, and 1 or more gives 255, as openpi.
     """
-    return np.asarray(np.digitize(state, _STATE_EDGES) - 1)
+    return np.asarray(_STATE_EDGES.searchsorted(state, side="right") - 1)
 
 
 def prompt_texts(prompt: str, state: np.ndarray | None, *, as_is: bool = False) -> list[tuple[str, bool]]:

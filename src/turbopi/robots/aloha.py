@@ -31,10 +31,11 @@ CAMERA_OF = {
     "cam_right_wrist": "right_wrist_0_rgb",
 }
 IGNORED = "cam_low"  # clients send it, no model reads it
+_ACCEPTED = frozenset((*CAMERA_OF, IGNORED))
 KEYS = ("state", *(f"images/{camera}" for camera in CAMERA_OF), "prompt")
 
-_FLIP = np.array([1, -1, -1, 1, 1, 1, 1] * 2)
-_GRIPPERS = [6, 13]
+_FLIP = np.array([1.0, -1, -1, 1, 1, 1, 1] * 2)
+_GRIPPERS = slice(6, None, 7)  # 6 and 13
 _GRIPPER_POSITION = (0.01844, 0.058)  # m, closed and open
 _GRIPPER_JOINT = (-0.6213, 1.4910)  # rad, closed and open, in the robot's actions
 _PI_GRIPPER = (0.5476, 1.6296)  # rad, what the base models call 0 and 1
@@ -75,16 +76,16 @@ class Aloha(Robot):
 
     def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         sent = names_in(observation, "images")
-        unexpected = sorted(set(sent) - {*CAMERA_OF, IGNORED})
-        if unexpected:
+        if unexpected := set(sent) - _ACCEPTED:
             raise ObservationError(
-                f"unexpected cameras in images: {listed(unexpected)}; expected {', '.join((*CAMERA_OF, IGNORED))}"
+                f"unexpected cameras in images: {listed(sorted(unexpected))}; expected "
+                f"{', '.join((*CAMERA_OF, IGNORED))}"
             )
-        wanted = [name for name in CAMERA_OF if name in sent or name == "cam_high"]
-        pictures = {
-            CAMERA_OF[name]: parse_chw_image(require(observation, f"images/{name}", KEYS), f"images/{name}")
-            for name in wanted
-        }
+        pictures = {}
+        for name, camera in CAMERA_OF.items():
+            if name in sent or name == "cam_high":
+                key = f"images/{name}"
+                pictures[camera] = parse_chw_image(require(observation, key, KEYS), key)
         images, mask = with_missing_cameras(pictures, like="base_0_rgb")
         state = read_state(require(observation, "state", KEYS), "state", self.state_dim)
         return RobotInputs(images, mask, self._to_pi(state), optional_prompt(observation))
@@ -116,7 +117,7 @@ def gripper_to_angle(position: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", over="ignore"):  # far outside the gripper's range; clipped below
         sine = (_HORN**2 + length**2 - _ARM**2) / (2 * _HORN * length)
     low, high = _PI_GRIPPER
-    return np.asarray((np.arcsin(np.clip(sine, -1.0, 1.0)) - low) / (high - low))
+    return np.asarray((np.arcsin(np.minimum(np.maximum(sine, -1.0), 1.0)) - low) / (high - low))
 
 
 def gripper_from_angle(value: np.ndarray) -> np.ndarray:

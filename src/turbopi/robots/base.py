@@ -147,7 +147,8 @@ def names_in(observation: Mapping[str, object], folder: str) -> list[str]:
     nested = observation.get(folder, {})
     if not isinstance(nested, Mapping):
         raise ObservationError(f"{folder!r} is a {type(nested).__name__}, expected a dict of pictures by camera")
-    flat = [str(key)[len(folder) + 1 :] for key in observation if str(key).startswith(folder + "/")]
+    prefix = folder + "/"
+    flat = [str(key)[len(prefix) :] for key in observation if str(key).startswith(prefix)]
     return [*map(str, nested), *flat]
 
 
@@ -165,10 +166,10 @@ def read_state(value: object, key: str, width: int | None) -> np.ndarray:
         state = np.asarray(value)
     except Exception as error:
         raise ObservationError(f"{key} isn't an array of numbers: {error}") from error
-    if state.dtype.kind in "iu":
-        state = state.astype(np.float64)
     if state.dtype.kind != "f":
-        raise ObservationError(f"{key} has dtype {state.dtype}; send floats")
+        if state.dtype.kind not in "iu":
+            raise ObservationError(f"{key} has dtype {state.dtype}; send floats")
+        state = state.astype(np.float64)
     if state.ndim == 0 and width == 1:
         state = state[None]
     if state.ndim != 1 or state.size == 0 or (width is not None and len(state) != width):
@@ -181,12 +182,14 @@ def read_state(value: object, key: str, width: int | None) -> np.ndarray:
 
 
 def all_finite(array: np.ndarray) -> bool:
-    """Whether no number is NaN or infinite. On short arrays counting takes a third of the time of `ndarray.all`."""
-    return np.count_nonzero(np.isfinite(array)) == array.size
+    """Whether no number is NaN or infinite. On short arrays searching bytes takes half the time of `ndarray.all`."""
+    return b"\0" not in np.isfinite(array).tobytes()
 
 
 def read_prompt(value: object, key: str = "prompt") -> str:
     """A prompt as text: str, numpy's str_, UTF-8 bytes, or an array that holds one of them."""
+    if type(value) is str:  # nearly always
+        return value
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.item()
     if isinstance(value, bytes):
@@ -203,16 +206,21 @@ def read_prompt(value: object, key: str = "prompt") -> str:
 
 def optional_prompt(observation: Mapping[str, object], key: str = "prompt") -> str | None:
     """The prompt at `key`; None if the observation has no such key."""
-    return read_prompt(find(observation, key), key) if has(observation, key) else None
+    try:
+        value = find(observation, key)
+    except KeyError:
+        return None
+    return read_prompt(value, key)
 
 
 def with_missing_cameras(images: dict[str, np.ndarray], like: str) -> tuple[dict[str, np.ndarray], dict[str, bool]]:
     """All of the model's cameras in its order, those not in `images` black (of the size of `like`), and their mask."""
-    black = black_like(images[like])
-    return (
-        {camera: images.get(camera, black) for camera in CAMERAS},
-        {camera: camera in images for camera in CAMERAS},
-    )
+    every: dict[str, np.ndarray] = {}
+    mask: dict[str, bool] = {}
+    for camera in CAMERAS:
+        mask[camera] = given = camera in images
+        every[camera] = images[camera] if given else black_like(images[like])
+    return every, mask
 
 
 def black_like(image: np.ndarray) -> np.ndarray:

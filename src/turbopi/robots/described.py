@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -54,7 +55,7 @@ class Described(Robot):
     def camera_counts(self) -> tuple[int, ...]:  # type: ignore[override]
         return (len(self.cameras),)
 
-    @property
+    @cached_property
     def _keys(self) -> tuple[str, ...]:
         return (*self.cameras, *self.state, self.prompt_key)
 

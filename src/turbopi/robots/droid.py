@@ -42,7 +42,8 @@ class Droid(Robot):
     camera_counts = (2,)
 
     def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
-        base, wrist = (parse_image(require(observation, key, KEYS), key) for key in KEYS[:2])
+        base = parse_image(require(observation, KEYS[0], KEYS), KEYS[0])
+        wrist = parse_image(require(observation, KEYS[1], KEYS), KEYS[1])
         images, mask = with_missing_cameras({"base_0_rgb": base, "left_wrist_0_rgb": wrist}, like="base_0_rgb")
         joints = read_state(require(observation, KEYS[2], KEYS), KEYS[2], 7)
         gripper = read_state(require(observation, KEYS[3], KEYS), KEYS[3], 1)

@@ -7,6 +7,7 @@ after them. Sources: LeRobot's `RenameObservationsProcessorStep` and `PI05Policy
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -95,12 +96,26 @@ class LeRobot(Robot):
     def camera_counts(self) -> tuple[int, ...]:  # type: ignore[override]
         return tuple(range(1, len(self.image_keys) + 1))
 
+    @cached_property
+    def _spare(self) -> tuple[str, ...]:
+        """The keys of LeRobot's empty cameras."""
+        return tuple(f"{IMAGES}empty_camera_{i}" for i in range(self.num_missing_cameras))
+
+    @cached_property
+    def _cameras(self) -> tuple[str, ...]:
+        """All keys that pictures are read from."""
+        return (*self.image_keys, *self._spare)
+
+    @cached_property
+    def _expected(self) -> tuple[str, ...]:
+        """What an observation should have, for a message."""
+        return (*map(self.sent_as, self.image_keys), self.sent_as(STATE), TASK)
+
     def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
         named = self._renamed(observation)
-        spare = [f"{IMAGES}empty_camera_{i}" for i in range(self.num_missing_cameras)]
-        present = [key for key in (*self.image_keys, *spare) if has(named, key)]
+        present = [key for key in self._cameras if has(named, key)]
         absent = [key for key in self.image_keys if key not in present]
-        others = [key for key in names_in_prefix(named, IMAGES) if key not in (*self.image_keys, *spare)]
+        others = [key for key in names_in_prefix(named, IMAGES) if key not in self._cameras]
         if not present:
             raise ObservationError(
                 f"the observation's cameras are {listed(others)}; this checkpoint's are "
@@ -111,12 +126,11 @@ class LeRobot(Robot):
             _warn_once(others, [self.sent_as(key) for key in absent])
         images = {key: parse_unit_image(find(named, key), key) for key in present}
         black = black_like(next(iter(images.values())))
-        masked = [*absent, *(f"missing_{i}" for i, key in enumerate(spare) if key not in present)]
-        expected = (*map(self.sent_as, self.image_keys), self.sent_as(STATE), TASK)
+        masked = [*absent, *(f"missing_{i}" for i, key in enumerate(self._spare) if key not in present)]
         return RobotInputs(
             images | dict.fromkeys(masked, black),
             dict.fromkeys(present, True) | dict.fromkeys(masked, False),
-            read_state(require(named, STATE, expected), STATE, self.state_dim),
+            read_state(require(named, STATE, self._expected), STATE, self.state_dim),
             self._prompt(observation),
             in_order=True,
         )

@@ -48,7 +48,8 @@ class Libero(Robot):
         return action_mask((6, -1)) if self.delta_actions else None
 
     def inputs(self, observation: Mapping[str, object]) -> RobotInputs:
-        base, wrist = (parse_image(require(observation, key, KEYS), key) for key in KEYS[:2])
+        base = parse_image(require(observation, KEYS[0], KEYS), KEYS[0])
+        wrist = parse_image(require(observation, KEYS[1], KEYS), KEYS[1])
         images, mask = with_missing_cameras({"base_0_rgb": base, "left_wrist_0_rgb": wrist}, like="base_0_rgb")
         state = read_state(require(observation, KEYS[2], KEYS), KEYS[2], self.state_dim)
         return RobotInputs(images, mask, state, optional_prompt(observation))

@@ -45,7 +45,7 @@ def parse_unit_image(value: object, name: str) -> np.ndarray:
     if image.shape[0] == 3:
         image = image.transpose(1, 2, 0)
     image = _check_rgb(image, name)
-    if image.dtype != np.uint8:
+    if image.dtype != _UINT8:
         _check_unit_range(image, name)
         image = image.astype(np.float32, copy=False)
     return image
@@ -57,7 +57,7 @@ def check_image(value: object, name: str) -> np.ndarray:
         image = np.asarray(value)
     except Exception as error:
         raise ObservationError(f"{name} isn't a picture: {error}") from error
-    if image.dtype != np.uint8 and image.dtype.kind != "f":
+    if image.dtype != _UINT8 and image.dtype.kind != "f":
         raise ObservationError(f"{name} has dtype {image.dtype}; send uint8 in [0, 255] or float in [0, 1]")
     if image.ndim != 3:
         raise ObservationError(
@@ -82,7 +82,7 @@ def _check_rgb(image: np.ndarray, name: str) -> np.ndarray:
 
 def to_uint8(image: np.ndarray, name: str = "image") -> np.ndarray:
     """Float pictures in [0, 1] to uint8 by truncation of 255 * x, as openpi; uint8 passes."""
-    if image.dtype == np.uint8:
+    if image.dtype == _UINT8:
         return image
     _check_unit_range(image, name)
     return np.asarray((255 * image).astype(np.uint8))
