@@ -49,6 +49,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("emulated")
 
 
+BLOCK_SHARED = 99 * 1024  # bytes, of the GPUs that have least
+
+
 class Emulated:
     """In place of `Kernel`."""
 
@@ -60,7 +63,7 @@ class Emulated:
         run = ctypes.CDLL(str(self.library)).run
         run.restype = ctypes.c_char_p
         pointers = (ctypes.c_void_p * 2)(ctypes.addressof(args), ctypes.addressof(self.prepare))
-        if (why := run(blocks, threads, together, self.seed, pointers)) is not None:
+        if (why := run(blocks, threads, together, BLOCK_SHARED, self.seed, pointers)) is not None:
             raise RuntimeError(why.decode())
 
     def launch(self, blocks: int, threads: int, args: ctypes.Structure) -> None:

@@ -45,6 +45,8 @@ INSTRUCTIONS = (
     *(("cp.async.bulk.tensor.2d", "copy_2d"), ("complete_tx::bytes.L2::cache_hint", "copy_bytes")),
     *(("cp.async.bulk.tensor.3d", "copy_3d"), ("ex2.approx", "ex2"), ("st.shared.v4.u32", "store_four")),
     ("st.shared.u32", "store_one"),
+    *(("red.global.add.noftz.v4.bf16x2", "add_bf16"), ("red.global.add.noftz.v2.bf16x2", "add_bf16")),
+    ("red.global.add.noftz.bf16x2", "add_bf16"),
 )
 # No effect on what is computed here: kernels run one by one, registers are plenty, and copies are seen at once.
 IGNORED = ("griddepcontrol", "setmaxnreg", "prefetch", "createpolicy", "fence")
@@ -147,10 +149,11 @@ def compiled(
     call = ", ".join(f"machine::given<{kind}>(values[{i}])" for i, kind in enumerate(kinds))
     text = f"""#include "{MACHINE}"
 {translated(source, in_part)}
-extern "C" const char* run(int blocks, int threads, int cluster, int seed, void** values) {{
+extern "C" const char* run(int blocks, int threads, int cluster, int shared, int seed, void** values) {{
     static std::string why;
     try {{
         machine::grid.x = blocks, machine::cta_threads = threads, machine::ranks = cluster;
+        machine::shared_bytes = shared;
         machine::random.seed(seed), machine::eager = seed % 2, machine::uneven = seed >= 4;
         machine::moved = 0;
         machine::kernel = [&] {{ {name}({call}); }};
@@ -184,6 +187,7 @@ class EmulatedKernel:
     cluster: int
     max_clusters: int
     seed: int
+    shared_bytes: int = instructions.SHARED_BYTES
 
     def launch_dependent(self, blocks: int, given: dict[str, Any]) -> None:
         """Raises RuntimeError where the kernel would hang."""
@@ -191,7 +195,7 @@ class EmulatedKernel:
         pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
         run = ctypes.CDLL(str(self.library)).run
         run.restype = ctypes.c_char_p
-        if (why := run(blocks, self.threads, self.cluster, self.seed, pointers)) is not None:
+        if (why := run(blocks, self.threads, self.cluster, self.shared_bytes, self.seed, pointers)) is not None:
             raise RuntimeError(why.decode())
 
 
@@ -216,7 +220,7 @@ class Machine:
         def kernel(cubin: bytes, name: str, takes: Parameters, *, shared_bytes: int, threads: int, cluster: int) -> Any:
             defines = defined[cubin.decode()]
             library = compiled(cubin.decode(), name, takes, defines, folder)
-            return EmulatedKernel(library, takes, threads, cluster, at_once(defines), self._seed)
+            return EmulatedKernel(library, takes, threads, cluster, at_once(defines), self._seed, shared_bytes)
 
         for module in (one for one in modules if hasattr(one, "compile_cubin")):
             patch.setattr(module, "compile_cubin", compile_cubin)

@@ -99,11 +99,12 @@ struct Map { uint64_t address; uint32_t axes, number_bytes; uint64_t sizes[3], s
 struct Copy { Map map; unsigned to, bar; int at[3]; unsigned mask; std::string bytes; };  // of a map, or these
 
 constexpr int SHARED = 256 * 1024, PLACE = 24;  // bits of an address within a CTA; above them its rank
+constexpr unsigned FIRST = 128;  // address of a CTA's shared memory: as aligned as kernels ask for, no more
 inline std::vector<Thread> threads;
 inline Thread* now;
 inline ucontext_t scheduler;
 inline Dim grid;
-inline int cta_threads, ranks;
+inline int cta_threads, ranks, shared_bytes;
 inline std::vector<std::unique_ptr<char[]>> memory;  // of each rank
 inline std::map<unsigned, MBarrier> mbarriers;
 inline std::map<int, Barrier> barriers;  // by rank and number; cluster's: -1
@@ -114,8 +115,12 @@ inline bool eager, uneven;  // uneven: again and again a block stands still for 
 inline long moved, rounds;  // moved: counts all that lets somebody go on
 inline std::function<void()> kernel;
 
-inline char* at(unsigned address) { return memory.at(address >> PLACE).get() + (address & ((1u << PLACE) - 1)); }
-inline char* shared() { return memory[now->rank].get(); }
+inline char* at(unsigned address, size_t bytes = 1) {
+    const unsigned place = address & ((1u << PLACE) - 1);
+    if (place < FIRST || place + bytes > FIRST + shared_bytes) throw std::runtime_error("an address outside a CTA's shared memory");
+    return memory.at(address >> PLACE).get() + place;
+}
+inline char* shared() { return memory[now->rank].get() + FIRST; }
 inline void wait_until(const std::function<bool()>& over) {
     do swapcontext(&now->context, &scheduler);  // also who needn't wait lets others go first
     while (!over());
@@ -361,7 +366,7 @@ inline long long clock64() {  // others go on while somebody looks at it
     return machine::rounds * 100;
 }
 inline unsigned __cvta_generic_to_shared(const void* p) {
-    return unsigned((const char*)p - machine::shared()) | machine::now->rank << machine::PLACE;
+    return unsigned((const char*)p - machine::shared() + machine::FIRST) | machine::now->rank << machine::PLACE;
 }
 inline void __syncthreads() { machine::meet(machine::barriers[machine::now->rank * 16], machine::cta_threads); }
 
@@ -427,7 +432,7 @@ inline void ptx_mapa(unsigned& there, unsigned address, int rank) {
 }
 template <typename Number>
 void st_async(unsigned to, const std::vector<Number>& all, unsigned bar) {
-    memcpy(machine::at(to), all.data(), all.size() * 4);
+    memcpy(machine::at(to, all.size() * 4), all.data(), all.size() * 4);
     machine::arrived_bytes(bar, all.size() * 4);
 }
 inline void ptx_st_async(unsigned to, float x, float y, float z, float w, unsigned bar) { st_async<float>(to, {x, y, z, w}, bar); }
@@ -438,10 +443,10 @@ inline void ptx_tanh(float& y, float x) { y = std::tanh(x); }
 inline void ptx_ex2(float& y, float x) { y = std::exp2(x); }
 inline void ptx_store_four(unsigned to, unsigned x, unsigned y, unsigned z, unsigned w) {
     const unsigned all[4] = {x, y, z, w};
-    memcpy(machine::at(to), all, 16);
+    memcpy(machine::at(to, 16), all, 16);
 }
 inline void ptx_store_four(unsigned to, unsigned v) { ptx_store_four(to, v, v, v, v); }
-inline void ptx_store_one(unsigned to, unsigned v) { memcpy(machine::at(to), &v, 4); }
+inline void ptx_store_one(unsigned to, unsigned v) { memcpy(machine::at(to, 4), &v, 4); }
 inline void ptx_wgmma_commit() { machine::commit(); }
 inline void ptx_wgmma_wait(int left) { machine::await(left); }
 inline void ptx_cvt_bf16x2(unsigned& both, float high, float low) {
@@ -523,13 +528,22 @@ inline void ptx_mma_e4m3(float& c0, float& c1, float& c2, float& c3, unsigned a0
         return 0;
     });
 }
+template <typename... Pairs>
+void ptx_add_bf16(void* to, Pairs... pairs) {
+    uint16_t* place = (uint16_t*)to;
+    auto add = [&](unsigned x) {
+        const float there = __uint_as_float((unsigned)*place << 16);
+        *place++ = machine::to_bf16(there + __uint_as_float(x << 16));
+    };
+    for (const unsigned both : {pairs...}) add(both & 0xffff), add(both >> 16);
+}
 // Of all blocks, which here are one cluster.
 inline void ptx_add_released(unsigned* to, unsigned what) { *to += what, ++machine::moved; }
 inline void ptx_load_acquired(unsigned& value, const unsigned* from) {
     swapcontext(&machine::now->context, &machine::scheduler);  // others go on while somebody looks
     value = *from;
 }
-inline void ptx_copy_16(unsigned to, const void* from) { memcpy(machine::at(to), from, 16); }
+inline void ptx_copy_16(unsigned to, const void* from) { memcpy(machine::at(to, 16), from, 16); }
 inline void ptx_put(void* to, unsigned value) { memcpy(to, &value, 4); }
 inline void ptx_load_once(unsigned& x, unsigned& y, unsigned& z, unsigned& w, const void* from) {
     const uint4 v = *(const uint4*)from;

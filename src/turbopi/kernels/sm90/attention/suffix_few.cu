@@ -172,7 +172,7 @@ attention(SUFFIX_PARAMETERS) {
             if (lane % 4 == 0) row_tops[member][row + 8 * half] = best[half];
         }
         __syncthreads();
-        if (tile == last - 1) cluster_arrive();  // keys aren't needed any more
+        if (tile == last - 1) cluster_arrive();  // keys aren't needed any more: what read them has ended
 #pragma unroll
         for (int half = 0; half < 2; ++half) {
             const int at = row + 8 * half;

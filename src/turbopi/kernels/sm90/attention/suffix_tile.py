@@ -1,6 +1,5 @@
 """How suffix.cu and suffix_few.cu are cut, and for what. Nothing here needs Triton."""
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
@@ -75,11 +74,15 @@ class FewTile:
 
     @property
     def shared_bytes(self) -> int:
-        """Keys, values, queries, weights, barriers, rows' tops and totals, and those of what is sent."""
+        """Keys, values, queries, weights, barriers, rows' tops and totals, and those of what is sent.
+
+        Or more: the last warpgroup's product reads columns behind the values' last one, which nobody uses.
+        """
         operands = (2 * self.keys + self.rows) * self.dim * 2
         weights = -(-self.keys // 64) * self.rows * 128 + (self._whole_rows - self.rows) * 128
         ends = 2 * self.members * self._whole_rows * 4 + self.sent_rows * 8
-        return 1024 + operands + weights + 16 + ends
+        read = self.keys * (self.dim + -(-self.dim // self.columns) * self.columns) * 2
+        return 1024 + max(operands + weights + 16 + ends, read)
 
     @property
     def _whole_rows(self) -> int:
@@ -111,9 +114,12 @@ def tiles(dim: int, rows: int, batch: int, keys: int) -> Iterator[tuple[Tile, in
     rows   of queries of an observation, those of all heads
     keys   of one observation, about
     """
+    assert takes(dim), f"no heads of {dim} columns"
+    fewest = FEW_CLUSTERS + 1
     for most, warpgroups in FEW_FORMS:
         clusters = batch * -(-rows // most)
-        if clusters <= FEW_CLUSTERS:
+        if clusters < fewest:  # where a form has no room, one of more warpgroups and as many clusters has none
+            fewest = clusters
             yield from ((_few(dim, _rows(rows, most), ranks, keys, warpgroups), clusters) for ranks in FEW_RANKS)
     clusters = batch * -(-rows // MOST_ROWS)
     for ranks in RANKS:
@@ -129,10 +135,7 @@ def _rows(rows: int, most: int) -> int:
 
 def _few(dim: int, rows: int, ranks: int, keys: int, warpgroups: int) -> FewTile:
     """With all of a CTA's keys in as few tiles as fit; what is sent lies where keys were, so there is room for it."""
-    share = -(-keys // ranks)
-    for count in itertools.count(1):
-        size = -(-max(-(-share // count), -(-rows // ranks) * ranks) // 16) * 16
-        tile = FewTile(dim, rows, ranks, size, warpgroups)
-        if size <= FEW_KEYS and tile.shared_bytes <= SHARED_BYTES:
-            return tile
-    raise AssertionError
+    share, least = -(-keys // ranks), -(-rows // ranks) * ranks
+    sizes = (-(-max(-(-share // count), least) // 16) * 16 for count in range(1, share + 1))
+    few = (FewTile(dim, rows, ranks, size, warpgroups) for size in sizes)
+    return next(tile for tile in few if tile.keys <= FEW_KEYS and tile.shared_bytes <= SHARED_BYTES)
