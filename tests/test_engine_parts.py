@@ -1,6 +1,7 @@
 """Large batches go in parts, pictures through vision's head and the prefix between two attentions: nothing changes."""
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -82,7 +83,64 @@ class TestPrefix:
         prefix(dataclasses.replace(PLAIN, linear=linear), False, monkeypatch, MOST_ROWS)
 
 
-def prefix(ops: Ops, fp8: bool, monkeypatch: pytest.MonkeyPatch, most: int) -> tuple[Tensor, Tensor]:
+class TestAdded:
+    """Operations that add a product to the residual stream themselves, in place."""
+
+    @pytest.mark.parametrize("most", [MOST_ROWS, 64])
+    @pytest.mark.parametrize("every", [1, 2])
+    def test_a_batchs_keys_and_values_stay(self, most: int, every: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Also where every second product is left to the norm, and when the graph runs again."""
+        usual = prefix(PLAIN, False, monkeypatch, most)
+        ours = prefix(adding(every), False, monkeypatch, most, runs=2)
+        for one, other in zip(usual, ours, strict=True):
+            assert bool(one.isfinite().all()) and torch.equal(one, other)
+
+    @pytest.mark.parametrize("every", [1, 2, 3])
+    @pytest.mark.parametrize("part", [2, 100])
+    def test_pictures_tokens_stay(self, every: int, part: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(call, "PART", part)
+        side = golden_model("pi05").config.vision.image_size
+        shown = [picture(side, side, seed=seed) for seed in range(5)]
+        for layers in (1, 3):
+            monkeypatch.setattr(forward, "HEAD_LAYERS", layers)
+            found = []
+            for ops in (PLAIN, adding(every)):
+                pictures = Pictures(golden_model("pi05").config, packed(), ops, 5, False, 0)
+                pictures.upload(shown)
+                pictures.run()
+                found.append(pictures.embs)
+            assert bool(found[0].isfinite().all()) and torch.equal(*found)
+
+    def test_one_observations_embeddings_are_not_written_over(self) -> None:
+        """Its prefix may be run again on the pictures' tokens, which another graph has left."""
+
+        def refused(*given: Any) -> bool:
+            raise AssertionError("the embeddings would be written over")
+
+        model = golden_model("pi05")
+        config, weights = model.config, packed()
+        x = torch.randn(40, config.vlm.width, generator=torch.Generator().manual_seed(0))
+        before, cache = x.clone(), torch.zeros(2, config.vlm.depth, 40, config.vlm.head_dim)
+        rope = forward.rope_of_all_positions(config, 40, x.device)
+        ops = dataclasses.replace(PLAIN, add_linear=refused)
+        forward.prefix_cache(config, weights, ops, x, torch.tensor([40]), cache[0], cache[1], rope)
+        assert torch.equal(x, before)
+
+
+def adding(every: int) -> Ops:
+    """Plain operations that add one of so many products themselves."""
+    count = itertools.count()
+
+    def add_linear(stream: Tensor, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> bool:
+        if next(count) % every:
+            return False
+        stream += PLAIN.linear(x, weight, bias)
+        return True
+
+    return dataclasses.replace(PLAIN, add_linear=add_linear)
+
+
+def prefix(ops: Ops, fp8: bool, monkeypatch: pytest.MonkeyPatch, most: int, *, runs: int = 1) -> tuple[Tensor, Tensor]:
     """Keys and values [layer, rows, K] of a batch of made-up tokens, chunks having at most so many rows."""
     monkeypatch.setattr(forward, "MOST_ROWS", most)
     model = golden_model("pi05")
@@ -93,7 +151,8 @@ def prefix(ops: Ops, fp8: bool, monkeypatch: pytest.MonkeyPatch, most: int) -> t
     buffers = BatchBuffers(config, weights, ops, BatchSize(4, 6), pictures, 160)
     run = PackedPrefix(buffers, 150)
     run.write(CAMERAS, [np.arange(1, count) for count in (40, 47, 20, 30)])
-    run.run()
+    for _ in range(runs):
+        run.run()
     return buffers.cache.k[:, : run.rows], buffers.cache.v[:, : run.rows]
 
 

@@ -63,6 +63,8 @@ BF16_TILES = [  # a ring of 3 is used again and again; clusters of either kind; 
     ("plain", Tile(1, 24, ring=3, overlap=True)),
     ("bias", Tile(1, 16, ring=3, overlap=True)),
     ("gelu", Tile(1, 32, cluster_m=2, ring=3, overlap=True)),
+    ("added", Tile(1, 16, ring=3)),
+    ("added", Tile(1, 24, ring=3, overlap=True)),
 ]
 
 
@@ -72,14 +74,18 @@ def test_a_product_in_bf16_is_right_in_whatever_order_its_threads_go(
 ) -> None:
     m, n, k = 136, 40, 504
     x, weight = random(m, k), random(2 * n if epilogue == "geglu" else n, k, seed=1) / k**0.5
-    bias = random(n) if epilogue in ("bias", "gelu", "partial") else None
+    bias = random(n) if epilogue in ("bias", "gelu", "partial", "added") else None
     expected = product(x, weight, bias, epilogue)
+    stream = random(m, n, seed=8) if epilogue == "added" else None
+    if stream is not None:
+        expected = (expected.bfloat16() + stream).float()
     for seed in SEEDS:
         machine(seed)
         residual = sums = None
         if tile.gather:
             residual, sums = random(m, n, seed=9), Sums.allocate(tile, m, n, CPU)
-        out = bf16.matmul(x, weight, tile, epilogue, bias, residual=residual, sums_out=sums).float()
+        into = None if stream is None else stream.clone()
+        out = bf16.matmul(x, weight, tile, epilogue, bias, into, residual=residual, sums_out=sums).float()
         out = out.sum(0) if epilogue in ("partial", "parts") else out
         wanted = expected if residual is None else expected + residual.float()
         torch.testing.assert_close(out, wanted, rtol=1e-2, atol=1e-2)
@@ -96,6 +102,8 @@ def test_a_product_in_bf16_is_right_in_whatever_order_its_threads_go(
         ("geglu", Tile(1, 64, ring=3), None),
         ("plain", Tile(1, 24, ring=3, overlap=True), None),
         ("gelu", Tile(1, 16, ring=3, overlap=True), 20.0),
+        ("added", Tile(1, 24, ring=3), None),
+        ("added", Tile(1, 16, ring=3, overlap=True), None),
     ],
 )
 def test_a_product_in_fp8_is_right_in_whatever_order_its_threads_go(
@@ -103,12 +111,14 @@ def test_a_product_in_fp8_is_right_in_whatever_order_its_threads_go(
 ) -> None:
     m, n, k = 72, 40, 1008
     weight = quantize(random(2 * n if epilogue == "geglu" else n, k, seed=1) / k**0.5, 0.01)
-    x, bias = to_e4m3(random(m, k), weight.inverse), random(n) if epilogue == "gelu" else None
-    sums = weight.product(x, bias)
+    x, bias = to_e4m3(random(m, k), weight.inverse), random(n) if epilogue in ("gelu", "added") else None
+    stream = random(m, n, seed=8) if epilogue == "added" else None
+    sums = weight.product(x, bias) + (0 if stream is None else stream.float())
     expected = plain.gelu(sums) if epilogue == "gelu" else plain.geglu(sums) if epilogue == "geglu" else sums
     for seed in SEEDS[:2]:
         machine(seed)
-        out = fp8.matmul_fp8(x, weight, tile, epilogue, bias, inverse=inverse)
+        into = None if stream is None else stream.clone()
+        out = fp8.matmul_fp8(x, weight, tile, epilogue, bias, into, inverse)
         assert out.dtype == (torch.bfloat16 if inverse is None else E4M3)
         error = (out.float() / (inverse or 1) - expected).norm() / expected.norm()
         assert error < (0.006 if inverse is None else 0.03)

@@ -174,7 +174,7 @@ def test_loads_fill_a_tile_and_its_stages_fit_into_shared_memory(
     stages = sizes["TP_STAGES"] * (tile.rows + tile.columns) * 128
     barriers = 16 * sizes["TP_STAGES"] + 16
     factors = 8 * tile.warpgroups * tile.columns if fp8 else 0
-    lines = tile.warpgroups * 4 * 16 * 128 if epilogue == "parts" else 0
+    lines = tile.warpgroups * 4 * 16 * 128 if epilogue in ("parts", "added") and not tile.overlap else 0
     assert sizes["TP_STAGES"] >= 3
     assert 1024 + stages + barriers + factors + lines <= sizes["TP_SHARED_BYTES"] <= instructions.SHARED_BYTES
     assert instructions.SHARED_BYTES == 227 * 1024
@@ -206,6 +206,8 @@ def test_a_halved_tile_fits_a_multiprocessor_twice() -> None:
             one.shared_bytes(factors=1, lines=lines) for one in (tile, dataclasses.replace(tile, ring=tile.ring + 1))
         ]
         assert bytes_of[0] <= gemm.HALF_SHARED_BYTES < bytes_of[1]
+    short = Tile(1, 16, ring=4)
+    assert short.halved(factors=1, lines=False) == short, "a ring that is shorter already stays"
 
 
 def test_what_is_fetched_ahead_is_shared_out_and_never_reaches_beyond_the_matrix(
@@ -305,6 +307,52 @@ def test_every_suffix_has_tiles_that_fit(dim: int) -> None:
             if isinstance(tile, FewTile):
                 assert tile.keys % 16 == 0 and tile.sent_rows <= tile.keys, "what is sent lies where keys were"
                 assert tile.members * tile.part >= tile.keys and tile.members * tile.columns >= dim
+
+
+@pytest.mark.parametrize("dim", [64, 128, 192, 256])
+def test_a_suffixs_products_read_only_what_their_cta_has(dim: int) -> None:
+    """By suffix_few.cu's layout, for all rows and sizes of tiles that `suffix_tile.tiles` yields, and for others.
+
+    Products read whole blocks of 64 rows and whole panels of 64 columns, of which some are nobody's.
+    """
+    sizes = range(16, suffix_tile.FEW_KEYS + 1, 16)
+    for rows, ranks, keys, warpgroups in itertools.product(range(8, 113, 8), (1, 6, 8), sizes, (2, 4)):
+        tile, blocks = FewTile(dim, rows, ranks, keys, warpgroups), -(-rows // 64)
+        if blocks > warpgroups or tile.sent_rows > keys:
+            continue
+        panels, key_panel, row_panel = dim // 64, keys * 128, rows * 128
+        values = panels * key_panel
+        queries = values + panels * key_panel
+        weights = queries + panels * row_panel
+        barriers = weights + -(-keys // 64) * row_panel + (64 * blocks - rows) * 128
+        ends = barriers + 16 + 2 * tile.members * 64 * blocks * 4
+        used = -(-dim // tile.columns)  # members that have columns
+        furthest = (
+            (panels - 1) * key_panel + tile.members * tile.part * 128,  # keys
+            values + used * tile.columns // 64 * key_panel,
+            queries + (panels - 1) * row_panel + 64 * blocks * 128,
+            weights + (-(-keys // 64) - 1) * row_panel + 64 * blocks * 128,
+            ends + tile.sent_rows * 8,
+        )
+        assert 1024 + max(furthest) == tile.shared_bytes, f"{tile}: beside what aligns its first byte"
+
+
+def test_four_warpgroups_are_tried_only_where_they_need_fewer_clusters() -> None:
+    for rows, batch in itertools.product(range(8, 417, 8), (1, 4, 8, 16)):
+        few = [
+            (tile, clusters)
+            for tile, clusters in suffix_tile.tiles(256, rows, batch, 570)
+            if tile.source == "suffix_few"
+        ]
+        needed = {tile.warpgroups: clusters for tile, clusters in few}
+        assert list(needed.values()) == sorted(set(needed.values()), reverse=True), f"{rows} rows of {batch}: {needed}"
+        assert all(tile.warpgroups == (2 if tile.rows <= 64 else 4) for tile, _ in few)
+
+
+def test_heads_that_the_suffixs_kernels_refuse_have_no_tiles() -> None:
+    for dim in (72, 320, 512):
+        with pytest.raises(AssertionError, match=f"no heads of {dim} columns"):
+            next(suffix_tile.tiles(dim, 80, 1, 570))
 
 
 # ---- the denoising kernel: what its launch is given, read back as the GPU reads it

@@ -11,8 +11,10 @@ import pytest
 pytest.importorskip("triton", reason="Triton isn't installed")
 
 from compile_for_all.allowed import ALLOWED, allowed
-from compile_for_all.document import CompiledForAll, read_compiled, written
+from compile_for_all.document import Compiled, CompiledForAll, read_compiled, replaced, written
 from compile_for_all.targets import TARGETS, over_limit
+
+from turbopi.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
 ALL = {"sm_80", "sm_86", "sm_87", "sm_89", "sm_90a", "sm_100a", "sm_103a", "sm_110a", "sm_120a", "sm_121a"}
@@ -107,3 +109,20 @@ def test_what_may_spill_is_what_does(kernel: str, number: int) -> None:
 
 def test_what_is_not_named_may_not_spill() -> None:
     assert allowed("attention.vision", 90) == allowed("batch.packed", 80) == 0
+
+
+def test_rows_of_some_kernels_are_replaced_and_the_others_stay() -> None:
+    def row(kernel: str, target: str, registers: int) -> Compiled:
+        return Compiled(kernel, "", target, registers)
+
+    versions = {"nvrtc": "13", "ptxas of 11.0": "13.5"}
+    before = CompiledForAll(
+        "then", versions, [row("a", "sm_80", 1), row("sm90: b", "sm_90a", 2), row("c", "sm_90a", 3)]
+    )
+    now = CompiledForAll("now", versions | {"ptxas of 11.0": "12.9"}, [row("sm90: d", "sm_90a", 4)])
+    found = replaced(before, now, {"sm_90a"}, "sm90: ")
+    assert found.date == "now" and found.versions == versions
+    assert found.rows == [row("a", "sm_80", 1), row("c", "sm_90a", 3), row("sm90: d", "sm_90a", 4)]
+    other = CompiledForAll("now", versions | {"nvrtc": "14"}, [])
+    with pytest.raises(ConfigError, match="nvrtc 13, here 14"):
+        replaced(before, other, {"sm_90a"}, "")

@@ -30,9 +30,9 @@ from turbopi.backends.tuned_tiles import PACKAGE, SHIPPED, SOURCES, TileFile, Tu
 from turbopi.errors import ConfigError
 from turbopi.kernels import nvrtc
 from turbopi.kernels.sm90.gemm import bf16, fp8
-from turbopi.kernels.sm90.gemm.bf16 import Tile
+from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
 from turbopi.kernels.sm90.gemm.candidates import epilogue_with
-from turbopi.kernels.sm90.gemm.products import from_knobs
+from turbopi.kernels.sm90.gemm.products import ADDING_ROWS, from_knobs
 from turbopi.reading import read_document
 from turbopi.source_code import code_of
 
@@ -44,10 +44,9 @@ ROOT = PACKAGE.parents[1]
 def forms(one: TunedTile, tile: Tile) -> Iterator[tuple[str, dict[str, int]]]:
     """The source and the constants of each kernel that the engine may launch for an operation with its tile."""
     in_fp8, residual = one.numbers == "fp8", one.operation == "residual"
-    epilogue = epilogue_with(one.operation, tile, in_fp8)
     copies = (0, PARTS) if residual else (0,)
     norms = (0, PARTS) if one.operation in ("bias", "gelu") and tile.splits == 1 else (0,)
-    for parts, copied in itertools.product(norms, copies):
+    for epilogue, parts, copied in itertools.product(epilogues(one, tile), norms, copies):
         of_norm = replace_tile(tile, overlap=False) if parts else tile
         takes = bf16.parameters(fp8=in_fp8, residual=residual, normed=parts > 0, copied=copied > 0)
         source = bf16.source(tile.columns, takes, fp8=in_fp8)
@@ -59,6 +58,14 @@ def forms(one: TunedTile, tile: Tile) -> Iterator[tuple[str, dict[str, int]]]:
             yield source, fp8.constants(of_norm, epilogue, out_fp8, promote, residual, parts, copied)
 
 
+def epilogues(one: TunedTile, tile: Tile) -> list[Epilogue]:
+    """Of many rows a whole product may be added to the residual stream, or leave as that of few."""
+    found = [epilogue_with(one.operation, tile, one.numbers == "fp8", adds) for adds in (False, True)]
+    if one.rows < ADDING_ROWS or found[1] != "added":
+        return found[:1]
+    return ["plain", "added"] if tile.overlap and found[0] == "parts" else found
+
+
 def machine_code(one: TunedTile) -> str:
     """A hash of the machine code of all forms and of how they are launched; of the library's tiles, which have none
     here, the same for all.
@@ -67,8 +74,7 @@ def machine_code(one: TunedTile) -> str:
     if isinstance(tile, Tile):
         in_fp8 = one.numbers == "fp8"
         steps = -(-one.inner // (fp8.DEPTH if in_fp8 else bf16.DEPTH))
-        epilogue = epilogue_with(one.operation, tile, in_fp8)
-        launched = bf16.layout(tile, epilogue, one.rows, one.columns, steps, None, None)
+        launched = bf16.layout(tile, epilogues(one, tile)[-1], one.rows, one.columns, steps, None, None)
         digest.update(repr((launched, bf16.clusters(tile, math.prod(launched[1]), 1 << 20))).encode())
         for source, constants in forms(one, tile):
             digest.update(nvrtc.compile_cubin(source, ARCH, constants))

@@ -22,6 +22,7 @@ from turbopi.kernels.sm90.denoise.packing import Arrangement
 from turbopi.kernels.sm90.gemm import bf16, fp8
 from turbopi.kernels.sm90.gemm.bf16 import Epilogue, Tile
 from turbopi.kernels.sm90.instructions import SHARED_BYTES
+from turbopi.kernels.sm90.norms import layer_norm
 
 ARCH = "sm_90a"
 CACHE_ROWS = 976  # of `fused` with three cameras and prompts of up to 200 tokens
@@ -71,6 +72,11 @@ def _attention(tile: attention.AttentionTile, whole: bool, folder: Path | None, 
     return nvrtc.compile_cubin(attention.source(tile), ARCH, sizes, folder=folder)
 
 
+def _layer_norm(has_y: bool, in_fp8: bool, folder: Path | None) -> bytes:
+    sizes = layer_norm.constants(preset("pi05_libero").model.vision.width, has_y, in_fp8)
+    return nvrtc.compile_cubin(layer_norm.source(in_fp8), ARCH, sizes, folder=folder)
+
+
 def _suffixes(tile: SuffixTile | FewTile, in_fp8: bool, folder: Path | None) -> bytes:
     return nvrtc.compile_cubin(suffix.source(tile), ARCH, suffix.constants(tile, in_fp8), folder=folder)
 
@@ -98,6 +104,19 @@ SHAPES: dict[str, Callable[[Path | None], bytes]] = {
     "prefix's GeGLU, fp8": partial(_product_fp8, Tile(3, 128, cluster_n=2, overlap=True), "geglu", 2048, 0, True),
     "vision's qkv in batches, bf16": partial(_product, Tile(2, 176, 2, overlap=True), "bias", False),
     "vision's fc1 in batches, fp8": partial(_product_fp8, Tile(2, 184, overlap=True), "gelu", 1152, 0, True),
+    "vision's output added to the stream in batches, fp8": partial(_product_fp8, Tile(3, 192), "added", 1152, 0, False),
+    "prefixes' output added to the stream, fp8": partial(
+        _product_fp8, Tile(2, 144, overlap=True), "added", 2048, 0, False
+    ),
+    "prefixes' output added to the stream, bf16": partial(_product, Tile(3, 192, cluster_m=2), "added", False),
+    "LayerNorm of many rows, fp8": partial(_layer_norm, False, True),
+    "LayerNorm of many rows and what is added, bf16": partial(_layer_norm, True, False),
+    # Few rows, in tiles that leave room for the next kernel
+    "expert's q|k|v in batches, bf16": partial(_product, Tile(1, 40), "plain", False),
+    "expert's GeGLU in batches, bf16": partial(_product, Tile(1, 64), "geglu", False),
+    "expert's output in parts in batches, fp8": partial(
+        _product_fp8, Tile(1, 32, splits=4, ring=4), "parts", 2048, 0, False
+    ),
     "product that leaves a copy, fp8": partial(_product_fp8, Tile(1, 80, cluster_m=2), "bias", 1152, 15, False),
     "vision's attention": partial(_attention, attention.AttentionTile(72, 128, sharing=2), True),
     "prefix's attention": partial(_attention, attention.AttentionTile(256, 64), False),

@@ -2,6 +2,7 @@
 
     PYTHONPATH=src:tools python -m compile_for_all --json benchmarks/results/compiled_for_all.json
     PYTHONPATH=src:tools python -m compile_for_all --targets 89,120 --kernels gemm
+    PYTHONPATH=src:tools python -m compile_for_all --targets 90 --kernels "sm90: " --into FILE
 
 Triton's kernels in each variant that the full model launches there, products and attention in each tile that
 `turbopi tune` may choose; CUDA C++ kernels by NVRTC: those below kernels/portable for each target, Hopper's for 90a.
@@ -33,10 +34,11 @@ def main() -> int:
     parser.add_argument("--chosen", action="store_true", help="products only in the tiles that the cost model chooses")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--json", type=Path, help="also write the result here")
+    parser.add_argument("--into", type=Path, help="a result: its rows of these targets and kernels are made anew")
     given = parser.parse_args()
     os.environ.pop("TRITON_INTERPRET", None)
     from compile_for_all.compiling import compile_target, versions
-    from compile_for_all.document import CompiledForAll, written
+    from compile_for_all.document import CompiledForAll, read_compiled, replaced, written
     from compile_for_all.targets import TARGETS
 
     numbers = None if given.targets is None else given.targets.split(",")
@@ -49,6 +51,11 @@ def main() -> int:
     show(rows, Console(width=WIDTH))
     if given.json is not None:
         given.json.write_text(written(CompiledForAll(date.today().isoformat(), versions(), rows)))
+    if given.into is not None:
+        now = CompiledForAll(date.today().isoformat(), versions(), rows)
+        given.into.write_text(
+            written(replaced(read_compiled(given.into), now, {one.arch for one in wanted}, given.kernels))
+        )
     return 1 if any(row.problem for row in rows) else 0
 
 

@@ -35,6 +35,23 @@ def read_compiled(file: Path) -> CompiledForAll:
     return read_document(file, CompiledForAll, ConfigError)
 
 
+def replaced(before: CompiledForAll, now: CompiledForAll, targets: set[str], only: str) -> CompiledForAll:
+    """`before` with the rows of `now` in place of its own of these targets and of kernels with `only` in their name.
+
+    For a change of some kernels. Raises ConfigError where compilers have other versions.
+    """
+    both = before.versions.keys() & now.versions.keys()
+    if not any("110" in target for target in targets):
+        both -= {"ptxas of 11.0"}
+    if other := [name for name in sorted(both) if before.versions[name] != now.versions[name]]:
+        told = ", ".join(f"{name} {before.versions[name]}, here {now.versions[name]}" for name in other)
+        raise ConfigError(f"the result is of other compilers: {told}. Make it anew with --json")
+    order = {row.target: place for place, row in enumerate(reversed(before.rows))}
+    kept = [row for row in before.rows if row.target not in targets or only not in row.kernel]
+    rows = sorted([*kept, *now.rows], key=lambda row: -order.get(row.target, 0))
+    return structs.replace(before, date=now.date, rows=rows)
+
+
 def written(document: CompiledForAll) -> str:
     """JSON with a line for each row: there are thousands."""
     rows = ",\n".join(f"  {json.dumps(plain_document(row))}" for row in document.rows)

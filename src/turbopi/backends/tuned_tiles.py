@@ -38,7 +38,7 @@ SOURCES: Final[dict[Kernels, tuple[str, ...]]] = {
         *("kernels/portable/norms.py", "kernels/portable/products.py", "kernels/dependent_launch.py"),
     ),
     "hopper": (
-        *("kernels/sm90/gemm/*", "kernels/sm90/instructions.*"),
+        *("kernels/sm90/gemm/*", "kernels/sm90/norms/*", "kernels/sm90/instructions.*"),
         *("kernels/portable/norms.py", "kernels/portable/activations.py", "kernels/portable/products.py"),
     ),
 }
@@ -221,9 +221,13 @@ def read_tile_file(file: Path) -> TileFile:
 
 
 def write_tile_file(document: TileFile, file: Path) -> None:
-    """Whole or not at all. Raises OutputError if it can't be written."""
+    """Whole or not at all, a tile on a line. Raises OutputError if it can't be written."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(file, json.dumps(plain_document(document), indent=1) + "\n")
+    about = plain_document(document)
+    tiles = ",\n  ".join(json.dumps(plain_document(tile)) for tile in document.tiles)
+    del about["tiles"]
+    begin = json.dumps(about, indent=1).removesuffix("\n}")
+    write_whole(file, f'{begin},\n "tiles": [\n  {tiles}\n ]\n}}\n')
 
 
 def knobs_text(knobs: Knobs) -> str:

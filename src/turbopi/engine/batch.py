@@ -114,7 +114,7 @@ class PackedPrefix:
         def attend(i: int, q: Tensor, **input: Any) -> Tensor:
             return batched.packed_attention(q, *places(i), segments, heads, **input)
 
-        forward.prefix_layers(config, weights, ops, self._embs, rope, places, attend)
+        forward.prefix_layers(config, weights, ops, self._embs, rope, places, attend, in_place=True)
 
 
 class BatchLoop:

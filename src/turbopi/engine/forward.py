@@ -5,7 +5,7 @@ sits at the end only and `length`, in device memory, says where it begins; so no
 or the state changes. The mathematics is `turbopi.model.reference`'s; only its order of work differs:
 
   - matrices that share an input are one product; adaRMS comes from a table of all steps;
-  - a residual is added together with the norm behind it;
+  - a residual is added together with the norm behind it, or of many rows by the product in front of that, in place;
   - where the next matrix is a `ScaledMatrix`, an operation's result is rounded to E4M3 for it;
   - logits leave their product in float32 and keys beyond `length` get -inf before the softmax.
 
@@ -62,8 +62,9 @@ def vision_tokens(
         y = None
         for layer in head:
             x, y = _vision_layer(config, ops, layer, x, y)
-        if several:  # only a norm can add y, whatever that is; what is normed isn't needed yet
+        if several and y is not None:  # only a norm can add it, whatever it is; what is normed isn't needed yet
             x, _ = ops.residual_layer_norm(x, y, *(rest[0].norm1 if rest else weights.post_layernorm), eps)
+        if several:
             ends.append(x)
         if rest or several:
             head_ends()
@@ -81,10 +82,19 @@ def _vision_layer(config: ModelConfig, ops: Ops, layer: VisionLayer, x: Tensor, 
     x, normed = ops.residual_layer_norm(x, y, *layer.norm1, v.layer_norm_eps, **input_of(layer.qkv[0]))
     qkv = ops.linear(normed, *layer.qkv)
     attended = ops.vision_attention(qkv, len(x) // v.num_tokens, v.num_heads, **input_of(layer.out[0]))
-    y = ops.residual_linear(attended, *layer.out)
+    y = _added(ops, x, attended, *layer.out)
     x, normed = ops.residual_layer_norm(x, y, *layer.norm2, v.layer_norm_eps, **input_of(layer.fc1[0]))
     hidden = ops.linear_gelu(normed, *layer.fc1, **input_of(layer.fc2[0]))
-    return x, ops.residual_linear(hidden, *layer.fc2)
+    return x, _added(ops, x, hidden, *layer.fc2)
+
+
+def _added(ops: Ops, stream: Tensor | None, x: Tensor, *affine: Any) -> Any:
+    """Add a product to the residual stream in place, if that may be written over (not None) and the operations say that
+    it is faster. Returns what the next norm is still to add.
+    """
+    if stream is not None and ops.add_linear is not None and ops.add_linear(stream, x, *affine):
+        return None
+    return ops.residual_linear(x, *affine)
 
 
 def prefix_cache(
@@ -110,9 +120,19 @@ def prefix_cache(
 
 
 def prefix_layers(
-    config: ModelConfig, weights: Weights, ops: Ops, x: Tensor, rope: Rope, places: Places, attend: Attend
+    config: ModelConfig,
+    weights: Weights,
+    ops: Ops,
+    x: Tensor,
+    rope: Rope,
+    places: Places,
+    attend: Attend,
+    *,
+    in_place: bool = False,
 ) -> None:
     """Prefix embeddings [S, D] through the language model; nothing is left of it but keys and values.
+
+    in_place: the embeddings may be written over.
 
     RoPE and attention are of all rows. What lies between two attentions, from a layer's `out` to the next one's `qkv`,
     is done for one chunk of rows after the other: see `MOST_ROWS`.
@@ -126,7 +146,7 @@ def prefix_layers(
         for c, rows in enumerate(chunks):
             stream, y = streams[c], None
             if attended is not None:
-                stream, y = _behind_attention(ops, layers[i - 1], stream, attended[rows], eps)
+                stream, y = _behind_attention(ops, layers[i - 1], stream, attended[rows], eps, in_place)
             streams[c], normed = ops.residual_rms_norm(stream, y, None, layer.norm1, None, eps, **input_of(layer.qkv))
             qkv = ops.linear(normed, matrix, None, None if joint is None else joint[rows])
         q = ops.rope_split(qkv if joint is None else joint, *rope, *places(i))
@@ -134,11 +154,14 @@ def prefix_layers(
             attended = attend(i, q, **input_of(layer.out))
 
 
-def _behind_attention(ops: Ops, layer: GemmaLayer[Any], x: Tensor, attended: Tensor, eps: float) -> tuple[Tensor, Any]:
+def _behind_attention(
+    ops: Ops, layer: GemmaLayer[Any], x: Tensor, attended: Tensor, eps: float, in_place: bool
+) -> tuple[Tensor, Any]:
     """The prefix's residual stream [rows, D], and what the next layer's norm is to add to it."""
-    y = ops.residual_linear(attended, layer.out)
+    y = _added(ops, x if in_place else None, attended, layer.out)
     x, normed = ops.residual_rms_norm(x, y, None, layer.norm2, None, eps, **input_of(layer.gate_up))
-    return x, ops.residual_linear(ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down)), layer.down)
+    hidden = ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down))
+    return x, _added(ops, x if in_place else None, hidden, layer.down)
 
 
 def row_chunks(rows: int) -> list[slice]:

@@ -84,6 +84,9 @@ class Ops:
     rope_split: Callable[..., Tensor]
     vision_attention: Callable[..., Tensor]
     attention: Callable[..., Tensor]
+    # adds a product to the residual stream, its first argument, in place; further arguments as of `residual_linear`.
+    # Returns whether it did: where it didn't, `residual_linear` is the faster way
+    add_linear: Callable[..., bool] | None = None
     prefix_cache: Callable[..., None] | None = None  # in place of `forward.prefix_cache`
     resize_pictures: Callable[[Tensor, Tensor], None] | None = None  # as `SOURCE` says; None: the host resizes them
     # by the expert's sizes, the number of its tokens, and whether keys are hidden from some of them (`Expert.hidden`);

@@ -41,4 +41,6 @@ def _fits_portable(key: TileKey, tile: portable.Tile, capability: Capability) ->
 def _fits_hopper(key: TileKey, knobs: Knobs) -> bool:
     tile = from_knobs(knobs)
     operation: Operation = key.operation  # type: ignore[assignment]
-    return isinstance(tile, Tile) and possible(tile, operation, key.numbers == "fp8", key.inner)
+    return isinstance(tile, Tile) and any(
+        possible(tile, operation, key.numbers == "fp8", key.inner, adds) for adds in (False, True)
+    )

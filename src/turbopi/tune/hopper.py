@@ -1,23 +1,26 @@
 """Hopper's products with their inputs, as the tuner measures them: as the vision tower and the prefix run them.
 
+Whole products of many rows are added to the residual stream in place, and the norm behind finds them there.
+
 Between two of the tower's products no kernel runs: one adds the residual stream, the next one takes the LayerNorm of
 its input from the sums of each row. So they are measured in these forms, where they have them.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from turbopi.kernels import plain
-from turbopi.kernels.portable import norms
 from turbopi.kernels.portable.products import linear, linear_geglu, linear_gelu
 from turbopi.kernels.sm90.gemm import candidates as hopper_candidates
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Folded, Sums, Tile, matmul
 from turbopi.kernels.sm90.gemm.candidates import epilogue_with
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, matmul_fp8
 from turbopi.kernels.sm90.gemm.products import (
+    ADDING_ROWS,
     Chosen,
     Operation,
     as_input,
@@ -28,6 +31,7 @@ from turbopi.kernels.sm90.gemm.products import (
     parts_at_once,
     to_knobs,
 )
+from turbopi.kernels.sm90.norms import layer_norm
 from turbopi.kernels.tile_table import NO_TILES, Knobs
 from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
 from turbopi.tune.gpu import poisoned, relative
@@ -40,11 +44,15 @@ INPUT_SCALE = 0.02
 
 
 def resolved(one: Wanted, sms: int) -> Wanted:
-    """As the tower runs it: into the residual stream, and with the norm in front folded, where its sizes have that."""
+    """As a call runs it: into the residual stream, and with the norm in front folded, where its sizes have that."""
+    adds = one.rows >= ADDING_ROWS
+    if one.kernels == "hopper" and one.name in ("prefix out", "prefix down"):
+        return replace(one, adds=adds and one.batch > 1)  # one observation's embeddings stay
     if one.kernels != "hopper" or not one.name.startswith(("vision", "projector")):
         return one
     if one.operation == "residual":
-        return one if sms >= GATHERING_SMS and usual_choice(one, sms) is not None else replace(one, operation="partial")
+        into_stream = sms >= GATHERING_SMS and usual_choice(one, sms) is not None
+        return one if into_stream else replace(one, operation="partial", adds=adds)
     before = replace(one, operation="residual", columns=one.inner)  # as the tower's product that leaves the stream
     folded = one.norm_in_front == "layer" and sms >= GATHERING_SMS and usual_choice(before, sms) is not None
     return replace(one, normed=True, norm_in_front=None) if folded else one
@@ -62,7 +70,7 @@ def candidates(one: Wanted, sms: int) -> list[Knobs]:
     """The usual choice first."""
     operation: Operation = one.operation  # type: ignore[assignment]
     sizes, usual = (one.rows, one.columns, one.inner), usual_choice(one, sms)
-    found = hopper_candidates.candidates(operation, one.numbers == "fp8", *sizes, sms, usual)
+    found = hopper_candidates.candidates(operation, one.numbers == "fp8", *sizes, sms, usual, one.adds)
     if one.normed:  # a norm is multiplied whole
         found = [cut for cut in found if not isinstance(cut, Tile) or (cut.splits == 1 and not cut.overlap)]
     return [to_knobs(cut) for cut in found]
@@ -140,7 +148,10 @@ class Product(ProductBench):
         if not isinstance(cut, Tile):
             return self._by_library(cut, copy, x)
         one, weight = self.operation, self.weights[copy]
-        epilogue = epilogue_with(one.operation, cut, self.fp8)
+        epilogue = epilogue_with(one.operation, cut, self.fp8, one.adds)
+        if epilogue == "added" and out is None:
+            assert self.norm_behind is not None
+            out = self.norm_behind.stream
         if one.operation == "residual":
             return self._into_stream(cut, copy, out, x)
         ahead = self._ahead(copy)
@@ -158,6 +169,19 @@ class Product(ProductBench):
             return matmul_fp8(x, weight, cut, epilogue, self.bias, out, self.inverse, ahead=ahead)
         return as_input(matmul(x, weight, cut, epilogue, self.bias, out, ahead=ahead), self.inverse)
 
+    def in_call(self, knobs: Knobs, copy: int) -> object:
+        result = self.run(knobs, copy, x=self.in_front())
+        if self.norm_behind is not None and self._added(from_knobs(knobs)):
+            return self.norm_behind(None)
+        return self.behind(result)
+
+    def _added(self, cut: Chosen) -> bool:
+        one = self.operation
+        return isinstance(cut, Tile) and epilogue_with(one.operation, cut, self.fp8, one.adds) == "added"
+
+    def layer_norm(self, *given: Any) -> tuple[Tensor, Tensor]:
+        return layer_norm.residual_layer_norm(*given)
+
     def _into_stream(self, tile: Tile, copy: int, out: Tensor | None, x: Tensor) -> Tensor:
         one, weight = self.operation, self.weights[copy]
         assert self.norm_behind is not None
@@ -174,7 +198,7 @@ class Product(ProductBench):
     def _by_library(self, parts: int | None, copy: int, x: Tensor) -> Tensor:
         one, weight, bias = self.operation, self.weights[copy], self.bias
         if one.normed:
-            x = norms.residual_layer_norm(self.raw, None, *self.front, EPS)[1]
+            x = self.layer_norm(self.raw, None, *self.front, EPS)[1]
         if parts is not None:
             assert isinstance(weight, Tensor)
             return parts_at_once(x, weight, parts)
@@ -187,6 +211,8 @@ class Product(ProductBench):
 
     def out_for(self, knobs: Knobs) -> Tensor | None:
         one, cut = self.operation, from_knobs(knobs)
+        if self._added(cut):
+            return torch.zeros(one.rows, one.columns, dtype=torch.bfloat16, device=self.device)
         if not isinstance(cut, Tile) or one.operation in ("partial", "parts") or (one.out_fp8 and not self.fp8):
             return None
         dtype = E4M3 if one.out_fp8 else torch.bfloat16

@@ -6,7 +6,9 @@ A norm that is a kernel of its own is timed with the product, in front or behind
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,11 +33,12 @@ class StreamNorm:
     scale: Tensor  # [width]
     shift: Tensor  # [width], of a LayerNorm
     inverse: float | None  # of a result in E4M3
+    layer_norm: Callable[..., tuple[Tensor, Tensor]]
 
-    def __call__(self, y: Tensor) -> Tensor:
-        """y: [rows, width], or a product's parts of it."""
+    def __call__(self, y: Tensor | None) -> Tensor:
+        """y: [rows, width], or a product's parts of it; None: the stream has it already."""
         if self.kind == "layer":
-            return norms.residual_layer_norm(self.stream, y, self.scale, self.shift, EPS, self.inverse)[1]
+            return self.layer_norm(self.stream, y, self.scale, self.shift, EPS, self.inverse)[1]
         return norms.residual_rms_norm(self.stream, y, None, self.scale, None, EPS, self.inverse)[1]
 
 
@@ -91,7 +94,11 @@ class ProductBench(GpuBench):
         scale, shift = self.random(width), self.random(width)
         if kind == "rms":
             scale = scale.float()  # as the engine has it
-        return StreamNorm(kind, self.random(self.operation.rows, width), scale, shift, inverse)
+        return StreamNorm(kind, self.random(self.operation.rows, width), scale, shift, inverse, self.layer_norm)
+
+    def layer_norm(self, *given: Any) -> tuple[Tensor, Tensor]:
+        """The kernel that a call runs, in place of `plain.residual_layer_norm`."""
+        return norms.residual_layer_norm(*given)
 
 
 def activated(operation: str, sums: Tensor) -> Tensor:

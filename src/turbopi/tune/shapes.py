@@ -41,10 +41,12 @@ class Operation:
     uses       how often a call runs it
     out_fp8    whether its result leaves in E4M3
     images     of vision's attention
-    batch, prefix_rows  of attention in a batch: observations, and rows of each one's prefix
+    batch      observations of its call; of vision 1, as nothing depends on them
+    prefix_rows  of attention in a batch: rows of each one's prefix
     norm_in_front  a kernel of its own, which makes the input from the residual stream
     norm_behind    likewise; adds the result to the residual stream
     normed     whether the product itself takes the LayerNorm of its input: see `tune.hopper.resolved`
+    adds       whether a whole product is added to the residual stream in place: see there
     """
 
     name: str
@@ -63,6 +65,7 @@ class Operation:
     norm_in_front: Norm | None = None
     norm_behind: Norm | None = None
     normed: bool = False
+    adds: bool = False
 
     @property
     def key(self) -> TileKey:
@@ -159,7 +162,8 @@ def _prefix(config: ModelConfig, call: Call, precision: Precision, kernels: Kern
         yield replace(attention, batch=call.batch, out_fp8=fp8)
     for size, count in Counter(chunk.stop - chunk.start for chunk in row_chunks(rows)).items():
         uses = (g.depth - 1) * count
-        usual = Operation("", kernels, "plain", precision, size, heads + 2 * g.head_dim, width, uses)
+        columns = heads + 2 * g.head_dim
+        usual = Operation("", kernels, "plain", precision, size, columns, width, uses, batch=call.batch)
         normed = replace(usual, norm_in_front="rms")
         yield replace(normed, name="prefix qkv")
         yield replace(normed, name="prefix last k, v", columns=2 * g.head_dim, uses=count)

@@ -21,6 +21,7 @@ from turbopi.kernels.sm90.gemm.bf16 import Tile
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS
 from turbopi.kernels.sm90.gemm.tiles import PARTS_TILES, RESIDUAL_TILES, VISION_TILES
 from turbopi.kernels.sm90.gemm.vision_products import VisionProducts
+from turbopi.kernels.sm90.norms import layer_norm
 from turbopi.kernels.sm90.vjp import products as vjp
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 
@@ -31,19 +32,23 @@ def hopper_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     origin = {
         "vision products": f"CUDA for {_rows(VISION_TILES)} rows, else cuBLAS",
         "GeGLU of the prefix": "CUDA, in its product's epilogue, or Triton behind cuBLAS",
+        "residual stream": f"products of {products.ADDING_ROWS} rows and more in our tiles are added to it in place",
         "product behind the prefix's GeGLU": "in parts that the norm behind it adds up: "
         f"CUDA for {_rows(PARTS_TILES, Tile)} rows, cuBLAS for {_rows(PARTS_TILES, int)}, in whole 64; else "
         "cuBLAS at once",
         "the expert with a way back": vjp.ORIGIN,
         "vision and prefix attention": "CUDA; Triton where head_dim isn't a multiple of 8 from 16 to 256",
     }
+    norms = f"CUDA from {layer_norm.ROWS} rows on, else Triton"
     if instructions.multiprocessors(device) >= GATHERING_SMS:
-        origin["LayerNorm"] = f"most in the products around them for {_rows(RESIDUAL_TILES)} rows, else Triton"
+        norms = f"most in the products around them for {_rows(RESIDUAL_TILES)} rows, {norms}"
+    origin["LayerNorm"] = norms
     return replace(
         portable,
         residual_layer_norm=vision.residual_layer_norm,
         linear=vision.linear,
         residual_linear=vision.residual_linear,
+        add_linear=vision.add_linear,
         linear_gelu=vision.linear_gelu,
         linear_geglu=partial(products.tuned_linear_geglu, tiles=tiles),
         vision_attention=partial(vision_attention, tiles=tiles),

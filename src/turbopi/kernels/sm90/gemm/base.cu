@@ -13,7 +13,8 @@
 // another waits for that kernel's end to load `a`.
 //
 // Epilogues: 0 plain, 1 + bias, 2 gelu(+ bias), 3 GeGLU (w has N gate rows, then N up rows), 4 float32 sums of a part
-// of K each (+ bias in the first) as out[split, M, N], 5 the same in bfloat16, without a bias.
+// of K each (+ bias in the first) as out[split, M, N], 5 the same in bfloat16, without a bias, 6 + bias, rounded and added
+// to what is in `out`, the residual stream: the L2 cache adds, so nobody waits for what was there.
 //
 // TP_GATHER: the CTAs that share a tile, each with a part of K, are in one cluster. In the end each gets the others'
 // sums of a share of the tile's columns through distributed shared memory. For one tile a CTA: without TP_APART they go
@@ -54,7 +55,8 @@ constexpr int A_BYTES = BM * ROW_BYTES, B_BYTES = BN * ROW_BYTES, STAGE_BYTES = 
 constexpr bool PACED = STAGE_BYTES >= 28 * 1024;
 constexpr int LEAD = 2;
 constexpr u32 PACE = 250;
-constexpr bool BIASED = !FP8 && !TP_NORMED && (EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4);  // E4M3: see Factors
+constexpr bool BIASED = !FP8 && !TP_NORMED &&  // E4M3: see Factors
+                        (EPILOGUE == 1 || EPILOGUE == 2 || EPILOGUE == 4 || EPILOGUE == 6);
 // TP_LEAVES_ROOM: a CTA has half of a multiprocessor's registers, so that one of the next kernel may start beside it.
 static_assert(!TP_LEAVES_ROOM || WGS == 1, "more warpgroups need more registers");
 constexpr int CONSUMER_REGISTERS = TP_LEAVES_ROOM ? 208 : WGS == 1 ? 240 : WGS == 2 ? 232 : 160;
@@ -136,7 +138,9 @@ __device__ constexpr int owner(int block) { return block / TOGETHER * SPLITS / G
 constexpr int FROM_ONE = (GROUPS + SPLITS - 1) / SPLITS * TOGETHER * 128 * WGS * 16;
 constexpr bool APART = TP_APART;
 constexpr int RECEIVED_BYTES = APART ? (SPLITS - 1) * FROM_ONE : 0;
-static_assert(1024 + STAGES * (STAGE_BYTES + 16) + RECEIVED_BYTES + 16 <= TP_SHARED_BYTES, "what a CTA is given");
+static_assert(1024 + STAGES * (STAGE_BYTES + 16) + RECEIVED_BYTES + 16  // then factors, then lines
+                      + (FP8 + (TP_NORMED > 0) + (TP_OVERLAP && BIASED)) * 8 * BN * WGS
+                      + (EPILOGUE >= 5 && !TP_OVERLAP ? BM * ROW_BYTES : 0) <= TP_SHARED_BYTES, "what a CTA is given");
 static_assert(!GATHER || APART || (SPLITS - 1) * FROM_ONE <= STAGES * STAGE_BYTES, "no room for the others' sums");
 
 // Adds up, for the blocks of 8 columns that are this part's, the sums of all parts of a tile, which come with `bar`.
@@ -207,6 +211,30 @@ __device__ __forceinline__ uint2 transpose_bytes(u32 p, u32 q, int lane) {
     return make_uint2(__byte_perm(mine, other, odd ? 0x1054 : 0x5410), __byte_perm(mine, other, odd ? 0x3276 : 0x7632));
 }
 
+// Two or four neighbouring numbers of a row, or eight, on their way out.
+__device__ __forceinline__ void put(u16* to, u32 x) {
+#if TP_EPILOGUE == 6
+    asm volatile("red.global.add.noftz.bf16x2 [%0], %1;" ::"l"(to), "r"(x) : "memory");
+#else
+    *(u32*)to = x;
+#endif
+}
+__device__ __forceinline__ void put(u16* to, uint2 x) {
+#if TP_EPILOGUE == 6
+    asm volatile("red.global.add.noftz.v2.bf16x2 [%0], {%1, %2};" ::"l"(to), "r"(x.x), "r"(x.y) : "memory");
+#else
+    *(uint2*)to = x;
+#endif
+}
+__device__ __forceinline__ void put(u16* to, uint4 x) {
+#if TP_EPILOGUE == 6
+    asm volatile("red.global.add.noftz.v4.bf16x2 [%0], {%1, %2, %3, %4};"
+                 ::"l"(to), "r"(x.x), "r"(x.y), "r"(x.z), "r"(x.w) : "memory");
+#else
+    *(uint4*)to = x;
+#endif
+}
+
 // A lane's part of a row of a tile's results, `value(block)` for each of `count` blocks of 8 columns; `to` is where the
 // tile begins in that row.
 template <typename Value>
@@ -218,11 +246,11 @@ __device__ __forceinline__ void store_row(u16* to, int count, int split, int lan
     for (int j = begin; j + 1 < end; j += 2) {  // lanes of a pair exchange halves of two blocks
         if (GATHER && owner(j) != split) continue;
         const u32 x = value(j), y = value(j + 1), other = __shfl_xor_sync(~0u, odd ? x : y, 1);
-        if (j + odd < count) *(uint2*)(place + j * 8) = odd ? make_uint2(other, y) : make_uint2(x, other);
+        if (j + odd < count) put(place + j * 8, odd ? make_uint2(other, y) : make_uint2(x, other));
     }
     if (end % 2 && (!GATHER || owner(end - 1) == split)) {
         const u32 x = value(end - 1);
-        if (end - 1 < count) *(u32*)(to + (end - 1) * 8 + lane % 4 * 2) = x;
+        if (end - 1 < count) put(to + (end - 1) * 8 + lane % 4 * 2, x);
     }
 }
 template <typename Value>
@@ -274,7 +302,7 @@ __device__ __forceinline__ void store_part(const float (&sums)[BN / 2], u16* to,
 #pragma unroll
         for (int row = lane / 8; row < 16; row += 4) {
             const uint4 line = *(const uint4*)(shared + row * 128 + (chunk ^ row % 8) * 16);
-            if (row < rows && first + chunk < blocks) *(uint4*)(to + (size_t)row * N + (first + chunk) * 8) = line;
+            if (row < rows && first + chunk < blocks) put(to + (size_t)row * N + (first + chunk) * 8, line);
         }
     }
 }

@@ -16,8 +16,8 @@ from turbopi.kernels.nvrtc import compile_cubin
 from turbopi.kernels.sm90 import instructions
 from turbopi.kernels.sm90.instructions import SHARED_BYTES, DependentKernel
 
-Epilogue = Literal["plain", "bias", "gelu", "geglu", "partial", "parts"]
-EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, "partial": 4, "parts": 5}
+Epilogue = Literal["plain", "bias", "gelu", "geglu", "partial", "parts", "added"]
+EPILOGUES: dict[Epilogue, int] = {"plain": 0, "bias": 1, "gelu": 2, "geglu": 3, "partial": 4, "parts": 5, "added": 6}
 SPLIT = ("partial", "parts")
 DEPTH = 64  # of a step along the inner axis
 STEP_BYTES = 128  # the same, in either precision
@@ -52,7 +52,7 @@ class Tile:
             return True
         if epilogue == "geglu":
             return steps > -(-self.columns // 64) * 2
-        return epilogue in ("plain", "bias", "gelu") and steps > -(-self.columns // 32)
+        return epilogue in ("plain", "bias", "gelu", "added") and steps > -(-self.columns // 32)
 
     def stages(self, *, factors: int, lines: bool = False) -> int:
         """As many as fit beside 1 KB of alignment, barriers, pairs of `factors` a column and warpgroup, and sums.
@@ -83,7 +83,7 @@ class Tile:
             self.shared_bytes(factors=factors, lines=lines)
             - self.stages(factors=factors, lines=lines) * self._stage_bytes
         )
-        return replace(self, ring=max(1, (HALF_SHARED_BYTES - least) // self._stage_bytes))
+        return replace(self, ring=min(self.ring, max(1, (HALF_SHARED_BYTES - least) // self._stage_bytes)))
 
     @property
     def _stage_bytes(self) -> int:
@@ -164,6 +164,7 @@ def matmul(
     ahead: Tensor | None = None,
 ) -> Tensor:
     """a [M, K] @ weightᵀ with the epilogue -> bfloat16[M, N]; "partial" -> float32, "parts" -> bfloat16[splits, M, N].
+    "added" rounds a whole product, with its bias or none, and adds it to what is in `out`.
 
     weight [N, K], for "geglu" [2N, K]. All bfloat16 and contiguous, K and N multiples of 8. With "bias" alone,
     `residual` [M, N] is added, the sums of the result's rows go into `sums_out`, and a `copy` may leave, too. With a
@@ -179,6 +180,7 @@ def matmul(
     assert k % 8 == 0 and n % 8 == 0 and weight.shape[1] == k, f"{a.shape} @ {weight.shape}"
     columns, groups = layout(tile, epilogue, m, n, -(-k // DEPTH), residual, sums_out)
     tile = fitted(tile, groups, -(-k // DEPTH), a.device)
+    assert out is not None or epilogue != "added"
     if out is None:
         shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
         out = torch.empty(shape, dtype=torch.float32 if epilogue == "partial" else torch.bfloat16, device=a.device)
@@ -206,7 +208,7 @@ def layout(
     assert residual is None or (epilogue == "bias" and residual.is_contiguous() and sums_out is not None)
     assert residual is None or not tile.overlap, "the stream is added behind the sums"
     assert tile.splits <= steps and tile.takes(epilogue, steps), f"{steps} steps are too few for {tile}"
-    assert not tile.gather or epilogue != "geglu", "sums are gathered after that"
+    assert not tile.gather or epilogue not in ("geglu", "added"), "sums are gathered after that"
     parts = tile.cluster_m * (2 if epilogue == "geglu" else 1)
     assert tile.columns % (8 * parts) == 0 and tile.rows % (8 * tile.cluster_n) == 0, "a share is whole groups of 8"
     assert (tile.splits == 1 or epilogue in SPLIT) != tile.gather, "only partial sums stay split"
@@ -317,7 +319,7 @@ def constants(
     tile: Tile, epilogue: Epilogue, residual: bool = False, normed: int = 0, copied: int = 0
 ) -> dict[str, int]:
     """What kernel.cu is compiled with."""
-    factors = normed > 0 or (tile.overlap and epilogue in ("bias", "gelu"))  # biases lie in shared memory then
+    factors = normed > 0 or (tile.overlap and epilogue in ("bias", "gelu", "added"))  # biases lie in shared memory then
     return tile_constants(tile, epilogue, residual, factors=factors) | {
         "TP_NORMED": normed,
         "TP_COPY": copied,
@@ -329,7 +331,7 @@ def tile_constants(
     tile: Tile, epilogue: Epilogue, residual: bool, *, factors: int, promoted: bool = False
 ) -> dict[str, int]:
     """Of these, what doesn't depend on the precision; for `factors` see `Tile.stages`."""
-    lines = epilogue == "parts"
+    lines = leaves_in_lines(tile, epilogue)
     return {
         "TP_WGS": tile.warpgroups,
         "TP_BN": tile.columns,
@@ -345,6 +347,11 @@ def tile_constants(
         "TP_EPILOGUE": EPILOGUES[epilogue],
         "TP_RESIDUAL": int(residual),
     }
+
+
+def leaves_in_lines(tile: Tile, epilogue: Epilogue) -> bool:
+    """Whether results take the way through shared memory."""
+    return epilogue == "parts" or (epilogue == "added" and not tile.overlap)
 
 
 @cache

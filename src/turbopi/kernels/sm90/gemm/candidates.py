@@ -22,14 +22,18 @@ def epilogue_of(operation: Operation) -> Epilogue:
     return "bias" if operation == "residual" else operation
 
 
-def epilogue_with(operation: str, tile: Tile, in_fp8: bool) -> Epilogue:
-    """What the kernel is compiled with: where nothing stays split, "partial" and E4M3's "parts" are "bias"."""
+def epilogue_with(operation: str, tile: Tile, in_fp8: bool, adds: bool = False) -> Epilogue:
+    """What the kernel is compiled with: where nothing stays split, "partial" and E4M3's "parts" are "bias", or, where
+    the result `adds` to the residual stream in place, "added".
+    """
     epilogue = epilogue_of(operation)  # type: ignore[arg-type]
     whole = tile.splits == 1 or tile.gather
+    if adds and epilogue in SPLIT and tile.splits == 1:
+        return "added"
     return "bias" if whole and epilogue in SPLIT and (in_fp8 or epilogue == "partial") else epilogue
 
 
-def possible(tile: Tile, operation: Operation, in_fp8: bool, k: int) -> bool:
+def possible(tile: Tile, operation: Operation, in_fp8: bool, k: int, adds: bool = False) -> bool:
     """Whether the kernel takes this tile: shares of a cluster in whole groups, registers, shared memory, splits."""
     geglu, steps = operation == "geglu", -(-k // (fp8.DEPTH if in_fp8 else bf16.DEPTH))
     share = 8 * tile.cluster_m * (2 if geglu else 1)
@@ -49,22 +53,28 @@ def possible(tile: Tile, operation: Operation, in_fp8: bool, k: int) -> bool:
         return False
     if tile.overlap and (operation == "residual" or promoted or tile.splits > 1):
         return False
-    stages = tile.stages(factors=2 if in_fp8 else 1, lines=operation == "parts")
-    return tile.takes(epilogue_with(operation, tile, in_fp8), steps) and stages >= LEAST_STAGES
+    epilogue = epilogue_with(operation, tile, in_fp8, adds)
+    stages = tile.stages(factors=2 if in_fp8 else 1, lines=bf16.leaves_in_lines(tile, epilogue))
+    return tile.takes(epilogue, steps) and stages >= LEAST_STAGES
 
 
-def candidates(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int, usual: Chosen) -> list[Chosen]:
-    """The usual choice, the library's in bfloat16, and tiles: the first is the usual one."""
+def candidates(
+    operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int, usual: Chosen, adds: bool = False
+) -> list[Chosen]:
+    """The usual choice, the library's in bfloat16, and tiles: the first is the usual one.
+
+    adds: as of `epilogue_with`
+    """
     found: list[Chosen] = [usual]
     if not in_fp8 and operation != "residual":
         found += [None, *(LIBRARY_PARTS if operation == "parts" else ())]
-    found += _tiles(operation, in_fp8, m, n, k, sms)
+    found += _tiles(operation, in_fp8, m, n, k, sms, adds)
     return list(dict.fromkeys(found))
 
 
-def _tiles(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int) -> list[Tile]:
+def _tiles(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int, adds: bool) -> list[Tile]:
     epilogue, wide = epilogue_of(operation), k if in_fp8 else 2 * k  # the cost model counts bytes along the inner axis
-    plain = [tile for tile in _plain(operation, m) if possible(tile, operation, in_fp8, k)]
+    plain = [tile for tile in _plain(operation, m) if possible(tile, operation, in_fp8, k, adds)]
 
     def price(tile: Tile) -> float:
         return fp8.cost(tile, m, n, wide, epilogue, sms)
@@ -72,12 +82,17 @@ def _tiles(operation: Operation, in_fp8: bool, m: int, n: int, k: int, sms: int)
     cheapest = sorted(plain, key=price)[:CHEAPEST]
     kin = [other for tile in cheapest[:WITH_KIN] for other in _kin(tile, operation, m, n)]
     overlapped = [] if operation == "geglu" else _overlapped(plain, m, n, sms)
-    overlapped = sorted((tile for tile in overlapped if possible(tile, operation, in_fp8, k)), key=price)[:OVERLAPPED]
-    factors, lines = 2 if in_fp8 else 1, operation == "parts"
-    halved = [tile.halved(factors=factors, lines=lines) for tile in sorted(plain, key=price) if tile.leaves_room]
+    overlapped = [tile for tile in overlapped if possible(tile, operation, in_fp8, k, adds)]
+    overlapped = sorted(overlapped, key=price)[:OVERLAPPED]
+    halved = [_halved(tile, operation, in_fp8, adds) for tile in sorted(plain, key=price) if tile.leaves_room]
     in_pairs = [replace(tile, cluster_m=2) for tile in overlapped[: OVERLAPPED // 2]]
     more = (*kin, *overlapped, *in_pairs, *halved[:HALVED])
-    return cheapest + [tile for tile in more if possible(tile, operation, in_fp8, k)]
+    return cheapest + [tile for tile in more if possible(tile, operation, in_fp8, k, adds)]
+
+
+def _halved(tile: Tile, operation: Operation, in_fp8: bool, adds: bool) -> Tile:
+    lines = bf16.leaves_in_lines(tile, epilogue_with(operation, tile, in_fp8, adds))
+    return tile.halved(factors=2 if in_fp8 else 1, lines=lines)
 
 
 def _overlapped(plain: list[Tile], m: int, n: int, sms: int) -> list[Tile]:

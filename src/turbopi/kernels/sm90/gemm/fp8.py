@@ -84,7 +84,7 @@ def matmul_fp8(
     ahead: Tensor | None = None,
 ) -> Tensor:
     """a e4m3[M, K] @ weightᵀ with the epilogue -> bfloat16[M, N], or with `inverse` e4m3[M, N] = round(… * inverse);
-    "partial" -> float32, "parts" -> bfloat16[splits, M, N].
+    "partial" -> float32, "parts" -> bfloat16[splits, M, N]. "added" as of `bf16.matmul`.
 
     With "bias" alone, `residual` bfloat16[M, N] is added, the sums of the result's rows go into `sums_out`, and a
     `copy` may leave, too. With a `FoldedFp8` ("bias" or "gelu"), a is a `Copy` and `sums` its `sums_out`: its LayerNorm
@@ -105,6 +105,7 @@ def matmul_fp8(
     tile = fitted(tile, groups, -(-k // DEPTH), a.device)
     partial = epilogue == "partial"
     assert bias is None or (bias.dtype == torch.bfloat16 and epilogue not in ("plain", "geglu", "parts"))
+    assert out is not None or epilogue != "added"
     if out is None:
         shape = (tile.splits, m, n) if epilogue in SPLIT else (m, n)
         out = torch.empty(shape, dtype=_result_dtype(partial, inverse), device=a.device)

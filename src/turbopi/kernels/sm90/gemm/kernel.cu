@@ -281,7 +281,12 @@ gemm(GEMM_PARAMETERS) {
             gather(sums, t.split, raw, base, rank, gathered);
 #endif
 
-#if TP_EPILOGUE == 5
+#if TP_EPILOGUE >= 5
+            if (BIASED) {
+#pragma unroll
+                for (int i = 0; i < BN / 2; ++i)
+                    sums[i] += i % 2 ? bf16_high(offsets[i / 4]) : bf16_low(offsets[i / 4]);
+            }
             store_part(sums, (u16*)out + ((size_t)t.split * M + t.m + group * 64 + warp * 16) * N + t.n,
                        (char*)(behind_barriers + FP8 * WGS * BN) + threadIdx.x / 32 * ROWS_BYTES,
                        M - (t.m + group * 64 + warp * 16), N, blocks, lane);

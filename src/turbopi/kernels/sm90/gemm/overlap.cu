@@ -2,7 +2,7 @@
 // have registers of their own: the tensor cores don't wait for bias, GELU and results on their way. Comes behind base.cu.
 // step(sums, is it the first, keep) multiplies, and all but this step is done then; end() waits for that one.
 #if TP_OVERLAP
-static_assert(EPILOGUE <= 3 && !TP_PROMOTE && !GATHER && SPLITS == 1 && !TP_RESIDUAL && !TP_NORMED);
+static_assert((EPILOGUE <= 3 || EPILOGUE == 6) && !TP_PROMOTE && !GATHER && SPLITS == 1 && !TP_RESIDUAL && !TP_NORMED);
 constexpr bool HALVES = EPILOGUE == 3;  // a piece has 4 blocks of columns, and of GeGLU half of the rows
 constexpr int PIECES = (BLOCKS + 3) / 4 * (HALVES ? 2 : 1);  // see `Tile.takes`
 constexpr bool FACTORED = FP8 || BIASED;

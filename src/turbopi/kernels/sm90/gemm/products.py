@@ -3,6 +3,7 @@
 `tiles` are those that `turbopi tune` measured on this GPU; gemm/tiles.py and best_tile choose what they don't have.
 """
 
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import lru_cache
 from typing import Any, Literal
@@ -26,10 +27,12 @@ from turbopi.kernels.sm90.instructions import multiprocessors
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, Knobs, TileTable
 from turbopi.quantization.fp8 import Matrix, ScaledMatrix, to_e4m3
 
+# Of fewer rows it wasn't measured; there the norm behind is bound by its launch.
+ADDING_ROWS = 1024
 GEGLU_FILL = 0.885  # where less of our tiles' area is used, the library's choice of tiles is better
 
 
-Operation = Literal["plain", "bias", "gelu", "geglu", "partial", "parts", "residual"]
+Operation = Epilogue | Literal["residual"]
 Chosen = Tile | int | None  # the library: over so many parts of the inner axis at once, or None
 
 
@@ -105,12 +108,43 @@ def tuned_residual_linear(
     if bias is None:
         cut = chosen(tiles, "parts", x.shape[0], *weight.shape)
         if isinstance(cut, Tile):
-            return matmul(x, weight, cut, "parts", ahead=ahead)
+            # a tile that was measured where its result is added may overlap, as that of "plain" may
+            return matmul(x, weight, cut, "plain" if cut.overlap else "parts", ahead=ahead)
         return linear(x, weight) if cut is None else parts_at_once(x, weight, cut)
     tile = bf16_tile(tiles, "partial", x, weight)
     if tile is None:
         return linear(x, weight, bias)
     return matmul(x, weight, tile, "partial" if tile.splits > 1 and not tile.gather else "bias", bias, ahead=ahead)
+
+
+def added(
+    stream: Tensor,
+    x: Tensor,
+    weight: Matrix,
+    bias: Tensor | None = None,
+    ahead: Callable[[], Tensor | None] = lambda: None,
+    *,
+    tiles: TileTable = NO_TILES,
+) -> bool:
+    """Add the product to the stream in place, if that is the faster way. Returns whether it did.
+
+    ahead: is asked, if so, for what may be fetched into L2.
+    """
+    if len(x) < ADDING_ROWS:
+        return False
+    (rows, inner), columns = x.shape, weight.shape[0]
+    operation: Operation = "parts" if bias is None else "partial"
+    if isinstance(weight, ScaledMatrix):
+        cut: Chosen = chosen_fp8(tiles, operation, rows, columns, inner, multiprocessors(x.device))
+    else:
+        cut = chosen(tiles, operation, rows, columns, inner)
+    if isinstance(cut, Tile) and cut.splits == 1:
+        if isinstance(weight, ScaledMatrix):
+            matmul_fp8(x, weight, cut, "added", bias, stream, ahead=ahead())
+        else:
+            matmul(x, weight, cut, "added", bias, stream, ahead=ahead())
+        return True
+    return False  # parts are added in the norm; the library loses more by the stream than the norm gains
 
 
 def parts_at_once(x: Tensor, weight: Tensor, count: int) -> Tensor:

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from turbopi.kernels.portable import norms
 from turbopi.kernels.sm90.gemm.bf16 import Copy, Epilogue, Folded, Sums, Tile, matmul
 from turbopi.kernels.sm90.gemm.fp8 import GATHERING_SMS, HEADROOM, FoldedFp8, matmul_fp8
 from turbopi.kernels.sm90.gemm.products import (
+    added,
     as_input,
     bf16_tile,
     chosen_fp8,
@@ -17,6 +17,7 @@ from turbopi.kernels.sm90.gemm.products import (
     tuned_residual_linear,
 )
 from turbopi.kernels.sm90.instructions import multiprocessors
+from turbopi.kernels.sm90.norms import layer_norm
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix
 
@@ -42,7 +43,7 @@ class Normed:
     eps: float
 
     def made(self) -> Tensor:
-        return norms.residual_layer_norm(self.x, None, self.scale, self.shift, self.eps)[1]
+        return layer_norm.residual_layer_norm(self.x, None, self.scale, self.shift, self.eps)[1]
 
 
 @dataclass(frozen=True)
@@ -68,17 +69,25 @@ class VisionProducts:
         self._behind: dict[int, Tensor] = {}  # which matrix came behind the one at this address last time: a hint
         self._last: Tensor | None = None
 
+    def add_linear(self, stream: Tensor, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> bool:
+        if self._residual_tile(x, weight, bias) is not None:
+            return False
+        return added(stream, x, weight, bias, lambda: None if bias is None else self._next(weight), tiles=self._tiles)
+
     def residual_linear(self, x: Tensor, weight: Matrix, bias: Tensor | None = None) -> Tensor | Product:
-        sms, tile = multiprocessors(x.device), None
-        if bias is not None and sms >= GATHERING_SMS:
-            if isinstance(weight, ScaledMatrix):
-                tile = chosen_fp8(self._tiles, "residual", x.shape[0], weight.shape[0], weight.shape[1], sms)
-            else:
-                tile = bf16_tile(self._tiles, "residual", x, weight)
+        tile = self._residual_tile(x, weight, bias)
         if tile is None or bias is None:
             ahead = None if bias is None else self._next(weight)
             return tuned_residual_linear(x, weight, bias, ahead, tiles=self._tiles)
         return Product(x, weight, bias, tile)
+
+    def _residual_tile(self, x: Tensor, weight: Matrix, bias: Tensor | None) -> Tile | None:
+        """Of a product that is made when the norm behind it brings the stream."""
+        if bias is None or (sms := multiprocessors(x.device)) < GATHERING_SMS:
+            return None
+        if isinstance(weight, ScaledMatrix):
+            return chosen_fp8(self._tiles, "residual", x.shape[0], weight.shape[0], weight.shape[1], sms)
+        return bf16_tile(self._tiles, "residual", x, weight)
 
     def residual_layer_norm(
         self,
@@ -91,7 +100,7 @@ class VisionProducts:
     ) -> tuple[Tensor, Tensor | Normed | NormedCopy]:
         before, self._stream = self._stream, None
         if not isinstance(y, Product):
-            return norms.residual_layer_norm(x, y, weight, bias, eps, inverse)
+            return layer_norm.residual_layer_norm(x, y, weight, bias, eps, inverse)
         ahead, copy = self._next(y.weight), None
         sums = plain = Sums.allocate(y.tile, x.shape[0], x.shape[1], x.device)
         if inverse is not None and before is not None and before.x is x:
@@ -107,7 +116,7 @@ class VisionProducts:
         if copy is not None:
             return x, NormedCopy(copy.out, sums, weight, bias)
         if inverse is not None:  # of the first layer's input nothing is known
-            return norms.residual_layer_norm(x, None, weight, bias, eps, inverse)
+            return layer_norm.residual_layer_norm(x, None, weight, bias, eps, inverse)
         return x, self._stream
 
     def linear(
