@@ -49,10 +49,10 @@ def main() -> int:
         jobs = [pool.submit(compile_target, target, given.kernels, given.chosen) for target in wanted]
         rows = [row for job in jobs for row in job.result()]
     show(rows, Console(width=WIDTH))
+    now = CompiledForAll(date.today().isoformat(), versions(), rows)
     if given.json is not None:
-        given.json.write_text(written(CompiledForAll(date.today().isoformat(), versions(), rows)))
+        given.json.write_text(written(now))
     if given.into is not None:
-        now = CompiledForAll(date.today().isoformat(), versions(), rows)
         given.into.write_text(
             written(replaced(read_compiled(given.into), now, {one.arch for one in wanted}, given.kernels))
         )

@@ -169,12 +169,6 @@ class Product(ProductBench):
             return matmul_fp8(x, weight, cut, epilogue, self.bias, out, self.inverse, ahead=ahead)
         return as_input(matmul(x, weight, cut, epilogue, self.bias, out, ahead=ahead), self.inverse)
 
-    def in_call(self, knobs: Knobs, copy: int) -> object:
-        result = self.run(knobs, copy, x=self.in_front())
-        if self.norm_behind is not None and self._added(from_knobs(knobs)):
-            return self.norm_behind(None)
-        return self.behind(result)
-
     def _added(self, cut: Chosen) -> bool:
         one = self.operation
         return isinstance(cut, Tile) and epilogue_with(one.operation, cut, self.fp8, one.adds) == "added"

@@ -75,10 +75,10 @@ class ProductBench(GpuBench):
         return self.x if self.norm_in_front is None else self.norm_in_front(self.raw)
 
     def behind(self, result: Tensor) -> Tensor:
-        """What the norm behind makes of the result; "residual" has added the stream itself."""
+        """What the norm behind makes of the result, which is the stream itself where that was added to."""
         if self.norm_behind is None or self.operation.operation == "residual":
             return result
-        return self.norm_behind(result)
+        return self.norm_behind(None if result is self.norm_behind.stream else result)
 
     def twin(self, x: Tensor, weight: Matrix) -> Tensor:
         """The plain operation."""
