@@ -17,7 +17,7 @@ from turbopi import backends
 from turbopi.backends import tuned_tiles
 from turbopi.backends.tuned_tiles import Machine, find_tiles, read_tile_file, write_tile_file
 from turbopi.errors import DeviceLost
-from turbopi.kernels.tile_table import LIBRARY, Knobs
+from turbopi.kernels.tile_table import LIBRARY, Knobs, TileTable
 from turbopi.tune import gpu, plan
 from turbopi.tune.race import Round
 from turbopi.tune.shapes import Operation
@@ -29,7 +29,7 @@ STEADY = [100.0, 101.0] * 20
 class FakeBench:
     """Fewer rows of a tile are faster; the library takes 100 us. Results of products' tiles of 32 rows are wrong."""
 
-    bound = 0.01
+    bound = margin = 0.01
 
     def __init__(self, one: Operation) -> None:
         self.one = one
@@ -56,10 +56,10 @@ class FakeGpu:
         monkeypatch.setattr(Machine, "of", classmethod(lambda cls, device: self.machine))
         monkeypatch.setattr(tuned_tiles, "cache_folder", lambda: cache)
         monkeypatch.setattr(gpu, "steadiness", lambda device: self.steady)
-        monkeypatch.setattr(plan, "bench_maker", lambda device: self.bench)
+        monkeypatch.setattr(plan, "bench_maker", lambda config, device: self.bench)
         monkeypatch.setenv("COLUMNS", "80")
 
-    def bench(self, one: Operation) -> Any:
+    def bench(self, one: Operation, tiles: TileTable) -> Any:
         self.measured.append(one)
         return self.make(one)
 

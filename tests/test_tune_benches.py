@@ -22,10 +22,11 @@ from turbopi.kernels.sm90.gemm import bf16, fp8
 from turbopi.kernels.sm90.gemm.bf16 import Folded, Tile
 from turbopi.kernels.sm90.gemm.fp8 import FoldedFp8
 from turbopi.kernels.tile_checks import why_not
-from turbopi.kernels.tile_table import LIBRARY, Knobs
+from turbopi.kernels.tile_table import LIBRARY, Knobs, TileTable
 from turbopi.quantization.fp8 import E4M3, ScaledMatrix, to_e4m3
 from turbopi.tune import gpu, hopper, portable, product_bench
 from turbopi.tune.gpu import GpuBench
+from turbopi.tune.in_layers import ExpertLayers, InLayers, LayersOf
 from turbopi.tune.race import Round, race
 from turbopi.tune.shapes import Call, Operation, operations
 
@@ -320,3 +321,65 @@ def test_the_towers_products_are_measured_in_the_form_that_they_run_in() -> None
     assert several["expert qkv"] == ("plain", False, "rms")
     few = [hopper.resolved(one, SMS - 1) for one in operations(FULL, Call(2, 48), "bf16", "hopper")]
     assert {one.operation for one in few if one.name == "vision fc2"} == {"partial"}
+
+
+# ---- Within layers
+
+
+@pytest.mark.usefixtures("float32")
+@pytest.mark.parametrize("name", ["pi05_libero", "pi0_libero"])
+@pytest.mark.parametrize("numbers", ["bf16", "fp8"])
+def test_the_experts_layers_are_those_of_a_denoising_step(name: str, numbers: Any) -> None:
+    """Finite, of the operations' sizes, and each of them as often as a layer has it."""
+    expert = replace(FULL.expert, depth=2, width=64, mlp_dim=96, num_heads=2, head_dim=64)
+    config = replace(preset(name).model, expert=expert, vlm=replace(FULL.vlm, depth=2, head_dim=64, num_heads=2))
+    tokens, of_state = 4, name == "pi0_libero"
+    found = [one for one in operations(config, Call(1, 16, 3), numbers, "hopper", horizon=tokens) if one.in_layers]
+    assert {LayersOf.of(one) for one in found} == {
+        LayersOf("hopper", numbers == "fp8", 3, tokens + of_state, config.vision.num_tokens + 16)
+    }
+    layers = ExpertLayers(config, LayersOf.of(found[0]), CPU)
+    sizes: list[tuple[int, int, int]] = []
+
+    def counted(kernel: Any, halves: int = 1) -> Any:
+        def run(x: Tensor, weight: Any, *rest: Any, **more: Any) -> Any:
+            sizes.append((len(x), weight.shape[0] // halves, x.shape[1]))
+            return kernel(x, weight, *rest, **more)
+
+        return run
+
+    ops = replace(
+        plain.PLAIN,
+        linear=counted(plain.PLAIN.linear),
+        residual_linear=counted(plain.PLAIN.residual_linear),
+        linear_geglu=counted(plain.PLAIN.linear_geglu, 2),
+    )
+    assert torch.isfinite(layers.run(ops)).all() and layers.depth == 2
+    products = [(one.rows, one.columns, one.inner) for one in found if not one.operation.endswith("attention")]
+    assert sizes == products * 2
+
+
+def test_a_tile_is_timed_in_layers_whose_other_tiles_stay() -> None:
+    seen: list[Any] = []
+
+    class Layers:
+        depth = 18
+
+        def ops(self, tiles: TileTable) -> str:
+            seen.append(tiles.tiles)
+            return "operations"
+
+        def run(self, ops: str) -> None:
+            seen.append(ops)
+
+    class Alone:
+        operation = replace(product("plain"), name="expert qkv")
+
+        def captured(self, run: Any, calls: int, least: float) -> Round:
+            run()
+            return timer(calls)
+
+    other = replace(Alone.operation, rows=640).key
+    bench = InLayers(Alone(), Layers(), TileTable({other: SMALL}))  # type: ignore[arg-type]
+    assert bench.timer({"columns": 32})() == 18
+    assert seen == [{other: SMALL, Alone.operation.key: {"columns": 32}}, "operations", "operations"]

@@ -1,6 +1,8 @@
 """The tuner on a GPU: small operations of every kind, really compiled, checked and timed."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -11,16 +13,22 @@ from conftest import on_hopper
 
 from turbopi.config import preset
 from turbopi.kernels.portable.gemm.tiles import fp8_refusal
-from turbopi.kernels.tile_table import Numbers
+from turbopi.kernels.tile_table import NO_TILES, Numbers, TileTable
 from turbopi.tune import hopper, portable
 from turbopi.tune.gpu import steadiness
 from turbopi.tune.plan import bench_maker
-from turbopi.tune.race import Raced, race
+from turbopi.tune.race import Bench, Raced, race
 from turbopi.tune.shapes import Call, Norm, Operation, Precision, operations
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")]
 DEVICE = torch.device("cuda", 0)
+MODEL = preset("pi05_libero").model
 FEW = 6  # candidates of each
+
+
+@cache
+def bench() -> Callable[[Operation, TileTable], Bench]:
+    return bench_maker(MODEL, DEVICE)
 
 
 def raced(one: Operation) -> Raced:
@@ -30,7 +38,7 @@ def raced(one: Operation) -> Raced:
         candidates = hopper.candidates(one, sms)
     else:
         candidates = portable.candidates(one, (properties.major, properties.minor), sms)
-    return race(bench_maker(DEVICE)(one), candidates[:FEW])
+    return race(bench()(one, NO_TILES), candidates[:FEW])
 
 
 def check(one: Operation) -> int:
@@ -74,10 +82,19 @@ def test_portable_products(operation: str, numbers: Numbers, in_front: Norm | No
 @pytest.mark.parametrize("batch", [1, 4])
 @pytest.mark.parametrize("precision", ["bf16", "fp8"])
 def test_hoppers_products(precision: Precision, batch: int) -> None:
-    found = operations(preset("pi05_libero").model, Call(1, 48, batch), precision, "hopper", horizon=10)
+    found = operations(MODEL, Call(1, 48, batch), precision, "hopper", horizon=10)
     sms = torch.cuda.get_device_properties(DEVICE).multi_processor_count
     timed = [check(hopper.resolved(one, sms)) for one in found if one.kernels == "hopper"]
     assert max(timed) > 1  # of some the first candidates don't fit, and the usual tile stays
+
+
+@pytest.mark.parametrize("precision", ["bf16", "fp8"])
+def test_the_experts_portable_operations_in_its_layers(precision: Precision) -> None:
+    if precision == "fp8" and fp8_refusal(torch.cuda.get_device_capability(DEVICE)):
+        pytest.skip("has no FP8")
+    found = operations(MODEL, Call(1, 48, 4), precision, "portable", horizon=10)
+    timed = [check(one) for one in found if one.in_layers]
+    assert len(timed) == (5 if precision == "fp8" else 2) and max(timed) > 1
 
 
 def test_an_idle_gpu_is_steady() -> None:

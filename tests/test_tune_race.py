@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 import pytest
 
 from turbopi.errors import DeviceLost
-from turbopi.kernels.tile_table import Knobs
+from turbopi.kernels.tile_table import NO_TILES, Knobs, TileKey, TileTable
 from turbopi.tune import race as racing
 from turbopi.tune.race import FINALISTS, MARGIN, Round, Timed, UsualFails, race, winner
-from turbopi.tune.run import Outcome, Planned, Progress, tune
+from turbopi.tune.run import Measured, Outcome, Planned, Progress, gained_ms, tune
 from turbopi.tune.shapes import Operation
 
 EXACT = 0.001
@@ -18,7 +18,7 @@ NAN = float("nan")
 class FakeBench:
     """times: what each tile takes, by its columns, or a list of them, one a round. Tiles are told by their columns."""
 
-    bound = 0.01
+    bound, margin = 0.01, MARGIN
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ def test_candidates_take_turns_in_every_round() -> None:
     race(bench, tiles(1, 2, 3))
     rounds = [tuple(bench.order[at : at + 3]) for at in range(0, len(bench.order), 3)]
     assert len(rounds) == racing.ROUNDS + racing.FINAL_ROUNDS
-    assert {*rounds[: racing.ROUNDS]} == {(1, 2, 3)} and all({*one} == {1, 2, 3} for one in rounds)
+    assert {*rounds[: racing.ROUNDS]} == {(1, 2, 3), (3, 2, 1)} and all({*one} == {1, 2, 3} for one in rounds)
 
 
 def test_a_clock_that_falls_hits_all_alike() -> None:
@@ -113,8 +113,8 @@ def test_a_clock_that_falls_hits_all_alike() -> None:
 
 def test_a_gain_within_the_noise_leaves_the_usual_tile() -> None:
     usual = Timed({"columns": 1}, 10.0, 0.0)
-    assert winner({0: usual, 1: Timed({"columns": 2}, 10 * (1 - MARGIN / 2), 0.0)}) == usual
-    assert winner({0: usual, 1: Timed({"columns": 2}, 10 * (1 - 2 * MARGIN), 0.0)}).knobs["columns"] == 2
+    rows = {0: usual, 1: Timed({"columns": 2}, 9.95, 0.0)}
+    assert winner(rows, 0.01) == usual and winner(rows, 0.003).knobs["columns"] == 2
 
 
 def test_only_the_best_of_many_run_the_final_with_the_usual_one() -> None:
@@ -144,14 +144,14 @@ def planned(*rows: int) -> list[Planned]:
     return [Planned(operation(one), tiles(1, 2)) for one in rows]
 
 
-def good(_: Operation) -> FakeBench:
+def good(_: Operation, tiles: TileTable = NO_TILES) -> FakeBench:
     return FakeBench({1: 10.0, 2: 9.0})
 
 
 def test_what_is_found_is_kept_after_each_operation_so_that_a_later_failure_loses_nothing() -> None:
     kept: list[list[int]] = []
 
-    def make(one: Operation) -> FakeBench:
+    def make(one: Operation, _: TileTable) -> FakeBench:
         if one.rows == 640:
             raise DeviceLost("the GPU failed")
         return good(one)
@@ -164,7 +164,7 @@ def test_what_is_found_is_kept_after_each_operation_so_that_a_later_failure_lose
 def test_no_operation_begins_when_time_is_up() -> None:
     now = 0.0
 
-    def make(one: Operation) -> FakeBench:
+    def make(one: Operation, _: TileTable) -> FakeBench:
         nonlocal now
         now += 40
         return good(one)
@@ -176,7 +176,7 @@ def test_no_operation_begins_when_time_is_up() -> None:
 
 def test_an_operation_whose_usual_tile_fails_is_named_and_the_others_are_measured() -> None:
     outcome = tune(
-        planned(512, 576), lambda one: good(one) if one.rows == 576 else FakeBench({}, {1: 1.0}), lambda found: None
+        planned(512, 576), lambda one, _: good(one) if one.rows == 576 else FakeBench({}, {1: 1.0}), lambda found: None
     )
     assert [one.operation.rows for one in outcome.measured] == [576]
     assert [what.rows for what in outcome.failed] == [512]
@@ -189,3 +189,26 @@ def test_progress_is_told_of_operations_candidates_and_results() -> None:
     )
     outcome: Outcome = tune(planned(512), good, lambda found: None, progress=progress)
     assert told == [("1/1 prefix qkv, fp8, 512 rows", 2), ".", ".", 1.0] and len(outcome.measured) == 1
+
+
+def test_an_operation_is_timed_beside_what_was_found_before_it() -> None:
+    elsewhere = TileKey("portable", "geglu", "fp8", 576, 16384, 2048)
+    seen: list[TileTable] = []
+
+    def make(one: Operation, tiles: TileTable) -> FakeBench:
+        seen.append(tiles)
+        return good(one)
+
+    tune(planned(512, 576, 640), make, lambda found: None, tiles=TileTable({elsewhere: {"columns": 8}}))
+    assert [len(tiles) for tiles in seen] == [1, 2, 3]
+    assert seen[2].tiles == {elsewhere: {"columns": 8}} | {operation(rows).key: tiles(2)[0] for rows in (512, 576)}
+
+
+def test_layers_in_which_several_operations_are_timed_are_counted_once() -> None:
+    def measured(name: str, rows: int, usual: float, best: float) -> Measured:
+        one = Operation(name, "hopper", "plain", "fp8", rows, 2560, 1024, 100)
+        return Measured(one, racing.Raced(Timed({}, usual, 0.0), Timed({}, best, 0.0), 2, {}))
+
+    found = [measured("expert qkv", 64, 30.0, 29.0), measured("expert out", 128, 29.0, 28.0)]
+    found.append(measured("prefix qkv", 192, 50.0, 45.0))
+    assert gained_ms({one.operation.key: one for one in found}, [one.operation for one in found]) == (8.0, 0.7, 0)

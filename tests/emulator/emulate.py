@@ -32,7 +32,7 @@ INSTRUCTIONS = (
     *(("mbarrier.try_wait.parity", "mbarrier_wait"), ("mbarrier.test_wait.parity", "mbarrier_test")),
     *(("mapa.", "mapa"), ("bar.sync", "bar_sync")),
     *(("cluster.arrive.relaxed;\\nbarrier.cluster.wait", "cluster_sync"), ("cluster.arrive.relaxed", "cluster_arrive")),
-    *(("cluster.arrive", "cluster_sync"), ("cluster.wait", "cluster_wait")),
+    *(("cluster.arrive", "cluster_exchange"), ("cluster.wait", "cluster_wait")),
     *(("st.async", "st_async"), ("rcp.approx", "rcp"), ("tanh.approx", "tanh")),
     *(("wgmma.commit_group", "wgmma_commit"), ("wgmma.wait_group", "wgmma_wait")),
     *(("fma.rn.bf16x2", "fma_bf16x2"), ("cvt.rn.f16x2.e4m3x2", "cvt_e4m3_halves"), ("cvt.rn.bf16x2", "cvt_bf16x2")),

@@ -110,14 +110,20 @@ inline std::map<unsigned, MBarrier> mbarriers;
 inline std::map<int, Barrier> barriers;  // by rank and number; cluster's: -1
 inline std::vector<Warp> warps;
 inline std::vector<Copy> copies;
+inline std::vector<unsigned> signals;  // to other CTAs' barriers, on their way
+inline std::vector<int> going;  // threads of each rank that haven't ended
 inline std::mt19937 random;
 inline bool eager, uneven;  // uneven: again and again a block stands still for a while
 inline long moved, rounds;  // moved: counts all that lets somebody go on
 inline std::function<void()> kernel;
 
+inline void check_there(unsigned address) {
+    if (!going.at(address >> PLACE)) throw std::runtime_error("shared memory of a CTA that has ended");
+}
 inline char* at(unsigned address, size_t bytes = 1) {
     const unsigned place = address & ((1u << PLACE) - 1);
     if (place < FIRST || place + bytes > FIRST + shared_bytes) throw std::runtime_error("an address outside a CTA's shared memory");
+    check_there(address);
     return memory.at(address >> PLACE).get() + place;
 }
 inline char* shared() { return memory[now->rank].get() + FIRST; }
@@ -140,6 +146,7 @@ inline void meet(Barrier& b, int count) {
 inline MBarrier& barrier(unsigned bar) {
     auto found = mbarriers.find(bar);
     if (found == mbarriers.end()) throw std::runtime_error("a barrier that nobody has initialised");
+    check_there(bar);
     return found->second;
 }
 inline void changed(MBarrier& b) {
@@ -149,6 +156,10 @@ inline void changed(MBarrier& b) {
 inline void arrive(unsigned bar, int bytes = 0, int times = 1) {
     MBarrier& b = barrier(bar);
     b.bytes += bytes, b.pending -= times, changed(b);
+}
+inline void deliver(size_t i) {
+    const unsigned bar = signals[i];
+    signals.erase(signals.begin() + i), arrive(bar), ++moved;
 }
 inline void arrived_bytes(unsigned bar, int bytes) { MBarrier& b = barrier(bar); b.bytes -= bytes, changed(b); }
 
@@ -301,11 +312,12 @@ inline void run_thread() {
     } catch (const std::exception& error) {
         fault = error.what();
     }
-    now->ended = true, ++moved;
+    now->ended = true, --going[now->rank], ++moved;
     swapcontext(&now->context, &scheduler);
 }
 inline void run_cluster(int first) {
-    memory.clear(), mbarriers.clear(), barriers.clear(), copies.clear(), fault.clear();
+    memory.clear(), mbarriers.clear(), barriers.clear(), copies.clear(), signals.clear(), fault.clear();
+    going.assign(ranks, cta_threads);
     for (int rank = 0; rank < ranks; ++rank) {
         memory.emplace_back(new char[SHARED]);
         memset(memory.back().get(), 0xff, SHARED);  // NaN: what is read before it is there shows
@@ -342,10 +354,13 @@ inline void run_cluster(int first) {
                 const Copy c = copies[i];
                 copies.erase(copies.begin() + i), make(c);
             }
+        for (size_t i = signals.size(); i-- > 0;)
+            if (!some || random() % 8 == 0) deliver(i);
         idle = moved == before ? idle + 1 : 0, ++rounds;
         if (moved == before) until = 0;  // all others wait for the one that stands still
         if (left && idle == 100) throw std::runtime_error("everybody waits for somebody else");
     }
+    while (!signals.empty()) deliver(0);  // to somebody who has ended
 }
 
 template <typename T>
@@ -410,7 +425,7 @@ inline void ptx_mbarrier_init(unsigned bar, unsigned count) { machine::mbarriers
 inline void ptx_mbarrier_expect(unsigned bar, unsigned bytes) { machine::arrive(bar, bytes); }
 inline void ptx_mbarrier_arrive(unsigned bar, int times = 1) { machine::arrive(bar, 0, times); }
 inline void ptx_mbarrier_arrive_remote(unsigned bar, unsigned cta) {
-    machine::arrive((bar & ((1u << machine::PLACE) - 1)) | cta << machine::PLACE);
+    machine::signals.push_back((bar & ((1u << machine::PLACE) - 1)) | cta << machine::PLACE);
 }
 inline void ptx_mbarrier_wait(unsigned bar, unsigned parity) {
     machine::wait_until([&] { return machine::barrier(bar).phase != parity; });
@@ -420,6 +435,10 @@ inline void ptx_mbarrier_test(unsigned& over, unsigned bar, unsigned parity) {
     over = machine::barrier(bar).phase != parity;
 }
 inline void ptx_cluster_sync() { machine::meet(machine::barriers[-1], machine::ranks * machine::cta_threads); }
+inline void ptx_cluster_exchange() {  // behind all that was sent
+    while (!machine::signals.empty()) machine::deliver(0);
+    ptx_cluster_sync();
+}
 inline void ptx_cluster_arrive() {
     machine::now->cluster_use = machine::arrive_at(machine::barriers[-1], machine::ranks * machine::cta_threads);
 }

@@ -47,7 +47,10 @@ _Microseconds = Annotated[float, Meta(gt=0)]
 
 
 class TunedTile(Struct, frozen=True, kw_only=True):
-    """The fastest tile of one operation. Sizes and tiles: see `kernels.tile_table`."""
+    """The fastest tile of one operation. Sizes and tiles: see `kernels.tile_table`.
+
+    Microseconds are of the operation with the norms around it; of the expert's in a batch of its whole layer.
+    """
 
     name: str  # "prefix gate, up"
     kernels: Kernels

@@ -1,6 +1,6 @@
 """`turbopi tune`: the fastest tiles of this GPU, measured."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,8 +16,9 @@ from turbopi.errors import BackendError, BackendUnavailable, ConfigError, Output
 if TYPE_CHECKING:
     import torch
 
-    from turbopi.backends.tuned_tiles import Machine, TileFile
+    from turbopi.backends.tuned_tiles import Machine
     from turbopi.config import ModelConfig
+    from turbopi.kernels.tile_table import TileTable
     from turbopi.tune.plan import Plan
     from turbopi.tune.run import Measured, Outcome
 
@@ -70,7 +71,8 @@ def tune(
     """Measure which tiles are the fastest on this GPU; backend `fused` uses them from then on.
 
     Each operation whose tile can be chosen is timed in every tile that the GPU takes, in turns, with weights that the
-    cache doesn't hold, and its result is compared with plain PyTorch's. The file is kept after each operation. Without
+    cache doesn't hold, and its result is compared with plain PyTorch's; those of batches' denoising are timed within
+    the action expert's layers. The file is kept after each operation. Without
     weights, sizes are those of pi05_libero. TURBOPI_TUNED=off has `fused` ignore what was measured.
     """
     output = Output(as_json)
@@ -80,10 +82,10 @@ def tune(
         options = WeightOptions(SIZES, options.weights_seed, options.config)
     resolved = usable_device(device)
     config = options.open(checkpoint).config.model
-    from turbopi.backends.tuned_tiles import Machine, find_tiles, own_file
+    from turbopi.backends.tuned_tiles import Machine, find_tiles, own_file, write_tile_file
     from turbopi.kernels.tile_table import NO_TILES, TileTable
     from turbopi.tune import plan as planning
-    from turbopi.tune.run import still_good
+    from turbopi.tune.run import still_good, tile_file
     from turbopi.tune.shapes import calls
 
     machine = Machine.of(resolved)
@@ -91,13 +93,14 @@ def tune(
     check_writable(file)
     before = still_good(file, machine, ships=out is not None)
     known = TileTable({} if before is None else {one.key: one.tile for one in before.tiles})
+    shipped = find_tiles(machine, own=False).table
     plan = planning.plan(
         config,
         calls(config, counts, prompts_within(prompts, config), batches),
         planning.precisions_to_tune([] if precision is None else precision.split(","), machine.capability),
         planning.kernels_to_tune(kernels, machine.capability),
         machine,
-        shipped=find_tiles(machine, own=False).table,
+        shipped=shipped,
         known=known if only_missing else NO_TILES,
     )
     output.line(
@@ -112,7 +115,12 @@ def tune(
         output.document({"file": file, "measured": []})
         return
     refuse_if_busy(resolved, noisy)
-    outcome = measure(plan, resolved, machine, file, before, seconds, output)
+
+    def keep(measured: "Sequence[Measured]") -> None:
+        write_tile_file(tile_file(machine, measured, before), file)
+
+    tiles = TileTable({**shipped.tiles, **known.tiles})
+    outcome = measure(plan, config, resolved, tiles, keep, seconds, output)
     show(plan, outcome, file, output)
     output.document(document(machine, outcome, file))
     if not outcome.measured:
@@ -181,28 +189,26 @@ def refuse_if_busy(device: "torch.device", noisy: bool) -> None:
 
 def measure(
     plan: "Plan",
+    config: "ModelConfig",
     device: "torch.device",
-    machine: "Machine",
-    file: Path,
-    before: "TileFile | None",
+    tiles: "TileTable",
+    keep: "Callable[[Sequence[Measured]], None]",
     seconds: float | None,
     output: Output,
 ) -> "Outcome":
-    """Everything that is planned; the file is written after each operation, with what it had before."""
-    from turbopi.backends.tuned_tiles import write_tile_file
+    """Everything that is planned. `tiles`: what runs now; `keep` is given what is measured, after each operation."""
     from turbopi.tune.plan import bench_maker
-    from turbopi.tune.run import Progress, tile_file
+    from turbopi.tune.run import Progress
     from turbopi.tune.run import tune as run
-
-    def keep(measured: "Sequence[Measured]") -> None:
-        write_tile_file(tile_file(machine, measured, before), file)
 
     def done(measured: "Measured") -> None:
         if not output.shows_progress:  # a log has no bar
             output.line(line(measured))
 
     return with_stages(
-        lambda progress: run(plan.planned, bench_maker(device), keep, seconds=seconds, progress=progress),
+        lambda progress: run(
+            plan.planned, bench_maker(config, device), keep, tiles=tiles, seconds=seconds, progress=progress
+        ),
         lambda begin, advance: Progress(begin, advance, done),
         output,
     )

@@ -238,7 +238,7 @@ class BatchLoop:
             )
 
         ops = batched.expert(buffers.ops)
-        return forward.expert_layers(config, weights, ops, tokens, self._times.modulation(step), attend)
+        return forward.expert_layers(config, weights.expert, ops, tokens, self._times.modulation(step), attend)
 
     def _velocity(self, weights: Weights, step: int, rope: forward.Rope) -> Tensor:
         """v_t float32[B, H, A]"""

@@ -192,16 +192,22 @@ def expert_output(
         q = ops.rope_split(qkv, *rope, cache_k[i, slots:], cache_v[i, slots:])
         return ops.attention(q, cache_k[i], cache_v[i], length, slots, heads, config.kind == "pi0", **input)
 
-    return final_norm(config, weights, ops, table, *expert_layers(config, weights, ops, tokens, table, attend))
+    stream = expert_layers(config, weights.expert, ops, tokens, table, attend)
+    return final_norm(config, weights, ops, table, *stream)
 
 
 def expert_layers(
-    config: ModelConfig, weights: Weights, ops: Ops, tokens: Tensor, table: Tensor | None, attend: Attend
+    config: ModelConfig,
+    layers: Sequence[GemmaLayer[Any]],
+    ops: Ops,
+    tokens: Tensor,
+    table: Tensor | None,
+    attend: Attend,
 ) -> Stream:
     """Suffix tokens [T, D] through all layers. `attend` applies RoPE, and knows where keys and values are."""
     eps = config.rms_norm_eps
     x, y, gate = tokens, None, None
-    for i, layer in enumerate(weights.expert):
+    for i, layer in enumerate(layers):
         scale, shift, next_gate = norm_weights(table, 2 * i, layer.norm1)
         x, normed = ops.residual_rms_norm(x, y, gate, scale, shift, eps, **input_of(layer.qkv))
         attended = attend(i, ops.linear(normed, layer.qkv), **input_of(layer.out))

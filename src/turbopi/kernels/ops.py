@@ -10,7 +10,7 @@ from turbopi.kernels.dependent_launch import capability
 from turbopi.kernels.interface import Ops
 from turbopi.kernels.portable.ops import portable_ops
 from turbopi.kernels.sm90.ops import hopper_ops
-from turbopi.kernels.tile_table import NO_TILES, TileTable
+from turbopi.kernels.tile_table import NO_TILES, Kernels, TileTable
 
 KERNELS_VARIABLE = "TURBOPI_KERNELS"
 
@@ -36,7 +36,12 @@ def fused_ops(device: torch.device, tiles: TileTable = NO_TILES) -> Ops:
     or int8. `tiles` were measured on this GPU. Raises ConfigError for a TURBOPI_KERNELS that is neither "auto" nor
     "portable".
     """
-    if not hopper_kernels(device):
+    return ops_of("hopper" if hopper_kernels(device) else "portable", device, tiles)
+
+
+def ops_of(kernels: Kernels, device: torch.device, tiles: TileTable) -> Ops:
+    """`fused_ops` of these kernels, whichever the device usually takes."""
+    if kernels == "portable":
         return portable_ops(tiles)
     ops = hopper_ops(device, tiles)
     return replace(

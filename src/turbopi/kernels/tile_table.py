@@ -51,6 +51,10 @@ class TileTable:
         """The tile for so many rows, which are rounded up to whole 64; None: nobody measured one."""
         return self.tiles.get(TileKey(kernels, operation, numbers, whole_64(rows), columns, inner))
 
+    def with_tile(self, key: TileKey, knobs: Knobs) -> "TileTable":
+        """The same with that tile, in place of another one or none."""
+        return TileTable({**self.tiles, key: knobs})
+
     def __len__(self) -> int:
         return len(self.tiles)
 

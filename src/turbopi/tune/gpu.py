@@ -13,7 +13,7 @@ from torch import Tensor
 
 from turbopi.backends.lost import Guard
 from turbopi.kernels.tile_table import Knobs
-from turbopi.tune.race import Round, first_line
+from turbopi.tune.race import MARGIN, Round, first_line
 from turbopi.tune.shapes import Operation
 
 INVERSE = 30.0  # 1 / scale of results that leave in E4M3
@@ -32,6 +32,7 @@ class GpuBench(ABC):
     exact: Tensor  # float32, what the result is to be
     twin_error: float  # of the plain operation in the same numbers
     copies: int  # of the inputs, which take turns
+    margin = MARGIN  # of the usual time that a tile must gain
 
     def __init__(self, operation: Operation, device: torch.device, seed: int = 1) -> None:
         self.operation, self.device = operation, device
@@ -89,18 +90,29 @@ class GpuBench(ABC):
         return wide / INVERSE if self.operation.out_fp8 else wide
 
     def timer(self, knobs: Knobs) -> Round:
-        """A CUDA graph of the operation, as `in_call` runs it, over all copies."""
+        """The operation as `in_call` runs it, over all copies."""
         calls = math.ceil(CALLS / self.copies) * self.copies
+
+        def run() -> None:
+            for call in range(calls):
+                self.in_call(knobs, call % self.copies)
+
+        return self.captured(run, calls, ROUND_MICROSECONDS)
+
+    def captured(self, run: Callable[[], object], calls: int, least: float) -> Round:
+        """A CUDA graph of what runs, which has been run before, by how many calls it is.
+
+        least  microseconds of a round
+        """
         with self._guard:
             if self._pool is None:
                 self._pool = torch.cuda.graph_pool_handle()
             torch.cuda.synchronize(self.device)
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph, pool=self._pool):
-                for call in range(calls):
-                    self.in_call(knobs, call % self.copies)
+                run()
             once = replayed(graph, 1, self.device)
-            replays = max(1, min(MOST_REPLAYS, math.ceil(ROUND_MICROSECONDS / max(once, 1.0))))
+            replays = max(1, min(MOST_REPLAYS, math.ceil(least / max(once, 1.0))))
 
         def measure() -> float:
             with self._guard:

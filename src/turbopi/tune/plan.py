@@ -14,8 +14,8 @@ from turbopi.kernels.portable.gemm.tiles import fp8_refusal
 from turbopi.kernels.tile_checks import HOPPER
 from turbopi.kernels.tile_table import Kernels, TileKey, TileTable
 from turbopi.tune import hopper, portable
-from turbopi.tune.gpu import GpuBench
-from turbopi.tune.race import UsualFails
+from turbopi.tune.in_layers import ExpertLayers, InLayers, LayersOf
+from turbopi.tune.race import Bench, UsualFails
 from turbopi.tune.run import Planned, usual_first
 from turbopi.tune.shapes import Call, Operation, Precision, distinct, operations
 
@@ -92,13 +92,21 @@ def planned(one: Operation, machine: Machine, shipped: TileTable) -> Planned:
     return Planned(one, usual_first(candidates, key, shipped))
 
 
-def bench_maker(device: torch.device) -> Callable[[Operation], GpuBench]:
-    """What puts an operation's inputs on the device."""
+def bench_maker(config: ModelConfig, device: torch.device) -> Callable[[Operation, TileTable], Bench]:
+    """What puts an operation's inputs on the device; other operations have those tiles."""
     gc.freeze()  # capturing a graph may collect garbage, each time through all that is imported
+    made: dict[LayersOf, ExpertLayers] = {}  # the last ones
 
-    def make(one: Operation) -> GpuBench:
+    def make(one: Operation, tiles: TileTable) -> Bench:
         try:
-            return hopper.Product(one, device) if one.kernels == "hopper" else portable.bench(one, device)
+            alone = hopper.Product(one, device) if one.kernels == "hopper" else portable.bench(one, device)
+            if not one.in_layers:
+                return alone
+            of = LayersOf.of(one)
+            if of not in made:
+                made.clear()
+                made[of] = ExpertLayers(config, of, device)
+            return InLayers(alone, made[of], tiles)
         except torch.OutOfMemoryError as failure:
             raise UsualFails("its inputs don't fit the GPU's free memory") from failure
 

@@ -15,7 +15,7 @@ from turbopi.kernels.tile_table import Knobs
 
 ROUNDS, FINAL_ROUNDS = 7, 31
 FINALISTS = 5  # beside the usual tile
-MARGIN = 0.01  # of the usual time that must be gained, or it stays: less is noise
+MARGIN = 0.01  # of the time of one operation alone: see `Bench.margin`
 MOST_SPREAD = 0.15  # half the rounds lie within this share of the median, or the GPU is busy
 
 Round = Callable[[], float]  # microseconds of one call, as one round measures it
@@ -33,6 +33,10 @@ class Bench(Protocol):
     @property
     def bound(self) -> float:
         """What the error may be."""
+
+    @property
+    def margin(self) -> float:
+        """Of the usual time that a tile must gain, or the usual one stays: less is noise."""
 
     def timer(self, knobs: Knobs) -> Round:
         """What measures a round of it."""
@@ -82,7 +86,7 @@ def race(bench: Bench, candidates: Sequence[Knobs], *, advance: Callable[[], Non
     others = sorted((place for place in first if place), key=lambda place: statistics.median(first[place]))
     final = in_turns({place: timers[place] for place in (0, *others[:FINALISTS])}, FINAL_ROUNDS)
     rows = {place: timed(candidates[place], times) for place, times in final.items()}
-    return Raced(rows[0], winner(rows), len(timers), refused)
+    return Raced(rows[0], winner(rows, bench.margin), len(timers), refused)
 
 
 def checked(bench: Bench, knobs: Knobs) -> tuple[Round | None, str | None]:
@@ -103,12 +107,12 @@ def wrong(error: float, bound: float) -> str | None:
     return f"its error is {error:.2g}; at most {bound:.2g} is right" if error > bound else None
 
 
-def in_turns(timers: Mapping[int, Round], rounds: int) -> dict[int, list[float]]:
-    """Every one in every round."""
+def in_turns(timers: dict[int, Round], rounds: int) -> dict[int, list[float]]:
+    """Every one in every round, forth and back, so that a clock that drifts favours none."""
     times: dict[int, list[float]] = {place: [] for place in timers}
-    for _ in range(rounds):
-        for place, measure in timers.items():
-            times[place].append(measure())
+    for number in range(rounds):
+        for place in reversed(timers) if number % 2 else timers:
+            times[place].append(timers[place]())
     return times
 
 
@@ -123,10 +127,10 @@ def spread(times: Sequence[float]) -> float:
     return (high - low) / median
 
 
-def winner(rows: Mapping[int, Timed]) -> Timed:
-    """The fastest, if it gains more than MARGIN on the usual one, which is at place 0."""
+def winner(rows: Mapping[int, Timed], margin: float) -> Timed:
+    """The fastest, if it gains more than the margin on the usual one, which is at place 0."""
     best = min(rows.values(), key=lambda row: row.microseconds)
-    return best if best.microseconds < rows[0].microseconds * (1 - MARGIN) else rows[0]
+    return best if best.microseconds < rows[0].microseconds * (1 - margin) else rows[0]
 
 
 def first_line(failure: BaseException) -> str:

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from turbopi.backends.tuned_tiles import Machine, TileFile, TunedTile, fingerprint, read_tile_file, usable
 from turbopi.errors import ConfigError
-from turbopi.kernels.tile_table import Kernels, Knobs, TileKey, TileTable
+from turbopi.kernels.tile_table import NO_TILES, Kernels, Knobs, TileKey, TileTable
 from turbopi.tune.race import Bench, Raced, UsualFails, race
 from turbopi.tune.shapes import Operation
 from turbopi.version import turbopi_version
@@ -65,15 +65,17 @@ def usual_first(candidates: Sequence[Knobs], key: TileKey, shipped: TileTable) -
 
 def tune(
     planned: Sequence[Planned],
-    make_bench: Callable[[Operation], Bench],
+    make_bench: Callable[[Operation, TileTable], Bench],
     keep: Callable[[Sequence[Measured]], None],
     *,
+    tiles: TileTable = NO_TILES,
     seconds: float | None = None,
     progress: Progress = Progress(),
     clock: Seconds = time.monotonic,
 ) -> Outcome:
     """Measure one operation after the other; after each, `keep` is given all that is measured.
 
+    tiles    what operations run in that aren't measured yet: some are timed among others
     seconds  begin no further operation after that
     """
     end, outcome = None if seconds is None else clock() + seconds, Outcome()
@@ -84,11 +86,12 @@ def tune(
         what = one.operation
         progress.begin(f"{place + 1}/{len(planned)} {what.name}, {what.numbers}, {what.rows} rows", len(one.candidates))
         try:
-            raced = race(make_bench(what), one.candidates, advance=progress.advance)
+            raced = race(make_bench(what, tiles), one.candidates, advance=progress.advance)
         except UsualFails as failure:
             outcome.failed[what] = str(failure)
             continue
         outcome.measured.append(Measured(what, raced))
+        tiles = tiles.with_tile(what.key, raced.best.knobs)
         keep(outcome.measured)
         progress.done(outcome.measured[-1])
     return outcome
@@ -143,15 +146,20 @@ def still_good(file: Path, machine: Machine, *, ships: bool = False) -> TileFile
 def gained_ms(found: Mapping[TileKey, Measured], operations: Sequence[Operation]) -> tuple[float, float, int]:
     """Of a call with these operations: (milliseconds that they take, milliseconds gained, how many aren't measured).
 
-    A norm between two products is timed with either, so the first number may have it twice.
+    A norm between two products is timed with either, so the first number may have it twice. The expert's operations
+    are timed in its layers, which are counted once.
     """
-    took = gained = 0.0
+    took = gained = layers = 0.0
     missing = 0
     for one in operations:
         measured = found.get(one.key)
         if measured is None:
             missing += 1
             continue
-        took += one.uses * measured.raced.usual.microseconds / 1e3
+        milliseconds = one.uses * measured.raced.usual.microseconds / 1e3
+        if one.in_layers:
+            layers = max(layers, milliseconds)
+        else:
+            took += milliseconds
         gained += one.uses * measured.gained / 1e3
-    return took, gained, missing
+    return took + layers, gained, missing

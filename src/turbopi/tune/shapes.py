@@ -42,7 +42,7 @@ class Operation:
     out_fp8    whether its result leaves in E4M3
     images     of vision's attention
     batch      observations of its call; of vision 1, as nothing depends on them
-    prefix_rows  of attention in a batch: rows of each one's prefix
+    prefix_rows  of the expert's operations: rows of each observation's prefix
     norm_in_front  a kernel of its own, which makes the input from the residual stream
     norm_behind    likewise; adds the result to the residual stream
     normed     whether the product itself takes the LayerNorm of its input: see `tune.hopper.resolved`
@@ -70,6 +70,11 @@ class Operation:
     @property
     def key(self) -> TileKey:
         return TileKey(self.kernels, self.operation, self.numbers, whole_64(self.rows), self.columns, self.inner)
+
+    @property
+    def in_layers(self) -> bool:
+        """Whether it is timed within the expert's layers: see `tune.in_layers`."""
+        return self.name.startswith("expert")
 
     @property
     def size(self) -> str:
@@ -178,13 +183,14 @@ def _expert(
     """Of a batch, whose denoising is operations."""
     g, fp8, rows = config.expert, precision == "fp8", call.batch * tokens
     heads, width, uses = g.num_heads * g.head_dim, g.width, g.depth * steps
+    prefix = call.cameras * config.vision.num_tokens + call.prompt_tokens
     usual = Operation("", kernels, "plain", precision, rows, heads + 2 * g.head_dim, width, uses, batch=call.batch)
+    usual = replace(usual, prefix_rows=prefix)
     normed = replace(usual, norm_in_front="rms")
     yield replace(normed, name="expert qkv")
     attention = replace(usual, kernels="portable", operation="suffix_attention", numbers="bf16", out_fp8=fp8)
-    prefix = call.cameras * config.vision.num_tokens + call.prompt_tokens
     if kernels == "portable" or not takes(g.head_dim):
-        yield replace(attention, name="expert attention", columns=g.num_heads, inner=g.head_dim, prefix_rows=prefix)
+        yield replace(attention, name="expert attention", columns=g.num_heads, inner=g.head_dim)
     yield replace(usual, name="expert out", operation="parts", columns=width, inner=heads, norm_behind="rms")
     yield replace(normed, name="expert gate, up", operation="geglu", columns=g.mlp_dim, out_fp8=fp8)
     yield replace(usual, name="expert down", operation="parts", columns=width, inner=g.mlp_dim, norm_behind="rms")

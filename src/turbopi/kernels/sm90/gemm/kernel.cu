@@ -68,6 +68,12 @@ gemm(GEMM_PARAMETERS) {
             if (ahead && producer == 0)
                 asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;"
                              ::"l"(ahead + (size_t)blockIdx.x * ahead_bytes), "r"(ahead_bytes) : "memory");
+            // Others signal this CTA's barriers, which must not end before: a cluster's barrier doesn't wait for signals
+            // on their way, unless it waits for all that was stored, too.
+            for (int s = 0; CLUSTER > 1 && producer == 0 && s < STAGES; ++s) {
+                if (round) barrier_wait(empty + 8 * slot, round & 1 ^ 1);
+                if (++slot == STAGES) slot = 0, ++round;
+            }
         }
         if (GATHER && !APART) {  // with the consumers
             __syncwarp();
@@ -368,5 +374,4 @@ gemm(GEMM_PARAMETERS) {
         }
 #endif
     }
-    if (CLUSTER > 1) cluster_sync();  // another CTA may still signal barriers here
 }
