@@ -1,8 +1,9 @@
 """`turbopi plan`: its arithmetic keeps what it promises, held against the server's own scheduler in simulated time."""
 
+import itertools
 import json
 import math
-import shlex
+from dataclasses import replace as replaced
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ from turbopi.bench.predict import predict
 from turbopi.bench.work import Job
 from turbopi.config import ModelConfig
 from turbopi.errors import ConfigError
+from turbopi.serve.options import ServerOptions
 from turbopi.serve.schedule import Schedule
-from turbopi.serve.sizing import Fleet, Plan, batch_times, plan_fleet, worst_seconds
+from turbopi.serve.sizing import OVERHEAD_MS, RAY_MS, Fleet, Plan, batch_times, plan_fleet, worst_seconds
 
 ROOT = Path(__file__).parents[1]
 SETTINGS = settings(max_examples=60, deadline=None)  # how long an example takes says nothing
@@ -45,8 +47,8 @@ def batch_tables(draw: st.DrawFn) -> dict[int, float]:
 @st.composite
 def fleets(draw: st.DrawFn) -> Fleet:
     horizon = draw(st.integers(2, 60))
-    steps = draw(st.integers(1, horizon - 1))
-    delay = draw(st.none() | st.integers(1, min(steps, horizon - steps)))
+    steps = draw(st.integers(1, horizon))
+    delay = draw(st.none() | st.integers(1, Fleet(1, 1, horizon, steps).most_delay))
     hz = draw(st.sampled_from([5.0, 10.0, 20.0, 33.3, 50.0]))
     overhead = draw(st.sampled_from([0.0, 1.0, 2.5]))
     return Fleet(draw(st.integers(1, 40)), hz, horizon, steps, delay, overhead)
@@ -59,19 +61,13 @@ def planned(fleet: Fleet, seconds: dict[int, float]) -> Plan | None:
         return None
 
 
-def with_robots(fleet: Fleet, robots: int) -> Fleet:
-    return Fleet(
-        robots, fleet.hz, fleet.horizon, fleet.execution_horizon, fleet.delay_steps, overhead_ms=fleet.overhead_ms
-    )
-
-
 # --- the arithmetic ---------------------------------------------------------------------------------------------------
 
 
 @SETTINGS
 @given(fleets(), batch_tables())
 def test_more_robots_never_need_fewer_gpus(fleet: Fleet, seconds: dict[int, float]) -> None:
-    plans = [planned(with_robots(fleet, robots), seconds) for robots in range(1, 31)]
+    plans = [planned(replaced(fleet, robots=robots), seconds) for robots in range(1, 31)]
     if plans[0] is None:
         assert plans == [None] * 30, "what can't serve one robot can't serve more"
         return
@@ -87,11 +83,11 @@ def test_more_robots_never_need_fewer_gpus(fleet: Fleet, seconds: dict[int, floa
 def test_a_plan_is_within_what_was_asked(fleet: Fleet, seconds: dict[int, float]) -> None:
     plan = planned(fleet, seconds)
     if plan is None:
-        assert seconds[1] > fleet.allowed
+        assert seconds[1] > fleet.allowed(1)
         return
     assert 1 <= plan.delay_steps <= fleet.most_delay
     assert fleet.delay_steps is None or plan.delay_steps <= fleet.delay_steps
-    assert plan.worst_seconds <= fleet.allowed + 1e-6
+    assert plan.worst_seconds <= fleet.allowed(1) + 1e-6
     assert plan.delay_steps / fleet.hz >= plan.worst_seconds + fleet.overhead_ms / 1e3 - 1e-9
     assert 0 < plan.utilisation <= 1 + 1e-9
     assert plan.batch <= max(seconds)
@@ -103,9 +99,11 @@ def test_one_gpu_less_would_not_do(fleet: Fleet, seconds: dict[int, float]) -> N
     plan = planned(fleet, seconds)
     if plan is None or plan.gpus == 1:
         return
+    with pytest.raises(ConfigError, match=f"can't do it: .*; --gpus {plan.gpus} would do"):
+        plan_fleet(fleet, seconds, gpus=plan.gpus - 1)
     crowded = math.ceil(fleet.robots / (plan.gpus - 1))
     for largest in seconds:
-        assert worst_seconds(batch_times(seconds, largest), crowded) > fleet.allowed - 1e-6
+        assert worst_seconds(batch_times(seconds, largest), crowded) > fleet.allowed(1) - 1e-6
 
 
 @SETTINGS
@@ -138,9 +136,18 @@ def test_with_batches_robots_wait_for_the_turn_that_runs_and_their_own() -> None
 
 def test_half_a_chunk_is_carried_out_between_two_requests_unless_said_otherwise() -> None:
     fleet = Fleet(1, 50, 50)
-    assert (fleet.steps, fleet.most_delay) == (25, 25) and fleet.allowed == pytest.approx(0.5)
+    assert (fleet.steps, fleet.most_delay) == (25, 25) and fleet.allowed(1) == pytest.approx(0.5)
     assert Fleet(1, 50, 50, 40).most_delay == 10
-    assert Fleet(1, 50, 50, 40, 3, 10).allowed == pytest.approx(0.05)
+    assert Fleet(1, 50, 50, 40, 3, 10).allowed(1) == pytest.approx(0.05)
+    assert Fleet(1, 50, 50, 50).most_delay == 50, "it stands still meanwhile"
+
+
+def test_several_gpus_have_rays_overhead_too() -> None:
+    seconds = published_table("h100", "bf16", 50).seconds
+    for robots, gpus, delay in ((8, 1, 4), (8, 2, 3), (4, 1, 2)):  # as docs/fleet.md says
+        fleet = Fleet(robots, 50, 50, None, None, OVERHEAD_MS, RAY_MS)
+        assert plan_fleet(fleet, seconds, gpus=gpus).delay_steps == delay
+    assert plan_fleet(Fleet(8, 50, 50, None, 2, OVERHEAD_MS, RAY_MS), seconds).gpus == 3
 
 
 @pytest.mark.parametrize(
@@ -149,8 +156,7 @@ def test_half_a_chunk_is_carried_out_between_two_requests_unless_said_otherwise(
         ((0, 50, 50), "a fleet has robots"),
         ((1, math.inf, 50), "a fleet has robots"),
         ((1, 50, 50, 51), "the execution horizon is 51; expected 1 to 50"),
-        ((1, 50, 50, 50), "leave no control step for computing it"),
-        ((1, 50, 50, 40, 11), "expected 1 to 10: d ≤ s and d ≤ H - s, with s = 40 and H = 50"),
+        ((1, 50, 50, 40, 11), "expected 1 to 10: d ≤ s and, unless s = H, d ≤ H - s, with s = 40 and H = 50"),
     ],
 )
 def test_what_cannot_be_a_fleet_is_refused(arguments: tuple[Any, ...], said: str) -> None:
@@ -160,7 +166,7 @@ def test_what_cannot_be_a_fleet_is_refused(arguments: tuple[Any, ...], said: str
 
 def test_a_gpu_that_is_too_slow_for_one_robot_is_told_with_the_numbers() -> None:
     with pytest.raises(
-        ConfigError, match=r"a call takes 120.0 ms, with 2 ms of overhead that is 7 control steps at 50 Hz; 5"
+        ConfigError, match=r"takes 120.0 ms at most, with 2 ms of overhead that is 7 control steps at 50 Hz; 5"
     ):
         plan_fleet(Fleet(3, 50, 50, None, 5, 2.0), {1: 0.12})
 
@@ -187,11 +193,17 @@ def test_the_promised_delay_holds_in_the_servers_scheduler(
         for round_ in range(4)
     ]
     served = {size: took for size, took in seconds.items() if size <= plan.batch}
-    history = simulate(Schedule(10 * len(phases), table(served)), asked)
+    history = simulate(Schedule(plan.queue_limit, table(served)), asked)
     assert not history.refused
     for one in asked:
         turn = history.turn_of(one)
         assert turn is not None and turn.ended <= one.deadline + 1e-6
+
+
+def test_robots_that_ask_together_are_all_served() -> None:
+    asked = [request(source=robot) for robot in range(20)]
+    for limit, refused in ((ServerOptions.queue_limit, 3), (plan_fleet(Fleet(20, 50, 50), SERIAL).queue_limit, 0)):
+        assert len(simulate(Schedule(limit, table(SERIAL)), asked).refused) == refused
 
 
 @SETTINGS
@@ -219,7 +231,9 @@ def test_measured_times_are_the_slow_calls_of_the_measurement() -> None:
         if (call.backend, call.kernels, call.job.batch) == ("fused", "hopper", 1):
             found = published_table(call.gpu, call.precision, call.job.horizon)
             assert not found.predicted and found.job == call.job
-            if found.source == call.source:
+            longer = published_table(call.gpu, call.precision, 50).seconds
+            assert all(found.seconds[size] <= longer[size] for size in longer)
+            if found.source == call.source and found.seconds[1] < longer[1]:
                 assert found.seconds[1] == slow(call.milliseconds["total"]) > call.milliseconds["total"].p50 / 1e3
             assert found.seconds[1] <= slow(call.milliseconds["total"]), "of several measurements the soonest"
 
@@ -341,7 +355,7 @@ def test_a_prediction_is_called_one() -> None:
 
 
 def test_a_plan_without_times_of_batches_says_so() -> None:
-    told = "Batches of chunks of 10 weren't measured there: `turbopi bench --batch`, then --times"
+    told = "Batches of such chunks weren't measured there: `turbopi bench --horizons 10 --batch 1,2,4,8`, then --times"
     ask = ["--hz", "20", "--horizon", "10", "--gpu", "h200", "--precision", "int8"]
     assert told in turbopi("plan", "--robots", "12", *ask).stdout.splitlines()
     assert told not in turbopi("plan", "--robots", "1", *ask).stdout
@@ -349,16 +363,29 @@ def test_a_plan_without_times_of_batches_says_so() -> None:
         assert "weren't measured" not in turbopi(*ASK, "--gpu", gpu).stdout
 
 
-def test_the_command_to_serve_parses_and_has_as_many_replicas() -> None:
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ("--robots 17 --horizon 50 --execution-horizon 50", "Robots carry out whole chunks, and stand still"),
+        ("--robots 16 --horizon 50 --gpus 4", "Without Ray, a server on each GPU: 2 control steps"),
+        ("--robots 140 --horizon 100 --gpus 2", "A replica takes 64 requests at once"),
+        ("--robots 300 --horizon 50", "One server decodes some 500 observations a second: take 2 servers"),
+    ],
+)
+def test_the_command_to_serve_has_what_the_plan_needs_and_its_limits_are_told(asked: str, told: str) -> None:
     from test_document_commands import check_parses
 
-    said = turbopi("plan", "--robots", "100", "--hz", "50", "--horizon", "10", "--gpu", "h200").stdout
-    (line,) = (line for line in said.splitlines() if line.startswith("run "))
-    words = shlex.split(line.removeprefix("run").strip())
-    (gpus,) = (line.split()[1].rstrip(",") for line in said.splitlines() if line.startswith("GPUs"))
-    assert words[0] == "turbopi" and words[-2:] == ["--replicas", gpus] and int(gpus) > 1
-    check_parses(words[1:], "turbopi plan")
-    assert max(map(len, said.splitlines())) <= 110
+    lines = turbopi("plan", "--hz", "50", "--gpu", "h200", *asked.split()).stdout.splitlines()
+    assert any(line.startswith(told) for line in lines)
+    (run,) = (line for line in lines if line.startswith("run "))
+    assert all(len(line) <= 110 for line in lines if line != run)
+    words = run.split()[2:]
+    check_parses(words, "turbopi plan")
+    (_, gpus, _, _, most, *_) = next(line for line in lines if line.startswith("GPUs")).split()
+    given = dict(itertools.pairwise(words))
+    assert given.get("--replicas", "1") == gpus.rstrip(",") and ("--ray" in words) == (gpus != "1,")
+    assert int(given.get("--queue-limit", 16)) == max(16, int(most))
+    assert int(given.get("--max-clients", 256)) == max(256, int(asked.split()[1]))
 
 
 @pytest.mark.parametrize(

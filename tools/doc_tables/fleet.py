@@ -4,9 +4,8 @@ from turbopi.bench.batch_table import published_table
 from turbopi.bench.gpus import find_gpu
 from turbopi.bench.measured import measured_calls
 from turbopi.errors import ConfigError
-from turbopi.serve.sizing import Fleet, Plan, plan_fleet
+from turbopi.serve.sizing import OVERHEAD_MS, RAY_MS, Fleet, Plan, plan_fleet
 
-OVERHEAD_MS = 2.0  # the command's own
 GPUS = (("h200", "fp8"), ("h200", "bf16"), ("h100", "fp8"), ("h100", "bf16"), ("rtx4090", "bf16"))
 ROBOTS = (4, 8, 16, 32, 64)
 CONTROL = ((50.0, 50), (20.0, 10))  # control rate, actions of a chunk
@@ -16,7 +15,7 @@ def plan(robots: int, hz: float, horizon: int, gpu: str, precision: str) -> Plan
     """What the command plans; None where one robot alone is too many."""
     try:
         times = published_table(gpu, precision, horizon)
-        return plan_fleet(Fleet(robots, hz, horizon, overhead_ms=OVERHEAD_MS), times.seconds)
+        return plan_fleet(Fleet(robots, hz, horizon, overhead_ms=OVERHEAD_MS, ray_ms=RAY_MS), times.seconds)
     except ConfigError:
         return None
 

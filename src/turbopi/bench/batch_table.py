@@ -68,7 +68,8 @@ def published_table(gpu: str, precision: str, horizon: int) -> BatchTable:
     if best is None:
         raise ConfigError(
             f"nothing that runs in {precision} on {spec.name} was measured anywhere, so there is no prediction; "
-            "measure T(B) there with `turbopi bench --batch 1,2,4,8 --report DIR`, and give --times DIR/results.json"
+            f"measure T(B) there with `turbopi bench --horizons {horizon} --batch 1,2,4,8 --report DIR`, and give "
+            "--times DIR/results.json"
         )
     return BatchTable(
         gpu=spec.key,
@@ -119,9 +120,11 @@ def _table(gpu: str, precision: str, horizon: int, timed: Sequence[_Timed]) -> B
     same = [
         one
         for one in timed
-        if (one.backend, one.kernels) == (best.backend, best.kernels) and replace(one.job, batch=1) == best.job
+        if (one.backend, one.kernels) == (best.backend, best.kernels)
+        and replace(one.job, batch=1, horizon=shortest) == best.job
+        and one.job.horizon >= shortest
     ]
-    # of several measurements the soonest, which are sorted last
+    # of several measurements the soonest, which are sorted last: a shorter chunk takes no longer than a longer one
     chosen = {one.job.batch: one for one in sorted(same, key=lambda one: (one.job.batch, -one.seconds))}
     return BatchTable(
         gpu=gpu,

@@ -1,5 +1,6 @@
 """`turbopi plan`: how many GPUs a fleet of robots needs."""
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from turbopi.serve.sizing import Fleet, Plan
 
 MOST_ROBOTS = 10_000
+DECODED = 500  # observations a second, by one server (docs/fleet.md)
 
 
 @command(
@@ -39,8 +41,11 @@ def plan(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Instead: T(B) of your GPU: results.json of `turbopi bench --batch 1,2,4,8 --report DIR`.",
+            help="Instead: T(B) of yours: results.json of `turbopi bench --horizons H --batch 1,2,4,8 --report DIR`.",
         ),
+    ] = None,
+    gpus: Annotated[
+        int | None, typer.Option(metavar="N", min=1, max=MOST_ROBOTS, help="Plan for so many GPUs; else the fewest.")
     ] = None,
     precision: Annotated[str, typer.Option(metavar="NAME", help="Such as bf16, fp8.")] = "bf16",
     delay_steps: Annotated[
@@ -49,13 +54,13 @@ def plan(
     ] = None,
     execution_horizon: Annotated[
         int | None,
-        typer.Option(metavar="S", min=1, help="Control steps between two requests of a robot; else half a chunk."),
+        typer.Option(metavar="S", min=1, help="Steps between two requests; else H / 2. H: the robot stands still."),
     ] = None,
     max_batch: Annotated[int | None, typer.Option(metavar="N", min=1, help="No larger batches.")] = None,
     overhead_ms: Annotated[
-        float,
-        typer.Option(metavar="MS", min=0, max=60_000, help="Of a request beyond the policy: network and server."),
-    ] = 2.0,
+        float | None,
+        typer.Option(metavar="MS", min=0, max=60_000, help="Of a request beyond the policy; else 2, with Ray 8."),
+    ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Say how many GPUs a fleet needs, in which batches they run, and the delay that each robot then has at most.
@@ -65,19 +70,20 @@ def plan(
     predictions, and the output says so.
     """
     from turbopi.bench.batch_table import published_table, table_of_file
-    from turbopi.serve.sizing import Fleet, plan_fleet
+    from turbopi.serve.sizing import OVERHEAD_MS, RAY_MS, Fleet, plan_fleet
 
     if gpu is not None and times is not None:
         raise ConfigError(f"--gpu {gpu} and --times {times} each name the times of a policy: give one of them")
     if gpu is None and times is None:
         raise ConfigError("give --gpu GPU, or --times FILE with what was measured on yours")
-    fleet = Fleet(robots, hz, horizon, execution_horizon, delay_steps, overhead_ms)
+    overhead = (OVERHEAD_MS, RAY_MS) if overhead_ms is None else (overhead_ms, 0.0)
+    fleet = Fleet(robots, hz, horizon, execution_horizon, delay_steps, *overhead)
     if times is not None:
         table = table_of_file(times, precision, horizon)
     else:
         assert gpu is not None
         table = published_table(gpu, precision, horizon)
-    planned = plan_fleet(fleet, table.seconds, max_batch)
+    planned = plan_fleet(fleet, table.seconds, max_batch, gpus)
     output = Output(as_json)
     for line in lines(fleet, table, planned):
         output.line(line)
@@ -88,14 +94,21 @@ def plan(
 
 def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
     """The plan for people."""
+    from turbopi.serve.fleet import MOST_AT_ONCE
+    from turbopi.serve.options import ServerOptions
+
     each = ", ".join(f"T({size}) {seconds * 1e3:.1f}" for size, seconds in table.seconds.items())
     kind = "PREDICTED, not measured there" if table.predicted else "measured"
     serve = (
         f"turbopi serve CHECKPOINT --backend {table.backend} --precision {table.precision} --max-batch {planned.batch}"
     )
+    if planned.queue_limit > ServerOptions.queue_limit:
+        serve += f" --queue-limit {planned.queue_limit}"
+    if fleet.robots > ServerOptions.max_clients:
+        serve += f" --max-clients {fleet.robots}"
     a_second = fleet.robots * fleet.hz / fleet.steps
     each_has = f"{planned.robots_per_gpu} robot{'s' * (planned.robots_per_gpu > 1)}"
-    return [
+    told = [
         f"{fleet.robots} robots at {fleet.hz:g} Hz, chunks of {fleet.horizon}, a new one every {fleet.steps} steps:",
         f"  {a_second:.1f} observations a second",
         f"{table.gpu}, {table.backend} {table.precision}, {kind} ({table.job}):",
@@ -104,13 +117,19 @@ def lines(fleet: "Fleet", table: "BatchTable", planned: "Plan") -> list[str]:
         f"GPUs         {planned.gpus}, at most {each_has} on each",
         f"batch        {planned.batch} at most",
         f"delay        {planned.delay_steps} control steps at most "
-        f"({planned.worst_seconds * 1e3:.1f} ms and {fleet.overhead_ms:g} ms overhead)",
+        f"({planned.worst_seconds * 1e3:.1f} ms and {fleet.overhead(planned.gpus):g} ms overhead)",
         f"utilisation  {planned.utilisation:.0%}",
         f"run          {serve}" + (f" --ray --replicas {planned.gpus}" if planned.gpus > 1 else ""),
-        *(
-            [f"Batches of chunks of {table.job.horizon} weren't measured there: `turbopi bench --batch`, then --times"]
-            if fleet.robots > 1 and len(table.seconds) == 1
-            else []
-        ),
-        *(["With Ray a call takes longer: see docs/fleet.md, and --overhead-ms"] if planned.gpus > 1 else []),
     ]
+    if fleet.steps == fleet.horizon:
+        told.append("Robots carry out whole chunks, and stand still for the delay")
+    if (alone := fleet.delay(planned.worst_seconds, 1)) < planned.delay_steps:
+        told.append(f"Without Ray, a server on each GPU: {alone} control steps at most")
+    if planned.robots_per_gpu > MOST_AT_ONCE and planned.gpus > 1:
+        told.append(f"A replica takes {MOST_AT_ONCE} requests at once, so the delay may be longer: take more GPUs")
+    if (servers := math.ceil(a_second / DECODED)) > 1:
+        told.append(f"One server decodes some {DECODED} observations a second: take {servers} servers")
+    if fleet.robots > 1 and len(table.seconds) == 1:
+        options = f"--horizons {table.job.horizon} --batch 1,2,4,8"
+        told.append(f"Batches of such chunks weren't measured there: `turbopi bench {options}`, then --times")
+    return told

@@ -1,8 +1,9 @@
 """How many GPUs a fleet of robots needs: arithmetic alone, from the times T(B) of a GPU.
 
 Each robot asks for a chunk of H actions every s control steps, and has it d steps later: d ≤ s, or it would ask before
-it has its answer, and d ≤ H - s, or it would run out of actions. The server gives all the same time, so that the
-earliest deadline is who asked first, and forms batches as `BatchTimes.best` says.
+it has its answer, and d ≤ H - s, or it would run out of actions. With s = H it does run out, and stands still for d.
+The server gives all the same time, so that the earliest deadline is who asked first, and forms batches as
+`BatchTimes.best` says.
 
 The longest that one of n robots waits on a GPU. When it asks, others wait or run, each with one request, since d ≤ s.
 If a turn runs, at most n - 1 of them wait, itself among them; the first m of those that wait are done after
@@ -18,7 +19,10 @@ from dataclasses import dataclass
 
 from turbopi.errors import ConfigError
 from turbopi.serve.batch_times import BatchTimes
+from turbopi.serve.options import ServerOptions
 
+OVERHEAD_MS = 2.0  # of a request, usually: the network, the server
+RAY_MS = 6.0  # more behind Ray, at most (docs/fleet.md)
 ROUNDING = 1e-9  # of a control step: 3.0000000001 steps are 3
 
 
@@ -28,9 +32,10 @@ class Fleet:
 
     hz                 control steps a second
     horizon            H, actions of a chunk
-    execution_horizon  s, control steps from one request to the next; None: half of H
+    execution_horizon  s, control steps from one request to the next; None: half of H. H: they stand still for d
     delay_steps        the most control steps of delay; None: as many as s and H allow
     overhead_ms        of a request beyond the policy's part: the network, the server
+    ray_ms             more of it with several GPUs, behind Ray
     """
 
     robots: int
@@ -39,6 +44,7 @@ class Fleet:
     execution_horizon: int | None = None
     delay_steps: int | None = None
     overhead_ms: float = 0.0
+    ray_ms: float = 0.0
 
     def __post_init__(self) -> None:
         """Raises ConfigError for numbers that don't fit each other."""
@@ -46,15 +52,10 @@ class Fleet:
             raise ConfigError(f"a fleet has robots, a control rate and a chunk above 0, not {self}")
         if not 1 <= self.steps <= self.horizon:
             raise ConfigError(f"the execution horizon is {self.steps}; expected 1 to {self.horizon}, a chunk's actions")
-        if self.most_delay < 1:
-            raise ConfigError(
-                f"chunks of {self.horizon} actions of which {self.steps} are carried out before the next takes over "
-                "leave no control step for computing it: take a shorter --execution-horizon or longer chunks"
-            )
         if self.delay_steps is not None and not 1 <= self.delay_steps <= self.most_delay:
             raise ConfigError(
                 f"the delay is to be {self.delay_steps} control steps at most; expected 1 to {self.most_delay}: "
-                f"d ≤ s and d ≤ H - s, with s = {self.steps} and H = {self.horizon}"
+                f"d ≤ s and, unless s = H, d ≤ H - s, with s = {self.steps} and H = {self.horizon}"
             )
 
     @property
@@ -65,17 +66,24 @@ class Fleet:
     @property
     def most_delay(self) -> int:
         """The most control steps that an answer may take: d ≤ s, d ≤ H - s."""
-        return min(self.steps, self.horizon - self.steps)
+        return min(self.steps, self.horizon - self.steps or self.horizon)
 
     @property
-    def allowed(self) -> float:
-        """Seconds that the policy's part of a request may take at most."""
-        most = self.most_delay if self.delay_steps is None else self.delay_steps
-        return most / self.hz - self.overhead_ms / 1e3
+    def allowed_steps(self) -> int:
+        """Those that were asked for, else as many as s and H allow."""
+        return self.most_delay if self.delay_steps is None else self.delay_steps
 
-    def delay(self, seconds: float) -> int:
+    def overhead(self, gpus: int) -> float:
+        """Milliseconds of a request beyond the policy's part."""
+        return self.overhead_ms + (self.ray_ms if gpus > 1 else 0.0)
+
+    def allowed(self, gpus: int) -> float:
+        """Seconds that the policy's part of a request may take at most."""
+        return self.allowed_steps / self.hz - self.overhead(gpus) / 1e3
+
+    def delay(self, seconds: float, gpus: int) -> int:
         """Control steps until a chunk is there, of which the policy's part takes so long."""
-        return max(1, math.ceil((seconds + self.overhead_ms / 1e3) * self.hz - ROUNDING))
+        return max(1, math.ceil((seconds + self.overhead(gpus) / 1e3) * self.hz - ROUNDING))
 
 
 @dataclass(frozen=True)
@@ -85,6 +93,7 @@ class Plan:
     gpus            of that kind
     robots_per_gpu  on the GPU that has most
     batch           observations of a turn, at most: the server's --max-batch
+    queue_limit     requests that may wait there: the server's --queue-limit
     worst_seconds   from a request to its answer, without the overhead, if no turn takes longer than T(B)
     delay_steps     the same in control steps, with the overhead
     utilisation     the part of the time that the GPU with most robots computes, from 0 to 1
@@ -93,50 +102,65 @@ class Plan:
     gpus: int
     robots_per_gpu: int
     batch: int
+    queue_limit: int
     worst_seconds: float
     delay_steps: int
     utilisation: float
 
 
-def plan_fleet(fleet: Fleet, seconds: Mapping[int, float], max_batch: int | None = None) -> Plan:
+def plan_fleet(
+    fleet: Fleet, seconds: Mapping[int, float], max_batch: int | None = None, gpus: int | None = None
+) -> Plan:
     """The fewest GPUs that keep every robot's delay.
 
     seconds    T(B) by B; 1 is among them
     max_batch  no larger batches; None: none larger than the largest of `seconds`
+    gpus       exactly so many GPUs
 
-    Raises ConfigError if a GPU isn't fast enough for one robot.
+    Raises ConfigError if a GPU isn't fast enough for one robot, or `gpus` aren't enough for all.
     """
     tables = [batch_times(seconds, size) for size in sorted(seconds) if max_batch is None or size <= max_batch]
+    fastest = min(took / size for size, took in seconds.items())  # no order of turns makes more a second
 
     def worst(robots: int) -> tuple[float, int]:
         return min((worst_seconds(times, robots), times.largest) for times in tables)
 
-    fastest = min(took / size for size, took in seconds.items())  # no order of turns makes more a second
-    most, too_many = 0, min(fleet.robots, max(0, math.floor(fleet.allowed / fastest))) + 1
-    while too_many - most > 1:  # what is enough for n robots is enough for fewer
-        robots = (most + too_many) // 2
-        if worst(robots)[0] <= fleet.allowed + ROUNDING / fleet.hz:
-            most = robots
-        else:
-            too_many = robots
-    if most == 0:
-        alone, allowed = worst(1)[0], fleet.most_delay if fleet.delay_steps is None else fleet.delay_steps
-        raise ConfigError(
-            f"this GPU can't do it for a single robot: a call takes {alone * 1e3:.1f} ms, "
-            f"with {fleet.overhead_ms:g} ms of overhead that is {fleet.delay(alone)} control steps at {fleet.hz:g} Hz; "
-            f"{allowed} are allowed"
+    def fits(robots: int, of_gpus: int) -> bool:
+        allowed = fleet.allowed(of_gpus) + ROUNDING / fleet.hz
+        return robots * fastest <= allowed and worst(robots)[0] <= allowed
+
+    def too_long(robots: int, of_gpus: int) -> str:
+        took = worst(robots)[0]
+        return (
+            f"a request takes {took * 1e3:.1f} ms at most, with {fleet.overhead(of_gpus):g} ms of overhead that is "
+            f"{fleet.delay(took, of_gpus)} control steps at {fleet.hz:g} Hz; {fleet.allowed_steps} are allowed"
         )
-    gpus = math.ceil(fleet.robots / most)
-    robots = math.ceil(fleet.robots / gpus)
+
+    def enough() -> int:
+        if fits(fleet.robots, 1):
+            return 1
+        most, too_many = 0, fleet.robots
+        while too_many - most > 1:  # what is enough for n robots is enough for fewer
+            robots = (most + too_many) // 2
+            most, too_many = (robots, too_many) if fits(robots, 2) else (most, robots)
+        if most == 0:
+            raise ConfigError(f"this GPU can't do it for a single robot: {too_long(1, fleet.robots)}")
+        return math.ceil(fleet.robots / most)
+
+    used = enough() if gpus is None else gpus
+    robots = math.ceil(fleet.robots / used)
+    if gpus is not None and not fits(robots, gpus):
+        raise ConfigError(f"--gpus {gpus} can't do it: {too_long(robots, gpus)}; --gpus {enough()} would do")
     took, largest = worst(robots)
     times = batch_times(seconds, largest)
     together = times.best(robots, 0.0)
     return Plan(
-        gpus=gpus,
+        gpus=used,
         robots_per_gpu=robots,
         batch=max(times.best(waiting, 0.0) for waiting in range(1, min(robots, largest) + 1)),
+        queue_limit=max(robots, ServerOptions.queue_limit),
         worst_seconds=took,
-        delay_steps=fleet.delay(took),
+        delay_steps=fleet.delay(took, used),
         utilisation=robots * _seconds(times, together) / together * fleet.hz / fleet.steps,
     )
 
