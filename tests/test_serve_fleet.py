@@ -4,8 +4,10 @@ import asyncio
 import contextlib
 import logging
 import os
+import re
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
@@ -16,7 +18,9 @@ from cli_helpers import refusal, text_of, turbopi
 from serve_fakes import FakePolicy, observation
 from websockets.sync.client import connect
 
-from turbopi.cli.serve_ray import check_fits, check_runs
+from turbopi.cli.fleet_update import Asked
+from turbopi.cli.options import PolicyOptions
+from turbopi.cli.serve_ray import FleetWishes, check_fits, check_runs
 from turbopi.client import RealTimeClient, ServerRefused
 from turbopi.errors import ConfigError
 from turbopi.serve import PolicyServer, ray_app, running
@@ -48,7 +52,7 @@ def replicated(
         policy = FakePolicy()
         replica = Replica.__new__(Replica)  # as Ray Serve makes one
         options = ServerOptions(queue_limit=1)
-        made: Any = replica.__init__(lambda: policy, "weights", warm, options, end)  # type: ignore[misc]
+        made: Any = replica.__init__(lambda: policy, "weights", warm, options, end, {"steps": 3})  # type: ignore[misc]
         await made
         try:
             await asyncio.wait_for(test(replica, policy), 60)
@@ -73,6 +77,7 @@ def test_a_replica_answers_with_actions_or_whose_fault_it_is() -> None:
         replica.check_health()
         assert not policy.warmed_up
         assert await replica.about() == policy.metadata
+        assert await replica.asked() == {"steps": 3}
 
     replicated(test)
 
@@ -118,8 +123,8 @@ def test_a_lost_device_is_told_and_ends_the_process() -> None:
 class SecondTimeWell(RemoteCalls):
     """Where requests are computed: the replica of the first one ends."""
 
-    def __init__(self, metrics: Metrics) -> None:
-        super().__init__(None, metrics, 60.0)
+    def __init__(self, metrics: Metrics, on_lost: Callable[[str], None]) -> None:
+        super().__init__(None, metrics, 60.0, on_lost=on_lost)
         self.asked = 0
 
     async def run(self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line) -> Outcome:
@@ -205,6 +210,7 @@ def test_a_ray_that_is_started_here_says_nothing_of_its_token_which_stays_on(
         (("--ray", "--gpus", "2"), "--gpus is all, or left out, not '2'"),
         (("--ray", "--gpus", "all", "--replicas", "2"), "--replicas and --gpus each say how many replicas there are"),
         (("--ray", "--update"), "--update needs the running fleet's name: --fleet NAME"),
+        (("--ray", "--strict", "--no-warmup"), "--strict refuses what warm-up didn't cover"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(options: tuple[str, ...], words: str) -> None:
@@ -219,10 +225,29 @@ def test_what_does_not_run_is_not_updated() -> None:
         check_runs("arm", [])
 
 
-def test_weights_with_chunks_of_another_length_are_no_update() -> None:
-    check_fits({"action_horizon": 10}, 10)
+def test_weights_with_other_chunks_or_for_another_robot_are_no_update() -> None:
+    running = {"action_horizon": 10, "robot": "libero"}
+    for robot in ("libero", None):  # None: a class of the user's, which isn't run here
+        check_fits(running, 10, robot)
     with pytest.raises(ConfigError, match="the running fleet's chunks have 10 actions, this checkpoint's 50"):
-        check_fits({"action_horizon": 10}, 50)
+        check_fits(running, 50, "libero")
+    with pytest.raises(ConfigError, match="is for the robot libero, this checkpoint for droid: start another fleet"):
+        check_fits(running, 10, "droid")
+
+
+@pytest.mark.parametrize(
+    ("device", "words"),
+    [
+        ("cuda:1", "device='cuda:1' was asked for, but in a fleet Ray gives each replica its GPU"),
+        ("cpu", "--gpus all gives each replica a GPU, but --device cpu was asked for"),
+    ],
+)
+def test_all_gpus_are_not_one_by_number_and_not_cpus(device: str, words: str) -> None:
+    asked = Asked(PolicyOptions(random_weights="pi05_tiny", device=device), ServerOptions(), True, False)
+    wishes = FleetWishes(True, None, "all", None, None, False)
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        wishes.options(asked, None)
+    assert wishes.options(replace(asked, policy=replace(asked.policy, device="cuda")), None).use_gpus
 
 
 def test_the_help_shows_a_fleet() -> None:
@@ -247,6 +272,11 @@ def test_fleets_that_cannot_be_are_refused(options: dict[str, Any], words: str) 
 def test_a_fleet_is_called_as_its_checkpoint_is(tmp_path: Path) -> None:
     assert name_of(str(tmp_path / "pi05 libero"), None) == "pi05_libero"
     assert name_of(None, "pi05_tiny") == "pi05_tiny"
+
+
+def test_a_fleet_is_not_called_as_a_step_is(tmp_path: Path) -> None:
+    assert name_of(str(tmp_path / "policy a" / "20000"), None) == "policy_a-20000"
+    assert name_of("/20000", None) == "20000"
 
 
 def test_ray_gives_each_replica_its_gpu_so_none_is_named() -> None:

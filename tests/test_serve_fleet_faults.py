@@ -10,6 +10,7 @@ import importlib.util
 import itertools
 import json
 import os
+import re
 import secrets
 import signal
 import socket
@@ -59,6 +60,12 @@ class FleetProcess:
         assert self._process.stdin is not None
         print(json.dumps({"do": do, **given}), file=self._process.stdin, flush=True)
         return self._said()
+
+    def end(self) -> None:
+        """End it, and its Ray; more than once is once."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        assert self._process.wait(MOST_SECONDS) == 0
 
     @contextlib.contextmanager
     def robot(self) -> Iterator["Robot"]:
@@ -131,6 +138,19 @@ def load(fleet: FleetProcess, robots: int) -> Iterator[list[Load]]:
 
 @pytest.fixture(scope="module")
 def fleet() -> Iterator[FleetProcess]:
+    with fleet_of_its_own() as process:
+        yield process
+
+
+def join(fleet: FleetProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let commands join the cluster of that process."""
+    for name, value in {**TOKEN, "RAY_ADDRESS": fleet.addresses["cluster"]}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+
+
+@contextlib.contextmanager
+def fleet_of_its_own() -> Iterator[FleetProcess]:
     with subprocess.Popen(
         [sys.executable, str(Path(__file__).parent / "fleet_process.py")],
         stdin=subprocess.PIPE,
@@ -140,10 +160,9 @@ def fleet() -> Iterator[FleetProcess]:
         start_new_session=True,
     ) as process:
         try:
-            yield FleetProcess(process)
-            assert process.stdin is not None
-            process.stdin.close()
-            assert process.wait(MOST_SECONDS) == 0
+            fleet = FleetProcess(process)
+            yield fleet
+            fleet.end()
         finally:
             with contextlib.suppress(ProcessLookupError):  # with all of Ray's
                 os.killpg(process.pid, signal.SIGKILL)
@@ -340,29 +359,82 @@ def test_serve_run_speaks_the_same_protocol_behind_rays_proxy(fleet: FleetProces
 def test_the_command_serves_and_updates_a_fleet_of_a_cluster(
     fleet: FleetProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("RAY_ADDRESS", fleet.addresses["cluster"])
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-    for name, value in TOKEN.items():
-        monkeypatch.setenv(name, value)
+    join(fleet, monkeypatch)
     frame = load_frames()[0]
     observation = {"observation/image": frame.base, "observation/wrist_image": frame.wrist, "prompt": "pick it up"}
-    with serving("--ray", "--replicas", "1", "--no-warmup") as (process, url, printed):
+    with serving("--ray", "--replicas", "1", "--no-warmup", "--steps", "1") as (process, url, printed):
         assert "Fleet pi05_tiny: 1 replica of pi05_tiny, on CPUs; loading and warming up …\n" in printed
+        assert re.search(
+            rf"error: a fleet 'pi05_tiny' runs already \(its server is process {process.pid} on .*\): --fleet NAME "
+            "starts another one, --update --fleet pi05_tiny replaces its weights",
+            turbopi_serve("--random-weights", "pi05_tiny", "--ray", "--port", "0").stderr,
+        )
         with connect(url, compression=None, open_timeout=MOST_SECONDS) as connection:
             robot = Robot(connection)
             connection.send(pack({**observation, "observation/state": frame.state}))
             before = robot.answer()
-            assert updated("pi05_tiny").stdout.endswith("Updated: 1 of 1 replicas run pi05_tiny.\n")
+            said = updated("pi05_tiny").stdout
+            assert "\nsteps: 1 -> 2\nFleet pi05_tiny: 1 replica of pi05_tiny" in said
+            assert said.endswith("Updated: 1 of 1 replicas run pi05_tiny.\n")
+            assert (
+                "\nAs in the running fleet: --steps 2, --no-warmup.\n"
+                in updated("pi05_tiny", "--weights-seed", "1").stdout
+            )
             connection.send(pack({**observation, "observation/state": frame.state}))
             after = robot.answer()
         assert isinstance(before, dict) and isinstance(after, dict)
         assert not np.array_equal(before["actions"], after["actions"])
+        process.kill()  # its replicas stay
+        process.wait(MOST_SECONDS)
+    droid = turbopi_serve("--random-weights", "pi05_tiny", "--robot", "droid", "--ray", "--port", "0")
+    assert "error: the running fleet is for the robot libero, this checkpoint for droid: start another" in droid.stderr
+    with serving("--ray", "--replicas", "1", "--no-warmup") as (process, url, printed):
+        assert any(line.startswith("The fleet pi05_tiny is there without a server") for line in printed)
+        with connect(url, compression=None, open_timeout=MOST_SECONDS) as connection:
+            robot = Robot(connection)
+            connection.send(pack({**observation, "observation/state": frame.state}))
+            assert isinstance(robot.answer(), dict)
         process.send_signal(signal.SIGINT)
         assert process.wait(MOST_SECONDS) == 0
 
 
-def updated(name: str) -> "subprocess.CompletedProcess[str]":
+def test_an_application_of_serve_run_is_no_fleet(fleet: FleetProcess, monkeypatch: pytest.MonkeyPatch) -> None:
+    join(fleet, monkeypatch)
+    assert fleet.do("build", arguments={"random_weights": "pi05_tiny", "cpus": "0.25", "warmup": "false"}) == {}
+    for options in (("--port", "0"), ("--update",)):
+        said = turbopi_serve("--random-weights", "pi05_tiny", "--ray", "--fleet", "whole", *options).stderr
+        assert (
+            "an application 'whole' that `turbopi serve --ray` didn't start, with the deployments ingress, pol" in said
+        )
+
+
+def test_a_server_whose_ray_has_ended_says_so_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    with contextlib.ExitStack() as stack:
+        fleet = stack.enter_context(fleet_of_its_own())
+        join(fleet, monkeypatch)
+        process, url, _ = stack.enter_context(serving("--ray", "--replicas", "1", "--no-warmup"))
+        connection = stack.enter_context(connect(url, compression=None, open_timeout=MOST_SECONDS))
+        robot = Robot(connection)
+        fleet.end()
+
+        def said() -> str:
+            time.sleep(0.1)
+            answer = robot.ask()
+            return answer if isinstance(answer, str) else ""
+
+        lost = wait_for(lambda: (text := said()).startswith("the device is lost: ") and text)
+        assert "Ray's cluster at" in lost and "has ended, and all replicas with it" in lost
+        assert asyncio.run(http_get(int(url.rpartition(":")[2]), "/healthz"))[::2] == (503, f"{lost}\n")
+        assert process.wait(MOST_SECONDS) == 4
+        assert process.stderr is not None and "error: Ray's cluster at" in process.stderr.read()
+
+
+def updated(name: str, *options: str) -> "subprocess.CompletedProcess[str]":
     """`turbopi serve --update` with other weights than the tests' own."""
-    weights = ("--random-weights", "pi05_tiny", "--weights-seed", "1", "--steps", "2", "--no-warmup")
-    command = [sys.executable, "-m", "turbopi.cli", "serve", *weights, "--ray", "--update", "--fleet", name]
+    options = options or ("--weights-seed", "1", "--steps", "2", "--no-warmup")
+    return turbopi_serve("--random-weights", "pi05_tiny", *options, "--ray", "--update", "--fleet", name)
+
+
+def turbopi_serve(*options: str) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "turbopi.cli", "serve", *options]
     return subprocess.run(command, capture_output=True, text=True, timeout=MOST_SECONDS, check=False)

@@ -9,6 +9,7 @@ import typer
 
 from turbopi.cli.api_key import ApiKey, chosen_key
 from turbopi.cli.files import check_folder
+from turbopi.cli.fleet_update import Asked, check_warmup
 from turbopi.cli.framework import Output, command, log_to_stderr
 from turbopi.cli.offers import check_server
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 )
 def serve(
     options: PolicyOptions,
+    context: typer.Context,
     checkpoint: CheckpointArgument = None,
     host: Annotated[
         str, typer.Option("--host", metavar="HOST", help="0.0.0.0 lets other machines in.")
@@ -163,10 +165,7 @@ def serve(
     options.check(checkpoint)
     wishes = FleetWishes(ray, replicas, gpus, fleet, autoscaling, update)
     wishes.check()
-    if strict and not warmup:
-        raise ConfigError("--strict refuses what warm-up didn't cover: with --no-warmup that would be everything")
-    if max_batch is not None and max_batch > 1 and not warmup:
-        raise ConfigError(f"--max-batch {max_batch} needs the warm-up, which measures batches: leave out --no-warmup")
+    check_warmup(warmup, strict, max_batch)
     shown = api_key is not None and api_key != os.environ.get("TURBOPI_API_KEY")
     wanted = ServerOptions(
         host=host,
@@ -195,7 +194,9 @@ def serve(
             "note: `ps` shows a key on the command line to all; --api-key-file or TURBOPI_API_KEY hides it", "yellow"
         )
     if ray:
-        serve_fleet(wishes, options, checkpoint, wanted, output, warmup=warmup, strict=strict, before_serving=_log_all)
+        given = [name for name in context.params if _was_given(context, name)]
+        asked = Asked(options, wanted, warmup, strict)
+        serve_fleet(wishes, asked, checkpoint, output, given=given, before_serving=_log_all)
         return
     opened = options.open(checkpoint)
     check_server(wanted, options, opened)
@@ -206,6 +207,12 @@ def serve(
 
     _log_all()
     serving.run(policy if warmup else _Cold(policy), wanted, console=output.console)
+
+
+def _was_given(context: typer.Context, name: str) -> bool:
+    """Whether an option is on the command line, be it with its default."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
 
 
 def _log_all() -> None:

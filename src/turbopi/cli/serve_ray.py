@@ -1,7 +1,7 @@
 """`turbopi serve --ray`: the options of a fleet, and its start and end."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from turbopi.cli.fleet_update import Asked, as_before, changes, of_the_front, runs, scale_of, scaled_as
 from turbopi.cli.framework import Output
 from turbopi.cli.offers import check_server
 from turbopi.cli.options import PolicyOptions
-from turbopi.errors import ConfigError
-from turbopi.serve.options import ServerOptions
+from turbopi.errors import BackendError, ConfigError
 
 if TYPE_CHECKING:
+    from turbopi.checkpoint import Checkpoint
     from turbopi.policy import UnifiedPolicy
     from turbopi.serve.fleet import FleetOptions
 
@@ -63,7 +64,8 @@ Update = Annotated[
     bool,
     typer.Option(
         "--update",
-        help="Only replace the replicas of the running --fleet by this checkpoint's, one after the other.",
+        help="Only replace the replicas of the running --fleet by this checkpoint's, one after the other. Options that "
+        "aren't given stay as they are there.",
         rich_help_panel=_FLEET,
     ),
 ]
@@ -100,71 +102,158 @@ class FleetWishes:
         if self.update and self.name is None:
             raise ConfigError("--update needs the running fleet's name: --fleet NAME")
 
-    def options(self, policy: PolicyOptions, checkpoint: str | None, server: ServerOptions) -> "FleetOptions":
+    def options(self, asked: Asked, checkpoint: str | None) -> "FleetOptions":
         """The fleet's options. Raises ConfigError."""
         from turbopi.serve.fleet import FleetOptions, line_of
         from turbopi.serve.ray_app import gpus_for, name_of, read_autoscaling
 
-        name = name_of(checkpoint, policy.random_weights)
+        name = name_of(checkpoint, asked.policy.random_weights)
+        use_gpus = gpus_for(asked.policy.device)
+        if self.gpus == "all" and use_gpus is False:
+            raise ConfigError(
+                f"--gpus all gives each replica a GPU, but --device {asked.policy.device} was asked for: leave out one "
+                "of them; --replicas says how many run on CPUs"
+            )
         return FleetOptions(
             name=self.name or name,
             checkpoint=name,
             replicas=self.replicas,
-            use_gpus=True if self.gpus == "all" else gpus_for(policy.device),
+            use_gpus=True if self.gpus == "all" else use_gpus,
             autoscaling=read_autoscaling(self.autoscaling),
-            line=line_of(server),
+            line=line_of(asked.server),
         )
 
 
 def serve_fleet(
     wishes: FleetWishes,
-    policy: PolicyOptions,
+    asked: Asked,
     checkpoint: str | None,
-    server: ServerOptions,
     output: Output,
     *,
-    warmup: bool,
-    strict: bool,
+    given: Collection[str],
     before_serving: Callable[[], None],
 ) -> None:
     """Start the replicas, then serve until a signal; with `--update` only replace replicas.
 
-    Raises ConfigError, CheckpointError, BackendUnavailable and BackendError for what can't be.
+    given  the options that were given, by their names here
+
+    Raises ConfigError, CheckpointError, BackendUnavailable and BackendError for what can't be, and DeviceLost when
+    Ray's cluster has ended.
     """
-    from turbopi import serve as serving
     from turbopi.serve import fleet
-    from turbopi.serve.ray_app import warm_up_of
 
     os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")  # what asks Ray after its end mustn't start another one
     fleet.import_ray()
-    options = wishes.options(policy, checkpoint, server)
-    opened = policy.open(checkpoint)  # what is wrong with it shows here, not in a replica's log
-    anywhere = replace(policy, backend="pytorch", precision=None, device="cpu")  # replicas may run on other devices
-    check_server(replace(server, max_batch=None), anywhere, opened)
-    policy.tell_if_random(opened, output)
-    make = partial(make_policy, _for_workers(policy), _absolute(checkpoint), strict)
-    with _cluster(output.console) as ours:
-        if wishes.update:
+    asked = replace(asked, policy=_for_workers(asked.policy))
+    options = wishes.options(asked, checkpoint)
+    if wishes.update:
+        with _cluster(output.console) as ours:
             check_runs(options.name, [] if ours else fleet.names())
-            check_fits(fleet.Fleet.attach(options.name).metadata, opened.config.model.action_horizon)
+            _update(wishes, asked, checkpoint, output, given)
+    else:
+        opened = _open(asked, checkpoint, output)  # what is wrong with it shows here, not in a replica's log
+        with _cluster(output.console):
+            _serve(options, asked, checkpoint, opened, output, before_serving)
+
+
+def _serve(
+    options: "FleetOptions",
+    asked: Asked,
+    checkpoint: str | None,
+    opened: "Checkpoint",
+    output: Output,
+    before_serving: Callable[[], None],
+) -> None:
+    from turbopi import serve as serving
+    from turbopi.serve import fleet
+    from turbopi.serve.fleet_name import claimed
+
+    with claimed(options.name):
+        fleet.check_is_fleet(options.name)
+        if options.name in fleet.names():
+            _check_orphan(options.name, asked.policy, opened, output)
         fleet.check_room(options)
-        application = fleet.replicas(make, options, warm=warm_up_of(warmup, server.execution))
-        count, use_gpus = fleet.planned(options)
-        output.line(
-            f"Fleet {options.name}: {count} replica{'s' * (count > 1)} of {options.checkpoint}, "
-            f"{'a GPU each' if use_gpus else 'on CPUs'}; loading and warming up …"
-        )
         try:
-            fleet.deploy(application, options.name, output.line)
-            if wishes.update:
-                output.line(f"Updated: {count} of {count} replicas run {options.checkpoint}.")
-                return
+            _deploy(options, asked, checkpoint, output)
             policies = fleet.Fleet.attach(options.name)
             before_serving()
-            serving.run(policies, server, console=output.console, calls=policies.calls)
+            serving.run(policies, asked.server, console=output.console, calls=policies.calls)
         finally:
-            if not wishes.update:
-                fleet.delete(options.name)
+            fleet.delete(options.name)
+
+
+def _check_orphan(name: str, policy: PolicyOptions, opened: "Checkpoint", output: Output) -> None:
+    """Of a fleet whose server has ended without its replicas. Raises ConfigError if the new one doesn't fit."""
+    from turbopi.serve import fleet
+
+    try:
+        metadata = fleet.Fleet.attach(name, fleet.REACH_SECONDS).metadata
+    except BackendError as error:
+        output.line(f"note: {error}; so what they run isn't compared", "yellow")
+    else:
+        check_fits(metadata, opened.config.model.action_horizon, robot_of(policy, opened))
+    output.line(f"The fleet {name} is there without a server, which must have crashed: its replicas are replaced.")
+
+
+def _update(wishes: FleetWishes, asked: Asked, checkpoint: str | None, output: Output, given: Collection[str]) -> None:
+    from turbopi.serve import fleet
+
+    typed = asked.plain()
+    name = wishes.name
+    assert name is not None
+    fleet.check_is_fleet(name)
+    running = fleet.Fleet.attach(name)
+    before = running.asked()
+    asked = asked.kept(before, given)
+    opened = _open(asked, checkpoint, output)
+    check_fits(running.metadata, opened.config.model.action_horizon, robot_of(asked.policy, opened))
+    options = scaled_as(wishes.options(asked, checkpoint), before, given)
+    fleet.check_room(options)
+    after = asked.plain() | scale_of(options, *fleet.planned(options))
+    if ignored := of_the_front(given, after):
+        output.line(f"note: {', '.join(ignored)}: of the server in front, which an update leaves as it is", "yellow")
+    if kept := as_before(typed, after):
+        output.line(f"As in the running fleet: {', '.join(kept)}.")
+    for line in changes(before, after, running.metadata, runs(asked.policy, opened)):
+        output.line(line)
+    count = _deploy(options, asked, checkpoint, output)
+    output.line(f"Updated: {count} of {count} replicas run {options.checkpoint}.")
+
+
+def _open(asked: Asked, checkpoint: str | None, output: Output) -> "Checkpoint":
+    """The checkpoint, with what can be said of it before a replica loads it. Raises ConfigError and CheckpointError."""
+    opened = asked.policy.open(checkpoint)
+    anywhere = replace(asked.policy, backend="pytorch", precision=None, device="cpu")  # replicas may run elsewhere
+    check_server(replace(asked.server, max_batch=None), anywhere, opened)
+    asked.policy.tell_if_random(opened, output)
+    return opened
+
+
+def _deploy(options: "FleetOptions", asked: Asked, checkpoint: str | None, output: Output) -> int:
+    """Start or replace the replicas; returns their number."""
+    from turbopi.serve import fleet
+    from turbopi.serve.ray_app import warm_up_of
+
+    count, use_gpus = fleet.planned(options)
+    make = partial(make_policy, asked.policy, _absolute(checkpoint), asked.strict)
+    warm = warm_up_of(asked.warmup, asked.server.execution)
+    application = fleet.replicas(make, options, warm=warm, asked=asked.plain() | scale_of(options, count, use_gpus))
+    output.line(
+        f"Fleet {options.name}: {count} replica{'s' * (count > 1)} of {options.checkpoint}, "
+        f"{'a GPU each' if use_gpus else 'on CPUs'}; loading and warming up …"
+    )
+    fleet.deploy(application, options.name, output.line)
+    return count
+
+
+def robot_of(policy: PolicyOptions, opened: "Checkpoint") -> str | None:
+    """The robot's name as the policy's metadata will have it; None for a class of the user's, which isn't run here."""
+    from turbopi.robots import robot_for
+
+    config, asked = opened.config, policy.robot
+    if ":" in (asked or config.robot):
+        return None
+    return robot_for(config.robot if asked is None else asked, config.robot, config.robot_options).name
 
 
 def check_runs(name: str, running: list[str]) -> None:
@@ -174,12 +263,20 @@ def check_runs(name: str, running: list[str]) -> None:
         raise ConfigError(f"no fleet {name!r} runs on this machine's Ray cluster; {there}")
 
 
-def check_fits(metadata: Mapping[str, object], horizon: int) -> None:
-    """Raise ConfigError for new weights whose chunks have another length: robots know that of the old ones."""
+def check_fits(metadata: Mapping[str, object], horizon: int, robot: str | None) -> None:
+    """Raise ConfigError for new weights whose chunks are of another length or for another robot than the running ones.
+
+    Robots know the metadata of those. `robot` None: it isn't known here.
+    """
     if metadata.get("action_horizon") != horizon:
         raise ConfigError(
             f"the running fleet's chunks have {metadata.get('action_horizon')} actions, this checkpoint's {horizon}: "
-            "start another fleet for it"
+            "start another fleet for it, with --fleet NAME"
+        )
+    if robot is not None and metadata.get("robot", robot) != robot:
+        raise ConfigError(
+            f"the running fleet is for the robot {metadata['robot']}, this checkpoint for {robot}: start another fleet "
+            "for it, with --fleet NAME"
         )
 
 

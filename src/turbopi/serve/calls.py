@@ -69,6 +69,10 @@ class Calls(Protocol):
     def largest(self) -> int:
         """Observations of one batch message that aren't split."""
 
+    @property
+    def unwell(self) -> str | None:
+        """Why no request can be computed at the moment, if it is known: `/healthz` says it."""
+
     def waits(self, session: str) -> bool:
         """Whether a request of that session waits: a newer one would replace it."""
 
@@ -97,6 +101,8 @@ class PolicyCalls:
     `on_lost(reason)` is called on that thread when the device fails for good, whether or not the client still waits.
     Raises ConfigError for a `max_batch` of the options that this policy can't have.
     """
+
+    unwell = None  # it computes, or is lost for good
 
     def __init__(
         self, policy: Policy, options: ServerOptions, metrics: Metrics, on_lost: Callable[[str], None]

@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from packaging.specifiers import SpecifierSet
@@ -28,6 +29,7 @@ from packaging.specifiers import SpecifierSet
 from turbopi.errors import BackendError, BackendUnavailable, ConfigError
 from turbopi.installation import install_command
 from turbopi.serve.calls import Policy
+from turbopi.serve.fleet_watch import Watch, answers
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
 from turbopi.serve.remote_calls import ROUTER_LINE, RemoteCalls
@@ -43,6 +45,7 @@ DRAIN_SECONDS = 30.0  # that a replica which is replaced may take for the reques
 START_TRIES = 3
 MOST_AT_ONCE = 64  # requests of a replica: the line before its policy refuses earlier
 POLL_SECONDS = 0.5
+REACH_SECONDS = 3.0  # for an answer of one that may have ended
 STARTED_HERE = {  # of a Ray that is started here
     "RAY_USAGE_STATS_ENABLED": "0",  # it reports to nobody
     "RAY_worker_niceness": "0",  # Ray's own 15 would let every other program on the machine go before the robots
@@ -209,10 +212,29 @@ def names() -> list[str]:
     return sorted(serve.status().applications)
 
 
-def delete(name: str) -> None:
-    """End the replicas of the fleet of that name, after the requests that they have."""
+def check_is_fleet(name: str) -> None:
+    """Raise ConfigError if Ray Serve runs something else under that name, such as an application of `serve run`."""
     _, serve = import_ray()
-    serve.delete(name)
+    application = serve.status().applications.get(name)
+    if application is not None and set(application.deployments) - {DEPLOYMENT}:
+        raise ConfigError(
+            f"Ray Serve runs an application {name!r} that `turbopi serve --ray` didn't start, with the deployments "
+            f"{', '.join(sorted(application.deployments))}: take another name with --fleet NAME, or change it with "
+            "Ray's own commands"
+        )
+
+
+def delete(name: str) -> None:
+    """End the replicas of the fleet of that name, after their requests. If Ray has ended, they have, too."""
+    _, serve = import_ray()
+    if answers(address()):
+        serve.delete(name)
+
+
+def address() -> str:
+    """host:port of the control service of the cluster that this process has joined."""
+    ray, _ = import_ray()
+    return str(ray.get_runtime_context().gcs_address)
 
 
 def _running(name: str) -> int:
@@ -223,8 +245,27 @@ def _running(name: str) -> int:
     return 0 if deployment is None else int(deployment.replica_states.get("RUNNING", 0))
 
 
-def replicas(make_policy: Callable[[], Policy], options: FleetOptions, *, warm: Mapping[str, Any] | None) -> Any:
-    """The replicas as a Ray Serve application; `make_policy` and `warm` are Replica's. Raises ConfigError."""
+def why_unwell(name: str) -> str | None:
+    """Why no replica of the fleet of that name runs; None if one does."""
+    _, serve = import_ray()
+    application = serve.status().applications.get(name)
+    deployment = None if application is None else application.deployments.get(DEPLOYMENT)
+    if application is None or deployment is None:
+        return f"no replica runs: Ray Serve has no fleet {name!r} any more"
+    if deployment.replica_states.get("RUNNING", 0):
+        return None
+    why = reason_in(deployment.message or application.message) or "its replicas are being started"
+    return f"no replica of the fleet {name!r} runs ({deployment.status.value}): {why}"
+
+
+def replicas(
+    make_policy: Callable[[], Policy],
+    options: FleetOptions,
+    *,
+    warm: Mapping[str, Any] | None,
+    asked: Mapping[str, Any] | None = None,
+) -> Any:
+    """The replicas as a Ray Serve application; `make_policy`, `warm` and `asked` are Replica's. Raises ConfigError."""
     _, serve = import_ray()
     from ray.serve.config import RequestRouterConfig
 
@@ -248,7 +289,7 @@ def replicas(make_policy: Callable[[], Policy], options: FleetOptions, *, warm: 
         )(Replica)
     except (ValueError, TypeError) as error:
         raise ConfigError(f"Ray Serve refuses the fleet's options: {error}") from error
-    return deployment.bind(make_policy, options.checkpoint, warm, options.line)
+    return deployment.bind(make_policy, options.checkpoint, warm, options.line, asked=asked)
 
 
 def check_known(autoscaling: Mapping[str, Any]) -> None:
@@ -309,13 +350,27 @@ class Fleet:
 
     @classmethod
     def attach(cls, name: str, answer_seconds: float = FleetOptions.answer_seconds) -> "Fleet":
-        """The fleet of that name, whose replicas run already. Not for an event loop."""
+        """The fleet of that name, whose replicas run already. Not for an event loop. Raises BackendError."""
         _, serve = import_ray()
         handle = serve.get_deployment_handle(DEPLOYMENT, app_name=name)
-        return cls(handle, name, handle.about.remote().result(timeout_s=answer_seconds), answer_seconds)
+        return cls(handle, name, _told(name, handle.about, answer_seconds), answer_seconds)
 
-    def calls(self, metrics: Metrics) -> "RemoteCalls":
-        return RemoteCalls(self._handle, metrics, self._answer_seconds)
+    def asked(self) -> dict[str, Any]:
+        """The options that the replicas were started with: empty if they don't know. Raises BackendError."""
+        told: dict[str, Any] = _told(str(self.metadata["fleet"]), self._handle.asked, self._answer_seconds)
+        return told
+
+    def calls(self, metrics: Metrics, on_lost: Callable[[str], None] = lambda reason: None) -> "RemoteCalls":
+        watch = Watch(address(), self._answers, partial(why_unwell, self.metadata["fleet"]))
+        return RemoteCalls(self._handle, metrics, self._answer_seconds, watch, on_lost)
+
+    def _answers(self) -> bool:
+        """Whether a replica can be reached."""
+        try:
+            self._handle.about.remote().result(timeout_s=REACH_SECONDS)
+        except Exception:  # Ray's, gRPC's: whichever it is, that was no answer
+            return False
+        return True
 
     def infer(self, obs: dict[str, Any], /, **arguments: Any) -> dict[str, Any]:
         """One request, by whichever replica has the fewest. Raises BackendError if it gives no actions."""
@@ -323,3 +378,15 @@ class Fleet:
         if outcome.result is None:
             raise BackendError(f"the fleet {self.metadata['fleet']!r} gave no actions: {outcome.text}")
         return outcome.result
+
+
+def _told(name: str, method: Any, seconds: float) -> Any:
+    """What a replica answers to a method without arguments."""
+    from ray.exceptions import RayError
+    from ray.serve.exceptions import RayServeException
+
+    try:
+        return method.remote().result(timeout_s=seconds)
+    except (TimeoutError, RayError, RayServeException) as error:
+        why = f" within {seconds:g} s" if isinstance(error, TimeoutError) else f": {reason_in(str(error))}"
+        raise BackendError(f"no replica of the fleet {name!r} answers{why}") from error

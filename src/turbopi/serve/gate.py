@@ -26,6 +26,8 @@ class Gate:
     has_page  whether the page and its feed are served
     why_lost  why no request can be served any more (the GPU failed for good), None while all is well: until the
               process ends, `/healthz` answers 503 with it, and so does every new client
+    why_unwell
+              why none can be served at the moment, None while all is well: `/healthz` alone answers 503 with it
 
     Raises ConfigError for a key that no header can carry.
     """
@@ -36,12 +38,14 @@ class Gate:
         metrics: Metrics,
         hosts: AllowedHosts,
         why_lost: Callable[[], str | None] = lambda: None,
+        why_unwell: Callable[[], str | None] = lambda: None,
         *,
         has_page: bool = False,
     ) -> None:
         check_key(api_key)
         self._key = None if api_key is None else api_key.encode()
-        self._metrics, self._hosts, self._why_lost, self._has_page = metrics, hosts, why_lost, has_page
+        self._metrics, self._hosts, self._has_page = metrics, hosts, has_page
+        self._why_lost, self._why_unwell = why_lost, why_unwell
         self._log = LimitedLog(logger)
 
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
@@ -50,9 +54,11 @@ class Gate:
         if len(request.headers.get_all("Host")) > 1:  # which of them a proxy has checked, nobody knows
             return connection.respond(HTTPStatus.BAD_REQUEST, "A request has one Host header.\n")
         if path == "/healthz":
-            if lost is None:
-                return connection.respond(HTTPStatus.OK, "OK\n")
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"the device is lost: {lost}\n")
+            if lost is not None:
+                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"the device is lost: {lost}\n")
+            if (unwell := self._why_unwell()) is not None:
+                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{unwell}\n")
+            return connection.respond(HTTPStatus.OK, "OK\n")
         if is_page(request) or is_feed(request):
             if not self._has_page:
                 return connection.respond(HTTPStatus.NOT_FOUND, "The page is off; --page or an API key turns it on.\n")

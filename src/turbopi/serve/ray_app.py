@@ -31,6 +31,7 @@ from turbopi.errors import ConfigError
 from turbopi.running_chunk import JoinMode
 from turbopi.serve.calls import Policy
 from turbopi.serve.fleet import QUIET, Fleet, FleetOptions, import_ray, line_of, replicas
+from turbopi.serve.fleet import connect as join_cluster
 from turbopi.serve.options import ServerOptions, key_in
 from turbopi.serve.server import PolicyServer
 
@@ -158,6 +159,7 @@ def build(arguments: dict[str, Any]) -> Any:
     if os.environ.get("TURBOPI_API_KEY") and given.api_key_file is None:  # it wouldn't reach the server's process
         raise ConfigError("TURBOPI_API_KEY is set, but a cluster takes the key from a file: api_key_file=FILE")
     given.server()  # a mistake shall show here, not in a log of the cluster
+    join_cluster()  # whose GPUs are counted: `serve run` calls this before it joins
     warm = warm_up_of(given.warmup, given.execution)
     ingress = serve.deployment(
         name="ingress",
@@ -170,8 +172,14 @@ def build(arguments: dict[str, Any]) -> Any:
 
 
 def name_of(checkpoint: str | None, random_weights: str | None) -> str:
-    """What a fleet is called if nobody says it: the checkpoint folder's name, or the preset's."""
-    name = random_weights if checkpoint is None else Path(checkpoint).resolve().name
+    """What a fleet is called if nobody says it: the checkpoint folder's name, or the preset's.
+
+    A name of digits alone is that of a training step, which every run has: its parent's comes in front.
+    """
+    name = random_weights
+    if checkpoint is not None:
+        folder = Path(checkpoint).resolve()
+        name = f"{folder.parent.name}-{folder.name}" if folder.name.isdigit() and folder.parent.name else folder.name
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name or "turbopi")
 
 

@@ -4,10 +4,12 @@ import asyncio
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from prometheus_client import Histogram
 
+from turbopi.serve.fleet_watch import Watch
 from turbopi.serve.metrics import BUCKETS, Metrics
 from turbopi.serve.outcome import Outcome
 from turbopi.serve.replica import Answer, Line
@@ -24,14 +26,26 @@ class RemoteCalls:
 
     The line is at the replicas: each has its own, with the deadlines and priorities of its requests, and forms its own
     batches. No request of a session replaces another: they may be at different replicas.
+
+    watch             over the cluster, from `warm_up` to `close`; None: nobody looks
+    on_lost(reason)   is called when Ray has ended; requests that wait are answered then
     """
 
     largest = MAX_ROWS  # a batch message's observations are requests of their own: there is nothing to split
 
-    def __init__(self, handle: Any, metrics: Metrics, answer_seconds: float) -> None:
+    def __init__(
+        self,
+        handle: Any,
+        metrics: Metrics,
+        answer_seconds: float,
+        watch: Watch | None = None,
+        on_lost: Callable[[str], None] = lambda reason: None,
+    ) -> None:
         self._handle, self._metrics, self._answer_seconds = handle, metrics, answer_seconds
+        self._watch, self._on_lost = watch, on_lost
         self._going: set[asyncio.Future[list[Outcome]]] = set()
         self._stopping = False
+        self._lost_for: str | None = None  # why no replica can ever answer again
 
         def histogram(name: str, text: str) -> Histogram:
             return Histogram(name, text, ["replica", "checkpoint"], buckets=BUCKETS, registry=metrics.registry)
@@ -48,11 +62,18 @@ class RemoteCalls:
     def running(self) -> bool:
         return bool(self._going)
 
+    @property
+    def unwell(self) -> str | None:
+        return None if self._watch is None else self._watch.unwell
+
     def waits(self, session: str) -> bool:
         return False
 
     async def warm_up(self, **arguments: Any) -> None:
-        """Nothing: a replica warms up before its first request."""
+        """Replicas warm up before their first request; what begins here is the watch over the cluster."""
+        if self._watch is not None:
+            loop = asyncio.get_running_loop()
+            self._watch.start(lambda reason: loop.call_soon_threadsafe(partial(self._lose, reason)))
 
     def ask(
         self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
@@ -84,6 +105,14 @@ class RemoteCalls:
 
     def close(self) -> None:
         self._stopping = True
+        if self._watch is not None:
+            self._watch.stop()
+
+    def _lose(self, reason: str) -> None:
+        self._lost_for = reason
+        self._on_lost(reason)
+        for work in tuple(self._going):
+            work.cancel()  # `run` makes an answer of it
 
     def _follow(self, work: Coroutine[Any, Any, list[Outcome]]) -> "asyncio.Future[list[Outcome]]":
         task = asyncio.ensure_future(work)
@@ -97,6 +126,8 @@ class RemoteCalls:
         from ray.exceptions import RayActorError, RayTaskError
         from ray.serve.exceptions import BackPressureError, DeploymentUnavailableError
 
+        if self._lost_for is not None:
+            return Outcome(0.0, wrong="lost", text=self._lost_for)
         if self._stopping:
             return STOPPING
         asked = time.perf_counter()
@@ -107,6 +138,8 @@ class RemoteCalls:
             response.cancel()
             return self._lost(asked, f"no replica answered within {self._answer_seconds:g} s; ask again")
         except asyncio.CancelledError:
+            if self._lost_for is not None:
+                return Outcome(time.perf_counter() - asked, wrong="lost", text=self._lost_for)
             response.cancel()
             raise
         except BackPressureError:

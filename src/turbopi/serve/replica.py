@@ -76,6 +76,7 @@ class Replica:
     checkpoint   the name of its weights, for people
     warm         arguments of the policy's `warmup`, which ends before the first request; None: no warm-up
     options      of these, what the line and the batches here go by
+    asked        what it was started with, for who replaces it (cli/fleet_update.py)
     """
 
     async def __init__(  # type: ignore[misc]  # Ray Serve awaits it
@@ -85,9 +86,10 @@ class Replica:
         warm: Mapping[str, Any] | None,
         options: ServerOptions,
         end: Callable[[], None] = end_process,
+        asked: Mapping[str, Any] | None = None,
     ) -> None:
         self.name = f"{socket.gethostname()}:{os.getpid()}"
-        self._checkpoint, self._end = checkpoint, end
+        self._checkpoint, self._end, self._asked = checkpoint, end, asked
         self._loop = asyncio.get_running_loop()
         self._lost: str | None = None
         self._policy = await asyncio.to_thread(make_policy)
@@ -98,6 +100,10 @@ class Replica:
     async def about(self) -> dict[str, Any]:
         """The policy's metadata."""
         return self._policy.metadata
+
+    async def asked(self) -> dict[str, Any]:
+        """The options that it was started with; none if nobody said."""
+        return dict(self._asked or {})
 
     async def infer(
         self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line | None = None

@@ -85,7 +85,8 @@ class PolicyServer:
 
     options  what it is asked for; `given` are ServerOptions' fields, instead of its own
     limits   what else a client may cost; its `clients` and `message_bytes` are those of the options
-    calls    what runs the requests, if not the policy in this process, of which then the metadata alone is used
+    calls    makes what runs the requests, if not the policy in this process, of which then the metadata alone is used;
+             called with the metrics, and with what to call with the reason when no request can be run any more
 
     `host` and `port` are where it listens; port 0 becomes the free one that it took, once started. Raises ConfigError
     for options that can't be right.
@@ -97,7 +98,7 @@ class PolicyServer:
         options: ServerOptions | None = None,
         *,
         limits: Limits | None = None,
-        calls: Callable[[Metrics], Calls] | None = None,
+        calls: Callable[[Metrics, Callable[[str], None]], Calls] | None = None,
         **given: Any,
     ) -> None:
         self.options = options = replace(options or ServerOptions(), **given)
@@ -107,13 +108,14 @@ class PolicyServer:
         self._limits = limits_for(options.max_message_mb, options.max_clients, limits)
         self._log = LimitedLog(logger)
         hosts = AllowedHosts(options.host, options.allowed_hosts)
-        gate = Gate(options.api_key, self.metrics, hosts, lambda: self.lost, has_page=options.has_page)
+        troubles = (lambda: self.lost, lambda: self._calls.unwell)
+        gate = Gate(options.api_key, self.metrics, hosts, *troubles, has_page=options.has_page)
         self._listener = Listener(gate, self._handle, Shared(self._limits, self.metrics, self._log))
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
         self._calls: Calls = (
-            PolicyCalls(policy, options, self.metrics, on_lost=self._lose) if calls is None else calls(self.metrics)
+            PolicyCalls(policy, options, self.metrics, self._lose) if calls is None else calls(self.metrics, self._lose)
         )
         self._real_time = RealTime(policy.metadata, options, self.metrics, waits=self._calls.waits)
         self._askings = Askings(self._calls, self._real_time, options, strict=bool(policy.metadata.get("strict")))

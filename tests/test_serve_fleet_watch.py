@@ -1,0 +1,200 @@
+"""A fleet's server and its cluster: Ray that ends, and a fleet without a replica. Without Ray."""
+
+import asyncio
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from serve_fakes import FakePolicy, http_get, observation
+from websockets.sync.client import connect
+
+from turbopi.errors import DeviceLost
+from turbopi.serve import PolicyServer, fleet_watch, running, server
+from turbopi.serve.fleet_watch import Watch, answers
+from turbopi.serve.metrics import Metrics
+from turbopi.serve.outcome import Outcome
+from turbopi.serve.remote_calls import RemoteCalls
+from turbopi.wire import pack, unpack
+
+MOST_SECONDS = 60.0
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_watch, "RAY_SECONDS", 0.01)
+    monkeypatch.setattr(fleet_watch, "REPLICAS_SECONDS", 0.01)
+
+
+@pytest.fixture
+def ray() -> Iterator[socket.socket]:
+    """Where Ray's control service listens."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        yield listening
+
+
+def at(ray: socket.socket) -> str:
+    return f"127.0.0.1:{ray.getsockname()[1]}"
+
+
+class Cluster:
+    """What a watch asks: each question is noted."""
+
+    def __init__(self) -> None:
+        self.reachable, self.asked, self.unwell = False, threading.Event(), threading.Event()
+        self.why: str | Exception | None = None
+
+    def answers(self) -> bool:
+        self.asked.set()
+        return self.reachable
+
+    def why_unwell(self) -> str | None:
+        self.unwell.set()
+        if isinstance(self.why, Exception):
+            raise self.why
+        return self.why
+
+
+def watching(ray: socket.socket, cluster: Cluster) -> tuple[Watch, threading.Event, list[str]]:
+    reasons: list[str] = []
+    gone = threading.Event()
+    watch = Watch(at(ray), cluster.answers, cluster.why_unwell)
+
+    def on_gone(reason: str) -> None:
+        reasons.append(reason)
+        gone.set()
+
+    watch.start(on_gone)
+    return watch, gone, reasons
+
+
+def test_ray_that_has_ended_is_told_once(ray: socket.socket) -> None:
+    address, cluster = at(ray), Cluster()
+    assert answers(address)
+    watch, gone, reasons = watching(ray, cluster)
+    assert not cluster.asked.wait(0.2) and not gone.is_set(), "as long as Ray is there, no replica is asked"
+    ray.close()
+    assert gone.wait(MOST_SECONDS)
+    watch.stop()
+    assert reasons == [f"Ray's cluster at {address} has ended, and all replicas with it. Start this server again"]
+
+
+def test_replicas_that_answer_go_on_without_rays_control_service(ray: socket.socket) -> None:
+    cluster = Cluster()
+    cluster.reachable = True
+    watch, gone, _ = watching(ray, cluster)
+    ray.close()
+    assert cluster.asked.wait(MOST_SECONDS) and not gone.wait(0.2)
+    watch.stop()
+
+
+def test_why_no_replica_runs_is_known_and_forgotten(ray: socket.socket) -> None:
+    cluster = Cluster()
+    watch, _, _ = watching(ray, cluster)
+
+    def comes(what: str | None) -> None:
+        for _ in range(2):  # one question may have been under way
+            cluster.unwell.clear()
+            assert cluster.unwell.wait(MOST_SECONDS)
+        wait_for(lambda: watch.unwell == what)
+
+    cluster.why = "no replica runs"
+    comes("no replica runs")
+    cluster.why = RuntimeError("Ray's controller is being restarted")  # nobody knows
+    comes(None)
+    watch.stop()
+
+
+def wait_for(true: Callable[[], bool]) -> None:
+    for _ in range(int(MOST_SECONDS / 0.01)):
+        if true():
+            return
+        threading.Event().wait(0.01)
+    raise AssertionError(f"not within {MOST_SECONDS:g} s")
+
+
+class Held(RemoteCalls):
+    """Where requests are computed: replicas that hold each request for ever."""
+
+    def __init__(self, metrics: Metrics, on_lost: Callable[[str], None], watch: Watch) -> None:
+        super().__init__(Handle(), metrics, MOST_SECONDS, watch, on_lost)
+
+
+class Handle:
+    """Ray Serve's, as far as it is used."""
+
+    def __init__(self) -> None:
+        self.infer = self
+
+    def remote(self, *arguments: Any) -> Any:
+        return Response()
+
+
+class Response:
+    def __await__(self) -> Any:
+        return asyncio.Event().wait().__await__()
+
+    def cancel(self) -> None:
+        pass
+
+
+@pytest.mark.filterwarnings("default")  # Ray's own
+def test_requests_that_wait_are_answered_when_ray_ends_and_health_says_so(ray: socket.socket) -> None:
+    pytest.importorskip("ray")
+    watch, address = Watch(at(ray), lambda: False, lambda: None), at(ray)
+    with (
+        running(FakePolicy(), calls=lambda metrics, on_lost: Held(metrics, on_lost, watch)) as serving,
+        connect(serving.url) as robot,
+    ):
+        robot.recv()
+        robot.send(pack(observation()))
+        wait_for(lambda: serving._calls.running)
+        assert health(serving) == (200, "OK\n")
+        ray.close()
+        lost = f"the device is lost: Ray's cluster at {address} has ended, and all replicas with it. "
+        assert str(robot.recv(timeout=MOST_SECONDS)).startswith(lost)
+        robot.send(pack(observation()))
+        assert str(robot.recv(timeout=MOST_SECONDS)).startswith(lost)
+        status, text = health(serving)
+        assert status == 503 and text.startswith(lost)
+
+
+def test_the_server_ends_when_ray_has_ended(ray: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "LOST_NOTICE", 0.01)
+    watch = Watch(at(ray), lambda: False, lambda: None)
+    ends = PolicyServer(FakePolicy(), port=0, calls=lambda metrics, on_lost: Held(metrics, on_lost, watch))
+    with pytest.raises(DeviceLost, match=r"Ray's cluster at .* has ended"):
+        ends.serve_forever(on_ready=lambda _: ray.close())
+
+
+class Resting(RemoteCalls):
+    """Where requests are computed: it says that no replica runs, as long as it is told to."""
+
+    why: str | None = None
+
+    def __init__(self, metrics: Metrics, on_lost: Callable[[str], None]) -> None:
+        super().__init__(None, metrics, MOST_SECONDS)
+
+    @property
+    def unwell(self) -> str | None:
+        return Resting.why
+
+    async def run(self, *arguments: Any) -> Outcome:
+        return Outcome(0.0, result={"actions": [[0.0]]})
+
+
+def test_without_a_replica_health_says_why_and_robots_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    with running(FakePolicy(), calls=Resting) as serving:
+        assert health(serving) == (200, "OK\n")
+        monkeypatch.setattr(Resting, "why", "no replica of the fleet 'arms' runs (UNHEALTHY): it died")
+        assert health(serving) == (503, "no replica of the fleet 'arms' runs (UNHEALTHY): it died\n")
+        with connect(serving.url) as robot:  # its request waits for one
+            robot.recv()
+            robot.send(pack(observation()))
+            assert isinstance(unpack(robot.recv(timeout=MOST_SECONDS)), dict)  # type: ignore[arg-type]
+
+
+def health(serving: PolicyServer) -> tuple[int, str]:
+    status, _, text = asyncio.run(http_get(serving.port, "/healthz"))
+    return status, text
