@@ -123,7 +123,6 @@ inline void check_there(unsigned address) {
 inline char* at(unsigned address, size_t bytes = 1) {
     const unsigned place = address & ((1u << PLACE) - 1);
     if (place < FIRST || place + bytes > FIRST + shared_bytes) throw std::runtime_error("an address outside a CTA's shared memory");
-    check_there(address);
     return memory.at(address >> PLACE).get() + place;
 }
 inline char* shared() { return memory[now->rank].get() + FIRST; }
@@ -214,6 +213,7 @@ inline void make(const Copy& c) {
     for (int rank = 0; rank < ranks; ++rank) {
         if (!(c.mask >> rank & 1)) continue;
         const unsigned to = (c.to & ((1u << PLACE) - 1)) | rank << PLACE;
+        check_there(to);
         for (int row = 0; row < rows; ++row)
             for (unsigned i = 0; i < m.box[0]; ++i) {
                 const int x = c.at[0] + i, y = c.at[1] + row % m.box[1], z = m.axes > 2 ? c.at[2] + row / m.box[1] : 0;
@@ -451,6 +451,7 @@ inline void ptx_mapa(unsigned& there, unsigned address, int rank) {
 }
 template <typename Number>
 void st_async(unsigned to, const std::vector<Number>& all, unsigned bar) {
+    machine::check_there(to);
     memcpy(machine::at(to, all.size() * 4), all.data(), all.size() * 4);
     machine::arrived_bytes(bar, all.size() * 4);
 }

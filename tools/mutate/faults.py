@@ -234,8 +234,8 @@ FAULTS = (
     Fault(
         "wrong parity at a barrier of the product's ring",
         "turbopi.kernels",
-        "barrier_wait(empty + 8 * slot, round & 1 ^ 1);",
-        "barrier_wait(empty + 8 * slot, round & 1);",
+        "barrier_wait(empty + 8 * slot, round & 1 ^ 1);\n                    } else",
+        "barrier_wait(empty + 8 * slot, round & 1);\n                    } else",
         "the kernel waits forever, or operands are overwritten while they are multiplied",
         (EMULATED,),
     ),

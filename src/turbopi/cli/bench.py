@@ -145,7 +145,7 @@ def _backends(names: list[str], precisions: "list[Precision]", device: "torch.de
         "turbopi bench checkpoints/mine --backends fused --precisions bf16,fp8",
         "turbopi bench checkpoints/pi05_libero --image-size 224x224,640x480,1280x720",
         "turbopi bench checkpoints/my_arm --config pi05_base --robot my_arm.json",
-        "turbopi bench checkpoints/mine --horizons 50 --batch 1,2,4,8 --no-error --report times",
+        "turbopi bench checkpoints/mine --horizons 50 --batch 1,2,4,8 --report times",
         "turbopi bench --predict rtx4090,rtx5090,orin,thor",
     ),
 )
