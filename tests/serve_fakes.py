@@ -2,6 +2,8 @@
 
 import asyncio
 import threading
+import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -123,6 +125,16 @@ class BatchingFakePolicy(FakePolicy):
         if "short" in self.batches[-1]:
             return []
         return [self.infer(obs) for obs in observations]
+
+
+def wait_for(true: Callable[[], Any], seconds: float = 120.0) -> Any:
+    """What `true` returns, as soon as that is true."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if found := true():
+            return found
+        time.sleep(0.01)
+    raise AssertionError(f"not within {seconds:g} s: {true}")
 
 
 def observation(prompt: str = "") -> dict[str, Any]:

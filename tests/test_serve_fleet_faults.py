@@ -18,13 +18,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from serve_fakes import http_get
+from serve_fakes import http_get, wait_for
 from test_cli_serve import serving
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
@@ -166,15 +166,6 @@ def fleet_of_its_own() -> Iterator[FleetProcess]:
         finally:
             with contextlib.suppress(ProcessLookupError):  # with all of Ray's
                 os.killpg(process.pid, signal.SIGKILL)
-
-
-def wait_for(true: Callable[[], Any]) -> Any:
-    deadline = time.monotonic() + MOST_SECONDS
-    while time.monotonic() < deadline:
-        if found := true():
-            return found
-        time.sleep(0.05)
-    raise AssertionError(f"not within {MOST_SECONDS:g} s: {true}")
 
 
 def held_by(name: Path) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from serve_fakes import FakePolicy, http_get, observation
+from serve_fakes import FakePolicy, http_get, observation, wait_for
 from websockets.sync.client import connect
 
 from turbopi.errors import DeviceLost
@@ -97,21 +97,13 @@ def test_why_no_replica_runs_is_known_and_forgotten(ray: socket.socket) -> None:
         for _ in range(2):  # one question may have been under way
             cluster.unwell.clear()
             assert cluster.unwell.wait(MOST_SECONDS)
-        wait_for(lambda: watch.unwell == what)
+        wait_for(lambda: watch.unwell == what, MOST_SECONDS)
 
     cluster.why = "no replica runs"
     comes("no replica runs")
     cluster.why = RuntimeError("Ray's controller is being restarted")  # nobody knows
     comes(None)
     watch.stop()
-
-
-def wait_for(true: Callable[[], bool]) -> None:
-    for _ in range(int(MOST_SECONDS / 0.01)):
-        if true():
-            return
-        threading.Event().wait(0.01)
-    raise AssertionError(f"not within {MOST_SECONDS:g} s")
 
 
 class Held(RemoteCalls):
@@ -149,7 +141,7 @@ def test_requests_that_wait_are_answered_when_ray_ends_and_health_says_so(ray: s
     ):
         robot.recv()
         robot.send(pack(observation()))
-        wait_for(lambda: serving._calls.running)
+        wait_for(lambda: serving._calls.running, MOST_SECONDS)
         assert health(serving) == (200, "OK\n")
         ray.close()
         lost = f"the device is lost: Ray's cluster at {address} has ended, and all replicas with it. "

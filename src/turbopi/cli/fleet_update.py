@@ -31,15 +31,12 @@ OF_CHECKPOINT = {  # what may come from a checkpoint, too: an option's name, and
 
 @dataclass(frozen=True)
 class Asked:
-    """The options that decide what a replica runs. Raises ConfigError for what contradicts itself."""
+    """The options that decide what a replica runs."""
 
     policy: PolicyOptions
     server: ServerOptions
     warmup: bool
     strict: bool
-
-    def __post_init__(self) -> None:
-        check_warmup(self.warmup, self.strict, self.server.max_batch)
 
     def plain(self) -> dict[str, Any]:
         """By their names on the command line, without those of the weights that are random."""
@@ -48,7 +45,10 @@ class Asked:
         return {name: value for name, value in values.items() if name not in ("random_weights", "weights_seed")}
 
     def kept(self, running: Mapping[str, Any], given: Collection[str]) -> "Asked":
-        """The same, with the options of the running fleet for those that weren't given. Raises ConfigError."""
+        """The same, with the options of the running fleet for those that weren't given.
+
+        Raises ConfigError if that isn't known, or contradicts itself.
+        """
         if not running:
             raise ConfigError(
                 "what the running fleet was started with isn't known here: `turbopi serve --ray` didn't start it. "
@@ -63,12 +63,14 @@ class Asked:
         if "quantization" in given and "fp8_parts" not in given:
             stays["fp8_parts"] = running["fp8_parts"]
         of_policy = {field.name for field in fields(self.policy)}
-        return Asked(
+        kept = Asked(
             policy=replace(self.policy, **{name: value for name, value in stays.items() if name in of_policy}),
             server=replace(self.server, **{name: value for name, value in stays.items() if name in OF_LINE}),
             warmup=stays.get("warmup", self.warmup),
             strict=stays.get("strict", self.strict),
         )
+        check_warmup(kept.warmup, kept.strict, kept.server.max_batch)
+        return kept
 
 
 def check_warmup(warmup: bool, strict: bool, max_batch: int | None) -> None:

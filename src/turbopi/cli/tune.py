@@ -72,8 +72,8 @@ def tune(
 
     Each operation whose tile can be chosen is timed in every tile that the GPU takes, in turns, with weights that the
     cache doesn't hold, and its result is compared with plain PyTorch's; those of batches' denoising are timed within
-    the action expert's layers. The file is kept after each operation. Without
-    weights, sizes are those of pi05_libero. TURBOPI_TUNED=off has `fused` ignore what was measured.
+    the action expert's layers. The file is kept after each operation. Without weights, sizes are those of pi05_libero.
+    TURBOPI_TUNED=off has `fused` ignore what was measured.
     """
     output = Output(as_json)
     batches, counts = numbers(batch, "--batch", BATCHES), numbers(cameras, "--cameras", CAMERAS)

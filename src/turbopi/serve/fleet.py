@@ -212,10 +212,16 @@ def names() -> list[str]:
     return sorted(serve.status().applications)
 
 
-def check_is_fleet(name: str) -> None:
-    """Raise ConfigError if Ray Serve runs something else under that name, such as an application of `serve run`."""
+def status_of(name: str) -> tuple[Any, Any]:
+    """Ray Serve's application of that name now, and its deployment of replicas. None: there is none."""
     _, serve = import_ray()
     application = serve.status().applications.get(name)
+    return application, None if application is None else application.deployments.get(DEPLOYMENT)
+
+
+def check_is_fleet(name: str) -> None:
+    """Raise ConfigError if Ray Serve runs something else under that name, such as an application of `serve run`."""
+    application, _ = status_of(name)
     if application is not None and set(application.deployments) - {DEPLOYMENT}:
         raise ConfigError(
             f"Ray Serve runs an application {name!r} that `turbopi serve --ray` didn't start, with the deployments "
@@ -239,18 +245,14 @@ def address() -> str:
 
 def _running(name: str) -> int:
     """How many replicas the fleet of that name has now."""
-    _, serve = import_ray()
-    application = serve.status().applications.get(name)
-    deployment = None if application is None else application.deployments.get(DEPLOYMENT)
+    _, deployment = status_of(name)
     return 0 if deployment is None else int(deployment.replica_states.get("RUNNING", 0))
 
 
 def why_unwell(name: str) -> str | None:
     """Why no replica of the fleet of that name runs; None if one does."""
-    _, serve = import_ray()
-    application = serve.status().applications.get(name)
-    deployment = None if application is None else application.deployments.get(DEPLOYMENT)
-    if application is None or deployment is None:
+    application, deployment = status_of(name)
+    if deployment is None:
         return f"no replica runs: Ray Serve has no fleet {name!r} any more"
     if deployment.replica_states.get("RUNNING", 0):
         return None
@@ -315,8 +317,7 @@ def deploy(application: Any, name: str, tell: Callable[[str], None]) -> None:
     serve.run_many([target], wait_for_applications_running=False)
     told = ""
     while True:
-        state = serve.status().applications.get(name)
-        deployment = None if state is None else state.deployments.get(DEPLOYMENT)
+        state, deployment = status_of(name)
         message = "" if deployment is None else deployment.message or (state.message if state else "")
         if state is not None and state.status == "RUNNING":
             return

@@ -53,7 +53,7 @@ class GpuBench(ABC):
         return None
 
     def random(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self._generator, device=self.device).to(torch.bfloat16)
+        return random(shape, self._generator)
 
     @property
     def bound(self) -> float:
@@ -124,6 +124,19 @@ class GpuBench(ABC):
         """A thread that compiles needs the GPU's context, for what it loads."""
         torch.cuda.set_device(self.device)
         torch.zeros(1, device=self.device)
+
+
+def random(shape: Sequence[int], generator: torch.Generator) -> Tensor:
+    """Normal numbers in bfloat16, on the generator's device."""
+    return torch.randn(shape, generator=generator, device=generator.device).to(torch.bfloat16)
+
+
+def prefixes_in_a_row(batch: int, rows: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """First row and number of rows of each observation's prefix, int32[batch + 1], all as long; the last is empty."""
+    starts = torch.arange(batch + 1, dtype=torch.int32, device=device) * rows
+    lengths = torch.full_like(starts, rows)
+    lengths[-1] = 0  # of the padding
+    return starts, lengths
 
 
 def workers() -> int:

@@ -19,7 +19,7 @@ from turbopi.kernels.plain_batch import PLAIN_BATCH
 from turbopi.kernels.portable.quantize import quantize
 from turbopi.kernels.tile_table import Kernels, Knobs, TileTable
 from turbopi.quantization.fp8 import Matrix
-from turbopi.tune.gpu import GpuBench
+from turbopi.tune.gpu import GpuBench, prefixes_in_a_row, random
 from turbopi.tune.race import Round
 from turbopi.tune.shapes import Operation
 
@@ -71,10 +71,7 @@ class ExpertLayers:
         angles = 6 * self._random(rows, g.head_dim // 2).float()
         self._rope = angles.cos(), angles.sin()
         self._keys, self._values = (self._random(g.depth, prefix, g.head_dim) for _ in range(2))
-        starts = torch.arange(of.batch + 1, dtype=torch.int32, device=device) * of.prefix_rows
-        lengths = torch.full_like(starts, of.prefix_rows)
-        lengths[-1] = 0  # of the padding
-        self._segments = starts, lengths
+        self._segments = prefixes_in_a_row(of.batch, of.prefix_rows, device)
 
     @property
     def depth(self) -> int:
@@ -100,7 +97,7 @@ class ExpertLayers:
         return quantize(weight, INPUT_SCALE) if self._of.fp8 else weight
 
     def _random(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self._generator, device=self._device).to(torch.bfloat16)
+        return random(shape, self._generator)
 
 
 @dataclass(frozen=True)

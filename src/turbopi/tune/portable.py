@@ -18,7 +18,7 @@ from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
 from turbopi.kernels.tile_table import LIBRARY, Knobs
 from turbopi.quantization.fp8 import E4M3, ScaledMatrix
-from turbopi.tune.gpu import INVERSE, GpuBench, poisoned, relative
+from turbopi.tune.gpu import INVERSE, GpuBench, poisoned, prefixes_in_a_row, relative
 from turbopi.tune.product_bench import ProductBench, activated
 from turbopi.tune.shapes import Operation
 
@@ -169,10 +169,7 @@ class SuffixAttention(Attention):
         angles = 6 * self.random(one.rows, self.dim // 2).float()
         self.rope = angles.cos(), angles.sin()
         self.prefix = self.random(prefix, self.dim), self.random(prefix, self.dim)
-        firsts = torch.arange(one.batch + 1, dtype=torch.int32, device=self.device) * one.prefix_rows
-        lengths = torch.full((one.batch + 1,), one.prefix_rows, dtype=torch.int32, device=self.device)
-        lengths[-1] = 0  # of the padding
-        self.places = firsts, lengths
+        self.places = prefixes_in_a_row(one.batch, one.prefix_rows, self.device)
 
     def _plain(self, dtype: torch.dtype) -> Tensor:
         qkv, prefix_k, prefix_v = (one.to(dtype) for one in (self.qkv, *self.prefix))
