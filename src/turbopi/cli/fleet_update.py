@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
+from turbopi.cli.offers import check_warmup
 from turbopi.cli.options import PolicyOptions
 from turbopi.errors import ConfigError
 from turbopi.serve.options import ServerOptions
@@ -71,14 +72,6 @@ class Asked:
         )
         check_warmup(kept.warmup, kept.strict, kept.server.max_batch)
         return kept
-
-
-def check_warmup(warmup: bool, strict: bool, max_batch: int | None) -> None:
-    """Raise ConfigError for what needs the warm-up."""
-    if strict and not warmup:
-        raise ConfigError("--strict refuses what warm-up didn't cover: with --no-warmup that would be everything")
-    if max_batch is not None and max_batch > 1 and not warmup:
-        raise ConfigError(f"--max-batch {max_batch} needs the warm-up, which measures batches: leave out --no-warmup")
 
 
 def scale_of(options: "FleetOptions", count: int, use_gpus: bool) -> dict[str, Any]:

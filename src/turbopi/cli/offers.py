@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from turbopi.config import typed_grid
+from turbopi.errors import ConfigError
 from turbopi.serve.options import ServerOptions
 
 if TYPE_CHECKING:
@@ -57,3 +58,11 @@ def check_server(server: ServerOptions, options: "PolicyOptions", checkpoint: "C
     offers = offers_of(options, checkpoint)
     check_execution(server, offers.real_time, checkpoint.config.model.action_horizon)
     largest_batch(server, pipelined=offers.pipelined, batch_modes=offers.batch_modes)
+
+
+def check_warmup(warmup: bool, strict: bool, max_batch: int | None) -> None:
+    """Raise ConfigError for what needs the warm-up."""
+    if strict and not warmup:
+        raise ConfigError("--strict refuses what warm-up didn't cover: with --no-warmup that would be everything")
+    if max_batch is not None and max_batch > 1 and not warmup:
+        raise ConfigError(f"--max-batch {max_batch} needs the warm-up, which measures batches: leave out --no-warmup")

@@ -9,9 +9,9 @@ import typer
 
 from turbopi.cli.api_key import ApiKey, chosen_key
 from turbopi.cli.files import check_folder
-from turbopi.cli.fleet_update import Asked, check_warmup
+from turbopi.cli.fleet_update import Asked
 from turbopi.cli.framework import Output, command, log_to_stderr
-from turbopi.cli.offers import check_server
+from turbopi.cli.offers import check_server, check_warmup
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.ports import why_not_free
 from turbopi.cli.serve_ray import Autoscaling, FleetName, FleetWishes, Gpus, Ray, Replicas, Update, serve_fleet
