@@ -139,6 +139,7 @@ def test_what_an_earlier_run_found_is_kept_beside_the_new_and_need_not_be_measur
     result = turbopi("tune", *USUAL, "--only-missing")
     assert result.exit_code == 0 and len(read_tile_file(fake.file).tiles) == len(fake.measured) > first
     assert {one.numbers for one in fake.measured[first:]} == {"fp8"}
+    assert "bf16, portable kernels" in result.stdout and "aren't measured yet" not in result.stdout
 
 
 def test_tiles_of_another_driver_are_not_kept(fake: FakeGpu) -> None:

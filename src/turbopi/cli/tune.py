@@ -16,7 +16,7 @@ from turbopi.errors import BackendError, BackendUnavailable, ConfigError, Output
 if TYPE_CHECKING:
     import torch
 
-    from turbopi.backends.tuned_tiles import Machine
+    from turbopi.backends.tuned_tiles import Machine, TunedTile
     from turbopi.config import ModelConfig
     from turbopi.kernels.tile_table import TileTable
     from turbopi.tune.plan import Plan
@@ -121,7 +121,7 @@ def tune(
 
     tiles = TileTable({**shipped.tiles, **known.tiles})
     outcome = measure(plan, config, resolved, tiles, keep, seconds, output)
-    show(plan, outcome, file, output)
+    show(plan, outcome, tile_file(machine, outcome.measured, before).tiles, file, output)
     output.document(document(machine, outcome, file))
     if not outcome.measured:
         raise BackendError("no operation could be measured; what each one said is above")
@@ -234,8 +234,8 @@ def show_plan(plan: "Plan", output: Output) -> None:
     )
 
 
-def show(plan: "Plan", outcome: "Outcome", file: Path, output: Output) -> None:
-    """What was found, by operation and by call."""
+def show(plan: "Plan", outcome: "Outcome", kept: "Sequence[TunedTile]", file: Path, output: Output) -> None:
+    """What was found, by operation; what all that the file has now gains, by call."""
     from turbopi.backends.tuned_tiles import knobs_text
     from turbopi.tune.race import busy
     from turbopi.tune.run import gained_ms
@@ -263,11 +263,11 @@ def show(plan: "Plan", outcome: "Outcome", file: Path, output: Output) -> None:
         output.line(
             "times varied by more than 15 %: is the GPU used by others? Measure again when it is idle", "yellow"
         )
-    found = {one.operation.key: one for one in outcome.measured}
+    found = {one.key: one for one in kept}
     for (call, precision, kernels), several in plan.calls.items():
         took, gained, missing = gained_ms(found, several)
         if took:
-            rest = f"; {missing} operations weren't measured" if missing else ""
+            rest = f"; {missing} operations aren't measured yet" if missing else ""
             output.line(
                 f"{call}, {precision}, {kernels} kernels: {gained:.2f} ms of {took:.2f} ms gained (predicted){rest}"
             )

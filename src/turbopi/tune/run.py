@@ -100,7 +100,7 @@ def tune(
 def tile_file(machine: Machine, measured: Sequence[Measured], before: TileFile | None = None) -> TileFile:
     """What is measured, and what `before` has beside it."""
     rows = {one.key: one for one in ([] if before is None else before.tiles)}
-    rows |= {one.operation.key: _row(one) for one in measured}
+    rows |= {one.operation.key: tuned_tile(one) for one in measured}
     kernels: dict[Kernels, str] = {one.kernels: fingerprint(one.kernels) for one in rows.values()}
     return TileFile(
         gpu=machine.gpu,
@@ -114,7 +114,7 @@ def tile_file(machine: Machine, measured: Sequence[Measured], before: TileFile |
     )
 
 
-def _row(one: Measured) -> TunedTile:
+def tuned_tile(one: Measured) -> TunedTile:
     what, key, raced = one.operation, one.operation.key, one.raced
     return TunedTile(
         name=what.name,
@@ -143,8 +143,9 @@ def still_good(file: Path, machine: Machine, *, ships: bool = False) -> TileFile
     return replace(document, tiles=found) if found else None
 
 
-def gained_ms(found: Mapping[TileKey, Measured], operations: Sequence[Operation]) -> tuple[float, float, int]:
-    """Of a call with these operations: (milliseconds that they take, milliseconds gained, how many aren't measured).
+def gained_ms(found: Mapping[TileKey, TunedTile], operations: Sequence[Operation]) -> tuple[float, float, int]:
+    """Of a call with these operations: (milliseconds that they take without the file, milliseconds that its tiles gain,
+    how many operations it lacks).
 
     A norm between two products is timed with either, so the first number may have it twice. The expert's operations
     are timed in its layers, which are counted once.
@@ -152,14 +153,14 @@ def gained_ms(found: Mapping[TileKey, Measured], operations: Sequence[Operation]
     took = gained = layers = 0.0
     missing = 0
     for one in operations:
-        measured = found.get(one.key)
-        if measured is None:
+        tuned = found.get(one.key)
+        if tuned is None:
             missing += 1
             continue
-        milliseconds = one.uses * measured.raced.usual.microseconds / 1e3
+        milliseconds = one.uses * tuned.usual_microseconds / 1e3
         if one.in_layers:
             layers = max(layers, milliseconds)
         else:
             took += milliseconds
-        gained += one.uses * measured.gained / 1e3
+        gained += one.uses * (tuned.usual_microseconds - tuned.microseconds) / 1e3
     return took + layers, gained, missing
