@@ -73,6 +73,19 @@ def test_one_folder_too_high_is_told_the_right_one(tmp_path: Path) -> None:
         open_checkpoint(tmp_path)
 
 
+def test_two_folders_too_high_or_too_low_are_told_the_right_one(tmp_path: Path) -> None:
+    run = tmp_path / "pi05_droid"
+    for step in ("9000", "10000"):
+        (run / "first_try" / step / "params").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match=r"some further below; give one, such as .*/first_try/10000$"):
+        open_checkpoint(run)
+    asset = run / "first_try" / "9000" / "assets" / "droid"
+    asset.mkdir(parents=True)
+    for low in (asset, asset.parent):
+        with pytest.raises(CheckpointError, match=r"but the folder above does; give .*/first_try/9000$"):
+            open_checkpoint(low)
+
+
 def test_a_training_run_names_its_steps(tmp_path: Path) -> None:
     for step in ("10000", "29999", "5000"):
         (tmp_path / step / "params").mkdir(parents=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from checkpoint_helpers import GOLDEN
+from checkpoint_helpers import GOLDEN, torch_copy
 from cli_helpers import refusal, text_of, turbopi
 from lerobot_golden import GOLDEN as GOLDEN_LEROBOT
 from lerobot_golden import GoldenCase
@@ -77,6 +77,27 @@ def test_inspect_without_a_configuration_shows_the_rest_and_the_choices() -> Non
     assert "not known yet: " in result.stdout
     assert "suggest pi05_libero" in result.stdout
     assert "443,232" in result.stdout
+
+
+def test_inspect_refuses_a_wrong_configuration_after_the_rest(tmp_path: Path) -> None:
+    """One that --config names, or the file beside the weights."""
+    given = turbopi("inspect", GOLDEN / "pi05" / "torch", "--config", "pi05-libero")
+    folder = torch_copy(tmp_path / "c", preset="pi05_libero", action_horizon=0)
+    beside = turbopi("inspect", folder)
+    for result, why in ((given, "did you mean pi05_libero?"), (beside, "action_horizon is 0")):
+        assert result.exit_code == 2, result.output
+        assert "443,232" in result.stdout and "not known yet" not in result.stdout
+        assert result.stderr.startswith("error: ") and why in result.stderr
+
+
+def test_inspect_says_where_the_tokenizer_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
+    folder = GOLDEN / "pi05" / "torch"
+    assert "openpi's cache: `turbopi doctor` says where to get it" in text_of(turbopi("inspect", folder).stdout)
+    (tmp_path / "big_vision").mkdir()
+    (tmp_path / "big_vision" / "paligemma_tokenizer.model").touch()
+    assert "none in the folder; openpi's: " in text_of(turbopi("inspect", folder).stdout)
+    assert "Turbo-Pi's own small one" in turbopi("inspect", "--random-weights", "pi05_tiny").stdout
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Finding out what a path holds, and telling users what to do about what Turbo-Pi can't read."""
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -134,14 +135,39 @@ def _refuse_other_formats(folder: Path) -> None:
         )
 
 
+def _steps(folder: Path) -> list[Path]:
+    """The steps of a training run in a folder, the last one at the end; none if it can't be read."""
+    with suppress(OSError):
+        return sorted((e for e in folder.iterdir() if e.name.isdigit() and e.is_dir()), key=lambda e: int(e.name))
+    return []
+
+
+def _checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints right in a folder; none if it can't be read."""
+    with suppress(OSError):
+        return sorted(entry for entry in folder.iterdir() if _holds_weights(entry))
+    return []
+
+
+def _holds_weights(folder: Path) -> bool:
+    with suppress(OSError):
+        return _has_safetensors(folder) or (folder / "params").is_dir()
+    return False
+
+
 def _nothing_here(folder: Path) -> str:
-    steps = sorted((entry.name for entry in folder.iterdir() if entry.name.isdigit() and entry.is_dir()), key=int)
-    if steps:
-        return f"{folder} holds training steps ({', '.join(steps)}); give one of them, such as {folder / steps[-1]}"
-    below = sorted(entry for entry in folder.iterdir() if _has_safetensors(entry) or (entry / "params").is_dir())
-    if below:
+    if steps := _steps(folder):
+        names = ", ".join(step.name for step in steps)
+        return f"{folder} holds training steps ({names}); give one of them, such as {steps[-1]}"
+    if below := _checkpoints(folder):
         names = listing([entry.name for entry in below])
         return f"{folder} holds no checkpoint, but folders that do ({names}); give one of them, such as {below[0]}"
+    for entry in sorted(entry for entry in folder.iterdir() if entry.is_dir()):
+        if deeper := _steps(entry)[-1:] or _checkpoints(entry):
+            return f"{folder} holds no checkpoint, but there are some further below; give one, such as {deeper[0]}"
+    for above in folder.resolve().parents[:2]:  # of assets/, or of an asset's folder
+        if _holds_weights(above):
+            return f"{folder} holds no checkpoint, but the folder above does; give {above}"
     entries = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in folder.iterdir())
     return (
         f"{folder} holds no checkpoint: expected {WEIGHTS} (openpi's PyTorch, LeRobot) or params/ (openpi's JAX), "

@@ -53,7 +53,8 @@ def inspect(
     """Show what a checkpoint holds, without loading it: format, sizes, statistics, robot, horizon.
 
     With the robot come the keys that its observations have. If it can't be known without --config, the rest is shown.
-    --robot holds another robot against the checkpoint.
+    A --config or a turbopi.json that can't be right is an error, after the rest. --robot holds another robot against
+    the checkpoint.
     """
     output = Output(as_json)
     options.check(checkpoint)
@@ -63,16 +64,30 @@ def inspect(
         info = options.open(None).info()
     else:
         info = inspect_checkpoint(checkpoint, "auto" if options.config is None else options.config)
+    refused = info.pop("config_error") if "config_error" in info and _is_said(options, info["path"]) else None
     if "config_error" in info:
         info["config_error"] = as_typed(info["config_error"])
     if "robot" in info or options.robot is not None:
         info |= _with_robot(options, checkpoint, info["notes"])
-    if hash:
+    if hash and refused is None:
         opened = options.open(checkpoint)
         opened.check_hash()
         info["sha256"] = opened.fingerprint()
     _show(info, output)
+    if refused is not None:
+        raise ConfigError(refused)
     output.document(info)
+
+
+def _is_said(options: RobotOptions, folder: str) -> bool:
+    """Whether what is wrong with the configuration was said by --config, or by a turbopi.json that can't be read."""
+    from turbopi.checkpoint.settings import read_settings
+
+    try:
+        read_settings("auto", Path(folder))
+    except ConfigError:
+        return True
+    return options.config is not None
 
 
 def _with_robot(options: RobotOptions, checkpoint: str | None, notes: list[str]) -> dict[str, Any]:
@@ -150,9 +165,22 @@ def _facts(info: dict[str, Any]) -> list[tuple[str, str]]:
         facts += [(key.replace("_", " "), str(info[key])) for key in ("action_horizon", "action_dim") if key in info]
     facts += [
         ("weights", f"{info['tensors']} tensors, {data_size(info['stored_bytes'])}, {_dtypes(info)}"),
-        ("tokenizer", ", ".join(info["tokenizers"]) or "none in the folder"),
+        ("tokenizer", _tokenizer(info)),
     ]
     return [*facts, ("SHA-256", info["sha256"])] if "sha256" in info else facts
+
+
+def _tokenizer(info: dict[str, Any]) -> str:
+    from turbopi.preprocess.tokenizer import cached_tokenizer
+
+    if info["tokenizers"]:
+        return ", ".join(info["tokenizers"])
+    if info["random_weights"]:
+        return "Turbo-Pi's own small one"
+    cached = cached_tokenizer()
+    if cached.is_file():
+        return f"none in the folder; openpi's: {cached}"
+    return "none in the folder or in openpi's cache: `turbopi doctor` says where to get it"
 
 
 def _statistics_source(info: dict[str, Any]) -> str:

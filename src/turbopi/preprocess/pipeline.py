@@ -269,7 +269,8 @@ class Pipeline:
         prompt = sample.robot.prompt if sample.robot.prompt is not None else self.default_prompt
         if prompt is None:
             raise ObservationError(
-                "the observation has no prompt (LeRobot: task), and the policy no default prompt; give one of them"
+                "the observation has no prompt (LeRobot: task), and the policy no default prompt: put one into the "
+                "observation, or give the policy one (--default-prompt, or default_prompt in turbopi.json)"
             )
         sample.prompt = read_prompt(prompt)
 

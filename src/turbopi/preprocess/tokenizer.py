@@ -176,8 +176,13 @@ def _in_folder(folder: Path) -> list[Path]:
     return [parent / name for parent in (folder, folder / "assets") for name in FILE_NAMES]
 
 
+def cached_tokenizer() -> Path:
+    """Where openpi keeps PaliGemma's, whether it is there or not."""
+    return openpi_cache() / "big_vision" / "paligemma_tokenizer.model"
+
+
 def _places(checkpoint_dir: str | Path | None, candidates: Iterable[str | Path]) -> list[Path]:
-    cached = openpi_cache() / "big_vision" / "paligemma_tokenizer.model"
+    cached = cached_tokenizer()
     in_checkpoint = [] if checkpoint_dir is None else _in_folder(Path(checkpoint_dir).expanduser())
     return list(dict.fromkeys([*in_checkpoint, *map(Path, candidates), cached]))
 

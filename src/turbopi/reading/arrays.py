@@ -174,15 +174,16 @@ def _read_header(
         if not isinstance(header, dict) or set(header) != {"descr", "fortran_order", "shape"}:
             raise ValueError("expected descr, fortran_order and shape")
         descr, fortran, shape = header["descr"], header["fortran_order"], header["shape"]
-        if not isinstance(descr, str) or not _DTYPE.fullmatch(descr):
-            raise ValueError(f"dtype {shown(descr)} isn't read, only numbers, bool and text")
         if not isinstance(fortran, bool):
             raise ValueError(f"fortran_order is {shown(fortran)}")
         if not isinstance(shape, tuple) or len(shape) > 32 or not all(is_integer(n) and 0 <= n < 2**48 for n in shape):
             raise ValueError(f"shape is {shown(shape)}")
-        dtype = np.dtype(descr)
-        if not dtype.itemsize and math.prod(shape) > 2**20:
+        dtype = np.dtype(descr) if isinstance(descr, str) and _DTYPE.fullmatch(descr) else None
+        if dtype is not None and not dtype.itemsize and math.prod(shape) > 2**20:
             raise ValueError(f"shape is {shown(shape)} of nothing")
     except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as reason:
         raise error(f"{where} has a damaged header: {_reason(reason)}") from reason
+    if dtype is None:
+        objects = ". None, or rows of different lengths, make an array of Python objects" if descr == "|O" else ""
+        raise error(f"{where}: dtype {shown(descr)} isn't read, only numbers, bool and text{objects}")
     return dtype, "F" if fortran else "C", shape, 8 + width + length
