@@ -248,7 +248,10 @@ def no_gpu(cuda: str | None, driver: str | None, names: list[str], board: str | 
         return Row("WARN", "GPU", "no NVIDIA GPU", instead)
     there = ", ".join(names)
     if cuda is None:
-        fix = "pip install --force-reinstall torch (on Linux the wheels of PyPI have CUDA)"
+        fix = (
+            "of a clone: delete .venv, then scripts/setup; elsewhere: pip install --force-reinstall torch (on Linux "
+            "PyPI's wheels have CUDA)"
+        )
         return Row("FAIL", "GPU", f"{there}, but this PyTorch is built without CUDA", fix)
     least = _least_driver(cuda)
     if driver is not None and 0 < _major(driver) < least:
