@@ -204,6 +204,9 @@ def test_runs_of_another_protocol_are_not_compared(tmp_path: Path) -> None:
     second = run(tmp_path / "b", SeekingPolicy(), states=(0,), replan=3)
     with pytest.raises(ConfigError, match="aren't comparable: replan is 5 in one and 3 in the other"):
         compare([first, second])
+    second.protocol = {**second.protocol, "simulator": "chase"}
+    with pytest.raises(ConfigError, match=r"aren't comparable: simulator is .* in one and 'chase' in the other"):
+        compare([first, second])
     third = run(tmp_path / "c", SeekingPolicy(), states=(1,))
     with pytest.raises(ConfigError, match="no episode has a verdict in every one of"):
         compare([first, third])

@@ -277,11 +277,15 @@ def test_the_bimodality_of_known_distributions() -> None:
         (("--policy", "mine=/nonexistent"), "--policy is 'mine=/nonexistent', but there is no folder /nonexistent"),
         (("--policy", "mine=.", "--policy", "mine=/tmp"), "--policy mine was given twice, as . and /tmp"),
         (("--out", __file__), f"can't write into {__file__}"),
+        (("--out", "OUT"), "report.json is there and isn't a report of `turbopi study`, so it isn't replaced"),
     ],
 )
 def test_what_a_study_could_not_use_is_refused_before_it_runs(
-    options: tuple[str, ...], why: str, monkeypatch: pytest.MonkeyPatch
+    options: tuple[str, ...], why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    (tmp_path / "steps").mkdir()
+    (tmp_path / "steps" / "report.json").write_text('{"frames": []}')
+    options = tuple(str(tmp_path) if option == "OUT" else option for option in options)
     ran: list[Setup] = []
     study = load("steps")
 

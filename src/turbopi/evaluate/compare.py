@@ -20,6 +20,8 @@ from turbopi.quantization.plan import format_of
 from turbopi.reading import plain_document
 from turbopi.wording import significant
 
+DOCUMENT = "compare.json"
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -146,7 +148,8 @@ def compare(
 def check_same_protocol(runs: Sequence[Results]) -> None:
     first = runs[0]
     for run in runs[1:]:
-        for name in sorted({*first.protocol, *run.protocol}):
+        names = {*first.protocol, *run.protocol}
+        for name in sorted(names, key=lambda name: (name not in ("simulator", "suite"), name)):  # what says most first
             mine, theirs = first.protocol.get(name), run.protocol.get(name)
             if mine != theirs:
                 raise ConfigError(
@@ -235,7 +238,7 @@ LEGEND = (
 def write_comparison(folder: Path, compared: Sequence[Compared]) -> list[Path]:
     """compare.json, compare.png and compare.html."""
     folder.mkdir(parents=True, exist_ok=True)
-    told = folder / "compare.json"
+    told = folder / DOCUMENT
     write_whole(told, json.dumps(plain_document(document(compared)), indent=1, ensure_ascii=False) + "\n")
     plot = write_comparison_plot(folder / "compare.png", [(run.label, run.rate) for run in compared])
     shown = folder / "compare.html"
