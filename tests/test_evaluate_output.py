@@ -146,7 +146,9 @@ def test_comparing_pairs_the_common_episodes(tmp_path: Path) -> None:
     paired = compared[1].paired
     assert paired is not None
     assert (paired.both, paired.only_first, paired.only_second, paired.neither) == (2, 1, 0, 0)
+    assert HEADS[3] == "difference,\npoints [95 %]"
     assert cells(compared[1])[2] == "66.7 % [20.8, 93.9]"
+    assert re.fullmatch(r"-33\.3 \[-\d+\.\d, \+\d+\.\d\]", cells(compared[1])[3])
     assert cells(compared[1])[4:6] == ["1 : 0", "1.00"]
     written = write_comparison(tmp_path / "c", compared)
     assert json.loads(written[0].read_text())["runs"][1]["paired_with_first"]["only_first"] == 1

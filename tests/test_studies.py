@@ -66,6 +66,7 @@ def test_a_study_writes_a_report_that_reads_back_and_shows_every_part(small_step
     found = read_document(small_steps / report.JSON, Report)
     text = (small_steps / report.MARKDOWN).read_text()
     assert found.small and found.sound and text == report.markdown(found)
+    assert not any("nan" in control.evidence for control in found.controls)
     parts = [
         "**Claimed before.**",
         "**Method.**",

@@ -199,7 +199,7 @@ HEADS = (
     "run",
     "precision",
     "success [95 %]",
-    "difference [95 %]",
+    "difference,\npoints [95 %]",
     "only 1st :\nonly this",
     "p",
     "call\np50 ms",
@@ -217,7 +217,7 @@ def cells(run: Compared) -> list[str]:
     else:
         low, high = run.paired.interval
         row += [
-            f"{100 * (run.paired.difference or 0):+.1f} % [{100 * low:+.1f}, {100 * high:+.1f}]",
+            f"{100 * (run.paired.difference or 0):+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]",
             f"{run.paired.only_first} : {run.paired.only_second}",
             significant(run.paired.p_value),
         ]
@@ -229,9 +229,9 @@ def cells(run: Compared) -> list[str]:
 
 LEGEND = (
     "All rates are on the episodes that every run has a verdict for. difference: this run's rate less the first one's, "
-    "with Bonett and Price's interval; p: McNemar's exact test; call: the policy's whole answer; steps: to success, "
-    "median; action error: rms against the float32 reference with the same noise, on observations that the run met, "
-    "in units of each action dimension's spread."
+    "in percentage points, with Bonett and Price's interval; p: McNemar's exact test; call: the policy's whole answer; "
+    "steps: to success, median; action error: rms against the float32 reference with the same noise, on observations "
+    "that the run met, in units of each action dimension's spread."
 )
 
 
