@@ -119,7 +119,7 @@ def test_an_impossible_number_of_cameras_is_refused(policy: UnifiedPolicy) -> No
 
 
 def test_a_prompt_longer_than_the_model_reads_is_refused(policy: UnifiedPolicy) -> None:
-    with pytest.raises(ConfigError, match="reads 1 to 200 prompt tokens; a job can't have 201"):
+    with pytest.raises(ConfigError, match="reads 1 to 200 prompt tokens; a job can't have 201: give --prompt-tokens"):
         Observations(policy, Job(prompt_tokens=201))
 
 

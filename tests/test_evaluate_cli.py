@@ -177,6 +177,32 @@ def test_bad_input_is_refused_with_the_way_out(command: str, why: str, tmp_path:
     assert not (tmp_path / "never").exists()
 
 
+@pytest.mark.parametrize(
+    ("file", "command"),
+    [
+        ("delays.json", f"eval reacher {QUICK} --tasks 0 --trials 1 --execution sync,async"),
+        ("compare.json", f"compare pytorch:f32 pytorch:bf16 --simulator reacher {QUICK} --tasks 0 --trials 1"),
+    ],
+)
+@pytest.mark.usefixtures("seeking")
+def test_anothers_file_is_not_replaced(file: str, command: str, tmp_path: Path) -> None:
+    (tmp_path / file).write_text('{"floors": {}}')
+    told = refused(command, "--out", tmp_path)
+    assert f"{file} is there and isn't a" in told and "so it isn't replaced" in told
+    assert [path.name for path in tmp_path.iterdir()] == [file]
+
+
+@pytest.mark.usefixtures("seeking")
+def test_ways_beside_an_earlier_run_leave_its_pages_as_they_are(tmp_path: Path) -> None:
+    """Unless --out is given, one way and several have the same folder."""
+    command = f"eval reacher {QUICK} --tasks 0 --trials 1 --max-steps 6 --out {tmp_path}"
+    assert turbopi(command).exit_code == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert turbopi(command, "--execution", "sync,async").exit_code == 0
+    assert {path: path.read_bytes() for path in before} == before
+    assert (tmp_path / "delays.png").exists()
+
+
 def test_a_policy_for_another_robot_is_refused(tmp_path: Path) -> None:
     told = refused(f"eval reacher {QUICK} --robot plain", "--out", tmp_path / "never")
     assert "the policy doesn't take the observations of reacher" in told

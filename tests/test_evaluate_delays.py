@@ -151,7 +151,7 @@ def test_the_report_counts_pairs_and_shows_every_cell(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "delays.json").read_text())["cells"][1]["success"]["successes"] == 2
     text = page.read_text()
     assert all(cell.folder in text for cell in cells)
-    assert (tmp_path / "success.png").exists() and (tmp_path / "seams.png").exists()
+    assert (tmp_path / "delays.png").exists() and (tmp_path / "seams.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -146,7 +146,9 @@ def test_comparing_pairs_the_common_episodes(tmp_path: Path) -> None:
     paired = compared[1].paired
     assert paired is not None
     assert (paired.both, paired.only_first, paired.only_second, paired.neither) == (2, 1, 0, 0)
+    assert HEADS[3] == "difference,\npoints [95 %]"
     assert cells(compared[1])[2] == "66.7 % [20.8, 93.9]"
+    assert re.fullmatch(r"-33\.3 \[-\d+\.\d, \+\d+\.\d\]", cells(compared[1])[3])
     assert cells(compared[1])[4:6] == ["1 : 0", "1.00"]
     written = write_comparison(tmp_path / "c", compared)
     assert json.loads(written[0].read_text())["runs"][1]["paired_with_first"]["only_first"] == 1
@@ -203,6 +205,9 @@ def test_runs_of_another_protocol_are_not_compared(tmp_path: Path) -> None:
     first = run(tmp_path / "a", SeekingPolicy(), states=(0,))
     second = run(tmp_path / "b", SeekingPolicy(), states=(0,), replan=3)
     with pytest.raises(ConfigError, match="aren't comparable: replan is 5 in one and 3 in the other"):
+        compare([first, second])
+    second.protocol = {**second.protocol, "simulator": "chase"}
+    with pytest.raises(ConfigError, match=r"aren't comparable: simulator is .* in one and 'chase' in the other"):
         compare([first, second])
     third = run(tmp_path / "c", SeekingPolicy(), states=(1,))
     with pytest.raises(ConfigError, match="no episode has a verdict in every one of"):

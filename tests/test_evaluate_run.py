@@ -310,7 +310,7 @@ def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
 
 
 def test_initial_states_that_do_not_exist_are_refused() -> None:
-    with pytest.raises(ConfigError, match="task 0 has the initial states 0 to 49; 3 to 50 were asked for"):
+    with pytest.raises(ConfigError, match="task 0 has the initial states 0 to 49; it has no 50"):
         jobs_for(states=(3, 50))
     with pytest.raises(ConfigError, match="reacher_colors has no task 3, 9; its tasks are\n  0: reach the red dot"):
         jobs_for(tasks=(3, 0, 9))

@@ -66,6 +66,7 @@ def test_a_study_writes_a_report_that_reads_back_and_shows_every_part(small_step
     found = read_document(small_steps / report.JSON, Report)
     text = (small_steps / report.MARKDOWN).read_text()
     assert found.small and found.sound and text == report.markdown(found)
+    assert not any("nan" in control.evidence for control in found.controls)
     parts = [
         "**Claimed before.**",
         "**Method.**",
@@ -277,11 +278,15 @@ def test_the_bimodality_of_known_distributions() -> None:
         (("--policy", "mine=/nonexistent"), "--policy is 'mine=/nonexistent', but there is no folder /nonexistent"),
         (("--policy", "mine=.", "--policy", "mine=/tmp"), "--policy mine was given twice, as . and /tmp"),
         (("--out", __file__), f"can't write into {__file__}"),
+        (("--out", "OUT"), "report.json is there and isn't a report of `turbopi study`, so it isn't replaced"),
     ],
 )
 def test_what_a_study_could_not_use_is_refused_before_it_runs(
-    options: tuple[str, ...], why: str, monkeypatch: pytest.MonkeyPatch
+    options: tuple[str, ...], why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    (tmp_path / "steps").mkdir()
+    (tmp_path / "steps" / "report.json").write_text('{"frames": []}')
+    options = tuple(str(tmp_path) if option == "OUT" else option for option in options)
     ran: list[Setup] = []
     study = load("steps")
 

@@ -279,6 +279,14 @@ def refusal_of(*arguments: object) -> str:
     return result.stderr.rstrip().splitlines()[-1].removeprefix("error: ")
 
 
+def test_anothers_file_is_not_replaced_by_a_certificate(tmp_path: Path) -> None:
+    file = tmp_path / "verify.json"
+    file.write_text('{"floors": {}}')
+    told = refusal_of("--report", tmp_path)
+    assert f"{file} is there and isn't a certificate of `turbopi verify`, so it isn't replaced" in told
+    assert file.read_text() == '{"floors": {}}'
+
+
 def test_no_weights_are_refused() -> None:
     assert "no weights" in refusal(turbopi("verify"))
 

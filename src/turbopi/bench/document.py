@@ -14,7 +14,7 @@ from turbopi.bench.machine_limits import Floors
 from turbopi.bench.work import Job, Work
 from turbopi.errors import ConfigError
 from turbopi.provenance import Gpu, Provenance
-from turbopi.reading import read_document
+from turbopi.reading import as_document, read_json
 
 MAX_BYTES = 64 * 2**20  # a table of six backends: about 1 MB
 Milliseconds = Annotated[float, Meta(ge=0)]
@@ -185,4 +185,7 @@ def all_steps(results: Sequence[Result]) -> list[int]:
 
 def read_benchmark(file: Path) -> BenchDocument:
     """Raises ConfigError, naming file and key, for a file that is none."""
-    return read_document(file, BenchDocument, ConfigError, limit=MAX_BYTES)
+    content = read_json(file, ConfigError, limit=MAX_BYTES)
+    if "floors" not in content:
+        raise ConfigError(f"{file} holds no benchmark; expected the results.json of `turbopi bench --report`")
+    return as_document(content, BenchDocument, file, ConfigError)

@@ -121,7 +121,10 @@ class Observations:
         self._own = None if isinstance(policy.pipeline.robot, Plain) else 10**6 * seed  # of the next example
         most = policy.config.model.max_prompt_tokens
         if not 1 <= job.prompt_tokens <= most:
-            raise ConfigError(f"this model reads 1 to {most} prompt tokens; a job can't have {job.prompt_tokens}")
+            raise ConfigError(
+                f"this model reads 1 to {most} prompt tokens; a job can't have {job.prompt_tokens}: give "
+                "--prompt-tokens"
+            )
         self._rng = np.random.default_rng(seed)
         self._cameras, self._size = CAMERAS[: job.cameras], (job.image_height, job.image_width, 3)
         self._policy = policy

@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from turbopi.cli.evaluate import EvalOptions, run_with_progress
+from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.errors import ConfigError
 
@@ -70,6 +71,8 @@ def compare_command(
     folders = [(Path(run) / FILE).exists() for run in runs]
     if all(folders):
         out = options.out
+        if out is not None:
+            _check_out(out)
         loaded = [load_results(Path(run)) for run in runs]
         compared = compare(loaded, across_calibrations=across_calibrations)
     elif any(Path(run).is_dir() for run in runs):
@@ -77,6 +80,7 @@ def compare_command(
         raise ConfigError(f"runs are all folders of evaluations, or all ways to run; not a folder with {FILE}: {named}")
     else:
         out = options.out or Path("turbopi-compare")
+        _check_out(out)
         results, errors = _run_variants(options, runs, checkpoint, simulator, out, output)
         compared = compare(results, errors, across_calibrations=across_calibrations)
     table = Table(
@@ -92,6 +96,14 @@ def compare_command(
     if out is not None:
         output.line(f"wrote {', '.join(str(path) for path in write_comparison(out, compared))}")
     output.document(document(compared))
+
+
+def _check_out(out: Path) -> None:
+    """Raises ConfigError now for what couldn't be written later, or would replace another command's file."""
+    from turbopi.evaluate.compare import DOCUMENT
+
+    check_folder(out)
+    check_replaces(out / DOCUMENT, "runs", "a comparison of `turbopi compare`")
 
 
 def _run_variants(

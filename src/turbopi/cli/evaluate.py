@@ -13,7 +13,7 @@ from rich.table import Table
 
 from turbopi.cli.api_key import ApiKey, ApiKeyFile, chosen_key
 from turbopi.cli.evaluate_options import EvalOptions
-from turbopi.cli.files import check_folder
+from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.offers import offers_of
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
@@ -161,6 +161,7 @@ def _run_cells(
     from turbopi.evaluate.checks import check_delay, check_fit
     from turbopi.evaluate.delays import FILE, document, heads, notes, row, write_delays
 
+    check_replaces(folder / FILE, "cells", "a report of `turbopi eval`")
     answer = check_fit(source, simulator, protocol.sim, protocol.image_px, min(cell.horizon for cell in cells))
     for cell in cells:  # what can't be run is better known before the first one is
         if answer.problem is None:

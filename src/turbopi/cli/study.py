@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from turbopi.cli.files import check_folder
+from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
 from turbopi.config import LIMITS
@@ -134,6 +134,8 @@ def study(
     if out is not None:
         check_folder(out)
     studies = [load(name) for name in chosen]
+    if out is not None and not episodes_only:
+        _check_reports(studies, out)
     if not any(one.episodes for one in studies):
         _check_for_none(chosen, way, simulator)
     if episodes_only or report_only:
@@ -208,6 +210,15 @@ def _check_parts(studies: "list[Study]", episodes_only: bool, report_only: bool,
     for one in studies:
         if one.episodes is None:
             raise ConfigError(f"{option} is for {_in_simulators()}; {one.name} keeps no episodes")
+
+
+def _check_reports(studies: "list[Study]", out: Path) -> None:
+    """Raises ConfigError now for a report that couldn't be written later, or that would replace another command's."""
+    from turbopi.studies.report import JSON
+
+    for one in studies:
+        check_folder(out / one.name)
+        check_replaces(out / one.name / JSON, "study", "a report of `turbopi study`")
 
 
 def _policies(given: list[str]) -> dict[str, Path]:

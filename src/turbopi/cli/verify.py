@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from turbopi.cli.files import check_folder
+from turbopi.cli.files import check_folder, check_replaces
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, plain
 from turbopi.cli.options import MOST_NOISES, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
@@ -17,6 +17,8 @@ from turbopi.wording import cosine, denoising, significant
 
 if TYPE_CHECKING:
     from turbopi.verify.document import CalibrationDetails, Certificate, Dimension, IntermediateDocument
+
+FILE = "verify.json"
 
 
 @command(
@@ -76,6 +78,7 @@ def verify(
     """
     if report is not None:
         check_folder(report)
+        check_replaces(report / FILE, "intermediates", "a certificate of `turbopi verify`")
     output = Output(as_json)
     opened = options.open(checkpoint)
     from turbopi.calibrate.run import Progress
@@ -107,7 +110,7 @@ def _write(document: "Certificate", folder: Path, output: Output) -> None:
     from turbopi.verify.plots import write_plots
 
     folder.mkdir(parents=True, exist_ok=True)
-    file = folder / "verify.json"
+    file = folder / FILE
     write_whole(file, json.dumps(plain(plain_document(document)), indent=1, ensure_ascii=False) + "\n")
     written = [file, *write_plots(document, folder)]
     output.line(f"wrote {', '.join(str(path) for path in written)}")

@@ -20,6 +20,8 @@ from turbopi.quantization.plan import format_of
 from turbopi.reading import plain_document
 from turbopi.wording import significant
 
+DOCUMENT = "compare.json"
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -146,7 +148,8 @@ def compare(
 def check_same_protocol(runs: Sequence[Results]) -> None:
     first = runs[0]
     for run in runs[1:]:
-        for name in sorted({*first.protocol, *run.protocol}):
+        names = {*first.protocol, *run.protocol}
+        for name in sorted(names, key=lambda name: (name not in ("simulator", "suite"), name)):  # what says most first
             mine, theirs = first.protocol.get(name), run.protocol.get(name)
             if mine != theirs:
                 raise ConfigError(
@@ -196,7 +199,7 @@ HEADS = (
     "run",
     "precision",
     "success [95 %]",
-    "difference [95 %]",
+    "difference,\npoints [95 %]",
     "only 1st :\nonly this",
     "p",
     "call\np50 ms",
@@ -214,7 +217,7 @@ def cells(run: Compared) -> list[str]:
     else:
         low, high = run.paired.interval
         row += [
-            f"{100 * (run.paired.difference or 0):+.1f} % [{100 * low:+.1f}, {100 * high:+.1f}]",
+            f"{100 * (run.paired.difference or 0):+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]",
             f"{run.paired.only_first} : {run.paired.only_second}",
             significant(run.paired.p_value),
         ]
@@ -226,16 +229,16 @@ def cells(run: Compared) -> list[str]:
 
 LEGEND = (
     "All rates are on the episodes that every run has a verdict for. difference: this run's rate less the first one's, "
-    "with Bonett and Price's interval; p: McNemar's exact test; call: the policy's whole answer; steps: to success, "
-    "median; action error: rms against the float32 reference with the same noise, on observations that the run met, "
-    "in units of each action dimension's spread."
+    "in percentage points, with Bonett and Price's interval; p: McNemar's exact test; call: the policy's whole answer; "
+    "steps: to success, median; action error: rms against the float32 reference with the same noise, on observations "
+    "that the run met, in units of each action dimension's spread."
 )
 
 
 def write_comparison(folder: Path, compared: Sequence[Compared]) -> list[Path]:
     """compare.json, compare.png and compare.html."""
     folder.mkdir(parents=True, exist_ok=True)
-    told = folder / "compare.json"
+    told = folder / DOCUMENT
     write_whole(told, json.dumps(plain_document(document(compared)), indent=1, ensure_ascii=False) + "\n")
     plot = write_comparison_plot(folder / "compare.png", [(run.label, run.rate) for run in compared])
     shown = folder / "compare.html"

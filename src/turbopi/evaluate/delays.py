@@ -24,7 +24,7 @@ from turbopi.plots import write_figure
 from turbopi.reading import plain_document, read_document
 
 FORMAT: Final = 1
-FILE, PAGE, SUCCESS_PLOT, SEAM_PLOT = "delays.json", "delays.html", "success.png", "seams.png"
+FILE, PAGE, SUCCESS_PLOT, SEAM_PLOT = "delays.json", "delays.html", "delays.png", "seams.png"
 COLORS = dict(zip(WAYS, ("#9aa0a6", "#b00020", "#e08a00", "#3b6fb6", "#7b4fb6", "#2f8f5b"), strict=True))
 
 
@@ -223,7 +223,7 @@ HEADS = (
     "delay",
     "horizon",
     "success [95 %]",
-    "against no delay",
+    "against least delay",
     "against the first way",
     "steps",
     "seam jump",

@@ -123,7 +123,7 @@ def make_jobs(
         if states[0] < 0 or states[-1] >= task.num_initial_states:
             raise ConfigError(
                 f"task {task.index} has the initial states 0 to {task.num_initial_states - 1}; "
-                f"{states[0]} to {states[-1]} were asked for"
+                f"it has no {states[-1] if states[0] >= 0 else states[0]}"
             )
         for number, state in enumerate(states):
             name = f"task{task.index:02d}_state{state:02d}" if videos.which != "none" else None

@@ -16,7 +16,9 @@ def load_results(folder: Path) -> Results:
         raise ConfigError(f"{folder} holds no {FILE}: it isn't the folder of an evaluation")
     content = read_json(path, ConfigError, limit=MAX_BYTES)
     if content.get("format") != FORMAT:
-        raise ConfigError(f"{path} isn't a result of this version's `turbopi eval` (format {FORMAT})")
+        raise ConfigError(
+            f"{path} isn't a result of this version's `turbopi eval` (format {FORMAT}); name another folder"
+        )
     run = as_document(content, RunDocument, path, ConfigError)
     Fields(run.protocol, f"{path}: protocol", ConfigError).text("suite")
     results = Results(path.parent, run.protocol, run.policy, run.tasks, run.versions, run.options)

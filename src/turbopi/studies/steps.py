@@ -5,7 +5,6 @@ with one way, the other one with two. Where a policy has one way its flow is nea
 nothing. A single step from noise gives the mean of all ways: between two ways around a post, that is the post.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -233,7 +232,8 @@ def _controls(policy: ToyPolicy, spreads: Sequence[Spread], halved: Mapping[str,
     off = loop_is_the_models(policy)
     worst = max(value for name, value in halved.items() if name != RANDOM)
     bound = 0.3 if small else 0.01  # ten steps in the small form
-    told = f"{worst:.1e} of the actions, with random weights {halved.get(RANDOM, math.nan):.1e}."
+    random = f", with random weights {halved[RANDOM]:.1e}" if RANDOM in halved else ""
+    told = f"{worst:.1e} of the actions{random}."
     controls = [
         Control("Ten Euler steps here are `Pi0Model.denoise`'s.", off < 1e-5, f"Largest difference {off:.1e}."),
         Control("A warm start at t = 1 is the plain run, bit for bit.", warm_from_noise_is_plain(policy), ""),
