@@ -249,8 +249,8 @@ def no_gpu(cuda: str | None, driver: str | None, names: list[str], board: str | 
     there = ", ".join(names)
     if cuda is None:
         fix = (
-            "of a clone: delete .venv, then scripts/setup; elsewhere: pip install --force-reinstall torch (on Linux "
-            "PyPI's wheels have CUDA)"
+            "delete .venv and run scripts/setup again; in an environment of your own: pip install --force-reinstall "
+            "torch (on Linux PyPI's wheels have CUDA)"
         )
         return Row("FAIL", "GPU", f"{there}, but this PyTorch is built without CUDA", fix)
     least = _least_driver(cuda)
