@@ -152,7 +152,7 @@ def test_the_policys_own_warm_up_is_called_first() -> None:
     [
         ("rtc", 6 / HZ, "120 ms, 6 control steps at 50 Hz: with chunks of 10 actions and an execution horizon of 5"),
         ("rtc_trained", 5 / HZ, "trained with delays up to 4"),
-        ("async", 1.5, "max_observation_age_s is 1"),
+        ("async", 1.5, "max_observation_age_s is 1. Raise it, or choose fewer denoising steps"),
     ],
 )
 def test_a_policy_that_is_too_slow_is_refused_before_the_robot_moves(execution: str, seconds: float, text: str) -> None:

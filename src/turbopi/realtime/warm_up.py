@@ -52,11 +52,12 @@ def expected_delay(
     """
     delay = math.ceil(round(seconds * hz, 6))
     slow = f"one call takes {seconds * 1e3:.0f} ms, {delay} control steps at {hz:g} Hz"
-    faster = "a lower control_hz, fewer denoising steps or a faster backend"
+    quicker = "fewer denoising steps or a faster backend"
+    faster = f"a lower control_hz, {quicker}"
     if seconds > max_age_s:
         raise ConfigError(
             f"{slow}: every chunk would be refused, as max_observation_age_s is {max_age_s:g}. Raise it, or choose "
-            f"{faster}"
+            f"{quicker}"
         )
     if way.holds and trained_max is not None and delay > trained_max:
         raise ConfigError(
