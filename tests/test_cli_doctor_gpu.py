@@ -201,7 +201,14 @@ def test_nothing_more_is_asked_of_a_gpu_without_code(fake: Fake) -> None:
 @pytest.mark.parametrize(
     ("cuda", "driver", "names", "board", "found", "fix"),
     [
-        (None, "570.1", ["NVIDIA H200"], None, "this PyTorch is built without CUDA", "delete .venv and run scripts/setup"),
+        (
+            None,
+            "570.1",
+            ["NVIDIA H200"],
+            None,
+            "this PyTorch is built without CUDA",
+            "delete .venv and run scripts/setup",
+        ),
         ("12.8", "570.1", ["NVIDIA H200"], None, "PyTorch (CUDA 12.8) can't use it", "see that CUDA_VISIBLE_DEVICES"),
         ("13.0", "570.1", ["NVIDIA H200"], None, "driver 570.1 is too old", f"{gpu_checkups._CUDA_12} (or update"),
         ("13.0", "470.2", ["NVIDIA A100"], None, "CUDA 13.0 needs 580 or newer", "update the NVIDIA driver to 580"),

@@ -16,7 +16,7 @@ from typer.testing import Result
 
 from turbopi.policy import UnifiedPolicy
 from turbopi.recordings import RecordedCall, save_call
-from turbopi.shipped import FRAMES, load_frames
+from turbopi.shipped import FRAMES, SMALL_POLICY, load_frames
 
 TINY = ("--random-weights", "pi05_tiny", "--steps", 2, "--no-warmup")
 
@@ -281,3 +281,13 @@ def test_a_full_disk_keeps_the_earlier_actions_and_names_the_file(npz: Path, tmp
     assert "Traceback" not in result.stderr
     assert (tmp_path / "actions.npz").read_bytes() == earlier
     assert sorted(file.name for file in tmp_path.iterdir()) == ["actions.npz", "observation.npz"]
+
+
+def test_a_state_in_other_units_than_the_training_datas_is_doubted(tmp_path: Path) -> None:
+    seen, file = observation(), tmp_path / "degrees.npz"
+    options = (SMALL_POLICY, file, "--steps", 1, "--no-warmup", "--no-plot", "-o", tmp_path / "actions.npz")
+    np.savez(file, **seen)
+    assert "note" not in turbopi("infer", *options).output
+    np.savez(file, **seen | {"observation/state": np.degrees(seen["observation/state"])})
+    shown = " ".join(turbopi("infer", *options).output.split())
+    assert re.search(r"note: .*degrees.npz: the state is far .*: value \d is .*, in the training data .* units", shown)

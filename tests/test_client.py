@@ -1,5 +1,6 @@
 """turbopi.client after interruptions: no answer is ever taken for another call's."""
 
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 from websockets.sync.client import ClientConnection
 
-from turbopi.client import RealTimeClient, ServerRefused
+from turbopi.client import RealTimeClient, ServerLost, ServerRefused
+from turbopi.errors import ConfigError, ObservationError
 from turbopi.serve import running
 from turbopi.wire import pack
 
@@ -60,3 +62,42 @@ def test_a_server_that_greets_with_nonsense_is_not_kept(greeting: str | bytes, m
         ):
             client.infer({"place": 1})
         assert client.infer({"place": 2})["actions"] == 2
+
+
+@pytest.mark.parametrize(
+    ("host", "text"),
+    [
+        ("http://localhost:8000", "the host is 'http://localhost:8000'; give a name, or a URL that begins with ws://"),
+        ("localhost:8000", "the host is 'localhost:8000'; give its name, and the port beside it"),
+    ],
+)
+def test_a_host_that_is_no_name_is_refused_in_words(host: str, text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        RealTimeClient(host)
+
+
+@pytest.mark.parametrize("host", ["::1", "ws://[::1]"])
+def test_without_a_server_the_error_says_where_and_that_it_may_not_be_warm(host: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]  # free when it is closed
+    with pytest.raises(ServerLost, match=rf"no policy server at ws://127\.0\.0\.1:{port}: .*once it is warm"):
+        RealTimeClient("127.0.0.1", port)
+    with pytest.raises(ServerLost, match=rf"no policy server at ws://\[::1\]:{port}: "):
+        RealTimeClient(host, port)
+
+
+@pytest.mark.parametrize("value", [object(), np.array([None]), 2**70])
+def test_what_cannot_be_sent_is_named_by_its_key_and_the_connection_stays(value: object) -> None:
+    with running(Echo()) as server, RealTimeClient("127.0.0.1", server.port) as client:
+        with pytest.raises(ObservationError, match="wrist: can't send "):
+            client.infer({"place": 1, "wrist": value})
+        with pytest.raises(ObservationError, match="wrist: can't send "):
+            client.infer({"place": 1, "wrist": [{"inner": value}]})
+        assert client.infer({"place": 2})["actions"] == 2
+
+
+def test_a_running_chunk_of_another_kind_is_refused() -> None:
+    with running(Echo()) as server, RealTimeClient("127.0.0.1", server.port) as client:
+        left_over: Any = np.zeros((3, 32), np.float32)
+        with pytest.raises(ObservationError, match=r"previous is a ndarray; .* turbopi\.running_chunk\.RunningChunk"):
+            client.infer({"place": 1}, previous=left_over)

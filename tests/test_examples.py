@@ -57,6 +57,13 @@ def test_the_robot_loop_moves_an_arm(policy: UnifiedPolicy, client: str) -> None
     assert shown.startswith("connected to a policy for libero\n") and shown.count("10 actions after") == 2
 
 
+def test_the_real_time_loop_gives_an_arm_a_command_in_every_step(policy: UnifiedPolicy) -> None:
+    with running(policy) as server:
+        options = ("--hz", "2", "--steps", "8", "--age", "30")  # for a busy CPU
+        shown = run("real_time_loop.py", "--port", str(server.port), *options)
+    assert shown.startswith("warm after ") and "'fresh': " in shown
+
+
 def test_the_so101_moves_by_its_own_keys() -> None:
     policy = UnifiedPolicy(random_checkpoint("pi05_tiny"), device="cpu", robot=str(EXAMPLES / "so101.json"))
     with running(policy) as server:
@@ -76,6 +83,7 @@ def test_a_server_that_is_not_warm_yet_is_waited_for(policy: UnifiedPolicy) -> N
         port = str(taken.getsockname()[1])  # free when it is closed
     asked = {
         "robot_loop.py": ("--host", "127.0.0.1", "--port", port),
+        "real_time_loop.py": ("--host", "127.0.0.1", "--port", port, "--steps", "2", "--age", "30"),
         "lerobot_so101.py": ("--server", f"ws://127.0.0.1:{port}"),
     }
     for name, where in asked.items():

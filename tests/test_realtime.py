@@ -1,6 +1,7 @@
 """The executor beside a robot: never late, never an old action as a new one, and every refusal counted."""
 
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -151,12 +152,29 @@ def test_the_policys_own_warm_up_is_called_first() -> None:
     [
         ("rtc", 6 / HZ, "120 ms, 6 control steps at 50 Hz: with chunks of 10 actions and an execution horizon of 5"),
         ("rtc_trained", 5 / HZ, "trained with delays up to 4"),
-        ("async", 1.5, "max_observation_age_s is 1"),
+        ("async", 1.5, "max_observation_age_s is 1. Raise it, or choose fewer denoising steps"),
     ],
 )
 def test_a_policy_that_is_too_slow_is_refused_before_the_robot_moves(execution: str, seconds: float, text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         started(execution, seconds=seconds)
+
+
+@pytest.mark.parametrize(
+    ("execution", "steps", "text"),
+    [
+        ("sync", 20, None),
+        ("async", 5, None),
+        ("async", 6, "6 control steps at 50 Hz, but chunks of 10 actions have only 5 left.*at most 4, or a lower"),
+        ("ensemble", 20, "no action at the end of each chunk. Choose a lower control_hz"),
+    ],
+)
+def test_a_warm_up_warns_of_a_robot_that_will_run_out_of_actions(
+    execution: str, steps: int, text: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    started(execution, seconds=steps / HZ)
+    assert bool(caplog.messages) == (text is not None)
+    assert text is None or re.search(text, caplog.messages[0])
 
 
 def test_what_a_background_warm_up_finds_stops_the_control_loop() -> None:
@@ -536,7 +554,9 @@ def test_a_way_that_the_policy_does_not_offer_is_refused(execution: str) -> None
     with pytest.raises(ConfigError, match="offers no real-time modes"):
         started(execution, modes=())
     others = tuple(name for name in RTC if name != execution)
-    with pytest.raises(ConfigError, match=f"{execution}' isn't offered by this policy, which offers"):
+    hint = "trained_max_delay" if execution == "rtc_trained" else "execution 'sync', 'async'"
+    offered = f"{execution}' isn't offered by this policy, which offers {', '.join(others)}; .*{hint}"
+    with pytest.raises(ConfigError, match=offered):
         started(execution, modes=others)
 
 

@@ -287,6 +287,18 @@ def test_lerobot_runs_with_a_camera_too_many_and_one_too_few_and_warns_once(capl
     assert "observation.images.warned_about, which is masked" in record.message
 
 
+def test_a_camera_that_lerobots_observation_lacks_is_warned_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    robot = create_robot("lerobot", {**LEROBOT, "image_keys": ["observation.images.unplugged", LEROBOT_WRIST]})
+    observation = robot.example(np.random.default_rng(0))
+    robot.inputs(observation)
+    assert not caplog.records
+    del observation["observation.images.unplugged"]
+    for _ in range(3):
+        robot.inputs(observation)
+    (record,) = caplog.records
+    assert "the observation lacks observation.images.unplugged, which is masked" in record.message
+
+
 def test_an_observation_without_any_of_lerobots_cameras_is_refused() -> None:
     none = {key: value for key, value in lerobot_observation().items() if "images" not in key}
     with pytest.raises(ObservationError, match=r"cameras are nothing; this checkpoint's are observation\.images\.top"):

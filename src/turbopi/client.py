@@ -10,6 +10,7 @@ openpi's own server, too, which offers none of the "rtc" ways.
 """
 
 import contextlib
+import ipaddress
 import threading
 from collections.abc import Iterator, Mapping
 from types import TracebackType
@@ -43,7 +44,7 @@ class ServerRefused(TurboPiError):
 class RealTimeClient:
     """A policy on another machine. Calls of several threads take turns.
 
-    host, port      the server's; `host` may be a URL, ws:// or wss://
+    host, port      the server's, 8000 unless given; `host` may be a URL, ws:// or wss://, that has the port in it
     api_key         if the server has one
     connect_s       seconds in which the server must take the connection and send its metadata
     answer_s        seconds after which a call gives up (ServerLost): the robot doesn't wait for a dead server for ever
@@ -60,10 +61,7 @@ class RealTimeClient:
         connect_s: float = 10.0,
         answer_s: float = 30.0,
     ) -> None:
-        if host.startswith(("ws://", "wss://")):
-            self.url = host if port is None else f"{host}:{port}"
-        else:
-            self.url = f"ws://{f'[{host}]' if ':' in host else host}:{8000 if port is None else port}"
+        self.url = _url(host, port)
         self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
         self._connect_s, self._answer_s = connect_s, answer_s
         self._lock = threading.Lock()
@@ -83,15 +81,20 @@ class RealTimeClient:
     ) -> dict[str, Any]:
         """The server's answer: {"actions": float64[H, d], …}; the other arguments as for UnifiedPolicy.
 
-        Raises ObservationError, ActionError, DeviceLost for what the server says of this call, ConfigError if the
-        server doesn't offer what is asked, ServerRefused for other answers, and ServerLost.
+        Raises ObservationError, ActionError, DeviceLost for what the server says of this call, ObservationError for
+        what can't be sent (such as a tensor), ConfigError if the server doesn't offer what is asked, ServerRefused for
+        other answers, and ServerLost.
         """
         with self._lock:
             if self._socket is None:
                 self.metadata = self._connect()
+            if previous is not None and not isinstance(previous, RunningChunk):
+                raise ObservationError(
+                    f"previous is a {type(previous).__name__}; it should be a turbopi.running_chunk.RunningChunk"
+                )
             if previous is not None or model_actions or seed is not None:
                 self._check_offered(None if previous is None else previous.mode)
-            packed = pack(message(obs, previous, model_actions, seed))
+            packed = _packed(message(obs, previous, model_actions, seed))
             assert self._socket is not None
             try:
                 with self._dropped_on_error():  # a late answer must not be taken for the next call's
@@ -161,7 +164,12 @@ class RealTimeClient:
         except (OSError, TimeoutError, WebSocketException) as error:
             if isinstance(error, InvalidStatus) and error.response.status_code in (401, 403):
                 raise ConfigError(f"the policy server at {self.url} wants its API key: give api_key") from error
-            raise ServerLost(f"no policy server at {self.url}: {_reason(error)}") from error
+            hint = (
+                ". Is it running? It takes connections once it is warm"
+                if isinstance(error, ConnectionRefusedError)
+                else ""
+            )
+            raise ServerLost(f"no policy server at {self.url}: {_reason(error)}{hint}") from error
 
     def _unpacked(self, data: str | bytes) -> dict[str, Any]:
         try:
@@ -187,6 +195,34 @@ class RealTimeClient:
         self._socket = None
         with contextlib.suppress(Exception):  # it may be gone already
             self._open.close()
+
+
+def _url(host: str, port: int | None) -> str:
+    """Raises ConfigError for a host that is something else: another program's URL, a host with its port."""
+    if host.startswith(("ws://", "wss://")):
+        return host if port is None else f"{host}:{port}"
+    if "://" in host:
+        raise ConfigError(f"the host is {host!r}; give a name, or a URL that begins with ws:// or wss://")
+    if ":" not in host:
+        return f"ws://{host}:{8000 if port is None else port}"
+    try:
+        ipaddress.IPv6Address(host.partition("%")[0])  # what follows is the interface
+    except ValueError:
+        raise ConfigError(f"the host is {host!r}; give its name, and the port beside it as a number") from None
+    return f"ws://[{host}]:{8000 if port is None else port}"
+
+
+def _packed(sent: Mapping[str, Any]) -> bytes:
+    """The message. Raises WireError, an ObservationError, that names the key of what can't be sent."""
+    try:
+        return pack(sent)
+    except WireError as error:
+        for key, value in sent.items():
+            try:
+                pack(value)
+            except WireError as its_own:
+                raise WireError(f"{key}: {its_own}") from None
+        raise error  # of a key
 
 
 def _keep_freed_memory() -> None:

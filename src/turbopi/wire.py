@@ -72,7 +72,8 @@ def _pack_numpy(value: object) -> dict[bytes, object]:
     if not isinstance(value, np.ndarray | np.generic):
         raise WireError(
             f"can't send a {type(value).__module__}.{type(value).__qualname__}: "
-            "a message holds dicts, lists, strings, bytes, numbers, None and numpy arrays"
+            "a message holds dicts, lists, strings, bytes, numbers, None and numpy arrays. Send a tensor or a picture "
+            "as a numpy array"
         )
     if value.dtype.kind in _REFUSED_KINDS:
         raise WireError(f"can't send dtype {value.dtype}: void, object and complex aren't part of the format")

@@ -93,6 +93,7 @@ def infer(
     check_writable(out)
     drawing = None if no_plot else plot or out.with_suffix(".png")
     from turbopi.arguments import checked_noise
+    from turbopi.preprocess.robot_checks import note_on_state
     from turbopi.recordings import load_observation
 
     _check_targets(Path(source), out, drawing)
@@ -102,7 +103,11 @@ def infer(
     opened = options.open(checkpoint)
     options.tell_if_random(opened, output)
     with _naming(sources[0]):  # what is wrong with it is better known before minutes of loading
-        robot_pipeline(opened, options.make_robot(), options.default_prompt).see(first, resize=False)
+        pipeline = robot_pipeline(opened, options.make_robot(), options.default_prompt)
+        seen = pipeline.see(first, resize=False)
+    doubt = note_on_state(seen.robot.state, pipeline.state_scale)
+    if doubt is not None and opened.format != "random":
+        output.line(f"note: {sources[0]}: {doubt}", "yellow")
     model = opened.config.model
     if given_noise is not None:  # now: it is no observation's fault
         checked_noise([given_noise], (1, model.action_horizon, model.action_dim))

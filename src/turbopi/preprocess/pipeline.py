@@ -26,7 +26,7 @@ from turbopi.preprocess.robot_checks import (
 )
 from turbopi.preprocess.tokenizer import PromptTokenizer
 from turbopi.robots import Robot, RobotInputs, robot_for
-from turbopi.robots.base import all_finite, read_prompt, read_state
+from turbopi.robots.base import all_finite, keys_of, listed, read_prompt, read_state
 from turbopi.robots.pictures import check_hwc, is_rgb8, to_uint8
 from turbopi.robots.plain import Plain
 
@@ -269,8 +269,9 @@ class Pipeline:
         prompt = sample.robot.prompt if sample.robot.prompt is not None else self.default_prompt
         if prompt is None:
             raise ObservationError(
-                "the observation has no prompt (LeRobot: task), and the policy no default prompt: put one into the "
-                "observation, or give the policy one (--default-prompt, or default_prompt in turbopi.json)"
+                f"the observation has no prompt. It has {listed(keys_of(sample.observation))}. Send the task as text: "
+                "most robots read 'prompt', LeRobot's read 'task', your own what it says. Or give the policy a default "
+                "one: --default-prompt, or default_prompt in turbopi.json"
             )
         sample.prompt = read_prompt(prompt)
 

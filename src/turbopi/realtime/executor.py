@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from turbopi.config import Schedule
 from turbopi.errors import ConfigError
 from turbopi.execution import ChunkQueue, DelayEstimate, Execution, Seam, way_named
 from turbopi.execution.messages import PREFIX
@@ -55,8 +56,10 @@ class RealTimeExecutor:
     delay_percentile, delay_window
                        the delay to expect is this percentile of so many last ones
     infer_arguments    what else `policy.infer` is given in every call, such as {"num_steps": 5}
-    joining            old_weight, schedule, max_guidance_weight of `ChunkQueue`
-    clock              seconds that never go back, for tests
+    old_weight         "ensemble": the running chunk's part of the mean, 0 to 1
+    schedule, max_guidance_weight
+                       of "rtc" and "rtc_identity", as in `RunningChunk`. None: the policy's
+    clock, inference   seconds that never go back, and the thread that calls the policy: for tests
 
     Raises ConfigError for what can't be right, and for a policy that doesn't offer the way to run. `observe`,
     `next_action`, `reset`, `report` may be called from different threads.
@@ -77,9 +80,11 @@ class RealTimeExecutor:
         delay_percentile: float = 95.0,
         delay_window: int = 50,
         infer_arguments: Mapping[str, Any] | None = None,
+        old_weight: float = 0.3,
+        schedule: Schedule | None = None,
+        max_guidance_weight: float | None = None,
         clock: Callable[[], float] = time.monotonic,
         inference: Inference | None = None,
-        **joining: Any,
     ) -> None:
         self._hz = above_zero("control_hz", control_hz, MAX_CONTROL_HZ)
         if on_empty not in get_args(OnEmpty):
@@ -104,8 +109,10 @@ class RealTimeExecutor:
             delay=self._delays,
             trained_max_delay=self._offered.get("trained_max_delay"),
             max_jump=max_jump,
+            old_weight=old_weight,
+            schedule=schedule,
+            max_guidance_weight=max_guidance_weight,
             policys_guidance=execution_horizon is None and self._offered.get("execution_horizon") is not None,
-            **joining,
         )
         self._lock = threading.Lock()
         self._inference = BackgroundThread() if inference is None else inference

@@ -37,7 +37,15 @@ def check_policy(policy: Any, way: Way) -> Mapping[str, Any]:
             f'real-time modes (its metadata has no "real_time"); {free}'
         )
     if way.mode not in modes:
-        raise ConfigError(f"execution {way.name!r} isn't offered by this policy, which offers {modes}; {free}")
+        trained = (
+            "it is for checkpoints that were trained with simulated delays, which say so: LeRobot's by "
+            'rtc_training_max_delay, others in a turbopi.json, {"real_time": {"trained_max_delay": …}}; '
+            if way.holds
+            else ""
+        )
+        raise ConfigError(
+            f"execution {way.name!r} isn't offered by this policy, which offers {', '.join(modes)}; {trained}{free}"
+        )
     return offered
 
 

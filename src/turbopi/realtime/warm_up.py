@@ -1,5 +1,6 @@
 """Bringing a policy to full speed, and whether that is fast enough."""
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -9,6 +10,8 @@ from turbopi.execution import Way
 from turbopi.running_chunk import RunningChunk
 
 TIMED_CALLS = 2
+
+logger = logging.getLogger(__name__)
 
 
 def warm_policy(
@@ -43,21 +46,34 @@ def warm_policy(
 def expected_delay(
     seconds: float, hz: float, *, way: Way, horizon: int, s: int, trained_max: int | None, max_age_s: float
 ) -> int:
-    """Control steps that a call of so many seconds takes. Raises ConfigError if the way can't be run with it at all."""
+    """Control steps that a call of so many seconds takes. Raises ConfigError if the way can't be run with it at all.
+
+    Warns, in the log, if the robot will run out of actions in each chunk.
+    """
     delay = math.ceil(round(seconds * hz, 6))
     slow = f"one call takes {seconds * 1e3:.0f} ms, {delay} control steps at {hz:g} Hz"
-    faster = "lower control_hz, take fewer denoising steps or a faster backend"
+    quicker = "fewer denoising steps or a faster backend"
+    faster = f"a lower control_hz, {quicker}"
     if seconds > max_age_s:
         raise ConfigError(
-            f"{slow}: every chunk would be refused, as max_observation_age_s is {max_age_s:g}. Raise it, or {faster}"
+            f"{slow}: every chunk would be refused, as max_observation_age_s is {max_age_s:g}. Raise it, or choose "
+            f"{quicker}"
         )
     if way.holds and trained_max is not None and delay > trained_max:
         raise ConfigError(
-            f"{slow}, but this checkpoint was trained with delays up to {trained_max}: {faster}, or use execution 'rtc'"
+            f"{slow}, but this checkpoint was trained with delays up to {trained_max}: choose {faster}, or execution "
+            "'rtc'"
         )
     if way.mode is not None and delay > horizon - max(s, delay):
         raise ConfigError(
             f"{slow}: with chunks of {horizon} actions and an execution horizon of {s}, {way.name} joins chunks up to "
-            f"a delay of {min(horizon - s, horizon // 2)}: {faster}"
+            f"a delay of {min(horizon - s, horizon // 2)}: choose {faster}"
+        )
+    if way.mode is None and not way.stands_still and delay > horizon - s:
+        fits = f"an execution horizon of at most {horizon - delay}, or " if delay < horizon else ""
+        logger.warning(
+            "%s, but chunks of %d actions have only %d left after an execution horizon of %d: the robot will have no "
+            "action at the end of each chunk. Choose %s%s",
+            *(slow, horizon, horizon - s, s, fits, faster),
         )
     return delay

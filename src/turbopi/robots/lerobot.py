@@ -41,8 +41,8 @@ class LeRobot(Robot):
             task                   text
     out     [H, action_dim]
 
-    image_keys           the checkpoint's cameras, full keys in its order. One that an observation lacks is masked, and
-                         cameras of other names aren't read, as in LeRobot; both at once are warned about, in the log
+    image_keys           the checkpoint's cameras, full keys in its order. One that an observation lacks is masked, as
+                         in LeRobot, and the log warns once; cameras of other names aren't read
     num_missing_cameras  LeRobot's empty_cameras after them: masked, unless an observation has observation.images.empty_
                          camera_0, ...
     rename_map           observations' keys -> the checkpoint's; where an observation has both, the later one is read
@@ -122,7 +122,7 @@ class LeRobot(Robot):
                 f"{', '.join(map(self.sent_as, self.image_keys))}. Rename them; a camera that the robot doesn't have "
                 "can be left out"
             )
-        if absent and others:
+        if absent:
             _warn_once(others, [self.sent_as(key) for key in absent])
         images = {key: parse_unit_image(find(named, key), key) for key in present}
         black = black_like(next(iter(images.values())))
@@ -165,17 +165,23 @@ class LeRobot(Robot):
         }
 
 
-_warned: set[tuple[str, ...]] = set()  # absent cameras: at most every choice of a checkpoint's
+_warned: set[tuple[bool | str, ...]] = set()  # absent cameras: at most every choice of a checkpoint's, twice
 
 
 def _warn_once(others: list[str], absent: list[str]) -> None:
     """Not at every step of an episode, and whatever names a client makes up."""
-    if tuple(absent) in _warned:
+    case: tuple[bool | str, ...] = (bool(others), *absent)
+    if case in _warned:
         return
-    _warned.add(tuple(absent))
-    logger.warning(
-        "the observation has %s, which this checkpoint doesn't read, and lacks %s, which is masked, as in LeRobot. Is "
-        "one of them misspelt?",
-        listed(others),
-        listed(absent),
-    )
+    _warned.add(case)
+    if others:
+        logger.warning(
+            "the observation has %s, which this checkpoint doesn't read, and lacks %s, which is masked, as in LeRobot. "
+            "Is one of them misspelt?",
+            listed(others),
+            listed(absent),
+        )
+    else:
+        logger.warning(
+            "the observation lacks %s, which is masked, as in LeRobot: the model acts without it", listed(absent)
+        )
