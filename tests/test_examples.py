@@ -2,6 +2,7 @@
 
 import ast
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -59,9 +60,11 @@ def test_the_robot_loop_moves_an_arm(policy: UnifiedPolicy, client: str) -> None
 
 def test_the_real_time_loop_gives_an_arm_a_command_in_every_step(policy: UnifiedPolicy) -> None:
     with running(policy) as server:
-        options = ("--hz", "2", "--steps", "8", "--age", "30")  # for a busy CPU
+        options = ("--hz", "2", "--steps", "8", "--age", "300")  # which of them are fresh depends on the CPU
         shown = run("real_time_loop.py", "--port", str(server.port), *options)
-    assert shown.startswith("warm after ") and "'fresh': " in shown
+    found = re.search(r"chunks, commands ({.*}), dropped", shown)
+    assert shown.startswith("warm after ") and found is not None
+    assert sum(ast.literal_eval(found[1]).values()) == 8
 
 
 def test_the_so101_moves_by_its_own_keys() -> None:
@@ -83,7 +86,7 @@ def test_a_server_that_is_not_warm_yet_is_waited_for(policy: UnifiedPolicy) -> N
         port = str(taken.getsockname()[1])  # free when it is closed
     asked = {
         "robot_loop.py": ("--host", "127.0.0.1", "--port", port),
-        "real_time_loop.py": ("--host", "127.0.0.1", "--port", port, "--steps", "2", "--age", "30"),
+        "real_time_loop.py": ("--host", "127.0.0.1", "--port", port, "--steps", "2", "--age", "300"),
         "lerobot_so101.py": ("--server", f"ws://127.0.0.1:{port}"),
     }
     for name, where in asked.items():

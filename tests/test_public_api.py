@@ -42,3 +42,13 @@ def test_import_turbopi_imports_neither_torch_nor_numpy() -> None:
     here = {**os.environ, "PYTHONPATH": str(Path(turbopi.__file__).parents[1])}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=here)
     assert done.stdout.strip() == "set()"
+
+
+def test_without_pytorch_a_policy_is_refused_in_words() -> None:
+    """A robot's computer has Turbo-Pi's client alone."""
+    code = "import sys; sys.modules['torch'] = None\nimport turbopi.client\nfrom turbopi import UnifiedPolicy"
+    here = {**os.environ, "PYTHONPATH": str(Path(turbopi.__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=here)
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("ImportError: turbopi.UnifiedPolicy needs PyTorch, which isn't installed: "), done.stderr
+    assert last.endswith("turbopi.client alone, without PyTorch (docs/real_time.md)")

@@ -301,7 +301,7 @@ def test_a_camera_that_lerobots_observation_lacks_is_warned_of_once(caplog: pyte
 
 def test_an_observation_without_any_of_lerobots_cameras_is_refused() -> None:
     none = {key: value for key, value in lerobot_observation().items() if "images" not in key}
-    with pytest.raises(ObservationError, match=r"cameras are nothing; this checkpoint's are observation\.images\.top"):
+    with pytest.raises(ObservationError, match=r"has no camera; this checkpoint's are observation\.images\.top"):
         CREATED["lerobot"].inputs(none)
     with pytest.raises(ObservationError, match=r"cameras are observation\.images\.x; this checkpoint's are"):
         CREATED["lerobot"].inputs({**none, "observation.images.x": np.zeros((3, 8, 8), np.uint8)})

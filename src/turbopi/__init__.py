@@ -73,7 +73,17 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module 'turbopi' has no attribute {name!r}")
     if name == "errors":
         return importlib.import_module("turbopi.errors")
-    return getattr(importlib.import_module(f"turbopi.{_MODULES.get(name, 'errors')}"), name)
+    try:
+        module = importlib.import_module(f"turbopi.{_MODULES.get(name, 'errors')}")
+    except ModuleNotFoundError as missing:
+        if missing.name != "torch":
+            raise
+        raise ImportError(
+            f"turbopi.{name} needs PyTorch, which isn't installed: scripts/setup of Turbo-Pi's clone does it. A robot's "
+            "computer that asks a server needs turbopi.client alone, without PyTorch (docs/real_time.md)",
+            name="torch",
+        ) from missing
+    return getattr(module, name)
 
 
 def __dir__() -> list[str]:

@@ -186,5 +186,6 @@ def noise_for(
     seeds = [seed + row for row in range(batch)] if isinstance(seed, int | np.integer) else seed
     whole = isinstance(seeds, Sequence) and all(isinstance(one, int | np.integer) and one >= 0 for one in seeds)
     if not whole or len(seeds) != batch:
-        raise ObservationError(f"seed {seed!r} should be a whole number from 0, or one for each of {batch} rows")
+        several = f", or {batch} of them, one for each row" if batch > 1 else ""
+        raise ObservationError(f"seed {seed!r} should be a whole number from 0{several}")
     return np.stack([np.random.default_rng(one).standard_normal(shape[1:], dtype=np.float32) for one in seeds])

@@ -87,8 +87,8 @@ def _notes(predictions: "Sequence[Prediction]") -> list[str]:
 
     measured = any(one.was_measured(call) for one in predictions for call in one.calls)
     lines = [
-        "These are predictions: nothing was run for them.",
-        *([f"{MEASURED} but this call was measured on that GPU"] if measured else []),
+        f"These are predictions: nothing was run for them{', but for those with a star' if measured else ''}.",
+        *([f"{MEASURED} this call was measured on that GPU"] if measured else []),
         "floor: the counted work at NVIDIA's published rates",
         "call: the floor and what the backend lost beyond its floor on the GPU where it",
         "      was measured, as the same time at one end, as the same ratio at the other",

@@ -117,8 +117,9 @@ class LeRobot(Robot):
         absent = [key for key in self.image_keys if key not in present]
         others = [key for key in names_in_prefix(named, IMAGES) if key not in self._cameras]
         if not present:
+            theirs = f"the observation's cameras are {listed(others)}" if others else "the observation has no camera"
             raise ObservationError(
-                f"the observation's cameras are {listed(others)}; this checkpoint's are "
+                f"{theirs}; this checkpoint's are "
                 f"{', '.join(map(self.sent_as, self.image_keys))}. Rename them; a camera that the robot doesn't have "
                 "can be left out"
             )
