@@ -79,8 +79,8 @@ def __getattr__(name: str) -> object:
         if missing.name != "torch":
             raise
         raise ImportError(
-            f"turbopi.{name} needs PyTorch, which isn't installed: scripts/setup of Turbo-Pi's clone does it. A robot's "
-            "computer that asks a server needs turbopi.client alone, without PyTorch (docs/real_time.md)",
+            f"turbopi.{name} needs PyTorch, which isn't installed: scripts/setup of Turbo-Pi's clone does it. A "
+            "robot's computer that asks a server needs turbopi.client alone, without PyTorch (docs/real_time.md)",
             name="torch",
         ) from missing
     return getattr(module, name)
