@@ -627,6 +627,35 @@ def test_a_taken_port_is_said_before_the_warm_up() -> None:
     assert not policy.warmed_up
 
 
+def test_a_port_that_another_server_takes_during_the_warm_up_is_said_and_nothing_is_left_open(tmp_path: Path) -> None:
+    """Linux lets both bind the port, as long as neither listens."""
+
+    async def main() -> None:
+        policy = FakePolicy()
+
+        def warmup() -> None:
+            policy.started.set()
+            assert policy.release.wait(30)
+
+        policy.warmup = warmup  # type: ignore[method-assign]
+        late = PolicyServer(policy, port=0, record_dir=tmp_path)
+        start = asyncio.create_task(late.start())
+        await eventually(policy.started.is_set)
+        async with PolicyServer(FakePolicy(), port=late.port) as first:
+            policy.release.set()
+            with pytest.raises(ConfigError, match=rf"can't listen on {first.url}: .*in use.*another --host or --port"):
+                await start
+        assert not any(thread.name == "turbopi-recorder" for thread in threading.enumerate())
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("host", ["robot..lab", "x" * 70])
+def test_a_host_that_is_no_name_is_refused_in_words(host: str) -> None:
+    with pytest.raises(ConfigError, match=r"can't listen on ws://.*another --host"), running(FakePolicy(), host=host):
+        pass
+
+
 def test_a_failing_warm_up_ends_the_start() -> None:
     class Broken(FakePolicy):
         def warmup(self) -> None:
