@@ -96,6 +96,16 @@ def test_what_cannot_be_sent_is_named_by_its_key_and_the_connection_stays(value:
         assert client.infer({"place": 2})["actions"] == 2
 
 
+def test_a_request_that_came_too_late_costs_no_connection() -> None:
+    """With the connection its session would end, and so the running chunk that the server keeps."""
+    with running(Echo()) as server, RealTimeClient("127.0.0.1", server.port) as client:
+        socket = client._socket
+        with pytest.raises(ServerRefused, match="sent no actions but: late: "):
+            client.infer({"place": 1, "turbopi/deadline_ms": 1e-6})
+        assert client.infer({"place": 2})["actions"] == 2
+        assert client._socket is socket
+
+
 def test_a_running_chunk_of_another_kind_is_refused() -> None:
     with running(Echo()) as server, RealTimeClient("127.0.0.1", server.port) as client:
         left_over: Any = np.zeros((3, 32), np.float32)

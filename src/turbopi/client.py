@@ -30,6 +30,7 @@ _REFUSALS: dict[str, type[TurboPiError]] = {
     "bad actions: ": ActionError,
     "the device is lost: ": DeviceLost,
 }
+_KEEPS_CONNECTION = ("busy: ", "late: ", "replaced: ", "the replica is lost: ")  # as do _REFUSALS
 _KEPT_BYTES = 8 * 2**20
 
 
@@ -115,8 +116,8 @@ class RealTimeClient:
         for beginning, kind in _REFUSALS.items():
             if text.startswith(beginning):
                 raise kind(_printable(text.removeprefix(beginning)))
-        if not text.startswith(("busy: ", "the replica is lost: ")):
-            self._drop()  # a server that sends a traceback closes the connection
+        if not text.startswith(_KEEPS_CONNECTION):
+            self._drop()  # a server that stops or sends a traceback closes the connection
         last = (text.strip().splitlines() or ["nothing"])[-1]
         raise ServerRefused(f"the policy server at {self.url} sent no actions but: {_printable(last)}")
 
