@@ -136,7 +136,10 @@ class Listener:
             if self._full(sock):
                 sock.close()
             else:
-                await loop.connect_accepted_socket(self._new_connection, sock)
+                try:
+                    await loop.connect_accepted_socket(self._new_connection, sock)
+                except OSError:  # its client has left: on macOS setting TCP_NODELAY fails then
+                    sock.close()
             await asyncio.sleep(self._pace.wait())
 
     def _full(self, sock: socket.socket) -> bool:
