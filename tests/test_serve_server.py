@@ -767,10 +767,12 @@ def test_run_prints_the_address_and_ends_cleanly_on_a_signal(number: signal.Sign
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_second_signal_ends_a_server_whose_inference_hangs(number: signal.Signals, tmp_path: Path) -> None:
     async def call(url: str, process: subprocess.Popen[str]) -> None:
+        port = int(url.rpartition(":")[2])
         async with connect(url) as connection:
             await connection.recv()
             await connection.send(pack(observation("hold")))
-            await asyncio.sleep(0.2)
+            while "turbopi_inference_in_progress 1.0" not in (await http_get(port, "/metrics"))[2]:
+                await asyncio.sleep(0.01)
             process.send_signal(number)
             assert process.stdout is not None
             assert "Stopping" in await asyncio.to_thread(process.stdout.readline)
