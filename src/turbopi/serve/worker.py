@@ -6,14 +6,14 @@ import queue
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
 from turbopi.serve.outcome import Outcome
-from turbopi.serve.schedule import Request, Schedule
+from turbopi.serve.schedule import Refused, Request, Schedule
 
 R = TypeVar("R")
 
@@ -94,8 +94,7 @@ class Worker:
             return answer
         self._answers[request] = answer
         answer.add_done_callback(partial(self._left, request))
-        for refused in self.schedule.add(request, self._clock()):
-            self._answer(refused.request, [Outcome(0.0, wrong=refused.kind, text=refused.text)])
+        self._refuse(self.schedule.add(request, self._clock()))
         self._next()
         return answer
 
@@ -125,8 +124,7 @@ class Worker:
     def _next(self) -> None:
         """Begin the next turn, if it is time for one; else be called again when it may be."""
         decision = self.schedule.decide(self._clock())
-        for refused in decision.refused:
-            self._answer(refused.request, [Outcome(0.0, wrong=refused.kind, text=refused.text)])
+        self._refuse(decision.refused)
         self._set_timer(decision.wake)
         if decision.turn:
             self._turns += 1
@@ -171,6 +169,10 @@ class Worker:
             if not self._idle.done():
                 self._idle.set_result(None)
             self._idle = None
+
+    def _refuse(self, refused: Iterable[Refused]) -> None:
+        for one in refused:
+            self._answer(one.request, [Outcome(0.0, wrong=one.kind, text=one.text)])
 
     def _answer(self, request: Request, outcomes: list[Outcome]) -> None:
         answer = self._answers.pop(request, None)
