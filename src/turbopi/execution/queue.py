@@ -174,7 +174,7 @@ class ChunkQueue:
         """s; 1 as long as neither it nor H is known."""
         if self._s is not None:
             return self._s
-        return 1 if self.horizon is None else max(1, self.horizon // 2)
+        return 1 if self.horizon is None else default_execution_horizon(self.horizon)
 
     @property
     def in_flight(self) -> Request | None:
@@ -212,13 +212,14 @@ class ChunkQueue:
                 f"the execution horizon is {self._s}, but the policy's chunks have {horizon} actions: "
                 f"choose an execution horizon from 1 to {horizon}"
             )
-        s = max(1, horizon // 2) if self._s is None else self._s
+        half = default_execution_horizon(horizon)
+        s = half if self._s is None else self._s
         d = self._delay.steps
         if self.way.mode is not None and self._fixed and d > min(s, horizon - s):
             raise ConfigError(
                 f"a delay of {d} control steps doesn't fit an execution horizon of s = {s} and chunks of H = {horizon} "
                 f"actions: {self.way.name} needs delay ≤ s and delay ≤ H − s, so at most {min(s, horizon - s)} here "
-                f"(at most {horizon // 2} with s = {max(1, horizon // 2)}). Choose another execution horizon, "
+                f"(at most {horizon // 2} with s = {half}). Choose another execution horizon, "
                 "a lower control rate, or fewer denoising steps"
             )
 
@@ -433,6 +434,11 @@ class ChunkQueue:
         if self._running is None or self._row >= len(self._running.actions):
             return None
         return self._running.actions[self._row]
+
+
+def default_execution_horizon(horizon: int) -> int:
+    """s, control steps, of chunks of `horizon` actions: half."""
+    return max(1, horizon // 2)
 
 
 def _horizon(s: int) -> int:

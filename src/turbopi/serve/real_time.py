@@ -18,6 +18,7 @@ import numpy as np
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.execution import DelayEstimate
 from turbopi.execution.messages import KEYS, PREFIX, SCHEDULING_KEYS, Asked, read_message
+from turbopi.execution.queue import default_execution_horizon
 from turbopi.running_chunk import JoinMode, RunningChunk
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
@@ -269,27 +270,31 @@ class RealTime:
         longest = horizon - max(s, row)
         trained = int(self._offered.get("trained_max_delay") or 0)
         fits = min(longest, trained) if mode == "rtc_trained" else longest
-        if asked.delay is not None:
-            if asked.delay > fits:
-                why = (
-                    f"this checkpoint was trained with delays up to {trained}"
-                    if fits < longest
-                    else (f"with chunks of H = {horizon} actions, s = {max(s, row)} carried out, H − s = {longest}")
-                )
-                raise ObservationError(
-                    f"{PREFIX}delay is {asked.delay} control steps, but {why}: at most {fits} fit. Ask earlier "
-                    f"(a smaller execution horizon), or lower the control rate"
-                )
-            delay, wanted = asked.delay, asked.delay
-        else:
-            wanted = session.delays.steps if self._options.delay_steps is None else self._options.delay_steps
-            if self._options.delay_steps is None:
-                self._need_control_hz()
-            delay = min(wanted, fits)
+        if asked.delay is not None and asked.delay > fits:
+            why = (
+                f"this checkpoint was trained with delays up to {trained}"
+                if fits < longest
+                else f"with chunks of H = {horizon} actions, s = {max(s, row)} carried out, H − s = {longest}"
+            )
+            raise ObservationError(
+                f"{PREFIX}delay is {asked.delay} control steps, but {why}: at most {fits} fit. Ask earlier "
+                f"(a smaller execution horizon), or lower the control rate"
+            )
+        wanted = self._expected_delay(session, asked)
+        delay = min(wanted, fits)
         about |= {"joined": True, "delay": delay, "execution_horizon": max(s, row), "delay_cut": delay < wanted}
         left_over = kept.model_actions[row:]
         guidance = dict(asked.guidance or {})
         return RunningChunk(left_over, delay, max(s, row), mode, kept.anchor, **guidance), about
+
+    def _expected_delay(self, session: _Session, asked: Asked) -> int:
+        """Control steps from the observation to its chunk: what the request says, else the option, else measured."""
+        if asked.delay is not None:
+            return asked.delay
+        if self._options.delay_steps is not None:
+            return self._options.delay_steps
+        self._need_control_hz()
+        return session.delays.steps
 
     def _carried_out(self, kept: _Kept, asked: Asked, now: float) -> tuple[int, str]:
         """How many actions the robot has carried out since the kept chunk's observation, and how that is known."""
@@ -325,11 +330,6 @@ class RealTime:
                     )
                 return s
         return default_execution_horizon(horizon)
-
-
-def default_execution_horizon(horizon: int) -> int:
-    """s, control steps, of chunks of `horizon` actions: half."""
-    return max(1, horizon // 2)
 
 
 def check_execution(options: ServerOptions, offered: Mapping[str, Any], horizon: int | None) -> None:
