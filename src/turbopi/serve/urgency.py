@@ -9,10 +9,9 @@ from typing import Any
 
 from turbopi.errors import ObservationError
 from turbopi.execution.messages import MAX_STEP, PREFIX, SCHEDULING_KEYS, as_number
-from turbopi.serve.options import MAX_DEADLINE_MS
+from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS
 from turbopi.serve.schedule import PRIORITIES, Priority
 
-MAX_CONTROL_HZ = 10_000.0
 MAX_ROWS = 1024
 
 
