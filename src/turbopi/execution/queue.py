@@ -76,7 +76,10 @@ class Action(NamedTuple):
 
 @dataclass(frozen=True)
 class Seam:
-    """Where a chunk takes over from another. In the robot's units; see `Action` for the first of all chunks."""
+    """Where a chunk takes over from another; `jump` and `gap` are in the robot's units.
+
+    The first chunk of an episode follows no command and has none: `Action.takes_over` tells of it.
+    """
 
     step: int  # control steps before it
     chunk: int
@@ -110,7 +113,8 @@ class ChunkQueue:
     old_weight           "ensemble": the running chunk's part of the mean; LeRobot's default
     schedule, max_guidance_weight
                          of the guided ways, as in RunningChunk. None: the policy's
-    policys_guidance     where guidance ends is left to the policy's own execution horizon (LeRobot's rtc_config)
+    policys_guidance     True: the policy isn't told s, so guidance ends by its own execution horizon (LeRobot's
+                         rtc_config)
 
     A fixed delay d and the horizons must fit: d ≤ s and d ≤ H − s for the "rtc" ways, else ConfigError, at the latest
     when the first chunk shows H. An estimate that is larger for a while is cut to what fits: `cut_delays` counts.

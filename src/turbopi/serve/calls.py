@@ -208,11 +208,11 @@ class PolicyCalls:
                 self._infer_batch([example] * size, [arguments] * size)
             return time.perf_counter() - started
 
-        at_will = self._asked_for is not None
-        if not at_will and (times.seconds(1, 0.0) or 0.0) * size * MEASURED > SIZE_SECONDS:
+        asked_for = self._asked_for is not None
+        if not asked_for and (times.seconds(1, 0.0) or 0.0) * size * MEASURED > SIZE_SECONDS:
             return False
         first = run()
-        if not at_will and size == 1 and first * MEASURED > SIZE_SECONDS:
+        if not asked_for and size == 1 and first * MEASURED > SIZE_SECONDS:
             return False
         for _ in range(MEASURED):
             times.measured(size, run())
@@ -289,13 +289,13 @@ class PolicyCalls:
         for call in calls:
             answers.append(outcomes[at : at + len(call.observations)])
             at += len(call.observations)
-        return Ran(answers, _told(outcomes))
+        return Ran(answers, _turn_seconds(outcomes))
 
     def _run_one(self, call: _Call) -> Ran:
         if len(call.observations) > 1:
             self._metrics.batch_size.observe(len(call.observations))
             if outcomes := self._together(call.observations, [{}] * len(call.observations)):
-                return Ran([outcomes], _told(outcomes))
+                return Ran([outcomes], _turn_seconds(outcomes))
             return Ran([[self._infer(observation, {}) for observation in call.observations]])
         self._metrics.batch_size.observe(1)
         (observation,) = call.observations
@@ -304,7 +304,7 @@ class PolicyCalls:
             future = self._submit(observation)
             return Ran([future], time.perf_counter() - started)
         outcome = self._infer(observation, call.arguments)
-        return Ran([[outcome]], _told([outcome]))
+        return Ran([[outcome]], _turn_seconds([outcome]))
 
     def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Outcome:
         return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments))
@@ -419,7 +419,7 @@ def _checked(result: Any) -> dict[str, Any]:
     return result
 
 
-def _told(outcomes: Sequence[Outcome]) -> float | None:
+def _turn_seconds(outcomes: Sequence[Outcome]) -> float | None:
     """The seconds of a turn, if all of it was one run with actions."""
     good = all(outcome.wrong is None and outcome.together == len(outcomes) for outcome in outcomes)
     return outcomes[0].seconds if good else None

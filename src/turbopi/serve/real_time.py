@@ -48,7 +48,10 @@ class _Session:
 
 @dataclass
 class Plan:
-    """One request: what the policy is given. `release` it when that has answered, `finish` it if it has actions."""
+    """One request: what the policy is given.
+
+    When the policy has answered, give it to `RealTime.release`; if there are actions, then to `RealTime.finish`.
+    """
 
     observation: dict[str, Any]
     arguments: dict[str, Any] = field(default_factory=dict)  # of `policy.infer`, besides the observation
@@ -60,7 +63,7 @@ class Plan:
 
 
 class RealTime:
-    """What a server does of it, for one policy. For the event loop's thread alone.
+    """Plans each request for one policy, and keeps the sessions' running chunks. For the event loop's thread alone.
 
     waits  whether a request of the session of that name still waits for its turn: then a newer one replaces it
 
@@ -260,7 +263,10 @@ class RealTime:
     def _previous(
         self, session: _Session, kept: _Kept, asked: Asked, mode: JoinMode, now: float
     ) -> tuple[RunningChunk | None, dict[str, Any]]:
-        """What is left of a session's chunk, and what the answer says of it."""
+        """What is left of a session's chunk (None: nothing), and what the answer says of it.
+
+        Raises ObservationError if the request's own delay doesn't fit.
+        """
         horizon = len(kept.model_actions)
         row, by = self._carried_out(kept, asked, now)
         about: dict[str, Any] = {"row": row, "row_by": by}

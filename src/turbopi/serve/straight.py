@@ -15,7 +15,7 @@ MOST = 4 * 2**20  # of larger ones the library takes care: the one buffer that i
 def goes_straight(first: int, second: int, length: int) -> bool:
     """Whether a frame that begins a message, with these first two bytes and a payload of `length`, is received here.
 
-    first, second  the final bit, no reserved bit, binary; masked: anything else is the library's, which checks it
+    That is a binary message in one frame, masked, without reserved bits. The library gets all others, and checks them.
     """
     return first == 0x80 | Opcode.BINARY and second >= 0x80 and LEAST <= length <= MOST
 

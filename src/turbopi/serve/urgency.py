@@ -20,7 +20,8 @@ class Urgency:
     """What a message says of it.
 
     within    seconds from its arrival to its answer
-    firm      the client said so itself: else it is the server's default, for which nothing is refused
+    firm      the client gave this deadline: a request that can't meet it is refused. False: it is the server's default,
+              for which nothing is refused
     priority  robots come before simulators
     rows      B of a batch message; None: one observation, without a batch axis
     """
