@@ -77,6 +77,10 @@ class Gate:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"the device is lost: {lost}\n")
         return None
 
+    def flush_log(self) -> None:
+        """Say at the end how many lines of the log were left out and not said yet."""
+        self._log.flush()
+
     def _metrics_page(self, connection: ServerConnection, request: Request) -> Response:
         host = _only(request, "Host")
         if self._key is None and (host is None or not self._hosts.has(host)):

@@ -109,8 +109,8 @@ class PolicyServer:
         self._log = LimitedLog(logger)
         hosts = AllowedHosts(options.host, options.allowed_hosts)
         troubles = (lambda: self.lost, lambda: self._calls.unwell)
-        gate = Gate(options.api_key, self.metrics, hosts, *troubles, has_page=options.has_page)
-        self._listener = Listener(gate, self._handle, Shared(self._limits, self.metrics, self._log))
+        self._gate = Gate(options.api_key, self.metrics, hosts, *troubles, has_page=options.has_page)
+        self._listener = Listener(self._gate, self._handle, Shared(self._limits, self.metrics, self._log))
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
@@ -209,6 +209,7 @@ class PolicyServer:
             await self._live.close()
         self._decoder.shutdown(wait=False)
         self._log.flush()
+        self._gate.flush_log()
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
 
