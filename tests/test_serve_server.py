@@ -594,15 +594,17 @@ def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], messa
 # --- start and stop ---------------------------------------------------------------------------------------------------
 
 
+class WarmsUpForLong(FakePolicy):
+    """Its warm-up begins with `started` and ends with `release`."""
+
+    def warmup(self) -> None:
+        self.started.set()
+        assert self.release.wait(120)
+
+
 def test_no_client_gets_in_before_the_warm_up_is_done() -> None:
     async def main() -> None:
-        policy = FakePolicy()
-
-        def warmup() -> None:
-            policy.started.set()
-            assert policy.release.wait(30)
-
-        policy.warmup = warmup  # type: ignore[method-assign]
+        policy = WarmsUpForLong()
         server = PolicyServer(policy, port=0)
         start = asyncio.create_task(server.start())
         await eventually(policy.started.is_set)
@@ -631,13 +633,7 @@ def test_a_port_that_another_server_takes_during_the_warm_up_is_said_and_nothing
     """Linux lets both bind the port, as long as neither listens."""
 
     async def main() -> None:
-        policy = FakePolicy()
-
-        def warmup() -> None:
-            policy.started.set()
-            assert policy.release.wait(30)
-
-        policy.warmup = warmup  # type: ignore[method-assign]
+        policy = WarmsUpForLong()
         late = PolicyServer(policy, port=0, record_dir=tmp_path)
         start = asyncio.create_task(late.start())
         await eventually(policy.started.is_set)
