@@ -201,7 +201,12 @@ class RealTimeClient:
 def _url(host: str, port: int | None) -> str:
     """Raises ConfigError for a host that is something else: another program's URL, a host with its port."""
     if host.startswith(("ws://", "wss://")):
-        return host if port is None else f"{host}:{port}"
+        if port is None:
+            return host
+        url = host.rstrip("/")
+        if "/" in url.partition("://")[2]:
+            raise ConfigError(f"the host is {host!r}, a URL with a path: give the port in it, and not beside it")
+        return f"{url}:{port}"
     if "://" in host:
         raise ConfigError(f"the host is {host!r}; give a name, or a URL that begins with ws:// or wss://")
     if ":" not in host:
@@ -242,4 +247,7 @@ def _printable(text: str) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    return str(error) or type(error).__name__
+    reason = str(error) or type(error).__name__
+    if isinstance(error, InvalidStatus) and error.response.body:
+        reason += f" ({_printable(error.response.body.decode(errors='replace').strip())})"
+    return reason
