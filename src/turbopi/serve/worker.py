@@ -41,14 +41,8 @@ class Worker:
     then the next turn begins while that goes on.
     """
 
-    def __init__(
-        self,
-        schedule: Schedule,
-        run: Callable[[tuple[Request, ...]], Ran] | None = None,
-        clock: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        self.schedule = schedule
-        self._run, self._clock = run, clock
+    def __init__(self, schedule: Schedule, run: Callable[[tuple[Request, ...]], Ran] | None = None) -> None:
+        self.schedule, self._run = schedule, run
         # A queue and not an executor, whose Future costs a turn twice as much as the queue does.
         self._work: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._perform, name="turbopi-inference", daemon=True)
@@ -94,7 +88,7 @@ class Worker:
             return answer
         self._answers[request] = answer
         answer.add_done_callback(partial(self._left, request))
-        self._refuse(self.schedule.add(request, self._clock()))
+        self._refuse(self.schedule.add(request, time.perf_counter()))
         self._next()
         return answer
 
@@ -123,7 +117,7 @@ class Worker:
 
     def _next(self) -> None:
         """Begin the next turn, if it is time for one; else be called again when it may be."""
-        decision = self.schedule.decide(self._clock())
+        decision = self.schedule.decide(time.perf_counter())
         self._refuse(decision.refused)
         self._set_timer(decision.wake)
         if decision.turn:
@@ -132,7 +126,7 @@ class Worker:
 
     def _ended(self, turn: tuple[Request, ...], ran: Ran) -> None:
         self._turns -= 1
-        self.schedule.freed(self._clock(), ran.seconds)
+        self.schedule.freed(time.perf_counter(), ran.seconds)
         for request, answer in zip(turn, ran.answers, strict=True):
             if answer is None and request in self._answers:
                 self.schedule.put_back(request)
@@ -189,7 +183,7 @@ class Worker:
             self._timer.cancel()
             self._timer = None
         if when is not None:
-            self._timer = asyncio.get_running_loop().call_later(max(0.0, when - self._clock()), self._next)
+            self._timer = asyncio.get_running_loop().call_later(max(0.0, when - time.perf_counter()), self._next)
 
     # --- the thread ---------------------------------------------------------------------------------------------------
 
