@@ -122,7 +122,7 @@ class RealTimeClient:
         raise ServerRefused(f"the policy server at {self.url} sent no actions but: {_printable(last)}")
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection, after the call of another thread that is running."""
         with self._lock:
             self._drop()
 

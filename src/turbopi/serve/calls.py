@@ -76,15 +76,25 @@ class Calls(Protocol):
     def waits(self, session: str) -> bool:
         """Whether a request of that session waits: a newer one would replace it."""
 
-    async def warm_up(self, **arguments: Any) -> None: ...
+    async def warm_up(self, **arguments: Any) -> None:
+        """Be ready for requests. `arguments` are those of the policy's `warmup`; raises what it raises."""
 
     def ask(
         self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
-    ) -> "asyncio.Future[list[Outcome]]": ...
+    ) -> "asyncio.Future[list[Outcome]]":
+        """One outcome, once the request had its turn: what is wrong if it gets none. May be cancelled.
+
+        arguments  of the policy's `infer`, besides the observation
+        """
 
     async def ask_rows(
         self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
-    ) -> list[Outcome]: ...
+    ) -> list[Outcome]:
+        """An outcome of each of `rows` observations, up to the first few among which one is wrong.
+
+        make  the request for some rows: of their number, and of the number that come later
+        row   the observation of a row, from 0
+        """
 
     def stop(self) -> None:
         """Turn away the requests that wait, and all that come; what runs goes on."""
@@ -92,7 +102,8 @@ class Calls(Protocol):
     async def drain(self) -> None:
         """Wait for what runs. Call `stop` first."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Ask for nothing more, and let go of threads; they aren't waited for long."""
 
 
 class PolicyCalls:

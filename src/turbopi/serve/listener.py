@@ -143,7 +143,7 @@ class Listener:
             await asyncio.sleep(self._pace.wait())
 
     def _full(self, sock: socket.socket) -> bool:
-        """Whether there is no room for one more; then it is told so. Who hasn't sent its request yet makes room."""
+        """Whether there is no room for one more: then it is told so. Who came first without a request makes room."""
         if len(self._connected) < self._clients_limit + SPARE_CONNECTIONS:
             return False
         for connection in self._opening:

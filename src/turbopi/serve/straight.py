@@ -42,7 +42,7 @@ class SpareBuffer:
 
 
 class StraightFrame:
-    """The payload of one frame while it comes. `room` is where the next bytes go; nothing is left of it at the end."""
+    """The payload of one frame while it comes. `room` is where its next bytes go, and is empty at its end."""
 
     def __init__(self, spare: SpareBuffer, length: int, mask: bytes) -> None:
         self._spare, self._length, self._mask = spare, length, mask
