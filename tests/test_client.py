@@ -96,9 +96,12 @@ def test_a_port_beside_a_url_is_the_urls() -> None:
 
 
 def test_a_server_that_lets_nobody_in_says_why() -> None:
-    with running(Echo(), max_clients=1) as server, RealTimeClient("127.0.0.1", server.port):
-        with pytest.raises(ServerLost, match=r"HTTP 503 .*1 clients, its limit \(--max-clients\); try again later"):
-            RealTimeClient("127.0.0.1", server.port)
+    with (
+        running(Echo(), max_clients=1) as server,
+        RealTimeClient("127.0.0.1", server.port),
+        pytest.raises(ServerLost, match=r"HTTP 503 .*1 clients, its limit \(--max-clients\); try again later"),
+    ):
+        RealTimeClient("127.0.0.1", server.port)
 
 
 @pytest.mark.parametrize("value", [object(), np.array([None]), 2**70])
