@@ -86,6 +86,24 @@ def test_without_a_server_the_error_says_where_and_that_it_may_not_be_warm(host:
         RealTimeClient(host, port)
 
 
+def test_a_port_beside_a_url_is_the_urls() -> None:
+    with running(Echo()) as server:
+        for host in ("ws://127.0.0.1", "ws://127.0.0.1/"):
+            with RealTimeClient(host, server.port) as client:
+                assert client.infer({"place": 2})["actions"] == 2
+    with pytest.raises(ConfigError, match=r"'ws://gpu/robot', a URL with a path: give the port in it"):
+        RealTimeClient("ws://gpu/robot", 8000)
+
+
+def test_a_server_that_lets_nobody_in_says_why() -> None:
+    with (
+        running(Echo(), max_clients=1) as server,
+        RealTimeClient("127.0.0.1", server.port),
+        pytest.raises(ServerLost, match=r"HTTP 503 .*1 clients, its limit \(--max-clients\); try again later"),
+    ):
+        RealTimeClient("127.0.0.1", server.port)
+
+
 @pytest.mark.parametrize("value", [object(), np.array([None]), 2**70])
 def test_what_cannot_be_sent_is_named_by_its_key_and_the_connection_stays(value: object) -> None:
     with running(Echo()) as server, RealTimeClient("127.0.0.1", server.port) as client:
@@ -94,6 +112,16 @@ def test_what_cannot_be_sent_is_named_by_its_key_and_the_connection_stays(value:
         with pytest.raises(ObservationError, match="wrist: can't send "):
             client.infer({"place": 1, "wrist": [{"inner": value}]})
         assert client.infer({"place": 2})["actions"] == 2
+
+
+def test_a_request_that_came_too_late_costs_no_connection() -> None:
+    """With the connection its session would end, and so the running chunk that the server keeps."""
+    with running(Echo()) as server, RealTimeClient("127.0.0.1", server.port) as client:
+        socket = client._socket
+        with pytest.raises(ServerRefused, match="sent no actions but: late: "):
+            client.infer({"place": 1, "turbopi/deadline_ms": 1e-6})
+        assert client.infer({"place": 2})["actions"] == 2
+        assert client._socket is socket
 
 
 def test_a_running_chunk_of_another_kind_is_refused() -> None:

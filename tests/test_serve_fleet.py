@@ -32,6 +32,7 @@ from turbopi.serve.outcome import Outcome
 from turbopi.serve.ray_app import Arguments, build, gpus_for, name_of, read_autoscaling, relay
 from turbopi.serve.remote_calls import RemoteCalls
 from turbopi.serve.replica import Line, Replica
+from turbopi.serve.schedule import Request
 from turbopi.wire import pack, unpack
 
 TINY = ("serve", "--random-weights", "pi05_tiny")
@@ -154,6 +155,17 @@ def test_our_client_keeps_its_connection_too() -> None:
             client.infer(observation())
         client.infer(observation())
         assert client._socket is socket
+
+
+def test_a_request_that_comes_at_the_moment_when_ray_ends_is_answered() -> None:
+    async def main() -> None:
+        calls = RemoteCalls(None, Metrics(), 60.0)
+        answer = calls.ask(Request(0.0, 1.0), observation(), {})
+        calls._lose("Ray's cluster has ended")
+        (outcome,) = await answer
+        assert outcome.wrong == "lost" and outcome.text == "Ray's cluster has ended"
+
+    asyncio.run(main())
 
 
 # --- what may be asked of a fleet -------------------------------------------------------------------------------------

@@ -187,6 +187,7 @@ def test_refused_keys_are_logged_with_the_peer_and_without_the_key(caplog: pytes
     assert re.fullmatch(r"127\.0\.0\.1:\d+ refused: it sent a wrong API key", lines[0])
     assert len(lines) <= 20, "the log of refused keys has no limit"
     assert not any("hunter2" in line or "secret" in line for line in lines)
+    assert re.fullmatch(r"\d+ lines were left out", lines[-1]), "the server's end says what the limit left out"
 
 
 def test_a_limited_log_says_how_much_it_left_out(caplog: pytest.LogCaptureFixture) -> None:

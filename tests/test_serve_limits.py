@@ -289,6 +289,29 @@ def test_a_server_without_descriptors_tries_on_quietly(
     assert 1 <= len(lines) <= 100
 
 
+def test_a_client_that_left_before_it_was_taken_ends_no_accepting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """macOS has no options for such a socket: setting TCP_NODELAY fails."""
+    left: list[socket.socket] = []
+
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        loop = asyncio.get_running_loop()
+        take = loop.connect_accepted_socket
+
+        async def connect_accepted_socket(make: Any, sock: socket.socket) -> Any:
+            if not left:
+                left.append(sock)
+                raise OSError(errno.EINVAL, "Invalid argument")
+            return await take(make, sock)
+
+        monkeypatch.setattr(loop, "connect_accepted_socket", connect_accepted_socket)
+        async with raw(server, b"") as gone, client(server) as good:
+            assert await gone.ended() == b""
+            await infer(good, observation())
+
+    served(test)
+    assert left[0].fileno() == -1
+
+
 def test_new_connections_come_at_a_rate_that_is_allowed() -> None:
     now = 0.0
     pace = AtMost(10, clock=lambda: now)

@@ -594,15 +594,17 @@ def test_options_that_cannot_be_right_are_refused(options: dict[str, Any], messa
 # --- start and stop ---------------------------------------------------------------------------------------------------
 
 
+class WarmsUpForLong(FakePolicy):
+    """Its warm-up begins with `started` and ends with `release`."""
+
+    def warmup(self) -> None:
+        self.started.set()
+        assert self.release.wait(120)
+
+
 def test_no_client_gets_in_before_the_warm_up_is_done() -> None:
     async def main() -> None:
-        policy = FakePolicy()
-
-        def warmup() -> None:
-            policy.started.set()
-            assert policy.release.wait(30)
-
-        policy.warmup = warmup  # type: ignore[method-assign]
+        policy = WarmsUpForLong()
         server = PolicyServer(policy, port=0)
         start = asyncio.create_task(server.start())
         await eventually(policy.started.is_set)
@@ -625,6 +627,29 @@ def test_a_taken_port_is_said_before_the_warm_up() -> None:
     ):
         pass
     assert not policy.warmed_up
+
+
+def test_a_port_that_another_server_takes_during_the_warm_up_is_said_and_nothing_is_left_open(tmp_path: Path) -> None:
+    """Linux lets both bind the port, as long as neither listens."""
+
+    async def main() -> None:
+        policy = WarmsUpForLong()
+        late = PolicyServer(policy, port=0, record_dir=tmp_path)
+        start = asyncio.create_task(late.start())
+        await eventually(policy.started.is_set)
+        async with PolicyServer(FakePolicy(), port=late.port) as first:
+            policy.release.set()
+            with pytest.raises(ConfigError, match=rf"can't listen on {first.url}: .*in use.*another --host or --port"):
+                await start
+        assert not any(thread.name == "turbopi-recorder" for thread in threading.enumerate())
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("host", ["robot..lab", "x" * 70])
+def test_a_host_that_is_no_name_is_refused_in_words(host: str) -> None:
+    with pytest.raises(ConfigError, match=r"can't listen on ws://.*another --host"), running(FakePolicy(), host=host):
+        pass
 
 
 def test_a_failing_warm_up_ends_the_start() -> None:
@@ -738,10 +763,12 @@ def test_run_prints_the_address_and_ends_cleanly_on_a_signal(number: signal.Sign
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_second_signal_ends_a_server_whose_inference_hangs(number: signal.Signals, tmp_path: Path) -> None:
     async def call(url: str, process: subprocess.Popen[str]) -> None:
+        port = int(url.rpartition(":")[2])
         async with connect(url) as connection:
             await connection.recv()
             await connection.send(pack(observation("hold")))
-            await asyncio.sleep(0.2)
+            while "turbopi_inference_in_progress 1.0" not in (await http_get(port, "/metrics"))[2]:
+                await asyncio.sleep(0.01)
             process.send_signal(number)
             assert process.stdout is not None
             assert "Stopping" in await asyncio.to_thread(process.stdout.readline)

@@ -30,6 +30,7 @@ _REFUSALS: dict[str, type[TurboPiError]] = {
     "bad actions: ": ActionError,
     "the device is lost: ": DeviceLost,
 }
+_KEEPS_CONNECTION = ("busy: ", "late: ", "replaced: ", "the replica is lost: ")  # as do _REFUSALS
 _KEPT_BYTES = 8 * 2**20
 
 
@@ -115,13 +116,13 @@ class RealTimeClient:
         for beginning, kind in _REFUSALS.items():
             if text.startswith(beginning):
                 raise kind(_printable(text.removeprefix(beginning)))
-        if not text.startswith(("busy: ", "the replica is lost: ")):
-            self._drop()  # a server that sends a traceback closes the connection
+        if not text.startswith(_KEEPS_CONNECTION):
+            self._drop()  # a server that stops or sends a traceback closes the connection
         last = (text.strip().splitlines() or ["nothing"])[-1]
         raise ServerRefused(f"the policy server at {self.url} sent no actions but: {_printable(last)}")
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection, after the call of another thread that is running."""
         with self._lock:
             self._drop()
 
@@ -200,7 +201,12 @@ class RealTimeClient:
 def _url(host: str, port: int | None) -> str:
     """Raises ConfigError for a host that is something else: another program's URL, a host with its port."""
     if host.startswith(("ws://", "wss://")):
-        return host if port is None else f"{host}:{port}"
+        if port is None:
+            return host
+        url = host.rstrip("/")
+        if "/" in url.partition("://")[2]:
+            raise ConfigError(f"the host is {host!r}, a URL with a path: give the port in it, and not beside it")
+        return f"{url}:{port}"
     if "://" in host:
         raise ConfigError(f"the host is {host!r}; give a name, or a URL that begins with ws:// or wss://")
     if ":" not in host:
@@ -241,4 +247,7 @@ def _printable(text: str) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    return str(error) or type(error).__name__
+    reason = str(error) or type(error).__name__
+    if isinstance(error, InvalidStatus) and error.response.body:
+        reason += f" ({_printable(error.response.body.decode(errors='replace').strip())})"
+    return reason

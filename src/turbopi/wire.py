@@ -239,8 +239,9 @@ def _check_structure(data: bytes) -> list[tuple[int, int, int]]:
 
 
 def _set_aside(data: bytes, places: list[tuple[int, int, int]]) -> tuple[bytes, list[memoryview]]:
-    """`data` without the bins at `places`, and those. msgpack copies a bin; here it finds the bin's number instead, as
-    an extension value, of which a message has none.
+    """`data` with a number in place of each bin at `places`, and the bins as views: msgpack would copy them.
+
+    The number is an extension value. A message has none of its own: `_check_structure` refuses them.
     """
     if not places:
         return data, []
@@ -268,9 +269,9 @@ _OPEN = frozenset((dict, list, memoryview))
 
 
 def _restore(value: Any, path: tuple[Any, ...]) -> Any:
-    """Turn the maps that stand for arrays and scalars into those, and what was set aside and is none into bytes.
+    """Turn maps that stand for arrays and scalars into these, and bins that were set aside alone into bytes.
 
-    `path` is where `value` is, for the messages.
+    path  of `value` in the message, for errors
     """
     if isinstance(value, memoryview):
         return bytes(value)

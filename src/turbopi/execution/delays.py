@@ -27,6 +27,7 @@ class DelayEstimate:
         self._initial = _checked(steps)
 
     def add(self, steps: int) -> None:
+        """A delay was measured, in control steps. Raises ConfigError for what is none, as `begin` does."""
         self._measured.append(_checked(steps))
 
     @property

@@ -1,8 +1,8 @@
 """What a message to a policy server says about real-time execution: optional keys beside the observation's own.
 
-Others, about the scheduling of the request, are only named here.
 docs/serving.md has them as a table. Any client of openpi's protocol can send them; a server of another make refuses or
-ignores them, so a client looks for "real_time" in the server's metadata first.
+ignores them, so a client looks for "real_time" in the server's metadata first. The keys about when a request wants its
+answer (SCHEDULING_KEYS) are only named here: serve/urgency.py reads them.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ MAX_SESSION = 64  # characters
 MAX_STEP = 2**53
 MAX_ACTION = float(np.sqrt(np.finfo(np.float32).max))  # of a normalised one: the model's norms square it in float32
 MAX_SEED = 2**64 - 1
-SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch")  # serve/urgency.py reads them
+SCHEDULING_KEYS = ("deadline_ms", "control_hz", "left", "priority", "batch")
 KEYS = (
     *("model_actions", "previous", "anchor", "delay", "execution_horizon", "mode", "schedule", "max_guidance_weight"),
     *("session", "step", "reset", "seed"),
@@ -34,8 +34,9 @@ class Asked:
 
     previous           the running chunk, if the client keeps it itself
     model_actions      the answer shall have "model_actions", and "anchor" for relative actions
-    mode, delay, execution_horizon, schedule, max_guidance_weight
-                       how to join, if the server keeps the running chunk
+    mode, delay, execution_horizon
+                       how to join, if the server keeps the running chunk; the latter two in control steps
+    guidance           {"schedule": …, "max_guidance_weight": …}, those of them that were given
     session            its name; None: the connection is the session
     step               actions that the robot has carried out in this session when the observation was taken
     reset              a new episode: the session's running chunk is forgotten
@@ -60,7 +61,10 @@ def message(
     model_actions: bool = False,
     seed: int | None = None,
 ) -> dict[str, Any]:
-    """The observation with what `UnifiedPolicy.infer` would be told beside it."""
+    """The message to send: the observation, and the arguments of `UnifiedPolicy.infer` under their keys.
+
+    `read_message` is its inverse.
+    """
     asked: dict[str, Any] = {} if seed is None else {"seed": seed}
     if model_actions:
         asked["model_actions"] = True
@@ -107,31 +111,12 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
         raise ObservationError(
             f"{PREFIX}session is {session!r:.100}; it should be text of 1 to {MAX_SESSION} characters"
         )
+    left_over = _left_over(given)
+    anchor = _numbers(given, "anchor", np.float64) if "anchor" in given else None
     previous = None
-    if "previous" in given:
-        left_over = _numbers(given, "previous")
-        if left_over.ndim != 2 or not len(left_over):
-            raise ObservationError(
-                f"{PREFIX}previous has shape {list(left_over.shape)}; it should be float32 [K, action_dim], the "
-                'rows of "model_actions" that are left when the observation is taken'
-            )
-        if (too_large := np.abs(left_over) > MAX_ACTION).any():
-            raise ObservationError(
-                f"{_first(left_over, too_large, 'previous')}, whose square isn't finite in float32, in which the model "
-                'computes. It should be rows of "model_actions", which are normalised: most are from -1 to 1'
-            )
-        if mode is None or delay is None:
-            missing = "mode" if mode is None else "delay"
-            raise ObservationError(f"{PREFIX}previous came without {PREFIX}{missing}: give both mode and delay")
-        if session is not None:
-            raise ObservationError(
-                f"{PREFIX}previous and {PREFIX}session were both given: either the client keeps the running chunk, or "
-                "the server does"
-            )
-        anchor = _numbers(given, "anchor", np.float64) if "anchor" in given else None
+    if left_over is not None:
+        assert delay is not None  # else `_left_over` refuses
         previous = RunningChunk(left_over, delay, horizon, cast("JoinMode", mode), anchor, **guidance)
-    elif "anchor" in given:
-        raise ObservationError(f"{PREFIX}anchor came without {PREFIX}previous, to which it belongs")
     asked = Asked(
         previous=previous,
         model_actions=_flag(given, "model_actions"),
@@ -147,7 +132,36 @@ def read_message(received: Mapping[str, Any]) -> tuple[dict[str, Any], Asked]:
     return observation, asked
 
 
+def _left_over(given: Mapping[str, Any]) -> np.ndarray | None:
+    """float32[K, A], the rows of the running chunk that the client keeps; None if it keeps none."""
+    if "previous" not in given:
+        if "anchor" in given:
+            raise ObservationError(f"{PREFIX}anchor came without {PREFIX}previous, to which it belongs")
+        return None
+    left_over = _numbers(given, "previous")
+    if left_over.ndim != 2 or not len(left_over):
+        raise ObservationError(
+            f"{PREFIX}previous has shape {list(left_over.shape)}; it should be float32 [K, action_dim], the "
+            'rows of "model_actions" that are left when the observation is taken'
+        )
+    if (too_large := np.abs(left_over) > MAX_ACTION).any():
+        raise ObservationError(
+            f"{_first(left_over, too_large, 'previous')}, whose square isn't finite in float32, in which the model "
+            'computes. It should be rows of "model_actions", which are normalised: most are from -1 to 1'
+        )
+    for needed in ("mode", "delay"):
+        if given.get(needed) is None:
+            raise ObservationError(f"{PREFIX}previous came without {PREFIX}{needed}: give both mode and delay")
+    if given.get("session") is not None:
+        raise ObservationError(
+            f"{PREFIX}previous and {PREFIX}session were both given: either the client keeps the running chunk, or "
+            "the server does"
+        )
+    return left_over
+
+
 def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of `RunningChunk` that say how guidance works, as far as they were given."""
     guidance: dict[str, Any] = {}
     if "schedule" in given:
         schedule = given["schedule"]
@@ -166,7 +180,7 @@ def _guidance(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def as_number(value: object) -> int | float | None:
-    """A message's number, also one of NumPy or of an array without axes; None for all else: booleans, times."""
+    """A message's number: Python's, NumPy's, or an array's without axes. None for all else: booleans, times."""
     if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 and value.dtype.kind in "iuf":
         value = value.item()
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
@@ -200,6 +214,6 @@ def _numbers(given: Mapping[str, Any], key: str, dtype: type[np.floating[Any]] =
 
 
 def _first(values: np.ndarray, wrong: np.ndarray, key: str) -> str:
-    """What is said of the first wrong one of an array."""
+    """The beginning of an error's text: the first value that is `wrong`, and its place."""
     place = tuple(int(axis) for axis in np.argwhere(wrong)[0])
     return f"{PREFIX}{key} has {float(values[place]):.3g} at {list(place)}"

@@ -76,7 +76,10 @@ class Action(NamedTuple):
 
 @dataclass(frozen=True)
 class Seam:
-    """Where a chunk takes over from another. In the robot's units; see `Action` for the first of all chunks."""
+    """Where a chunk takes over from another; `jump` and `gap` are in the robot's units.
+
+    The first chunk of an episode follows no command and has none: `Action.takes_over` tells of it.
+    """
 
     step: int  # control steps before it
     chunk: int
@@ -110,7 +113,8 @@ class ChunkQueue:
     old_weight           "ensemble": the running chunk's part of the mean; LeRobot's default
     schedule, max_guidance_weight
                          of the guided ways, as in RunningChunk. None: the policy's
-    policys_guidance     where guidance ends is left to the policy's own execution horizon (LeRobot's rtc_config)
+    policys_guidance     True: the policy isn't told s, so guidance ends by its own execution horizon (LeRobot's
+                         rtc_config)
 
     A fixed delay d and the horizons must fit: d ≤ s and d ≤ H − s for the "rtc" ways, else ConfigError, at the latest
     when the first chunk shows H. An estimate that is larger for a while is cut to what fits: `cut_delays` counts.
@@ -174,7 +178,7 @@ class ChunkQueue:
         """s; 1 as long as neither it nor H is known."""
         if self._s is not None:
             return self._s
-        return 1 if self.horizon is None else max(1, self.horizon // 2)
+        return 1 if self.horizon is None else default_execution_horizon(self.horizon)
 
     @property
     def in_flight(self) -> Request | None:
@@ -212,13 +216,14 @@ class ChunkQueue:
                 f"the execution horizon is {self._s}, but the policy's chunks have {horizon} actions: "
                 f"choose an execution horizon from 1 to {horizon}"
             )
-        s = max(1, horizon // 2) if self._s is None else self._s
+        half = default_execution_horizon(horizon)
+        s = half if self._s is None else self._s
         d = self._delay.steps
         if self.way.mode is not None and self._fixed and d > min(s, horizon - s):
             raise ConfigError(
                 f"a delay of {d} control steps doesn't fit an execution horizon of s = {s} and chunks of H = {horizon} "
                 f"actions: {self.way.name} needs delay ≤ s and delay ≤ H − s, so at most {min(s, horizon - s)} here "
-                f"(at most {horizon // 2} with s = {max(1, horizon // 2)}). Choose another execution horizon, "
+                f"(at most {horizon // 2} with s = {half}). Choose another execution horizon, "
                 "a lower control rate, or fewer denoising steps"
             )
 
@@ -433,6 +438,11 @@ class ChunkQueue:
         if self._running is None or self._row >= len(self._running.actions):
             return None
         return self._running.actions[self._row]
+
+
+def default_execution_horizon(horizon: int) -> int:
+    """s, control steps, of chunks of `horizon` actions: half."""
+    return max(1, horizon // 2)
 
 
 def _horizon(s: int) -> int:

@@ -10,7 +10,8 @@ from typing import Any, Protocol
 class Inference(Protocol):
     """Runs one call after the other, somewhere else."""
 
-    def begin(self, call: Callable[[], Any]) -> "Future[Any]": ...
+    def begin(self, call: Callable[[], Any]) -> "Future[Any]":
+        """Have it run after those that were begun before. The Future gets what it returns or raises."""
 
     def close(self, timeout_s: float) -> bool:
         """Take no more calls. Whether the running one ended in time."""

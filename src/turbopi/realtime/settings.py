@@ -11,6 +11,7 @@ Hold = Literal["last"] | np.ndarray | None
 
 
 def above_zero(name: str, value: float, most: float = math.inf) -> float:
+    """`value` as a float. Raises ConfigError, with its `name`, unless it is a finite number above 0, at most `most`."""
     number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
     if not number or not 0 < value < math.inf or value > most:
         limit = "" if most == math.inf else f", at most {most:g}"
@@ -19,9 +20,9 @@ def above_zero(name: str, value: float, most: float = math.inf) -> float:
 
 
 def checked_hold_action(given: object, on_empty: str) -> Hold:
-    """Raises ConfigError for what is none."""
+    """The executor's `hold_action`: "last", float64[d] or None. Raises ConfigError for anything else."""
     if given is None:
-        return "last" if on_empty == "slow_down" else None  # which is for absolute positions
+        return "last" if on_empty == "slow_down" else None  # slowing down is for absolute positions, as "last" is
     if isinstance(given, str):
         if given == "last":
             return "last"

@@ -1,4 +1,4 @@
-"""From a decoded message to what the policy is asked for, and from what became of it to the answer."""
+"""Turns a decoded message into requests for the policy, and their outcomes into the answer."""
 
 import asyncio
 import time
@@ -21,7 +21,7 @@ from turbopi.serve.urgency import Urgency, check_batch, read_urgency
 
 @dataclass(frozen=True)
 class Asking:
-    """What a message asks for. `Askings.release` it once its outcomes are there."""
+    """What a message asks for. Give it to `Askings.release` once its outcomes are there."""
 
     plan: Plan
     urgency: Urgency
@@ -74,7 +74,7 @@ class Askings:
                 session=plan.name,
                 rows=rows,
                 later=later,
-                alone=connection.bad_in_a_row > 0,  # what follows a bad one had better not spoil a batch
+                alone=connection.bad_in_a_row > 0,  # after a bad one it is likely bad, too: it must spoil no batch
             )
 
         if urgency.rows is None:

@@ -5,9 +5,9 @@ from bisect import bisect_left, insort
 from collections import deque
 
 KEPT = 50  # times of one size, the last ones
-FEW = 3  # times that a size needs to be known by what runs
+FEW = 3  # recent runs that a size needs: with fewer, its times of the warm-up count
 FRESH_SECONDS = 60.0  # a size that didn't run for so long has its times of the warm-up again
-GAIN = 0.95  # of B * T(1): a batch must be sooner than that, so that noise of a few percent forms none
+GAIN = 0.95  # a batch must take less than 0.95 * B * T(1): measurement noise of a few percent must form none
 TYPICAL, SAFE = 0.5, 0.95  # quantiles: what is expected; what nearly every run keeps
 
 
@@ -26,8 +26,8 @@ class _Times:
         insort(self._sorted, seconds)
         self.last = now
 
-    def tell(self, now: float) -> bool:
-        """Whether there are enough of them, and not too old."""
+    def reliable(self, now: float) -> bool:
+        """Whether there are enough of them, and the last one isn't too old."""
         return len(self._in_time) >= FEW and now - self.last <= FRESH_SECONDS
 
     def quantile(self, part: float) -> float:
@@ -50,8 +50,8 @@ class BatchTimes:
         self.largest = largest
         self._warm: dict[int, _Times] = {}
         self._recent: dict[int, _Times] = {}
-        # What was found, which holds from and until these moments, as long as nothing is added: whoever forms batches
-        # asks again and again, while clients wait.
+        # Answers that were given, as the schedule asks the same again and again while clients wait. They hold from the
+        # one moment to the other, and until a time is added.
         self._seconds: dict[tuple[int, float], float | None] = {}
         self._totals: dict[int, float] = {}
         self._found_from, self._found_until = math.inf, -math.inf
@@ -98,11 +98,11 @@ class BatchTimes:
             self._seconds, self._totals = {}, {}
             self._found_from = now
             self._found_until = min(
-                (times.last + FRESH_SECONDS for times in self._recent.values() if times.tell(now)), default=math.inf
+                (times.last + FRESH_SECONDS for times in self._recent.values() if times.reliable(now)), default=math.inf
             )
 
     def _times(self, rows: int, now: float) -> _Times | None:
-        good = {size: times for size, times in self._recent.items() if times.tell(now)}
+        good = {size: times for size, times in self._recent.items() if times.reliable(now)}
         of_size = self._warm | good or self._recent  # before anything is known well, what there is
         size = min((size for size in of_size if size >= rows), default=None)
         return None if size is None else of_size[size]

@@ -76,15 +76,25 @@ class Calls(Protocol):
     def waits(self, session: str) -> bool:
         """Whether a request of that session waits: a newer one would replace it."""
 
-    async def warm_up(self, **arguments: Any) -> None: ...
+    async def warm_up(self, **arguments: Any) -> None:
+        """Be ready for requests. `arguments` are those of the policy's `warmup`; raises what it raises."""
 
     def ask(
         self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
-    ) -> "asyncio.Future[list[Outcome]]": ...
+    ) -> "asyncio.Future[list[Outcome]]":
+        """One outcome, once the request had its turn: what is wrong if it gets none. May be cancelled.
+
+        arguments  of the policy's `infer`, besides the observation
+        """
 
     async def ask_rows(
         self, make: Callable[[int, int], Request], row: Callable[[int], dict[str, Any]], rows: int
-    ) -> list[Outcome]: ...
+    ) -> list[Outcome]:
+        """An outcome of each of `rows` observations, up to the first few among which one is wrong.
+
+        make  the request for some rows: of their number, and of the number that come later
+        row   the observation of a row, from 0
+        """
 
     def stop(self) -> None:
         """Turn away the requests that wait, and all that come; what runs goes on."""
@@ -92,7 +102,8 @@ class Calls(Protocol):
     async def drain(self) -> None:
         """Wait for what runs. Call `stop` first."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Ask for nothing more, and let go of threads; they aren't waited for long."""
 
 
 class PolicyCalls:
@@ -208,11 +219,11 @@ class PolicyCalls:
                 self._infer_batch([example] * size, [arguments] * size)
             return time.perf_counter() - started
 
-        at_will = self._asked_for is not None
-        if not at_will and (times.seconds(1, 0.0) or 0.0) * size * MEASURED > SIZE_SECONDS:
+        asked_for = self._asked_for is not None
+        if not asked_for and (times.seconds(1, 0.0) or 0.0) * size * MEASURED > SIZE_SECONDS:
             return False
         first = run()
-        if not at_will and size == 1 and first * MEASURED > SIZE_SECONDS:
+        if not asked_for and size == 1 and first * MEASURED > SIZE_SECONDS:
             return False
         for _ in range(MEASURED):
             times.measured(size, run())
@@ -289,13 +300,13 @@ class PolicyCalls:
         for call in calls:
             answers.append(outcomes[at : at + len(call.observations)])
             at += len(call.observations)
-        return Ran(answers, _told(outcomes))
+        return Ran(answers, _turn_seconds(outcomes))
 
     def _run_one(self, call: _Call) -> Ran:
         if len(call.observations) > 1:
             self._metrics.batch_size.observe(len(call.observations))
             if outcomes := self._together(call.observations, [{}] * len(call.observations)):
-                return Ran([outcomes], _told(outcomes))
+                return Ran([outcomes], _turn_seconds(outcomes))
             return Ran([[self._infer(observation, {}) for observation in call.observations]])
         self._metrics.batch_size.observe(1)
         (observation,) = call.observations
@@ -304,7 +315,7 @@ class PolicyCalls:
             future = self._submit(observation)
             return Ran([future], time.perf_counter() - started)
         outcome = self._infer(observation, call.arguments)
-        return Ran([[outcome]], _told([outcome]))
+        return Ran([[outcome]], _turn_seconds([outcome]))
 
     def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Outcome:
         return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments))
@@ -419,7 +430,7 @@ def _checked(result: Any) -> dict[str, Any]:
     return result
 
 
-def _told(outcomes: Sequence[Outcome]) -> float | None:
+def _turn_seconds(outcomes: Sequence[Outcome]) -> float | None:
     """The seconds of a turn, if all of it was one run with actions."""
     good = all(outcome.wrong is None and outcome.together == len(outcomes) for outcome in outcomes)
     return outcomes[0].seconds if good else None

@@ -27,8 +27,8 @@ from turbopi.wire import Unpacker
 AHEAD = 2  # messages of one client: one that is computed, one that waits
 READ_BYTES = 512 * 1024  # at most, in one read of a socket: two pictures of 224 x 224 are 300 KB
 BYTES_OF_ONE_WORK = 65536
-BREATH_SECONDS = 0.002  # 128 MB a second and more: who sent too much shall come to read why it is closed
-WORK_OF_A_SECOND = 4000.0  # that a message keeps the event loop busy: all who are slowed get a fifth of its time
+BREATH_SECONDS = 0.002  # between reads of what is thrown away: 128 MB/s and more, so that a client gets to read why
+WORK_OF_A_SECOND = 4000.0  # of decoding: 5 * Limits.work_total_rate, so all who are slowed get a fifth of the loop
 WORK_OF_A_REFUSAL = 3.0  # to find out what is wrong, say and log it
 
 
@@ -160,7 +160,7 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
             self._go_on(b"")
 
     def data_received(self, data: bytes | memoryview) -> None:
-        """What was read elsewhere than into `get_buffer`: uvloop, for one, never asks for it."""
+        """Bytes that weren't read into the buffer of `get_buffer`: uvloop, for one, never asks for that."""
         if self._head is not None:
             data = self._http(bytes(data))
             if not data:
@@ -250,9 +250,9 @@ class GuardedConnection(ServerConnection, asyncio.BufferedProtocol):
         self._watch_progress(holding)
 
     def _scan(self) -> bool:
-        """Hand over what may be handled now of what is held; whether the rest must wait (if not, it is half a header).
+        """Hand over as much of what is held as may be handled now. Returns whether the rest must wait.
 
-        The library gets it in one piece, but for frames that go straight.
+        A rest that needn't wait is half a header. The library gets all in one piece, but for frames that go straight.
         """
         data, at, begun, waits = self._held, 0, 0, False  # the library's next piece begins at `begun`
         while at < len(data):

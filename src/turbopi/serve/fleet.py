@@ -153,12 +153,12 @@ def _silent_about_its_token() -> Iterator[None]:
     The token stays on. Ray's own setting for silence, RAY_AUTH_MODE=token, would have to be in the environment before
     Ray is imported, and then clusters without a token could no longer be joined.
     """
-    logger = logging.getLogger(TOKEN_LOGGER)
-    logger.addFilter(_isnt_about_its_token)
+    rays = logging.getLogger(TOKEN_LOGGER)
+    rays.addFilter(_isnt_about_its_token)
     try:
         yield
     finally:
-        logger.removeFilter(_isnt_about_its_token)
+        rays.removeFilter(_isnt_about_its_token)
 
 
 def _isnt_about_its_token(record: logging.LogRecord) -> bool:

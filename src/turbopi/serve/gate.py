@@ -2,7 +2,7 @@
 
 import hmac
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 
 from websockets.asyncio.server import ServerConnection
@@ -12,7 +12,7 @@ from turbopi.serve.hosts import AllowedHosts
 from turbopi.serve.limited_log import LimitedLog, peer
 from turbopi.serve.metrics import CONTENT_TYPE, Metrics
 from turbopi.serve.options import check_key
-from turbopi.serve.page.http import document, is_feed, is_page, page_key
+from turbopi.serve.page.http import asked_for, document, is_feed, is_page, page_key
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class Gate:
 
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a plain HTTP request, or None to go on with the websocket handshake."""
-        path, lost = request.path.partition("?")[0], self._why_lost()
+        path, lost = asked_for(request), self._why_lost()
         if len(request.headers.get_all("Host")) > 1:  # which of them a proxy has checked, nobody knows
             return connection.respond(HTTPStatus.BAD_REQUEST, "A request has one Host header.\n")
         if path == "/healthz":
@@ -77,25 +77,22 @@ class Gate:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"the device is lost: {lost}\n")
         return None
 
+    def flush_log(self) -> None:
+        """Say at the end how many lines of the log were left out and not said yet."""
+        self._log.flush()
+
     def _metrics_page(self, connection: ServerConnection, request: Request) -> Response:
         host = _only(request, "Host")
         if self._key is None and (host is None or not self._hosts.has(host)):
             # A page's GET of its own origin has no Origin, so a rebound name shows in Host alone
             return self._forbidden(connection, f"/metrics is not for {_short(host)}")
-        response = connection.respond(HTTPStatus.OK, self._metrics.text())
-        del response.headers["Content-Type"]
-        response.headers["Content-Type"] = CONTENT_TYPE
-        return response
+        return _found(connection, {"Content-Type": CONTENT_TYPE}, self._metrics.text())
 
     def _page(self, connection: ServerConnection, request: Request) -> Response:
         host = _only(request, "Host")
         if host is None or not self._hosts.has(host):
             return self._forbidden(connection, f"the page is not for {_short(host)}")
-        headers, text = document(needs_key=self._key is not None)
-        response = connection.respond(HTTPStatus.OK, text)
-        del response.headers["Content-Type"]
-        response.headers.update(headers)
-        return response
+        return _found(connection, *document(needs_key=self._key is not None))
 
     def _forbidden(self, connection: ServerConnection, why: str) -> Response:
         self._metrics.error("origin")
@@ -120,6 +117,14 @@ class Gate:
             scheme, key = "api-key", page_key(request) or ""
         given = key.strip().encode(errors="replace")
         return scheme.lower() == "api-key" and hmac.compare_digest(given, self._key)  # in constant time
+
+
+def _found(connection: ServerConnection, headers: Mapping[str, str], text: str) -> Response:
+    """`text` with these headers, a Content-Type among them."""
+    response = connection.respond(HTTPStatus.OK, text)
+    del response.headers["Content-Type"]  # a second one would be added, not put in its place
+    response.headers.update(headers)
+    return response
 
 
 def _only(request: Request, name: str) -> str | None:

@@ -64,13 +64,16 @@ def limits_for(max_message_mb: float, max_clients: int, others: Limits | None) -
 
 
 class WorkPool:
-    """How many connections are slowed at the moment: they share `total_rate`. And what newcomers wait for.
+    """The rate of work that slowed connections share, and how long new connections wait.
 
-    Who leaves when it is slowed and comes back would never be slowed. So work that led to nothing, beyond `total_rate`,
-    makes all who come then wait until it has leaked away, one after the other. Who is there already notices nothing.
+    A client that leaves when it is slowed and connects again would never be slowed. So work that led to nothing is
+    counted, and leaks away at `total_rate`. A new connection waits until all is gone; connections that are there
+    already don't.
+
+    total_rate  work a second
     """
 
-    LONGEST_WAIT = 5.0  # seconds. Who waits so long holds a place among the clients, which are counted
+    LONGEST_WAIT = 5.0  # seconds; not more, as who waits takes a client's place
     NEWCOMER = 30.0  # work that a newcomer is expected to waste while others do
 
     def __init__(self, total_rate: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -96,6 +99,7 @@ class WorkPool:
         self._wasted, self._at = max(0.0, self._wasted - (now - self._at) * self.total_rate), now
 
     def share(self) -> float:
+        """Work a second that one slowed connection may cause."""
         return self.total_rate / max(self.slowed, 1)
 
 
@@ -116,6 +120,7 @@ class Credit:
 
     @property
     def spent(self) -> bool:
+        """Whether nothing more should be read now."""
         return self._level <= 0 or self._clock() < self._opens
 
     def spend(self, work: float) -> None:
@@ -140,6 +145,7 @@ class Credit:
         return (self.BATCH - self._level) / self._current_rate()
 
     def close(self) -> None:
+        """The connection has ended, and shares the pool's rate no more."""
         self._set_slowed(False)
 
     def _current_rate(self) -> float:
@@ -151,7 +157,7 @@ class Credit:
 
 
 class MemoryBudget:
-    """Bytes that all connections share. Who doesn't get its part is called when some came free."""
+    """Bytes that all connections share. A connection that doesn't get its part is called once some are free."""
 
     def __init__(self, total: int) -> None:
         self.total = total

@@ -56,7 +56,10 @@ class Listener:
     # --- lifecycle ----------------------------------------------------------------------------------------------------
 
     async def bind(self, host: str, port: int) -> int:
-        """Take the port on all addresses of `host`, and return it. Nobody can connect yet. Raises OSError."""
+        """Take the port on all addresses of `host`, and return it. Nobody can connect yet.
+
+        Raises OSError, and UnicodeError for a `host` that can't be a name.
+        """
         loop = asyncio.get_running_loop()
         found = await loop.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         for family, kind, protocol, _, address in dict.fromkeys(found):
@@ -84,7 +87,7 @@ class Listener:
         return port
 
     def start(self) -> None:
-        """Let clients in."""
+        """Let clients in. Raises OSError if another process listens on the port by now."""
         room = room_for_connections(self._clients_limit + SPARE_CONNECTIONS) - SPARE_CONNECTIONS
         if room < self._clients_limit:
             self._clients_limit = max(room, 1)
@@ -133,11 +136,14 @@ class Listener:
             if self._full(sock):
                 sock.close()
             else:
-                await loop.connect_accepted_socket(self._new_connection, sock)
+                try:
+                    await loop.connect_accepted_socket(self._new_connection, sock)
+                except OSError:  # its client has left: on macOS setting TCP_NODELAY fails then
+                    sock.close()
             await asyncio.sleep(self._pace.wait())
 
     def _full(self, sock: socket.socket) -> bool:
-        """Whether there is no room for one more; then it is told so. Who hasn't sent its request yet makes room."""
+        """Whether there is no room for one more: then it is told so. Who came first without a request makes room."""
         if len(self._connected) < self._clients_limit + SPARE_CONNECTIONS:
             return False
         for connection in self._opening:

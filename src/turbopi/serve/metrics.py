@@ -133,6 +133,7 @@ class Metrics:
             self._refused.labels(wrong, priority).inc()
 
     def slack(self, seconds: float, priority: str) -> None:
+        """An answer was sent `seconds` before its request's deadline; below 0: after it, a miss."""
         self._slack.labels(priority).observe(seconds)
         if seconds < 0:
             self._misses.labels(priority).inc()

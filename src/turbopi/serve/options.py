@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # `turbopi --help` needs no NumPy
 
 MAX_BATCH = 64
 MAX_DEADLINE_MS = 60_000.0  # of options and requests, so that nobody waits behind others for ever
+MAX_CONTROL_HZ = 10_000.0
 JOINING = ("rtc", "rtc_identity", "rtc_trained")
 
 
@@ -77,8 +78,8 @@ class ServerOptions:
             )
         if self.execution is not None and self.control_hz is None:
             raise ConfigError(f"execution={self.execution!r} needs the robots' control rate, too: give control_hz=")
-        if self.control_hz is not None and not 0 < self.control_hz <= 10_000:
-            raise ConfigError(f"control_hz={self.control_hz:g} should be more than 0 and at most 10000")
+        if self.control_hz is not None and not 0 < self.control_hz <= MAX_CONTROL_HZ:
+            raise ConfigError(f"control_hz={self.control_hz:g} should be more than 0 and at most {MAX_CONTROL_HZ:g}")
         if self.execution_horizon is not None and self.execution_horizon < 1:
             raise ConfigError(f"execution_horizon={self.execution_horizon} should be 1 or more")
         if self.delay_steps is not None and self.delay_steps < 0:

@@ -8,15 +8,15 @@ Wrong = Literal["observation", "actions", "lost", "replica", "policy", "busy", "
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of it: a `result`, or what is `wrong` and the `text` about it.
+    """A `result`, or what is `wrong` and the `text` about it.
 
     wrong    "observation": the client's fault; "actions": the model gave none that a robot may get; "lost": the device
-             failed for good; "replica": of several processes the one that had it gave no answer; "policy": anything
+             failed for good; "replica": a fleet's replica that had it gave no answer; "policy": anything
              else of the policy's, and `text` is the traceback. "busy", "late", "replaced" and "stopping": it got no
              turn, and `text` is what the client is told
     seconds  in the policy
     together observations in its run
-    run      its run's number: rows of one run share it
+    run      its run's number: observations of one run share it
     """
 
     seconds: float

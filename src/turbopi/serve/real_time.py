@@ -18,6 +18,7 @@ import numpy as np
 from turbopi.errors import ConfigError, ObservationError
 from turbopi.execution import DelayEstimate
 from turbopi.execution.messages import KEYS, PREFIX, SCHEDULING_KEYS, Asked, read_message
+from turbopi.execution.queue import default_execution_horizon
 from turbopi.running_chunk import JoinMode, RunningChunk
 from turbopi.serve.metrics import Metrics
 from turbopi.serve.options import ServerOptions
@@ -47,7 +48,10 @@ class _Session:
 
 @dataclass
 class Plan:
-    """One request: what the policy is given. `release` it when that has answered, `finish` it if it has actions."""
+    """One request: what the policy is given.
+
+    When the policy has answered, give it to `RealTime.release`; if there are actions, then to `RealTime.finish`.
+    """
 
     observation: dict[str, Any]
     arguments: dict[str, Any] = field(default_factory=dict)  # of `policy.infer`, besides the observation
@@ -59,7 +63,7 @@ class Plan:
 
 
 class RealTime:
-    """What a server does of it, for one policy. For the event loop's thread alone.
+    """Plans each request for one policy, and keeps the sessions' running chunks. For the event loop's thread alone.
 
     waits  whether a request of the session of that name still waits for its turn: then a newer one replaces it
 
@@ -259,7 +263,10 @@ class RealTime:
     def _previous(
         self, session: _Session, kept: _Kept, asked: Asked, mode: JoinMode, now: float
     ) -> tuple[RunningChunk | None, dict[str, Any]]:
-        """What is left of a session's chunk, and what the answer says of it."""
+        """What is left of a session's chunk (None: nothing), and what the answer says of it.
+
+        Raises ObservationError if the request's own delay doesn't fit.
+        """
         horizon = len(kept.model_actions)
         row, by = self._carried_out(kept, asked, now)
         about: dict[str, Any] = {"row": row, "row_by": by}
@@ -269,27 +276,31 @@ class RealTime:
         longest = horizon - max(s, row)
         trained = int(self._offered.get("trained_max_delay") or 0)
         fits = min(longest, trained) if mode == "rtc_trained" else longest
-        if asked.delay is not None:
-            if asked.delay > fits:
-                why = (
-                    f"this checkpoint was trained with delays up to {trained}"
-                    if fits < longest
-                    else (f"with chunks of H = {horizon} actions, s = {max(s, row)} carried out, H − s = {longest}")
-                )
-                raise ObservationError(
-                    f"{PREFIX}delay is {asked.delay} control steps, but {why}: at most {fits} fit. Ask earlier "
-                    f"(a smaller execution horizon), or lower the control rate"
-                )
-            delay, wanted = asked.delay, asked.delay
-        else:
-            wanted = session.delays.steps if self._options.delay_steps is None else self._options.delay_steps
-            if self._options.delay_steps is None:
-                self._need_control_hz()
-            delay = min(wanted, fits)
+        if asked.delay is not None and asked.delay > fits:
+            why = (
+                f"this checkpoint was trained with delays up to {trained}"
+                if fits < longest
+                else f"with chunks of H = {horizon} actions, s = {max(s, row)} carried out, H − s = {longest}"
+            )
+            raise ObservationError(
+                f"{PREFIX}delay is {asked.delay} control steps, but {why}: at most {fits} fit. Ask earlier "
+                f"(a smaller execution horizon), or lower the control rate"
+            )
+        wanted = self._expected_delay(session, asked)
+        delay = min(wanted, fits)
         about |= {"joined": True, "delay": delay, "execution_horizon": max(s, row), "delay_cut": delay < wanted}
         left_over = kept.model_actions[row:]
         guidance = dict(asked.guidance or {})
         return RunningChunk(left_over, delay, max(s, row), mode, kept.anchor, **guidance), about
+
+    def _expected_delay(self, session: _Session, asked: Asked) -> int:
+        """Control steps from the observation to its chunk: what the request says, else the option, else measured."""
+        if asked.delay is not None:
+            return asked.delay
+        if self._options.delay_steps is not None:
+            return self._options.delay_steps
+        self._need_control_hz()
+        return session.delays.steps
 
     def _carried_out(self, kept: _Kept, asked: Asked, now: float) -> tuple[int, str]:
         """How many actions the robot has carried out since the kept chunk's observation, and how that is known."""
@@ -325,11 +336,6 @@ class RealTime:
                     )
                 return s
         return default_execution_horizon(horizon)
-
-
-def default_execution_horizon(horizon: int) -> int:
-    """s, control steps, of chunks of `horizon` actions: half."""
-    return max(1, horizon // 2)
 
 
 def check_execution(options: ServerOptions, offered: Mapping[str, Any], horizon: int | None) -> None:

@@ -78,7 +78,7 @@ class RemoteCalls:
     def ask(
         self, request: Request, observation: dict[str, Any], arguments: Mapping[str, Any]
     ) -> "asyncio.Future[list[Outcome]]":
-        """Cancelled, it is at the replica too, unless it runs already."""
+        """Begin it; an outcome of one row. Cancelling it cancels it at the replica, too, unless it runs already."""
 
         async def one() -> list[Outcome]:
             return [await self.run(observation, arguments, Line.of(request, time.perf_counter()))]
@@ -109,10 +109,12 @@ class RemoteCalls:
             self._watch.stop()
 
     def _lose(self, reason: str) -> None:
+        """Ray has ended: answer all requests with the reason."""
         self._lost_for = reason
         self._on_lost(reason)
-        for work in tuple(self._going):
-            work.cancel()  # `run` makes an answer of it
+        loop = asyncio.get_running_loop()
+        for work in self._going:  # `run` makes an answer of the cancellation, but only once it has begun: so not yet
+            loop.call_soon(work.cancel)
 
     def _follow(self, work: Coroutine[Any, Any, list[Outcome]]) -> "asyncio.Future[list[Outcome]]":
         task = asyncio.ensure_future(work)
@@ -121,15 +123,15 @@ class RemoteCalls:
         return task
 
     async def run(self, observation: dict[str, Any], arguments: Mapping[str, Any], line: Line) -> Outcome:
-        """One request. Cancelled, it is at the replica too, unless it runs already."""
-        from grpc import RpcError
-        from ray.exceptions import RayActorError, RayTaskError
-        from ray.serve.exceptions import BackPressureError, DeploymentUnavailableError
-
+        """One request. Cancelling it cancels it at the replica, too, unless it runs already."""
         if self._lost_for is not None:
             return Outcome(0.0, wrong="lost", text=self._lost_for)
         if self._stopping:
             return STOPPING
+        from grpc import RpcError
+        from ray.exceptions import RayActorError, RayTaskError
+        from ray.serve.exceptions import BackPressureError, DeploymentUnavailableError
+
         asked = time.perf_counter()
         response = self._handle.infer.remote(observation, arguments, line)
         try:

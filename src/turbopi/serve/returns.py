@@ -9,9 +9,10 @@ from collections.abc import Container, Hashable
 
 KEPT = 5  # returns of a source, the last ones
 FEW = 2  # that tell something
-TYPICAL = 3 / 4  # of the kept ones in order: that one is expected
-LATER = 2.0  # times the expected return, and
-LATER_SECONDS = 0.0005  # more, after which a source isn't expected any more this time
+TYPICAL = 3 / 4  # the quantile of the kept ones that counts as a source's usual return
+# LATER * its usual return + LATER_SECONDS after its answer, a source isn't expected any more this time.
+LATER = 2.0
+LATER_SECONDS = 0.0005
 MOST = 1024  # sources that are remembered
 
 
@@ -40,12 +41,13 @@ class Returns:
             self._seconds.popitem(last=False)
 
     def expected(self, now: float, within: float, but: Container[Hashable]) -> list[tuple[float, float]]:
-        """(when it is expected, when it isn't any more) of each source that was answered within seconds, in order.
+        """(when it is expected, when it isn't any more) of each source that may ask again soon; the earliest first.
 
-        but  sources that are left out
+        within  seconds: who was answered longer ago isn't expected
+        but     sources that are left out
         """
         while self._answered and next(iter(self._answered.values())) < now - within:
-            self._answered.popitem(last=False)  # who asks so late doesn't come for company
+            self._answered.popitem(last=False)  # it asks too rarely to be waited for
         found = []
         for source, since in self._answered.items():
             usual = self._usual(source)

@@ -6,8 +6,8 @@ whenever something has changed or the moment `Decision.wake` has come, and runs 
 What holds:
 
 - Requests with the same deadline, priority and size run in the order in which they came.
-- A request is overtaken (a turn goes to one that came later) at most OVERTAKEN times, and after that once for each
-  turn of another one that was overtaken as often: nobody starves, simulators neither.
+- A request may be overtaken (a turn goes to one that came later) OVERTAKEN times. Of those that were, the one that came
+  first gets every other turn at least: nobody starves, not even simulators.
 - What has a deadline of its own and can't meet it is refused: when it comes, if its wait and its run are already too
   long; else as soon as that is so. Without one, nothing is refused for being late.
 - A turn has no more observations than the table T(B) says is worth it, nor than fit the earliest deadline in it.
@@ -29,7 +29,7 @@ PRIORITIES: tuple[Priority, ...] = ("robot", "simulator")
 OVERTAKEN = 16
 ACTIVE_SECONDS = 1.0  # who asked within it may ask again soon: company to wait for
 TIGHT_SECONDS = 10.0  # for so long a robot's deadline limits how long a turn of others may be
-GAPS = 32  # between arrivals, that tell how soon company comes
+GAPS = 32  # times between two arrivals, the last ones: their median is how soon company comes
 LATE_TIMER = 0.0005  # seconds that a wait ends before the last moment: a late timer must not shrink the batch
 PATIENCE = 4.0  # usual gaps without an arrival, after which no more company is waited for
 LATER = 1e-4  # seconds after the moment from which a deadline can't be met, so that rounding doesn't matter
@@ -45,9 +45,9 @@ class Request:
     source    who asks (a connection)
     session   its name, if it has one: a newer request of the session replaces one that waits
     rows      observations in it; they run together
-    later     observations of the same message that come after these, for whose last one the deadline is
+    later     observations of the same message that are still to be asked for: the deadline is for the last of them
     alone     never in a batch with others
-    joins     it joins a chunk, or is else not as others are: runs with such a request have times of their own
+    joins     it joins a chunk or asks for model_actions: runs with such a request have a table T(B) of their own
     call      what to run; not looked at here
     """
 
@@ -193,7 +193,10 @@ class Schedule:
         return waiting
 
     def freed(self, now: float, seconds: float | None) -> None:
-        """The running turn has ended: the next one may begin. `seconds` that it took; None if they tell nothing."""
+        """The running turn has ended: the next one may begin.
+
+        seconds  that it took, for T(B); None if they say nothing of how long such a turn takes
+        """
         if seconds is not None:
             rows = sum(request.rows for request in self._running)
             self._turn_times(self._running).ran(rows, seconds, now)

@@ -109,8 +109,8 @@ class PolicyServer:
         self._log = LimitedLog(logger)
         hosts = AllowedHosts(options.host, options.allowed_hosts)
         troubles = (lambda: self.lost, lambda: self._calls.unwell)
-        gate = Gate(options.api_key, self.metrics, hosts, *troubles, has_page=options.has_page)
-        self._listener = Listener(gate, self._handle, Shared(self._limits, self.metrics, self._log))
+        self._gate = Gate(options.api_key, self.metrics, hosts, *troubles, has_page=options.has_page)
+        self._listener = Listener(self._gate, self._handle, Shared(self._limits, self.metrics, self._log))
         self._decoder = ThreadPoolExecutor(1, thread_name_prefix="turbopi-decoding")
         self._record_dir = None if options.record_dir is None else Path(options.record_dir)
         self._recorder: Recorder | None = None
@@ -164,8 +164,8 @@ class PolicyServer:
         self._started = True
         try:
             self.port = await self._listener.bind(self.host, self.port)
-        except OSError as error:
-            raise ConfigError(f"can't listen on {self.url}: {error}. Choose another --host or --port.") from error
+        except (OSError, UnicodeError) as error:  # UnicodeError: a host that can't be a name
+            raise self._cannot_listen(error) from error
         try:
             execution = self.options.execution
             await self._calls.warm_up(**({} if execution is None else {"real_time": execution}))
@@ -175,11 +175,19 @@ class PolicyServer:
                 self._recorder = Recorder(self._record_dir, metadata, count=self.metrics.recorded)
             if self._live is not None:
                 self._live.start(metadata, self.options.queue_limit)
-            self._listener.start()
+            try:
+                self._listener.start()
+            except OSError as error:  # two may bind a port on Linux: the one that was warm first has it
+                raise self._cannot_listen(error) from error
         except BaseException:
             self._listener.close()
             self._calls.close()
+            if self._recorder is not None:
+                self._recorder.close()
             raise
+
+    def _cannot_listen(self, error: Exception) -> ConfigError:
+        return ConfigError(f"can't listen on {self.url}: {error}. Choose another --host or --port.")
 
     async def stop(self) -> None:
         """Stop gracefully: refuse new clients, finish the running inference and send its actions, close with 1001.
@@ -201,6 +209,7 @@ class PolicyServer:
             await self._live.close()
         self._decoder.shutdown(wait=False)
         self._log.flush()
+        self._gate.flush_log()
         if self._recorder is not None:
             await asyncio.to_thread(self._recorder.close)
 

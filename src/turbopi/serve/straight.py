@@ -15,7 +15,7 @@ MOST = 4 * 2**20  # of larger ones the library takes care: the one buffer that i
 def goes_straight(first: int, second: int, length: int) -> bool:
     """Whether a frame that begins a message, with these first two bytes and a payload of `length`, is received here.
 
-    first, second  the final bit, no reserved bit, binary; masked: anything else is the library's, which checks it
+    That is a binary message in one frame, masked, without reserved bits. The library gets all others, and checks them.
     """
     return first == 0x80 | Opcode.BINARY and second >= 0x80 and LEAST <= length <= MOST
 
@@ -42,7 +42,7 @@ class SpareBuffer:
 
 
 class StraightFrame:
-    """The payload of one frame while it comes. `room` is where the next bytes go; nothing is left of it at the end."""
+    """The payload of one frame while it comes. `room` is where its next bytes go, and is empty at its end."""
 
     def __init__(self, spare: SpareBuffer, length: int, mask: bytes) -> None:
         self._spare, self._length, self._mask = spare, length, mask

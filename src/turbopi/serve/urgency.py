@@ -9,10 +9,9 @@ from typing import Any
 
 from turbopi.errors import ObservationError
 from turbopi.execution.messages import MAX_STEP, PREFIX, SCHEDULING_KEYS, as_number
-from turbopi.serve.options import MAX_DEADLINE_MS
+from turbopi.serve.options import MAX_CONTROL_HZ, MAX_DEADLINE_MS
 from turbopi.serve.schedule import PRIORITIES, Priority
 
-MAX_CONTROL_HZ = 10_000.0
 MAX_ROWS = 1024
 
 
@@ -21,7 +20,8 @@ class Urgency:
     """What a message says of it.
 
     within    seconds from its arrival to its answer
-    firm      the client said so itself: else it is the server's default, for which nothing is refused
+    firm      the client gave this deadline: a request that can't meet it is refused. False: it is the server's default,
+              for which nothing is refused
     priority  robots come before simulators
     rows      B of a batch message; None: one observation, without a batch axis
     """

@@ -6,14 +6,14 @@ import queue
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
 from turbopi.serve.outcome import Outcome
-from turbopi.serve.schedule import Request, Schedule
+from turbopi.serve.schedule import Refused, Request, Schedule
 
 R = TypeVar("R")
 
@@ -41,14 +41,8 @@ class Worker:
     then the next turn begins while that goes on.
     """
 
-    def __init__(
-        self,
-        schedule: Schedule,
-        run: Callable[[tuple[Request, ...]], Ran] | None = None,
-        clock: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        self.schedule = schedule
-        self._run, self._clock = run, clock
+    def __init__(self, schedule: Schedule, run: Callable[[tuple[Request, ...]], Ran] | None = None) -> None:
+        self.schedule, self._run = schedule, run
         # A queue and not an executor, whose Future costs a turn twice as much as the queue does.
         self._work: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._perform, name="turbopi-inference", daemon=True)
@@ -94,8 +88,7 @@ class Worker:
             return answer
         self._answers[request] = answer
         answer.add_done_callback(partial(self._left, request))
-        for refused in self.schedule.add(request, self._clock()):
-            self._answer(refused.request, [Outcome(0.0, wrong=refused.kind, text=refused.text)])
+        self._refuse(self.schedule.add(request, time.perf_counter()))
         self._next()
         return answer
 
@@ -124,9 +117,8 @@ class Worker:
 
     def _next(self) -> None:
         """Begin the next turn, if it is time for one; else be called again when it may be."""
-        decision = self.schedule.decide(self._clock())
-        for refused in decision.refused:
-            self._answer(refused.request, [Outcome(0.0, wrong=refused.kind, text=refused.text)])
+        decision = self.schedule.decide(time.perf_counter())
+        self._refuse(decision.refused)
         self._set_timer(decision.wake)
         if decision.turn:
             self._turns += 1
@@ -134,7 +126,7 @@ class Worker:
 
     def _ended(self, turn: tuple[Request, ...], ran: Ran) -> None:
         self._turns -= 1
-        self.schedule.freed(self._clock(), ran.seconds)
+        self.schedule.freed(time.perf_counter(), ran.seconds)
         for request, answer in zip(turn, ran.answers, strict=True):
             if answer is None and request in self._answers:
                 self.schedule.put_back(request)
@@ -172,6 +164,10 @@ class Worker:
                 self._idle.set_result(None)
             self._idle = None
 
+    def _refuse(self, refused: Iterable[Refused]) -> None:
+        for one in refused:
+            self._answer(one.request, [Outcome(0.0, wrong=one.kind, text=one.text)])
+
     def _answer(self, request: Request, outcomes: list[Outcome]) -> None:
         answer = self._answers.pop(request, None)
         if answer is not None and not answer.done():
@@ -187,7 +183,7 @@ class Worker:
             self._timer.cancel()
             self._timer = None
         if when is not None:
-            self._timer = asyncio.get_running_loop().call_later(max(0.0, when - self._clock()), self._next)
+            self._timer = asyncio.get_running_loop().call_later(max(0.0, when - time.perf_counter()), self._next)
 
     # --- the thread ---------------------------------------------------------------------------------------------------
 
