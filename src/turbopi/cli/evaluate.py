@@ -137,13 +137,12 @@ def _check_cells(
     options: EvalOptions, opened: "Checkpoint", cells: "list[Cell]", protocol: "Protocol", simulator: "Simulator"
 ) -> None:
     """Raise ConfigError for what the policy won't be able to do, before its weights are loaded."""
-    from turbopi.evaluate.checks import check_delay, check_horizon, check_offered
+    from turbopi.evaluate.checks import check_delay, check_offered
 
     offered, horizon = offers_of(options, opened).real_time, opened.config.model.action_horizon
     for cell in cells:
         own = cell.protocol(protocol)
         check_offered(offered, None, own)
-        check_horizon(horizon, own.replan)
         check_delay(own, simulator, horizon)
 
 
