@@ -226,8 +226,6 @@ def run_with_progress(
     results = prepare(folder, protocol, source, simulator, jobs, restart=options.restart)
     to_run = pending(results, jobs)
     left = len(to_run)
-    recording = None if options.record is None or not left else Recording(options.record, source)
-    hooks = [hook for hook in (on_answer, recording) if hook is not None]
     workers = 1 if options.real_time else min(options.workers or default_workers(), most_at_once(protocol, to_run))
     max_batch = options.max_batch or max_batch or workers
     hz = protocol.control_hz
@@ -237,6 +235,8 @@ def run_with_progress(
         output.line(f"{len(jobs) - left} of them are finished already; {left} to go")
     if left:  # a worker has one request at a time
         source.warm_up(min(workers, max_batch), way_named(protocol.execution).mode, output.line)
+    recording = None if options.record is None or not left else Recording(options.record, source)
+    hooks = [hook for hook in (on_answer, recording) if hook is not None]
 
     def answered(*request: Any) -> None:
         for hook in hooks:
