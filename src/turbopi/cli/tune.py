@@ -171,7 +171,7 @@ def check_writable(file: Path) -> None:
 
 
 def refuse_if_busy(device: "torch.device", noisy: bool) -> None:
-    """Raises BackendError if the same work takes now this long and now that."""
+    """Raises BackendError if the time of one and the same work varies, unless `noisy`."""
     from turbopi.tune.gpu import steadiness
     from turbopi.tune.race import MOST_SPREAD, spread
 
