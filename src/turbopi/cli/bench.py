@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from turbopi.cli.files import check_folder, check_replaces
-from turbopi.cli.framework import JsonFlag, Output, command, new_console
+from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions, own_precision
 from turbopi.cli.predict import show_predictions
 from turbopi.config import CAMERAS, LIMITS, ModelConfig, typed_grid
@@ -312,7 +312,7 @@ def bench(
         output.line(f"wrote {', '.join(str(path) for path in written)}")
     output.document(document)
     if document.failed:
-        raise typer.Exit(1)
+        raise typer.Exit(CHECK_FAILED)
 
 
 def _starts(checkpoint: str | None, options: RobotOptions, plan: "BenchPlan", device: str) -> "list[Ready]":
