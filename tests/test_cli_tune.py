@@ -214,6 +214,18 @@ def test_a_cache_that_cannot_be_written_is_an_error_before_anything_is_measured(
     assert "can't write" in said and str(fake.cache) in said and "--out FILE" in said and not fake.measured
 
 
+def test_an_out_that_is_a_folder_is_an_error_before_anything_is_measured(fake: FakeGpu, tmp_path: Path) -> None:
+    assert refusal(turbopi("tune", *USUAL, "--out", tmp_path)) == f"{tmp_path} is a folder; give a file's name"
+    assert not fake.measured
+
+
+def test_what_lies_beside_the_file_stays(fake: FakeGpu, tmp_path: Path) -> None:
+    beside = tmp_path / "a.json.probe"
+    beside.write_text("mine")
+    assert turbopi("tune", *USUAL, "--precision", "bf16", "--out", tmp_path / "a.json").exit_code == 0
+    assert beside.read_text() == "mine"
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

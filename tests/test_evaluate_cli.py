@@ -12,6 +12,8 @@ from typer.testing import CliRunner, Result
 from turbopi import serve
 from turbopi.cli import app
 from turbopi.cli.options import PolicyOptions
+from turbopi.errors import ConfigError
+from turbopi.evaluate.sources import LocalPolicy
 from turbopi.installation import install_command
 from turbopi.recordings import load_call, recorded_files
 from turbopi.sim import libero
@@ -75,6 +77,17 @@ def test_what_the_policy_sees_is_recorded(tmp_path: Path) -> None:
     assert calls[0].observation["observation/image"].shape == (64, 64, 3)
     turbopi(command, "--record", tmp_path / "again")
     assert not (tmp_path / "again").exists()  # nothing was left to run
+
+
+@pytest.mark.usefixtures("seeking")
+def test_a_run_that_cannot_be_warmed_up_leaves_no_recording(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def refuse(*_: object) -> None:
+        raise ConfigError("takes more than the GPU's memory")
+
+    monkeypatch.setattr(LocalPolicy, "warm_up", refuse)
+    command = f"eval reacher {QUICK} --tasks 0 --trials 1 --out {tmp_path / 'run'} --record {tmp_path / 'seen'}"
+    assert "takes more than the GPU's memory" in refused(command)
+    assert not (tmp_path / "seen").exists()
 
 
 def test_a_server_is_evaluated(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,22 @@ def test_a_delay_that_does_not_fit_is_refused_with_what_would(way: str, delay: i
     with pytest.raises(ConfigError, match=rf"a delay of {delay} control steps doesn't fit .* at most {most} does"):
         check_delay(protocol, create("chase"), 10)
     check_delay(Protocol("chase", "chase_post", execution="sync", delay=delay, replan=every), create("chase"), 10)
+
+
+@pytest.mark.parametrize(("way", "most"), [("async", 45), ("ensemble", 45), ("rtc", 5)])
+def test_the_longest_delay_that_a_refusal_names_does_fit_and_one_more_does_not(way: str, most: int) -> None:
+    """The execution horizon limits the delay only where the policy is told of the running chunk."""
+    longest = Protocol("chase", "chase_post", execution=way, delay=most, replan=5)
+    check_delay(longest, create("chase"), 50)
+    with pytest.raises(ConfigError, match=f"at most {most} does"):
+        check_delay(replace(longest, delay=most + 1), create("chase"), 50)
+
+
+@pytest.mark.parametrize("way", ["sync", "async", "rtc"])
+def test_chunks_that_end_before_the_execution_horizon_are_refused_whatever_the_delay(way: str) -> None:
+    protocol = Protocol("chase", "chase_post", execution=way, replan=60)
+    with pytest.raises(ConfigError, match=r"chunks have 50 actions, so it can't act 60 steps .*give --replan 50"):
+        check_delay(protocol, create("chase"), 50)
 
 
 def test_ways_that_tell_the_model_ask_the_policy_for_it() -> None:

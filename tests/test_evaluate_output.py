@@ -293,5 +293,6 @@ def test_numbers_and_ranges_are_read() -> None:
     for text in ("", "a", "3-", "-3", "1,,2", "¹", "0-9999999999", "1" * 5000):
         with pytest.raises(ConfigError, match=r"--tasks is .*expected whole numbers and ranges"):
             parse_numbers("--tasks", text)
-    with pytest.raises(ConfigError, match="nothing in that range"):
-        parse_numbers("--tasks", "7-5")
+    for text in ("7-5", "0,7-5", "7-5,0"):
+        with pytest.raises(ConfigError, match=rf"--tasks is '{text}': there is nothing in the range 7-5"):
+            parse_numbers("--tasks", text)

@@ -176,7 +176,7 @@ def test_a_simulator_that_is_too_slow_is_late_and_the_clock_does_not_wait_for_it
     assert told.speed == pytest.approx(50 / 60, abs=1e-3) and told.longest_step_ms == pytest.approx(60)
     text = told_of_lateness(told, HZ)
     assert text is not None and text.startswith("NOT REAL TIME. 9 of 10 control steps (90 %) began late, by 50.0 ms")
-    assert "took 60.0 ms, and 50.0 ms are one at 20 Hz; the world's time ran at 0.833 of the clock's" in text
+    assert "took 60.0 ms, where 20 Hz leaves 50.0 ms for one; the world's time ran at 0.833 of the clock's" in text
 
 
 def test_one_slow_step_is_caught_up_with() -> None:

@@ -15,13 +15,14 @@ import pytest
 from evaluate_fakes import NO_VIDEOS, SeekingPolicy, TroubledSimulator, gathering, jobs_for, run
 
 from turbopi.errors import ActionError, ConfigError, OutputError, TurboPiError
-from turbopi.evaluate.plan import VideoPlan, noise_seed
+from turbopi.evaluate.plan import VideoPlan, make_jobs, noise_seed
 from turbopi.evaluate.reading import load_results
 from turbopi.evaluate.results import Results
 from turbopi.evaluate.schedule import TooManyCrashes
 from turbopi.evaluate.sources import PolicyRefused
 from turbopi.files import alone_in
 from turbopi.sim import SimulatorUnavailable
+from turbopi.sim.base import Task
 
 TROUBLED = "evaluate_fakes:TroubledSimulator"
 
@@ -314,6 +315,8 @@ def test_initial_states_that_do_not_exist_are_refused() -> None:
         jobs_for(states=(3, 50))
     with pytest.raises(ConfigError, match="reacher_colors has no task 3, 9; its tasks are\n  0: reach the red dot"):
         jobs_for(tasks=(3, 0, 9))
+    with pytest.raises(ConfigError, match="task 4 has no initial states"):
+        make_jobs([Task(4, "empty", "reach", 0, 10)], None, None, NO_VIDEOS)
 
 
 def test_requests_carry_the_resized_pictures(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+import websockets.sync.client
 import websockets.sync.server
 from evaluate_fakes import SeekingPolicy, run
 from hypothesis import given, settings
@@ -235,6 +236,26 @@ def test_times_are_optional(extra: Any) -> None:
     with foreign({}, {"actions": [[1, 2.5]]} | extra) as source:
         answer = ask(source)
     assert answer.actions.tolist() == [[1.0, 2.5]] and answer.infer_ms is None
+
+
+def test_the_connection_to_a_server_that_never_greets_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Silent:
+        closed = False
+
+        def __enter__(self) -> "Silent":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            self.closed = True
+
+        def recv(self, timeout: float) -> bytes:
+            raise TimeoutError("timed out in 10.0s")
+
+    silent = Silent()
+    monkeypatch.setattr(websockets.sync.client, "connect", lambda url, **options: silent)
+    with pytest.raises(PolicyLost, match=r"no policy server at ws://gpu:8000: timed out in 10\.0s"):
+        RemotePolicy("gpu")
+    assert silent.closed
 
 
 def test_a_server_that_leaves_or_says_too_much_is_lost() -> None:

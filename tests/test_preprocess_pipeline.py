@@ -354,7 +354,7 @@ def test_the_observations_prompt_comes_first_then_the_arguments_the_configs_and_
 def test_without_any_prompt_the_observation_is_refused() -> None:
     edges = pipeline(LIBERO)
     observation = {key: value for key, value in edges.example().items() if key != "prompt"}
-    expected = r"no prompt\. It has .*state.*'prompt', LeRobot's read 'task'.* default prompt"
+    expected = r"no prompt\. It has .*state.*'prompt', LeRobot's read 'task'.* default one: --default-prompt"
     with pytest.raises(ObservationError, match=expected):
         edges.before(observation)
 

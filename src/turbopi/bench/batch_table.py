@@ -124,7 +124,7 @@ def _table(gpu: str, precision: str, horizon: int, timed: Sequence[_Timed]) -> B
         and replace(one.job, batch=1, horizon=shortest) == best.job
         and one.job.horizon >= shortest
     ]
-    # of several measurements the soonest, which are sorted last: a shorter chunk takes no longer than a longer one
+    # of several measurements the fastest, which is sorted last: a shorter chunk takes no longer than a longer one
     chosen = {one.job.batch: one for one in sorted(same, key=lambda one: (one.job.batch, -one.seconds))}
     return BatchTable(
         gpu=gpu,

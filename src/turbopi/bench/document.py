@@ -148,8 +148,8 @@ class BenchDocument(Struct, frozen=True, kw_only=True, omit_defaults=True):
     observations_seed: int
     robot: str | None = None  # whose own observations were measured; None: random ones of the jobs' shapes
     main_job: Job  # the one that counts
-    solver: str | None = None  # of all jobs, whose steps are its evaluations; None: the checkpoint's. So is the next
-    time_grid: str | None = None
+    solver: str | None = None  # of all jobs, whose steps are its evaluations; None: the checkpoint's
+    time_grid: str | None = None  # of all jobs; None: the checkpoint's
     floors: dict[str, Floors]  # by precision
     results: list[Result]
     failed: list[Failed]

@@ -26,7 +26,7 @@ class Floors(Struct, frozen=True):
     barrier_us: float | None = None  # one grid-wide barrier inside a cooperative kernel; None on a CPU
 
 
-PATIENCE = 3.0
+PATIENCE = 3.0  # seconds of one measurement on a CPU
 
 
 def measure_floors(device: torch.device, precision: str) -> Floors:
@@ -40,7 +40,8 @@ def measure_floors(device: torch.device, precision: str) -> Floors:
 def median_seconds(run: Callable[[], object], device: torch.device, repeats: int = 10) -> float:
     """Median time of `run`, on the device's own clock, after three warm-up runs.
 
-    Of what takes long, as a bfloat16 product on a CPU without such instructions, fewer: PATIENCE seconds in all.
+    On a CPU it stops after PATIENCE seconds, warm-up or not: some take long, such as a bfloat16 product where the CPU
+    has no such instructions.
     """
     times: list[float] = []
     end_of_patience = time.perf_counter() + PATIENCE

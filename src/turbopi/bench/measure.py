@@ -112,7 +112,7 @@ def conditioning(policy: UnifiedPolicy, job: Job) -> Conditioning | None:
 class Observations:
     """Random observations of a job: another picture, state and prompt each time, the same ones for the same seed.
 
-    Of any robot but `plain` they are its own examples, which all have its prompt.
+    For a robot other than `plain` they are that robot's examples, which all have its one prompt.
     """
 
     def __init__(self, policy: UnifiedPolicy, job: Job, seed: int = 0) -> None:

@@ -60,8 +60,8 @@ class BenchPlan:
     profile: bool = False
     quantization: str | None = None  # what fp8, fp8-mlp or int8 needs
     robot: str | Robot | None = None  # whose own observations are measured; None: random ones of the jobs' shapes
-    solver: Solver | None = None  # None: the checkpoint's; so is the next
-    time_grid: TimeGrid | None = None
+    solver: Solver | None = None  # None: the checkpoint's
+    time_grid: TimeGrid | None = None  # None: the checkpoint's
 
     @property
     def main(self) -> Job:

@@ -102,7 +102,7 @@ class Checkpoint:
         return Loaded(state, time.perf_counter() - began, total)
 
     def check_hash(self) -> None:
-        """CheckpointError if the configuration says which weights these are, and they are others: reads them all."""
+        """CheckpointError if the configuration has the weights' SHA-256 and theirs is another. Reads them all then."""
         if self.expected_sha256 is not None and self.fingerprint() != self.expected_sha256:
             raise CheckpointError(
                 f"{self.path}: {self.config_source} says that the weights' SHA-256 is {self.expected_sha256}, but it "

@@ -25,7 +25,7 @@ def for_policy(given: "str | Path | Quantization | None", tier: str, checkpoint:
     quantization = calibration_of(given, tier, checkpoint)
     if quantization is None:
         return None
-    if checkpoint.path is None:  # so not yet
+    if checkpoint.path is None:  # then `calibration_of` has checked the shapes alone
         quantization.check(checkpoint.config.model, checkpoint.fingerprint(trust_files=True))
     for warning in quantization.warnings:
         logger.warning("%s: %s", quantization.format.label, warning)

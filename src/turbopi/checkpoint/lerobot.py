@@ -41,7 +41,7 @@ _SCHEDULES: dict[str, Schedule] = {"EXP": "exponential", "LINEAR": "linear", "ON
 _EPS = 1e-8
 _FEATURE_TYPES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
 _VARIANTS = ("gemma_300m", "gemma_2b")
-_CHOICES = {  # values that LeRobot refuses others of; sizes and stored dtypes are the tensors'
+_CHOICES = {  # LeRobot refuses any other value of these; what counts here are the tensors' sizes and dtypes
     "paligemma_variant": _VARIANTS,
     "action_expert_variant": _VARIANTS,
     "dtype": ("bfloat16", "float32"),
@@ -52,7 +52,7 @@ _FIXED = {
     "min_period": (4e-3, "the time embedding's shortest period 0.004"),
     "max_period": (4.0, "the time embedding's longest period 4.0"),
 }
-# what LeRobot writes: read here, in no use for Pi0.5 and Pi0 (n_obs_steps), or about training and the hub
+# every key that LeRobot writes: read here, not used by Pi0.5 and Pi0 (n_obs_steps), or about training and the hub
 _KNOWN = versions.FIRST_KEYS | versions.LATER_KEYS
 
 

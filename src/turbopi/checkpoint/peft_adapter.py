@@ -42,12 +42,8 @@ _NO_MATTER = {
     *("modules_to_save", "peft_version", "qalora_group_size", "revision", "runtime_config", "target_modules"),
     *("task_type", "loftq_config"),
 }
-_PLAIN_STARTS = (
-    True,
-    False,
-    "gaussian",
-    "eva",
-)  # of A and B; others (PiSSA, LoftQ, ...) change the base's weights, too
+# init_lora_weights that set A and B alone; others (PiSSA, LoftQ, ...) change the base's weights, too
+_PLAIN_STARTS = (True, False, "gaussian", "eva")
 _REPEATS, _REPEATED_GROUP = re.compile(r"[*+?{]"), re.compile(r"\)[*+?{]")  # a hostile one matches for hours
 _ADVICE = "Merge it in LeRobot's environment (peft's merge_and_unload), save the whole policy, and give that folder"
 

@@ -124,7 +124,7 @@ def policy_config(
 def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
     """`config` with the values of a .json over it."""
     values = settings.values
-    fields = (
+    names = (
         "name",
         "robot",
         "robot_options",
@@ -142,7 +142,7 @@ def with_values(config: PolicyConfig, settings: Settings) -> PolicyConfig:
     )
     if values.get("robot", config.robot) != config.robot:  # the options were the other robot's
         config = replace(config, robot_options={})
-    config = replace(config, **{key: values[key] for key in fields if key in values})
+    config = replace(config, **{key: values[key] for key in names if key in values})
     model = {key: values[key] for key in ("action_horizon", "max_prompt_tokens", "time_grid") if key in values}
     config = config.with_model(**model)
     check_real_time(config, settings.source)

@@ -15,9 +15,8 @@ from torch import Tensor
 from turbopi.errors import CheckpointError
 from turbopi.reading import listing
 
-PIECE_BYTES = (
-    8 * 2**20
-)  # of stored values: small beside any model that fills a machine, large beside the cost of a read
+# of stored values: small beside a model that fills a machine, large enough that reads cost little each
+PIECE_BYTES = 8 * 2**20
 
 Shape = tuple[int, ...]
 
@@ -34,9 +33,9 @@ class Piece:
 class WeightSource(Protocol):
     """A checkpoint's weights under canonical names."""
 
-    format: str  # "openpi_torch", "openpi_jax", "lerobot" or "random"
+    format: str  # "openpi_torch", "openpi_jax", "lerobot", "onnx" or "random"
     shapes: dict[str, Shape]
-    dtypes: dict[str, str]  # stored: "F32", "BF16", "F16"
+    dtypes: dict[str, str]  # stored: "F32", "BF16", "F16"; of ONNX exports also "F8_E4M3"
     vision_heads: int | None  # where the layout carries them
     notes: list[str]  # what a reader of `inspect` should know (merged adapters, ...)
 

@@ -15,7 +15,7 @@ from turbopi.errors import BackendUnavailable, ConfigError
 def backends(
     device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     precision: Annotated[
-        str, typer.Option("--precision", metavar="bf16|f32|fp8|fp8-mlp|int8", help="For which auto would choose.")
+        str, typer.Option("--precision", metavar="bf16|f32|fp8|fp8-mlp|int8", help="Say what auto takes in this one.")
     ] = "bf16",
     as_json: JsonFlag = False,
 ) -> None:

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from turbopi.cli.files import check_folder, check_replaces
-from turbopi.cli.framework import JsonFlag, Output, command, new_console
+from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions, own_precision
 from turbopi.cli.predict import show_predictions
 from turbopi.config import CAMERAS, LIMITS, ModelConfig, typed_grid
@@ -171,10 +171,10 @@ def bench(
     steps: Annotated[str | None, typer.Option(metavar="N,N,…", help="Denoising steps; else 10.")] = None,
     solver: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="As of `turbopi serve`; --steps counts its evaluations. Not with --join."),
+        typer.Option(metavar="NAME", help="As for `turbopi serve`; --steps counts its evaluations. Not with --join."),
     ] = None,
     time_grid: Annotated[
-        str | None, typer.Option("--time-grid", metavar="NAME|T,T,…", help="As of `turbopi serve`. Not with --join.")
+        str | None, typer.Option("--time-grid", metavar="NAME|T,T,…", help="As for `turbopi serve`. Not with --join.")
     ] = None,
     batch: Annotated[str | None, typer.Option(metavar="N,N,…", help="Observations of one call; else 1.")] = None,
     image_size: Annotated[
@@ -202,12 +202,15 @@ def bench(
         ),
     ] = None,
     seconds: Annotated[
-        float, typer.Option(metavar="S", min=0, help="A measurement ends after them, though not before 20 calls.")
+        float,
+        typer.Option(metavar="S", min=0, help="A measurement ends after so many seconds, though not before 20 calls."),
     ] = SECONDS,
     error: Annotated[
         bool, typer.Option(help="Also the error against the float32 reference, for the main job's cameras and prompt.")
     ] = True,
-    ready: Annotated[bool, typer.Option("--ready", help="Also the time from a program's start to its answer.")] = False,
+    ready: Annotated[
+        bool, typer.Option("--ready", help="Also the time from a program's start to its first answer.")
+    ] = False,
     profile: Annotated[bool, typer.Option("--profile", help="Name the kernels that take longest, by stage.")] = False,
     device: Annotated[str, typer.Option("--device", metavar="DEVICE", help="auto, cpu, cuda or cuda:N.")] = "auto",
     tokenizer: Annotated[str | None, typer.Option(metavar="FILE", help="SentencePiece model.")] = None,
@@ -309,7 +312,7 @@ def bench(
         output.line(f"wrote {', '.join(str(path) for path in written)}")
     output.document(document)
     if document.failed:
-        raise typer.Exit(1)
+        raise typer.Exit(CHECK_FAILED)
 
 
 def _starts(checkpoint: str | None, options: RobotOptions, plan: "BenchPlan", device: str) -> "list[Ready]":

@@ -44,7 +44,12 @@ def build(
     ] = None,
     horizon: Annotated[
         int | None,
-        typer.Option(min=1, max=LIMITS["action_horizon"], metavar="N", help="Actions in a chunk; the model's."),
+        typer.Option(
+            min=1,
+            max=LIMITS["action_horizon"],
+            metavar="N",
+            help="Actions in a chunk; the model's own number unless given.",
+        ),
     ] = None,
     precision: Annotated[
         str, typer.Option(metavar="bf16|fp8", help="Of the prefix's MLPs: for backend tensorrt, or tensorrt_fp8.")

@@ -44,7 +44,7 @@ def calibrate(
             "--observations",
             metavar="PATH",
             help="What `turbopi serve --record` wrote, a folder of observations, or an .npz. Unless given: LIBERO "
-            "pictures, for that robot. random-noise: none at all, which every output of the policy will say.",
+            "pictures, for that robot. random-noise: noise alone, which every output of the policy will say.",
         ),
     ] = None,
     out: Annotated[
@@ -53,7 +53,7 @@ def calibrate(
             "--out",
             "-o",
             metavar="FILE",
-            help="Where it goes.",
+            help="Where the calibration is written.",
             show_default="turbopi_fp8.json or turbopi_int8.json beside the weights",
         ),
     ] = None,
@@ -71,7 +71,8 @@ def calibrate(
             min=0,
             max=1,
             metavar="X",
-            help="Cosine of what denoising does, against float32: sites are kept in bf16 until it is met.",
+            help="Cosine between this precision's deltas (actions less noise) and float32's: sites stay in bf16 until "
+            "it is reached.",
         ),
     ] = 0.9975,
     steps: Annotated[
@@ -94,8 +95,8 @@ def calibrate(
     """Prepare a checkpoint for FP8 or INT8: scales of every activation, and which products had better stay in bf16.
 
     Runs the float32 policy on your observations over all denoising steps, tries several ways to choose scales, and
-    reports on observations held out from all of that what that does to the actions. The file it writes holds for these
-    weights and this precision alone. Needs no such hardware.
+    measures the error of the actions on observations that were held out. The file that it writes holds for these
+    weights and this precision alone. No hardware with FP8 or INT8 is needed.
     """
     output = Output(as_json)
     from turbopi.quantization.formats import FORMATS

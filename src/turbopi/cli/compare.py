@@ -35,8 +35,8 @@ def compare_command(
     runs: Annotated[
         list[str],
         typer.Argument(
-            metavar="RUN RUN…",
-            help="Folders of finished evaluations; or ways to run, each BACKEND[:PRECISION[:STEPS]].",
+            metavar="RUN",
+            help="Two or more: folders of finished evaluations; or ways to run, each BACKEND[:PRECISION[:STEPS]].",
         ),
     ],
     checkpoint: Annotated[
@@ -48,7 +48,7 @@ def compare_command(
     across_calibrations: Annotated[
         bool,
         typer.Option(
-            "--across-calibrations", help="FP8 runs of the same weights may come from different calibrations."
+            "--across-calibrations", help="FP8 or INT8 runs of the same weights may have different calibrations."
         ),
     ] = False,
     as_json: JsonFlag = False,
@@ -57,7 +57,8 @@ def compare_command(
 
     Ways to run (backend, precision, denoising steps) are evaluated first, one after the other, with the same episodes
     and the same noise; their action error is measured against the float32 reference with the first one's number of
-    steps, on observations that each of them met. Folders are compared as they are.
+    steps, on observations that each of them met; all goes to turbopi-compare/ unless --out is given. Folders are
+    compared as they are, and nothing is written without --out.
     """
     from turbopi.evaluate.compare import HEADS, LEGEND, cells, compare, document, write_comparison
     from turbopi.evaluate.reading import load_results

@@ -137,13 +137,12 @@ def _check_cells(
     options: EvalOptions, opened: "Checkpoint", cells: "list[Cell]", protocol: "Protocol", simulator: "Simulator"
 ) -> None:
     """Raise ConfigError for what the policy won't be able to do, before its weights are loaded."""
-    from turbopi.evaluate.checks import check_delay, check_horizon, check_offered
+    from turbopi.evaluate.checks import check_delay, check_offered
 
     offered, horizon = offers_of(options, opened).real_time, opened.config.model.action_horizon
     for cell in cells:
         own = cell.protocol(protocol)
         check_offered(offered, None, own)
-        check_horizon(horizon, own.replan)
         check_delay(own, simulator, horizon)
 
 
@@ -227,8 +226,6 @@ def run_with_progress(
     results = prepare(folder, protocol, source, simulator, jobs, restart=options.restart)
     to_run = pending(results, jobs)
     left = len(to_run)
-    recording = None if options.record is None or not left else Recording(options.record, source)
-    hooks = [hook for hook in (on_answer, recording) if hook is not None]
     workers = 1 if options.real_time else min(options.workers or default_workers(), most_at_once(protocol, to_run))
     max_batch = options.max_batch or max_batch or workers
     hz = protocol.control_hz
@@ -238,6 +235,8 @@ def run_with_progress(
         output.line(f"{len(jobs) - left} of them are finished already; {left} to go")
     if left:  # a worker has one request at a time
         source.warm_up(min(workers, max_batch), way_named(protocol.execution).mode, output.line)
+    recording = None if options.record is None or not left else Recording(options.record, source)
+    hooks = [hook for hook in (on_answer, recording) if hook is not None]
 
     def answered(*request: Any) -> None:
         for hook in hooks:

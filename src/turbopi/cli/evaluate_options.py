@@ -101,7 +101,7 @@ class EvalOptions(PolicyOptions):
     ] = None
     execution_horizon: Annotated[
         str | None,
-        _option("--execution-horizon", panel=_DELAY, metavar="N,N,…", help="--replan, for several at once."),
+        _option("--execution-horizon", panel=_DELAY, metavar="N,N,…", help="As --replan; several are run in turn."),
     ] = None
     max_steps: Annotated[
         int | None,
@@ -128,8 +128,8 @@ class EvalOptions(PolicyOptions):
             "--max-batch",
             panel=_RUNS,
             metavar="N",
-            help="Requests that are computed together: as many as workers, and in compare 1. With 1, a run repeats "
-            "bit for bit.",
+            help="Requests that are computed together, at most. Unless given: as many as workers; of `turbopi compare` "
+            "1. With 1, a run repeats bit for bit.",
             min=1,
         ),
     ] = None
@@ -140,17 +140,25 @@ class EvalOptions(PolicyOptions):
     video_successes: Annotated[
         int,
         _option(
-            "--video-successes", panel=_OUTPUT, metavar="N", help="Initial states of a task whose success is filmed."
+            "--video-successes",
+            panel=_OUTPUT,
+            metavar="N",
+            help="Of sample: successes from a task's first N initial states.",
         ),
     ] = 1
     smooth_videos: Annotated[
         bool,
-        _option("--smooth-videos", panel=_OUTPUT, help="Draw every control step for them, which takes its time."),
+        _option(
+            "--smooth-videos", panel=_OUTPUT, help="Film every control step, not only where the policy looks: slower."
+        ),
     ] = False
     out: Annotated[
-        Path | None, _option("--out", panel=_OUTPUT, metavar="DIR", help="Where results go, and continue; see below.")
+        Path | None,
+        _option("--out", panel=_OUTPUT, metavar="DIR", help="Where results go; an interrupted run there continues."),
     ] = None
-    restart: Annotated[bool, _option("--restart", panel=_OUTPUT, help="Forget what the folder holds.")] = False
+    restart: Annotated[
+        bool, _option("--restart", panel=_OUTPUT, help="Delete an earlier run's results in that folder.")
+    ] = False
     record: Annotated[
         Path | None,
         _option(

@@ -53,7 +53,7 @@ def export(
     """Write a model for another runtime: as float32 ONNX graphs of vision, prompt, prefix and denoising step.
 
     The folder is a checkpoint, too, for the backend onnx. A full-size model needs 14 GB of disk and of memory. With
-    --precision fp8 the prefix's MLPs are FP8 (E4M3), with scales that observations bring about in the model.
+    --precision fp8 the prefix's MLPs are FP8 (E4M3), with scales that are measured on observations.
     """
     output = Output(as_json)
     if precision not in PRECISIONS:

@@ -39,7 +39,7 @@ EngineCalibration = Annotated[
     ),
 ]
 ScaleMethod = Annotated[
-    str, typer.Option(metavar="modelopt|max", help="Who measures the scales: NVIDIA's ModelOpt, or Turbo-Pi.")
+    str, typer.Option(metavar="modelopt|max", help="Who measures the scales: NVIDIA's ModelOpt, or Turbo-Pi (max).")
 ]
 
 
@@ -53,8 +53,8 @@ SolverOption = Annotated[
         "--solver",
         panel=_RUNNING,
         metavar="NAME",
-        help="Of the flow from noise to actions: euler, midpoint, heun, ab2 or exponential. --steps counts its "
-        "evaluations. Unless given: what the checkpoint says, else euler.",
+        help="Solver of the flow from noise to actions: euler, midpoint, heun, ab2 or exponential. --steps counts "
+        "evaluations of the model. Unless given: what the checkpoint says, else euler.",
     ),
 ]
 TimeGridOption = Annotated[
@@ -63,8 +63,8 @@ TimeGridOption = Annotated[
         "--time-grid",
         panel=_RUNNING,
         metavar="NAME|T,T,…",
-        help="uniform, shifted_to_noise, shifted_to_actions, or times that fall strictly from 1 to 0. Unless given: "
-        "what the checkpoint says, else uniform.",
+        help="Times of the steps: uniform, shifted_to_noise, shifted_to_actions, or numbers that fall strictly from 1 "
+        "to 0. Unless given: what the checkpoint says, else uniform.",
     ),
 ]
 
@@ -93,7 +93,7 @@ class WeightOptions:
             panel=_WEIGHTS,
             metavar="PRESET|FILE",
             help="What the checkpoint doesn't record (robot, horizon, …): a preset's name or a .json. Unless given, "
-            "the turbopi.json beside the weights, or LeRobot's own files. Of random weights it leaves the sizes.",
+            "the turbopi.json beside the weights, or LeRobot's own files. Random weights keep their preset's sizes.",
         ),
     ] = None
 
@@ -202,7 +202,8 @@ class PolicyOptions(RobotOptions):
             "--quantization",
             panel=_RUNNING,
             metavar="FILE",
-            help="What `turbopi calibrate` wrote. Unless given: turbopi_fp8.json or turbopi_int8.json beside them.",
+            help="What `turbopi calibrate` wrote. Unless given: turbopi_fp8.json or turbopi_int8.json beside the "
+            "weights.",
         ),
     ] = None
     fp8_parts: Annotated[

@@ -35,13 +35,14 @@ def plan(
     horizon: Annotated[int, typer.Option(metavar="H", min=2, max=LIMITS["action_horizon"], help="Actions of a chunk.")],
     gpu: Annotated[
         str | None,
-        typer.Option("--gpu", metavar="GPU", help="Such as h100, h200, rtx4090: as of `turbopi bench --predict`."),
+        typer.Option("--gpu", metavar="GPU", help="Such as h100, h200, rtx4090: as for `turbopi bench --predict`."),
     ] = None,
     times: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Instead: T(B) of yours: results.json of `turbopi bench --horizons H --batch 1,2,4,8 --report DIR`.",
+            help="Instead of --gpu, what you measured: results.json of `turbopi bench --horizons H --batch 1,2,4,8 "
+            "--report DIR`.",
         ),
     ] = None,
     gpus: Annotated[
@@ -59,7 +60,12 @@ def plan(
     max_batch: Annotated[int | None, typer.Option(metavar="N", min=1, help="No larger batches.")] = None,
     overhead_ms: Annotated[
         float | None,
-        typer.Option(metavar="MS", min=0, max=60_000, help="Of a request beyond the policy; else 2, with Ray 8."),
+        typer.Option(
+            metavar="MS",
+            min=0,
+            max=60_000,
+            help="Of a request besides the policy's call: network, server. Else 2, with Ray 8.",
+        ),
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from turbopi.cli import files
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.cli.options import CheckpointArgument, WeightOptions
 from turbopi.cli.progress import with_stages
@@ -59,7 +60,7 @@ def tune(
         bool, typer.Option("--only-missing", help="Leave out what the file has from an earlier run.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write here instead of the cache, where engines look.")
+        Path | None, typer.Option(metavar="FILE", help="Write here instead of the cache, where `fused` looks.")
     ] = None,
     noisy: Annotated[bool, typer.Option("--noisy", help="Measure although other programs use the GPU.")] = False,
     dry_run: Annotated[
@@ -72,8 +73,8 @@ def tune(
 
     Each operation whose tile can be chosen is timed in every tile that the GPU takes, in turns, with weights that the
     cache doesn't hold, and its result is compared with plain PyTorch's; those of batches' denoising are timed within
-    the action expert's layers. The file is kept after each operation. Without weights, sizes are those of pi05_libero.
-    TURBOPI_TUNED=off has `fused` ignore what was measured.
+    the action expert's layers. The file is written after each operation. Without weights, sizes are those of
+    pi05_libero. TURBOPI_TUNED=off has `fused` ignore what was measured.
     """
     output = Output(as_json)
     batches, counts = numbers(batch, "--batch", BATCHES), numbers(cameras, "--cameras", CAMERAS)
@@ -161,21 +162,16 @@ def usable_device(device: str) -> "torch.device":
 
 
 def check_writable(file: Path) -> None:
-    """Raises OutputError before minutes of measuring, not after them."""
-    from turbopi.files import new_file
-
+    """Raises OutputError or ConfigError before minutes of measuring, not after them. Makes the file's folder."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"can't write {file}: {error.strerror}; --out FILE writes elsewhere") from error
-    probe = file.with_name(f"{file.name}.probe")
-    with new_file(probe, sync=False):
-        pass
-    probe.unlink()
+    files.check_writable(file)
 
 
 def refuse_if_busy(device: "torch.device", noisy: bool) -> None:
-    """Raises BackendError if the same work takes now this long and now that."""
+    """Raises BackendError if the time of one and the same work varies, unless `noisy`."""
     from turbopi.tune.gpu import steadiness
     from turbopi.tune.race import MOST_SPREAD, spread
 

@@ -61,7 +61,7 @@ def verify(
     ] = None,
     factor: Annotated[
         float | None,
-        typer.Option("--factor", metavar="X", help="Hold it to X times the control's instead."),
+        typer.Option("--factor", metavar="X", help="Hold the actions' relative rms to X times the control's instead."),
     ] = None,
     no_hash: Annotated[
         bool, typer.Option("--no-hash", help="Leave out the weights' fingerprint, which reads all of them once more.")

@@ -56,10 +56,15 @@ def actions_needed(protocol: Protocol) -> int:
 
 
 def check_delay(protocol: Protocol, simulator: Simulator, horizon: int) -> None:
-    """Raise ConfigError for a delay that chunks of `horizon` actions, or the simulator, can't be run with."""
-    way = way_named(protocol.execution)
-    if horizon < actions_needed(protocol) or (way.mode is not None and protocol.delay > protocol.replan):
-        most = min(protocol.replan, horizon - protocol.replan)
+    """Raise ConfigError for a delay that chunks of `horizon` actions, or the simulator, can't be run with.
+
+    As `check_horizon`, too.
+    """
+    check_horizon(horizon, protocol.replan)
+    way, most = way_named(protocol.execution), horizon - protocol.replan
+    if way.mode is not None:  # as in `ChunkQueue`: the delay is at most the execution horizon
+        most = min(most, protocol.replan)
+    if protocol.delay > most and not way.stands_still:
         raise ConfigError(
             f"a delay of {protocol.delay} control steps doesn't fit --execution {way.name} with chunks of {horizon} "
             f"actions and an execution horizon of {protocol.replan}: at most {most} does; give another "

@@ -41,7 +41,7 @@ class ComparedRun(Struct, frozen=True):
 
     label: str
     precision: str
-    calibration: str | None  # FP8's
+    calibration: str | None  # of FP8 or INT8
     folder: str
     success: RateDocument
     paired_with_first: PairedDocument | None  # None: it is the first
@@ -146,6 +146,7 @@ def compare(
 
 
 def check_same_protocol(runs: Sequence[Results]) -> None:
+    """Raise ConfigError, naming the first difference, unless all runs have the same protocol."""
     first = runs[0]
     for run in runs[1:]:
         names = {*first.protocol, *run.protocol}
@@ -159,15 +160,16 @@ def check_same_protocol(runs: Sequence[Results]) -> None:
 
 
 def check_same_calibration(runs: Sequence[Results]) -> None:
-    """Two runs in FP8, or in INT8, that differ in backend or steps should differ in nothing else without anybody's
-    noticing.
+    """Raise ConfigError if two runs of one model in FP8, or in INT8, have different calibrations.
+
+    Else a table that seems to compare backends or steps would compare calibrations, too.
     """
     first: dict[str, Results] = {}
     for run in runs:
         calibration = _calibration(run)
         if calibration is None:
             continue
-        # a server doesn't tell its weights: what it tells besides stands for them
+        # a server doesn't tell which weights it has: its configuration's name has to do
         told = run.policy.identity.get("weights") or _at(run.policy.identity, "server", "config")
         numbers = format_of(str(run.policy.identity.get("precision"))).label
         other = first.setdefault(f"{numbers} of {told}", run)

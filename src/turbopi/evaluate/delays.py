@@ -32,7 +32,7 @@ COLORS = dict(zip(WAYS, ("#9aa0a6", "#b00020", "#e08a00", "#3b6fb6", "#7b4fb6", 
 class Cell:
     """A way to run, the delay and the execution horizon, both in control steps.
 
-    Delay None: in real time, it is measured.
+    Delay None: in real time, where it is measured.
     """
 
     execution: str
@@ -93,7 +93,10 @@ class CellSummary(Struct, frozen=True):
 
 
 class DelaysDocument(Struct, frozen=True):
-    """delays.json. `outcomes`: of each cell in order, one letter an episode: s, f, a (aborted), c (crash)."""
+    """delays.json. `outcomes`: a text a cell, with a letter for each of `episodes`.
+
+    The letters: s success, f failure, a aborted, c crash, - not run.
+    """
 
     format: Literal[1]
     protocol: Plain
@@ -106,6 +109,7 @@ class DelaysDocument(Struct, frozen=True):
 
 
 def summarise(cells: Sequence[tuple[Cell, Results]]) -> list[CellSummary]:
+    """One summary a cell, in order. The first cell's way to run is the one that others are compared with."""
     found, first = dict(cells), cells[0][0].execution
     least = min((cell.delay for cell, _ in cells if cell.delay is not None), default=None)
 

@@ -13,8 +13,8 @@ from turbopi.evaluate.plan import Job
 from turbopi.execution import ChunkQueue
 from turbopi.sim import Environment
 
-# Asks the policy at a step: observation, what else it is told (`Request.arguments`) -> what `infer` returns, "actions"
-# float64[H, d] at least. Raises NoActions if it has none that can be used
+# Asks the policy: (step, observation, what else it is told: `Request.arguments`) -> what `infer` returns, of which
+# "actions", float64[H, d], must be there. Raises NoActions if the policy found that its actions can't be used
 Ask = Callable[[int, dict[str, object], Mapping[str, Any]], Mapping[str, Any]]
 # The action with which the robot stands still, after this one
 StandStill = Callable[[np.ndarray], np.ndarray]

@@ -12,7 +12,7 @@ class Frame:
     """One picture of a film: what the cameras see at a step, and the chunk that is carried out there.
 
     entered   the row at which the chunk took over. While it was computed, the robot carried out the one before
-    planned   the row behind the last one that was carried out: [entered, planned) were
+    planned   rows entered to planned - 1 were carried out
     done      the row that comes next
     before    float64[n, d], n ≤ entered: what the robot was commanded instead of the rows before `entered`
     note      what the robot waits for, if it does
@@ -64,7 +64,8 @@ class Reel:
 
     def asked(self, step: int) -> None:
         """The next chunk was asked for, with what is seen at this step."""
-        self._asked.append(step)
+        if self._film is not None:
+            self._asked.append(step)
 
     def answered(self, number: int, chunk: np.ndarray) -> None:
         """float64[H, d], what the policy predicted when it was asked for the chunk of this number."""

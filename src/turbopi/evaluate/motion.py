@@ -18,7 +18,7 @@ class Motion(Struct, frozen=True):
 
     seams       chunks that took over from another one
     seam_jump   mean over the seams: the first action less the command before it; None without a seam
-    seam_gap    the same, less what the running chunk had for that step; None where it had nothing left
+    seam_gap    mean over the seams where the running chunk had an action left: the first action less that one
     step_jump   mean change of the command in all other steps
     jerk        mean second difference of the commands: the jerk, where they are velocities or small steps
     standing    control steps in which the robot had no action and stood still

@@ -134,7 +134,7 @@ def told_of_lateness(summary: PacedSummary, control_hz: float) -> str | None:
     text = (
         f"{summary.late_steps} of {summary.steps} control steps ({share:.2g} %) began late, by "
         f"{summary.late_ms.p50:.1f} ms in the median and {summary.late_ms.max:.1f} ms at most: the simulator's slowest "
-        f"step took {summary.longest_step_ms:.1f} ms, and {1e3 / control_hz:.1f} ms are one at {control_hz:g} Hz"
+        f"step took {summary.longest_step_ms:.1f} ms, where {control_hz:g} Hz leaves {1e3 / control_hz:.1f} ms for one"
         f"{speed}."
     )
     if summary.is_real_time:

@@ -120,6 +120,8 @@ def make_jobs(
                     "initial state"
                 )
             states = states[:trials]
+        if not states:
+            raise ConfigError(f"task {task.index} has no initial states, so no episode of it can be run")
         if states[0] < 0 or states[-1] >= task.num_initial_states:
             raise ConfigError(
                 f"task {task.index} has the initial states 0 to {task.num_initial_states - 1}; "
@@ -138,7 +140,8 @@ def parse_numbers(option: str, text: str) -> list[int]:
         found = re.fullmatch(r"\s*([0-9]{1,6})(?:-([0-9]{1,6}))?\s*", part)
         if found is None:
             raise ConfigError(f"{option} is {text!r}; expected whole numbers and ranges, such as 0,2,5-7")
-        numbers += range(int(found[1]), int(found[2] or found[1]) + 1)
-    if not numbers:
-        raise ConfigError(f"{option} is {text!r}: there is nothing in that range")
+        first, last = int(found[1]), int(found[2] or found[1])
+        if last < first:
+            raise ConfigError(f"{option} is {text!r}: there is nothing in the range {part.strip()}")
+        numbers += range(first, last + 1)
     return numbers

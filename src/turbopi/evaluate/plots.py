@@ -113,5 +113,5 @@ def write_comparison_plot(path: Path, rows: Sequence[tuple[str, Rate]]) -> Path:
     return path
 
 
-def _short(text: str, most: int = 72) -> str:
+def _short(text: str, most: int) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"

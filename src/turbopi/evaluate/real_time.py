@@ -20,8 +20,8 @@ from turbopi.realtime import Command, RealTimeExecutor
 from turbopi.realtime.inference import BackgroundThread, Inference
 from turbopi.sim import Environment
 
-MAX_OBSERVATION_AGE_S: Final = 600.0  # however slow a policy is, how it does is what is asked
-_STEP: Final = "turbopi.evaluate/step"  # an observation's, on its way through the executor
+MAX_OBSERVATION_AGE_S: Final = 600.0  # far above any policy's latency: a slow policy is measured, not refused
+_STEP: Final = "turbopi.evaluate/step"  # the key under which an observation carries its step through the executor
 
 
 # As `episode.Ask`; step None: to warm the policy up
@@ -35,7 +35,7 @@ class Unfit(Exception):
 class RealTimeLoop:
     """The control loop beside a simulator, for one episode after the other.
 
-    ask           the policy; called on a thread of its own, which is all that it does
+    ask           the policy; called on a thread that does nothing else
     offered       what the policy offers for chunks that join: its metadata's "real_time"
     control_hz    control steps in a second of the wall clock
     clock, sleep, inference
@@ -82,8 +82,8 @@ class RealTimeLoop:
     ) -> Ending:
         """One episode. Its clock starts with the first observation, and the robot stands still until the first chunk.
 
-        The first episode warms the policy up before. Raises Unfit if the policy is too slow for the way to run, and
-        what `ask` raises, but for NoActions: then that chunk is dropped, and counted.
+        The policy is warmed up before the first episode. Raises Unfit if the policy is too slow for the way to run,
+        and what `ask` raises; only NoActions isn't raised: that chunk is dropped, and counted.
         """
         environment.reset(job.initial_state)
         try:
@@ -115,8 +115,8 @@ class RealTimeLoop:
                     status = "success"
                     break
             seconds = self._pacer.seconds
-        finally:  # also of an episode that crashes: an answer that comes later would be taken for the next one's
-            self._inference.begin(lambda: None).result()  # the call that is under way, if there is one, has ended
+        finally:  # after a crash, too: an answer that comes later would be taken for the next episode's
+            self._inference.begin(lambda: None).result()  # waits until the call that is under way has ended
         self._policy.check()
         if film is not None:
             for number, chunk in self._policy.chunks.items():

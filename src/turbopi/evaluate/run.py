@@ -13,6 +13,7 @@ import torch
 from turbopi.errors import ConfigError
 from turbopi.evaluate.plan import Job, Protocol, VideoPlan
 from turbopi.evaluate.reading import check_is_run, load_results
+from turbopi.evaluate.report import FILE as REPORT
 from turbopi.evaluate.report import write_report
 from turbopi.evaluate.results import FILE, OWN_HZ, Episode, PolicyTold, Results, protocol_json
 from turbopi.evaluate.schedule import OnAnswer, Scheduler
@@ -143,7 +144,7 @@ def _alone(folder: Path) -> AbstractContextManager[None]:
 
 def _clear(folder: Path) -> None:
     """Remove what an earlier run wrote, and nothing else."""
-    for name in (FILE, LOG, "report.html", "success.png", "steps.png", "latency.png", "visited.npz"):
+    for name in (FILE, LOG, REPORT, "success.png", "steps.png", "latency.png", "visited.npz"):
         with contextlib.suppress(FileNotFoundError):
             (folder / name).unlink()
     for film in (folder / "videos").glob("task*_state*_*.mp4"):

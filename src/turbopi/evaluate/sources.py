@@ -202,6 +202,7 @@ class RemotePolicy:
         except (InvalidURI, ValueError) as error:
             raise ConfigError(f"{url} is no address of a server: {error}") from error
         except (OSError, TimeoutError, WebSocketException) as error:
+            self.close()
             if isinstance(error, InvalidStatus) and error.response.status_code in (401, 403):
                 raise ConfigError(f"{url} wants its API key: --api-key-file FILE, or TURBOPI_API_KEY") from error
             chosen = "" if port is None else f" --port {port}"

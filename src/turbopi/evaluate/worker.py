@@ -18,7 +18,7 @@ from turbopi.sim.base import observation_problem
 class Worker:
     """Runs jobs that come through a connection, holding the environment of the last task.
 
-    Messages out   ("observation", step, observation, arguments)   answered with ("actions", what infer returned),
+    It sends       ("observation", step, observation, arguments)   answered with ("actions", what infer returned),
                                                                    ("problem", text) or ("stop",). step None: to warm
                                                                    the policy up
                    ("finished", status, steps, message, seconds, video, motion, paced)

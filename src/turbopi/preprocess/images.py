@@ -30,7 +30,7 @@ class _Way:
 
     float_images: bool
     padding: int
-    low: float  # of a picture in [0, 1]: what is below becomes it
+    low: float  # where a resized picture in [0, 1] is clamped from below
 
 
 RESIZES: dict[ImageResize, _Way] = {
@@ -50,7 +50,7 @@ def fitted(picture: np.ndarray, size: int, resize: ImageResize) -> np.ndarray:
         return picture
     out: np.ndarray = np.empty((size, size, 3), np.float32 if way.float_images else np.uint8)
     if picture.shape != out.shape:
-        out.fill(way.padding)  # what stays of it
+        out.fill(way.padding)  # which stays where the picture doesn't reach
     if way.float_images:
         resize_unit_into(picture, out, low=way.low)
     else:
@@ -62,7 +62,9 @@ LARGE = 1 << 18  # bytes of a picture; of smaller ones handing work to threads c
 
 
 def all_fitted(pictures: Sequence[np.ndarray], size: int, resize: ImageResize) -> list[np.ndarray]:
-    """`fitted` of each, the same bytes. Large pictures have a thread each in openpi's way; LeRobot's has PyTorch's."""
+    """`fitted` of each, the same bytes. In openpi's way large pictures are resized in threads of our own; LeRobot's way
+    has PyTorch's.
+    """
     large = max((one.size for one in pictures), default=0) > LARGE
     if _cores() == 1 or len(pictures) == 1 or RESIZES[resize].float_images or not large:
         return [fitted(one, size, resize) for one in pictures]
@@ -134,7 +136,7 @@ def resize_unit_into(image: np.ndarray, out: np.ndarray, *, low: float = 0.0) ->
     """LeRobot's way: one picture in [0, 1] into `out` float32[height, width, 3] in [-1, 1], which holds the padding.
 
     image   uint8[h, w, 3], divided by 255 first, or float32[h, w, 3] in [0, 1]
-    low     what is below it becomes it where a picture is resized: 0, in LeRobot 0.4 -1
+    low     where a resized picture is clamped from below: 0, in LeRobot 0.4 -1
     """
     planes = np.empty((3, *image.shape[:2]), np.float32)  # by channel: torch's layout, and faster than a transpose
     for channel in range(3):

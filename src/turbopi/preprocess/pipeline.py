@@ -64,7 +64,7 @@ class Incoming:
 
 @dataclass
 class _Outgoing:
-    """A call's action chunks on their way out, all at once: that costs eight of them twice what it costs one."""
+    """A call's action chunks on their way out, all at once: eight together take twice as long as one alone."""
 
     actions: np.ndarray  # [B, H, d]
     states: Sequence[np.ndarray]  # of each [s], s from action_dim

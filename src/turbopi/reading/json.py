@@ -50,11 +50,11 @@ def parse_json(
             parse_float=_finite,
             object_pairs_hook=_unique,
         )
-        _check_depth(value, depth, where, error)
     except RecursionError as reason:
         raise error(f"{where} holds objects and lists more than {depth} deep") from reason
     except ValueError as reason:  # not UTF-8, not JSON, or refused by a hook below
         raise error(f"{where} isn't JSON: {reason if data.strip() else 'it is empty'}") from reason
+    _check_depth(value, depth, where, error)
     if not nan and (b"NaN" in data or b"Infinity" in data):
         _check_constants(value, where, error)
     if rb"\u" in data:

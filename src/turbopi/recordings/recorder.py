@@ -73,7 +73,7 @@ class Recorder:
             logger.warning("%d calls weren't recorded: the disk can't keep up", self.dropped)
 
     def close(self, timeout: float = 30.0) -> None:
-        """Write what waits, for at most `timeout` seconds, and stop. Call `put` no more after it."""
+        """Write what waits, for at most `timeout` seconds, and stop. Don't call `put` after it."""
         deadline = time.monotonic() + timeout
         try:
             self._queue.put(None, timeout=timeout)

@@ -144,7 +144,9 @@ class RawKeys(Robot):
         return self.checkpoint.inputs(named)
 
     def _pictures(self, observation: Mapping[str, object]) -> dict[str, object]:
-        """Under the checkpoint's keys; with other pictures, of which `LeRobot` warns where a camera is missing."""
+        """The pictures under the checkpoint's keys. Without `cameras` in the description, pictures of other names are
+        handed on, too: `LeRobot` names them in its warning where a camera is missing.
+        """
         if self.described.cameras is not None:
             return {sent: require(observation, raw, self._expected) for raw, sent in self.cameras.items()}
         if not any(camera in observation for camera in self.cameras):

@@ -100,9 +100,9 @@ class GpuBench(ABC):
         return self.captured(run, calls, ROUND_MICROSECONDS)
 
     def captured(self, run: Callable[[], object], calls: int, least: float) -> Round:
-        """A CUDA graph of what runs, which has been run before, by how many calls it is.
+        """What times `run` as a CUDA graph: microseconds of one of its `calls`. It must have been run once before.
 
-        least  microseconds of a round
+        least  microseconds that a round takes at least
         """
         with self._guard:
             if self._pool is None:

@@ -93,21 +93,21 @@ class Product(ProductBench):
 
     def _fold_norm(self, first: Matrix) -> None:
         """The norm's weights, the sums of the rows that it is made of, and matrices that take it."""
-        one, assert_bias = self.operation, self.bias
-        assert assert_bias is not None, "the tower's products have biases"
+        one, bias = self.operation, self.bias
+        assert bias is not None, "the tower's products have biases"
         scale, shift = self.random(one.inner), self.random(one.inner)
         self.front = scale, shift
         normed = F.layer_norm(self.raw.float(), (one.inner,), scale.float(), shift.float(), EPS)
         if isinstance(first, ScaledMatrix):
             self._copied(first, scale, shift)
-            wide = normed @ first.dequantized().T + assert_bias.float()
-            twin = first.product(to_e4m3(normed, first.inverse), assert_bias)
+            wide = normed @ first.dequantized().T + bias.float()
+            twin = first.product(to_e4m3(normed, first.inverse), bias)
         else:
             self.sums = sums_of(self.raw)
-            made = Folded.fold(first, assert_bias, scale, shift)
+            made = Folded.fold(first, bias, scale, shift)
             self.folded: list[Folded] = [replace(made, data=made.data.clone()) for _ in range(self.copies)]
-            wide = normed @ first.float().T + assert_bias.float()
-            twin = F.linear(normed.to(torch.bfloat16), first, assert_bias).float()
+            wide = normed @ first.float().T + bias.float()
+            twin = F.linear(normed.to(torch.bfloat16), first, bias).float()
         self.exact = activated(one.operation, wide)
         twin = plain.as_input(activated(one.operation, twin), torch.bfloat16, self.inverse)
         self.twin_error = relative(self.whole(twin), self.exact)

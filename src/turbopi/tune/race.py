@@ -16,7 +16,7 @@ from turbopi.kernels.tile_table import Knobs
 ROUNDS, FINAL_ROUNDS = 7, 31
 FINALISTS = 5  # beside the usual tile
 MARGIN = 0.01  # of the time of one operation alone: see `Bench.margin`
-MOST_SPREAD = 0.15  # half the rounds lie within this share of the median, or the GPU is busy
+MOST_SPREAD = 0.15  # the interquartile range over the median; beyond it the GPU counts as busy
 
 Round = Callable[[], float]  # microseconds of one call, as one round measures it
 
@@ -108,7 +108,7 @@ def wrong(error: float, bound: float) -> str | None:
 
 
 def in_turns(timers: dict[int, Round], rounds: int) -> dict[int, list[float]]:
-    """Every one in every round, forth and back, so that a clock that drifts favours none."""
+    """Every one in every round, in order and then in reverse, so that a clock that drifts favours none."""
     times: dict[int, list[float]] = {place: [] for place in timers}
     for number in range(rounds):
         for place in reversed(timers) if number % 2 else timers:
@@ -117,8 +117,7 @@ def in_turns(timers: dict[int, Round], rounds: int) -> dict[int, list[float]]:
 
 
 def timed(knobs: Knobs, times: Sequence[float]) -> Timed:
-    median = statistics.median(times)
-    return Timed(knobs, median, spread(times))
+    return Timed(knobs, statistics.median(times), spread(times))
 
 
 def spread(times: Sequence[float]) -> float:
