@@ -19,7 +19,8 @@
     ├── evaluate.sources.PolicyRefused     a policy doesn't fit the simulator
     └── evaluate.schedule.TooManyCrashes   the simulator breaks again and again
 
-Messages name the value, what was expected, and what to do about it. Broken invariants of our own are `assert`s.
+Messages name the value, what was expected, and what to do about it. Broken invariants of our own are `assert`s. As some
+errors are ValueErrors, or an OSError, `except ValueError` around our own checks would catch what they raise, too.
 """
 
 
