@@ -31,7 +31,7 @@ from turbopi.errors import ConfigError
 from turbopi.model.reference import parameter_shapes
 
 _ROBOT_DIMS = {"libero": (8, 7), "droid": (8, 8), "aloha": (14, 14)}  # state, actions; other robots: the model's width
-_BLOCK = {"cpu": 2**14, "cuda": 2**24}  # values made at once: few, so that torch uses one core; many
+_BLOCK = {"cpu": 2**14, "cuda": 2**24}  # values made at once: few, so that torch takes one core; enough for a GPU
 
 
 class RandomSource:

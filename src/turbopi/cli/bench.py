@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from turbopi.cli.files import check_folder, check_replaces
+from turbopi.cli.files import check_report
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, RobotOptions, own_precision
 from turbopi.cli.predict import show_predictions
@@ -300,8 +300,7 @@ def bench(
         if ready and (plan.solver, plan.time_grid) != (None, None):
             raise ConfigError("--ready starts programs with openpi's steps: give it without --solver and --time-grid")
         if report is not None:
-            check_folder(report)
-            check_replaces(report / RESULTS, "floors", "a benchmark's results")
+            check_report(report / RESULTS, "floors", "a benchmark's results")
         starts = _starts(checkpoint, options, plan, str(resolved)) if ready else []
         document = _run_with_bar(lambda progress: run(opened, plan, resolved, progress), plan, report, output)
     told = replace(document.provenance, command=["turbopi", *sys.argv[1:]])

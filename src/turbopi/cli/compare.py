@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from turbopi.cli.evaluate import EvalOptions, run_with_progress
-from turbopi.cli.files import check_folder, check_replaces
+from turbopi.cli.files import check_report
 from turbopi.cli.framework import JsonFlag, Output, command
 from turbopi.errors import ConfigError
 
@@ -103,8 +103,7 @@ def _check_out(out: Path) -> None:
     """Raises ConfigError now for what couldn't be written later, or would replace another command's file."""
     from turbopi.evaluate.compare import DOCUMENT
 
-    check_folder(out)
-    check_replaces(out / DOCUMENT, "runs", "a comparison of `turbopi compare`")
+    check_report(out / DOCUMENT, "runs", "a comparison of `turbopi compare`")
 
 
 def _run_variants(

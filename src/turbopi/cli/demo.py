@@ -8,7 +8,7 @@ import typer
 from rich.progress import Progress
 from rich.table import Table
 
-from turbopi.cli.files import check_folder, check_replaces
+from turbopi.cli.files import check_report
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, new_console, plain
 from turbopi.cli.options import CheckpointArgument, PolicyOptions
 from turbopi.cli.timings import STAGES, timing_columns
@@ -91,8 +91,8 @@ def demo(
         from turbopi.shipped import SMALL_POLICY
 
         checkpoint = str(SMALL_POLICY)
-    check_folder(report)  # what can't be written, or played, is better known before the work
-    check_replaces(report / "report.json", "frames", "a report of `turbopi demo`")
+    # what can't be written, or played, is better known before the work
+    check_report(report / "report.json", "frames", "a report of `turbopi demo`")
     if episodes:
         from turbopi.sim import create
 

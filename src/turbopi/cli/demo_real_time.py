@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from rich.progress import Progress
 
-from turbopi.cli.files import check_folder, check_replaces
+from turbopi.cli.files import check_report
 from turbopi.cli.framework import Output, new_console, plain
 from turbopi.cli.options import PolicyOptions
 from turbopi.files import write_whole
@@ -22,8 +22,7 @@ def show_real_time(
     options: PolicyOptions, checkpoint: str | None, episodes: int | None, seed: int, report: Path, output: Output
 ) -> None:
     """Play, tell and plot. The numbers are counted here, and the sentences follow from them."""
-    check_folder(report)
-    check_replaces(report / "real_time.json", "ways", "a report of `turbopi demo --real-time`")
+    check_report(report / "real_time.json", "ways", "a report of `turbopi demo --real-time`")
     if checkpoint is None and options.random_weights is None:
         from turbopi.shipped import CHASE_POLICY
 

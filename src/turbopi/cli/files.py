@@ -65,6 +65,15 @@ def check_replaces(file: Path, key: str, what: str) -> None:
         raise ConfigError(f"{file} is there and isn't {what}, so it isn't replaced; name another folder")
 
 
+def check_report(file: Path, key: str, what: str) -> None:
+    """Raise ConfigError now for a report that couldn't be written later, or would replace another command's file.
+
+    key, what  as for `check_replaces`
+    """
+    check_folder(file.parent)
+    check_replaces(file, key, what)
+
+
 def let_import_from_here() -> None:
     """Have "module:Class" find modules of the current folder: a console script's path lacks it, `python -m` has it."""
     if os.getcwd() not in sys.path:

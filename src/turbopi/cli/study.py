@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from turbopi.cli.files import check_folder, check_replaces
+from turbopi.cli.files import check_folder, check_report
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command
 from turbopi.cli.options import MOST_CALLS, CheckpointArgument, WeightOptions
 from turbopi.config import LIMITS
@@ -217,8 +217,7 @@ def _check_reports(studies: "list[Study]", out: Path) -> None:
     from turbopi.studies.report import JSON
 
     for one in studies:
-        check_folder(out / one.name)
-        check_replaces(out / one.name / JSON, "study", "a report of `turbopi study`")
+        check_report(out / one.name / JSON, "study", "a report of `turbopi study`")
 
 
 def _policies(given: list[str]) -> dict[str, Path]:

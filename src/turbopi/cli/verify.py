@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from turbopi.cli.files import check_folder, check_replaces
+from turbopi.cli.files import check_report
 from turbopi.cli.framework import CHECK_FAILED, JsonFlag, Output, command, plain
 from turbopi.cli.options import MOST_NOISES, CheckpointArgument, PolicyOptions
 from turbopi.cli.progress import with_stages
@@ -77,8 +77,7 @@ def verify(
     bfloat16 does to the same inputs. Exit code 0: PASS; 1: FAIL, and the first intermediate that is off is named.
     """
     if report is not None:
-        check_folder(report)
-        check_replaces(report / FILE, "intermediates", "a certificate of `turbopi verify`")
+        check_report(report / FILE, "intermediates", "a certificate of `turbopi verify`")
     output = Output(as_json)
     opened = options.open(checkpoint)
     from turbopi.calibrate.run import Progress

@@ -21,6 +21,7 @@ from turbopi.execution.delays import DelayEstimate, number_up_to
 from turbopi.execution.ways import Execution, way_named
 from turbopi.running_chunk import RunningChunk
 
+OLD_WEIGHT = 0.3  # LeRobot's default
 KEPT = 10_000  # seams and delays of one queue
 
 # Why a chunk was never carried out:
@@ -130,7 +131,7 @@ class ChunkQueue:
         delay: int | DelayEstimate = 0,
         trained_max_delay: int | None = None,
         max_jump: float | np.ndarray | None = None,
-        old_weight: float = 0.3,
+        old_weight: float = OLD_WEIGHT,
         schedule: Schedule | None = None,
         max_guidance_weight: float | None = None,
         policys_guidance: bool = False,

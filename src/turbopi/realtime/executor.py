@@ -16,7 +16,7 @@ from turbopi.config import Schedule
 from turbopi.errors import ConfigError
 from turbopi.execution import ChunkQueue, DelayEstimate, Execution, Seam, way_named
 from turbopi.execution.messages import PREFIX
-from turbopi.execution.queue import summary
+from turbopi.execution.queue import OLD_WEIGHT, summary
 from turbopi.realtime.inference import BackgroundThread, Inference
 from turbopi.realtime.journal import Command, Inferred, Journal, Kind, OutOfActions
 from turbopi.realtime.policies import check_policy, server_joins
@@ -80,7 +80,7 @@ class RealTimeExecutor:
         delay_percentile: float = 95.0,
         delay_window: int = 50,
         infer_arguments: Mapping[str, Any] | None = None,
-        old_weight: float = 0.3,
+        old_weight: float = OLD_WEIGHT,
         schedule: Schedule | None = None,
         max_guidance_weight: float | None = None,
         clock: Callable[[], float] = time.monotonic,
