@@ -24,25 +24,25 @@ def code(tmp_path: Path, name: str, text: str) -> str:
     return gpu_evidence.code_of(tmp_path / name)
 
 
-def test_the_checked_in_gpu_result_is_of_this_code() -> None:
-    result = gpu_evidence.result()
-    assert result.ok and result.tests.parts_to_go == 0
-    changed = gpu_evidence.changed_since(result.fingerprint)
+def test_a_checked_in_gpu_result_is_of_this_code() -> None:
+    results = [gpu_evidence.read_result(file) for file in gpu_evidence.result_files()]
+    whole = [one for one in results if one.ok and one.tests.parts_to_go == 0]
     waiting = gpu_evidence.pending()
-    if waiting is not None and changed:  # conftest.py says so at the end of every run
-        changed = gpu_evidence.changed_since(waiting.fingerprint)
+    recorded = [*whole, waiting] if waiting is not None else whole  # conftest.py says what waits after every run
+    changed = min((gpu_evidence.changed_since(one.fingerprint) for one in recorded), key=len)
     assert not changed, (
         f"{len(changed)} files differ from those that scripts/gpu_check saw: {', '.join(changed)}. Run it on a Hopper "
         "GPU and check its result in; where none can be had, scripts/gpu_check --pending REASON says so"
     )
-    assert waiting is None or gpu_evidence.changed_since(result.fingerprint), "nothing is pending: remove that file"
+    tested = [one for one in whole if not gpu_evidence.changed_since(one.fingerprint)]
+    assert waiting is None or not tested, "nothing is pending: remove that file"
 
 
 def test_the_kernels_compile_to_the_machine_code_that_was_tested(cubins: Path) -> None:
     here = machine_code.machine_code(cubins)
     if here is None:
         pytest.skip("no NVRTC here: only the source's fingerprint is compared")
-    known = gpu_evidence.result(), gpu_evidence.pending()
+    known = [*map(gpu_evidence.read_result, gpu_evidence.result_files()), gpu_evidence.pending()]
     recorded = [one.machine_code for one in known if one is not None and one.machine_code]
     assert recorded, "no machine code was recorded: run scripts/gpu_check on a Hopper GPU"
     if all(one["NVRTC"] != here["NVRTC"] for one in recorded):
@@ -70,6 +70,43 @@ def test_comments_and_docstrings_do_not_count_and_all_else_does(tmp_path: Path) 
     assert code(tmp_path, "a.py", SOURCE) == plain
     assert code(tmp_path, "a.py", SOURCE.replace("2 * x", "3 * x")) != plain
     assert code(tmp_path, "a.py", SOURCE.replace("why", "how").replace("Twice", "Two times")) == plain
+
+
+RAISING = """def check(rows: int) -> str:
+    if rows > 8:
+        raise ValueError(
+            f"é: {rows} rows",
+            "at most 8",
+            rows
+        ) from None
+    return "f32"
+"""
+
+
+def test_the_text_of_an_error_does_not_count_and_what_runs_does(tmp_path: Path) -> None:
+    def running(text: str) -> str:
+        (tmp_path / "a.py").write_text(text)
+        return gpu_evidence.code_of(tmp_path / "a.py", errors=False)
+
+    assert running(RAISING.replace("é: {rows} rows", "{rows} rows are too many").replace("at most", "≤")) == running(
+        RAISING
+    )
+    for old, new in (("> 8", "> 9"), ('"f32"', '"bf16"'), ("ValueError", "TypeError"), ("rows\n", "rows + 1\n")):
+        assert running(RAISING.replace(old, new)) != running(RAISING)
+
+
+@pytest.mark.parametrize(
+    "module", ["policy", "model_call", "cli.serve", "serve.worker", "errors", "checkpoint.reading"]
+)
+def test_files_of_the_host_are_not_in_the_fingerprint(module: str) -> None:
+    assert f"src/turbopi/{module.replace('.', '/')}.py" not in gpu_evidence.fingerprint()
+
+
+def test_a_result_file_is_named_by_gpu_and_date() -> None:
+    assert gpu_evidence.result_file("NVIDIA H200", "2026-11-28").name == "h200_2026-11-28_gpu_check.json"
+    assert (
+        gpu_evidence.result_file("NVIDIA GeForce RTX 4090", "2027-01-02").name == "rtx_4090_2027-01-02_gpu_check.json"
+    )
 
 
 def test_kernels_comments_do_not_count_and_their_strings_do(tmp_path: Path) -> None:

@@ -221,22 +221,19 @@ def test_checked_in_load_tests_read_and_come_out_as_they_were() -> None:
             assert json.dumps(plain_document(read_load(RESULTS / name)), indent=1) + "\n" == text
 
 
-def test_the_checked_in_gpu_result_reads_and_comes_out_as_it_was() -> None:
-    written = plain_document(gpu_evidence.result())
-    assert json.dumps(written, indent=1) + "\n" == gpu_evidence.RESULT.read_text()
+def test_the_checked_in_gpu_results_read_and_come_out_as_they_were() -> None:
+    for file in gpu_evidence.result_files():
+        assert json.dumps(plain_document(gpu_evidence.read_result(file)), indent=1) + "\n" == file.read_text()
 
 
 @pytest.mark.parametrize("key", ["tests", "golden", "fingerprint", "machine_code"])
-def test_a_gpu_result_that_lacks_something_is_refused_by_key(
-    key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    content = json.loads(gpu_evidence.RESULT.read_text())
+def test_a_gpu_result_that_lacks_something_is_refused_by_key(key: str, tmp_path: Path) -> None:
+    content = json.loads(gpu_evidence.result_files()[-1].read_text())
     del content[key]
     file = tmp_path / "gpu_check.json"
     file.write_text(json.dumps(content))
-    monkeypatch.setattr(gpu_evidence, "RESULT", file)
     with pytest.raises(ConfigError, match=f"{file}: {key} is missing"):
-        gpu_evidence.result()
+        gpu_evidence.read_result(file)
 
 
 def test_the_checked_in_calibrations_report_reads_and_comes_out_as_it_was() -> None:

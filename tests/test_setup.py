@@ -13,6 +13,7 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import gpu_evidence
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -191,6 +192,6 @@ def test_the_tests_take_the_extras_versions_of_what_cpu_builds_lack(machine: Mac
 
 
 def test_the_extra_cuda_is_what_the_gpu_tests_ran_with() -> None:
-    ran = json.loads((ROOT / "benchmarks/results/gpu_check.json").read_text(encoding="utf-8"))["provenance"]
+    ran = json.loads(gpu_evidence.result_files()[-1].read_text(encoding="utf-8"))["provenance"]
     pinned = pins()
     assert pinned["torch"] == ran["torch"].split("+")[0] and pinned["triton"] == ran["triton"]

@@ -1,8 +1,8 @@
-"""Whether the checked-in result of scripts/gpu_check belongs to the code as it is.
+"""Whether a checked-in result of scripts/gpu_check belongs to the code as it is.
 
-CI has no GPU, so all that it knows of the GPU tests is a result file. That file carries a hash of each source file that
-runs on the GPU, decides what does, or judges it. A CPU test compares them with the tree. Comments, docstrings and blank
-lines don't count.
+CI has no GPU, so all that it knows of the GPU tests is result files, one a GPU and date. Each carries a hash of each
+source file that runs on the GPU, decides what is launched there, or judges it. A CPU test compares them with the tree.
+Comments, docstrings, blank lines and the texts of errors don't count.
 """
 
 import ast
@@ -18,8 +18,9 @@ from turbopi.reading import read_document
 from turbopi.source_code import code_of
 
 ROOT = Path(__file__).resolve().parent.parent
-RESULT = ROOT / "benchmarks/results/gpu_check.json"
-PENDING = ROOT / "benchmarks/results/gpu_check_pending.json"
+RESULTS = ROOT / "benchmarks/results"
+PENDING = RESULTS / "gpu_check_pending.json"
+NAME = "gpu_check.json"  # of h200_2026-11-27_gpu_check.json
 
 # Files whose code runs on the GPU, or decides what does.
 PRODUCT = (
@@ -29,19 +30,15 @@ PRODUCT = (
         "src/turbopi/calibrate/*",
         "src/turbopi/config.py",
         "src/turbopi/observation.py",
-        "src/turbopi/policy.py",
-        "src/turbopi/joining.py",
-        "src/turbopi/model_call.py",
-        "src/turbopi/running_chunk.py",
     ),
     "src/turbopi/verify/check_golden.py",
 )
-# Modules that those import and that only read files or format text on the host: CPU tests see all of what they do.
+# Modules that only read files, format text or hand tensors on: CPU tests see all of what they do.
 HOST_ONLY = (
     *("turbopi", "turbopi.checkpoint", "turbopi.preprocess", "turbopi.robots", "turbopi.shipped"),
     *("turbopi.export", "turbopi.tensorrt", "turbopi.errors", "turbopi.files", "turbopi.reading", "turbopi.arguments"),
     *("turbopi.provenance", "turbopi.toolchain", "turbopi.recordings", "turbopi.examples", "turbopi.verify.golden"),
-    "turbopi.source_code",
+    *("turbopi.policy", "turbopi.joining", "turbopi.model_call", "turbopi.running_chunk", "turbopi.source_code"),
     "turbopi.backends.onnx",  # refuses every device but the CPU
 )
 MARKED = re.compile(r"mark\.gpu|\bon_hopper\b|gpu_or_interpreter")
@@ -104,8 +101,8 @@ def product_files() -> list[Path]:
 def fingerprint() -> dict[str, str]:
     """{file, relative to the repository: hash of its code} for the product's files and the GPU tests."""
     judging = [ROOT / "tools/kernel_turns" / name for name in ("problems.py", "portable.py", "ptx.py", "triton_ptx.py")]
-    files = [*product_files(), *gpu_test_files(), ROOT / "tests/conftest.py", *judging]
-    code = {str(path.relative_to(ROOT)): code_of(path) for path in files}
+    files = [*product_files(), *gpu_test_files(), *judging]
+    code = {str(path.relative_to(ROOT)): code_of(path, errors=False) for path in files}
     return {name: hashlib.sha256(text.encode()).hexdigest()[:16] for name, text in code.items()}
 
 
@@ -149,9 +146,20 @@ def changed_since(recorded: dict[str, str]) -> list[str]:
     return sorted(name for name in {*now, *recorded} - host_only if now.get(name) != recorded.get(name))
 
 
-def result() -> GpuCheck:
-    """The checked-in result. Raises ConfigError for a file of another kind, as `pending` does."""
-    return read_document(RESULT, GpuCheck, ConfigError)
+def result_file(gpu: str, date: str) -> Path:
+    """Where a result of that GPU, such as "NVIDIA H200", and date is checked in."""
+    name = "_".join(re.findall(r"\w+", gpu.lower().replace("nvidia", "").replace("geforce", "")))
+    return RESULTS / f"{name}_{date}_{NAME}"
+
+
+def result_files() -> list[Path]:
+    """The checked-in results, oldest first."""
+    return sorted(RESULTS.glob(f"*_{NAME}"), key=lambda path: path.name.removesuffix(f"_{NAME}").split("_")[-1])
+
+
+def read_result(file: Path) -> GpuCheck:
+    """Raises ConfigError for a file of another kind, as `pending` does."""
+    return read_document(file, GpuCheck, ConfigError)
 
 
 def pending() -> GpuCheckPending | None:

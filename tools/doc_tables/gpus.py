@@ -26,7 +26,7 @@ from turbopi.config import ModelConfig
 from turbopi.errors import TurboPiError
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
-TESTED = "gpu_check.json"
+TESTED = "*_gpu_check.json"
 COMPILED, AS_PTX = "compiled_for_all.json", "h?00_*_ptx.json"  # the second of an H100 or H200; its newest counts
 DEVICE = torch.device("cuda", 0)
 TIERS: tuple[Precision, ...] = tuple(one for one in backends.PRECISIONS if one != "f32" and not one.endswith("-mlp"))
@@ -114,10 +114,11 @@ def counted(rows: list[dict[str, object]]) -> str:
 def was_run(gpu: GpuSpec, results: Path) -> str:
     """What of checked-in results was run on it: by the GPU's name that is in them."""
     found = []
-    document = json.loads((results / TESTED).read_text(encoding="utf-8"))
-    name = str(document["provenance"].get("gpu", {}).get("name", ""))
-    if document["ok"] and re.search(rf"\b{gpu.key}\b", name.lower()):
-        found.append("GPU tests")
+    for file in results.glob(TESTED):
+        document = json.loads(file.read_text(encoding="utf-8"))
+        name = str(document["provenance"].get("gpu", {}).get("name", ""))
+        if document["ok"] and re.search(rf"\b{gpu.key}\b", name.lower()):
+            found = ["GPU tests"]
     if any(call.gpu == gpu.key for call in measured_calls()):
         found.append("speed")
     return ", ".join(found) or "no"
