@@ -15,7 +15,7 @@ from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import CAMERAS, LIMITS
 from turbopi.engine.runner import HostRow
-from turbopi.errors import BackendError, ConfigError, ObservationError
+from turbopi.errors import ConfigError, ObservationError
 from turbopi.observation import Observation, with_cameras
 from turbopi.robots import ROBOTS, LeRobot, Robot, create_robot
 from turbopi.robots.described import Described
