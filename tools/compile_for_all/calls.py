@@ -59,17 +59,23 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
     """
     numbers = E4M3 if tiles.fp8_refusal(target.capability) is None else torch.int8
     inverses: tuple[Input, ...] = ({}, {"inverse": 30.0, "numbers": numbers})
+    marking = ({}, inverses[1] | _marks(numbers))
     calls = [
         *_norms(inverses),
-        *_attention(target, inverses),
+        *_attention(target, inverses, marking),
         *_batch(target, inverses),
         *_rest(),
         *_backward(),
         *_way_back(),
     ]
-    calls += [partial(lambda input: activations.geglu(of(PREFIX, 2 * 16384), **input), one) for one in inverses]
+    calls += [partial(lambda input: activations.geglu(of(PREFIX, 2 * 16384), **input), one) for one in marking]
     calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152), numbers)]
     return [*calls, *product_calls(target, numbers, chosen)]
+
+
+def _marks(numbers: torch.dtype) -> Input:
+    """Where int8's damage is marked."""
+    return {"stream": of(PREFIX, 2048)} if numbers == torch.int8 else {}
 
 
 def product_calls(target: Target, numbers: torch.dtype, chosen: bool = False) -> Calls:
@@ -104,7 +110,10 @@ def _product(
     data = of(rows, k, dtype=numbers)
     weight = data if numbers == BF16 else ScaledMatrix(data, of(rows, dtype=F32), 50.0, BF16)
     inverse, added = 30.0 if behind else None, of(n) if bias else None
-    return product(of(m, k, dtype=numbers), weight, epilogue, added, inverse=inverse, tile=tile, numbers=numbers)
+    marks = _marks(numbers) if behind else {}
+    return product(
+        of(m, k, dtype=numbers), weight, epilogue, added, inverse=inverse, tile=tile, numbers=numbers, **marks
+    )
 
 
 def _norms(inverses: tuple[Input, ...]) -> Calls:
@@ -139,7 +148,7 @@ def _layer_norm(rows: int, width: int, y: tuple[int, ...] | None, input: Input) 
     return norms.residual_layer_norm(of(rows, width), given, of(width), of(width), 1e-6, **input)
 
 
-def _attention(target: Target, inverses: tuple[Input, ...]) -> Calls:
+def _attention(target: Target, inverses: tuple[Input, ...], marking: tuple[Input, ...]) -> Calls:
     """In every tile that this GPU takes."""
 
     def vision(tile: AttentionTile, input: Input) -> Tensor:
@@ -155,7 +164,7 @@ def _attention(target: Target, inverses: tuple[Input, ...]) -> Calls:
         return attention.masked_softmax(of(SUFFIX * 8, 1026, dtype=F32), length, 976, 8, state_token, 0.06, BF16)
 
     return [
-        *(partial(vision, *one) for one in _in_tiles(target, "vision_attention", 72, inverses)),
+        *(partial(vision, *one) for one in _in_tiles(target, "vision_attention", 72, marking)),
         *(partial(prefix, *one) for one in _in_tiles(target, "prefix_attention", 256, inverses)),
         *(partial(softmax, state_token) for state_token in (False, True)),
     ]

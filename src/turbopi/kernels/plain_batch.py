@@ -37,7 +37,7 @@ def packed_attention(
     visible = whose[:, None] == whose
     queries = q.view(rows, heads, dim).transpose(0, 1)
     attended = F.scaled_dot_product_attention(queries, k.expand(heads, -1, -1), v.expand(heads, -1, -1), visible)
-    return as_input(attended.transpose(0, 1).reshape(rows, heads * dim), q.dtype, inverse, numbers)
+    return as_input(attended.transpose(0, 1).reshape(rows, heads * dim), q.dtype, inverse, numbers, v)
 
 
 def suffix_attention(
