@@ -59,23 +59,26 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
     """
     numbers = E4M3 if tiles.fp8_refusal(target.capability) is None else torch.int8
     inverses: tuple[Input, ...] = ({}, {"inverse": 30.0, "numbers": numbers})
-    marking = ({}, inverses[1] | _marks(numbers))
     calls = [
         *_norms(inverses),
-        *_attention(target, inverses, marking),
+        *_attention(target, inverses),
         *_batch(target, inverses),
         *_rest(),
         *_backward(),
         *_way_back(),
     ]
-    calls += [partial(lambda input: activations.geglu(of(PREFIX, 2 * 16384), **input), one) for one in marking]
+    calls += [partial(_geglu, one) for one in inverses]
     calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152), numbers)]
     return [*calls, *product_calls(target, numbers, chosen)]
 
 
-def _marks(numbers: torch.dtype) -> Input:
-    """Where int8's damage is marked."""
-    return {"stream": of(PREFIX, 2048)} if numbers == torch.int8 else {}
+def _marks(input: Input) -> Input:
+    """The residual stream, in which int8's damage is marked."""
+    return {"stream": of(PREFIX, 2048)} if input.get("numbers") == torch.int8 else {}
+
+
+def _geglu(input: Input) -> Tensor:
+    return activations.geglu(of(PREFIX, 2 * 16384), **input, **_marks(input))
 
 
 def product_calls(target: Target, numbers: torch.dtype, chosen: bool = False) -> Calls:
@@ -109,11 +112,9 @@ def _product(
     rows = 2 * n if epilogue == "geglu" else n
     data = of(rows, k, dtype=numbers)
     weight = data if numbers == BF16 else ScaledMatrix(data, of(rows, dtype=F32), 50.0, BF16)
-    inverse, added = 30.0 if behind else None, of(n) if bias else None
-    marks = _marks(numbers) if behind else {}
-    return product(
-        of(m, k, dtype=numbers), weight, epilogue, added, inverse=inverse, tile=tile, numbers=numbers, **marks
-    )
+    input: Input = {"inverse": 30.0, "numbers": numbers} if behind else {}
+    added = of(n) if bias else None
+    return product(of(m, k, dtype=numbers), weight, epilogue, added, tile=tile, **input, **_marks(input))
 
 
 def _norms(inverses: tuple[Input, ...]) -> Calls:
@@ -148,11 +149,11 @@ def _layer_norm(rows: int, width: int, y: tuple[int, ...] | None, input: Input) 
     return norms.residual_layer_norm(of(rows, width), given, of(width), of(width), 1e-6, **input)
 
 
-def _attention(target: Target, inverses: tuple[Input, ...], marking: tuple[Input, ...]) -> Calls:
+def _attention(target: Target, inverses: tuple[Input, ...]) -> Calls:
     """In every tile that this GPU takes."""
 
     def vision(tile: AttentionTile, input: Input) -> Tensor:
-        return attention.vision_attention(of(ROWS, 3456), 2, 16, tile=tile, **input)
+        return attention.vision_attention(of(ROWS, 3456), 2, 16, tile=tile, **input, **_marks(input))
 
     def prefix(tile: AttentionTile, input: Input) -> Tensor:
         k = of(PREFIX, 256)
@@ -164,7 +165,7 @@ def _attention(target: Target, inverses: tuple[Input, ...], marking: tuple[Input
         return attention.masked_softmax(of(SUFFIX * 8, 1026, dtype=F32), length, 976, 8, state_token, 0.06, BF16)
 
     return [
-        *(partial(vision, *one) for one in _in_tiles(target, "vision_attention", 72, marking)),
+        *(partial(vision, *one) for one in _in_tiles(target, "vision_attention", 72, inverses)),
         *(partial(prefix, *one) for one in _in_tiles(target, "prefix_attention", 256, inverses)),
         *(partial(softmax, state_token) for state_token in (False, True)),
     ]

@@ -102,7 +102,7 @@ class GraphRunner:
         self._tables: dict[tuple[int, tuple[float, ...]], Tensor | None] = {}  # by `Loop.table`
         self._calls: dict[CallShape, StaticCall] = {}
         self._pictures: dict[tuple[int, bool], Pictures] = {}  # by cameras, and whether they are float
-        self._graphs: dict[tuple[CallShape | Pictures, str], Graph] = {}
+        self._graphs: dict[tuple[CallShape | Pictures | None, str], Graph] = {}
         self._begun: object = None  # what may be finished
         self._pool: Any = None
         self._stream: torch.cuda.Stream | None = None  # that graphs are captured on
@@ -203,7 +203,8 @@ class GraphRunner:
 
     def describe(self) -> dict[str, Any]:
         captured = sorted(
-            {(s.cameras, s.prompt_slots, s.loop) for s in list(self._calls)},  # a call of another thread may add some
+            # a call of another thread may add some
+            {(s.cameras, s.prompt_slots, s.loop) for s, _ in list(self._graphs) if isinstance(s, CallShape)},
             key=lambda one: (*one[:2], *one[2][:2], str(one[2])),
         )
         return {
@@ -342,9 +343,9 @@ class GraphRunner:
             )
 
     def _forget_all(self, loop: Loop) -> None:
-        """Let go of a loop, and of its evaluations' that no other loop has."""
+        """Let go of a loop, and of its evaluations' that no other loop has or is."""
         self._forget(loop)
-        kept = {one for other in self._recent for one in evaluation_loops(other)}
+        kept = {*self._recent, *(one for other in self._recent for one in evaluation_loops(other))}
         for one in evaluation_loops(loop):
             if one not in kept:
                 self._forget(one)
@@ -370,10 +371,10 @@ class GraphRunner:
 
     def _pictures_of(self, cameras: int, float_images: bool) -> Pictures:
         key, slots = (cameras, float_images), bucket(self.config.max_prompt_tokens)
+        if self.strict and not self._warming and (self._pictures.get(key), "vision") not in self._graphs:
+            warm = (f"{of.cameras} cameras" for of, _ in self._graphs if isinstance(of, Pictures))
+            raise not_warm(self.name, f"{cameras} cameras", warm, cameras=cameras)
         if key not in self._pictures:
-            if self.strict and not self._warming:
-                warm = (f"{count} cameras" for count, _ in self._pictures)
-                raise not_warm(self.name, f"{cameras} cameras", warm, cameras=cameras)
             self._pictures[key] = Pictures(self.config, self._weights, self._ops, cameras, float_images, slots)
         return self._pictures[key]
 
