@@ -279,11 +279,11 @@ def test_too_many_cameras_or_tokens_or_none_at_all_are_refused() -> None:
     backend = on_cpu()
     observation, noise = made_up("pi05", 1, 5)
     row = HostRow.of(observation, 0)
-    with pytest.raises(BackendError, match="up to 4 cameras, this observation has 5"):
+    with pytest.raises(ObservationError, match="up to 4 cameras, this observation has 5"):
         backend.begin(row.images * 5)
     most = backend.config.max_prompt_tokens
-    with pytest.raises(BackendError, match=f"{most} prompt tokens, this observation has 1 and {most + 1}"):
+    with pytest.raises(ObservationError, match=f"{most} prompt tokens, this observation has 1 and {most + 1}"):
         backend.begin(row.images).finish(np.ones(most + 1, np.int64), row.state, noise[0].numpy(), 1)
-    with pytest.raises(BackendError, match="this observation has 0 and 0"):
+    with pytest.raises(ObservationError, match="this observation has 0 and 0"):
         backend.begin([]).finish(row.tokens[:0], row.state, noise[0].numpy(), 1)
     assert backend.sample(observation, noise, 1).actions.isfinite().all()

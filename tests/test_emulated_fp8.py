@@ -3,11 +3,13 @@
 import json
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from cli_helpers import turbopi
 from conftest import golden_cases, golden_folder, golden_model
+from test_engine_batch import observations
 from torch import Tensor
 
 from turbopi import backends
@@ -95,6 +97,31 @@ def test_in_int8_the_experts_activations_stay_and_products_err_less_than_in_fp8(
     assert torch.equal(input_rounding(site, 0.1, INT8)(x), x)
     assert not torch.equal(input_rounding(site, 0.1, FP8)(x), x)
     assert model.config.expert.depth * 4 == len(experts)
+
+
+@pytest.mark.parametrize("tier", ["fp8", "int8"])
+def test_damage_is_refused_and_harms_no_other_observation(tier: Tier) -> None:
+    """A NaN in what one prompt alone has; then one, in INT8 an infinity too, where rounding would hide it."""
+    backend: Any = emulated(calibrated("pi05", format_of(tier).name), tier)
+    observation, noise = observations("pi05", [1, 1], [4, 4], 5)
+    token = int(observation.tokens[0, 2])
+    assert token not in observation.tokens[1]
+
+    def finite() -> list[bool]:
+        return backend.sample(observation, noise, 1).actions.isfinite().all(-1).all(-1).tolist()  # type: ignore[no-any-return]
+
+    model = backend.model
+    vision, prefix, last = model.vision.layers[0], model.vlm.layers[0], model.vlm.layers[-1]
+    weights = [model.vlm.embed_tokens.weight[token], vision.layer_norm1.weight, vision.self_attn.q_proj.bias]
+    weights += [vision.mlp.fc1.bias, prefix.self_attn.q_proj.weight[1], prefix.mlp.up_proj.weight[1]]
+    weights += [last.self_attn.v_proj.weight[0], model.expert.layers[1].mlp.down_proj.weight[0]]
+    for number in weights:
+        before = number[0].clone()
+        for damage in (torch.nan, torch.inf) if tier == "int8" else (torch.nan,):
+            number[0] = damage
+            assert finite() == [False, number is weights[0]]
+        number[0] = before
+    assert finite() == [True, True]
 
 
 def test_a_calibration_for_other_numbers_is_refused() -> None:

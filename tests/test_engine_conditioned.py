@@ -1,6 +1,6 @@
 """Conditioned calls of the engine equal the reference's, in one captured graph a form, beside plain calls as ever."""
 
-from types import SimpleNamespace
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from turbopi.engine.conditioned import MOST_TIMES, conditioned_loop
 from turbopi.engine.recent_loops import MOST_LOOPS, Loop
 from turbopi.errors import ObservationError
 from turbopi.model.conditioning import Conditioning, TokenTimes
+from turbopi.model.solvers import Integration
 from turbopi.observation import Observation
 
 KINDS: list[Kind] = ["pi05", "pi0"]
@@ -93,8 +94,7 @@ def test_rows_of_a_batch_have_conditionings_of_their_own(engine: OnCpu) -> None:
         engine.sample(both, noises, STEPS, conditioning=[None, None, None])
 
 
-def test_denoise_alone_takes_a_conditioning(engine: OnCpu, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: SimpleNamespace(synchronize=lambda: None))
+def test_denoise_alone_takes_a_conditioning(engine: OnCpu) -> None:
     observation, noise = made_up(engine.config.kind, 1, 7)
     asked = conditioned("held_and_identity", STEPS, 7, 32)
     whole = engine.sample(observation, noise, STEPS, conditioning=asked).actions
@@ -103,6 +103,23 @@ def test_denoise_alone_takes_a_conditioning(engine: OnCpu, monkeypatch: pytest.M
     torch.testing.assert_close(alone, whole, atol=1e-5, rtol=1e-5)
     trace = engine.intermediates(observation, noise, STEPS, conditioning=asked)
     assert torch.equal(trace["actions"], whole) and trace["x_t"].shape == (STEPS + 1, 1, 7, 32)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("which", ["plain", "ab2", "held_and_identity", "jacobian"])
+def test_a_cache_from_elsewhere_is_denoised_by_an_engine_that_encoded_nothing(kind: Kind, which: str) -> None:
+    """Behind the given rows the engine's own cache is as it was allocated: NaN."""
+    observation, noise = made_up(kind, 1, 5)
+    asked: Any = {"plain": None, "ab2": Conditioning(integration=Integration("ab2", (1.0, 0.4, 0.2, 0.1, 0.0)))}
+    told = asked[which] if which in asked else conditioned(which, STEPS, 7, 32)
+    model = golden_model(kind)
+    cache, fresh = model.prefix(observation), on_cpu(kind, Unrun)
+    found = fresh.denoise(cache, noise, STEPS, conditioning=told)
+    torch.testing.assert_close(found, model.denoise(cache, noise, STEPS, conditioning=told), atol=2e-5, rtol=2e-5)
+    too_many = model.config.max_prompt_tokens + 1
+    long = dataclasses.replace(cache, k=cache.k.new_zeros(*cache.k.shape[:3], 4 * 256 + too_many, cache.k.shape[4]))
+    with pytest.raises(ObservationError, match=f"prompt tokens, this observation has 4 and {too_many}"):
+        fresh.denoise(long, noise, STEPS)
 
 
 @pytest.mark.parametrize("which", ["held", "identity", "staircase", "jacobian"])

@@ -1,13 +1,15 @@
 """The engine with FP8 matrices equals the emulated reference, and a calibration decides which matrices those are."""
 
 import dataclasses
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 
 import pytest
 import torch
 from conftest import golden_cases, golden_folder, golden_model
-from test_engine import answer, shape_of
+from test_begin import Unrun, on_cpu
+from test_engine import answer, made_up, shape_of
 from torch import Tensor
 
 from turbopi.backends.fused import FusedBackend
@@ -80,6 +82,63 @@ def test_the_engine_equals_the_emulated_reference(format: Format) -> None:
     # rounded numbers near an edge may fall either way where float32 sums differ in their last bit
     assert relative(ours, emulated) < 0.25 * relative(emulated, exact)
     assert (0.01 if format is FP8 else 0.002) < relative(emulated, exact) < 0.2
+
+
+def damages(weights: Weights) -> dict[str, Tensor]:
+    """Of each kind of thing that a NaN or an infinity may be in, one number."""
+
+    def scale(matrix: Matrix, row: int = 3) -> Tensor:
+        return matrix.scale[row:][:1] if isinstance(matrix, ScaledMatrix) else matrix[row, :1]
+
+    vision, prefix, expert = weights.vision[0], weights.vlm[0], weights.expert[1]
+    found = {
+        "patches": weights.patch[5, :1],
+        "position": weights.position[7, :1],
+        "projector": weights.projector[1][:1],
+    }
+    for kind in ("qkv", "out", "fc1", "fc2"):
+        matrix, bias = getattr(vision, kind)
+        found |= {f"vision's {kind}": scale(matrix), f"the bias of vision's {kind}": bias[:1]}
+    found |= {"vision's first norm": vision.norm1[0][:1], "vision's second norm": vision.norm2[1][:1]}
+    found |= {f"the prefix's {kind}": scale(getattr(prefix, kind)) for kind in ("qkv", "out", "gate_up", "down")}
+    assert prefix.norm1 is not None and prefix.norm2 is not None
+    found |= {"the prefix's first norm": prefix.norm1[:1], "the prefix's second norm": prefix.norm2[:1]}
+    last = weights.vlm[-1]
+    assert last.norm1 is not None
+    found |= {"the last layer's norm": last.norm1[:1], "the last layer's values": scale(last.qkv, -1)}
+    found |= {f"the expert's {kind}": scale(getattr(expert, kind)) for kind in ("qkv", "out", "gate_up", "down")}
+    return found
+
+
+@pytest.mark.parametrize("numbers", [*FORMATS, "f32"])
+def test_damage_anywhere_reaches_the_actions_and_goes_with_it(numbers: str) -> None:
+    model, (observation, noise) = golden_model("pi05"), made_up("pi05", 1, 5)
+    scales: Mapping[str, float] = {}
+    if numbers != "f32":
+        format = FORMATS[numbers]  # type: ignore[index]
+        measured = {str(site): scale for site, scale in scales_of(observation, noise, format).items()}
+        entries = {str(site): SiteScale(measured.get(str(site), 1.0), 1.0, 0.0, 0.0) for site in sites(model.config)}
+        calibration = Quantization("0" * 64, shapes_of(model.config), entries, {}, format.name)
+        scales = {k: v for k, v in calibration.plan(model.config, numbers).scales.items() if k in measured}
+
+    def make(place: str, matrix: Tensor) -> Matrix:
+        return quantize(matrix, scales[place], format=format) if place in scales else matrix
+
+    class Rounded(Unrun):
+        def _pack(self, load: Any) -> Weights:
+            return pack(self.config, {name: one.clone() for name, one in load(CPU, "f32").items()}, make)
+
+    engine = on_cpu("pi05", Rounded)
+    right, hidden = engine.sample(observation, noise, 1).actions, []
+    for place, number in damages(engine._weights).items():
+        for damage in (torch.nan, torch.inf) if numbers != "fp8" else (torch.nan,):  # infinities saturate in FP8
+            before = number.clone()
+            number.fill_(damage)
+            if bool(engine.sample(observation, noise, 1).actions.isfinite().all()):
+                hidden.append((place, damage))
+            number.copy_(before)
+    assert not hidden
+    assert torch.equal(engine.sample(observation, noise, 1).actions, right)
 
 
 def test_a_part_in_fp8_beside_one_in_full() -> None:
@@ -229,14 +288,16 @@ def test_with_int8_weights_batches_denoise_in_bf16_and_metadata_tells_it() -> No
     backend._quantization, backend._plan = calibration, calibration.plan(backend.config, "int8")
     state = {name: tensor.clone() for name, tensor in golden_model("pi05").state_dict().items()}
     backend._weights = pack(backend.config, state, backend._quantized)
-    assert {layer.qkv.numbers for layer in backend._weights.vlm} == {torch.int8}  # type: ignore[union-attr]
+    *before, last = (layer.qkv for layer in backend._weights.vlm)
+    assert {matrix.numbers for matrix in before} == {torch.int8} and isinstance(last, Tensor)  # type: ignore[union-attr]
     backend._calls, backend._ops, backend._denoisers, backend._pair_denoisers, backend._refused = {}, PLAIN, {}, {}, {}
     backend._keepers = {}
     backend._packed_expert = None
     backend._batches = SimpleNamespace(describe=list)  # type: ignore[assignment]
     backend._graphs, backend._recent = {}, RecentLoops(backend._forget)
     told = backend.describe()["int8"]["plan"]
-    assert told["expert"] == told["expert.down"] == told["prefix.qkv"] == "int8" and "expert of batches" not in told
+    assert told["expert"] == told["expert.down"] == told["prefix.out"] == "int8" and "expert of batches" not in told
+    assert told["prefix.qkv"]["int8"] == "layers 0, 1" and "bf16: INT8 has no NaN" in " ".join(told["prefix.qkv"])
     backend._keep_expert_on = moved.append  # type: ignore[method-assign, assignment]
     assert backend._batch_weights() is backend._weights and moved == [backend.device]
     assert backend.describe()["int8"]["plan"]["expert of batches"] == "bf16, as operations denoise"

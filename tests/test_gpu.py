@@ -145,7 +145,10 @@ def test_prefix_and_denoise_apart_equal_the_whole(name: str) -> None:
     case = golden_cases()["b_third_masked"]
     runner = backend(name, "pi05", "bf16")
     whole = runner.sample(case.observation, case.noise, 10).actions
-    apart = runner.denoise(runner.prefix(case.observation), case.noise, 10).cpu()
+    cache = runner.prefix(case.observation)
+    for rows in (runner._cache.k, runner._cache.v):  # type: ignore[attr-defined]
+        rows.fill_(torch.nan)  # as a backend has them that encoded nothing
+    apart = runner.denoise(cache, case.noise, 10).cpu()
     assert float((whole - apart).abs().max()) < 0.02  # the bucket may differ, and so the order of summation
 
 

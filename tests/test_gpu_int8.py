@@ -1,7 +1,7 @@
 """INT8 of the `fused` backend on a real GPU: what the emulated reference says, on openpi's golden cases."""
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -111,6 +111,36 @@ def test_sites_kept_in_bf16_reach_the_target(case: str) -> None:
     cosine = delta_cosine(ours, exact, torch.zeros_like(exact))
     print(f"{case}: cosine {cosine:.6f}, plan {backend(one.kind, FP8_TARGET).describe()['int8']['plan']}")
     assert cosine >= FP8_COSINE
+
+
+@pytest.mark.parametrize("rows", [1, 4])
+def test_damage_is_refused_and_harms_no_other_observation(rows: int) -> None:
+    """NaN in what captured kernels round to int8, then in a token of one prompt. It goes with its call."""
+    one, runner = golden_cases()["b_third_masked"], cast(FusedBackend, backend("pi05"))
+    many = Observation(
+        **{name: value.repeat(rows, *[1] * (value.dim() - 1)) for name, value in vars(one.observation).items()}
+    )
+    noise, weights = one.noise.repeat(rows, 1, 1), runner._weights
+    own = int(next(token for token in range(3, 100) if token not in many.tokens))
+    many.tokens[0, 1] = own  # of the first observation alone
+
+    def finite() -> list[bool]:
+        return runner.sample(many, noise, STEPS).actions.isfinite().all(-1).all(-1).tolist()
+
+    right, layer = runner.sample(many, noise, STEPS).actions, weights.vlm[0]
+    assert layer.norm2 is not None
+    damaged = [weights.vision[0].fc1[1], weights.vision[0].qkv[1], weights.vision[1].norm1[0], layer.norm2]
+    damaged += [layer.gate_up.scale, layer.qkv.scale]  # type: ignore[union-attr]
+    for numbers in damaged:
+        before = numbers[3].clone()
+        numbers[3] = torch.nan
+        assert finite() == [False] * rows
+        numbers[3] = before
+    embedding, before = weights.embed_tokens[own], weights.embed_tokens[own].clone()
+    embedding.fill_(torch.nan)
+    assert finite() == [False] + [True] * (rows - 1)
+    embedding.copy_(before)
+    assert torch.equal(runner.sample(many, noise, STEPS).actions, right)
 
 
 def test_repeated_calls_are_bit_identical_and_the_denoising_kernel_runs() -> None:

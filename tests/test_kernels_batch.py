@@ -70,6 +70,14 @@ def test_packed_attention_leaves_in_int8(lengths: list[int], spare: int, batch: 
     assert bool(((ours.float() - 40 * twin).abs() <= rounding + before).all())
 
 
+def test_damage_in_int8_shows_in_the_values_of_its_own_observation() -> None:
+    segments, _ = packed([5, 3], 1, 2)
+    q, k, v = random(9 * HEADS, DIM), random(9, DIM, seed=1), random(9, DIM, seed=2)
+    q[6 * HEADS + 1, 4] = torch.nan
+    portable_batch.packed_attention(q, k, v, segments, HEADS, inverse=40.0, numbers=torch.int8)
+    assert v.isnan().nonzero().tolist() == [[6, 0]]
+
+
 @on_hopper
 @LENGTHS
 def test_packed_attention_on_hopper(lengths: list[int], spare: int, batch: int) -> None:

@@ -221,6 +221,54 @@ def test_whatever_stands_before_a_product_leaves_in_its_numbers(format: Format) 
             assert relative(ours.float(), twin.float()) < 0.05
 
 
+@pytest.mark.parametrize("damage", [torch.nan, torch.inf])
+def test_damage_that_int8_cannot_hold_shows_in_its_row_of_the_stream(damage: float) -> None:
+    to: dict[str, Any] = {"inverse": 30.0, "numbers": torch.int8}
+
+    def ones(*shape: int) -> Tensor:
+        return torch.ones(shape, device=DEVICE, dtype=DTYPE)
+
+    def bad(row: int, column: int, *shape: int) -> Tensor:
+        x = random(*shape)
+        x[row, column] = damage
+        return x
+
+    def marked(operation: Callable[[Tensor], Any]) -> list[int]:
+        stream = ones(8, 32)
+        operation(stream)
+        assert bool(stream[:, 1:].isfinite().all()), "one number of a row is enough"
+        return [int(row) for row in stream[:, 0].isnan().nonzero()]
+
+    numbers, matrix = operands(8, 32, 64, INT8)
+    gated = replace(matrix, data=torch.cat((matrix.data, matrix.data)), scale=torch.cat((matrix.scale, matrix.scale)))
+    bias, x, qkv = ones(32), bad(3, 7, 8, 64), bad(3, 90, 8, 96)  # a value of the first of two pictures
+    bias[5] = damage
+    gated.scale[5] = damage
+    every = list(range(8))
+    tile = {"tile": SMALL[0]}
+    for ours, twin, rows in (
+        (lambda s: product(numbers, matrix, "gelu", bias, stream=s, **tile, **to), plain.linear_gelu, every),
+        (lambda s: product(numbers, gated, "geglu", stream=s, **tile, **to), plain.linear_geglu, every),
+    ):
+        given = (numbers, matrix, bias) if twin is plain.linear_gelu else (numbers, gated)
+        assert marked(ours) == marked(lambda s, twin=twin, given=given: twin(*given, **to, stream=s)) == rows  # type: ignore[misc]
+    assert marked(lambda s: activations.geglu(x, **to, stream=s)) == [3]
+    for attended in (attention.vision_attention, plain.vision_attention):
+        assert marked(lambda s, attended=attended: attended(qkv, 2, 2, **to, stream=s)) == [0, 1, 2, 3]  # type: ignore[misc]
+    for normed in (norms.residual_rms_norm, plain.residual_rms_norm):
+        stream, _ = normed(bad(3, 7, 8, 32), random(8, 32), None, ones(32).float(), None, 1e-6, **to)
+        assert stream[:, 0].isnan().nonzero().flatten().tolist() == [3], "its other numbers hide it"
+        stream, _ = normed(random(8, 32), None, None, bias.float(), None, 1e-6, **to)
+        assert stream[:, 0].isnan().all()
+    for normed in (norms.residual_layer_norm, plain.residual_layer_norm):
+        stream, _ = normed(bad(3, 7, 8, 32), random(8, 32), ones(32), ones(32), 1e-6, **to)
+        assert stream[:, 0].isnan().nonzero().flatten().tolist() == [3]
+    for prefix in (attend, plain.attention):  # two heads of four tokens; the values are the cache's rows
+        values, queries = random(4, 16), bad(5, 7, 8, 16)
+        prefix(queries, random(4, 16), values, torch.tensor([3], device=DEVICE), 4, 2, **to)
+        assert values[:, 0].isnan().nonzero().flatten().tolist() == [2]
+
+
 # Which tile
 
 

@@ -11,16 +11,20 @@ from conftest import golden_cases, golden_model
 from tensorrt_fakes import golden_backend
 from test_begin import Unrun, on_cpu
 from test_engine import made_up
+from test_engine_batch import observations
 from torch import Tensor
 
 from turbopi.backends.fused import FusedBackend
 from turbopi.backends.tensorrt import TensorRTBackend
 from turbopi.backends.tensorrt_pipelined import TensorRTPipelinedBackend
+from turbopi.engine.batch import SharedRows
 from turbopi.engine.call import CallShape
 from turbopi.engine.recent_loops import MOST_LOOPS, MOST_STEPS, Loop, RecentLoops, fit
 from turbopi.engine.runner import HostRow
+from turbopi.engine.solving import evaluation_loops
 from turbopi.engine.without_compiler import OPS
-from turbopi.errors import BackendUnavailable
+from turbopi.errors import BackendUnavailable, ObservationError
+from turbopi.model.solvers import Integration
 
 STEPS = range(1, 41)
 
@@ -108,6 +112,71 @@ def test_what_is_forgotten_is_freed() -> None:
     for steps in STEPS[1 : MOST_LOOPS + 1]:
         backend.sample(observation, noise, steps)
     assert buffer() is None
+
+
+def test_a_loop_of_its_own_outlives_a_solvers_loop_with_the_same_evaluation() -> None:
+    backend, gone = on_cpu(cls=Unrun), []
+    backend._forget = gone.append  # type: ignore[method-assign, assignment]
+    integration = Integration("ab2", (1.0, 0.5, 0.0))
+    solver = Loop(2, 7, "solver", integration.evaluated, integration)
+    mine, others = sorted(evaluation_loops(solver), key=str)[0], evaluation_loops(solver)
+    backend._recent.use(solver)
+    backend._recent.use(mine)
+    for steps in STEPS[: MOST_LOOPS - 1]:
+        backend._recent.use(Loop(steps, 10))
+    assert set(gone) == {solver} | others - {mine}
+
+
+class OutOfMemory(Unrun):
+    """Whose captures fail while there is no memory."""
+
+    full = True
+
+    def _capture(self, run: Any, after: Any, like: Any = None) -> Any:
+        if self.full:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return super()._capture(run, after, like)
+
+
+def test_what_failed_to_be_captured_is_not_called_warm() -> None:
+    backend, (observation, noise) = on_cpu(cls=OutOfMemory), observations("pi05", [1, 1], [3, 3], 7)
+    alone = made_up("pi05", 1, 5)
+    for _ in range(2):
+        with pytest.raises(torch.OutOfMemoryError):
+            backend.warmup(alone[0], 2, 7)
+        with pytest.raises(torch.OutOfMemoryError):
+            backend.warmup_batches(observation, 2, 7, [2])
+    assert backend.describe()["captured"] == [] == backend.describe()["batches"]
+    backend.full, backend.strict = False, True
+    with pytest.raises(ObservationError, match="Warm is: nothing yet"):
+        backend.sample(*alone, 2)
+    backend.warmup(alone[0], 2, 7)
+    assert backend.sample(observation, noise, 2).actions.shape == noise.shape, "one by one"
+    assert not backend.describe()["batches"]
+
+
+def test_batches_of_all_sizes_have_their_rows_in_the_same_buffers() -> None:
+    """And each observation gets what it gets alone, whichever sizes ran before."""
+    backend, expected = on_cpu(cls=Unrun), {}
+    batches = {count: observations("pi05", [1] * count, [3] * count, 7) for count in (4, 2)}
+    for _ in range(2):
+        for count, (observation, noise) in batches.items():
+            found = backend.sample(observation, noise, 1).actions
+            assert torch.equal(expected.setdefault(count, found), found)
+    kept = backend._batches._buffers.values()
+    for parts in ([one.cache.k for one in kept], [one.embs for one in kept], [one.pictures.embs for one in kept]):
+        assert len({part.data_ptr() for part in parts}) == 1
+    whole = golden_model("pi05").sample(*batches[4], 1)
+    torch.testing.assert_close(expected[4], whole, atol=2e-5, rtol=2e-5)
+
+
+def test_shared_rows_grow_to_at_least_twice_as_many() -> None:
+    shared = SharedRows(golden_model("pi05").config, torch.float32, torch.device("cpu"))
+    small, large = shared.embs(10), shared.embs(11)
+    assert shared.embs(20).data_ptr() == large.data_ptr() != small.data_ptr()
+    first = shared.cache(10)
+    assert first.k.shape[1] == 10 and shared.cache(12).k.shape[1] == 12
+    assert shared.cache(20).k.data_ptr() == shared.cache(1).k.data_ptr() != first.k.data_ptr()
 
 
 class Fused(FusedBackend):

@@ -13,9 +13,9 @@ from test_engine import made_up
 from turbopi import UnifiedPolicy, backends
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.checkpoint import random_checkpoint
-from turbopi.config import CAMERAS
+from turbopi.config import CAMERAS, LIMITS
 from turbopi.engine.runner import HostRow
-from turbopi.errors import BackendError, ConfigError, ObservationError
+from turbopi.errors import ConfigError, ObservationError
 from turbopi.observation import Observation, with_cameras
 from turbopi.robots import ROBOTS, LeRobot, Robot, create_robot
 from turbopi.robots.described import Described
@@ -109,7 +109,7 @@ def test_a_warmup_that_cant_be_is_refused_before_anything_is_captured(wrong: dic
 
 def test_more_cameras_than_the_backend_takes_are_refused_if_asked_for_and_else_left_out() -> None:
     policy = made()
-    with pytest.raises(BackendError, match="up to 4 cameras, this observation has 5"):
+    with pytest.raises(ObservationError, match="up to 4 cameras, this observation has 5"):
         policy.warmup(cameras=5)
     inputs = policy.prepare(policy.example_observation())
     backend: Any = policy.backend
@@ -196,13 +196,16 @@ def test_noise_must_have_the_calls_horizon(reference: UnifiedPolicy) -> None:
         reference.infer(reference.example_observation(), noise=np.zeros((H, 32), np.float32), horizon=6)
 
 
-def test_a_horizon_beyond_the_cache_is_one_clear_error_and_forgets_nothing() -> None:
-    policy = made()
-    policy.infer(seen_by(3, policy), seed=0)
-    before = captures(policy)
-    with pytest.raises(BackendError, match="cache rows, but 3 cameras, 48 prompt tokens and an action horizon of 1000"):
-        policy.infer(seen_by(3, policy), seed=0, horizon=1000)
-    assert captures(policy) == before
+def test_every_horizon_fits_with_every_prompt_and_number_of_cameras() -> None:
+    backend, most = on_cpu(cls=Unrun), LIMITS["action_horizon"]
+    shape = (backend.config.action_dim,)
+    for cameras, tokens in ((0, 1), (3, backend.config.max_prompt_tokens)):
+        row = HostRow.of(made_up("pi05", cameras, tokens)[0], 0)
+        for horizon in (130, most):
+            sample = backend.begin(row.images).finish(row.tokens, row.state, np.zeros((horizon, *shape), np.float32), 1)
+            assert sample.actions.shape == (1, horizon, *shape)
+        with pytest.raises(ObservationError, match=f"the action horizon is {most + 1}; .* from 1 to {most}"):
+            backend.begin(row.images).finish(row.tokens, row.state, np.zeros((most + 1, *shape), np.float32), 1)
 
 
 def test_a_backend_with_engines_for_one_horizon_refuses_another(

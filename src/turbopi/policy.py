@@ -190,8 +190,10 @@ class UnifiedPolicy:
         infinite; DeviceLost once the GPU has failed for good (`lost`).
         """
         noises = None if noise is None else [noise]
+        own = of_each("conditioning", [conditioning], 1, Conditioning)
+        joined = of_each("previous", [previous], 1, RunningChunk)
         asked = self._denoising.of_call(num_steps, solver, time_grid, conditioning)
-        return self._infer([obs], noises, seed, asked, horizon, [conditioning], [previous], [model_actions])[0]
+        return self._infer([obs], noises, seed, asked, horizon, own, joined, [model_actions])[0]
 
     def infer_batch(
         self,

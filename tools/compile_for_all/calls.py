@@ -67,9 +67,18 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
         *_backward(),
         *_way_back(),
     ]
-    calls += [partial(lambda input: activations.geglu(of(PREFIX, 2 * 16384), **input), one) for one in inverses]
+    calls += [partial(_geglu, one) for one in inverses]
     calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152), numbers)]
     return [*calls, *product_calls(target, numbers, chosen)]
+
+
+def _marks(input: Input) -> Input:
+    """The residual stream, in which int8's damage is marked."""
+    return {"stream": of(PREFIX, 2048)} if input.get("numbers") == torch.int8 else {}
+
+
+def _geglu(input: Input) -> Tensor:
+    return activations.geglu(of(PREFIX, 2 * 16384), **input, **_marks(input))
 
 
 def product_calls(target: Target, numbers: torch.dtype, chosen: bool = False) -> Calls:
@@ -103,8 +112,9 @@ def _product(
     rows = 2 * n if epilogue == "geglu" else n
     data = of(rows, k, dtype=numbers)
     weight = data if numbers == BF16 else ScaledMatrix(data, of(rows, dtype=F32), 50.0, BF16)
-    inverse, added = 30.0 if behind else None, of(n) if bias else None
-    return product(of(m, k, dtype=numbers), weight, epilogue, added, inverse=inverse, tile=tile, numbers=numbers)
+    input: Input = {"inverse": 30.0, "numbers": numbers} if behind else {}
+    added = of(n) if bias else None
+    return product(of(m, k, dtype=numbers), weight, epilogue, added, tile=tile, **input, **_marks(input))
 
 
 def _norms(inverses: tuple[Input, ...]) -> Calls:
@@ -143,7 +153,7 @@ def _attention(target: Target, inverses: tuple[Input, ...]) -> Calls:
     """In every tile that this GPU takes."""
 
     def vision(tile: AttentionTile, input: Input) -> Tensor:
-        return attention.vision_attention(of(ROWS, 3456), 2, 16, tile=tile, **input)
+        return attention.vision_attention(of(ROWS, 3456), 2, 16, tile=tile, **input, **_marks(input))
 
     def prefix(tile: AttentionTile, input: Input) -> Tensor:
         k = of(PREFIX, 256)

@@ -26,7 +26,7 @@ from turbopi.engine.not_warm import not_warm
 from turbopi.engine.recent_loops import Loop, RecentLoops
 from turbopi.engine.runner import golden_trace
 from turbopi.engine.weights import Weights, modulation, pack
-from turbopi.errors import BackendError
+from turbopi.errors import BackendError, ObservationError
 from turbopi.model.kv_cache import KVCache
 from turbopi.model.reference import FloatPrecision, Trace
 from turbopi.observation import Observation
@@ -164,7 +164,7 @@ class TensorRTBackend:
         key = CallKey(shape, num_steps, False)
         graph, call = self._graph(key, "denoise"), self._calls[key]
         for ours, given in ((call.cache_k, cache.k), (call.cache_v, cache.v)):
-            ours[:, :length], ours[:, length:] = given[:, 0, 0], 0  # hidden rows must be finite
+            ours[:, :length], ours[:, length:] = given[:, 0, 0], 0  # rows that are masked must be finite
         call.length.fill_(length)
         call.noise.copy_(noise[0])
         call.state.copy_(cache.state[0])
@@ -218,11 +218,11 @@ class TensorRTBackend:
     def _shape(self, cameras: int, tokens: int, horizon: int) -> EngineShape:
         """The smallest engines that an observation fits: loaded ones, else cached ones, else, before warm-up, new ones.
 
-        Raises BackendError, naming both shapes, if there are none.
+        Raises BackendError, naming both shapes, if there are none; ObservationError for what no engines are built for.
         """
         empty = cameras + tokens == 0 and not self._warming
         if cameras > MAX_CAMERAS or tokens > self.config.max_prompt_tokens or empty:
-            raise BackendError(
+            raise ObservationError(
                 f"{self.name} takes up to {MAX_CAMERAS} cameras and {self.config.max_prompt_tokens} prompt tokens, "
                 f"this observation has {cameras} and {tokens}"
             )

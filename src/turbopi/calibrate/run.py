@@ -33,6 +33,7 @@ from turbopi.quantization.calibration_file import RANDOM_NOISE, Quantization, Si
 from turbopi.quantization.directions import Rows, directions
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions
+from turbopi.quantization.plan import refusal
 from turbopi.quantization.sites import KINDS, MLP_KINDS, PARTS, Site, sites
 from turbopi.reading import plain_document
 
@@ -139,7 +140,8 @@ def calibrate_model(
     """The same for a reference model and calls that are given. Raises what `calibrate` raises."""
     progress, format = progress or Progress(), settings.format
     everywhere = sites(model.config)
-    eligible = [site for site in everywhere if site.refusal is None]
+    impossible = {site: why for site in everywhere if (why := refusal(site, format)) is not None}
+    eligible = [site for site in everywhere if site not in impossible]
 
     def statistics(
         text: str, calls: Sequence[NoisyExample], rows: dict[str, Rows] | None = None
@@ -176,7 +178,7 @@ def calibrate_model(
     progress.begin("products of every site", 1)
     products = product_errors(model, {site: scales[site] for site in eligible}, selection.batches, steps, weights)
     progress.advance()
-    kept = {str(site): f"not possible: {site.refusal}" for site in everywhere if site.refusal is not None}
+    kept = {str(site): f"not possible: {why}" for site, why in impossible.items()}
     kept |= {
         name: f"its products alone are off by {error:.0%}" for name, error in products.items() if error > SITE_LIMIT
     }

@@ -43,21 +43,61 @@ class BatchSize:
     float_images: bool = False  # as `CallShape`'s
 
 
+class SharedRows:
+    """Buffers of which calls of every size take the first rows: one call runs after the other, whatever its size.
+
+    A call that doesn't fit gets a new one. Graphs of smaller calls go on pointing to theirs, so it is at least twice as
+    large: all together are at most as large as twice the last.
+    """
+
+    def __init__(self, config: ModelConfig, dtype: torch.dtype, device: torch.device) -> None:
+        self._config, self._options = config, {"dtype": dtype, "device": device}
+        self._cache = Cache.allocate(config, 0, device, dtype)
+        self._embs = self._pictures = torch.empty(0, config.vlm.width, **self._options)  # type: ignore[arg-type]
+
+    def cache(self, rows: int) -> Cache:
+        if rows > (has := self._cache.k.shape[1]):
+            self._cache = Cache.allocate(self._config, max(rows, 2 * has), **self._options)  # type: ignore[arg-type]
+        return Cache(self._cache.k[:, :rows], self._cache.v[:, :rows])
+
+    def embs(self, rows: int) -> Tensor:
+        """Packed prefixes [rows, D]."""
+        self._embs = self._grown(self._embs, rows)
+        return self._embs[:rows]
+
+    def pictures(self, rows: int) -> Tensor:
+        """What vision makes of all pictures [rows, D]."""
+        self._pictures = self._grown(self._pictures, rows)
+        return self._pictures[:rows]
+
+    def _grown(self, buffer: Tensor, rows: int) -> Tensor:
+        if rows <= len(buffer):
+            return buffer
+        return buffer.new_full((max(rows, 2 * len(buffer)), buffer.shape[1]), torch.nan)  # as in `Cache`
+
+
 class BatchBuffers:
     """What the three graphs of one size share."""
 
     def __init__(
-        self, config: ModelConfig, weights: Weights, ops: Ops, size: BatchSize, pictures: Pictures, prompt_slots: int
+        self,
+        config: ModelConfig,
+        weights: Weights,
+        ops: Ops,
+        size: BatchSize,
+        pictures: Pictures,
+        prompt_slots: int,
+        shared: SharedRows | None = None,
     ) -> None:
-        """`prompt_slots`: the most of any call, of all observations together."""
+        """`prompt_slots`: the most of any call, of all observations together. Without `shared` rows it has its own."""
         self.config, self.weights, self.ops, self.size, self.pictures = config, weights, ops, size, pictures
         assert pictures.cameras == size.pictures
         table = weights.embed_tokens
         self.device, self.rows = table.device, pictures.rows + prompt_slots
-        self.cache = Cache.allocate(config, self.rows, self.device, table.dtype)
+        shared = shared or SharedRows(config, table.dtype, self.device)
+        self.cache, self.embs = shared.cache(self.rows), shared.embs(self.rows)
         self.segments = torch.zeros((2, size.batch + 1), dtype=torch.int32, device=self.device)
         self.rope = forward.rope_of_all_positions(config, self.rows, self.device)
-        self.embs = torch.empty((self.rows, config.vlm.width), device=self.device, dtype=table.dtype)
 
 
 class PackedPrefix:

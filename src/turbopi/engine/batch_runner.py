@@ -123,7 +123,8 @@ class BatchRunner(GraphRunner):
         self._check_cameras(cameras)
         self._warming = True
         try:
-            for batch in sorted({bucket for count in batches for bucket in split(count, self._costs_of(form))} - {1}):
+            sizes = {bucket for count in batches for bucket in split(count, self._costs_of(form))} - {1}
+            for batch in sorted(sizes, reverse=True):  # the largest first: the others' rows are parts of its rows
                 with building(self.device):
                     self._recent.use(loop)
                     size = self._batches.size(batch, [cameras] * batch, float_images)

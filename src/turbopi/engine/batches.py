@@ -2,7 +2,8 @@
 
 A batch is split into calls of 1, 2, 4, 8 or 16 observations (batch_runner.py); one of them alone is the runner's own
 call. Rows are packed, so a call's sizes are sums over its observations: their pictures, rounded up to a multiple of its
-size, and their prompts' tokens, rounded up to 16 an observation. Of each size buffers are kept for good.
+size, and their prompts' tokens, rounded up to 16 an observation. Graphs of each size are kept for good; their rows lie
+in the same buffers, as calls run one after the other.
 """
 
 import itertools
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from turbopi.config import ImageResize, ModelConfig
-from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix
+from turbopi.engine.batch import BatchBuffers, BatchLoop, BatchSize, PackedPrefix, SharedRows
 from turbopi.engine.call import Pictures
 from turbopi.engine.graph import Graph, Mark
 from turbopi.engine.recent_loops import Loop
@@ -57,6 +58,7 @@ class Batches:
         self._config, self._weights, self._ops, self._device = config, weights, ops, device
         self._bucket, self._capture, self._table = bucket, capture, table
         self._denoises_by, self._refuse = denoises_by, refuse
+        self._shared = SharedRows(config, weights.embed_tokens.dtype, device)
         self._pictures: dict[tuple[int, bool], Pictures] = {}
         self._buffers: dict[BatchSize, BatchBuffers] = {}
         self._prefixes: dict[tuple[BatchSize, int], PackedPrefix] = {}
@@ -157,13 +159,15 @@ class Batches:
     def _pictures_of(self, size: BatchSize) -> Pictures:
         key = (size.pictures, size.float_images)
         if key not in self._pictures:
-            self._pictures[key] = Pictures(self._config, self._weights, self._ops, *key, 0)
+            embs = self._shared.pictures(size.pictures * self._config.vision.num_tokens)
+            self._pictures[key] = Pictures(self._config, self._weights, self._ops, *key, 0, embs)
         return self._pictures[key]
 
     def _buffers_of(self, size: BatchSize) -> BatchBuffers:
         if size not in self._buffers:
             pictures, most = self._pictures_of(size), self._most_slots(size)
-            self._buffers[size] = BatchBuffers(self._config, self._weights, self._ops, size, pictures, most)
+            own = self._config, self._weights, self._ops
+            self._buffers[size] = BatchBuffers(*own, size, pictures, most, self._shared)
         return self._buffers[size]
 
     def _vision_graph(self, size: BatchSize, resized: bool) -> Graph:
@@ -177,9 +181,11 @@ class Batches:
 
     def _prefix_graph(self, size: BatchSize, slots: int) -> Graph:
         def capture() -> Graph:
-            prefix = self._prefixes[size, slots] = PackedPrefix(self._buffers_of(size), slots)
+            prefix = PackedPrefix(self._buffers_of(size), slots)
             prefix.write([0] * size.batch, [np.zeros(1, np.int64)] * size.batch)
-            return self._capture(prefix.run, None)
+            graph = self._capture(prefix.run, None)
+            self._prefixes[size, slots] = prefix
+            return graph
 
         return self._graph(size, ("prefix", size, slots), capture)
 
@@ -187,8 +193,10 @@ class Batches:
         def capture() -> Graph:
             table, buffers = self._table(loop), self._buffers_of(size)
             by = self._denoises_by(loop, size.batch, buffers.rows)
-            run = self._loops[size, loop] = BatchLoop(buffers, loop, by, table)
-            return self._capture(run.run, None)
+            run = BatchLoop(buffers, loop, by, table)
+            graph = self._capture(run.run, None)
+            self._loops[size, loop] = run  # what is here counts as warm
+            return graph
 
         return self._graph(size, ("denoise", size, loop), capture)
 

@@ -158,10 +158,18 @@ class Pictures:
         cameras: how many pictures; with none of them the stage is empty.
         float_images: as `CallShape`'s.
         prompt_slots: the most of any call: `embs` has the cameras' tokens, then room for the prompt's.
+        embs: these rows, if they are shared with other calls; None: its own.
     """
 
     def __init__(
-        self, config: ModelConfig, weights: Weights, ops: Ops, cameras: int, float_images: bool, prompt_slots: int
+        self,
+        config: ModelConfig,
+        weights: Weights,
+        ops: Ops,
+        cameras: int,
+        float_images: bool,
+        prompt_slots: int,
+        embs: Tensor | None = None,
     ) -> None:
         self.config, self.weights, self.ops = config, weights, ops
         self.cameras, self.float_images, self.rows = cameras, float_images, cameras * config.vision.num_tokens
@@ -172,7 +180,9 @@ class Pictures:
         self._places = places_of_parts(cameras)
         self._parts = [Part(host[place], self.images[place]) for place in self._places]
         size = (self.rows + prompt_slots, config.vlm.width)
-        self.embs = torch.full(size, torch.nan, device=table.device, dtype=table.dtype)  # as in `Cache`
+        # NaN as in `Cache`
+        self.embs = torch.full(size, torch.nan, device=table.device, dtype=table.dtype) if embs is None else embs
+        assert self.embs.shape == size
 
     def resizes(self, pictures: Sequence[np.ndarray], resize: ImageResize | None) -> bool:
         """Whether `run_resized` is needed: some picture hasn't the size and dtype of `images`, and the device may

@@ -96,12 +96,13 @@ def _checked_times(wanted: set[float], rows: int = 1) -> tuple[float, ...]:
 @lru_cache
 def _own_times(num_steps: int, time_grid: str) -> tuple[float, ...]:
     """Of openpi's loop, and 0."""
-    return tuple(sorted({*TokenTimes.plain(num_steps, 1, time_grid).distinct().tolist(), 0.0}, reverse=True))
+    return tuple(sorted({*_own_tokens(num_steps, time_grid).distinct().tolist(), 0.0}, reverse=True))
 
 
 @lru_cache
-def _plain(num_steps: int, horizon: int, time_grid: str) -> TokenTimes:
-    return TokenTimes.plain(num_steps, horizon, time_grid)
+def _own_tokens(num_steps: int, time_grid: str) -> TokenTimes:
+    """Of openpi's loop, for one action: all have the same."""
+    return TokenTimes.plain(num_steps, 1, time_grid)
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ class Conditioned:
         if row is not None:
             arrays = {name: array[row] if name in BY_ACTION else array[:, row] for name, array in arrays.items()}
         own = conditioning.own_tokens(loop.horizon)
-        asked = own or _plain(loop.steps, loop.horizon, self.config.time_grid)
+        asked = own or _own_tokens(loop.steps, self.config.time_grid)
         arrays["steps"][:], arrays["times"][:] = asked.steps, asked.times
         if own is None:
             arrays["rows"][:] = np.searchsorted(-table, -asked.times[:, :1])  # all actions have a step's time

@@ -6,7 +6,7 @@ or the state changes. The mathematics is `turbopi.model.reference`'s; only its o
 
   - matrices that share an input are one product; adaRMS comes from a table of all steps;
   - a residual is added together with the norm behind it, or of many rows by the product in front of that, in place;
-  - where the next matrix is a `ScaledMatrix`, an operation's result is rounded to E4M3 for it;
+  - where the next matrix is a `ScaledMatrix`, an operation's result is rounded to E4M3 or int8 for it;
   - logits leave their product in float32 and keys beyond `length` get -inf before the softmax.
 
 Rows of several observations may stand one behind the other: only attention knows whose they are (engine/batch.py).
@@ -81,10 +81,10 @@ def _vision_layer(config: ModelConfig, ops: Ops, layer: VisionLayer, x: Tensor, 
     v = config.vision
     x, normed = ops.residual_layer_norm(x, y, *layer.norm1, v.layer_norm_eps, **input_of(layer.qkv[0]))
     qkv = ops.linear(normed, *layer.qkv)
-    attended = ops.vision_attention(qkv, len(x) // v.num_tokens, v.num_heads, **input_of(layer.out[0]))
+    attended = ops.vision_attention(qkv, len(x) // v.num_tokens, v.num_heads, **input_of(layer.out[0], x))
     y = _added(ops, x, attended, *layer.out)
     x, normed = ops.residual_layer_norm(x, y, *layer.norm2, v.layer_norm_eps, **input_of(layer.fc1[0]))
-    hidden = ops.linear_gelu(normed, *layer.fc1, **input_of(layer.fc2[0]))
+    hidden = ops.linear_gelu(normed, *layer.fc1, **input_of(layer.fc2[0], x))
     return x, _added(ops, x, hidden, *layer.fc2)
 
 
@@ -160,7 +160,7 @@ def _behind_attention(
     """The prefix's residual stream [rows, D], and what the next layer's norm is to add to it."""
     y = _added(ops, x if in_place else None, attended, layer.out)
     x, normed = ops.residual_rms_norm(x, y, None, layer.norm2, None, eps, **input_of(layer.gate_up))
-    hidden = ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down))
+    hidden = ops.linear_geglu(normed, layer.gate_up, **input_of(layer.down, x))
     return x, _added(ops, x if in_place else None, hidden, layer.down)
 
 

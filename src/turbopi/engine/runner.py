@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbopi.config import ImageResize, ModelConfig
+from turbopi.config import LIMITS, ImageResize, ModelConfig
 from turbopi.engine.call import Cache, CallShape, Pictures, StaticCall
 from turbopi.engine.conditioned import conditioned_loop
 from turbopi.engine.graph import Graph, Mark, building
@@ -28,7 +28,7 @@ from turbopi.engine.not_warm import not_warm
 from turbopi.engine.recent_loops import Loop, RecentLoops
 from turbopi.engine.solving import evaluation_loops, solving
 from turbopi.engine.weights import Weights, modulation, modulation_at
-from turbopi.errors import BackendError
+from turbopi.errors import BackendError, ObservationError
 from turbopi.kernels.interface import Denoiser, KeepingDenoiser, Ops
 from turbopi.model.conditioning import Conditioning, Conditionings, Form, of_rows
 from turbopi.model.kv_cache import KVCache
@@ -95,13 +95,14 @@ class GraphRunner:
     ) -> None:
         self.config, self.device = config, device
         self._weights, self._ops = weights, ops
-        rows = MAX_CAMERAS * config.vision.num_tokens + bucket(config.max_prompt_tokens) + config.action_horizon + 64
-        self._cache = Cache.allocate(config, rows, device, weights.embed_tokens.dtype, joint)
+        # of any horizon: 18 kB an action, and nothing depends on how long the prompt is
+        longest = CallShape(MAX_CAMERAS, bucket(config.max_prompt_tokens), Loop(1, LIMITS["action_horizon"]))
+        self._cache = Cache.allocate(config, longest.cache_rows(config), device, weights.embed_tokens.dtype, joint)
         self._recent = RecentLoops(self._forget_all)
         self._tables: dict[tuple[int, tuple[float, ...]], Tensor | None] = {}  # by `Loop.table`
         self._calls: dict[CallShape, StaticCall] = {}
         self._pictures: dict[tuple[int, bool], Pictures] = {}  # by cameras, and whether they are float
-        self._graphs: dict[tuple[CallShape | Pictures, str], Graph] = {}
+        self._graphs: dict[tuple[CallShape | Pictures | None, str], Graph] = {}
         self._begun: object = None  # what may be finished
         self._pool: Any = None
         self._stream: torch.cuda.Stream | None = None  # that graphs are captured on
@@ -154,15 +155,16 @@ class GraphRunner:
             )
         length, per_image = cache.k.shape[3], self.config.vision.num_tokens
         cameras = min(length // per_image, MAX_CAMERAS)
+        self._check_tokens(cameras, length - cameras * per_image)
         asked = of_rows(conditioning, 1)[0]
         loop = self._loop(asked, num_steps, noise.shape[1])
         shape = CallShape(cameras, bucket(length - cameras * per_image), loop)
         graph, call = self._graph(shape, "denoise"), self._calls[shape]
-        call.cache_k[:, :length], call.cache_v[:, :length] = cache.k[:, 0, 0], cache.v[:, 0, 0]
+        for ours, given in ((call.cache_k, cache.k), (call.cache_v, cache.v)):
+            ours[:, :length], ours[:, length:] = given[:, 0, 0], 0  # rows that are masked must be finite
         call.inputs.length.fill_(length)
         call.inputs.noise.copy_(torch.from_numpy(call.started(noise[0].cpu().numpy(), asked)))
         call.inputs.state.copy_(cache.state[0])
-        torch.cuda.current_stream(self.device).synchronize()
         graph.replay()
         return call.x_t[-1:].clone()
 
@@ -201,7 +203,8 @@ class GraphRunner:
 
     def describe(self) -> dict[str, Any]:
         captured = sorted(
-            {(s.cameras, s.prompt_slots, s.loop) for s in list(self._calls)},  # a call of another thread may add some
+            # a call of another thread may add some
+            {(s.cameras, s.prompt_slots, s.loop) for s, _ in list(self._graphs) if isinstance(s, CallShape)},
             key=lambda one: (*one[:2], *one[2][:2], str(one[2])),
         )
         return {
@@ -212,12 +215,12 @@ class GraphRunner:
 
     def _check_cameras(self, count: int) -> None:
         if count > MAX_CAMERAS:
-            raise BackendError(f"{self.name} takes up to {MAX_CAMERAS} cameras, this observation has {count}")
+            raise ObservationError(f"{self.name} takes up to {MAX_CAMERAS} cameras, this observation has {count}")
 
     def _check_tokens(self, cameras: int, tokens: int) -> None:
         most = self.config.max_prompt_tokens
         if tokens > most or cameras + tokens == 0:
-            raise BackendError(
+            raise ObservationError(
                 f"{self.name} takes up to {MAX_CAMERAS} cameras and {most} prompt tokens, this observation has "
                 f"{cameras} and {tokens}"
             )
@@ -228,6 +231,9 @@ class GraphRunner:
         return False
 
     def _loop(self, conditioning: Conditioning | None, num_steps: int, horizon: int) -> Loop:
+        """Raises ObservationError for a horizon that no call may have, whatever its prompt and cameras."""
+        if horizon > (most := LIMITS["action_horizon"]):
+            raise ObservationError(f"the action horizon is {horizon}; it should be a whole number from 1 to {most}")
         by_token = self._times_by_token
         return conditioned_loop(conditioning, num_steps, horizon, self.config, times_by_token=by_token)
 
@@ -298,8 +304,6 @@ class GraphRunner:
         """
         graph = self._graphs.get((of, part))
         if isinstance(of, CallShape):
-            if graph is None:
-                self._check_rows(of)
             if graph is None and part == "answer":
                 self._refuse_if_cold(of)
             self._recent.use(of.loop)
@@ -324,15 +328,6 @@ class GraphRunner:
         run = {"answer": call.answer, "prefix": call.encode, "denoise": call.denoise}[part]
         return self._capture(run, None if part == "denoise" else self._graph(call.pictures, "vision"))
 
-    def _check_rows(self, shape: CallShape) -> None:
-        needs, has = shape.cache_rows(self.config), self._cache.k.shape[1]
-        if needs > has:
-            raise BackendError(
-                f"{self.name} has {has} cache rows, but {shape.cameras} cameras, {shape.prompt_slots} prompt tokens "
-                f"and an action horizon of {shape.horizon} need {needs}; the config's horizon is "
-                f"{self.config.action_horizon}"
-            )
-
     def _refuse_if_cold(self, shape: CallShape) -> None:
         """Raise ObservationError for a shape that isn't captured, if that isn't allowed now."""
         if self.strict and not self._warming:
@@ -348,9 +343,9 @@ class GraphRunner:
             )
 
     def _forget_all(self, loop: Loop) -> None:
-        """Let go of a loop, and of its evaluations' that no other loop has."""
+        """Let go of a loop, and of its evaluations' that no other loop has or is."""
         self._forget(loop)
-        kept = {one for other in self._recent for one in evaluation_loops(other)}
+        kept = {*self._recent, *(one for other in self._recent for one in evaluation_loops(other))}
         for one in evaluation_loops(loop):
             if one not in kept:
                 self._forget(one)
@@ -376,10 +371,10 @@ class GraphRunner:
 
     def _pictures_of(self, cameras: int, float_images: bool) -> Pictures:
         key, slots = (cameras, float_images), bucket(self.config.max_prompt_tokens)
+        if self.strict and not self._warming and (self._pictures.get(key), "vision") not in self._graphs:
+            warm = (f"{of.cameras} cameras" for of, _ in self._graphs if isinstance(of, Pictures))
+            raise not_warm(self.name, f"{cameras} cameras", warm, cameras=cameras)
         if key not in self._pictures:
-            if self.strict and not self._warming:
-                warm = (f"{count} cameras" for count, _ in self._pictures)
-                raise not_warm(self.name, f"{cameras} cameras", warm, cameras=cameras)
             self._pictures[key] = Pictures(self.config, self._weights, self._ops, cameras, float_images, slots)
         return self._pictures[key]
 

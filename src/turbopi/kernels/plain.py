@@ -4,7 +4,8 @@
 float32 inside; results have the activations' dtype.
 
 Where the product behind an operation is a `ScaledMatrix`, the operation gets that input's `inverse` scale and its
-`numbers`, E4M3 or int8, and its result is of these, rounded once from float32.
+`numbers`, E4M3 or int8, and its result is of these, rounded once from float32. `stream`: the residual stream, whose
+rows int8's damage is marked in (`quantization.int8`); norms mark their own result, the prefix's attention `v`.
 
 Shapes: D, W widths, F hidden width of an MLP, K head_dim, n query heads over one key/value head.
 """
@@ -19,7 +20,7 @@ from turbopi.kernels.interface import PILLOW_BITS, Ops, Taps
 from turbopi.model.layers import apply_rope, rms_normalize
 from turbopi.model.vision import normalize_images
 from turbopi.quantization.fp8 import E4M3, Matrix, ScaledMatrix, to_e4m3
-from turbopi.quantization.int8 import to_int8
+from turbopi.quantization.int8 import mark_damage, to_int8
 
 
 def transfer(source: Tensor, to: Tensor) -> None:
@@ -101,7 +102,7 @@ def residual_rms_norm(
         x = x + (y if gate is None else y * gate.to(x.dtype))
     normed = rms_normalize(x, eps) * scale
     normed = normed if shift is None else normed + shift
-    return x, as_input(normed, x.dtype, inverse, numbers)
+    return x, as_input(normed, x.dtype, inverse, numbers, x)
 
 
 def residual_layer_norm(
@@ -118,7 +119,7 @@ def residual_layer_norm(
         x = x + y
     if inverse is not None:
         normed = F.layer_norm(x.float(), (x.shape[-1],), weight.float(), bias.float(), eps)
-        return x, as_input(normed, x.dtype, inverse, numbers)
+        return x, as_input(normed, x.dtype, inverse, numbers, x)
     return x, F.layer_norm(x, (x.shape[-1],), weight, bias, eps)
 
 
@@ -129,26 +130,47 @@ def linear(x: Tensor, weight: Matrix, bias: Tensor | None = None, out: Tensor | 
 
 
 def linear_gelu(
-    x: Tensor, weight: Matrix, bias: Tensor, inverse: float | None = None, numbers: torch.dtype = E4M3
+    x: Tensor,
+    weight: Matrix,
+    bias: Tensor,
+    inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
 ) -> Tensor:
     """gelu(x @ weightᵀ + bias). A ScaledMatrix's product isn't rounded before."""
     if not isinstance(weight, ScaledMatrix):
-        return as_input(gelu(F.linear(x, weight, bias)), x.dtype, inverse, numbers)
-    return as_input(gelu(weight.product(x, bias)), weight.dtype, inverse, numbers)
+        return as_input(gelu(F.linear(x, weight, bias)), x.dtype, inverse, numbers, stream)
+    return as_input(gelu(weight.product(x, bias)), weight.dtype, inverse, numbers, stream)
 
 
-def linear_geglu(x: Tensor, gate_up: Matrix, inverse: float | None = None, numbers: torch.dtype = E4M3) -> Tensor:
+def linear_geglu(
+    x: Tensor,
+    gate_up: Matrix,
+    inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
+) -> Tensor:
     """[tokens, D] times [2F, D], gate rows before up rows -> gelu(gate) * up [tokens, F]."""
     if not isinstance(gate_up, ScaledMatrix):
-        return as_input(geglu(F.linear(x, gate_up)), x.dtype, inverse, numbers)
-    return as_input(geglu(gate_up.product(x)), gate_up.dtype, inverse, numbers)
+        return as_input(geglu(F.linear(x, gate_up)), x.dtype, inverse, numbers, stream)
+    return as_input(geglu(gate_up.product(x)), gate_up.dtype, inverse, numbers, stream)
 
 
-def as_input(x: Tensor, dtype: torch.dtype, inverse: float | None, numbers: torch.dtype = E4M3) -> Tensor:
-    """x for the product behind it: E4M3 or int8 if it asks for that."""
+def as_input(
+    x: Tensor,
+    dtype: torch.dtype,
+    inverse: float | None,
+    numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
+) -> Tensor:
+    """x for the product behind it: E4M3 or int8 if it asks for that. int8's damage is marked in `stream`."""
     if inverse is None:
         return x.to(dtype)
-    return to_int8(x, inverse) if numbers == torch.int8 else to_e4m3(x, inverse)
+    if numbers != torch.int8:
+        return to_e4m3(x, inverse)
+    if stream is not None:
+        mark_damage(x, stream)
+    return to_int8(x, inverse)
 
 
 def gelu(x: Tensor) -> Tensor:
@@ -186,13 +208,18 @@ def rope_split(qkv: Tensor, cos: Tensor, sin: Tensor, k_out: Tensor, v_out: Tens
 
 
 def vision_attention(
-    qkv: Tensor, images: int, heads: int, inverse: float | None = None, numbers: torch.dtype = E4M3
+    qkv: Tensor,
+    images: int,
+    heads: int,
+    inverse: float | None = None,
+    numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
 ) -> Tensor:
     """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W]."""
     rows, width = qkv.shape[0], qkv.shape[1] // 3
     q, k, v = qkv.view(images, -1, 3, heads, width // heads).permute(2, 0, 3, 1, 4)
     attended = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(rows, width)
-    return as_input(attended, qkv.dtype, inverse, numbers)
+    return as_input(attended, qkv.dtype, inverse, numbers, stream)
 
 
 def masked_softmax(
@@ -228,7 +255,7 @@ def attention(
     """
     logits = matmul_f32(q, k.t())
     probabilities = softmax(logits, length, slots, heads, state_token, q.shape[1] ** -0.5, v.dtype)
-    return as_input((probabilities @ v).view(-1, heads * q.shape[1]), q.dtype, inverse, numbers)
+    return as_input((probabilities @ v).view(-1, heads * q.shape[1]), q.dtype, inverse, numbers, v)
 
 
 def matmul_f32(a: Tensor, b: Tensor) -> Tensor:

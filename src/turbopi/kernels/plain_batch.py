@@ -37,7 +37,7 @@ def packed_attention(
     visible = whose[:, None] == whose
     queries = q.view(rows, heads, dim).transpose(0, 1)
     attended = F.scaled_dot_product_attention(queries, k.expand(heads, -1, -1), v.expand(heads, -1, -1), visible)
-    return as_input(attended.transpose(0, 1).reshape(rows, heads * dim), q.dtype, inverse, numbers)
+    return as_input(attended.transpose(0, 1).reshape(rows, heads * dim), q.dtype, inverse, numbers, v)
 
 
 def suffix_attention(
@@ -64,11 +64,13 @@ def suffix_attention(
     k, v = qkv.new_empty(count, dim), qkv.new_empty(count, dim)
     q = rope_split(qkv, cos, sin, k, v)
     visible = visible_to_suffix(starts, lengths, len(prefix_k), count, state_token).repeat_interleave(heads, 0)
-    # what nobody has written yet counts with 0, but 0 * NaN is NaN
-    keys, values = torch.cat((prefix_k, k)), torch.cat((prefix_v, v)).nan_to_num(0.0)
+    keys, values = torch.cat((prefix_k, k)), torch.cat((prefix_v, v))
+    # what a row doesn't see counts with 0, but 0 * NaN is NaN: of another observation, or of rows nobody has written
+    damaged = ~values.isfinite().all(1)
     logits = (matmul_f32(q, keys.t()) * dim**-0.5).masked_fill(~visible, -torch.inf)
-    attended = (logits.softmax(-1).to(v.dtype) @ values).view(count, heads * dim)
-    return as_input(attended, q.dtype, inverse)
+    attended = logits.softmax(-1).to(v.dtype) @ values.masked_fill(damaged[:, None], 0)
+    attended = attended.masked_fill((visible & damaged).any(1)[:, None], torch.nan)
+    return as_input(attended.view(count, heads * dim), q.dtype, inverse)
 
 
 def end_step(

@@ -25,8 +25,7 @@ def linears(model: Pi0Model, site: Site) -> Iterator[nn.Linear]:
         "fc2": lambda: (mlp.fc2,),
     }
     found = modules[site.kind]()
-    last = site.part == "prefix" and site.layer + 1 == len(stack.layers)
-    yield from found[1:] if last else found  # nothing asks for the last layer's queries
+    yield from found[1:] if site.last else found  # nothing asks for the last layer's queries
 
 
 def norm_of(model: Pi0Model, site: Site) -> AdaRMSNorm | None:

@@ -7,7 +7,7 @@ is refused. What was measured to get there is kept in it and goes with it into e
 import base64
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -142,11 +142,7 @@ class Quantization:
     def check_shapes(self, config: ModelConfig) -> None:
         """Raise CalibrationError unless this was made for a model of these sizes."""
         where = self.source or "this calibration"
-        wrong = [
-            f"{name} is {self.shapes.get(name)!r} there and {ours!r} here"[:200]
-            for name, ours in shapes_of(config).items()
-            if self.shapes.get(name) != ours
-        ]
+        wrong = list(_differences(self.shapes, shapes_of(config)))
         if wrong:
             raise CalibrationError(
                 f"{where} was made for a model of other shapes: {'; '.join(wrong)}. Run `turbopi calibrate` on this one"
@@ -270,6 +266,16 @@ class Quantization:
 _UNSOUND = (KeyError, TypeError, ValueError, OverflowError, RuntimeError)  # the last: tensors, or nested too deeply
 _MAX_BYTES = 512 * 2**20  # the directions of a full-size model are most of it
 _SCALES = (1e-30, 1e30)  # of an activation; further out float32 has no room for products
+
+
+def _differences(theirs: Mapping[str, Any], ours: Mapping[str, Any], within: str = "") -> Iterator[str]:
+    """In words, each size of ours that isn't theirs."""
+    for name, here in ours.items():
+        there = theirs.get(name)
+        if isinstance(here, Mapping) and isinstance(there, Mapping):
+            yield from _differences(there, here, f"{within}{name}.")
+        elif there != here:
+            yield f"{within}{name} is {shown(there)} there and {shown(here)} here"
 
 
 def _is_number(value: Any) -> bool:

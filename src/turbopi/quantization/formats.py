@@ -18,6 +18,7 @@ class Format:
     """Numbers of eight bits.
 
     rounded        (x, 1 / scale) -> x in these numbers, to nearest, saturated
+    holds_nan      whether a NaN that is rounded stays one; else damage shows beside the numbers: see int8.py
     expert_inputs  whether the expert's activations are rounded, too, or its weights alone: denoising is bound by
                    reading weights, so activations of bfloat16 cost nothing there
     """
@@ -26,6 +27,7 @@ class Format:
     dtype: torch.dtype
     largest: float
     rounded: Callable[[Tensor, float | Tensor], Tensor]
+    holds_nan: bool
     expert_inputs: bool
 
     @property
@@ -34,16 +36,17 @@ class Format:
         return self.name.upper()
 
     def held(self, x: Tensor, scale: float) -> Tensor:
-        """x as these numbers hold it with a scale, in x's dtype."""
-        return (self.rounded(x, 1 / scale).float() * scale).to(x.dtype)
+        """x as these numbers hold it with a scale, in x's dtype. Damage that they can't hold is NaN."""
+        held = (self.rounded(x, 1 / scale).float() * scale).to(x.dtype)
+        return held if self.holds_nan else held.masked_fill_(~x.isfinite(), torch.nan)
 
     def rounds_input(self, part: str) -> bool:
         """Whether activations of a part of the model are rounded, beside its weights."""
         return self.expert_inputs or part != "expert"
 
 
-FP8 = Format("fp8", E4M3, E4M3_MAX, to_e4m3, expert_inputs=True)
-INT8 = Format("int8", torch.int8, INT8_MAX, to_int8, expert_inputs=False)
+FP8 = Format("fp8", E4M3, E4M3_MAX, to_e4m3, holds_nan=True, expert_inputs=True)
+INT8 = Format("int8", torch.int8, INT8_MAX, to_int8, holds_nan=False, expert_inputs=False)
 FORMATS: Mapping[Numbers, Format] = {"fp8": FP8, "int8": INT8}
 
 

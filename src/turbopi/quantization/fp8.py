@@ -100,11 +100,15 @@ def whole_lines(columns: int) -> int:
     return -(-columns // LINE) * LINE
 
 
-def input_of(matrix: Matrix) -> dict[str, Any]:
+def input_of(matrix: Matrix, stream: Tensor | None = None) -> dict[str, Any]:
     """What the operation in front of a matrix must know: nothing, or that its result is to be of eight bits, with which
     scale, and of which numbers, if not E4M3.
+
+    stream  the residual stream [tokens, width] of the same tokens, in which int8's damage is marked: see int8.py. None:
+            the operation has a place for it among its other arguments
     """
     if not isinstance(matrix, ScaledMatrix):
         return {}
-    numbers = {} if matrix.numbers == E4M3 else {"numbers": matrix.numbers}
-    return {"inverse": matrix.inverse, **numbers}
+    if matrix.numbers == E4M3:
+        return {"inverse": matrix.inverse}
+    return {"inverse": matrix.inverse, "numbers": matrix.numbers} | ({} if stream is None else {"stream": stream})

@@ -56,6 +56,13 @@ class PrecisionPlan:
         }
 
 
+def refusal(site: Site, format: Format) -> str | None:
+    """Why a site can't be in a format, whatever its calibration says, or None."""
+    if site.last and not format.holds_nan:
+        return f"{format.label} has no NaN, and a NaN of the prefix reaches the actions through these keys and values"
+    return site.refusal
+
+
 def reason_for_bf16(site: Site, scale: float | None, kept: str | None, tier: str, parts: Sequence[str]) -> str | None:
     """Why a site stays in bfloat16; None: it doesn't. `scale` and `kept`: what its calibration says."""
     if site.part not in parts:
@@ -64,4 +71,4 @@ def reason_for_bf16(site: Site, scale: float | None, kept: str | None, tier: str
         return "fp8-mlp takes the feed-forward products of vision and prefix alone"
     if scale is None:
         return "its calibration is older than FP8 for this activation; run `turbopi calibrate` again"
-    return site.refusal or kept
+    return refusal(site, format_of(tier)) or kept

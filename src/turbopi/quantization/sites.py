@@ -29,6 +29,7 @@ class Site:
     kind: str
     width: int  # of the activation
     outputs: int  # of all matrices that read it
+    last: bool = False  # of the prefix's last layer, of which nothing but its keys and values is used
 
     def __str__(self) -> str:
         return f"{self.part}.{self.layer}.{self.kind}"
@@ -65,5 +66,6 @@ def sites(config: ModelConfig) -> list[Site]:
         sizes["down"] = (hidden, width)
         for layer in range(depth):
             last = part == "prefix" and layer + 1 == depth
-            found += [Site(part, layer, kind, *sizes[kind]) for kind in (("qkv",) if last else KINDS[part])]
+            kinds = ("qkv",) if last else KINDS[part]
+            found += [Site(part, layer, kind, *sizes[kind], last) for kind in kinds]
     return found

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
 from turbopi.kernels.portable.attention_tiles import AttentionTile, chosen_tile
-from turbopi.kernels.portable.rounding import as_stored
+from turbopi.kernels.portable.rounding import as_stored, damaged, marks
 from turbopi.kernels.portable.shared_memory import capability_of
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 from turbopi.quantization.fp8 import E4M3
@@ -21,9 +21,9 @@ LOG2_E = 1.4426950408889634
 
 @triton.jit
 def _vision_kernel(
-    qkv, out, tokens, heads, scale, inverse,
+    qkv, out, tokens, heads, scale, inverse, stream, stride,
     DIM: tl.constexpr, BLOCK_A: tl.constexpr, BLOCK_B: tl.constexpr,
-    BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SCALED: tl.constexpr,
+    BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SCALED: tl.constexpr, MARKS: tl.constexpr,
 ):  # fmt: skip
     """One head's BLOCK_M queries of one picture. A head's columns come as BLOCK_A (a power of two) and BLOCK_B more."""
     image, head = tl.program_id(1) // heads, tl.program_id(1) % heads
@@ -67,6 +67,11 @@ def _vision_kernel(
     if BLOCK_B > 0:
         stored = (m < tokens)[:, None] & (b < DIM)[None, :]
         tl.store(to + b[None, :], as_stored(acc_b / total[:, None], out), stored)
+    if MARKS:
+        found = damaged(acc_a / total[:, None], 1)
+        if BLOCK_B > 0:
+            found |= damaged(acc_b / total[:, None], 1)
+        tl.store(stream + (image * tokens + m) * stride, float("nan"), (m < tokens) & found)
 
 
 def vision_attention(
@@ -75,14 +80,15 @@ def vision_attention(
     heads: int,
     inverse: float | None = None,
     numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
     *,
     tile: AttentionTile | None = None,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """Self-attention inside each picture: [V * tokens, 3W], q before k before v, heads inside -> [V * tokens, W].
 
-    With `inverse` the result leaves as `numbers`, E4M3 or int8: see `quantization.fp8`. Without a `tile`, that of
-    `tiles`, else the usual one.
+    With `inverse` the result leaves as `numbers`, E4M3 or int8: see `quantization.fp8`, and for `stream`
+    [V * tokens, W] `kernels.plain`. Without a `tile`, that of `tiles`, else the usual one.
     """
     assert qkv.is_contiguous(), "qkv is read as it lies in memory"
     rows, width = qkv.shape[0], qkv.shape[1] // 3
@@ -96,13 +102,14 @@ def vision_attention(
     _vision_kernel[(triton.cdiv(tokens, tile.rows), images * heads)](
         qkv, out, tokens, heads, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim, BLOCK_A=block_a, BLOCK_B=block_b,
         BLOCK_M=tile.rows, BLOCK_N=tile.keys, SCALED=inverse is not None, num_warps=tile.warps, num_stages=tile.stages,
+        **marks(stream, out),
     )  # fmt: skip
     return out
 
 
 @triton.jit
 def _prefix_kernel(
-    q, k, v, length, out, rows, scale, inverse,
+    q, k, v, length, out, rows, heads, scale, inverse,
     DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SCALED: tl.constexpr,
     PDL: tl.constexpr,
 ):  # fmt: skip
@@ -134,6 +141,8 @@ def _prefix_kernel(
     if SCALED:
         total /= inverse
     tl.store(out + m[:, None] * DIM + d[None, :], as_stored(acc / total[:, None], out), inside)
+    if out.dtype.element_ty == tl.int8:
+        tl.store(v + m // heads * DIM, float("nan"), (m < rows) & damaged(acc / total[:, None], 1))
 
 
 def prefix_attention(
@@ -150,8 +159,8 @@ def prefix_attention(
 ) -> Tensor:
     """Rows q [tokens * n, K] over the first `length` (int64[1], on the device, at least 1) keys -> [tokens, n * K].
 
-    k, v [keys, K]; what lies beyond `length` is never read. With `inverse` the result leaves as `numbers`. The tile is
-    chosen as in `vision_attention`.
+    k, v [keys, K]; what lies beyond `length` is never read. With `inverse` the result leaves as `numbers`, and
+    int8's damage is marked in `v`. The tile is chosen as in `vision_attention`.
     """
     assert q.is_contiguous() and k.is_contiguous() and v.is_contiguous(), "rows are read as they lie in memory"
     rows, dim = q.shape
@@ -159,9 +168,9 @@ def prefix_attention(
     out = q.new_empty(rows // heads, heads * dim, dtype=result_dtype(q, inverse, numbers))
     tile = tile or chosen_tile(tiles, "prefix_attention", capability_of(q), rows // heads, heads, dim)
     _prefix_kernel[(triton.cdiv(rows, tile.rows),)](
-        q, k, v, length, out, rows, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim, BLOCK_D=triton.next_power_of_2(dim),
-        BLOCK_M=tile.rows, BLOCK_N=tile.keys, SCALED=inverse is not None, num_warps=tile.warps, num_stages=tile.stages,
-        **dependent_launch(q),
+        q, k, v, length, out, rows, heads, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim,
+        BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=tile.rows, BLOCK_N=tile.keys, SCALED=inverse is not None,
+        num_warps=tile.warps, num_stages=tile.stages, **dependent_launch(q),
     )  # fmt: skip
     return out
 

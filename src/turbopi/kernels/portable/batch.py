@@ -22,7 +22,7 @@ from turbopi.kernels.interface import BatchOps, Segments
 from turbopi.kernels.portable import batch_steps
 from turbopi.kernels.portable.attention import LOG2_E
 from turbopi.kernels.portable.attention_tiles import PACKED_ROWS, AttentionTile, chosen_tile
-from turbopi.kernels.portable.rounding import as_stored
+from turbopi.kernels.portable.rounding import as_stored, damaged
 from turbopi.kernels.portable.shared_memory import capability_of
 from turbopi.kernels.tile_table import NO_TILES, TileTable
 from turbopi.quantization.fp8 import E4M3
@@ -66,7 +66,7 @@ def _softmax_step(logits, values, acc, top, total):
 
 @triton.jit
 def _packed_kernel(
-    q, k, v, tiles, out, scale, inverse,
+    q, k, v, tiles, out, heads, scale, inverse,
     DIM: tl.constexpr, BLOCK_D: tl.constexpr, BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SCALED: tl.constexpr,
     PDL: tl.constexpr,
 ):  # fmt: skip
@@ -94,6 +94,8 @@ def _packed_kernel(
         if SCALED:
             total /= inverse
         tl.store(out + m[:, None] * DIM + d[None, :], as_stored(acc / total[:, None], out), inside)
+        if out.dtype.element_ty == tl.int8:
+            tl.store(v + m // heads * DIM, float("nan"), (m < end) & damaged(acc / total[:, None], 1))
 
 
 def packed_attention(
@@ -116,7 +118,7 @@ def packed_attention(
     tile = tile or chosen_tile(tiles, "packed_attention", capability_of(q), rows // heads, heads, dim)
     assert tile.rows == PACKED_ROWS, f"{tile}: `segments.tiles` have {PACKED_ROWS} rows"
     _packed_kernel[(len(segments.tiles),)](
-        q, k, v, segments.tiles, out, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim,
+        q, k, v, segments.tiles, out, heads, dim**-0.5 * LOG2_E, inverse or 1.0, DIM=dim,
         BLOCK_D=triton.next_power_of_2(dim), BLOCK_M=tile.rows, BLOCK_N=tile.keys, SCALED=inverse is not None,
         num_warps=tile.warps, num_stages=tile.stages, **dependent_launch(q),
     )  # fmt: skip

@@ -2,7 +2,8 @@
 
 Twins: `residual_rms_norm` and `residual_layer_norm` of `kernels.plain`. `y` may also be [splits, tokens, D], float32
 or as x: the partial sums of a product split over its inner axis, added up here in float32. With `inverse` the norm
-leaves as `numbers`, E4M3 or int8, rounded once from float32: see `quantization.fp8`.
+leaves as `numbers`, E4M3 or int8, rounded once from float32: see `quantization.fp8`. int8's damage is marked in the
+residual stream.
 """
 
 import torch
@@ -11,7 +12,7 @@ import triton.language as tl
 from torch import Tensor
 
 from turbopi.kernels.dependent_launch import dependent_launch, launch_dependents, result_dtype, wait_for_producer
-from turbopi.kernels.portable.rounding import as_stored
+from turbopi.kernels.portable.rounding import as_stored, damaged
 from turbopi.quantization.fp8 import E4M3
 
 
@@ -64,6 +65,8 @@ def _rms_norm_kernel(
     if SCALED:
         result *= inverse
     tl.store(normed + row * width + cols, as_stored(result, normed), mask)
+    if normed.dtype.element_ty == tl.int8:  # by the thread that has stored the row's first number
+        tl.store(out + row * width + cols, float("nan"), (cols == 0) & damaged(result, 0))
 
 
 @triton.jit
@@ -87,6 +90,8 @@ def _layer_norm_kernel(
     if SCALED:
         result *= inverse
     tl.store(normed + row * width + cols, as_stored(result, normed), mask)
+    if normed.dtype.element_ty == tl.int8:  # by the thread that has stored the row's first number
+        tl.store(out + row * width + cols, float("nan"), (cols == 0) & damaged(result, 0))
 
 
 def residual_rms_norm(

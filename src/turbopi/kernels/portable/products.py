@@ -38,13 +38,14 @@ def linear_gelu(
     bias: Tensor,
     inverse: float | None = None,
     numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
     *,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     if isinstance(weight, ScaledMatrix):
-        return product(x, weight, "gelu", bias, inverse=inverse, numbers=numbers, tiles=tiles)
+        return product(x, weight, "gelu", bias, inverse=inverse, numbers=numbers, stream=stream, tiles=tiles)
     result = torch._addmm_activation(bias, x, weight.t(), use_gelu=True)  # on CUDA: tanh's GELU, in the epilogue
-    return as_input(result, x.dtype, inverse, numbers)
+    return as_input(result, x.dtype, inverse, numbers, stream)
 
 
 def linear_geglu(
@@ -52,11 +53,12 @@ def linear_geglu(
     gate_up: Matrix,
     inverse: float | None = None,
     numbers: torch.dtype = E4M3,
+    stream: Tensor | None = None,
     *,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """In bfloat16 with GeGLU in the epilogue of a tile that was measured to be faster, else behind cuBLAS."""
     shape = x.shape[0], gate_up.shape[0] // 2, x.shape[1]
     if isinstance(gate_up, ScaledMatrix) or tuned_tile(tiles, "bf16", "geglu", *shape) is not None:
-        return product(x, gate_up, "geglu", inverse=inverse, numbers=numbers, tiles=tiles)
-    return activations.geglu(F.linear(x, gate_up), inverse, numbers)
+        return product(x, gate_up, "geglu", inverse=inverse, numbers=numbers, stream=stream, tiles=tiles)
+    return activations.geglu(F.linear(x, gate_up), inverse, numbers, stream)

@@ -1,7 +1,9 @@
-"""Numbers to eight bits: what kernels store, and weights with error feedback.
+"""Numbers to eight bits: what kernels store, the damage that int8 can't hold, and weights with error feedback.
 
-Twin of the second: `quantization.rounding.columns_with_feedback`.
+Twin of the last: `quantization.rounding.columns_with_feedback`.
 """
+
+from typing import Any
 
 import torch
 import triton
@@ -41,6 +43,12 @@ def as_stored(x, out):
 
 
 @triton.jit
+def damaged(x, AXIS: tl.constexpr):
+    """Along this axis of float32 x, where something isn't finite: what int8 can't hold, see `quantization.int8`."""
+    return tl.max(tl.where(tl.abs(x) < float("inf"), 0, 1), AXIS) != 0  # NaN is below nothing
+
+
+@triton.jit
 def _feedback_kernel(
     weight, inverse, order, errors, answers, out, rows, columns,
     NUM: tl.constexpr, R: tl.constexpr, ROWS: tl.constexpr,
@@ -62,6 +70,12 @@ def _feedback_kernel(
         left += (rounded * scale - exact)[:, None] * error[None, :]
         tl.store(out + row * columns + at, rounded.to(out.dtype.element_ty), valid)
         at, exact = following, next_exact
+
+
+def marks(stream: Tensor | None, unused: Tensor) -> dict[str, Any]:
+    """Arguments of a kernel that marks int8's damage in `stream` [tokens, width]; None: it doesn't."""
+    given = unused if stream is None else stream
+    return {"stream": given, "stride": given.stride(0), "MARKS": stream is not None}
 
 
 def round_with_feedback(

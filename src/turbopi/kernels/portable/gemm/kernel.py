@@ -21,7 +21,7 @@ from turbopi.kernels.dependent_launch import (
 )
 from turbopi.kernels.portable.activations import gelu_tanh
 from turbopi.kernels.portable.gemm.tiles import STEP_BYTES, Epilogue, Tile, best_tile, promotes, tuned_tile
-from turbopi.kernels.portable.rounding import as_stored
+from turbopi.kernels.portable.rounding import as_stored, damaged, marks
 from turbopi.kernels.tile_table import NO_TILES, Numbers, TileTable
 from turbopi.quantization.fp8 import ALIGNMENT, E4M3, Matrix, ScaledMatrix
 
@@ -39,9 +39,9 @@ def _sum(a, b, acc, PROMOTE: tl.constexpr, DEPTH: tl.constexpr):
 
 @triton.jit
 def _product_kernel(
-    x, weight, scale, bias, out, rows, columns, inner, inverse,
+    x, weight, scale, bias, out, rows, columns, inner, inverse, stream, stride,
     GELU: tl.constexpr, GEGLU: tl.constexpr, HAS_BIAS: tl.constexpr, HAS_SCALE: tl.constexpr, SCALED: tl.constexpr,
-    PROMOTE: tl.constexpr, WHOLE: tl.constexpr, SPLIT: tl.constexpr, GROUP: tl.constexpr,
+    MARKS: tl.constexpr, PROMOTE: tl.constexpr, WHOLE: tl.constexpr, SPLIT: tl.constexpr, GROUP: tl.constexpr,
     BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, DEPTH: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     """Tile [BLOCK_M, BLOCK_N] of the result. WHOLE: DEPTH divides `inner`. GEGLU: weight has 2 * columns rows."""
@@ -93,6 +93,8 @@ def _product_kernel(
         acc *= inverse
     to = out + ((split * rows + m)[:, None] * columns + n[None, :])
     tl.store(to, as_stored(acc, out), (m < rows)[:, None] & there[None, :])
+    if MARKS:
+        tl.store(stream + m * stride, float("nan"), (m < rows) & damaged(acc, 1))
 
 
 def product(
@@ -105,13 +107,14 @@ def product(
     tile: Tile | None = None,
     numbers: torch.dtype = E4M3,
     *,
+    stream: Tensor | None = None,
     tiles: TileTable = NO_TILES,
 ) -> Tensor:
     """x [M, K] @ weightᵀ + bias, then the epilogue -> [M, N] in the weight's dtype, or with `inverse` in `numbers`.
 
     x is of the numbers of a `ScaledMatrix`, else as the weight. weight [N, K], of "geglu" [2N, K], gate rows before up
     rows; bias [N]. "parts" -> [splits, M, N], whose sum is the result; of one split [M, N]. All contiguous, K a
-    multiple of 16. Without a `tile`, that of `tiles`, else the cost model's.
+    multiple of 16. Without a `tile`, that of `tiles`, else the cost model's. `stream` [M, width]: see `kernels.plain`.
     """
     data = weight.data if isinstance(weight, ScaledMatrix) else weight
     m, k = x.shape
@@ -138,7 +141,7 @@ def product(
         GELU=epilogue == "gelu", GEGLU=epilogue == "geglu", HAS_BIAS=bias is not None, HAS_SCALE=scaled,
         SCALED=inverse is not None, PROMOTE=x.dtype == E4M3 and promotes(on[0], k), WHOLE=k % depth == 0,
         SPLIT=tile.splits > 1, GROUP=GROUP, BLOCK_M=tile.rows, BLOCK_N=block_n, DEPTH=depth,
-        num_warps=tile.warps, num_stages=tile.stages, **dependent_launch(x),
+        num_warps=tile.warps, num_stages=tile.stages, **marks(stream, out), **dependent_launch(x),
     )  # fmt: skip
     return out
 
