@@ -19,7 +19,7 @@ import torch
 from msgspec import Meta, Struct
 
 from turbopi.errors import ConfigError
-from turbopi.files import cache_folder, write_whole
+from turbopi.files import cache_folder, make_folder, write_whole
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, Kernels, Knobs, Numbers, TileKey, TileTable
 from turbopi.provenance import driver_version
 from turbopi.reading import plain_document, read_document
@@ -225,7 +225,7 @@ def read_tile_file(file: Path) -> TileFile:
 
 def write_tile_file(document: TileFile, file: Path) -> None:
     """Whole or not at all, a tile on a line. Raises OutputError if it can't be written."""
-    file.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(file)
     about = plain_document(document)
     tiles = ",\n  ".join(json.dumps(plain_document(tile)) for tile in document.tiles)
     del about["tiles"]

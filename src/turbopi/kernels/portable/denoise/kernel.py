@@ -16,7 +16,7 @@ from turbopi.config import ModelConfig
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct
 from turbopi.kernels.interface import State, TokenInputs
-from turbopi.kernels.nvrtc import Kernel, compile_cubin, compile_ptx
+from turbopi.kernels.nvrtc import Kernel, compile_for, native_arch
 from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
 from turbopi.kernels.portable.denoise.packing import CHUNK_BYTES, PackedExpert, Tables, WeightNumbers
 
@@ -144,13 +144,7 @@ def source() -> str:
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
     """The kernel's machine code ("sm_80") or PTX ("compute_80"). Raises BackendError with the compiler's log."""
-    compile_for = compile_ptx if arch.startswith("compute_") else compile_cubin
     return compile_for(source(), arch, sizes, folder=folder)
-
-
-def native_arch(capability: tuple[int, int]) -> str:
-    """What the kernel is compiled for on a GPU of this compute capability."""
-    return f"sm_{capability[0]}{capability[1]}"
 
 
 class PortableDenoiser:
