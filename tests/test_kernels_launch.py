@@ -1,5 +1,5 @@
-"""Compiling, loading and launching through NVRTC and the driver: what they answer is heeded, and what they hold is given
-back. On a machine without a GPU by fakes of them.
+"""Compiling, loading and launching through NVRTC and the driver: what they answer is heeded, and what they hold is
+given back. On a machine without a GPU by fakes of them.
 """
 
 import ctypes

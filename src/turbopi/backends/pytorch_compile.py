@@ -24,8 +24,8 @@ from turbopi.observation import Observation
 from turbopi.toolchain import missing_for_c, missing_for_cpp
 
 
-# Variants of a stage that are compiled, of one model and of all models of a process. PyTorch's own limits are 8 and 256,
-# beyond which it runs the stage without compiling it
+# Variants of a stage that are compiled, of one model and of all models of a process. PyTorch's own limits are 8 and
+# 256, beyond which it runs the stage without compiling it
 MOST_VARIANTS, MOST_OF_ALL = 64, 1024
 SWITCHES = ("TORCH_COMPILE_DISABLE", "TORCHDYNAMO_DISABLE")  # 1: torch.compile does nothing
 

@@ -149,10 +149,10 @@ class _Module:
 
     def __init__(self, driver: Any, code: bytes, device: int | None) -> None:
         result = driver.cuModuleLoadData(code)
-        if int(result[0]) in _NOT_FOR_THIS_GPU:
+        if (why := _NOT_FOR_THIS_GPU.get(int(result[0]))) is not None:
             raise BackendUnavailable(
-                f"the driver doesn't take a kernel's code ({_NOT_FOR_THIS_GPU[int(result[0])]}): it is older than NVRTC, "
-                "or the GPU is newer than both; update the driver"
+                f"the driver doesn't take a kernel's code ({why}): it is older than NVRTC, or the GPU is newer than "
+                "both; update the driver"
             )
         self.handle = checked("cuModuleLoadData", result)
         weakref.finalize(self, _unload, driver, self.handle, device).atexit = False  # then the driver is going, too
