@@ -21,7 +21,7 @@ from turbopi.errors import BackendError, BackendUnavailable, ObservationError
 from turbopi.model.conditioning import Conditioning, Conditionings, Form
 from turbopi.model.reference import FloatPrecision, Pi0Model
 from turbopi.observation import Observation
-from turbopi.toolchain import missing_for_c, missing_for_cpp
+from turbopi.toolchain import make_caches_writable, missing_for_c, missing_for_cpp
 
 
 # Variants of a stage that are compiled, of one model and of all models of a process. PyTorch's own limits are 8 and
@@ -95,9 +95,7 @@ class Compiled:
     def of(cls, observation: Observation, horizon: int) -> "Compiled":
         cameras, tokens = observation.image_mask, observation.token_mask
         masked = bool((cameras != cameras[:1]).any()) or bool((tokens != tokens[:1]).any())
-        return cls(
-            observation.batch_size, int(cameras.any(0).sum()), masked, horizon, pixels=observation.images.dtype
-        )
+        return cls(observation.batch_size, int(cameras.any(0).sum()), masked, horizon, pixels=observation.images.dtype)
 
     def __str__(self) -> str:
         rows = "" if self.batch == 1 else f"batch {self.batch}{' of unequal lengths' if self.masked else ''}, "
@@ -120,6 +118,7 @@ class PyTorchCompileBackend(PyTorchBackend):
     ) -> None:
         if torch._dynamo.config.disable:
             raise BackendUnavailable("torch.compile is switched off by torch._dynamo.config.disable")
+        make_caches_writable()
         super().__init__(config, load, device=device, precision=precision)
         self._compiled: set[Compiled] = set()
         self._warming = False

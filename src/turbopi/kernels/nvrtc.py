@@ -219,15 +219,17 @@ class Kernel:
         self._driver = bindings("driver")
         d = self._driver
         self._module = _loaded(d, code)
-        self._function = checked("cuModuleGetFunction", d.cuModuleGetFunction(self._module.handle, name.encode()))
+        self._loaded = checked("cuModuleGetFunction", d.cuModuleGetFunction(self._module.handle, name.encode()))
         self._shared = shared_bytes
         attribute = d.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
-        checked("cuFuncSetAttribute", d.cuFuncSetAttribute(self._function, attribute, shared_bytes))
+        checked("cuFuncSetAttribute", d.cuFuncSetAttribute(self._loaded, attribute, shared_bytes))
 
-    def _launching(self) -> None:
-        """Note for `capturing` that this kernel is launched."""
+    @property
+    def _function(self) -> Any:
+        """What the driver launches, which `capturing` notes."""
         if (kernels := getattr(_LAUNCHED, "kernels", None)) is not None and self not in kernels:
             kernels.append(self)
+        return self._loaded
 
     def max_active_clusters(self, ranks: int, threads: int) -> int:
         """How many clusters of `ranks` blocks the device holds at once."""
@@ -244,7 +246,6 @@ class Kernel:
 
     def launch(self, blocks: int, threads: int, args: ctypes.Structure) -> None:
         """Launch on PyTorch's current stream; `args` is the kernel's one parameter."""
-        self._launching()
         d, pointers = self._driver, (ctypes.c_void_p * 1)(ctypes.addressof(args))
         stream = torch.cuda.current_stream().cuda_stream
         result = d.cuLaunchKernel(
@@ -258,7 +259,6 @@ class Kernel:
         The driver starts all blocks together or none: a kernel whose blocks wait for one another can't hang half
         started. Raises BackendUnavailable if they don't fit on what this process may use of the GPU.
         """
-        self._launching()
         d, pointers = self._driver, (ctypes.c_void_p * 1)(ctypes.addressof(args))
         stream = torch.cuda.current_stream().cuda_stream
         result = d.cuLaunchCooperativeKernel(

@@ -44,7 +44,6 @@ class DependentKernel(Kernel):
 
     def launch_dependent(self, blocks: int, given: Mapping[str, Any]) -> None:
         """Launch on PyTorch's current stream; `given` has each parameter's value by its name."""
-        self._launching()
         arguments = self._parameters.values(given)
         pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(value) for value in arguments))
         config = self._config(blocks)
