@@ -81,8 +81,8 @@ def provenance(device: torch.device) -> Provenance:
 
 def driver_version() -> str:
     """NVIDIA's driver, such as "580.95.05": as the kernel tells it, else nvidia-smi; of a Jetson without either its
-    system's release, such as "L4T 36.4.3"; else the CUDA that the driver knows, such as "CUDA 13.0". "unknown" without a
-    driver.
+    system's release, such as "L4T 36.4.3"; else the CUDA that the driver knows, such as "CUDA 13.0". "unknown" without
+    a driver.
     """
     try:
         found = re.search(r"\s(\d+\.\d+(?:\.\d+)?)\s", DRIVER_FILE.read_text())

@@ -1,5 +1,5 @@
-"""What compiling at run time needs beside Python packages: a compiler, for C also Python's own headers, and a folder that
-can be written.
+"""What compiling at run time needs beside Python packages: a compiler, for C also Python's own headers, and a folder
+that can be written.
 """
 
 import atexit
@@ -19,8 +19,8 @@ logger = logging.getLogger(__name__)
 
 
 def make_caches_writable() -> None:
-    """Where Triton or Inductor couldn't write its cache, which would fail, a temporary folder takes its place, with a line
-    of the log. Before the first kernel is compiled.
+    """Where Triton or Inductor couldn't write its cache, which would fail, a temporary folder takes its place, with a
+    line of the log. Before the first kernel is compiled.
     """
     home = os.environ.get("TRITON_HOME") or os.path.expanduser("~")
     usual = {TRITON_CACHE_VARIABLE: os.path.join(home, ".triton", "cache"), INDUCTOR_CACHE_VARIABLE: None}

@@ -23,7 +23,6 @@ from turbopi.model.reference import FloatPrecision, Pi0Model
 from turbopi.observation import Observation
 from turbopi.toolchain import make_caches_writable, missing_for_c, missing_for_cpp
 
-
 # Variants of a stage that are compiled, of one model and of all models of a process. PyTorch's own limits are 8 and
 # 256, beyond which it runs the stage without compiling it
 MOST_VARIANTS, MOST_OF_ALL = 64, 1024

@@ -71,8 +71,8 @@ class TunedTile(Struct, frozen=True, kw_only=True):
 
 
 class TileFile(Struct, frozen=True, kw_only=True):
-    """What `turbopi tune` writes. fingerprints: of the kernels' source, by kernels. triton: its version; None in a file of
-    before it was kept.
+    """What `turbopi tune` writes. fingerprints: of the kernels' source, by kernels. triton: its version; older files
+    have none.
     """
 
     gpu: str

@@ -95,7 +95,7 @@ ARGS = Struct(
         Parameter("float*", "tops", "[row tile][share of keys][16][2] largest logit, sum of weights"),
         Parameter("float*", "rope", "[T][K/2][2] cosine, sine"),
         Parameter("u32*", "counter", "of the grid's barrier"),
-        Parameter("u32*", "hang", "host memory: the number of the barrier that a block gave up at"),
+        Parameter("u32*", "hang", "host memory: arrivals that a block waited for when it gave up"),
         Parameter("u32*", "trace", "[blocks][PHASES][2] cycles at work and at the barrier behind it, with TP_TRACE"),
         Parameter("long long", "layer_stride"),
         Parameter("int", "steps"),
@@ -244,7 +244,7 @@ class PortableDenoiser:
 
     def why_it_trapped(self) -> str | None:
         """After a launch that failed: where a block waited for seconds before it gave up, or None."""
-        return stuck(int(self._tensors["hang"]), self._config.expert.depth)
+        return stuck(int(self._tensors["hang"]) // self._blocks, self._config.expert.depth)
 
     def trace(self) -> Tensor:  # of a kernel that was made with `traced`
         """int64[blocks, PHASES, 2]: cycles of all launches so far at work, and at the barrier behind it."""
