@@ -314,7 +314,7 @@ def test_doctor_says_whose_tiles_are_in_use_and_from_when(
 ) -> None:
     fake((8, 9))
     assert "the kernels' own tables and cost model choose; `turbopi tune` measures" in rows()["GPU 0 tiles"].found
-    machine = tuned_tiles.Machine("NVIDIA Fake", (8, 9), 100, "580.95.05")
+    machine = tuned_tiles.Machine("NVIDIA Fake", (8, 9), 100, "580.95.05", "3.6.0")
     file = tuned_tiles.own_file(machine.gpu)
     document = tile_document(machine)
     tuned_tiles.write_tile_file(document, file)
@@ -326,7 +326,7 @@ def test_doctor_says_whose_tiles_are_in_use_and_from_when(
 
 def test_doctor_names_a_file_of_another_driver_and_the_command(fake: Fake) -> None:
     fake((8, 9), driver="580.95.05")
-    before = tuned_tiles.Machine("NVIDIA Fake", (8, 9), 100, "570.1")
+    before = tuned_tiles.Machine("NVIDIA Fake", (8, 9), 100, "570.1", "3.6.0")
     tuned_tiles.write_tile_file(tile_document(before), tuned_tiles.own_file(before.gpu))
     found = rows()["GPU 0 tiles"]
     assert (found.level, found.fix) == ("WARN", "turbopi tune")

@@ -22,7 +22,7 @@ from turbopi.tune import gpu, plan
 from turbopi.tune.race import Round
 from turbopi.tune.shapes import Operation
 
-HOPPER = Machine("NVIDIA H200", (9, 0), 132, "580.95.05")
+HOPPER = Machine("NVIDIA H200", (9, 0), 132, "580.95.05", "3.6.0")
 STEADY = [100.0, 101.0] * 20
 
 
@@ -243,7 +243,7 @@ def test_what_is_asked_wrongly_is_named(fake: FakeGpu, arguments: list[str], sai
 
 
 def test_fp8_is_refused_where_the_gpu_has_none(fake: FakeGpu) -> None:
-    fake.machine = Machine("NVIDIA A100", (8, 0), 108, "580.95.05")
+    fake.machine = Machine("NVIDIA A100", (8, 0), 108, "580.95.05", "3.6.0")
     assert "from compute capability 8.9 on; this GPU has 8.0" in refusal(turbopi("tune", "--precision", "fp8"))
     planned = json.loads(turbopi("tune", "--dry-run", "--json", *USUAL).stdout)["planned"]
     assert {one["numbers"] for one in planned} == {"bf16"}

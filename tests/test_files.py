@@ -19,12 +19,48 @@ from file_helpers import no_room
 from matplotlib.figure import Figure
 
 from turbopi.errors import CheckpointError, ConfigError, OutputError
-from turbopi.files import alone_in, append_line, new_file, new_folder, whole_lines, write_whole
+from turbopi.files import (
+    alone_in,
+    append_line,
+    cache_folder,
+    keep_in_cache,
+    new_file,
+    new_folder,
+    whole_lines,
+    write_whole,
+)
 from turbopi.plots import write_figure
 
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
+
+
+# -- caches ------------------------------------------------------------------------------------------------------------
+
+
+def test_what_can_be_made_again_is_kept_or_named_once_in_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert keep_in_cache(tmp_path / "new" / "cubin", b"code") and (tmp_path / "new" / "cubin").read_bytes() == b"code"
+    assert not caplog.messages
+    (tmp_path / "file").write_text("")
+    for name in ("one", "another"):
+        assert not keep_in_cache(tmp_path / "file" / "folder" / name, b"code")
+    with no_room(100):
+        assert not keep_in_cache(tmp_path / "full", b"code" * 100)
+    not_made, full = caplog.messages
+    assert "can't make the folder" in not_made and "make room" in full
+    assert names(tmp_path) == ["file", "new"]
+
+
+def test_a_user_without_a_home_has_a_cache_folder_that_cannot_be_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    assert not keep_in_cache(cache_folder() / "cubin", b"code")
 
 
 # -- one file ----------------------------------------------------------------------------------------------------------

@@ -1,15 +1,23 @@
-"""Launches through the CUDA driver: what it answers is heeded, on a machine without a GPU by a fake of it."""
+"""Compiling, loading and launching through NVRTC and the driver: what they answer is heeded, and what they hold is
+given back. On a machine without a GPU by fakes of them.
+"""
 
 import ctypes
 import enum
+import gc
+import itertools
+import logging
 import subprocess
 import sys
+import threading
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+from turbopi.engine.graph import Graph, Mark
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels import grid_barrier as barrier
 from turbopi.kernels import nvrtc
@@ -19,6 +27,9 @@ from turbopi.kernels.sm90 import instructions
 
 class Status(enum.IntEnum):
     CUDA_SUCCESS = 0
+    CUDA_ERROR_DEINITIALIZED = 4
+    CUDA_ERROR_NO_BINARY_FOR_GPU = 209
+    CUDA_ERROR_UNSUPPORTED_PTX_VERSION = 222
     CUDA_ERROR_ILLEGAL_ADDRESS = 700
     CUDA_ERROR_COOPERATIVE_LAUNCH_TOO_LARGE = 720
 
@@ -42,6 +53,7 @@ def fake_driver(**answers: tuple[Any, ...]) -> SimpleNamespace:
     calls: list[tuple[str, tuple[Any, ...]]] = []
     results: dict[str, tuple[Any, ...]] = {
         "cuModuleLoadData": (Status(0), 1),
+        "cuModuleUnload": (Status(0),),
         "cuModuleGetFunction": (Status(0), 2),
         "cuFuncSetAttribute": (Status(0),),
         "cuOccupancyMaxActiveClusters": (Status(0), 4),
@@ -134,7 +146,8 @@ def test_a_dependent_launch_has_the_kernels_grid_block_cluster_and_shared_memory
 @pytest.mark.parametrize("call", ["launch", "launch_cooperative"])
 def test_a_launch_says_grid_block_shared_memory_stream_and_where_the_struct_is(driver: Any, call: str) -> None:
     installed, args = driver(), Args(41)
-    getattr(nvrtc.Kernel(b"", "turbopi_denoise", 1234), call)(64, 640, args)
+    kernel = nvrtc.Kernel(b"", "turbopi_denoise", 1234)
+    getattr(kernel, call)(64, 640, args)
     function, *sizes, stream, pointers = installed.calls[-1][1][:10]
     assert (function, sizes, stream) == (2, [64, 1, 1, 640, 1, 1, 1234], STREAM)
     assert (
@@ -170,6 +183,236 @@ def test_failed_launches_are_heeded_without_asserts_too() -> None:
     )
     ran = subprocess.run([sys.executable, "-O", "-c", script], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "False BackendError cuLaunchKernelEx failed: 700"
+
+
+# -- modules -----------------------------------------------------------------------------------------------------------
+
+
+def count(driver: SimpleNamespace) -> tuple[int, int]:
+    """Modules that were loaded and unloaded."""
+    names = [name for name, _ in driver.calls]
+    return names.count("cuModuleLoadData"), names.count("cuModuleUnload")
+
+
+def test_kernels_of_one_code_share_a_module_that_goes_with_the_last_of_them(driver: Any) -> None:
+    installed = driver()
+    loop, prepare = (nvrtc.Kernel(b"loop's", name, 0) for name in ("loop", "prepare"))
+    other = nvrtc.Kernel(b"another", "loop", 0)
+    assert count(installed) == (2, 0)
+    del loop
+    assert count(installed) == (2, 0), "the other function is in the same module"
+    del prepare
+    assert count(installed) == (2, 1)
+    again = nvrtc.Kernel(b"loop's", "loop", 0)
+    assert count(installed) == (3, 1)
+    del other, again
+    assert count(installed) == (3, 3)
+
+
+def test_modules_of_two_devices_are_two(driver: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed, current = driver(), itertools.count()
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: True)  # nothing is unloaded in this test
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: next(current))
+    kernels = [nvrtc.Kernel(b"code", "loop", 0) for _ in range(2)]
+    assert count(installed) == (2, 0)
+    del kernels
+    nvrtc._UNUSED.clear()
+
+
+def test_a_kernel_without_its_function_leaves_no_module(driver: Any) -> None:
+    installed = driver(cuModuleGetFunction=(Status.CUDA_ERROR_NO_BINARY_FOR_GPU, None))
+    with pytest.raises(BackendError, match="cuModuleGetFunction"):
+        nvrtc.Kernel(b"code", "loop", 0)
+    gc.collect()
+    assert count(installed) == (1, 1)
+
+
+def test_what_is_captured_holds_its_kernels_and_nothing_is_unloaded_meanwhile(driver: Any) -> None:
+    installed = driver()
+    kernel, unused, dependent = nvrtc.Kernel(b"a", "loop", 0), nvrtc.Kernel(b"b", "loop", 0), cluster_of_two()
+    with nvrtc.capturing() as held:
+        kernel.launch(8, 128, NOTHING)
+        kernel.launch_cooperative(8, 128, NOTHING)
+        dependent.launch_dependent(8, {"count": 1})
+        del unused
+        assert count(installed) == (3, 0), "unloading waits for the device"
+        other = threading.Thread(target=nvrtc._unload_unused)
+        other.start()
+        other.join()
+        assert count(installed) == (3, 0), "in no thread"
+    assert held == [kernel, dependent] and count(installed) == (3, 1)
+    kernel.launch(8, 128, NOTHING)
+    del kernel, dependent
+    assert count(installed) == (3, 1), "the graph needs them"
+    held.clear()
+    assert count(installed) == (3, 3)
+
+
+def test_a_driver_that_is_gone_unloads_nothing_and_breaks_nothing(driver: Any) -> None:
+    installed = driver(cuModuleUnload=(Status.CUDA_ERROR_DEINITIALIZED,))
+    kernels = [nvrtc.Kernel(code, "loop", 0) for code in (b"a", b"b")]
+    del kernels
+    assert count(installed) == (2, 2)
+
+
+@pytest.mark.parametrize("status", [Status.CUDA_ERROR_NO_BINARY_FOR_GPU, Status.CUDA_ERROR_UNSUPPORTED_PTX_VERSION])
+def test_code_that_the_driver_does_not_take_is_unavailable(driver: Any, status: Status) -> None:
+    driver(cuModuleLoadData=(status, None))
+    with pytest.raises(BackendUnavailable, match="update the driver"):
+        nvrtc.Kernel(b"code", "loop", 0)
+    driver(cuModuleLoadData=(Status.CUDA_ERROR_ILLEGAL_ADDRESS, None))
+    with pytest.raises(BackendError, match="cuModuleLoadData failed: CUDA_ERROR_ILLEGAL_ADDRESS") as raised:
+        nvrtc.Kernel(b"code", "loop", 0)
+    assert not isinstance(raised.value, BackendUnavailable)
+
+
+# -- NVRTC -------------------------------------------------------------------------------------------------------------
+
+
+class Result(enum.IntEnum):
+    NVRTC_SUCCESS = 0
+    NVRTC_ERROR_INVALID_OPTION = 5
+    NVRTC_ERROR_COMPILATION = 6
+
+
+@pytest.fixture
+def compiler(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """`compiler(…)`: an NVRTC that answers so; the list it returns has the options of each program it compiles."""
+
+    def install(known: tuple[int, ...] = (75, 80, 120), status: int = 0, build: str = "V13.0.88") -> list[list[str]]:
+        compiled: list[list[str]] = []
+
+        def fill(program: Any, text: bytes) -> tuple[int]:
+            ctypes.memmove(text, b"c" * len(text), len(text))
+            return (0,)
+
+        fake = SimpleNamespace(
+            nvrtcVersion=lambda: (0, 13, 0),
+            nvrtcGetSupportedArchs=lambda: (0, list(known)),
+            nvrtcCreateProgram=lambda *given: (0, object()),
+            nvrtcCompileProgram=lambda program, count, options: (
+                compiled.append([option.decode() for option in options]) or Result(status),
+            ),
+            nvrtcResult=Result,
+            nvrtcDestroyProgram=lambda program: (0,),
+        )
+        for kind in ("CUBIN", "PTX", "ProgramLog"):
+            setattr(fake, f"nvrtcGet{kind}Size", lambda program: (0, 4))
+            setattr(fake, f"nvrtcGet{kind}", fill)
+        monkeypatch.setattr(nvrtc, "bindings", lambda name: fake)
+        monkeypatch.setattr(nvrtc, "_build", lambda: build)
+        return compiled
+
+    return install
+
+
+def test_a_gpu_newer_than_nvrtc_gets_ptx_of_the_newest_that_it_knows(compiler: Any, tmp_path: Path) -> None:
+    compiled = compiler()
+    archs = [nvrtc.native_arch(one) for one in ((8, 0), (8, 7), (12, 0), (12, 1), (13, 0))]
+    assert archs == ["sm_80", "compute_80", "sm_120", "compute_120", "compute_120"]
+    for arch in ("sm_80", "compute_120"):
+        assert nvrtc.compile_for("source", arch, {}, folder=tmp_path) == b"cccc"
+    assert [options[0] for options in compiled] == ["-arch=sm_80", "-arch=compute_120"]
+    assert sorted(file.suffix for file in tmp_path.iterdir()) == [".cubin", ".ptx"]
+    with pytest.raises(BackendUnavailable, match=r"compute capability 7\.5 and newer; this GPU has 7\.0"):
+        nvrtc.native_arch((7, 0))
+
+
+def test_only_source_that_does_not_compile_is_an_error_of_ours(compiler: Any, tmp_path: Path) -> None:
+    compiler(status=Result.NVRTC_ERROR_INVALID_OPTION)
+    with pytest.raises(BackendUnavailable, match=r"NVRTC_ERROR_INVALID_OPTION.*-arch=sm_130"):
+        nvrtc.compile_cubin("source", "sm_130", {}, folder=tmp_path)
+    compiler(status=Result.NVRTC_ERROR_COMPILATION)
+    with pytest.raises(BackendError, match="doesn't compile with -arch=sm_80") as raised:
+        nvrtc.compile_cubin("source", "sm_80", {}, folder=tmp_path)
+    assert not isinstance(raised.value, BackendUnavailable)
+
+
+def test_without_nvrtcs_library_kernels_are_unavailable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def missing() -> None:
+        raise RuntimeError("Failed to dlopen libnvrtc.so.13")
+
+    fake = SimpleNamespace(nvrtcVersion=missing, nvrtcGetSupportedArchs=missing)
+    monkeypatch.setattr(nvrtc, "bindings", lambda name: fake)
+    for call in (lambda: nvrtc.native_arch((8, 0)), lambda: nvrtc.compile_cubin("", "sm_80", {}, folder=tmp_path)):
+        with pytest.raises(BackendUnavailable, match="NVRTC can't be loaded"):
+            call()
+
+
+def test_another_build_of_nvrtc_compiles_again(compiler: Any, tmp_path: Path) -> None:
+    for build, times in (("V13.0.88", 1), ("V13.0.88", 0), ("V13.0.90", 1)):
+        compiled = compiler(build=build)
+        nvrtc.compile_cubin("source", "sm_80", {}, folder=tmp_path)
+        assert len(compiled) == times, build
+
+
+def test_nvrtcs_build_is_told_by_what_it_compiles() -> None:
+    pytest.importorskip("cuda.bindings.nvrtc", reason="cuda.bindings isn't installed")
+    try:
+        build = nvrtc._build()
+    except BackendUnavailable as e:
+        pytest.skip(str(e))
+    major, minor = nvrtc._nvrtc("nvrtcVersion")
+    assert f"V{major}.{minor}." in build
+
+
+def test_a_cache_that_cannot_be_written_or_read_costs_one_line_of_the_log(
+    compiler: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    compiler()
+    (tmp_path / "file").write_text("")
+    with caplog.at_level(logging.WARNING):
+        for source in ("one", "another"):
+            assert nvrtc.compile_cubin(source, "sm_80", {}, folder=tmp_path / "file" / "below") == b"cccc"
+    (line,) = caplog.messages
+    assert "going on without the cache" in line and str(tmp_path / "file") in line
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
+def test_a_captured_graph_runs_on_when_its_kernel_is_let_go() -> None:
+    """Modules are unloaded by the driver, and what a graph launches is not."""
+    device = torch.device("cuda", 0)
+    blocks = torch.cuda.get_device_properties(device).multi_processor_count
+    code = nvrtc.compile_for(barrier.SOURCE, nvrtc.native_arch(torch.cuda.get_device_capability(device)), {})
+    counter = torch.zeros(1, dtype=torch.int32, device=device)
+    args = barrier._Args(counter.data_ptr(), 3)
+
+    def run(mark: Mark) -> None:
+        counter.zero_()
+        kernels[-1].launch_cooperative(blocks, barrier.THREADS, args)
+
+    kernels = [nvrtc.Kernel(code, "turbopi_barriers", 0)]
+    graph = Graph(run, None, torch.cuda.Stream(device))
+    kernels.clear()
+    gc.collect()
+    assert (code, device.index) in nvrtc._LOADED
+    for _ in range(3):
+        graph.replay()
+        assert int(counter) == 3 * blocks
+    del graph
+    gc.collect()
+    assert (code, device.index) not in nvrtc._LOADED and not nvrtc._UNUSED
+    kernels.append(nvrtc.Kernel(code, "turbopi_barriers", 0))
+    run(lambda stage: None)
+    assert int(counter) == 3 * blocks
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
+def test_loading_and_letting_go_takes_no_memory_of_the_device() -> None:
+    device = torch.device("cuda", 0)
+    code = nvrtc.compile_for(barrier.SOURCE, nvrtc.native_arch(torch.cuda.get_device_capability(device)), {})
+    torch.zeros(1, device=device)
+
+    def load(times: int) -> int:
+        for _ in range(times):
+            nvrtc.Kernel(code, "turbopi_barriers", 0)
+        return torch.cuda.mem_get_info(device)[0]
+
+    before = load(10)
+    assert before - load(500) < 2 << 20
 
 
 @pytest.mark.gpu

@@ -57,7 +57,7 @@ class Emulated:
 
     def __init__(self, sizes: dict[str, int], folder: Path, seed: int, prepare: bool) -> None:
         self.library = emulate.compiled(denoise.source() + BOTH, "both", TAKES, sizes, folder)
-        self.seed, self.prepare = seed, ctypes.c_int(prepare)
+        self.seed, self.prepare, self.missing = seed, ctypes.c_int(prepare), 0  # missing: blocks that aren't launched
 
     def _launch(self, blocks: int, threads: int, together: int, args: ctypes.Structure) -> None:
         run = ctypes.CDLL(str(self.library)).run
@@ -70,10 +70,10 @@ class Emulated:
         self._launch(blocks, threads, 1, args)
 
     def launch_cooperative(self, blocks: int, threads: int, args: ctypes.Structure) -> None:
-        self._launch(blocks, threads, blocks, args)
+        self._launch(blocks - self.missing, threads, blocks - self.missing, args)
 
 
-def run(
+def made(
     p: Problem,
     packed: PackedExpert,
     monkeypatch: pytest.MonkeyPatch,
@@ -82,7 +82,7 @@ def run(
     blocks: int,
     seed: int = 0,
     choice: denoise.Choices | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> denoise.PortableDenoiser:
     def load(device: torch.device, sizes: dict[str, int], arch: str | None) -> tuple[Any, Any]:
         return Emulated(sizes, folder, seed, prepare=False), Emulated(sizes, folder, seed, prepare=True)
 
@@ -90,17 +90,23 @@ def run(
     monkeypatch.setattr(denoise, "unavailable", lambda device, weights: None)
     monkeypatch.setattr(denoise, "has_large_l2", lambda device: True)
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
-    suffix, rows, steps = p.noise.shape[0], p.cache_k.shape[1], len(p.table)
-    kernel = denoise.PortableDenoiser(
+    return denoise.PortableDenoiser(
         *(p.config, packed, p.small, p.table),
-        cache_rows=rows,
-        suffix=suffix,
+        cache_rows=p.cache_k.shape[1],
+        suffix=p.noise.shape[0],
         device=CPU,
         choice=choice,
         blocks=blocks,
     )
-    x_t = torch.full((steps + 1, *p.noise.shape), torch.nan)
-    v_t = torch.full((steps, *p.noise.shape), torch.nan)
+
+
+def run(
+    p: Problem, packed: PackedExpert, monkeypatch: pytest.MonkeyPatch, folder: Path, **options: Any
+) -> tuple[Tensor, Tensor]:
+    """options: of `made`"""
+    kernel = made(p, packed, monkeypatch, folder, **options)
+    x_t = torch.full((len(p.table) + 1, *p.noise.shape), torch.nan)
+    v_t = torch.full((len(p.table), *p.noise.shape), torch.nan)
     kernel.launch(p.noise, p.cache_k, p.cache_v, torch.tensor([p.length]), x_t, v_t)
     return x_t, v_t
 
@@ -136,6 +142,31 @@ def test_it_is_right_in_whatever_order_its_threads_go(monkeypatch: pytest.Monkey
     assert all(
         torch.equal(a, b) for a, b in zip(first, run(p, packed, monkeypatch, folder, blocks=5, seed=seed), strict=True)
     )
+
+
+def test_blocks_that_wait_in_vain_give_up_and_say_where(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    p = problem("golden", 1, 1, 5, 1, CPU)
+    monkeypatch.setattr(denoise, "LOOKS", 40)
+    kernel = made(p, PackedExpert.pack(p.config, p.layers), monkeypatch, folder, blocks=2)
+    launch = p.noise, p.cache_k, p.cache_v, torch.tensor([p.length])
+    steps = torch.zeros(2, *p.noise.shape), torch.zeros(1, *p.noise.shape)
+    kernel.launch(*launch, *steps)
+    assert kernel.why_it_trapped() is None
+    kernel._kernel.missing = 1  # type: ignore[attr-defined]
+    with pytest.raises(RuntimeError, match="a trap"):
+        kernel.launch(*launch, *steps)
+    assert "waited for seconds for one another behind embed in step 0" in str(kernel.why_it_trapped())
+
+
+def test_a_barriers_number_names_its_place() -> None:
+    layers = 3
+    a_step = (
+        ["embed"] + [f"phase {one} of layer {i}" for i in range(layers) for one in denoise.PHASES[:6]] + ["advance"]
+    )
+    for number, where in enumerate([*a_step, *a_step], 1):
+        step = (number - 1) // len(a_step)
+        assert str(denoise.stuck(number, layers)).endswith(f"behind {where} in step {step}")
+    assert denoise.stuck(0, layers) is None
 
 
 def test_choices_of_a_launch_change_no_more_than_the_order_of_sums(

@@ -100,15 +100,33 @@ def test_errors_of_nvfp4_cancel_too() -> None:
     assert error(spared, weight, seen) < 0.3 * error(nearest, weight, seen)
 
 
-def test_without_feedback_the_kernel_rounds_every_number_to_nearest() -> None:
-    numbers = torch.arange(256, dtype=torch.uint8).view(torch.float8_e4m3fn).float()
-    numbers = torch.unique(numbers[numbers.isfinite()])
-    between = (numbers[1:] + numbers[:-1]) / 2
-    x = torch.cat((numbers, between, between * 1.001, torch.tensor([449.0, -1e30, torch.inf, -torch.inf])))
+def in_e4m3(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Bytes of float32 x: the kernel's, without feedback, and PyTorch's."""
     weight, none = x[:, None].contiguous().to(DEVICE), torch.zeros(1, 1, device=DEVICE)
     order, inverse = torch.zeros(1, dtype=torch.int64, device=DEVICE), torch.ones(len(x), device=DEVICE)
     ours = round_with_feedback(weight, inverse, order, none, none)
-    assert torch.equal(ours.float(), to_e4m3(weight, 1.0).float())
+    assert ours.dtype == torch.float8_e4m3fn
+    return ours.view(torch.uint8).flatten().cpu(), to_e4m3(x, 1.0).view(torch.uint8)
+
+
+def test_bfloat16_becomes_the_byte_that_pytorch_makes_of_it() -> None:
+    """Positive ones from 2^-11, which becomes 0, to 2^9, which saturates."""
+    first, last = (torch.tensor(x, dtype=torch.bfloat16).view(torch.int16).item() for x in (2**-11, 512.0))
+    x = torch.arange(int(first), int(last) + 1, dtype=torch.int16).view(torch.bfloat16).float()
+    ours, theirs = in_e4m3(x)
+    assert torch.equal(ours, theirs)
+
+
+def test_numbers_between_two_of_e4m3_become_the_byte_that_pytorch_makes_of_them() -> None:
+    numbers = torch.arange(256, dtype=torch.uint8).view(torch.float8_e4m3fn).float()
+    numbers = torch.unique(numbers[numbers.isfinite()])
+    between = (numbers[1:] + numbers[:-1]) / 2
+    beside = [torch.nextafter(between, torch.full_like(between, side)) for side in (-torch.inf, torch.inf)]
+    ends = torch.tensor([449.0, 463.9, 464.0, 480.0, -1e30, torch.inf, -torch.inf, 1e-40, -1e-40, -0.0])
+    ours, theirs = in_e4m3(torch.cat((numbers, between, *beside, ends)))
+    assert torch.equal(ours, theirs)
+    damaged, _ = in_e4m3(torch.tensor([torch.nan, -torch.nan]))
+    assert (damaged & 0x7F).tolist() == [0x7F, 0x7F]
 
 
 def test_without_feedback_the_kernel_rounds_every_whole_number_to_nearest() -> None:

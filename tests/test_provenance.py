@@ -93,5 +93,12 @@ def test_the_driver_is_told_by_the_kernel(
     assert driver_version() == version
     monkeypatch.setattr(module, "DRIVER_FILE", tmp_path / "none")
     assert driver_version() == "570.1"
-    monkeypatch.setattr(module, "_output", lambda command: "")
+    monkeypatch.setattr(module, "_output", lambda command: "[N/A]\n")
+    monkeypatch.setattr(module, "JETSON_FILE", tmp_path / "jetson")
+    (tmp_path / "jetson").write_text("# R36 (release), REVISION: 4.3, GCID: 38968081, BOARD: generic\n")
+    assert driver_version() == "L4T 36.4.3"
+    (tmp_path / "jetson").unlink()
+    monkeypatch.setattr(torch._C, "_cuda_getDriverVersion", lambda: 12060, raising=False)
+    assert driver_version() == "CUDA 12.6"
+    monkeypatch.setattr(torch._C, "_cuda_getDriverVersion", lambda: 0)
     assert driver_version() == "unknown"

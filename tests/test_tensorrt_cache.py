@@ -132,12 +132,21 @@ def test_a_build_that_fails_leaves_nothing_and_keeps_what_was_there(cache: Engin
 
 def test_a_full_disk_leaves_what_was_there(cache: EngineCache) -> None:
     with no_room(100), pytest.raises(OutputError, match=r"can't write .*part\.engine: File too large; make room"):
-        cache.get_or_build(specification(), Builder())
+        cache.get_or_build(specification(), Builder(), keep=True)
     assert list(cache.folder.iterdir()) == []
-    cache.get_or_build(specification(), Builder())
+    cache.get_or_build(specification(), Builder(), keep=True)
     with no_room(100), pytest.raises(OutputError):
-        cache.get_or_build(specification(), Builder(b"other"), rebuild=True)
+        cache.get_or_build(specification(), Builder(b"other"), rebuild=True, keep=True)
     assert cache.get(specification()) == b"plan" and list(cache.folder.iterdir()) == [cache.file("part")]
+
+
+def test_an_engine_that_cannot_be_stored_is_used_and_reported(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    cache, told = EngineCache(tmp_path / "file" / "engines", ENVIRONMENT), list[str]()
+    assert cache.get_or_build(specification(), Builder(), told.append) == (b"plan", "built")
+    assert len(told) == 2 and "isn't kept" in told[1] and str(cache.folder) in told[1], "it can't be read either"
+    with pytest.raises(OutputError, match="can't make the folder"):
+        cache.get_or_build(specification(), Builder(), keep=True)
 
 
 def store(folder: Path, number: int, times: int) -> None:

@@ -63,6 +63,23 @@ def test_every_triton_kernel_is_among_the_calls() -> None:
     assert json.loads(left) == [] and int(count) > 15, done.stderr
 
 
+def test_weights_are_rounded_to_every_format_on_every_gpu(tmp_path: Path) -> None:
+    """Triton has no E4M3 below 8.9, and `turbopi calibrate` needs none of the hardware."""
+    result = compiled(tmp_path, "--targets", "80", "--kernels", "rounding.feedback")
+    assert [row for row in result.rows if row.problem or row.refused] == []
+    numbers = {frozenset(row.variant.split("num_warps=1 ")[1].split()) for row in result.rows}
+    assert numbers == {
+        frozenset({"fp32", "i64", stored, *weights}) for weights in (["bf16"], []) for stored in ("u8", "i8")
+    }
+
+
+def test_the_checked_in_result_has_e4m3_only_where_triton_has_it() -> None:
+    rows = read_compiled(ROOT / "benchmarks/results/compiled_for_all.json").rows
+    assert {row.target for row in rows if "fp8e4nv" in row.variant} == ALL - {"sm_80", "sm_86", "sm_87"}
+    rounded = {row.target for row in rows if row.kernel == "rounding.feedback" and " u8" in row.variant}
+    assert rounded == ALL
+
+
 def test_the_checked_in_result_has_every_cuda_kernel() -> None:
     done = ours(
         "-c",

@@ -36,7 +36,7 @@ from turbopi.kernels.tile_checks import why_not
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, TileKey, TileTable
 from turbopi.reading import plain_document
 
-HOPPER = Machine("NVIDIA H200", (9, 0), 132, "580.95.05")
+HOPPER = Machine("NVIDIA H200", (9, 0), 132, "580.95.05", "3.6.0")
 
 
 @pytest.fixture
@@ -96,12 +96,12 @@ def test_the_shipped_files_are_read_and_hold_for_their_own_gpus() -> None:
     assert tuned_tiles.SHIPPED.is_dir()
     for file in tuned_tiles.SHIPPED.glob("*.json"):
         read_tile_file(file)
-    assert not find_tiles(Machine("No such GPU", (8, 9), 1, "1"), cache=Path("/nonexistent")).table.tiles
+    assert not find_tiles(Machine("No such GPU", (8, 9), 1, "1", "3.6.0"), cache=Path("/nonexistent")).table.tiles
 
 
 def test_the_tiles_that_ship_for_an_h200_are_of_todays_kernels() -> None:
     """Otherwise they lie unused: measure them again, with `turbopi tune --out`."""
-    found = find_tiles(Machine("NVIDIA H200", (9, 0), 132, "any"), cache=Path("/nonexistent"))
+    found = find_tiles(Machine("NVIDIA H200", (9, 0), 132, "any", "3.6.0"), cache=Path("/nonexistent"))
     assert sum(key.kernels == "hopper" for key in found.table) > 100
 
 
@@ -138,8 +138,34 @@ def test_tiles_of_kernels_that_have_not_changed_stay(tmp_path: Path) -> None:
     assert [key.kernels for key in tiles.table] == ["hopper"] and len(tiles.unused) == 1
 
 
-def test_a_shipped_file_holds_for_every_driver_but_not_for_other_kernels(tmp_path: Path, shipped: Path) -> None:
-    write_tile_file(tile_document(driver="1.0"), shipped / "a.json")
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"driver": "570.1"}, "with driver 570.1, and here it is 580.95.05"),
+        ({"triton": "3.5.1"}, "with Triton 3.5.1, and here it is 3.6.0"),
+        ({"triton": None}, "with Triton of an unknown version, and here it is 3.6.0"),
+    ],
+)
+def test_the_users_file_of_another_driver_or_triton_is_named(
+    tmp_path: Path, changed: dict[str, Any], told: str
+) -> None:
+    kept(tmp_path, tile_document(**changed))
+    tiles = find_tiles(ADA, cache=tmp_path, shipped=tmp_path / "none")
+    assert not tiles.table.tiles and told in tiles.unused[0]
+    kept(tmp_path, tile_document())
+    assert len(find_tiles(ADA, cache=tmp_path, shipped=tmp_path / "none").table) == 1
+
+
+def test_a_folder_that_cannot_be_read_has_no_tiles(tmp_path: Path) -> None:
+    (tmp_path / "tiles").write_text("")
+    tiles = find_tiles(ADA, cache=tmp_path, shipped=tmp_path / "none")
+    assert not tiles.table.tiles and not tiles.unused
+
+
+def test_a_shipped_file_holds_for_every_driver_and_triton_but_not_for_other_kernels(
+    tmp_path: Path, shipped: Path
+) -> None:
+    write_tile_file(tile_document(driver="1.0", triton="3.5"), shipped / "a.json")
     assert len(find_tiles(ADA, cache=tmp_path, shipped=shipped).table) == 1
     write_tile_file(tile_document(fingerprints={"portable": "0"}), shipped / "a.json")
     tiles = find_tiles(ADA, cache=tmp_path, shipped=shipped)

@@ -11,11 +11,12 @@ from test_begin import CPU, Unrun, on_cpu
 from test_engine import made_up
 
 from turbopi import UnifiedPolicy, backends
+from turbopi.backends import pytorch_compile
 from turbopi.backends.pytorch_compile import PyTorchCompileBackend
 from turbopi.checkpoint import random_checkpoint
 from turbopi.config import CAMERAS, LIMITS
 from turbopi.engine.runner import HostRow
-from turbopi.errors import ConfigError, ObservationError
+from turbopi.errors import BackendError, BackendUnavailable, ConfigError, ObservationError
 from turbopi.observation import Observation, with_cameras
 from turbopi.robots import ROBOTS, LeRobot, Robot, create_robot
 from turbopi.robots.described import Described
@@ -164,6 +165,53 @@ def test_a_strict_compiler_compiles_nothing_in_a_call(monkeypatch: pytest.Monkey
     with pytest.raises(ObservationError, match=r"needs batch 2, 2 cameras, H=10.* one by one"):
         policy.infer_batch([seen_by(2, policy)] * 2)
     assert policy.metadata["backend_details"]["compiled_for"] == ["1 cameras, H=10", "2 cameras, H=10"]
+
+
+def test_a_stage_never_runs_without_being_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyTorch by itself runs a function as it is once it has been compiled for 8 shapes, and behind a graph break."""
+    came: list[Any] = []
+    compile = torch.compile
+
+    def note(graph: Any, inputs: Any) -> Any:
+        came.append(graph)
+        return graph.forward
+
+    def stage(x: torch.Tensor) -> torch.Tensor:
+        return x + 1
+
+    def broken(x: torch.Tensor) -> torch.Tensor:
+        torch._dynamo.graph_break()
+        return x + 1
+
+    monkeypatch.setattr(torch, "compile", lambda function, **options: compile(function, backend=note, **options))
+    monkeypatch.setattr(pytorch_compile, "MOST_VARIANTS", 12)
+    call = pytorch_compile.compiled(stage, dynamic=False)
+    for size in range(2, 14):
+        assert call(torch.zeros(size)).shape == (size,) and len(came) == size - 1
+    call(torch.zeros(5))
+    assert len(came) == 12
+    with pytest.raises(BackendError, match="has compiled stage for 12 batch sizes"):
+        call(torch.zeros(14))
+    with pytest.raises(torch._dynamo.exc.Unsupported):
+        pytorch_compile.compiled(broken)(torch.zeros(2))
+
+
+def test_pixels_of_another_kind_are_another_shape() -> None:
+    cameras, tokens = torch.ones(1, 2, dtype=torch.bool), torch.ones(1, 4, dtype=torch.int64)
+    images = torch.zeros(1, 2, 8, 8, 3, dtype=torch.uint8)
+    observation = Observation(images, cameras, tokens, tokens.bool(), torch.zeros(1, 32))
+    floats = dataclasses.replace(observation, images=images.float())
+    warm, other = (pytorch_compile.Compiled.of(one, H) for one in (observation, floats))
+    assert warm != other and (str(warm), str(other)) == ("2 cameras, H=10", "2 cameras of float32 pixels, H=10")
+
+
+@pytest.mark.parametrize("variable", ["TORCH_COMPILE_DISABLE", "TORCHDYNAMO_DISABLE"])
+def test_a_compiler_that_is_switched_off_is_unavailable(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(variable, "1")
+    assert "unset TORCH_COMPILE_DISABLE and TORCHDYNAMO_DISABLE" in str(PyTorchCompileBackend.unavailable(CPU))
+    monkeypatch.delenv(variable)
+    with torch._dynamo.config.patch(disable=True), pytest.raises(BackendUnavailable, match="switched off"):
+        made(cls=PyTorchCompileBackend)
 
 
 # -- a horizon for one call --------------------------------------------------------------------------------------------

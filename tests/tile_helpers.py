@@ -5,7 +5,7 @@ from typing import Any
 from turbopi.backends.tuned_tiles import Machine, TileFile, TunedTile, fingerprint
 from turbopi.kernels.tile_table import TileKey
 
-ADA = Machine("NVIDIA GeForce RTX 4090", (8, 9), 128, "580.95.05")
+ADA = Machine("NVIDIA GeForce RTX 4090", (8, 9), 128, "580.95.05", "3.6.0")
 TILE = {"rows": 64, "columns": 64, "warps": 4, "stages": 6, "splits": 1}
 OTHER = {"rows": 128, "columns": 128, "warps": 8, "stages": 3, "splits": 1}
 KEY = TileKey("portable", "plain", "fp8", 576, 2560, 2048)
@@ -34,6 +34,7 @@ def tile_document(machine: Machine = ADA, *tiles: TunedTile, **changes: Any) -> 
         "compute_capability": machine.compute_capability,
         "multiprocessors": machine.multiprocessors,
         "driver": machine.driver,
+        "triton": machine.triton,
         "turbopi": "0.1.0",
         "date": "2026-11-24",
         "fingerprints": {"portable": fingerprint("portable"), "hopper": fingerprint("hopper")},

@@ -5,6 +5,7 @@
     with new_file(file) as temporary: ...                       or to a path
     with new_folder(folder) as temporary: ...
     append_line(file, line)                                     one more line of a .jsonl
+    keep_in_cache(file, content)                                what can be made again: a failure is a line of the log
     with alone_in(folder, "another run"): ...                   one writer of several files
 
 The content goes to a temporary file of a name of its own in the same folder, hidden; it is on the disk before it takes
@@ -15,6 +16,7 @@ reason.
 
 import errno
 import json
+import logging
 import os
 import platform
 import re
@@ -31,13 +33,22 @@ from turbopi.errors import OutputError, TurboPiError
 Error = type[TurboPiError]
 Content = str | bytes | Callable[[IO[bytes]], object]
 
+logger = logging.getLogger(__name__)
+
 _LOCK = ".turbopi.lock"
+_UNWRITABLE: set[Path] = set()  # folders of caches of which the log says so already
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def cache_folder() -> Path:
-    """For compiled kernels, engines and fingerprints: $XDG_CACHE_HOME/turbopi or ~/.cache/turbopi."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "turbopi"
+    """For compiled kernels, engines and fingerprints: $XDG_CACHE_HOME/turbopi or ~/.cache/turbopi.
+
+    It may be missing or unwritable. A user without a home gets a folder that can't be made.
+    """
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "turbopi"
+    except RuntimeError:
+        return Path(os.devnull) / "turbopi"
 
 
 def openpi_cache() -> Path:
@@ -56,6 +67,29 @@ def write_whole(file: Path, content: Content, error: Error = OutputError, *, syn
             content(stream)
         else:
             stream.write(content.encode() if isinstance(content, str) else content)
+
+
+def make_folder(file: Path, error: Error = OutputError) -> None:
+    """The folder of a file, if it isn't there. Raises `error` if it can't be made."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as reason:
+        raise error(f"can't make the folder {file.parent}: {reason.strerror or reason}") from reason
+
+
+def keep_in_cache(file: Path, content: Content) -> bool:
+    """Write a file that can be made again, and its folder. False if it can't be written: the first time in a folder, a
+    line of the log says so.
+    """
+    try:
+        make_folder(file)
+        write_whole(file, content)
+    except OutputError as error:
+        if file.parent not in _UNWRITABLE:
+            _UNWRITABLE.add(file.parent)
+            logger.warning("going on without the cache, so the next start takes longer: %s", error)
+        return False
+    return True
 
 
 @contextmanager

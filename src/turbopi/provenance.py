@@ -14,6 +14,7 @@ from msgspec import UNSET, Struct, UnsetType, field
 from turbopi.version import turbopi_version
 
 DRIVER_FILE = Path("/proc/driver/nvidia/version")
+JETSON_FILE = Path("/etc/nv_tegra_release")
 _GPU_FIELDS = ("name", "driver_version", "clocks.sm", "clocks.mem", "clocks_throttle_reasons.active", "temperature.gpu")
 
 
@@ -79,7 +80,10 @@ def provenance(device: torch.device) -> Provenance:
 
 
 def driver_version() -> str:
-    """NVIDIA's driver, such as "580.95.05": as the kernel tells it, else nvidia-smi; "unknown" where neither does."""
+    """NVIDIA's driver, such as "580.95.05": as the kernel tells it, else nvidia-smi; of a Jetson without either its
+    system's release, such as "L4T 36.4.3"; else the CUDA that the driver knows, such as "CUDA 13.0". "unknown" without
+    a driver.
+    """
     try:
         found = re.search(r"\s(\d+\.\d+(?:\.\d+)?)\s", DRIVER_FILE.read_text())
     except OSError:
@@ -87,7 +91,16 @@ def driver_version() -> str:
     if found is not None:
         return found[1]
     lines = _output(["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]).splitlines()
-    return lines[0].strip() if lines else "unknown"
+    if lines and lines[0].strip()[:1].isdigit():
+        return lines[0].strip()
+    try:
+        release = re.match(r"# R(\d+) \(release\), REVISION: ([\d.]+)", JETSON_FILE.read_text())
+    except OSError:
+        release = None
+    if release is not None:
+        return f"L4T {release[1]}.{release[2]}"
+    known = getattr(torch._C, "_cuda_getDriverVersion", lambda: 0)()  # 13000
+    return f"CUDA {known // 1000}.{known % 1000 // 10}" if known else "unknown"
 
 
 def _gpu(device: torch.device) -> Gpu:

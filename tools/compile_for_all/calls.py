@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -17,9 +18,9 @@ from turbopi.kernels.portable import (
     batch_steps,
     embedding,
     norms,
+    quantize,
     resize,
     rope,
-    rounding,
     transfer,
 )
 from turbopi.kernels.portable.attention_tiles import Attention, AttentionTile
@@ -27,7 +28,8 @@ from turbopi.kernels.portable.attention_tiles import candidates as attention_can
 from turbopi.kernels.portable.gemm import tiles
 from turbopi.kernels.portable.gemm.kernel import product
 from turbopi.kernels.portable.vjp.ops import FEW_TOKENS
-from turbopi.quantization.fp8 import E4M3, ScaledMatrix
+from turbopi.quantization.formats import FORMATS, Format
+from turbopi.quantization.fp8 import E4M3, Directions, ScaledMatrix
 
 BF16, F32 = torch.bfloat16, torch.float32
 Calls = list[Callable[[], Any]]
@@ -68,8 +70,7 @@ def all_calls(target: Target, chosen: bool = False) -> Calls:
         *_way_back(),
     ]
     calls += [partial(_geglu, one) for one in inverses]
-    calls += [lambda: rounding.round_with_feedback(of(2048, 1152), of(2048, dtype=F32), *_feedback(1152), numbers)]
-    return [*calls, *product_calls(target, numbers, chosen)]
+    return [*calls, *_weights(), *product_calls(target, numbers, chosen)]
 
 
 def _marks(input: Input) -> Input:
@@ -294,5 +295,15 @@ def _way_back() -> Calls:
     ]
 
 
-def _feedback(columns: int) -> tuple[Tensor, Tensor, Tensor]:
-    return of(columns, dtype=torch.int64), of(columns, 16, dtype=F32), of(columns, 16, dtype=F32)
+def _weights() -> Calls:
+    """To eight bits. `turbopi calibrate` and the emulated backends round to each format on every GPU, whatever its
+    tensor cores multiply, of float32 weights; `fused` of bfloat16.
+    """
+
+    def rounded(format: Format, dtype: torch.dtype) -> Tensor:
+        directions = Directions(of(1152, 16, dtype=E4M3), of(16, dtype=F32), 0.1)
+        feeding = of(1152, dtype=torch.int64), of(1152, 16, dtype=F32), of(1152, 16, dtype=F32)
+        with patch.object(quantize, "feedback", lambda given: feeding):  # PyTorch's operations, which need a GPU
+            return quantize.round_rows(of(2048, 1152, dtype=dtype), of(2048, dtype=F32), directions, format)
+
+    return [partial(rounded, format, dtype) for format in FORMATS.values() for dtype in (BF16, F32)]

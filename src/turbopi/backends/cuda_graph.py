@@ -22,6 +22,7 @@ from turbopi.engine.room import PackingRoom, is_conditioning
 from turbopi.engine.weights import Weights, pack
 from turbopi.errors import BackendError
 from turbopi.kernels.interface import Denoiser, Ops
+from turbopi.toolchain import make_caches_writable
 
 
 class CudaGraphBackend(BatchRunner):
@@ -35,6 +36,7 @@ class CudaGraphBackend(BatchRunner):
         if config.vlm.num_kv_heads != 1:
             raise BackendError(f"{self.name} needs one key/value head, this model has {config.vlm.num_kv_heads}")
         self.config, self.device, self.precision = config, device, precision
+        make_caches_writable()
         weights, ops = self._pack(load), self._make_ops()
         super().__init__(config, weights, ops, device, joint=ops is without_compiler.OPS)
         self._loops: dict[tuple[int, tuple[float, ...]], without_compiler.Denoiser] = {}  # by `Loop.table`

@@ -1,10 +1,12 @@
 """Backend `pytorch_compile`: the reference with its three stages through torch.compile.
 
 The prefix length is a symbol in the compiled code, so prompts of other lengths compile nothing anew. Another number of
-cameras, another batch size or a mask (batches with unequal prompts) do, once each.
+cameras, another batch size, images of other numbers or a mask (batches with unequal prompts) do, once each.
 """
 
 import importlib.util
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -15,11 +17,37 @@ from turbopi.backends.base import LoadState, Sample
 from turbopi.backends.pytorch import PyTorchBackend
 from turbopi.config import ModelConfig
 from turbopi.engine.not_warm import not_warm
-from turbopi.errors import ObservationError
+from turbopi.errors import BackendError, BackendUnavailable, ObservationError
 from turbopi.model.conditioning import Conditioning, Conditionings, Form
 from turbopi.model.reference import FloatPrecision, Pi0Model
 from turbopi.observation import Observation
-from turbopi.toolchain import missing_for_c, missing_for_cpp
+from turbopi.toolchain import make_caches_writable, missing_for_c, missing_for_cpp
+
+# Variants of a stage that are compiled, of one model and of all models of a process. PyTorch's own limits are 8 and
+# 256, beyond which it runs the stage without compiling it
+MOST_VARIANTS, MOST_OF_ALL = 64, 1024
+SWITCHES = ("TORCH_COMPILE_DISABLE", "TORCHDYNAMO_DISABLE")  # 1: torch.compile does nothing
+
+
+def compiled(stage: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """`stage`, compiled on first use for each variant of its arguments. It never runs without being compiled: the call
+    then raises BackendError.
+    """
+    jitted = torch.compile(stage, fullgraph=True, **options)
+
+    def call(*args: Any) -> Any:
+        limits = {"recompile_limit": MOST_VARIANTS, "accumulated_recompile_limit": MOST_OF_ALL}
+        with torch._dynamo.config.patch(limits):
+            try:
+                return jitted(*args)
+            except torch._dynamo.exc.FailOnRecompileLimitHit as e:
+                raise BackendError(
+                    f"backend 'pytorch_compile' has compiled {stage.__name__} for {MOST_VARIANTS} batch sizes, cameras "
+                    "and horizons, the most that it keeps, and this call needs another one: keep to fewer, or use "
+                    "backend 'pytorch'"
+                ) from e
+
+    return call
 
 
 class CompiledModel(Pi0Model):
@@ -27,9 +55,9 @@ class CompiledModel(Pi0Model):
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__(config)
-        self._embed_images = torch.compile(super().embed_images, dynamic=False)
-        self._encode_prefix = torch.compile(super().encode_prefix)
-        self._velocity = torch.compile(super().velocity)
+        self._embed_images = compiled(super().embed_images, dynamic=False)
+        self._encode_prefix = compiled(super().encode_prefix)
+        self._velocity = compiled(super().velocity)
 
     def embed_images(self, images: Tensor) -> tuple[Tensor, Tensor]:
         return self._embed_images(images)
@@ -60,22 +88,24 @@ class Compiled:
     cameras: int  # that some row needs
     masked: bool  # whether the rows' valid slots differ
     horizon: int
+    pixels: torch.dtype  # uint8 or float32
 
     @classmethod
     def of(cls, observation: Observation, horizon: int) -> "Compiled":
         cameras, tokens = observation.image_mask, observation.token_mask
         masked = bool((cameras != cameras[:1]).any()) or bool((tokens != tokens[:1]).any())
-        return cls(observation.batch_size, int(cameras.any(0).sum()), masked, horizon)
+        return cls(observation.batch_size, int(cameras.any(0).sum()), masked, horizon, pixels=observation.images.dtype)
 
     def __str__(self) -> str:
         rows = "" if self.batch == 1 else f"batch {self.batch}{' of unequal lengths' if self.masked else ''}, "
-        return f"{rows}{self.cameras} cameras, H={self.horizon}"
+        pixels = " of float32 pixels" if self.pixels == torch.float32 else ""
+        return f"{rows}{self.cameras} cameras{pixels}, H={self.horizon}"
 
 
 class PyTorchCompileBackend(PyTorchBackend):
     """The first calls compile, for a minute or so at full size: `UnifiedPolicy.warmup()` before the robot moves.
 
-    What is compiled is kept by PyTorch, which bounds it itself; it doesn't depend on the number of steps.
+    What is compiled is kept by PyTorch, up to MOST_VARIANTS of each stage; it doesn't depend on the number of steps.
     """
 
     name: ClassVar[str] = "pytorch_compile"
@@ -85,6 +115,9 @@ class PyTorchCompileBackend(PyTorchBackend):
     def __init__(
         self, config: ModelConfig, load: LoadState, *, device: torch.device, precision: FloatPrecision
     ) -> None:
+        if torch._dynamo.config.disable:
+            raise BackendUnavailable("torch.compile is switched off by torch._dynamo.config.disable")
+        make_caches_writable()
         super().__init__(config, load, device=device, precision=precision)
         self._compiled: set[Compiled] = set()
         self._warming = False
@@ -125,6 +158,8 @@ class PyTorchCompileBackend(PyTorchBackend):
 
     @classmethod
     def unavailable(cls, device: torch.device) -> str | None:
+        if any(os.environ.get(variable) == "1" for variable in SWITCHES):
+            return f"torch.compile is switched off; unset {' and '.join(SWITCHES)}"
         if device.type == "cpu" and (missing := missing_for_cpp()) is not None:
             return f"torch.compile can't build its code here: {missing}"
         if device.type == "cuda":

@@ -6,6 +6,7 @@ hand-made tables and cost model.
 """
 
 import hashlib
+import importlib
 import json
 import logging
 import os
@@ -19,7 +20,7 @@ import torch
 from msgspec import Meta, Struct
 
 from turbopi.errors import ConfigError
-from turbopi.files import cache_folder, write_whole
+from turbopi.files import cache_folder, make_folder, write_whole
 from turbopi.kernels.tile_table import LIBRARY, NO_TILES, Kernels, Knobs, Numbers, TileKey, TileTable
 from turbopi.provenance import driver_version
 from turbopi.reading import plain_document, read_document
@@ -70,12 +71,15 @@ class TunedTile(Struct, frozen=True, kw_only=True):
 
 
 class TileFile(Struct, frozen=True, kw_only=True):
-    """What `turbopi tune` writes. fingerprints: of the kernels' source, by kernels."""
+    """What `turbopi tune` writes. fingerprints: of the kernels' source, by kernels. triton: its version; older files
+    have none.
+    """
 
     gpu: str
     compute_capability: Annotated[str, Meta(pattern=r"^\d+\.\d+$")]
     multiprocessors: _Size
     driver: str
+    triton: str | None = None
     turbopi: str
     date: str  # "2026-11-24", UTC
     fingerprints: dict[Kernels, str]
@@ -90,16 +94,26 @@ class Machine:
     capability: tuple[int, int]
     multiprocessors: int
     driver: str
+    triton: str
 
     @classmethod
     def of(cls, device: torch.device) -> "Machine":
         properties = torch.cuda.get_device_properties(device)
         capability = (properties.major, properties.minor)
-        return cls(properties.name, capability, properties.multi_processor_count, driver_version())
+        versions = driver_version(), triton_version()
+        return cls(properties.name, capability, properties.multi_processor_count, *versions)
 
     @property
     def compute_capability(self) -> str:
         return f"{self.capability[0]}.{self.capability[1]}"
+
+
+def triton_version() -> str:
+    """As the module says, which comes in packages of several names; "none" where it isn't installed."""
+    try:
+        return str(importlib.import_module("triton").__version__)
+    except ImportError:
+        return "none"
 
 
 @dataclass(frozen=True)
@@ -158,7 +172,7 @@ def find_tiles(machine: Machine, *, cache: Path | None = None, shipped: Path | N
         *((users,) if own else ()),
     ):  # the last one goes before the others
         ships = file != users
-        if not file.is_file():
+        if not os.path.isfile(file):  # nor is one in a folder that can't be read
             continue
         try:
             document = read_tile_file(file)
@@ -179,14 +193,16 @@ def find_tiles(machine: Machine, *, cache: Path | None = None, shipped: Path | N
 
 
 def usable(document: TileFile, machine: Machine, *, ships: bool = False) -> tuple[list[TunedTile], str | None]:
-    """(the tiles that hold on this GPU, why others don't). A shipped file holds for every driver."""
+    """(the tiles that hold on this GPU, why others don't). A shipped file holds for every driver and Triton."""
     for what, theirs, ours in (
         ("on a GPU called", document.gpu, machine.gpu),
         ("on compute capability", document.compute_capability, machine.compute_capability),
         ("on so many multiprocessors:", document.multiprocessors, machine.multiprocessors),
-        ("with driver", document.driver, document.driver if ships else machine.driver),
+        *(() if ships else (("with driver", document.driver, machine.driver),)),
+        *(() if ships else (("with Triton", document.triton, machine.triton),)),
     ):
         if theirs != ours:
+            theirs = "of an unknown version" if theirs is None else theirs
             return [], f"tiles aren't used, as they were measured {what} {theirs}, and here it is {ours}"
     current = {kernels for kernels, found in document.fingerprints.items() if found == fingerprint(kernels)}
     found = [one for one in document.tiles if one.kernels in current]
@@ -225,7 +241,7 @@ def read_tile_file(file: Path) -> TileFile:
 
 def write_tile_file(document: TileFile, file: Path) -> None:
     """Whole or not at all, a tile on a line. Raises OutputError if it can't be written."""
-    file.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(file)
     about = plain_document(document)
     tiles = ",\n  ".join(json.dumps(plain_document(tile)) for tile in document.tiles)
     del about["tiles"]

@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from turbopi.files import cache_folder, write_whole
+from turbopi.files import cache_folder, keep_in_cache
 
 _SETTLED_S = 2.0  # a file that was changed since may be changed again within the clock's tick: not remembered
 _VERSION = 1  # of what a fingerprint is made from
@@ -47,12 +47,7 @@ def look_up(key: str) -> str | None:
 
 def remember(key: str, fingerprint: str) -> None:
     """Keep it. A folder that can't be written costs nothing but the next start's time."""
-    file = _file(key)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(file, fingerprint + "\n")
-    except OSError:
-        return
+    keep_in_cache(_file(key), fingerprint + "\n")
 
 
 def _file(key: str) -> Path:

@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 
+from turbopi.kernels.nvrtc import capturing
 from turbopi.model.exact import exact_float32
 
 Mark = Callable[[str], None]  # is told the end of each stage, or `HEAD`
@@ -136,16 +137,16 @@ class Graph:
         return {name: start.elapsed_time(end) for (_, start), (name, end) in pairs}
 
     def _capture(self, run: Callable[[Mark], None], pool: Any, stream: torch.cuda.Stream) -> None:
-        with uncollected(), ExitStack() as capturing:
+        with capturing() as self._kernels, uncollected(), ExitStack() as graph:  # kernels live as long as their graph
 
             def begin() -> None:
                 self._parts.append(torch.cuda.CUDAGraph())
                 options: dict[str, Any] = {"pool": pool, "stream": stream, "capture_error_mode": "thread_local"}
-                capturing.enter_context(torch.cuda.graph(self._parts[-1], **options))
+                graph.enter_context(torch.cuda.graph(self._parts[-1], **options))
 
             def mark(stage: str) -> None:
                 if stage == HEAD:
-                    capturing.close()
+                    graph.close()
                     begin()
                 else:
                     self._mark(stage)

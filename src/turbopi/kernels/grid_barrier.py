@@ -5,7 +5,7 @@ import ctypes
 import torch
 
 from turbopi.errors import BackendUnavailable
-from turbopi.kernels.nvrtc import Kernel, compile_cubin
+from turbopi.kernels.nvrtc import Kernel, compile_for, native_arch
 
 THREADS = 512
 SOURCE = """
@@ -38,12 +38,12 @@ def barrier_us(device: torch.device, barriers: int = 1000, repeats: int = 5) -> 
     """Microseconds of one barrier over one block per multiprocessor; None where the kernel can't be compiled."""
     properties = torch.cuda.get_device_properties(device)
     try:
-        cubin = compile_cubin(SOURCE, f"sm_{properties.major}{properties.minor}", {})
+        code = compile_for(SOURCE, native_arch((properties.major, properties.minor)), {})
     except BackendUnavailable:
         return None
     counter = torch.zeros(1, dtype=torch.int32, device=device)
     with torch.cuda.device(device):
-        kernel = Kernel(cubin, "turbopi_barriers", 0)
+        kernel = Kernel(code, "turbopi_barriers", 0)
 
         def milliseconds(count: int) -> float:
             times = []

@@ -22,8 +22,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from turbopi.errors import BackendError
-from turbopi.files import cache_folder, write_whole
+from turbopi.errors import BackendError, OutputError
+from turbopi.files import cache_folder, make_folder, write_whole
 from turbopi.reading import parse_json
 from turbopi.tensorrt.engine import Specification
 
@@ -112,16 +112,23 @@ class EngineCache:
             stream.write(json.dumps(about).encode() + b"\n")
             stream.write(plan)
 
-        file.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(file)
         write_whole(file, write)
         shutil.rmtree(self.folder / specification.name, ignore_errors=True)  # where 0.1.0 kept it
 
     def get_or_build(
-        self, specification: Specification, build: Build, report: Report = logger.info, *, rebuild: bool = False
+        self,
+        specification: Specification,
+        build: Build,
+        report: Report = logger.info,
+        *,
+        rebuild: bool = False,
+        keep: bool = False,
     ) -> tuple[bytes, str]:
         """The engine, and "cached" or "built". A stale or corrupt one is told and replaced.
 
-        A build that fails raises BackendError and leaves what was there.
+        A build that fails raises BackendError and leaves what was there. keep: an engine that can't be stored raises
+        OutputError; without, that is reported.
         """
         try:
             plan = None if rebuild else self.get(specification)
@@ -133,7 +140,12 @@ class EngineCache:
         started = time.perf_counter()
         plan = build(specification)
         seconds = time.perf_counter() - started
-        self.put(specification, plan, round(seconds, 3))
+        try:
+            self.put(specification, plan, round(seconds, 3))
+        except OutputError as error:
+            if keep:
+                raise
+            report(f"an engine isn't kept, so the next start builds it again: {error}")
         return plan, "built"
 
     def names(self) -> Iterator[str]:

@@ -63,11 +63,14 @@ class ModelEngines:
     def prepare(
         self, shape: EngineShape, *, rebuild: bool = False, progress: Callable[[str], None] = lambda name: None
     ) -> None:
-        """Have every engine of a shape in the cache; `progress` hears of each one when it is there."""
+        """Have every engine of a shape in the cache; `progress` hears of each one when it is there.
+
+        Raises OutputError if the cache can't be written.
+        """
 
         def one(specification: Specification) -> None:
             _, self.origin[specification.name] = self.cache.get_or_build(
-                specification, self._build, self.report, rebuild=rebuild
+                specification, self._build, self.report, rebuild=rebuild, keep=True
             )
             progress(specification.name)
 

@@ -107,6 +107,7 @@ def tile_file(machine: Machine, measured: Sequence[Measured], before: TileFile |
         compute_capability=machine.compute_capability,
         multiprocessors=machine.multiprocessors,
         driver=machine.driver,
+        triton=machine.triton,
         turbopi=turbopi_version(),
         date=datetime.now(timezone.utc).strftime("%Y-%m-%d"),
         fingerprints=kernels,
@@ -132,7 +133,7 @@ def tuned_tile(one: Measured) -> TunedTile:
 
 
 def still_good(file: Path, machine: Machine, *, ships: bool = False) -> TileFile | None:
-    """What a file has that holds on this GPU, for these kernels and driver (`ships`: any driver); None: nothing."""
+    """What a file has that holds on this GPU, for these kernels, driver and Triton (`ships`: any); None: nothing."""
     if not file.is_file():
         return None
     try:

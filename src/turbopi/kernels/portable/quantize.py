@@ -7,6 +7,7 @@ from torch import Tensor
 from turbopi.quantization.formats import FP8, Format
 from turbopi.quantization.fp8 import Directions, ScaledMatrix, channel_scales
 from turbopi.quantization.rounding import feedback, round_with_feedback_plain
+from turbopi.toolchain import make_caches_writable
 
 
 def quantize(
@@ -28,6 +29,7 @@ def round_rows(weight: Tensor, inverse: Tensor, directions: Directions | None = 
         return format.rounded(weight, inverse[:, None])
     feeding = feedback(directions.to(weight.device))
     if weight.is_cuda and importlib.util.find_spec("triton") is not None:
+        make_caches_writable()
         from turbopi.kernels.portable.rounding import round_with_feedback  # Triton isn't imported elsewhere
 
         return round_with_feedback(weight, inverse, *feeding, format.dtype)

@@ -10,7 +10,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from turbopi.kernels.dependent_launch import result_dtype
 from turbopi.quantization.fp8 import E4M3
 
 ROWS = 16  # of a program, one warp: a row's columns depend on each other, so rows are all there is to share
@@ -25,6 +24,18 @@ def _to_e4m3(x):
     normal = ((bits + 0x7FFFF + ((bits >> 20) & 1)) & -0x100000).to(tl.float32, bitcast=True)  # to nearest even
     small = (x + 24576.0) - 24576.0  # in steps of 2^-9
     return tl.where(damaged, float("nan"), tl.where(tl.abs(x) < 0.015625, small, normal))
+
+
+@triton.jit
+def _e4m3_byte(x, rounded):
+    """The byte of `rounded`, which is `_to_e4m3` of x, with the sign of x. Whole numbers alone: below compute
+    capability 8.9 Triton hasn't the type.
+    """
+    size = tl.abs(rounded)
+    normal = (size.to(tl.int32, bitcast=True) >> 20) - (120 << 3)  # exponents begin at 2^-7, with three bits behind
+    byte = tl.where(size < 0.015625, (size * 512.0).to(tl.int32), normal)
+    sign = (x.to(tl.int32, bitcast=True) >> 24) & 0x80
+    return (tl.where(x != x, 0x7F, byte) | sign).to(tl.uint8)
 
 
 @triton.jit
@@ -66,9 +77,14 @@ def _feedback_kernel(
         error = tl.load(errors + column * NUM + direction, direction < NUM, 0.0)
         answer = tl.load(answers + column * NUM + direction, direction < NUM, 0.0)
         wanted = exact - tl.sum(left * answer[None, :], 1)
-        rounded = _to_int8(wanted * by) if out.dtype.element_ty == tl.int8 else _to_e4m3(wanted * by)
+        if out.dtype.element_ty == tl.int8:
+            rounded = _to_int8(wanted * by)
+            stored = rounded.to(tl.int8)
+        else:  # bytes of E4M3
+            rounded = _to_e4m3(wanted * by)
+            stored = _e4m3_byte(wanted * by, rounded)
         left += (rounded * scale - exact)[:, None] * error[None, :]
-        tl.store(out + row * columns + at, rounded.to(out.dtype.element_ty), valid)
+        tl.store(out + row * columns + at, stored, valid)
         at, exact = following, next_exact
 
 
@@ -95,9 +111,10 @@ def round_with_feedback(
     assert order.shape == (columns,) and errors.shape == answers.shape == (columns, num)
     assert errors.is_contiguous() and answers.is_contiguous() and inverse.is_contiguous()
     assert inverse.shape == (rows,)
-    out = torch.empty(rows, columns, dtype=result_dtype(weight, 1.0, numbers), device=weight.device)
+    out = torch.empty(rows, columns, dtype=numbers, device=weight.device)
+    stored = out.view(torch.uint8) if numbers == E4M3 else out  # which every GPU has
     _feedback_kernel[(triton.cdiv(rows, ROWS),)](
-        weight, inverse, order, errors, answers, out, rows, columns,
+        weight, inverse, order, errors, answers, stored, rows, columns,
         NUM=num, R=triton.next_power_of_2(num), ROWS=ROWS, num_warps=1,
     )  # fmt: skip
     return out

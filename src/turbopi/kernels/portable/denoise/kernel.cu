@@ -66,7 +66,7 @@ extern "C" __global__ void __launch_bounds__(256) turbopi_portable_denoise_prepa
 
 extern "C" __global__ void __launch_bounds__(THREADS, 1) turbopi_portable_denoise(const Args args) {
   extern __shared__ __align__(16) float smem[];
-  Grid grid(args.counter, args.trace);
+  Grid grid(args);
   const int length = *args.length;
   auto nothing = [] {};
   auto inverse_rms = [&] { make_inverse_rms(args, smem); };

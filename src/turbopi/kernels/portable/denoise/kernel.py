@@ -16,7 +16,7 @@ from turbopi.config import ModelConfig
 from turbopi.errors import BackendError, BackendUnavailable
 from turbopi.kernels.arguments import Parameter, Struct
 from turbopi.kernels.interface import State, TokenInputs
-from turbopi.kernels.nvrtc import Kernel, compile_cubin, compile_ptx
+from turbopi.kernels.nvrtc import Kernel, compile_for, native_arch
 from turbopi.kernels.portable.denoise.host import affine, check_launch, inverse_frequencies
 from turbopi.kernels.portable.denoise.packing import CHUNK_BYTES, PackedExpert, Tables, WeightNumbers
 
@@ -26,6 +26,7 @@ SHARED_BYTES = 99 * 1024  # what a block has on every GPU from 8.0 on
 MAX_SPLITS, MAX_SPLIT_KEYS = 16, 256  # shares of the keys: as many as are combined at once; what fits a block
 PREPARE_THREADS = 256
 PHASES = ("qkv", "attention", "combine", "out", "gate_up", "down", "embed", "advance")  # of the trace
+LOOKS = 1 << 24  # at a barrier's counter, before a block gives up: 2 to 20 seconds, and a barrier takes microseconds
 LARGE_L2 = 32 << 20  # bytes: a layer's weights, and what else is read meanwhile
 
 
@@ -94,6 +95,7 @@ ARGS = Struct(
         Parameter("float*", "tops", "[row tile][share of keys][16][2] largest logit, sum of weights"),
         Parameter("float*", "rope", "[T][K/2][2] cosine, sine"),
         Parameter("u32*", "counter", "of the grid's barrier"),
+        Parameter("u32*", "hang", "host memory: arrivals that a block waited for when it gave up"),
         Parameter("u32*", "trace", "[blocks][PHASES][2] cycles at work and at the barrier behind it, with TP_TRACE"),
         Parameter("long long", "layer_stride"),
         Parameter("int", "steps"),
@@ -132,6 +134,7 @@ def kernel_sizes(
         "TP_FP8": int(weights == "fp8"),
         "TP_INT8": int(weights == "int8"),
         "TP_SHARED_BYTES": SHARED_BYTES,
+        "TP_LOOKS": LOOKS,
         "TP_TRACE": 0,
     }
 
@@ -144,13 +147,7 @@ def source() -> str:
 
 def compiled(arch: str, sizes: dict[str, int], *, folder: Path | None = None) -> bytes:
     """The kernel's machine code ("sm_80") or PTX ("compute_80"). Raises BackendError with the compiler's log."""
-    compile_for = compile_ptx if arch.startswith("compute_") else compile_cubin
     return compile_for(source(), arch, sizes, folder=folder)
-
-
-def native_arch(capability: tuple[int, int]) -> str:
-    """What the kernel is compiled for on a GPU of this compute capability."""
-    return f"sm_{capability[0]}{capability[1]}"
 
 
 class PortableDenoiser:
@@ -242,6 +239,13 @@ class PortableDenoiser:
         self._prepare.launch(-(-prepared // PREPARE_THREADS), PREPARE_THREADS, args)
         self._kernel.launch_cooperative(self._blocks, self._choice.warps * 32, args)
 
+    def clock_mhz(self) -> None:
+        """This kernel doesn't measure it."""
+
+    def why_it_trapped(self) -> str | None:
+        """After a launch that failed: where a block waited for seconds before it gave up, or None."""
+        return stuck(int(self._tensors["hang"]) // self._blocks, self._config.expert.depth)
+
     def trace(self) -> Tensor:  # of a kernel that was made with `traced`
         """int64[blocks, PHASES, 2]: cycles of all launches so far at work, and at the barrier behind it."""
         return self._tensors["trace"].long() & 0xFFFFFFFF
@@ -253,6 +257,16 @@ def multiprocessors(device: torch.device) -> int:
 
 def has_large_l2(device: torch.device) -> bool:
     return int(torch.cuda.get_device_properties(device).L2_cache_size) >= LARGE_L2
+
+
+def stuck(barrier: int, layers: int) -> str | None:
+    """Where the barrier with this number, from 1 on, is in the loop; None: no block gave up."""
+    if not barrier:
+        return None
+    step, place = divmod(barrier - 1, 6 * layers + 2)  # the first is behind `embed`
+    layer, phase = divmod(place - 1, 6)
+    where = f"phase {PHASES[phase]} of layer {layer}" if 0 < place <= 6 * layers else PHASES[-2 if place == 0 else -1]
+    return f"blocks of the denoising kernel waited for seconds for one another behind {where} in step {step}"
 
 
 def load(device: torch.device, sizes: dict[str, int], arch: str | None = None) -> tuple[Kernel, Kernel]:
@@ -300,5 +314,6 @@ def tensors(packed: PackedExpert, small: State, table: Tensor, sizes: dict[str, 
         "tops": scratch(shares, 16, 2),
         "rope": scratch(suffix, g.head_dim // 2, 2),
         "counter": scratch(1, dtype=torch.int32),
+        "hang": torch.zeros(1, dtype=torch.int32, pin_memory=device.type == "cuda"),  # see `why_it_trapped`
         "trace": scratch(sizes["TP_BLOCKS"], len(PHASES), 2, dtype=torch.int32),
     }

@@ -22,11 +22,14 @@ __device__ __forceinline__ int thread_of_phase() { return of_phase(threadIdx.x);
 __device__ __forceinline__ int block_of_phase() { return of_phase(blockIdx.x); }
 
 // A barrier of the whole grid in two halves: what lies between depends on no other block.
+// A block that has looked LOOKS times in vain gives up: a look takes the way to L2 and back, so that is seconds. Time is
+// not measured, as it also passes while the GPU is paused or works for others; then nobody looks.
 struct Grid {
-  u32 *counter, *trace;
+  u32 *counter, *trace, *hang;
   u32 expected;
   long long last;
-  __device__ __forceinline__ Grid(u32* counter, u32* trace) : counter(counter), trace(trace), expected(0) {
+  __device__ __forceinline__ explicit Grid(const Args& args)
+      : counter(args.counter), trace(args.trace), hang(args.hang), expected(0) {
     if (TP_TRACE) last = clock64();
   }
   __device__ __forceinline__ void arrive() {
@@ -37,13 +40,20 @@ struct Grid {
   }
   __device__ __forceinline__ void wait() {
     if (threadIdx.x == 0) {
-      u32 arrived;
+      u32 arrived, looks = 0;
       do {
         asm volatile("ld.acquire.gpu.global.u32 %0, [%1];" : "=r"(arrived) : "l"(counter) : "memory");
+        if (++looks == LOOKS) give_up();
       } while (arrived < expected);
     }
     __syncthreads();
     if (TP_TRACE) note(1);
+  }
+  __device__ __forceinline__ void give_up() {
+    *(volatile u32*)hang = expected;
+    __threadfence_system();
+    __trap();
+    __builtin_unreachable();  // so that nothing is kept for afterwards
   }
   // Cycles of thread 0: [block][phase][working, at the barrier behind it]; phases are PHASES of kernel.py.
   __device__ __forceinline__ void note(int waited) {

@@ -30,6 +30,7 @@ using u64 = unsigned long long;
 constexpr int D = TP_WIDTH, F = TP_MLP_DIM, L = TP_DEPTH, HEADS = TP_HEADS, HD = TP_HEAD_DIM;
 constexpr int T = TP_TOKENS, A = TP_ACTION_DIM;
 constexpr int BLOCKS = TP_BLOCKS, WARPS = TP_WARPS, THREADS = WARPS * 32;
+constexpr u32 LOOKS = TP_LOOKS;
 constexpr bool FP8 = TP_FP8, INT8 = TP_INT8;  // INT8: weights alone, which become bfloat16 in registers, exactly
 constexpr bool SCALED = FP8 || INT8;          // each output channel has a scale
 constexpr int WEIGHT_BYTES = SCALED ? 1 : 2, OPERAND_BYTES = FP8 ? 1 : 2;  // an operand: an activation that meets weights

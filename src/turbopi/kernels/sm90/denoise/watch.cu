@@ -23,8 +23,11 @@ __device__ __forceinline__ long long nanoseconds() {
   asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(v));
   return v;
 }
+// Gives up after seconds without progress in which it has also looked LOOKS times: clocks go on while the GPU is paused
+// or works for others, and then nobody looks.
+constexpr u32 LOOKS = 1000000;
 __device__ __forceinline__ void watch(const Cta& b) {
-  u32 last = 0, layer = ~0u;
+  u32 last = 0, layer = ~0u, looks = 0;
   const long long begun = clock64(), begun_at = nanoseconds();
   long long since = begun;
   prefetch(b, 0);
@@ -33,8 +36,8 @@ __device__ __forceinline__ void watch(const Cta& b) {
     now = *(volatile u32*)(b.smem + M_PROGRESS);
     if ((now & 0xfffff) != layer) layer = now & 0xfffff, prefetch(b, int(layer) + 1);
     if (now != last) {
-      last = now, since = clock64();
-    } else if (clock64() - since > 4000000000ll) {
+      last = now, since = clock64(), looks = 0;
+    } else if (++looks > LOOKS && clock64() - since > 4000000000ll) {
       *(volatile u32*)(b.a.hang + blockIdx.x) = 1u << 31 | now;
       __threadfence_system();
       const long long end = clock64() + 1000000000ll;  // for the other CTAs to say where they are
