@@ -323,9 +323,7 @@ def test_other_weights_shapes_and_versions_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"q\.json was made for other weights: their hash is .*calibrate"):
         calibration.check(TINY, random_checkpoint("pi05_tiny", 1).fingerprint())
     wider = dataclasses.replace(TINY, expert=dataclasses.replace(TINY.expert, mlp_dim=512))
-    with pytest.raises(
-        CalibrationError, match=r"other shapes: expert\.mlp_dim is 256 there and 512 here\. Run"
-    ):
+    with pytest.raises(CalibrationError, match=r"other shapes: expert\.mlp_dim is 256 there and 512 here\. Run"):
         calibration.check(wider, calibration.fingerprint)
     content = json.loads(file.read_text())
     site = content["sites"]["vision.0.qkv"]

@@ -131,6 +131,17 @@ def test_suffix_attention(lengths: list[int], blocks: int, state_token: bool, mo
     check_suffix(portable_batch.suffix_attention, lengths, 3, state_token, HEADS, DIM)
 
 
+@pytest.mark.parametrize("damage", [torch.nan, torch.inf])
+def test_a_damaged_value_shows_in_its_own_observation_alone(damage: float) -> None:
+    sizes = torch.tensor([5, 4, 0], dtype=torch.int32)
+    starts, sizes = (sizes.cumsum(0) - sizes).int().to(DEVICE), sizes.to(DEVICE)
+    qkv, k, v = random(6, (HEADS + 2) * DIM), random(12, DIM, seed=1), random(12, DIM, seed=2)
+    v[3, 0] = damage  # of the first one
+    for attend in (portable_batch.suffix_attention, plain_batch.suffix_attention):
+        rows = attend(qkv, *angles(6, DIM), k, v, starts, sizes, HEADS).isfinite().all(1)
+        assert rows.tolist() == [False] * 3 + [True] * 3
+
+
 @on_hopper
 @pytest.mark.parametrize("state_token", [False, True])
 @pytest.mark.parametrize("tokens", [3, 10, 51])
