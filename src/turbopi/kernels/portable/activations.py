@@ -18,7 +18,7 @@ def gelu_tanh(x):
 
 @triton.jit
 def _geglu_kernel(
-    gate_up, out, hidden, inverse, stream, stride,
+    gate_up, out, hidden, inverse, residual, stride,
     SCALED: tl.constexpr, MARKS: tl.constexpr, BLOCK: tl.constexpr, PDL: tl.constexpr,
 ):  # fmt: skip
     wait_for_producer(PDL)
@@ -33,7 +33,7 @@ def _geglu_kernel(
         result *= inverse
     tl.store(out + row * hidden + cols, as_stored(result, out), mask)
     if MARKS:
-        tl.store(stream + row * stride, float("nan"), damaged(result, 0))
+        tl.store(residual + row * stride, float("nan"), damaged(result, 0))
 
 
 def geglu(

@@ -21,7 +21,7 @@ LOG2_E = 1.4426950408889634
 
 @triton.jit
 def _vision_kernel(
-    qkv, out, tokens, heads, scale, inverse, stream, stride,
+    qkv, out, tokens, heads, scale, inverse, residual, stride,
     DIM: tl.constexpr, BLOCK_A: tl.constexpr, BLOCK_B: tl.constexpr,
     BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, SCALED: tl.constexpr, MARKS: tl.constexpr,
 ):  # fmt: skip
@@ -71,7 +71,7 @@ def _vision_kernel(
         found = damaged(acc_a / total[:, None], 1)
         if BLOCK_B > 0:
             found |= damaged(acc_b / total[:, None], 1)
-        tl.store(stream + (image * tokens + m) * stride, float("nan"), (m < tokens) & found)
+        tl.store(residual + (image * tokens + m) * stride, float("nan"), (m < tokens) & found)
 
 
 def vision_attention(

@@ -89,9 +89,12 @@ def _feedback_kernel(
 
 
 def marks(stream: Tensor | None, unused: Tensor) -> dict[str, Any]:
-    """Arguments of a kernel that marks int8's damage in `stream` [tokens, width]; None: it doesn't."""
+    """Arguments of a kernel that marks int8's damage in `stream` [tokens, width]; None: it doesn't.
+
+    Triton takes no argument named "stream" itself.
+    """
     given = unused if stream is None else stream
-    return {"stream": given, "stride": given.stride(0), "MARKS": stream is not None}
+    return {"residual": given, "stride": given.stride(0), "MARKS": stream is not None}
 
 
 def round_with_feedback(

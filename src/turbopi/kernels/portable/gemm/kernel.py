@@ -39,7 +39,7 @@ def _sum(a, b, acc, PROMOTE: tl.constexpr, DEPTH: tl.constexpr):
 
 @triton.jit
 def _product_kernel(
-    x, weight, scale, bias, out, rows, columns, inner, inverse, stream, stride,
+    x, weight, scale, bias, out, rows, columns, inner, inverse, residual, stride,
     GELU: tl.constexpr, GEGLU: tl.constexpr, HAS_BIAS: tl.constexpr, HAS_SCALE: tl.constexpr, SCALED: tl.constexpr,
     MARKS: tl.constexpr, PROMOTE: tl.constexpr, WHOLE: tl.constexpr, SPLIT: tl.constexpr, GROUP: tl.constexpr,
     BLOCK_M: tl.constexpr, BLOCK_N: tl.constexpr, DEPTH: tl.constexpr, PDL: tl.constexpr,
@@ -94,7 +94,7 @@ def _product_kernel(
     to = out + ((split * rows + m)[:, None] * columns + n[None, :])
     tl.store(to, as_stored(acc, out), (m < rows)[:, None] & there[None, :])
     if MARKS:
-        tl.store(stream + m * stride, float("nan"), (m < rows) & damaged(acc, 1))
+        tl.store(residual + m * stride, float("nan"), (m < rows) & damaged(acc, 1))
 
 
 def product(
