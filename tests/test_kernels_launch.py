@@ -401,22 +401,6 @@ def test_a_captured_graph_runs_on_when_its_kernel_is_let_go() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
-def test_loading_and_letting_go_takes_no_memory_of_the_device() -> None:
-    device = torch.device("cuda", 0)
-    code = nvrtc.compile_for(barrier.SOURCE, nvrtc.native_arch(torch.cuda.get_device_capability(device)), {})
-    torch.zeros(1, device=device)
-
-    def load(times: int) -> int:
-        for _ in range(times):
-            nvrtc.Kernel(code, "turbopi_barriers", 0)
-        return torch.cuda.mem_get_info(device)[0]
-
-    before = load(10)
-    assert before - load(500) < 2 << 20
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
 def test_more_blocks_than_the_gpu_holds_are_refused_and_cost_nothing_else() -> None:
     device = torch.device("cuda", 0)
     properties = torch.cuda.get_device_properties(device)
