@@ -75,7 +75,7 @@ class FakePolicy:
         if prompt == "no actions":
             return {"policy_timing": {}}
         if prompt == "unpackable":
-            return {"actions": object()}
+            return {"actions": np.zeros((1, 1)), "more": object()}
         if prompt == "mutate":
             obs.clear()
         return {"actions": np.stack([state, state]), "policy_timing": {"infer_ms": 1.0}, "prompt": prompt}

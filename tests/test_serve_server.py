@@ -357,7 +357,6 @@ def test_a_client_that_leaves_costs_nothing(how: str) -> None:
         ("crash", "RuntimeError: CUDA error: invalid argument"),
         ("stop iteration", "StopIteration"),
         ("exit", "SystemExit: 3"),
-        ("no actions", 'TypeError: the policy\'s result must be a dict with "actions", not dict'),
         ("unpackable", "turbopi.wire.WireError: can't send a builtins.object"),
     ],
 )

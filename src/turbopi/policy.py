@@ -309,6 +309,9 @@ class UnifiedPolicy:
         running.add_done_callback(finish)
         return answer
 
+    def reset(self) -> None:
+        """A new episode, as openpi's `BasePolicy.reset`. Nothing to forget: no call of this policy knows an earlier one."""
+
     def warmup(
         self,
         *,
