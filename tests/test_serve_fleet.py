@@ -72,6 +72,7 @@ def test_a_replica_answers_with_actions_or_whose_fault_it_is() -> None:
         for obs, wrong in (
             ({}, "observation"),
             (observation("nan actions"), "actions"),
+            (observation("answer nan"), "actions"),
             (observation("crash"), "policy"),
         ):
             assert (await replica.infer(obs, {})).outcome.wrong == wrong

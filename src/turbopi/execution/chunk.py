@@ -59,9 +59,9 @@ def _checked_array(name: str, value: object, axes: str = "", rows: int | None = 
         raise ActionError(f'"{name}" isn\'t an array of numbers{" " + axes if axes else ""} but {_shape(value)}')
     assert array is not None
     if array.dtype.kind == "f":
-        finite = np.isfinite(array) if array.dtype.itemsize <= 4 else np.abs(array) <= _MOST
-        if not finite.all():
-            places = np.argwhere(~finite)
+        single = array.dtype.itemsize <= 4
+        if not (np.isfinite(array).all() if single else np.abs(array).max() <= _MOST):  # the largest is NaN if one is
+            places = np.argwhere(~np.isfinite(array) if single else ~(np.abs(array) <= _MOST))
             first = tuple(map(int, places[0]))
             raise NotFinite(
                 f'"{name}" has {array[first]} at {list(first)} (from 0): {len(places)} of {array.size} numbers are NaN, '

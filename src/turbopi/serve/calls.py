@@ -7,7 +7,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from turbopi.errors import ActionError, ConfigError, DeviceLost, ObservationError
@@ -339,8 +339,8 @@ class PolicyCalls:
             results = self._infer_batch(observations, arguments)
             seconds = time.perf_counter() - started
             run = next(self._numbers)
-            checked = [_checked(result, one) for result, one in zip(results, arguments, strict=True)]
-            return [Outcome(seconds, result=result, together=rows, run=run) for result in checked]
+            each = zip(results, arguments, strict=True)
+            return [_checked(Outcome(seconds, together=rows, run=run), result, one) for result, one in each]
         except DeviceLost as error:
             self._on_lost(str(error))
             return [Outcome(time.perf_counter() - started, wrong="lost", text=str(error))] * rows
@@ -380,8 +380,8 @@ class PolicyCalls:
             return time.perf_counter() - started
 
         try:
-            result = _checked(get(), arguments)
-            return Outcome(seconds(), result=result, run=next(self._numbers))
+            result = get()
+            return _checked(Outcome(seconds(), run=next(self._numbers)), result, arguments)
         except ObservationError as error:
             return Outcome(seconds(), wrong="observation", text=str(error))
         except ActionError as error:
@@ -426,9 +426,12 @@ def largest_batch(
     return 1
 
 
-def _checked(result: Any, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """A policy's result that a client may get. Raises ActionError."""
-    return checked_answer(result, model_actions=bool(arguments.get("model_actions")))
+def _checked(outcome: Outcome, result: Any, arguments: Mapping[str, Any]) -> Outcome:
+    """The outcome with the result of an `infer` with these arguments, if a client may get that."""
+    try:
+        return replace(outcome, result=checked_answer(result, model_actions=bool(arguments.get("model_actions"))))
+    except ActionError as error:
+        return replace(outcome, wrong="actions", text=str(error))
 
 
 def _turn_seconds(outcomes: Sequence[Outcome]) -> float | None:
