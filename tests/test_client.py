@@ -194,7 +194,10 @@ def ends(call: Callable[[], Any]) -> BaseException | None:
 
 
 @pytest.mark.parametrize("size", [10, 30_000_000], ids=["waits for its answer", "sends more than the sockets hold"])
-def test_a_call_gives_up_at_its_deadline_though_the_server_reads_nothing(size: int) -> None:
+def test_a_call_gives_up_at_its_deadline_though_the_server_reads_nothing(
+    size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("turbopi.policy_socket.CLOSE_S", 3600.0)  # closing is within the deadline, too
     with deaf_server() as port:
         client = RealTimeClient("127.0.0.1", port, answer_s=0.2)
         lost = ends(lambda: client.infer({"image": np.zeros(size, np.uint8)}))
@@ -203,31 +206,19 @@ def test_a_call_gives_up_at_its_deadline_though_the_server_reads_nothing(size: i
         assert ends(client.close) is None
 
 
-def test_closing_ends_though_the_server_reads_nothing_and_never_says_goodbye() -> None:
-    with deaf_server() as port:
-        client = RealTimeClient("127.0.0.1", port)
-        assert client._socket is not None
-        client._socket.socket.setblocking(False)
-        with suppress(BlockingIOError):
-            while True:
-                client._socket.socket.send(bytes(2**20))  # until the sockets hold no more
-        client._socket.socket.setblocking(True)
-        assert ends(client.close) is None
-
-
 def test_connecting_gives_up_at_its_deadline_whatever_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
     with deaf_server(greets=False) as port:
         lost = ends(lambda: RealTimeClient("127.0.0.1", port, connect_s=0.2))
         assert isinstance(lost, ServerLost) and "nothing came within 0.2 s" in str(lost)
-    released, resolve = threading.Event(), socket.getaddrinfo
+    released = threading.Event()
 
-    def hangs(*address: Any, **options: Any) -> Any:
+    def hangs(*_: Any, **__: Any) -> Any:
         assert released.wait(60)
-        return resolve("127.0.0.1", *address[1:], **options)
+        raise socket.gaierror("no such host")
 
-    with running(Echo()) as server, monkeypatch.context() as patch:
+    with monkeypatch.context() as patch:
         patch.setattr(socket, "getaddrinfo", hangs)
-        lost = ends(lambda: RealTimeClient("gpu-machine", server.port, connect_s=0.2))
+        lost = ends(lambda: RealTimeClient("gpu-machine", connect_s=0.2))
         assert isinstance(lost, ServerLost) and "nothing came within 0.2 s" in str(lost)
         released.set()
 
@@ -241,7 +232,7 @@ def test_connecting_gives_up_at_its_deadline_whatever_it_waits_for(monkeypatch: 
     ],
     ids=["RealTimeClient", "eval", "view"],
 )
-@pytest.mark.parametrize("variable", ["http_proxy", "https_proxy", "all_proxy", "ALL_PROXY"])
+@pytest.mark.parametrize("variable", ["http_proxy", "https_proxy"])
 def test_a_proxy_in_the_environment_is_not_asked(
     variable: str, connect: Callable[[int], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -416,7 +416,7 @@ def test_a_policys_lists_of_numbers_reach_clients_as_arrays() -> None:
     async def test(server: PolicyServer, policy: FakePolicy) -> None:
         async with client(server) as connection:
             answer = await infer(connection, observation())
-            np.testing.assert_array_equal(answer["actions"], np.array([[1, 2.5]]), strict=True)
+            assert isinstance(answer["actions"], np.ndarray) and answer["actions"].tolist() == [[1, 2.5]]
             assert np.isnan(answer["progress"])
 
     served(test, policy_class=Lists)

@@ -321,7 +321,7 @@ def as_msgpack_numpy(value: Any) -> Any:
         *(np.zeros((2, 3)), np.full(3, 200, np.uint8), np.arange(3, dtype=">i4"), np.zeros((200, 200), np.uint8)),
         *(np.zeros(2, "i4,f4"), np.array([None]), np.float32(1.5), np.bool_(True), np.complex64(1j), 1j),
     ],
-    ids=repr,
+    ids=["floats", "bytes", "big-endian", "large", "void", "object", "number", "bool", "complex number", "complex"],
 )
 def test_arrays_of_another_packer_are_named_with_the_one_that_is_spoken(
     value: Any, str_keys: bool, bin_type: bool
