@@ -1,4 +1,4 @@
-"""turbopi.client: no answer is ever taken for another call's, none waits for ever, and none that isn't one gets through."""
+"""turbopi.client: no answer is taken for another call's, no call waits for ever, what is no chunk doesn't get through."""
 
 import base64
 import hashlib

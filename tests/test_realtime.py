@@ -330,7 +330,7 @@ def test_raising_is_patient_with_the_first_warm_up_until_that_fails() -> None:
         loop.step()  # it compiles
     policy.error = RuntimeError("no such server")
     loop.hand.answer()
-    with pytest.raises(OutOfActions, match="the warm-up failed .*no such server"):
+    with pytest.raises(OutOfActions, match=r"the warm-up failed .*no such server"):
         loop.step()
     policy.error = None
     loop.executor.observe({"place": 0})
@@ -342,9 +342,10 @@ def test_raising_is_patient_with_the_first_warm_up_until_that_fails() -> None:
 def test_raising_when_a_sync_robot_gets_no_observation() -> None:
     loop, _ = started("sync", execution_horizon=2, on_empty="raise", max_observation_age_s=0.2)
     loop.run(3, delay=0)
+    for _ in range(loop.executor.remaining + 11):  # the actions that are left, and as long as it is patient
+        loop.step(observe=False)
     with pytest.raises(OutOfActions, match="no observation came in time"):
-        for _ in range(30):
-            loop.step(observe=False)
+        loop.step(observe=False)
 
 
 def test_raising_when_no_observation_comes() -> None:

@@ -494,5 +494,8 @@ def test_health_and_metrics_come_through() -> None:
             await relay(lambda: server.port)(scope, sent.get, sent.put)
             assert (await sent.get())["status"] == status
             assert (await sent.get())["body"]
+            await relay(lambda: server.port)({**scope, "method": "POST"}, sent.get, sent.put)
+            assert await sent.get() == {"type": "http.response.start", "status": 405, "headers": [(b"allow", b"GET")]}
+            assert not (await sent.get())["body"]
 
     relayed(test)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from attack import doors
 from cli_helpers import refusal, text_of, turbopi
 from serve_fakes import FakePolicy, http_get, observation
 from websockets.asyncio.client import connect
@@ -123,7 +124,7 @@ BROWSERS = {  # what they add to a websocket's handshake, and a page can't leave
 
 
 def test_a_client_that_is_no_browser_may_name_itself_as_its_origin() -> None:
-    """PyPI's websocket-client sends these headers and no other, with the name of a LAN's DNS or of a Compose service."""
+    """PyPI's websocket-client sends these headers alone; the names are of a LAN's DNS and of a Compose service."""
 
     async def test(server: PolicyServer) -> None:
         for name in ("policy-server:8000", CLIENTS_OWN, "policy.example"):
@@ -179,7 +180,19 @@ async def said(server: PolicyServer, line: str, *headers: str) -> tuple[int, byt
 @pytest.mark.parametrize("path", ["/", "/metrics", "/healthz", "/live"])
 def test_nothing_but_get_is_answered(path: str) -> None:
     async def test(server: PolicyServer) -> None:
-        for method in ("POST", "PUT", "DELETE", "CONNECT", "TRACE", "OPTIONS", "HEAD", "PATCH", "get", "Get", "X" * 200):
+        for method in (
+            "POST",
+            "PUT",
+            "DELETE",
+            "CONNECT",
+            "TRACE",
+            "OPTIONS",
+            "HEAD",
+            "PATCH",
+            "get",
+            "Get",
+            "X" * 200,
+        ):
             for headers in ((), UPGRADE):
                 status, answer = await said(server, f"{method} {path} HTTP/1.1", *headers)
                 assert status in (405, 0), (method, headers)
@@ -198,6 +211,22 @@ def test_another_version_of_http_is_refused(version: str) -> None:
                 assert (await said(server, f"GET {path} {version}", *headers))[0] in (505, 400, 0)
 
     served(test)
+
+
+def test_whatever_knocks_is_answered_as_the_attack_on_the_doors_expects() -> None:
+    """With each version of the websockets library: some of it is that library's doing."""
+
+    async def test(server: PolicyServer) -> None:
+        knocks = [knock for knock in doors.knocks(server.port) if knock.name != "TLS"]  # waits for the handshake's end
+        statuses = await asyncio.gather(*(doors.status_of(server.port, knock) for knock in knocks))
+        wrong = {
+            knock.name: status
+            for knock, status in zip(knocks, statuses, strict=True)
+            if knock.statuses and status not in knock.statuses
+        }
+        assert not wrong
+
+    served(test, api_key=doors.KEY)
 
 
 def test_metrics_are_for_known_hosts_and_health_is_for_all() -> None:

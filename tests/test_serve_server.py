@@ -401,7 +401,9 @@ def test_whatever_a_policy_answers_clients_get_chunks_of_finite_numbers_alone(po
     async def test(server: PolicyServer, policy: FakePolicy) -> None:
         async with client(server) as connection:
             for name in NO_CHUNKS:
-                assert (await refused(connection, pack(observation(f"answer {name}")))).startswith("bad actions: "), name
+                assert (await refused(connection, pack(observation(f"answer {name}")))).startswith("bad actions: "), (
+                    name
+                )
             assert (await infer(connection, observation("after")))["prompt"] == "after"
             assert metric(server, "turbopi_errors_total", kind="actions") == len(NO_CHUNKS)
 

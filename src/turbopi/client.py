@@ -53,7 +53,9 @@ class RealTimeClient:
     answer_s        seconds after which a call gives up (ServerLost), whatever it waits for: a connection, a server that
                     doesn't read, its answer. The robot doesn't wait for a dead server for ever
 
-    It connects to the server itself: proxies that the environment names (http_proxy) aren't used. Raises ServerLost if nobody answers, ConfigError for an address that can't be one and a wrong key.
+    It connects to the server itself: proxies that the environment names (http_proxy) aren't used.
+
+    Raises ServerLost if nobody answers, ConfigError for an address that can't be one and a wrong key.
     """
 
     def __init__(

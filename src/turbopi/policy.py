@@ -310,7 +310,7 @@ class UnifiedPolicy:
         return answer
 
     def reset(self) -> None:
-        """A new episode, as openpi's `BasePolicy.reset`. Nothing to forget: no call of this policy knows an earlier one."""
+        """A new episode, as openpi's `BasePolicy.reset`. Nothing to forget: no call knows of an earlier one."""
 
     def warmup(
         self,

@@ -271,8 +271,8 @@ def _unique_keys(pairs: list[tuple[object, object]]) -> dict[object, object]:
 _OPEN = frozenset((dict, list, memoryview))
 _OTHER_MARKS = frozenset((b"nd", b"complex", "nd", "complex"))  # PyPI's msgpack-numpy, with bin keys and with str keys
 PACK_WITH = (
-    "This protocol has openpi's arrays, {b'__ndarray__': True, b'data': …, b'dtype': …, b'shape': …}: pack and unpack with "
-    "openpi_client.msgpack_numpy or turbopi.wire"
+    "This protocol has openpi's arrays, {b'__ndarray__': True, b'data': …, b'dtype': …, b'shape': …}: pack and unpack "
+    "with openpi_client.msgpack_numpy or turbopi.wire"
 )
 
 

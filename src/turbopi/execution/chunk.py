@@ -64,8 +64,8 @@ def _checked_array(name: str, value: object, axes: str = "", rows: int | None = 
             places = np.argwhere(~np.isfinite(array) if single else ~(np.abs(array) <= _MOST))
             first = tuple(map(int, places[0]))
             raise NotFinite(
-                f'"{name}" has {array[first]} at {list(first)} (from 0): {len(places)} of {array.size} numbers are NaN, '
-                "infinite or beyond float32"
+                f'"{name}" has {array[first]} at {list(first)} (from 0): {len(places)} of {array.size} numbers are '
+                "NaN, infinite or beyond float32"
             )
     return array
 

@@ -374,7 +374,10 @@ class PolicyCalls:
         return outcome
 
     def _outcome(self, started: float, get: Callable[[], Any], arguments: Mapping[str, Any]) -> Outcome:
-        """What `get`, an `infer` with these arguments, returns or raises. Never raises: an exception couldn't tell whose fault it is."""
+        """What `get`, an `infer` with these arguments, returns or raises.
+
+        Never raises: an exception couldn't tell whose fault it is.
+        """
 
         def seconds() -> float:
             return time.perf_counter() - started

@@ -16,8 +16,8 @@ from turbopi.serve.page.http import asked_for, document, is_feed, is_page, page_
 
 logger = logging.getLogger(__name__)
 WHAT_TO_SET = (
-    "start the server with --allowed-hosts NAME (allowed_hosts= in Python), the host's name without port. A client that "
-    "is no web page may leave Origin out instead (websocket-client: suppress_origin=True)."
+    "start the server with --allowed-hosts NAME (allowed_hosts= in Python), the host's name without port. A client "
+    "that is no web page may leave Origin out instead (websocket-client: suppress_origin=True)."
 )
 
 

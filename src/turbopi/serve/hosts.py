@@ -6,9 +6,9 @@ suddenly resolves to 127.0.0.1 is of the server's own origin as far as the brows
 `evil.example:8000`. Only a list of the names that are really the server's tells it apart. An address instead of a name
 can't be rebound, so any address is good.
 
-Some clients that are no browsers send `Origin`, too: PyPI's websocket-client, for one, always sends its own address. What
-a browser sends with a websocket's handshake is its own doing: a page can neither leave a header out nor change it. So a
-request without any of those that browsers send is no page's.
+Some clients that are no browsers send `Origin`, too: PyPI's websocket-client always sends the address it connects to.
+The headers of a browser's handshake are the browser's: a page can neither leave one out nor change one. So a request
+without any of those that browsers send is no page's.
 """
 
 import ipaddress
@@ -19,10 +19,12 @@ from urllib.parse import SplitResult, urlsplit
 from turbopi.errors import ConfigError
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
-# Chrome, Firefox and Safari each send at least the first five with every websocket's handshake.
+# Chrome, Firefox and Safari each send the first six with every websocket's handshake.
 _BROWSERS_HEADERS = frozenset(
-    ("user-agent", "accept-encoding", "accept-language", "sec-websocket-extensions", "cache-control", "pragma")
-    + ("accept", "cookie", "dnt", "referer")
+    (
+        *("user-agent", "accept-encoding", "accept-language", "sec-websocket-extensions", "cache-control", "pragma"),
+        *("accept", "cookie", "dnt", "referer"),
+    )
 )
 _BROWSERS_BEGINNINGS = ("sec-fetch-", "sec-ch-", "sec-gpc")
 
