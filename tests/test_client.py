@@ -1,4 +1,4 @@
-"""turbopi.client: no answer is taken for another call's, no call waits for ever, what is no chunk doesn't get through."""
+"""turbopi.client: no answer is taken for another call's, no call waits for ever, only chunks get through."""
 
 import base64
 import hashlib

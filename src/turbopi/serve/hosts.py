@@ -19,7 +19,7 @@ from urllib.parse import SplitResult, urlsplit
 from turbopi.errors import ConfigError
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
-# Chrome, Firefox and Safari each send the first six with every websocket's handshake.
+# What browsers add to a websocket's handshake: each of them several, and a page chooses none of them.
 _BROWSERS_HEADERS = frozenset(
     (
         *("user-agent", "accept-encoding", "accept-language", "sec-websocket-extensions", "cache-control", "pragma"),
