@@ -54,10 +54,13 @@ def checked_answer(answer: Any, *, model_actions: bool = False, batch: bool = Fa
 def _checked_array(name: str, value: object, axes: str = "", rows: int | None = None) -> np.ndarray:
     """`value` as an array of finite numbers: of any shape, or with the two `axes`, and `rows` if they are known."""
     array = _array(value)
-    right = array is not None and array.dtype.kind in "fiu" and array.size
-    if not right or (axes and (array.ndim != 2 or rows not in (None, len(array)))):
+    if (
+        array is None
+        or array.dtype.kind not in "fiu"
+        or not array.size
+        or (axes and (array.ndim != 2 or rows not in (None, len(array))))
+    ):
         raise ActionError(f'"{name}" isn\'t an array of numbers{" " + axes if axes else ""} but {_shape(value)}')
-    assert array is not None
     if array.dtype.kind == "f":
         single = array.dtype.itemsize <= 4
         if not (np.isfinite(array).all() if single else np.abs(array).max() <= _MOST):  # the largest is NaN if one is
