@@ -36,6 +36,6 @@ WORKDIR /home/robot
 EXPOSE 8000
 # A checkpoint loads and warms up before the port answers
 HEALTHCHECK --interval=10s --timeout=5s --start-period=10m \
-    CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8000/healthz', timeout=4)"]
+    CMD ["python", "-c", "import urllib.request as u; u.build_opener(u.ProxyHandler({})).open('http://127.0.0.1:8000/healthz', timeout=4)"]
 ENTRYPOINT ["turbopi"]
 CMD ["serve", "/small_policy", "--host", "0.0.0.0"]

@@ -27,7 +27,7 @@ from turbopi.wire import pack, unpack
 
 def ask(url: str, seen: list[dict[str, object]]) -> Any:
     """Send observations to a server, as a robot does; the last answer."""
-    with connect(url, max_size=None) as client:
+    with connect(url, max_size=None, proxy=None) as client:
         client.recv()  # the policy's metadata
         for observation in seen:
             client.send(pack(observation))

@@ -59,7 +59,7 @@ def connected(server: str, patience_s: float) -> ClientConnection:
     end = time.monotonic() + patience_s
     while True:
         try:
-            return connect(server, max_size=None, compression=None)
+            return connect(server, max_size=None, compression=None, proxy=None)
         except ConnectionRefusedError:
             if time.monotonic() > end:
                 raise SystemExit(f"no server answers at {server}; start one with: turbopi serve CHECKPOINT") from None

@@ -18,6 +18,28 @@ OBSERVATION = {
 }
 
 
+NO_CHUNKS: dict[str, Any] = {  # what a policy of one's own may answer, and no robot may get
+    "nan": {"actions": np.array([[0.0, 1.0], [np.nan, 2.0]])},
+    "inf": {"actions": np.array([[0.0, -np.inf]], np.float32)},
+    "half": {"actions": np.array([[np.inf]], np.float16)},
+    "beyond float32": {"actions": np.array([[1e39]])},
+    "text": {"actions": "hello"},
+    "None": {"actions": None},
+    "no action": {"actions": np.zeros((0, 7))},
+    "no numbers": {"actions": np.zeros((4, 0))},
+    "one action": {"actions": np.zeros(7)},
+    "a batch": {"actions": np.zeros((1, 4, 7))},
+    "objects": {"actions": np.array([[0.0, None]])},
+    "complex": {"actions": np.zeros((4, 7), np.complex64)},
+    "bool": {"actions": np.zeros((4, 7), bool)},
+    "ragged": {"actions": [[1.0], [1.0, 2.0]]},
+    "a dict": {"actions": {"arm": np.zeros((4, 7))}},
+    "another key": {"action": np.zeros((4, 7))},
+    "no dict": [np.zeros((4, 7))],
+    "nothing": None,
+}
+
+
 class FakePolicy:
     """Answers with what it was sent; `prompt` selects the trouble it makes, and `hold` makes it wait for `release`."""
 
@@ -72,10 +94,10 @@ class FakePolicy:
             raise SystemExit(3)
         if prompt == "large actions":  # more than sockets hold
             return {"actions": np.zeros((1_000_000, 8))}
-        if prompt == "no actions":
-            return {"policy_timing": {}}
+        if prompt.startswith("answer "):
+            return NO_CHUNKS[prompt.removeprefix("answer ")]
         if prompt == "unpackable":
-            return {"actions": object()}
+            return {"actions": np.zeros((1, 1)), "more": object()}
         if prompt == "mutate":
             obs.clear()
         return {"actions": np.stack([state, state]), "policy_timing": {"infer_ms": 1.0}, "prompt": prompt}

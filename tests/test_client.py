@@ -1,18 +1,27 @@
-"""turbopi.client after interruptions: no answer is ever taken for another call's."""
+"""turbopi.client: no answer is taken for another call's, no call waits for ever, only chunks get through."""
 
+import base64
+import hashlib
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 import pytest
+import websockets.sync.server
+from serve_fakes import NO_CHUNKS
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection
 
 from turbopi.client import RealTimeClient, ServerLost, ServerRefused
-from turbopi.errors import ConfigError, ObservationError
+from turbopi.errors import ActionError, ConfigError, ObservationError
+from turbopi.evaluate.sources import RemotePolicy
+from turbopi.running_chunk import RunningChunk
 from turbopi.serve import running
-from turbopi.wire import pack
+from turbopi.view.live import LiveServer
+from turbopi.wire import pack, unpack
 
 
 class Echo:
@@ -129,3 +138,207 @@ def test_a_running_chunk_of_another_kind_is_refused() -> None:
         left_over: Any = np.zeros((3, 32), np.float32)
         with pytest.raises(ObservationError, match=r"previous is a ndarray; .* turbopi\.running_chunk\.RunningChunk"):
             client.infer({"place": 1}, previous=left_over)
+
+
+# --- no call waits for ever -------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def deaf_server(*, greets: bool = True) -> Iterator[int]:
+    """The port of a server that greets each client, unless told otherwise, and never reads what it is sent."""
+    clients: list[socket.socket] = []
+
+    def serve() -> None:
+        with suppress(OSError):  # the end
+            while True:
+                client, _ = listening.accept()
+                clients.append(client)
+                head = b""
+                while b"\r\n\r\n" not in head:
+                    head += client.recv(4096)
+                (key,) = (line[19:] for line in head.split(b"\r\n") if line.lower().startswith(b"sec-websocket-key: "))
+                accept = base64.b64encode(hashlib.sha1(key + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
+                upgrade = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: " + accept
+                greeting = pack({"policy": "deaf"})
+                client.sendall(b"HTTP/1.1 101 Switching Protocols\r\n" + upgrade + b"\r\n\r\n")
+                if greets:
+                    client.sendall(bytes([0x82, len(greeting)]) + greeting)
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            listening.shutdown(socket.SHUT_RDWR)
+            thread.join()
+            for client in clients:
+                client.close()
+
+
+def ends(call: Callable[[], Any]) -> BaseException | None:
+    """What a call raises, which must not take for ever."""
+    raised: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            call()
+        except BaseException as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(60)
+    assert not thread.is_alive(), "it waits for ever"
+    return raised[0] if raised else None
+
+
+@pytest.mark.parametrize("size", [10, 30_000_000], ids=["waits for its answer", "sends more than the sockets hold"])
+def test_a_call_gives_up_at_its_deadline_though_the_server_reads_nothing(
+    size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("turbopi.policy_socket.CLOSE_S", 3600.0)  # closing is within the deadline, too
+    with deaf_server() as port:
+        client = RealTimeClient("127.0.0.1", port, answer_s=0.2)
+        lost = ends(lambda: client.infer({"image": np.zeros(size, np.uint8)}))
+        assert isinstance(lost, ServerLost) and "gave no answer within 0.2 s" in str(lost)
+        assert client._socket is None
+        assert ends(client.close) is None
+
+
+def test_connecting_gives_up_at_its_deadline_whatever_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    with deaf_server(greets=False) as port:
+        lost = ends(lambda: RealTimeClient("127.0.0.1", port, connect_s=0.2))
+        assert isinstance(lost, ServerLost) and "nothing came within 0.2 s" in str(lost)
+    released = threading.Event()
+
+    def hangs(*_: Any, **__: Any) -> Any:
+        assert released.wait(60)
+        raise socket.gaierror("no such host")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "getaddrinfo", hangs)
+        lost = ends(lambda: RealTimeClient("gpu-machine", connect_s=0.2))
+        assert isinstance(lost, ServerLost) and "nothing came within 0.2 s" in str(lost)
+        released.set()
+
+
+@pytest.mark.parametrize(
+    "connect",
+    [
+        lambda port: RealTimeClient("127.0.0.1", port),
+        lambda port: RemotePolicy("127.0.0.1", port),
+        lambda port: LiveServer(f"http://127.0.0.1:{port}"),
+    ],
+    ids=["RealTimeClient", "eval", "view"],
+)
+@pytest.mark.parametrize("variable", ["http_proxy", "https_proxy"])
+def test_a_proxy_in_the_environment_is_not_asked(
+    variable: str, connect: Callable[[int], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("no_proxy", raising=False)
+    monkeypatch.delenv("NO_PROXY", raising=False)
+    monkeypatch.setenv(variable, "http://127.0.0.1:9")  # where nobody listens
+    with running(Echo()) as server:
+        connect(server.port).close()
+
+
+# --- answers ----------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def foreign(metadata: dict[str, Any], *answers: Any) -> Iterator[tuple[RealTimeClient, list[dict[str, Any]]]]:
+    """A client of a server that gives these answers whatever it is sent, and the messages that it got."""
+    received: list[dict[str, Any]] = []
+
+    def handle(connection: Any) -> None:
+        with suppress(ConnectionClosed):
+            connection.send(pack(metadata))
+            for answer in answers:
+                received.append(unpack(connection.recv()))
+                connection.send(answer if isinstance(answer, str) else pack(answer))
+            connection.recv()
+
+    with websockets.sync.server.serve(handle, "127.0.0.1", 0, compression=None) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            with RealTimeClient("127.0.0.1", server.socket.getsockname()[1]) as client:
+                yield client, received
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_what_another_server_answers_gets_through_as_a_chunk_of_finite_numbers_alone() -> None:
+    sendable = {name: answer for name, answer in NO_CHUNKS.items() if name not in ("objects", "complex")}
+    answers = [answer for answer in sendable.values() if isinstance(answer, dict)]
+    with foreign({}, *answers, {"actions": np.zeros((4, 7))}) as (client, _):
+        for _ in answers:
+            with pytest.raises(ActionError):
+                client.infer({})
+        assert client.infer({})["actions"].shape == (4, 7)  # on the same connection
+
+
+def test_the_chunks_of_a_batch_message_are_each_checked() -> None:
+    chunks = np.zeros((3, 4, 7))
+    bad = chunks.copy()
+    bad[2, 1, 0] = np.nan
+    with foreign({}, {"actions": chunks}, {"actions": [chunks[0], chunks[1, :2]]}, {"actions": bad}) as (client, _):
+        assert client.infer({"turbopi/batch": 3})["actions"].shape == (3, 4, 7)
+        assert [len(chunk) for chunk in client.infer({"turbopi/batch": 2})["actions"]] == [4, 2]
+        with pytest.raises(ActionError, match="nan"):
+            client.infer({"turbopi/batch": 3})
+
+
+def test_the_arrays_of_an_answer_may_be_written_to() -> None:
+    answer = {"actions": np.zeros((4, 7)), "named": {"arm": np.zeros(4)}, "more": [np.zeros(2)]}
+    with foreign({}, answer) as (client, _):
+        got = client.infer({})
+        for array in (got["actions"], got["named"]["arm"], got["more"][0]):
+            array[0] = 1.0
+
+
+# --- as openpi's own clients are used ---------------------------------------------------------------------------------
+
+ACTIONS = {"actions": np.zeros((4, 7)), "model_actions": np.zeros((4, 32), np.float32)}
+MODES = ["rtc"]
+
+
+def test_openpis_name_for_the_metadata_works() -> None:
+    with running(Echo()) as server, RealTimeClient("127.0.0.1", server.port) as client:
+        assert client.get_server_metadata() == client.metadata
+
+
+def test_a_reset_is_told_once_to_a_server_that_keeps_the_running_chunk() -> None:
+    metadata = {"real_time": {"modes": MODES, "execution": "rtc"}}
+    with foreign(metadata, *[ACTIONS] * 2, "late: 3 ms", *[ACTIONS] * 2) as (client, received):
+        client.infer({})
+        client.reset()
+        client.infer({}, previous=RunningChunk(np.zeros((2, 32), np.float32), 1), model_actions=True)  # keeps it itself
+        with pytest.raises(ServerRefused, match="late"):
+            client.infer({})
+        client.infer({})
+        client.infer({})
+    assert [message.get("turbopi/reset") for message in received] == [None, None, True, True, None]
+
+
+@pytest.mark.parametrize(
+    ("execution", "keys", "told"),
+    [
+        (None, {}, False),
+        (None, {"turbopi/session": "a", "turbopi/mode": "rtc"}, True),
+        ("rtc", {"turbopi/session": "a"}, True),
+        ("rtc", {"turbopi/session": "a", "turbopi/mode": "none"}, False),
+        ("rtc", {"turbopi/reset": False}, True),
+        ("rtc", {"turbopi/batch": 1}, False),
+    ],
+)
+def test_a_reset_is_told_where_there_is_something_to_forget(
+    execution: str | None, keys: dict[str, Any], told: bool
+) -> None:
+    answer = {"actions": np.zeros((1, 4, 7))} if "turbopi/batch" in keys else ACTIONS
+    with foreign({"real_time": {"modes": MODES, "execution": execution}}, answer) as (client, received):
+        client.reset()
+        client.infer(keys)
+        assert received == [{**keys, "turbopi/reset": True} if told else keys]

@@ -111,6 +111,13 @@ def _sum_of_parts(timing: dict[str, float]) -> float:
     return sum(timing[f"{part}_ms"] for part in ("preprocess", "queue", "infer", "postprocess"))
 
 
+def test_openpis_brokers_and_agents_may_reset_it_and_write_to_its_actions(policy: UnifiedPolicy) -> None:
+    before = policy.infer(policy.example_observation(), seed=1, model_actions=True)
+    assert all(before[name].flags.writeable for name in ("actions", "model_actions"))
+    policy.reset()
+    np.testing.assert_array_equal(policy.infer(policy.example_observation(), seed=1)["actions"], before["actions"])
+
+
 def test_num_steps_may_change_with_the_call(policy: UnifiedPolicy) -> None:
     observation = policy.example_observation()
     assert not np.array_equal(

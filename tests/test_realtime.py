@@ -307,6 +307,47 @@ def test_raising_is_patient_with_sync_for_as_long_as_its_answer_would_count() ->
     assert kinds(loop).endswith("h" * 10)
 
 
+@pytest.mark.parametrize("execution", ["sync", "async"])
+def test_raising_ends_the_wait_for_a_policy_that_fails_at_once_again_and_again(execution: str) -> None:
+    loop, policy = started(execution, execution_horizon=2, on_empty="raise", max_observation_age_s=0.2)
+    policy.error = RuntimeError("the server is lost")
+    with pytest.raises(OutOfActions, match="failed: RuntimeError: the server is lost"):
+        loop.run(20, delay=0)
+    assert kinds(loop) == "w" * 11
+    loop.executor.reset()
+    policy.error = None
+    loop.run(6, delay=0)  # of which 2 are of each chunk
+    policy.error = RuntimeError("lost again")
+    loop.run(2, delay=0)
+    with pytest.raises(OutOfActions, match="lost again"):
+        loop.run(20, delay=0)
+    assert set(kinds(loop)[11:]) <= set("wfh") and kinds(loop).endswith("h" * 10 if execution == "sync" else "f")
+
+
+def test_raising_is_patient_with_the_first_warm_up_until_that_fails() -> None:
+    loop, policy = started("async", warm=False, on_empty="raise", max_observation_age_s=0.2)
+    for _ in range(50):
+        loop.step()  # it compiles
+    policy.error = RuntimeError("no such server")
+    loop.hand.answer()
+    with pytest.raises(OutOfActions, match=r"the warm-up failed .*no such server"):
+        loop.step()
+    policy.error = None
+    loop.executor.observe({"place": 0})
+    loop.hand.answer()
+    assert loop.step().kind == "waiting"  # warm: the first chunk has its time
+    assert loop.step(answer=True).kind == "fresh"
+
+
+def test_raising_when_a_sync_robot_gets_no_observation() -> None:
+    loop, _ = started("sync", execution_horizon=2, on_empty="raise", max_observation_age_s=0.2)
+    loop.run(3, delay=0)
+    for _ in range(loop.executor.remaining + 11):  # the actions that are left, and as long as it is patient
+        loop.step(observe=False)
+    with pytest.raises(OutOfActions, match="no observation came in time"):
+        loop.step(observe=False)
+
+
 def test_raising_when_no_observation_comes() -> None:
     loop, _ = started("async", execution_horizon=4, on_empty="raise")
     loop.run(6, delay=0)
@@ -422,6 +463,18 @@ def test_a_jump_of_the_clock_drops_all_actions(jump: float) -> None:
     loop.step()
     loop.step(answer=True)
     assert kinds(loop)[-1] == "f"
+
+
+@pytest.mark.parametrize("jump", [600.0, -600.0])
+def test_after_a_jump_of_the_clock_observations_are_used_again(jump: float) -> None:
+    loop, _ = started("async", execution_horizon=4)
+    executor, clock = loop.executor, loop.clock
+    for steps in (20, 20):
+        for _ in range(steps):
+            executor.observe({"place": loop.place}, taken_at=clock.now)
+            loop.step(observe=False, answer=bool(loop.hand.waiting))
+        fresh, clock.now = executor.report()["commands"]["fresh"], clock.now + jump
+    assert fresh >= 36 and executor.report()["clock_jumps"] == 1
 
 
 def test_a_new_episode_drops_the_old_ones_chunks() -> None:

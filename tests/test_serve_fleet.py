@@ -72,6 +72,7 @@ def test_a_replica_answers_with_actions_or_whose_fault_it_is() -> None:
         for obs, wrong in (
             ({}, "observation"),
             (observation("nan actions"), "actions"),
+            (observation("answer nan"), "actions"),
             (observation("crash"), "policy"),
         ):
             assert (await replica.infer(obs, {})).outcome.wrong == wrong
@@ -493,5 +494,8 @@ def test_health_and_metrics_come_through() -> None:
             await relay(lambda: server.port)(scope, sent.get, sent.put)
             assert (await sent.get())["status"] == status
             assert (await sent.get())["body"]
+            await relay(lambda: server.port)({**scope, "method": "POST"}, sent.get, sent.put)
+            assert await sent.get() == {"type": "http.response.start", "status": 405, "headers": [(b"allow", b"GET")]}
+            assert not (await sent.get())["body"]
 
     relayed(test)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from attack import doors
 from cli_helpers import refusal, text_of, turbopi
 from serve_fakes import FakePolicy, http_get, observation
 from websockets.asyncio.client import connect
@@ -104,6 +105,128 @@ def test_robots_send_no_origin_and_may_use_any_name() -> None:
             assert await upgrade(server, host) == 101
 
     served(test)
+
+
+CLIENTS_OWN = "gpu-box.lab:8000"
+BROWSERS = {  # what they add to a websocket's handshake, and a page can't leave out
+    "Chrome": (
+        *("Pragma: no-cache", "Cache-Control: no-cache", "User-Agent: Mozilla/5.0 (X11; Linux x86_64) Chrome/141.0"),
+        *("Accept-Encoding: gzip, deflate, br, zstd", "Accept-Language: en-US,en;q=0.9"),
+        "Sec-WebSocket-Extensions: permessage-deflate; client_max_window_bits",
+    ),
+    "Firefox": (
+        *("User-Agent: Mozilla/5.0 (X11; Linux x86_64; rv:144.0) Gecko/20100101 Firefox/144.0", "Accept: */*"),
+        *("Accept-Language: en-US,en;q=0.5", "Accept-Encoding: gzip, deflate, br, zstd"),
+        *("Sec-WebSocket-Extensions: permessage-deflate", "Pragma: no-cache", "Cache-Control: no-cache"),
+        *("Sec-Fetch-Dest: empty", "Sec-Fetch-Mode: websocket", "Sec-Fetch-Site: same-origin"),
+    ),
+}
+
+
+def test_a_client_that_is_no_browser_may_name_itself_as_its_origin() -> None:
+    """PyPI's websocket-client sends these headers alone; the names are of a LAN's DNS and of a Compose service."""
+
+    async def test(server: PolicyServer) -> None:
+        for name in ("policy-server:8000", CLIENTS_OWN, "policy.example"):
+            for scheme in ("http", "https"):
+                assert await upgrade(server, name, f"Origin: {scheme}://{name}") == 101
+        assert await upgrade(server, CLIENTS_OWN, f"Origin: http://{CLIENTS_OWN}", "Authorization: Api-Key k") == 101
+        for origin in ("http://other.lab:8000", "http://gpu-box.lab", "null", "file://gpu-box.lab:8000"):
+            assert await upgrade(server, CLIENTS_OWN, f"Origin: {origin}") == 403
+
+    served(test, host="0.0.0.0")
+
+
+@pytest.mark.parametrize("browser", BROWSERS)
+def test_a_rebound_name_in_a_browser_is_forbidden_by_each_header_that_only_browsers_send(browser: str) -> None:
+    async def test(server: PolicyServer) -> None:
+        here, origin = f"127.0.0.1:{server.port}", f"Origin: http://{CLIENTS_OWN}"
+        for headers in (BROWSERS[browser], *((header,) for header in BROWSERS[browser])):
+            assert await upgrade(server, CLIENTS_OWN, origin, *headers) == 403, headers
+            assert await upgrade(server, here, f"Origin: http://{here}", *headers) == 101  # the server's own page
+        assert await upgrade(server, CLIENTS_OWN, origin, "Cookie: a=b") == 403
+
+    served(test, host="0.0.0.0")
+
+
+def test_who_is_forbidden_reads_what_to_set() -> None:
+    async def test(server: PolicyServer) -> None:
+        upgrading = ("Upgrade: websocket", "Origin: http://evil.example")
+        status, _, body = await http_get(server.port, "/robot", *upgrading)
+        assert status == 403
+        for words in ("'http://evil.example'", "--allowed-hosts NAME", "allowed_hosts=", "leave Origin out"):
+            assert words in body
+
+    served(test)
+
+
+# --- methods ----------------------------------------------------------------------------------------------------------
+
+UPGRADE = (
+    *("Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"),
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+)
+
+
+async def said(server: PolicyServer, line: str, *headers: str) -> tuple[int, bytes]:
+    """Status and answer of a request that begins with `line`; 0: it was closed without one, as websockets 16 does."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+    writer.write("\r\n".join([line, f"Host: 127.0.0.1:{server.port}", *headers, "", ""]).encode())
+    answer = await asyncio.wait_for(reader.read(), 120)
+    writer.close()
+    return int(answer.split()[1]) if answer else 0, answer
+
+
+@pytest.mark.parametrize("path", ["/", "/metrics", "/healthz", "/live"])
+def test_nothing_but_get_is_answered(path: str) -> None:
+    async def test(server: PolicyServer) -> None:
+        for method in (
+            "POST",
+            "PUT",
+            "DELETE",
+            "CONNECT",
+            "TRACE",
+            "OPTIONS",
+            "HEAD",
+            "PATCH",
+            "get",
+            "Get",
+            "X" * 200,
+        ):
+            for headers in ((), UPGRADE):
+                status, answer = await said(server, f"{method} {path} HTTP/1.1", *headers)
+                assert status in (405, 0), (method, headers)
+                assert not answer or b"\r\nAllow: GET\r\n" in answer
+                assert method != "HEAD" or not answer.partition(b"\r\n\r\n")[2]
+        assert (await said(server, "GET /healthz HTTP/1.1"))[0] == 200
+
+    served(test)
+
+
+@pytest.mark.parametrize("version", ["HTTP/1.0", "HTTP/2.0", "HTTP/9", "http/1.1", ""])
+def test_another_version_of_http_is_refused(version: str) -> None:
+    async def test(server: PolicyServer) -> None:
+        for path in ("/", "/metrics", "/healthz"):
+            for headers in ((), UPGRADE):
+                assert (await said(server, f"GET {path} {version}", *headers))[0] in (505, 400, 0)
+
+    served(test)
+
+
+def test_whatever_knocks_is_answered_as_the_attack_on_the_doors_expects() -> None:
+    """With each version of the websockets library: some of it is that library's doing."""
+
+    async def test(server: PolicyServer) -> None:
+        knocks = [knock for knock in doors.knocks(server.port) if knock.name != "TLS"]  # waits for the handshake's end
+        statuses = await asyncio.gather(*(doors.status_of(server.port, knock) for knock in knocks))
+        wrong = {
+            knock.name: status
+            for knock, status in zip(knocks, statuses, strict=True)
+            if knock.statuses and status not in knock.statuses
+        }
+        assert not wrong
+
+    served(test, api_key=doors.KEY)
 
 
 def test_metrics_are_for_known_hosts_and_health_is_for_all() -> None:

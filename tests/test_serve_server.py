@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from serve_fakes import FakePolicy, PipelinedFakePolicy, http_get, observation
+from serve_fakes import NO_CHUNKS, FakePolicy, PipelinedFakePolicy, http_get, observation
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidStatus
 
@@ -357,7 +357,6 @@ def test_a_client_that_leaves_costs_nothing(how: str) -> None:
         ("crash", "RuntimeError: CUDA error: invalid argument"),
         ("stop iteration", "StopIteration"),
         ("exit", "SystemExit: 3"),
-        ("no actions", 'TypeError: the policy\'s result must be a dict with "actions", not dict'),
         ("unpackable", "turbopi.wire.WireError: can't send a builtins.object"),
     ],
 )
@@ -395,6 +394,34 @@ def test_actions_that_no_robot_may_get_are_a_text_frame_and_the_connection_stays
             assert metric(server, "turbopi_errors_total", kind="policy") == 0
 
     served(test, policy_class=policy_class)
+
+
+@pytest.mark.parametrize("policy_class", [FakePolicy, PipelinedFakePolicy])
+def test_whatever_a_policy_answers_clients_get_chunks_of_finite_numbers_alone(policy_class: type[FakePolicy]) -> None:
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with client(server) as connection:
+            for name in NO_CHUNKS:
+                assert (await refused(connection, pack(observation(f"answer {name}")))).startswith("bad actions: "), (
+                    name
+                )
+            assert (await infer(connection, observation("after")))["prompt"] == "after"
+            assert metric(server, "turbopi_errors_total", kind="actions") == len(NO_CHUNKS)
+
+    served(test, policy_class=policy_class)
+
+
+def test_a_policys_lists_of_numbers_reach_clients_as_arrays() -> None:
+    class Lists(FakePolicy):
+        def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
+            return {"actions": [[1, 2.5]], "progress": float("nan")}  # what else it answers is its own affair
+
+    async def test(server: PolicyServer, policy: FakePolicy) -> None:
+        async with client(server) as connection:
+            answer = await infer(connection, observation())
+            assert isinstance(answer["actions"], np.ndarray) and answer["actions"].tolist() == [[1, 2.5]]
+            assert np.isnan(answer["progress"])
+
+    served(test, policy_class=Lists)
 
 
 @pytest.mark.parametrize("policy_class", [FakePolicy, PipelinedFakePolicy])

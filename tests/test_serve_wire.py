@@ -302,6 +302,47 @@ def test_a_wrong_message_is_refused_with_its_reason(data: bytes, message: str) -
         unpack(data)
 
 
+def as_msgpack_numpy(value: Any) -> Any:
+    """What PyPI's msgpack-numpy has msgpack pack instead of it."""
+    if isinstance(value, np.ndarray):
+        kind = value.dtype.kind.encode() if value.dtype.kind in "VO" else b""
+        dtype = value.dtype.descr if kind else value.dtype.str
+        return {b"nd": True, b"type": dtype, b"kind": kind, b"shape": value.shape, b"data": value.tobytes()}
+    if isinstance(value, np.generic):
+        return {b"nd": False, b"type": value.dtype.str, b"data": value.tobytes()}
+    return {b"complex": True, b"data": repr(value)}
+
+
+@pytest.mark.parametrize("bin_type", [True, False])
+@pytest.mark.parametrize("str_keys", [True, False])
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(np.zeros((2, 3)), np.full(3, 200, np.uint8), np.arange(3, dtype=">i4"), np.zeros((200, 200), np.uint8)),
+        *(np.zeros(2, "i4,f4"), np.array([None]), np.float32(1.5), np.bool_(True), np.complex64(1j), 1j),
+    ],
+    ids=["floats", "bytes", "big-endian", "large", "void", "object", "number", "bool", "complex number", "complex"],
+)
+def test_arrays_of_another_packer_are_named_with_the_one_that_is_spoken(
+    value: Any, str_keys: bool, bin_type: bool
+) -> None:
+    def packer(value: Any) -> Any:
+        fields = as_msgpack_numpy(value)
+        return {key.decode(): field for key, field in fields.items()} if str_keys else fields
+
+    packed = msgpack.packb({"cameras": [{"wrist": value}]}, default=packer, use_bin_type=bin_type)
+    with pytest.raises(
+        WireError, match=r"openpi's arrays, .*__ndarray__.*openpi_client\.msgpack_numpy or turbopi\.wire"
+    ) as no:
+        unpack(packed)
+    assert str(no.value).startswith(("'cameras'/0/'wrist': ", "'cameras'/[0]/'wrist': ", "not a msgpack message: "))
+
+
+def test_the_keys_of_another_packer_are_anyones_where_they_are_no_array() -> None:
+    for value in ({"nd": 3, "data": 1}, {"complex": True}, {"nd": "x"}, {"nd": True, "kind": "robot"}):
+        assert unpack(pack({"a": value})) == {"a": value}
+
+
 def test_the_deepest_allowed_message_is_read() -> None:
     assert unpack(b"\x91" * (MAX_DEPTH - 1) + b"\x90") is not None
 

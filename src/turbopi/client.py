@@ -9,20 +9,22 @@ It also is a policy for `turbopi.realtime.RealTimeExecutor`, in every way to run
 openpi's own server, too, which offers none of the "rtc" ways.
 """
 
-import contextlib
 import ipaddress
 import threading
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, NoReturn
 
+import numpy as np
 from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
-from websockets.sync.client import ClientConnection, connect
 
 from turbopi.errors import ActionError, ConfigError, DeviceLost, ObservationError, TurboPiError
-from turbopi.execution.messages import message
+from turbopi.execution.chunk import checked_answer
+from turbopi.execution.messages import PREFIX, message
+from turbopi.policy_socket import PolicySocket
 from turbopi.running_chunk import RunningChunk
-from turbopi.wire import MAX_BYTES, WireError, pack, unpack
+from turbopi.wire import WireError, pack, unpack
 
 _REFUSALS: dict[str, type[TurboPiError]] = {
     "bad request: ": ObservationError,
@@ -48,7 +50,10 @@ class RealTimeClient:
     host, port      the server's, 8000 unless given; `host` may be a URL, ws:// or wss://, that has the port in it
     api_key         if the server has one
     connect_s       seconds in which the server must take the connection and send its metadata
-    answer_s        seconds after which a call gives up (ServerLost): the robot doesn't wait for a dead server for ever
+    answer_s        seconds after which a call gives up (ServerLost), whatever it waits for: a connection, a server that
+                    doesn't read, its answer. The robot doesn't wait for a dead server for ever
+
+    It connects to the server itself: proxies that the environment names (http_proxy) aren't used.
 
     Raises ServerLost if nobody answers, ConfigError for an address that can't be one and a wrong key.
     """
@@ -63,14 +68,14 @@ class RealTimeClient:
         answer_s: float = 30.0,
     ) -> None:
         self.url = _url(host, port)
-        self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
+        self._api_key = api_key
         self._connect_s, self._answer_s = connect_s, answer_s
         self._lock = threading.Lock()
-        self._socket: ClientConnection | None = None
-        self._open = contextlib.ExitStack()
+        self._socket: PolicySocket | None = None
+        self._episode = self._told = 0  # the one now, and the one that a server which keeps the running chunk knows of
         _keep_freed_memory()
         with self._lock:
-            self.metadata = self._connect()
+            self.metadata = self._connect(connect_s)
 
     def infer(
         self,
@@ -82,26 +87,32 @@ class RealTimeClient:
     ) -> dict[str, Any]:
         """The server's answer: {"actions": float64[H, d], …}; the other arguments as for UnifiedPolicy.
 
-        Raises ObservationError, ActionError, DeviceLost for what the server says of this call, ObservationError for
-        what can't be sent (such as a tensor), ConfigError if the server doesn't offer what is asked, ServerRefused for
-        other answers, and ServerLost.
+        Its arrays are the caller's own and may be written to. Raises ObservationError, ActionError, DeviceLost for what
+        the server says of this call, ActionError for an answer that no robot may get (NaN, no chunk), ObservationError
+        for what can't be sent (such as a tensor), ConfigError if the server doesn't offer what is requested,
+        ServerRefused for other answers, and ServerLost.
         """
         with self._lock:
+            deadline = time.monotonic() + self._answer_s
             if self._socket is None:
-                self.metadata = self._connect()
+                self.metadata = self._connect(min(self._connect_s, self._answer_s))
             if previous is not None and not isinstance(previous, RunningChunk):
                 raise ObservationError(
                     f"previous is a {type(previous).__name__}; it should be a turbopi.running_chunk.RunningChunk"
                 )
             if previous is not None or model_actions or seed is not None:
                 self._check_offered(None if previous is None else previous.mode)
-            packed = _packed(message(obs, previous, model_actions, seed))
+            sent, told = message(obs, previous, model_actions, seed), self._told
+            if told != self._episode and self._keeps_chunk(sent):
+                sent[f"{PREFIX}reset"], told = True, self._episode
+            packed = _packed(sent)
             assert self._socket is not None
             try:
-                with self._dropped_on_error():  # a late answer must not be taken for the next call's
-                    self._socket.send(packed)
-                    reply = self._socket.recv(timeout=self._answer_s)
-            except (OSError, TimeoutError, WebSocketException) as error:
+                reply = self._socket.ask(packed, deadline - time.monotonic())
+            except BaseException as error:
+                self._socket = None
+                if not isinstance(error, OSError | WebSocketException):
+                    raise  # Ctrl-C
                 raise ServerLost(
                     f"the policy server at {self.url} gave no answer within {self._answer_s:g} s"
                     if isinstance(error, TimeoutError)
@@ -109,7 +120,20 @@ class RealTimeClient:
                 ) from error
             if isinstance(reply, str):
                 self._raise(reply)
-            return self._unpacked(reply)
+            answer, self._told = self._unpacked(reply), told
+        return checked_answer(_writable(answer), model_actions=model_actions, batch=f"{PREFIX}batch" in obs)
+
+    def reset(self) -> None:
+        """A new episode, as openpi's `BasePolicy.reset`: the next chunk joins none of the last one's.
+
+        Sends nothing. A server that keeps the running chunk of this client (`turbopi serve --execution`, a session) is
+        told with the next request; otherwise there is nothing to forget.
+        """
+        self._episode += 1
+
+    def get_server_metadata(self) -> dict[str, Any]:
+        """`metadata`, by the name that openpi's WebsocketClientPolicy has for it."""
+        return self.metadata
 
     def _raise(self, text: str) -> NoReturn:
         """What the server says instead of actions."""
@@ -122,7 +146,7 @@ class RealTimeClient:
         raise ServerRefused(f"the policy server at {self.url} sent no actions but: {_printable(last)}")
 
     def close(self) -> None:
-        """Close the connection, after the call of another thread that is running."""
+        """Close the connection, within a second, after the call of another thread that is running."""
         with self._lock:
             self._drop()
 
@@ -145,24 +169,28 @@ class RealTimeClient:
         if mode is not None and mode not in modes:
             raise ConfigError(f"the policy server at {self.url} doesn't offer {mode!r}; it offers {modes}")
 
-    def _connect(self) -> dict[str, Any]:
+    def _keeps_chunk(self, sent: Mapping[str, Any]) -> bool:
+        """Whether the server keeps the chunk that this request joins, in a session."""
+        own = {key.removeprefix(PREFIX) for key in sent if key.startswith(PREFIX)}
+        if "batch" in own or sent.get(f"{PREFIX}mode") == "none":
+            return False  # joins nothing
+        if "session" in own:
+            return "mode" in own or self._execution is not None
+        return self._execution is not None and not own & {"previous", "model_actions"}
+
+    @property
+    def _execution(self) -> Any:
+        """The mode in which the server itself joins chunks; None if it doesn't."""
+        offered = self.metadata.get("real_time")
+        return offered.get("execution") if isinstance(offered, Mapping) else None
+
+    def _connect(self, seconds: float) -> dict[str, Any]:
         """Connect; the server's metadata."""
         try:
-            with self._dropped_on_error():
-                connecting = connect(
-                    self.url,
-                    additional_headers=self._headers,
-                    compression=None,
-                    max_size=MAX_BYTES,
-                    open_timeout=self._connect_s,
-                    close_timeout=1.0,  # a server that hangs says no goodbye
-                    ping_interval=None,  # openpi's server answers no ping while it computes
-                )
-                self._socket = self._open.enter_context(connecting)
-                return self._unpacked(self._socket.recv(timeout=self._connect_s))
+            connected = PolicySocket(self.url, self._api_key, seconds)
         except (InvalidURI, ValueError) as error:
             raise ConfigError(f"{self.url} is no address of a server: {error}") from error
-        except (OSError, TimeoutError, WebSocketException) as error:
+        except (OSError, WebSocketException) as error:
             if isinstance(error, InvalidStatus) and error.response.status_code in (401, 403):
                 raise ConfigError(f"the policy server at {self.url} wants its API key: give api_key") from error
             hint = (
@@ -171,6 +199,13 @@ class RealTimeClient:
                 else ""
             )
             raise ServerLost(f"no policy server at {self.url}: {_reason(error)}{hint}") from error
+        try:
+            metadata = self._unpacked(connected.greeting)
+        except ServerRefused:
+            connected.close()
+            raise
+        self._socket = connected
+        return metadata
 
     def _unpacked(self, data: str | bytes) -> dict[str, Any]:
         try:
@@ -183,19 +218,10 @@ class RealTimeClient:
             raise ServerRefused(f"the server at {self.url} doesn't speak openpi's protocol: {error}") from error
         return unpacked
 
-    @contextlib.contextmanager
-    def _dropped_on_error(self) -> Iterator[None]:
-        """Drop the connection if anything interrupts what waits for the server: Ctrl-C, too."""
-        try:
-            yield
-        except BaseException:
-            self._drop()
-            raise
-
     def _drop(self) -> None:
-        self._socket = None
-        with contextlib.suppress(Exception):  # it may be gone already
-            self._open.close()
+        dropped, self._socket = self._socket, None
+        if dropped is not None:
+            dropped.close()
 
 
 def _url(host: str, port: int | None) -> str:
@@ -229,6 +255,15 @@ def _packed(sent: Mapping[str, Any]) -> bytes:
             except WireError as its_own:
                 raise WireError(f"{key}: {its_own}") from None
         raise error  # of a key
+
+
+def _writable(value: Any) -> Any:
+    """The same with arrays that may be written to: those of a message are views of it, or of read-only bytes."""
+    if isinstance(value, dict):
+        return {key: _writable(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_writable(item) for item in value]
+    return value.copy() if isinstance(value, np.ndarray) else value
 
 
 def _keep_freed_memory() -> None:

@@ -9,7 +9,7 @@
     ├── BackendError           a backend can't do what it was asked to
     │   ├── BackendUnavailable it can't run here at all; says why and what to do
     │   └── DeviceLost         the GPU failed under it: no later call of this process can work
-    ├── ActionError            the model computed actions that no robot may be given: NaN, infinite
+    ├── ActionError            a policy's answer that no robot may be given: NaN, infinite, no chunk of numbers
     ├── OutputError            a file that can't be written: a full disk, no permission        (also an OSError)
     ├── client.ServerLost                  the policy server can't be reached, went away or took too long
     ├── client.ServerRefused               it answered with something else than actions
@@ -61,7 +61,7 @@ class DeviceLost(BackendError):
 
 
 class ActionError(TurboPiError, ArithmeticError):
-    """The model computed an action chunk that no robot may be given: a number in it is NaN or infinite."""
+    """A policy's answer that no robot may be given: a number in it is NaN or infinite, or it is no chunk of numbers."""
 
 
 class OutputError(TurboPiError, OSError):

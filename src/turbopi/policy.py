@@ -311,6 +311,9 @@ class UnifiedPolicy:
         running.add_done_callback(finish)
         return answer
 
+    def reset(self) -> None:
+        """A new episode, as openpi's `BasePolicy.reset`. Nothing to forget: no call knows of an earlier one."""
+
     def warmup(
         self,
         *,

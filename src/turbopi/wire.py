@@ -113,7 +113,10 @@ def unpack(data: bytes, *, max_bytes: int = MAX_BYTES) -> Any:
     except WireError:
         raise
     except UnicodeDecodeError as error:
-        raise WireError(f"not a msgpack message: a string isn't UTF-8 ({error.reason})") from error
+        raise WireError(
+            f"not a msgpack message: a string isn't UTF-8 ({error.reason}). Bytes are msgpack bin (use_bin_type=True). "
+            + PACK_WITH
+        ) from error
     except (ValueError, TypeError, msgpack.UnpackException) as error:  # the structure is right: it's about the keys
         raise WireError(f"the keys of a map must be str or bin: {error}") from error
     return _restore(value, ())
@@ -266,6 +269,11 @@ def _unique_keys(pairs: list[tuple[object, object]]) -> dict[object, object]:
 
 
 _OPEN = frozenset((dict, list, memoryview))
+_OTHER_MARKS = frozenset((b"nd", b"complex", "nd", "complex"))  # PyPI's msgpack-numpy, with bin keys and with str keys
+PACK_WITH = (
+    "This protocol has openpi's arrays, {b'__ndarray__': True, b'data': …, b'dtype': …, b'shape': …}: pack and unpack "
+    "with openpi_client.msgpack_numpy or turbopi.wire"
+)
 
 
 def _restore(value: Any, path: tuple[Any, ...]) -> Any:
@@ -282,6 +290,8 @@ def _restore(value: Any, path: tuple[Any, ...]) -> Any:
             return _scalar(value, path)
         if "__ndarray__" in value or "__npgeneric__" in value:
             raise WireError(f"{_at(path)}: the keys of a packed array are msgpack bin, not str")
+        if any(type(value[mark]) is bool for mark in _OTHER_MARKS & value.keys()) and {b"data", "data"} & value.keys():
+            raise WireError(f"{_at(path)}: an array or number as msgpack-numpy packs it. {PACK_WITH}")
         return {key: _restore(item, (*path, key)) if type(item) in _OPEN else item for key, item in value.items()}
     if isinstance(value, list) and not _OPEN.isdisjoint(map(type, value)):
         return [_restore(item, (*path, i)) if type(item) in _OPEN else item for i, item in enumerate(value)]

@@ -72,10 +72,17 @@ def knocks(port: int) -> Iterator[Knock]:
     yield Knock("/healthz", f"GET /healthz HTTP/1.1\r\nHost: {here}\r\n\r\n".encode(), (200,))
     yield Knock("/healthz?x", f"GET /healthz?{'x' * 500} HTTP/1.1\r\nHost: {here}\r\n\r\n".encode(), (200,))
     yield Knock("long path", f"GET /{'x' * 9000} HTTP/1.1\r\nHost: {here}\r\n{AUTHORIZED}\r\n\r\n".encode(), (*OUT, 0))
-    for method in ("POST", "PUT", "HEAD", "CONNECT", "TRACE", "get", "X" * 300):
-        yield Knock(f"method {method[:10]}", f"{method} / HTTP/1.1\r\nHost: {here}\r\n\r\n".encode(), (*OUT, 0))
+    for method in ("POST", "PUT", "HEAD", "CONNECT", "TRACE", "OPTIONS", "get", "X" * 300):
+        for path in ("/", "/healthz"):
+            wire = f"{method} {path} HTTP/1.1\r\nHost: {here}\r\n\r\n".encode()
+            yield Knock(f"method {method[:10]} of {path}", wire, (405, 0))
+        wire = request(port, AUTHORIZED).replace(b"GET ", f"{method} ".encode(), 1)
+        yield Knock(f"method {method[:10]} that upgrades", wire, (405, 0))
     for version in ("HTTP/1.0", "HTTP/2.0", "HTTP/9", "http/1.1", ""):
         yield Knock(f"version {version!r}", f"GET / {version}\r\nHost: {here}\r\n\r\n".encode(), (*OUT, 0))
+        yield Knock(
+            f"version {version!r} that upgrades", request(port).replace(b"HTTP/1.1", version.encode()), (*OUT, 0)
+        )
     yield Knock(
         "body", f"GET /healthz HTTP/1.1\r\nHost: {here}\r\nContent-Length: 5\r\n\r\nhello".encode(), (200, *OUT, 0)
     )
@@ -107,7 +114,7 @@ async def doors(arena: Arena) -> None:
     everything = [knock for _ in range(arena.count) for knock in knocks(arena.port)]
     arena.random.shuffle(everything)
     for number, knock in enumerate(everything):
-        status = await _knock(arena.port, knock)
+        status = await status_of(arena.port, knock)
         arena.found.count += 1
         if knock.statuses:
             arena.found.outcomes["silence" if status is None else f"HTTP {status}" if status else "closed"] += 1
@@ -123,8 +130,8 @@ def _said(statuses: tuple[int, ...]) -> str:
     return "a refusal" if len(statuses) > 4 else " or ".join(map(str, statuses))
 
 
-async def _knock(port: int, knock: Knock) -> int | None:
-    """The status; 0 for a close without one, None for silence."""
+async def status_of(port: int, knock: Knock) -> int | None:
+    """The status that answers a knock; 0 for a close without one, None for silence."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     try:
         with contextlib.suppress(OSError):

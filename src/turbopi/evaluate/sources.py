@@ -1,6 +1,5 @@
 """Where actions come from: a policy in this process, or an openpi websocket server."""
 
-import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,7 +15,7 @@ from turbopi.execution.queue import of_batch
 from turbopi.quantization.formats import told_by
 from turbopi.reading import is_finite, shown
 from turbopi.running_chunk import JoinMode
-from turbopi.wire import MAX_BYTES, WireError, pack, unpack
+from turbopi.wire import WireError, pack, unpack
 from turbopi.wording import denoising
 
 CONNECT_S = 10.0
@@ -177,7 +176,8 @@ class RemotePolicy:
         answers there, ConfigError for a key that isn't the server's.
         """
         from websockets.exceptions import InvalidStatus, InvalidURI, WebSocketException
-        from websockets.sync.client import connect
+
+        from turbopi.policy_socket import PolicySocket
 
         if host.startswith(("ws://", "wss://")):
             url = host if port is None else f"{host}:{port}"
@@ -185,24 +185,11 @@ class RemotePolicy:
             port = 8000 if port is None else port
             url = f"ws://{f'[{host}]' if ':' in host else host}:{port}"
         self._where = url.removeprefix("ws://")
-        self._open = contextlib.ExitStack()
-        headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
         try:
-            self._socket = self._open.enter_context(
-                connect(
-                    url,
-                    additional_headers=headers,
-                    compression=None,
-                    max_size=MAX_BYTES,
-                    open_timeout=CONNECT_S,
-                    ping_interval=None,  # openpi's server answers no ping while it computes
-                )
-            )
-            greeting = self._socket.recv(timeout=CONNECT_S)
+            self._socket = PolicySocket(url, api_key, CONNECT_S)
         except (InvalidURI, ValueError) as error:
             raise ConfigError(f"{url} is no address of a server: {error}") from error
-        except (OSError, TimeoutError, WebSocketException) as error:
-            self.close()
+        except (OSError, WebSocketException) as error:
             if isinstance(error, InvalidStatus) and error.response.status_code in (401, 403):
                 raise ConfigError(f"{url} wants its API key: --api-key-file FILE, or TURBOPI_API_KEY") from error
             chosen = "" if port is None else f" --port {port}"
@@ -211,7 +198,7 @@ class RemotePolicy:
                 "then give the same command again: finished episodes are kept"
             ) from error
         try:
-            metadata = _told(_unpacked(greeting, self._where), self._where)
+            metadata = _told(_unpacked(self._socket.greeting, self._where), self._where)
         except PolicyRefused:
             self.close()
             raise
@@ -242,16 +229,14 @@ class RemotePolicy:
         """Nothing: a server has warmed itself up."""
 
     def close(self) -> None:
-        with contextlib.suppress(Exception):  # it may be gone already
-            self._open.close()
+        self._socket.close()
 
     def _one(self, asked: dict[str, Any]) -> Answer:
         from websockets.exceptions import WebSocketException
 
         try:
-            self._socket.send(pack(asked))
-            reply = self._socket.recv(timeout=ANSWER_S)
-        except (OSError, TimeoutError, WebSocketException) as error:
+            reply = self._socket.ask(pack(asked), ANSWER_S)
+        except (OSError, WebSocketException) as error:
             raise PolicyLost(
                 f"the policy server at {self._where} went away: {_reason(error)}. What was finished is kept: start the "
                 "server again and give the same command to continue"
@@ -285,7 +270,7 @@ def _answer(result: object, *timings: str) -> Answer:
         raise PolicyRefused(f"the policy's actions aren't numbers: {error}") from error
     if actions.dtype.kind not in "fiu":
         raise PolicyRefused(f"the policy's actions aren't numbers but {actions.dtype}: {shown(result['actions'])}")
-    if actions.ndim != 2:
+    if actions.ndim != 2 or not actions.size:
         raise PolicyRefused(f"the policy's actions have shape {list(actions.shape)}; expected [horizon, width]")
     infer_ms = next((ms for ms in (_milliseconds(result, timing) for timing in timings) if ms is not None), None)
     return Answer(actions.astype(np.float64), infer_ms)

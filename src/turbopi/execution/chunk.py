@@ -1,13 +1,17 @@
-"""A chunk as the policy answered it, and what can be wrong with one."""
+"""An answer of a policy, checked before a robot may get it, and the chunk in it."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from turbopi.errors import ConfigError
+from turbopi.errors import ActionError, ConfigError
 
 _MOST = float(np.finfo(np.float32).max)
+
+
+class NotFinite(ActionError):
+    """A number of an answer is NaN, infinite or beyond float32: there differences and means overflow."""
 
 
 class Chunk(NamedTuple):
@@ -16,42 +20,80 @@ class Chunk(NamedTuple):
     model_actions: np.ndarray | None  # float32[H, A]
     anchor: np.ndarray | None  # float64, of relative actions
 
-    @property
-    def finite(self) -> bool:
-        """Whether every number is one, in float32, too: beyond it differences and means overflow."""
-        parts = (self.actions, self.model_actions, self.anchor)
-        return all(bool((np.abs(part) <= _MOST).all()) for part in parts if part is not None)
+
+def checked_answer(answer: Any, *, model_actions: bool = False, batch: bool = False) -> dict[str, Any]:
+    """What a policy answered, once a robot may get it: "actions" are an array [H, d] of finite numbers, H and d from 1.
+
+    model_actions  the answer must have "model_actions" [H, A], too; "anchor" is checked if it is there
+    batch          "actions" of several observations: [B, H, d], or a list of chunks
+
+    Every answer passes here, whatever the policy is: in the server, `RealTimeClient` and the executor. What else an
+    answer holds is passed on as it is. Raises ActionError that says what is wrong, NotFinite if it is a number.
+    """
+    if not isinstance(answer, Mapping):
+        raise ActionError(f'the policy\'s answer is a {type(answer).__name__}; it should be a dict with "actions"')
+    for name in ("actions", "model_actions") if model_actions else ("actions",):
+        if name not in answer:
+            keys = ", ".join(map(str, answer)) or "none"
+            raise ActionError(f'the policy\'s answer has no "{name}"; its keys: {keys:.200}')
+    if batch:
+        chunks = answer["actions"]
+        if not isinstance(chunks, list | np.ndarray) or not len(chunks):
+            raise ActionError(f'"actions" of a batch aren\'t a chunk for each observation but {_shape(chunks)}')
+        checked = [_checked_array("actions", chunk, "[H, d]") for chunk in chunks]
+        return dict(answer) if isinstance(chunks, np.ndarray) else {**answer, "actions": checked}
+    arrays = {"actions": _checked_array("actions", answer["actions"], "[H, d]")}
+    if model_actions:
+        rows = len(arrays["actions"])
+        arrays["model_actions"] = _checked_array("model_actions", answer["model_actions"], f"[{rows}, A]", rows)
+        if answer.get("anchor") is not None:
+            arrays["anchor"] = _checked_array("anchor", answer["anchor"])
+    return {**answer, **arrays}
 
 
-def read_chunk(
-    number: int, result: Mapping[str, Any], shape: tuple[int, int] | None, needed_by: str | None
-) -> Chunk | str:
-    """The chunk of a policy's result, or what is wrong with it.
+def _checked_array(name: str, value: object, axes: str = "", rows: int | None = None) -> np.ndarray:
+    """`value` as an array of finite numbers: of any shape, or with the two `axes`, and `rows` if they are known."""
+    array = _array(value)
+    if (
+        array is None
+        or array.dtype.kind not in "fiu"
+        or not array.size
+        or (axes and (array.ndim != 2 or rows not in (None, len(array))))
+    ):
+        raise ActionError(f'"{name}" isn\'t an array of numbers{" " + axes if axes else ""} but {_shape(value)}')
+    if array.dtype.kind == "f":
+        single = array.dtype.itemsize <= 4
+        if not (np.isfinite(array).all() if single else np.abs(array).max() <= _MOST):  # the largest is NaN if one is
+            places = np.argwhere(~np.isfinite(array) if single else ~(np.abs(array) <= _MOST))
+            first = tuple(map(int, places[0]))
+            raise NotFinite(
+                f'"{name}" has {array[first]} at {list(first)} (from 0): {len(places)} of {array.size} numbers are '
+                "NaN, infinite or beyond float32"
+            )
+    return array
+
+
+def read_chunk(number: int, answer: Any, shape: tuple[int, int] | None, needed_by: str | None) -> Chunk:
+    """The chunk of an answer, in arrays of its own.
 
     shape      of the actions of chunks before; None: there was none
     needed_by  the way to run that needs "model_actions"; None: none does, and they aren't read
+
+    Raises as `checked_answer`, and ActionError for actions of another shape.
     """
-    actions = numbers(result.get("actions"), np.float64)
-    if actions is None or actions.ndim != 2 or 0 in actions.shape:
-        return f'"actions" isn\'t an array of numbers [H, d] but {_shape(result.get("actions"))}'
-    if shape is not None and actions.shape != shape:
-        return f"its actions have shape {list(actions.shape)}; those before had {list(shape)}"
-    if needed_by is None:
-        return Chunk(number, actions, None, None)
-    if "model_actions" not in result:
-        return (
+    if needed_by is not None and isinstance(answer, Mapping) and "actions" in answer and "model_actions" not in answer:
+        raise ActionError(
             f'the policy\'s answer has no "model_actions", which {needed_by} needs for the next chunk: '
             "take a policy that offers it, or execution 'sync', 'async' or 'ensemble'"
         )
-    model_actions = numbers(result["model_actions"], np.float32)
-    if model_actions is None or model_actions.ndim != 2 or len(model_actions) != len(actions):
-        return f'"model_actions" isn\'t float32 [{len(actions)}, A] but {_shape(result["model_actions"])}'
-    anchor = None
-    if result.get("anchor") is not None:
-        anchor = numbers(result["anchor"], np.float64)
-        if anchor is None:
-            return f'"anchor" isn\'t an array of numbers but {_shape(result["anchor"])}'
-    return Chunk(number, actions, model_actions, anchor)
+    checked = checked_answer(answer, model_actions=needed_by is not None)
+    actions = checked["actions"].astype(np.float64)
+    if shape is not None and actions.shape != shape:
+        raise ActionError(f"its actions have shape {list(actions.shape)}; those before had {list(shape)}")
+    if needed_by is None:
+        return Chunk(number, actions, None, None)
+    anchor = None if checked.get("anchor") is None else checked["anchor"].astype(np.float64)
+    return Chunk(number, actions, checked["model_actions"].astype(np.float32), anchor)
 
 
 def too_far(actions: np.ndarray, last: np.ndarray | None, most: np.ndarray) -> str | None:
@@ -83,12 +125,15 @@ def checked_max_jump(given: float | np.ndarray) -> np.ndarray:
 
 def numbers(value: object, dtype: type[np.floating[Any]]) -> np.ndarray | None:
     """`value` as an array of its own, if it is numbers."""
+    array = _array(value)
+    return None if array is None or array.dtype.kind not in "fiu" else array.astype(dtype)
+
+
+def _array(value: object) -> np.ndarray | None:
     try:
-        array = np.asarray(value)
+        return np.asarray(value)
     except (ValueError, TypeError, RuntimeError, OverflowError):  # lists of different lengths, a tensor on a GPU
         return None
-    with np.errstate(over="ignore"):  # an infinity is found later
-        return array.astype(dtype) if array.dtype.kind in "fiu" else None
 
 
 def _shape(value: object) -> str:

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from turbopi.config import RealTime, Schedule
-from turbopi.errors import ConfigError
-from turbopi.execution.chunk import Chunk, checked_max_jump, mix, read_chunk, too_far
+from turbopi.errors import ActionError, ConfigError
+from turbopi.execution.chunk import Chunk, NotFinite, checked_max_jump, mix, read_chunk, too_far
 from turbopi.execution.delays import DelayEstimate, number_up_to
 from turbopi.execution.ways import Execution, way_named
 from turbopi.running_chunk import RunningChunk
@@ -265,7 +265,7 @@ class ChunkQueue:
         s_told = None if self._policys_guidance else s
         return RunningChunk(left_over, min(expected, most), s_told, self.way.mode, chunk.anchor, **self._guidance)
 
-    def arrive(self, result: Mapping[str, Any]) -> Reason | None:
+    def arrive(self, result: Any) -> Reason | None:
         """The chunk in flight is there: what `policy.infer` returned. None if it takes over, else why it is dropped.
 
         Raises ConfigError if chunks of its length can't be run in this way at all (`check_horizon`).
@@ -275,14 +275,13 @@ class ChunkQueue:
         self._delay_measured(delay)
         if flight.refused is not None:
             return self._drop(flight.refused, "its observation belongs to what was interrupted")
-        chunk = self._read(flight.request.number, result)
-        if isinstance(chunk, str):
-            return self._drop("malformed", chunk)
+        try:
+            chunk = self._read(flight.request.number, result)
+        except ActionError as error:
+            return self._drop("not_finite" if isinstance(error, NotFinite) else "malformed", str(error))
         horizon = len(chunk.actions)
         if self.horizon is None:
             self._learn(chunk)
-        if not chunk.finite:
-            return self._drop("not_finite", "a number in it is NaN, infinite or beyond float32")
         if entry >= horizon:
             return self._drop("used_up", f"{entry} actions were carried out since its observation; it has {horizon}")
         previous = flight.request.previous
@@ -306,15 +305,19 @@ class ChunkQueue:
         self.chunks += 1
         return None
 
-    def learn(self, result: Mapping[str, Any]) -> RunningChunk | None:
+    def learn(self, result: Any) -> RunningChunk | None:
         """A chunk that nobody carries out, such as a warm-up's, shows H. Raises ConfigError as `arrive` does.
 
         Returns what the policy would be told once s actions of it were carried out, for another call of the warm-up;
-        None if nothing would be left, or the policy is never told.
+        None if nothing would be left, or the policy is never told. Raises ConfigError for what is no chunk, ActionError
+        for one with numbers that aren't finite: the next one's may be.
         """
-        chunk = self._read(-1, result)
-        if isinstance(chunk, str):
-            raise ConfigError(chunk)
+        try:
+            chunk = self._read(-1, result)
+        except NotFinite:
+            raise
+        except ActionError as error:
+            raise ConfigError(str(error)) from error
         self._learn(chunk)
         return self._told(chunk, self.execution_horizon, self._delay.steps)
 
@@ -430,7 +433,7 @@ class ChunkQueue:
         self.last_problem = f"{reason}: {text}"
         return reason
 
-    def _read(self, number: int, result: Mapping[str, Any]) -> Chunk | str:
+    def _read(self, number: int, result: Any) -> Chunk:
         shape = None if self.horizon is None or self.width is None else (self.horizon, self.width)
         return read_chunk(number, result, shape, None if self.way.mode is None else self.way.name)
 

@@ -44,7 +44,8 @@ class RealTimeExecutor:
                                       actions that are left, by commands half way between them; then "hold".
                                       For absolute positions alone: half way between two velocities is no such thing
                          "raise"      OutOfActions. Standing still is a part of "sync", and so is waiting for the
-                                      first chunk: there, once it takes longer than `max_observation_age_s`
+                                      first chunk: there, once it takes longer than `max_observation_age_s`, whatever
+                                      the reason (the first warm-up may take longer, until it fails)
     hold_action        the action of commands that hold. None: none at all, the robot's controller keeps its place.
                        "last": the last command once more, right for absolute positions and nothing else. An array
                        [d]: this one, such as zeros for velocities; where it is NaN, as the last command (a gripper)
@@ -124,7 +125,7 @@ class RealTimeExecutor:
         self._closed = False
         self._fresh_at: deque[float] = deque(maxlen=1024)  # when actions were given out
         self._called_at: float | None = None  # the last call of next_action
-        self._begun_at = 0.0  # when the last call of the policy began
+        self._empty_at: float | None = None  # the first control step without an action since the last one with one
         self._stretched = False  # the last command was "slowed"
         self._anew = True  # a server that keeps the running chunk must forget it
         self._kept_at: int | None = None  # which one that is: actions before its observation
@@ -171,11 +172,12 @@ class RealTimeExecutor:
             )
             self._delays.begin(delay)
             self._warm_seconds = self._clock() - began
+            self._empty_at = None
 
     def _learn(self, result: Any) -> RunningChunk | None:
         """What the first answer of a warm-up shows. Raises ConfigError."""
         with self._lock:
-            previous = self._queue.learn(result if isinstance(result, Mapping) else {})
+            previous = self._queue.learn(result)
             width = self._queue.width
         if isinstance(self._hold, np.ndarray) and len(self._hold) != width:
             raise ConfigError(f"hold_action has {len(self._hold)} numbers, but the policy's actions have {width}")
@@ -239,7 +241,6 @@ class RealTimeExecutor:
             self._anew, self._kept_at = False, request.carried_out
             arguments = {**self._arguments, **request.arguments}
             self._journal.inferred.append(Inferred(request.number, request.step))
-            self._begun_at = now
             future = self._inference.begin(lambda: self._timed(message, arguments))
             self._pending = (future, now - age)
             return True
@@ -264,7 +265,7 @@ class RealTimeExecutor:
         """A new episode: what is left of the last one is dropped, and its answer, should it still come."""
         with self._lock:
             self._queue.reset()
-            self._called_at = None
+            self._called_at = self._empty_at = None
             self._stretched = False
             self._anew = True
             self._fresh_at.clear()
@@ -371,7 +372,8 @@ class RealTimeExecutor:
         if before is not None and not 0 <= now - before <= self._max_pause:
             self._journal.clock_jumps += 1
             self._queue.interrupt("clock_jump")
-            self._anew = True
+            self._anew, self._empty_at = True, None
+            self._fresh_at.clear()  # moments of the clock before
             logger.warning("%.3f s between two control steps: the actions that were left are dropped", now - before)
 
     def _take_answer(self, now: float) -> None:
@@ -392,7 +394,6 @@ class RealTimeExecutor:
                 self._queue.fail("stale", f"its observation is {now - taken_at:.3f} s old")
                 entry.outcome = "stale"
             else:
-                result = result if isinstance(result, Mapping) else {}
                 entry.outcome = self._queue.arrive(result) or "used"
         self._anew = self._anew or entry.outcome != "used"  # the server takes every chunk for carried out
         entry.ended = self._queue.steps
@@ -422,25 +423,35 @@ class RealTimeExecutor:
         if action is None:
             return None
         self._fresh_at.append(now)
+        self._empty_at = None
         return Command("fresh", action.values, self._queue.remaining, action.chunk, action.row, action.takes_over)
 
     def _empty(self, now: float) -> Command:
         last = self._queue.last_values
         kind: Kind = "waiting" if last is None else "held"
-        if self._on_empty == "raise":
-            patient = last is None or self._way.stands_still
-            if not patient or (self._pending is not None and now - self._begun_at > self._max_age):
-                step = self._queue.steps - 1
-                text = f"no action for control step {step}: {self._why_empty()}; the robot must stop now"
-                raise OutOfActions(text) from self.last_error
+        if self._empty_at is None:
+            self._empty_at = now
+        if self._on_empty == "raise" and not self._may_wait(now, self._empty_at):
+            step = self._queue.steps - 1
+            text = f"no action for control step {step}: {self._why_empty()}; the robot must stop now"
+            raise OutOfActions(text) from self.last_error
         return Command(kind, held_values(self._hold, last), 0)
 
+    def _may_wait(self, now: float, since: float) -> bool:
+        """Whether standing still is right for now, with no action `since` then."""
+        if self._queue.last_values is not None and not self._way.stands_still:
+            return False
+        first_warm_up = self._warm_seconds is None and self.last_error is None  # it may compile
+        return first_warm_up or now - since <= self._max_age
+
     def _why_empty(self) -> str:
-        if self._pending is not None:
-            expected = self._queue.expected_delay
-            return f"the policy has been computing for {self._queue.waited} control steps, expected were {expected}"
-        if self._queue.last_problem:
-            return f"the last chunk was dropped ({self._queue.last_problem})"
+        if self._warm_seconds is None and self.last_error is not None:
+            return f"the warm-up failed ({_named(self.last_error)})"
+        waited, expected, problem = self._queue.waited, self._queue.expected_delay, self._queue.last_problem
+        if self._pending is not None and (waited > expected or not problem):
+            return f"the policy has been computing for {waited} control steps, expected were {expected}"
+        if problem:
+            return f"the last chunk was dropped ({problem})"
         return "no observation came in time"
 
 

@@ -7,10 +7,11 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from turbopi.errors import ActionError, ConfigError, DeviceLost, ObservationError
+from turbopi.execution.chunk import checked_answer
 from turbopi.execution.queue import of_batch
 from turbopi.running_chunk import RunningChunk
 from turbopi.serve.batch_times import BatchTimes
@@ -318,7 +319,7 @@ class PolicyCalls:
         return Ran([[outcome]], _turn_seconds([outcome]))
 
     def _infer(self, observation: dict[str, Any], arguments: Mapping[str, Any]) -> Outcome:
-        return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments))
+        return self._outcome(time.perf_counter(), lambda: self._policy.infer(observation, **arguments), arguments)
 
     def _infer_batch(
         self, observations: Sequence[dict[str, Any]], arguments: Sequence[Mapping[str, Any]]
@@ -338,7 +339,8 @@ class PolicyCalls:
             results = self._infer_batch(observations, arguments)
             seconds = time.perf_counter() - started
             run = next(self._numbers)
-            return [Outcome(seconds, result=_checked(result), together=rows, run=run) for result in results]
+            each = zip(results, arguments, strict=True)
+            return [_checked(Outcome(seconds, together=rows, run=run), result, one) for result, one in each]
         except DeviceLost as error:
             self._on_lost(str(error))
             return [Outcome(time.perf_counter() - started, wrong="lost", text=str(error))] * rows
@@ -366,20 +368,23 @@ class PolicyCalls:
             answer.set_exception(error)
 
         def done(ran: "Future[dict[str, Any]]") -> None:
-            outcome.set_result([self._outcome(started, ran.result)])
+            outcome.set_result([self._outcome(started, ran.result, {})])
 
         answer.add_done_callback(done)
         return outcome
 
-    def _outcome(self, started: float, get: Callable[[], dict[str, Any]]) -> Outcome:
-        """What `get` returns or raises. Never raises: an exception couldn't tell whose fault it is."""
+    def _outcome(self, started: float, get: Callable[[], Any], arguments: Mapping[str, Any]) -> Outcome:
+        """What `get`, an `infer` with these arguments, returns or raises.
+
+        Never raises: an exception couldn't tell whose fault it is.
+        """
 
         def seconds() -> float:
             return time.perf_counter() - started
 
         try:
-            result = _checked(get())
-            return Outcome(seconds(), result=result, run=next(self._numbers))
+            result = get()
+            return _checked(Outcome(seconds(), run=next(self._numbers)), result, arguments)
         except ObservationError as error:
             return Outcome(seconds(), wrong="observation", text=str(error))
         except ActionError as error:
@@ -424,10 +429,12 @@ def largest_batch(
     return 1
 
 
-def _checked(result: Any) -> dict[str, Any]:
-    if not isinstance(result, dict) or "actions" not in result:
-        raise TypeError(f'the policy\'s result must be a dict with "actions", not {type(result).__name__}')
-    return result
+def _checked(outcome: Outcome, result: Any, arguments: Mapping[str, Any]) -> Outcome:
+    """The outcome with the result of an `infer` with these arguments, if a client may get that."""
+    try:
+        return replace(outcome, result=checked_answer(result, model_actions=bool(arguments.get("model_actions"))))
+    except ActionError as error:
+        return replace(outcome, wrong="actions", text=str(error))
 
 
 def _turn_seconds(outcomes: Sequence[Outcome]) -> float | None:

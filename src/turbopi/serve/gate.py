@@ -15,6 +15,10 @@ from turbopi.serve.options import check_key
 from turbopi.serve.page.http import asked_for, document, is_feed, is_page, page_key
 
 logger = logging.getLogger(__name__)
+WHAT_TO_SET = (
+    "start the server with --allowed-hosts NAME (allowed_hosts= in Python), the host's name without port. A client "
+    "that is no web page may leave Origin out instead (websocket-client: suppress_origin=True)."
+)
 
 
 class Gate:
@@ -50,6 +54,8 @@ class Gate:
 
     def __call__(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a plain HTTP request, or None to go on with the websocket handshake."""
+        if (refusal := _protocol_refusal(connection, request)) is not None:
+            return refusal
         path, lost = asked_for(request), self._why_lost()
         if len(request.headers.get_all("Host")) > 1:  # which of them a proxy has checked, nobody knows
             return connection.respond(HTTPStatus.BAD_REQUEST, "A request has one Host header.\n")
@@ -69,8 +75,8 @@ class Gate:
         if path == "/metrics":
             return self._metrics_page(connection, request)
         host = _only(request, "Host")
-        for origin in request.headers.get_all("Origin"):  # of browsers, always; robots send none
-            if host is None or not self._hosts.has_page(origin, host):
+        for origin in request.headers.get_all("Origin"):  # of browsers, always; most robots send none
+            if host is None or not self._hosts.lets_in(origin, host, request.headers):
                 return self._forbidden(connection, f"pages of {_short(origin)} may not use {_short(host)}")
         if lost is not None:
             self._metrics.error("lost")
@@ -97,7 +103,7 @@ class Gate:
     def _forbidden(self, connection: ServerConnection, why: str) -> Response:
         self._metrics.error("origin")
         self._log.warning(f"{peer(connection)} refused: {why}")
-        return connection.respond(HTTPStatus.FORBIDDEN, f"{why}; --allowed-hosts names those that may.\n")
+        return connection.respond(HTTPStatus.FORBIDDEN, f"{why}: {WHAT_TO_SET}\n")
 
     def _unauthorized(self, connection: ServerConnection, request: Request) -> Response:
         self._metrics.error("unauthorized")
@@ -117,6 +123,20 @@ class Gate:
             scheme, key = "api-key", page_key(request) or ""
         given = key.strip().encode(errors="replace")
         return scheme.lower() == "api-key" and hmac.compare_digest(given, self._key)  # in constant time
+
+
+def _protocol_refusal(connection: ServerConnection, request: Request) -> Response | None:
+    """The answer to what isn't a GET of HTTP/1.1. websockets before 17 closes such a connection by itself."""
+    method, version = getattr(request, "method", "GET"), getattr(request, "protocol", "HTTP/1.1")
+    if method != "GET":
+        response = connection.respond(HTTPStatus.METHOD_NOT_ALLOWED, "This server answers GET alone.\n")
+        response.headers["Allow"] = "GET"
+        if method == "HEAD":
+            response.body = b""
+        return response
+    if version != "HTTP/1.1":
+        return connection.respond(HTTPStatus.HTTP_VERSION_NOT_SUPPORTED, "This server speaks HTTP/1.1 alone.\n")
+    return None
 
 
 def _found(connection: ServerConnection, headers: Mapping[str, str], text: str) -> Response:

@@ -41,7 +41,7 @@ Send = Callable[[dict[str, Any]], Awaitable[None]]
 
 PROXY_MB = 16.0  # of a message: what Ray Serve's proxy takes
 AHEAD_BYTES = 64 * 2**20  # that a client may send while its requests wait: Ray's proxy reads all that comes
-PASSED_ON = ("authorization", "origin")
+PASSED_ON = ("authorization", "origin")  # by these and Host a server on loopback judges whom it lets in (hosts.py)
 HTTP_SECONDS = 30.0
 CLOSE_SECONDS = 1.0  # for the server to see that a client has left, before the connection is cut
 
@@ -265,7 +265,11 @@ def _headers(scope: Scope, names: tuple[str, ...]) -> list[tuple[str, str]]:
 
 
 async def _http(port: int, scope: Scope, send: Send) -> None:
-    """/healthz, /metrics, and what the server says to all else."""
+    """/healthz, /metrics, and what the server says to all else; GET alone, as there."""
+    if scope.get("method", "GET") != "GET":
+        await send({"type": "http.response.start", "status": 405, "headers": [(b"allow", b"GET")]})
+        await send({"type": "http.response.body", "body": b""})
+        return
 
     def ask() -> tuple[int, list[tuple[str, str]], bytes]:
         connection = HTTPConnection("127.0.0.1", port, timeout=HTTP_SECONDS)

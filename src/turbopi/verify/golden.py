@@ -8,7 +8,6 @@
 Any seed, batch size, camera mask, prompt and horizon; tensors may be missing from any file.
 """
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from turbopi.checkpoint import Checkpoint, open_checkpoint
 from turbopi.config import CAMERAS, GemmaConfig, Kind, ModelConfig, Normalization, PolicyConfig, VisionConfig
 from turbopi.errors import CheckpointError, ObservationError
 from turbopi.observation import Observation
+from turbopi.reading import read_json, read_npz
 
 VARIANTS = ("torch_fp32", "jax_fp32", "torch_bf16", "jax_bf16")
 Arrays = dict[str, np.ndarray]
@@ -55,8 +55,7 @@ class GoldenFolder:
 
     @cached_property
     def sizes(self) -> dict[str, object]:
-        sizes: dict[str, object] = json.loads((self.path / "checkpoints/model.json").read_text())
-        return sizes
+        return read_json(self.path / "checkpoints/model.json")
 
     def model_config(self, kind: Kind) -> ModelConfig:
         """The tiny model's sizes, from model.json."""
@@ -96,9 +95,9 @@ class GoldenFolder:
         for file in sorted(folder.glob("*.steps*.npz")):
             match = re.fullmatch(r"(\w+)\.steps(\d+)\.npz", file.name)
             if match and match[1] in VARIANTS:
-                found.setdefault(int(match[2]), {})[match[1]] = _load(file)
+                found.setdefault(int(match[2]), {})[match[1]] = read_npz(file)
         runs = [Run(steps, variants) for steps, variants in sorted(found.items())]
-        inputs = _load(folder / "inputs.npz")
+        inputs = read_npz(folder / "inputs.npz")
         kind = self._kind(folder.name, inputs, runs)
         return Case(folder.name, kind, _observation(inputs), torch.from_numpy(inputs["noise"]), runs)
 
@@ -119,11 +118,6 @@ class GoldenFolder:
             f"case {name}: can't tell Pi0.5 from Pi0: {width} prompt slots fit {fits or 'neither'} of {limits}, "
             "no file has `cond`, and there are checkpoints of both"
         )
-
-
-def _load(file: Path) -> Arrays:
-    with np.load(file) as archive:
-        return {name: archive[name] for name in archive.files}
 
 
 def _observation(inputs: Arrays) -> Observation:

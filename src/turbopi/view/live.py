@@ -33,7 +33,7 @@ class LiveServer:
         self._open = contextlib.ExitStack()
         headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
         try:
-            socket = connect(self.url, additional_headers=headers, max_size=MAX_MESSAGE)
+            socket = connect(self.url, additional_headers=headers, max_size=MAX_MESSAGE, proxy=None)
             self._socket: ClientConnection = self._open.enter_context(socket)
         except InvalidStatus as error:
             told = (error.response.body or b"").decode(errors="replace").strip()
