@@ -89,13 +89,18 @@ class BatchTimes:
         return pause
 
     def formed_largest(self, now: float) -> int:
-        """The largest batch that may be formed now."""
-        return min(self.measured_largest, max(1, self._failed - 1) if now < self._failed_until else self.largest)
+        """The largest batch that may be formed now: none as large as one that failed a moment ago."""
+        if now < self._failed_until:
+            return self._measured_up_to(min(self.largest, self._failed - 1))
+        return self.measured_largest
 
     @property
     def measured_largest(self) -> int:
         """The largest batch that may be formed at all; 1 if none was measured."""
-        return max((rows for rows in self._warm if rows <= self.largest), default=1)
+        return self._measured_up_to(self.largest)
+
+    def _measured_up_to(self, most: int) -> int:
+        return max((rows for rows in self._warm if rows <= most), default=1)
 
     @property
     def sizes(self) -> list[int]:
