@@ -203,10 +203,10 @@ def test_a_turn_is_of_the_earliest_deadline_and_of_robots_first(
 
 
 @settings(max_examples=100, deadline=None)
-@given(arrivals(plain=True), limits)
-def test_without_deadlines_and_batches_it_is_first_come_first_served(made: list[Request], limit: int) -> None:
+@given(arrivals(plain=True))
+def test_without_deadlines_and_batches_it_is_first_come_first_served(made: list[Request]) -> None:
     """Nobody begins later than in a line of one call at a time."""
-    history = simulate(Schedule(limit, table({1: T1})), made)
+    history = simulate(Schedule(40, table({1: T1})), made)
     served = [turn.requests[0] for turn in history.turns]
     assert served == sorted(served, key=lambda one: one.number)
     free = 0.0
@@ -218,9 +218,9 @@ def test_without_deadlines_and_batches_it_is_first_come_first_served(made: list[
 
 
 @settings(max_examples=100, deadline=None)
-@given(arrivals(plain=True), limits)
-def test_batches_of_equal_deadlines_never_change_the_order(made: list[Request], limit: int) -> None:
-    served = [one for turn in simulate(Schedule(limit, table(PAYING)), made).turns for one in turn.requests]
+@given(arrivals(plain=True))
+def test_batches_of_equal_deadlines_never_change_the_order(made: list[Request]) -> None:
+    served = [one for turn in simulate(Schedule(40, table(PAYING)), made).turns for one in turn.requests]
     assert served == sorted(served, key=lambda one: one.number)
 
 
@@ -430,10 +430,10 @@ class Crowd:
 
 
 def beside(crowd: Crowd, robots: Sequence[float | None], seconds: float = 5.0, limit: int = 16) -> float:
-    """The part of its requests that a robot gets answers to in time, beside a crowd and others like it; the worst one's.
+    """The part of a robot's requests that get answers in time, beside a crowd and other robots; the worst one's.
 
-    Turns take 20 ms. Each robot asks five times a second, with jitter, but not before it is answered. Its deadline is in
-    `robots`; None: the default one of a second, which isn't its own.
+    Turns take 20 ms. Each robot asks five times a second, with jitter, but not before it is answered. `robots` has
+    their deadlines; None: the default one of a second, which isn't their own.
     """
     schedule, randoms, events, order = Schedule(limit, table({1: 0.02})), Random(0), list[Any](), count()
     asked, good, now, wake = [0] * len(robots), [0] * len(robots), 0.0, -1.0
@@ -483,7 +483,8 @@ def beside(crowd: Crowd, robots: Sequence[float | None], seconds: float = 5.0, l
 
 
 @pytest.mark.parametrize(
-    ("others", "pause"), [(17, 0.001), (24, 0.01), (40, 0.01), (17, 0.1), (40, 0.05), (40, 0.1), (150, 0.05), (150, 0.1)]
+    ("others", "pause"),
+    [(17, 0.001), (24, 0.01), (40, 0.01), (17, 0.1), (40, 0.05), (40, 0.1), (150, 0.05), (150, 0.1)],
 )
 @pytest.mark.parametrize("own", [0.2, None], ids=["deadline", "plain"])
 def test_a_robot_is_served_beside_a_crowd_that_asks_again_at_once(others: int, pause: float, own: float | None) -> None:
@@ -522,7 +523,7 @@ def test_several_robots_are_served_beside_a_crowd() -> None:
 
 
 def test_a_robot_in_a_crowd_of_others_like_it_has_its_share() -> None:
-    """150 that ask three times a second are too much: each gets some answers, and so does a robot that asks more often."""
+    """150 that ask three times a second are too much: a robot that asks more often gets some answers, too."""
     assert beside(Crowd(150, 0.3), [None], 12.0) >= 0.05
 
 

@@ -55,7 +55,11 @@ class BatchTimes:
         self._recent: dict[int, _Times] = {}
         # Answers that were given, as the schedule asks the same again and again while clients wait. They hold from the
         # one moment to the other, and until a time is added.
-        self._failed, self._failed_until, self._pause = 0, -math.inf, PAUSE  # the size that failed, for how long it counts
+        self._failed, self._failed_until, self._pause = (
+            0,
+            -math.inf,
+            PAUSE,
+        )  # the size that failed, for how long it counts
         self._seconds: dict[tuple[int, float], float | None] = {}
         self._totals: dict[int, float] = {}
         self._found_from, self._found_until = math.inf, -math.inf

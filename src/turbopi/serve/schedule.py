@@ -1,19 +1,20 @@
 """Whose turn it is: earliest deadline first, robots before simulators, batches where they pay.
 
 When more ask than can be served (a place or a firm deadline was refused within CROWDED_SECONDS), claims come before
-deadlines. A source's claim is how long it usually pauses before it asks, from its last request, answer or refusal on; LONG
-turns are as good as any longer pause. So a robot that asks five times a second has a strong claim, and a client that asks
-again at once has a weak one, however often it was refused. Of about equal claims the earlier deadline decides. The order
-goes by this, and so does who gives way in a full line: simulators to robots, then a source that has more than its share of
-the places, then the weakest claim, then the latest deadline. A quarter of the places are safe: those of the sources that
-were served longest ago, so that nobody is refused for ever. Neither a short deadline nor a new connection is a claim.
+deadlines. A source's claim is how long it usually pauses before it asks, from its last request, answer or refusal on;
+LONG turns are as good as any longer pause. So a robot that asks five times a second has a strong claim, and a client
+that asks again at once has a weak one, however often it was refused. Of about equal claims the earlier deadline
+decides. The order goes by this, and so does who gives way in a full line: simulators to robots, then a source that
+has more than its share of the places, then the weakest claim, then the latest deadline. A quarter of the places are
+safe: those of the sources that were served longest ago, so that nobody is refused for ever. Neither a short deadline
+nor a new connection is a claim.
 
 A pure decision: nothing here waits, and time is an argument (seconds of any steady clock). worker.py asks `decide`
 whenever something has changed or the moment `Decision.wake` has come, and runs the turn that it is given.
 
 What holds:
 
-- Requests with the same deadline, priority and size run in the order in which they came.
+- Requests with the same deadline, priority, size and, in a crowd, claim run in the order in which they came.
 - A request may be overtaken (a turn goes to one that came later) OVERTAKEN times. Of those that were, the one that came
   first gets every other turn at least: nobody starves, not even simulators.
 - What has a deadline of its own and can't meet it is refused: when it comes, if its wait and its run are already too
@@ -43,7 +44,7 @@ LATE_TIMER = 0.0005  # seconds that a wait ends before the last moment: a late t
 PATIENCE = 4.0  # usual gaps without an arrival, after which no more company is waited for
 CROWDED_SECONDS = 1.0
 LONG = 8.0  # turns: who pauses so long takes a ninth of the policy's time at most
-NEW = 1 / 16  # the claim of a source that wasn't seen lately: weaker than a robot's, stronger than one's that asks at once
+NEW = 1 / 16  # the claim of a source that wasn't seen lately: weaker than a robot's
 WEAKEST = 12  # levels of claims, from 0; one is a factor of √2
 SAFE_PLACES = 1 / 4  # of the line: those of the sources that were served longest ago
 LATER = 1e-4  # seconds after the moment from which a deadline can't be met, so that rounding doesn't matter
@@ -351,7 +352,7 @@ class Schedule:
         return min(moments, default=None)
 
     def _order(self, now: float) -> Callable[[Request], tuple[float, ...]]:
-        """Who comes first: robots, then the strongest claim in a crowd, then the earliest deadline, then who came first."""
+        """Robots first, then in a crowd the strongest claim, then the earliest deadline, then who came first."""
         return _IN_CROWD if now < self.crowded_until else _ORDER
 
     # --- turns --------------------------------------------------------------------------------------------------------

@@ -106,8 +106,8 @@ class Worker:
     async def drain(self) -> None:
         """Wait for the running turn to end, if there is one, and for all that turns began. Call `stop` first.
 
-        A policy that never ends holds nobody: after DRAIN_SECONDS and twice the time that it usually takes, the log says
-        so, and its requests are turned away.
+        A policy that never ends holds nobody: after DRAIN_SECONDS and twice its usual time the log says so, and its
+        requests are turned away.
         """
         if not self.running:
             return
