@@ -538,6 +538,19 @@ def test_a_source_with_more_than_its_share_of_a_full_line_gives_way() -> None:
     assert refused.request is greedy[-1] and "gave its place" in refused.text
 
 
+def test_a_source_that_is_slowed_has_no_claim_from_its_pauses() -> None:
+    schedule = Schedule(1, table({1: T1}))
+    schedule.add(request(source=9), 0.0)
+    begin(schedule, 0.0)
+    for source in (1, 2):  # both pause until 0.5
+        schedule.add(first := request(0.0, source=source), 0.0)
+        schedule.remove(first)
+    slowed = request(0.5, source=1)
+    slowed.slowed = True
+    assert schedule.add(slowed, 0.5) == []
+    assert [one.request for one in schedule.add(request(0.5, source=2), 0.5)] == [slowed]
+
+
 def test_a_message_of_many_rows_keeps_its_place() -> None:
     schedule = Schedule(1, table({1: T1}))
     schedule.add(request(), 0.0)

@@ -77,6 +77,7 @@ class Request:
     alone: bool = False
     joins: bool = False
     continued: bool = False  # of a message that has its place in the line already
+    slowed: bool = False  # its source is read more slowly than it sends: its pauses say nothing, and it has no claim
     call: Any = None
     number: int = field(default=0, init=False)  # in the order in which they came
     overtaken: int = field(default=0, init=False)
@@ -276,7 +277,7 @@ class Schedule:
         if not request.continued:
             self._returns.asked(request.source, now)
             claim, request.served = self._pauses.asked(request.source, LONG * self._seconds(request, now), NEW, now)
-            request.level = min(WEAKEST, int(-2 * math.log2(claim))) if claim > 0 else WEAKEST
+            request.level = min(WEAKEST, int(-2 * math.log2(claim))) if claim > 0 and not request.slowed else WEAKEST
         priority = PRIORITIES.index(request.priority)
         request.order = priority, request.deadline, request.number
         request.in_crowd = priority, request.level, request.deadline, request.number
